@@ -1,0 +1,1 @@
+"""Commands: identification of a plant under control."""

@@ -1,0 +1,1 @@
+"""Commands: delay identification, and the on-line estimator that watches a loop."""

@@ -1,0 +1,1 @@
+"""Commands: design on a model or on points, and margins of a given controller."""

@@ -1,0 +1,1 @@
+"""Commands: simulation of a model on a recording, and diagnosis of where the two differ."""

@@ -1,0 +1,1 @@
+"""Commands: frequency points from a recording."""

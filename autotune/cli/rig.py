@@ -1,0 +1,1 @@
+"""Commands: first contact with a rig, and simulated rigs behind real transports."""

@@ -1,0 +1,1 @@
+"""Commands: the whole chain, from a config file to a verified controller."""

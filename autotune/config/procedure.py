@@ -1,0 +1,132 @@
+"""What is to be done on the rig: signals, limits, operating point, experiment, design, verification."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+
+class Section(BaseModel):
+    """A table of the configuration: frozen, and a key it does not know is refused."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+Positive = Annotated[float, Field(gt=0)]
+
+
+class SignalSettings(Section):
+    """Units and sample time."""
+
+    sample_time_s: Annotated[float, Field(gt=0, le=3600, description="control period [s], above 0 up to 3600")]
+    u_unit: Annotated[str, Field(description="unit of the command, as people say it")] = ""
+    y_unit: Annotated[str, Field(description="unit of the measurement, as people say it")] = ""
+
+
+class LimitSettings(Section):
+    """Safety envelope: applied to every command, in every state."""
+
+    u_min: Annotated[float, Field(description="lowest command [u unit]")]
+    u_max: Annotated[float, Field(description="highest command [u unit]")]
+    u_safe: Annotated[float, Field(description="command the rig is left with [u unit], within u_min..u_max")]
+    u_rate: Annotated[float, Field(gt=0, description="largest change of the command per second [u unit/s]")] = 1e9
+    y_min: Annotated[float, Field(description="lowest measurement the experiment may see once it floats [y unit]")]
+    y_max: Annotated[float, Field(description="highest measurement the experiment may see once it floats [y unit]")]
+    swing: Annotated[float, Field(gt=0, description="largest departure of y from the operating point [y unit]")]
+    time_s: Annotated[float, Field(gt=0, description="longest time on the rig [s]")] = 600.0
+
+    @model_validator(mode="after")
+    def _ordered(self) -> LimitSettings:
+        if not self.u_min < self.u_max:
+            raise ValueError(f"u_min = {self.u_min:g} must be below u_max = {self.u_max:g}")
+        if not self.u_min <= self.u_safe <= self.u_max:
+            raise ValueError(f"u_safe = {self.u_safe:g} must lie within u_min..u_max")
+        if not self.y_min < self.y_max:
+            raise ValueError(f"y_min = {self.y_min:g} must be below y_max = {self.y_max:g}")
+        return self
+
+
+class OperatingPointSettings(Section):
+    """Where the loop is commissioned, and how to get there."""
+
+    y: Annotated[float, Field(description="measurement to oscillate around [y unit]")]
+    u_guess: Annotated[float, Field(description="nominal command that holds it [u unit]")]
+    u_uncertainty: Annotated[float, Field(gt=0, description="how far the true one may be from u_guess [u unit]")]
+    approach: Annotated[
+        Literal["ramp", "hold"],
+        Field(description="ramp the command until y moves, or start where the rig is"),
+    ] = "ramp"
+    plant_sign: Annotated[Literal[-1, 0, 1], Field(description="sign of the plant's gain; 0 to have it measured")] = 0
+
+
+class ExperimentSettings(Section):
+    """Relay sweep."""
+
+    phases_deg: Annotated[
+        tuple[float, float],
+        Field(description="phases of the plant (positive gain) between which points are wanted [deg]"),
+    ] = (-105.0, -160.0)
+    points: Annotated[int, Field(ge=3, le=20, description="number of points, 3 to 20")] = 5
+    relay_amplitude: Annotated[
+        float | None,
+        Field(gt=0, description="half-amplitude of the relay [u unit]; chosen by the tool when absent"),
+    ] = None
+    gain_sd: Annotated[
+        float, Field(gt=0, lt=0.5, description="relative standard deviation at which a point is good enough")
+    ] = 0.004
+    budget_s: Annotated[float, Field(gt=0, description="rig time for the sweep [s]")] = 60.0
+
+
+SPECIFICATIONS = {"Spec1": (0.5, 45.0), "Spec2": (0.8, 60.0)}
+
+
+class DesignSettings(Section):
+    """Specification of the controller: a named one, or margins that replace its values."""
+
+    kind: Annotated[Literal["pi", "pid"], Field(description="structure of the controller")] = "pi"
+    specification: Annotated[
+        Literal["Spec1", "Spec2"],
+        Field(description="Spec1: modulus margin 0.5 and 45 deg; Spec2: 0.8 and 60 deg (plant that varies)"),
+    ] = "Spec1"
+    modulus_margin: Annotated[float | None, Field(gt=0, lt=1, description="replaces the named one, 0 to 1")] = None
+    phase_margin_deg: Annotated[float | None, Field(gt=0, lt=90, description="replaces the named one [deg]")] = None
+    noise_gain: Annotated[
+        float,
+        Field(gt=0, description="largest amplification of measurement noise to command, N_max [u/y unit]"),
+    ] = 0.1
+    source: Annotated[
+        Literal["reduced model", "points"],
+        Field(description="design on the reduced model, or straight on the measured points and their regions"),
+    ] = "reduced model"
+
+    @property
+    def margins(self) -> tuple[float, float]:
+        """Modulus margin and phase margin [rad] to be kept."""
+        modulus, phase_deg = SPECIFICATIONS[self.specification]
+        modulus = self.modulus_margin if self.modulus_margin is not None else modulus
+        phase_deg = self.phase_margin_deg if self.phase_margin_deg is not None else phase_deg
+        return modulus, math.radians(phase_deg)
+
+
+class ControllerSettings(Section):
+    """The gains the loop has now: restored when the new ones do not verify."""
+
+    K: Annotated[float, Field(description="proportional gain with its sign [u unit/y unit]")]
+    Ti_s: Annotated[float, Field(gt=0, description="integral time [s]")]
+
+
+class VerificationSettings(Section):
+    """Set-point step and input-disturbance step on the rig with the new gains, compared with the prediction."""
+
+    setpoint_step: Annotated[float | None, Field(description="step of the set-point [y unit]; default swing / 3")] = (
+        None
+    )
+    disturbance_step: Annotated[
+        float | None,
+        Field(description="step added to the command [u unit]; chosen from the design when absent"),
+    ] = None
+    duration_s: Annotated[
+        float | None, Field(gt=0, description="time per step [s]; chosen from the design when absent")
+    ] = None

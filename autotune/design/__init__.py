@@ -1,0 +1,1 @@
+"""Controllers and margins: from models or points to a controller with its guarantees."""

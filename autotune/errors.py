@@ -1,0 +1,66 @@
+"""Failures as named verdicts: what happened, where, and the mend.
+
+Every error of the tool says these three things in one line; the command line prints that line and leaves with the
+exit status of the error's class (0 done, 2 input refused, 3 experiment stopped and rig safe, 130 stopped by the
+operator).
+"""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+
+class AutotuneError(Exception):
+    """Base of every error this project raises on purpose.
+
+    Parameters
+    ----------
+    what : str
+        What happened, in the reader's terms.
+    where : str
+        File, key, row, register or state it happened at.
+    mend : str
+        What the reader can do about it.
+    """
+
+    exit_status: ClassVar[int] = 1
+
+    def __init__(self, what: str, *, where: str = "", mend: str = "") -> None:
+        super().__init__(what, where, mend)
+        self.what = what
+        self.where = where
+        self.mend = mend
+
+    def __str__(self) -> str:
+        head = f"{self.where}: {self.what}" if self.where else self.what
+        return f"{head}; {self.mend}" if self.mend else head
+
+
+class InputError(AutotuneError, ValueError):
+    """A file, a setting or an argument was refused; nothing was done."""
+
+    exit_status = 2
+
+
+class IdentificationError(InputError):
+    """The data do not determine what was asked for; the message names the reason and the experiment that would."""
+
+
+class DesignError(InputError):
+    """No controller meets the specification; the message names the nearest reachable one."""
+
+
+class ExperimentStopped(AutotuneError, RuntimeError):  # noqa: N818 - a verdict, not a defect
+    """A limit or a fault ended the experiment; the rig was left at its safe output and the recording kept."""
+
+    exit_status = 3
+
+
+class LinkError(ExperimentStopped, ConnectionError):
+    """The link to the rig failed, or answered something that is not a sample."""
+
+
+class OperatorStop(ExperimentStopped):
+    """Ctrl-C or SIGTERM ended the experiment; the rig was left at its safe output."""
+
+    exit_status = 130

@@ -1,0 +1,95 @@
+"""What the experiment needs of a rig: small protocols by capability. Time is injected through the rig's clock."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+from autotune.controller import PIDController
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reading:
+    """One sample of the rig.
+
+    Attributes
+    ----------
+    t_s : float
+        Time of the measurement on the rig's clock [s].
+    y : float
+        Measurement in engineering units; NaN where the device sent something that is not a number.
+    u_applied : float
+        Output the device says it applies, in engineering units; NaN where it does not say.
+    device_time_s : float
+        Device time stamp [s]; NaN where it has none.
+    latency_s : float
+        Time the read took on the link [s].
+    suspect : bool
+        Whether the link had to retry or the answer did not identify itself: not to be used in an estimate.
+    """
+
+    t_s: float
+    y: float
+    u_applied: float = math.nan
+    device_time_s: float = math.nan
+    latency_s: float = 0.0
+    suspect: bool = False
+
+
+class Clock(Protocol):
+    """Time as the rig lives it: virtual for a simulated rig, monotonic for a real one."""
+
+    def now(self) -> float:
+        """Return the time [s]."""
+        ...
+
+    def sleep_until(self, t_s: float) -> None:
+        """Return at the absolute deadline ``t_s`` [s], at once when it has passed."""
+        ...
+
+
+class Rig(Protocol):
+    """A plant that can be measured and commanded.
+
+    Every method may raise :class:`autotune.errors.LinkError`. ``make_safe`` and ``close`` can be called in any
+    state, more than once.
+    """
+
+    @property
+    def clock(self) -> Clock:
+        """The clock that the rig's time stamps are on."""
+        ...
+
+    def open(self) -> None:
+        """Connect and take command of the actuator (enable coil, host-in-the-loop mode)."""
+        ...
+
+    def read(self) -> Reading:
+        """Take one sample."""
+        ...
+
+    def write(self, u: float) -> None:
+        """Command the actuator, in engineering units; also feeds the device's dead-man timer."""
+        ...
+
+    def make_safe(self) -> None:
+        """Command the safe output and give the actuator back."""
+        ...
+
+    def close(self) -> None:
+        """Disconnect."""
+        ...
+
+
+@runtime_checkable
+class HoldsGains(Protocol):
+    """A rig whose own controller's gains can be read and written."""
+
+    def read_gains(self) -> PIDController:
+        """Return the gains the device's controller holds now."""
+        ...
+
+    def write_gains(self, controller: PIDController) -> None:
+        """Write gains and read them back; raises LinkError if what is read back differs."""
+        ...

@@ -1,0 +1,1 @@
+"""Estimators: from recordings to frequency points and models, each with its covariance."""

@@ -1,0 +1,318 @@
+"""Models: transfer functions with exact dead time, and the chain of blocks that a person believes the rig to be.
+
+The model file is TOML: ``[input]``, ``[output]``, a ``[[block]]`` for every link of the chain, and ``[[effect]]`` tables
+where a diagnosis added physics. ``y = last block's output + output.offset``, driven by ``u - input.offset``.
+"""
+
+from __future__ import annotations
+
+import os
+import tomllib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, Literal, TypeAlias, get_args
+
+import numpy as np
+import tomli_w
+
+from autotune.arrays import ComplexArray, FloatArray
+from autotune.errors import InputError
+
+Place: TypeAlias = Literal["actuator", "plant", "sensor"]
+Hold: TypeAlias = Literal["zero", "linear"]
+
+
+def _trimmed(coefficients: Sequence[float]) -> tuple[float, ...]:
+    values = [float(value) for value in coefficients]
+    while len(values) > 1 and values[0] == 0.0:
+        values.pop(0)
+    return tuple(values)
+
+
+@dataclass(frozen=True, kw_only=True)
+class TransferFunction:
+    """num(s)/den(s) exp(-s delay): rational with an exact dead time.
+
+    Attributes
+    ----------
+    num, den : tuple of float
+        Coefficients in descending powers of s; leading zeros are dropped.
+    delay_s : float
+        Dead time [s], evaluated exactly as exp(-j omega L), never by a Pade approximation.
+
+    Raises
+    ------
+    InputError
+        A denominator that is zero, coefficients that are not finite, or a negative dead time.
+    """
+
+    num: tuple[float, ...]
+    den: tuple[float, ...]
+    delay_s: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not self.num or not self.den or not np.all(np.isfinite((*self.num, *self.den, self.delay_s))):
+            raise InputError("num, den and delay must be finite numbers", where="transfer function")
+        object.__setattr__(self, "num", _trimmed(self.num))
+        object.__setattr__(self, "den", _trimmed(self.den))
+        if self.den == (0.0,):
+            raise InputError("the denominator is zero", where="transfer function")
+        if self.delay_s < 0.0:
+            raise InputError(f"delay = {self.delay_s:g} s is negative", where="transfer function")
+
+    def response(self, omega_rad_s: FloatArray) -> ComplexArray:
+        """Return the complex gain at the angular frequencies, same shape as ``omega_rad_s``."""
+        s = 1j * np.asarray(omega_rad_s, dtype=np.float64)
+        rational = np.polyval(self.num, s) / np.polyval(self.den, s)
+        return np.asarray(rational * np.exp(-s * self.delay_s), dtype=np.complex128)
+
+    def __mul__(self, other: TransferFunction) -> TransferFunction:
+        return TransferFunction(
+            num=tuple(np.polymul(self.num, other.num)),
+            den=tuple(np.polymul(self.den, other.den)),
+            delay_s=self.delay_s + other.delay_s,
+        )
+
+    @property
+    def poles(self) -> ComplexArray:
+        """Roots of the denominator [rad/s]."""
+        return np.asarray(np.roots(self.den), dtype=np.complex128)
+
+    @property
+    def zeros(self) -> ComplexArray:
+        """Roots of the numerator [rad/s]."""
+        return np.asarray(np.roots(self.num), dtype=np.complex128)
+
+    @property
+    def integrators(self) -> int:
+        """Number of poles at s = 0 that the numerator does not cancel."""
+
+        def at_origin(coefficients: tuple[float, ...]) -> int:
+            return len(coefficients) - len(np.trim_zeros(np.array(coefficients), "b"))
+
+        return max(0, at_origin(self.den) - at_origin(self.num))
+
+    @property
+    def is_proper(self) -> bool:
+        """Whether the numerator's degree is at most the denominator's."""
+        return len(self.num) <= len(self.den)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Port:
+    """The chain's input or output: unit, operating-point offset and, at the input, how u runs between samples."""
+
+    unit: str = ""
+    offset: float = 0.0
+    hold: Hold = "zero"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Block:
+    """One link of the chain.
+
+    Attributes
+    ----------
+    name : str
+        What it is, in the reader's terms.
+    place : {"actuator", "plant", "sensor"}
+        Where in the rig it sits.
+    dynamics : TransferFunction
+        Proper transfer function with its dead time.
+    output, unit : str
+        Name and unit of the block's output signal, empty where not given.
+    """
+
+    name: str
+    place: Place
+    dynamics: TransferFunction
+    output: str = ""
+    unit: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Parameter:
+    """A value with its standard deviation and unit; the standard deviation is NaN where it is not known."""
+
+    value: float
+    unit: str = ""
+    sd: float = float("nan")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Effect:
+    """Physics added to the chain: an entry ``PLACE.EFFECT`` of the catalogue, where it acts, its parameters."""
+
+    name: str
+    at: str = ""
+    parameters: Mapping[str, Parameter] = field(default_factory=lambda: MappingProxyType({}))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Model:
+    """A chain of blocks in series, with the effects that were added to it."""
+
+    name: str
+    input: Port
+    output: Port
+    blocks: tuple[Block, ...]
+    effects: tuple[Effect, ...] = ()
+
+    def transfer_function(self) -> TransferFunction:
+        """Return the product of the blocks: the small-signal model, without the effects."""
+        product = TransferFunction(num=(1.0,), den=(1.0,))
+        for block in self.blocks:
+            product = product * block.dynamics
+        return product
+
+    def response(self, omega_rad_s: FloatArray) -> ComplexArray:
+        """Return the complex gain from u to y, effects left out, same shape as ``omega_rad_s``."""
+        product = np.ones_like(np.asarray(omega_rad_s), dtype=np.complex128)
+        for block in self.blocks:
+            product = product * block.dynamics.response(omega_rad_s)
+        return product
+
+
+def read_model(path: str | os.PathLike[str]) -> Model:
+    """Read a model file.
+
+    Raises
+    ------
+    InputError
+        No such file, not TOML, an unknown key or place, or a block that is not proper; names the table and the key.
+    """
+    where = str(path)
+    try:
+        content = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"cannot be read ({error.strerror})", where=where, mend="check the path") from None
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"not TOML: {error}", where=where) from None
+    _known(content, {"name", "input", "output", "block", "effect"}, where)
+    blocks = content.get("block", [])
+    if not isinstance(blocks, list) or not blocks:
+        raise InputError("no [[block]]", where=where, mend="a model needs at least one block")
+    return Model(
+        name=str(content.get("name", Path(path).stem)),
+        input=_port(content.get("input", {}), f"{where} [input]"),
+        output=_port(content.get("output", {}), f"{where} [output]"),
+        blocks=tuple(_block(table, f"{where} [[block]] {i + 1}") for i, table in enumerate(blocks)),
+        effects=tuple(
+            _effect(table, f"{where} [[effect]] {i + 1}") for i, table in enumerate(content.get("effect", []))
+        ),
+    )
+
+
+def _known(table: Mapping[str, Any], keys: set[str], where: str) -> None:
+    for key in table:
+        if key not in keys:
+            raise InputError(f"unknown key {key!r}", where=where, mend=f"known are {', '.join(sorted(keys))}")
+
+
+def _real(value: Any, key: str, where: str) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
+        raise InputError(f"{key} = {value!r}", where=where, mend="write a finite number")
+    return float(value)
+
+
+def _port(table: Mapping[str, Any], where: str) -> Port:
+    _known(table, {"unit", "offset", "hold"}, where)
+    hold = table.get("hold", "zero")
+    if hold not in get_args(Hold):
+        raise InputError(f"hold = {hold!r}", where=where, mend='write "zero" (held command) or "linear"')
+    return Port(unit=str(table.get("unit", "")), offset=_real(table.get("offset", 0.0), "offset", where), hold=hold)
+
+
+def _block(table: Mapping[str, Any], where: str) -> Block:
+    _known(table, {"name", "place", "num", "den", "delay", "output", "unit"}, where)
+    place = table.get("place", "plant")
+    if place not in get_args(Place):
+        raise InputError(f"place = {place!r}", where=where, mend=f"write one of {', '.join(get_args(Place))}")
+    coefficients = {}
+    for key in ("num", "den"):
+        values = table.get(key, [1.0])
+        if not isinstance(values, list) or not values:
+            raise InputError(f"{key} = {values!r}", where=where, mend="write a list in descending powers of s")
+        coefficients[key] = tuple(_real(value, key, where) for value in values)
+    try:
+        dynamics = TransferFunction(**coefficients, delay_s=_real(table.get("delay", 0.0), "delay", where))
+    except InputError as error:
+        raise InputError(error.what, where=where) from None
+    if not dynamics.is_proper:
+        raise InputError("num has a higher degree than den", where=where, mend="a block must be proper")
+    return Block(
+        name=str(table.get("name", place)),
+        place=place,
+        dynamics=dynamics,
+        output=str(table.get("output", "")),
+        unit=str(table.get("unit", "")),
+    )
+
+
+def _effect(table: Mapping[str, Any], where: str) -> Effect:
+    _known(table, {"name", "at", "parameters", "equation"}, where)
+    if "." not in str(table.get("name", "")):
+        raise InputError(f"name = {table.get('name')!r}", where=where, mend="write PLACE.EFFECT of the catalogue")
+    parameters = {}
+    for key, entry in table.get("parameters", {}).items():
+        given = entry if isinstance(entry, dict) else {"value": entry}
+        sd = given.get("sd", float("nan"))
+        parameters[key] = Parameter(
+            value=_real(given.get("value"), key, where), unit=str(given.get("unit", "")), sd=float(sd)
+        )
+    return Effect(name=str(table["name"]), at=str(table.get("at", "")), parameters=MappingProxyType(parameters))
+
+
+def write_model(model: Model, path: str | os.PathLike[str], equations: Mapping[str, str] | None = None) -> None:
+    """Write a model file that :func:`read_model` reads back to an equal model.
+
+    Parameters
+    ----------
+    model : Model
+        What to write.
+    path : path
+        Where to.
+    equations : mapping of effect name to equation, optional
+        Written into the ``[[effect]]`` tables for the reader; not read back.
+    """
+    content: dict[str, Any] = {
+        "name": model.name,
+        "input": _port_table(model.input),
+        "output": _port_table(model.output),
+        "block": [_block_table(block) for block in model.blocks],
+    }
+    if model.effects:
+        content["effect"] = [_effect_table(effect, (equations or {}).get(effect.name)) for effect in model.effects]
+    Path(path).write_bytes(tomli_w.dumps(content).encode())
+
+
+def _port_table(port: Port) -> dict[str, Any]:
+    table: dict[str, Any] = {"unit": port.unit, "offset": port.offset}
+    return table | ({"hold": port.hold} if port.hold != "zero" else {})
+
+
+def _block_table(block: Block) -> dict[str, Any]:
+    table: dict[str, Any] = {
+        "name": block.name,
+        "place": block.place,
+        "num": list(block.dynamics.num),
+        "den": list(block.dynamics.den),
+    }
+    optional = {"delay": block.dynamics.delay_s, "output": block.output, "unit": block.unit}
+    return table | {key: value for key, value in optional.items() if value}
+
+
+def _effect_table(effect: Effect, equation: str | None) -> dict[str, Any]:
+    table: dict[str, Any] = {"name": effect.name}
+    if effect.at:
+        table["at"] = effect.at
+    if equation:
+        table["equation"] = equation
+    table["parameters"] = {
+        key: {"value": parameter.value, "unit": parameter.unit}
+        | ({"sd": parameter.sd} if np.isfinite(parameter.sd) else {})
+        for key, parameter in effect.parameters.items()
+    }
+    return table

@@ -1,0 +1,311 @@
+"""Recordings: read, append row by row, slice, resample.
+
+The format is CSV with a header ``t,u,y`` and optional further columns, and an optional TOML sidecar of the same
+name. ``u`` is the command held from its row's time until the next row; ``y`` is the measurement taken at that
+row's time, before that row's ``u`` acts. Lines beginning with ``#`` are comments.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import tomllib
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from types import MappingProxyType, TracebackType
+from typing import Any
+
+import numpy as np
+import tomli_w
+
+from autotune.arrays import FloatArray
+from autotune.errors import InputError
+
+_REQUIRED = ("t", "u", "y")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Recording:
+    """What a rig did: time stamps, held commands, measurements and any further named signals.
+
+    Attributes
+    ----------
+    t : (N,) array
+        Time stamps in seconds, strictly increasing, not necessarily uniform.
+    u, y : (N,) array
+        Command held from each row's time on, and measurement before that command acts. ``y`` and the extra
+        columns may hold NaN where a sample was bad; ``t`` may not.
+    extra : mapping of str to (N,) array
+        Further columns: ``r`` set-point, ``u_applied`` read back from the device, any named internal signal.
+    metadata : mapping
+        The sidecar: units, rig, relay settings, why the recording ended.
+    name : str
+        Where it came from, for messages.
+
+    Raises
+    ------
+    InputError
+        Columns of unequal length, fewer than two rows, or time that does not increase; the row is named.
+    """
+
+    t: FloatArray
+    u: FloatArray
+    y: FloatArray
+    extra: Mapping[str, FloatArray] = field(default_factory=lambda: MappingProxyType({}))
+    metadata: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
+    name: str = "recording"
+
+    def __post_init__(self) -> None:
+        for column, values in {"u": self.u, "y": self.y, **self.extra}.items():
+            if values.shape != self.t.shape:
+                raise InputError(
+                    f"column {column!r} has {values.size} rows, t has {self.t.size}",
+                    where=self.name,
+                    mend="give every column the same number of rows",
+                )
+        if self.t.size < 2:
+            raise InputError(f"{self.t.size} row(s)", where=self.name, mend="a recording needs at least two rows")
+        steps = np.diff(self.t)
+        if not np.all(steps > 0):  # also catches NaN
+            row = int(np.argmax(~(steps > 0))) + 1
+            raise InputError(
+                f"time does not increase at data row {row + 1} (t = {self.t[row]:g} after {self.t[row - 1]:g})",
+                where=self.name,
+                mend="sort the rows by t and drop repeated stamps",
+            )
+
+    def __len__(self) -> int:
+        return int(self.t.size)
+
+    @property
+    def sample_time_s(self) -> float:
+        """Median step between rows [s]."""
+        return float(np.median(np.diff(self.t)))
+
+    @property
+    def duration_s(self) -> float:
+        """Time from the first row to the end of the last row's hold [s]."""
+        return float(self.t[-1] - self.t[0]) + self.sample_time_s
+
+    @property
+    def is_uniform(self) -> bool:
+        """Whether every step is within 1 % of the median step."""
+        steps = np.diff(self.t)
+        return bool(np.all(np.abs(steps - np.median(steps)) <= 0.01 * np.median(steps)))
+
+    def __getitem__(self, column: str) -> FloatArray:
+        """Return a column by its name in the file."""
+        columns = {"t": self.t, "u": self.u, "y": self.y, **self.extra}
+        if column not in columns:
+            raise InputError(f"no column {column!r}", where=self.name, mend=f"it has {', '.join(columns)}")
+        return columns[column]
+
+    def between(self, start_s: float, end_s: float) -> Recording:
+        """Return the rows with ``start_s <= t < end_s``, time stamps unchanged."""
+        return self._rows((self.t >= start_s) & (self.t < end_s))
+
+    def _rows(self, keep: Any) -> Recording:
+        extra = {name: values[keep] for name, values in self.extra.items()}
+        return replace(self, t=self.t[keep], u=self.u[keep], y=self.y[keep], extra=MappingProxyType(extra))
+
+    def resampled(self, dt_s: float) -> Recording:
+        """Return the recording on a uniform grid: commands held, other columns linearly interpolated.
+
+        Parameters
+        ----------
+        dt_s : float
+            Step of the new grid [s].
+
+        Notes
+        -----
+        Interpolation filters the noise of ``y`` and attenuates content near the Nyquist frequency; use the
+        recorded stamps wherever a method can.
+        """
+        t = self.t[0] + dt_s * np.arange(int(np.floor((self.t[-1] - self.t[0]) / dt_s + 1e-9)) + 1)
+        held = np.clip(np.searchsorted(self.t, t + 1e-9 * dt_s, side="right") - 1, 0, None)
+        extra = {
+            name: values[held] if name == "u_applied" else np.interp(t, self.t, values)
+            for name, values in self.extra.items()
+        }
+        return replace(self, t=t, u=self.u[held], y=np.interp(t, self.t, self.y), extra=MappingProxyType(extra))
+
+    def require_finite(self, columns: Iterable[str] = ("u", "y")) -> Recording:
+        """Return self if the columns hold no NaN or infinity.
+
+        Raises
+        ------
+        InputError
+            Names the first bad row and how many there are.
+        """
+        for column in columns:
+            bad = ~np.isfinite(self[column])
+            if bad.any():
+                row = int(np.argmax(bad))
+                raise InputError(
+                    f"column {column!r} is not a number in {int(bad.sum())} row(s), first at t = {self.t[row]:g} s",
+                    where=self.name,
+                    mend="cut the recording there or fill the gap with measured values",
+                )
+        return self
+
+
+def read_recording(path: str | os.PathLike[str]) -> Recording:
+    """Read ``NAME.csv`` and, where it exists, its sidecar ``NAME.toml``.
+
+    A last line without its line end was cut off while it was written: it is dropped, since even its last digit
+    could be missing.
+
+    Raises
+    ------
+    InputError
+        No such file, no ``t,u,y`` header, or a cell that is not a number; names the line.
+    """
+    path = Path(path)
+    try:
+        text = path.read_text(encoding="utf-8-sig", errors="replace")
+    except OSError as error:
+        raise InputError(f"cannot be read ({error.strerror})", where=str(path), mend="check the path") from None
+    if not text.endswith("\n"):
+        text = text[: text.rfind("\n") + 1]
+    lines = text.splitlines()
+    header_at = next((i for i, line in enumerate(lines) if line.strip() and not line.startswith("#")), None)
+    header = [] if header_at is None else [cell.strip() for cell in lines[header_at].split(",")]
+    missing = [column for column in _REQUIRED if column not in header]
+    if header_at is None or missing:
+        raise InputError(
+            f"the header lacks {', '.join(missing) or 'everything'}",
+            where=str(path),
+            mend="the first line that is no comment must name the columns t,u,y and any others",
+        )
+    if len(set(header)) != len(header):
+        raise InputError("the header names a column twice", where=str(path), mend="give each column its own name")
+    values = _parse(lines, header_at, len(header), path)
+    columns = {name: np.ascontiguousarray(values[:, i]) for i, name in enumerate(header)}
+    t, u, y = (columns.pop(name) for name in _REQUIRED)
+    return Recording(t=t, u=u, y=y, extra=MappingProxyType(columns), metadata=_read_sidecar(path), name=str(path))
+
+
+def _parse(lines: Sequence[str], header_at: int, width: int, path: Path) -> FloatArray:
+    body = lines[header_at + 1 :]
+    try:
+        with io.StringIO("\n".join(body)) as stream:
+            if not any(line.strip() and not line.startswith("#") for line in body):
+                return np.empty((0, width))
+            values: FloatArray = np.loadtxt(stream, delimiter=",", comments="#", ndmin=2, dtype=np.float64)
+        if values.shape[1] == width:
+            return values
+    except ValueError:
+        pass
+    return _parse_slowly(body, header_at, width, path)
+
+
+def _parse_slowly(body: Sequence[str], header_at: int, width: int, path: Path) -> FloatArray:
+    """Parse again row by row: empty cells become NaN, and what is wrong is named by its line."""
+    rows: list[list[float]] = []
+    for number, line in enumerate(body, start=header_at + 2):
+        if not line.strip() or line.startswith("#"):
+            continue
+        cells = line.split(",")
+        try:
+            if len(cells) != width:
+                raise ValueError(f"{len(cells)} cells where the header has {width}")
+            rows.append([float(cell) if cell.strip() else np.nan for cell in cells])
+        except ValueError as error:
+            raise InputError(str(error), where=f"{path} line {number}", mend="mend or delete the line") from None
+    return np.array(rows, dtype=np.float64).reshape(-1, width)
+
+
+def _read_sidecar(path: Path) -> Mapping[str, Any]:
+    sidecar = path.with_suffix(".toml")
+    if not sidecar.is_file():
+        return MappingProxyType({})
+    try:
+        return MappingProxyType(tomllib.loads(sidecar.read_text(encoding="utf-8")))
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"not TOML: {error}", where=str(sidecar), mend="mend the line or move the file") from None
+
+
+class RecordingWriter:
+    """Append-only writer: each row is with the operating system before :meth:`append` returns.
+
+    A process that is killed leaves a readable recording up to its last row. Use it as a context manager.
+
+    Parameters
+    ----------
+    path : path
+        The CSV to create; an existing one is refused, so that no recording is ever overwritten.
+    columns : sequence of str
+        Header, beginning with ``t, u, y``.
+    metadata : mapping
+        First content of the sidecar; :meth:`finish` replaces it.
+    """
+
+    def __init__(
+        self, path: str | os.PathLike[str], columns: Sequence[str], metadata: Mapping[str, Any] | None = None
+    ) -> None:
+        if tuple(columns[:3]) != _REQUIRED:
+            raise InputError("columns must begin with t, u, y", where="RecordingWriter")
+        self.path = Path(path)
+        self._width = len(columns)
+        self._metadata = dict(metadata or {})
+        try:
+            self._file = open(self.path, "xb", buffering=0)  # noqa: SIM115 - closed by close()
+        except FileExistsError:
+            raise InputError(
+                "a recording is already there", where=str(self.path), mend="choose another --out"
+            ) from None
+        self._file.write((",".join(columns) + "\n").encode())
+        self._write_sidecar()
+
+    def append(self, row: Sequence[float]) -> None:
+        """Write one row, NaN for what is not known."""
+        if len(row) != self._width:
+            raise ValueError(f"{len(row)} values for {self._width} columns")
+        self._file.write((",".join(format(value, ".12g") for value in row) + "\n").encode())
+
+    def comment(self, text: str) -> None:
+        """Write a comment line, for a person who reads the file."""
+        self._file.write(f"# {text}\n".replace("\r", " ").encode())
+
+    def finish(self, metadata: Mapping[str, Any]) -> None:
+        """Add to the sidecar why the recording ended and what else is known, and close."""
+        self._metadata |= metadata
+        self._write_sidecar()
+        self.close()
+
+    def close(self) -> None:
+        """Bring the file to the disk and close it; harmless when closed already."""
+        if not self._file.closed:
+            os.fsync(self._file.fileno())
+            self._file.close()
+
+    def _write_sidecar(self) -> None:
+        sidecar = self.path.with_suffix(".toml")
+        part = sidecar.with_suffix(".toml.part")
+        part.write_bytes(tomli_w.dumps(self._metadata).encode())
+        part.replace(sidecar)
+
+    def __enter__(self) -> RecordingWriter:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+def write_recording(recording: Recording, path: str | os.PathLike[str]) -> None:
+    """Write a whole recording and its sidecar, replacing what is there."""
+    path = Path(path)
+    columns = {"t": recording.t, "u": recording.u, "y": recording.y, **recording.extra}
+    np.savetxt(
+        path,
+        np.column_stack(list(columns.values())),
+        fmt="%.12g",
+        delimiter=",",
+        header=",".join(columns),
+        comments="",
+    )
+    if recording.metadata:
+        path.with_suffix(".toml").write_bytes(tomli_w.dumps(dict(recording.metadata)).encode())

@@ -1,0 +1,48 @@
+"""Shared fixtures and the rule for tests that need a system package."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+
+import pytest
+from hypothesis import settings
+
+# one profile everywhere: the machine's load decides how long an example takes, so there is no deadline
+settings.register_profile("project", deadline=None, print_blob=True)
+settings.load_profile("project")
+
+#: Recordings that lie beside a checkout and never in it; tests that use them are skipped elsewhere.
+SHARED = Path(__file__).resolve().parents[2] / "shared"
+
+
+@pytest.fixture
+def shared() -> Path:
+    """Folder of recordings beside the checkout."""
+    if not SHARED.is_dir():
+        pytest.skip(f"no recordings at {SHARED}")
+    return SHARED
+
+
+#: Debian package -> a program or file that shows it is there.
+SYSTEM_PACKAGES = {
+    "chromium": "chromium",
+    "gcc-avr": "avr-gcc",
+    "avr-libc": "/usr/lib/avr/include/avr/io.h",
+    "libsimavr-dev": "/usr/include/simavr/sim_avr.h",
+    "libelf-dev": "/usr/include/libelf.h",
+    "socat": "socat",
+    "libmodbus-dev": "/usr/include/modbus/modbus.h",
+    "mbpoll": "mbpoll",
+}
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Skip a test whose system package is missing, or fail it where the packages were promised."""
+    for mark in item.iter_markers("system"):
+        for package in mark.args:
+            shows = SYSTEM_PACKAGES[package]
+            if not (Path(shows).exists() if shows.startswith("/") else shutil.which(shows)):
+                say = pytest.fail if os.environ.get("REQUIRE_SYSTEM_PACKAGES") else pytest.skip
+                say(f"needs {package}: apt-get install {package}")
