@@ -1,6 +1,6 @@
 """Models: transfer functions with exact dead time, and the chain of blocks that a person believes the rig to be.
 
-The model file is TOML: ``[input]``, ``[output]``, a ``[[block]]`` for every link of the chain, and ``[[effect]]`` tables
+The model file is TOML: ``[input]``, ``[output]``, a ``[[block]]`` for every link of the chain, ``[[effect]]`` tables
 where a diagnosis added physics. ``y = last block's output + output.offset``, driven by ``u - input.offset``.
 """
 

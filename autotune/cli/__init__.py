@@ -11,7 +11,7 @@ from autotune.errors import AutotuneError
 
 app = typer.Typer(
     name="autotune",
-    help="Commission a control loop: measure its Bode points with a relay, design its controller, verify it on the rig.",
+    help="Commission a control loop: measure its Bode points with a relay, design its controller, verify it.",
     no_args_is_help=True,
     add_completion=True,
     pretty_exceptions_enable=False,

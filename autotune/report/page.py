@@ -1,0 +1,233 @@
+"""One self-contained HTML page: sections of sentences, tables and plotly figures; no request leaves the browser."""
+
+from __future__ import annotations
+
+import html
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, TypeAlias
+
+import numpy as np
+import plotly.graph_objects as go
+from plotly.offline import get_plotlyjs
+
+from autotune.arrays import FloatArray
+
+Tone: TypeAlias = Literal["good", "warn", "bad"]
+
+#: Colours told apart in print and by colour-blind readers (Okabe & Ito), legible on white and on black.
+BLUE, ORANGE, GREEN, RED, GREY, PURPLE = "#3b82c4", "#d98200", "#0d9a72", "#d1495b", "#8a8a8a", "#a467b0"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Table:
+    """Rows of cells under a header; numbers are formatted by the caller, with their units in the header."""
+
+    header: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    caption: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Figure:
+    """A plotly figure with the sentence that says what is to be seen in it."""
+
+    figure: Any
+    caption: str
+    height_px: int = 420
+
+
+@dataclass(frozen=True, kw_only=True)
+class Section:
+    """A heading with paragraphs, then tables, then figures."""
+
+    title: str
+    text: tuple[str, ...] = ()
+    tables: tuple[Table, ...] = ()
+    figures: tuple[Figure, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Page:
+    """A report: the verdict first, then what it rests on.
+
+    Attributes
+    ----------
+    title : str
+        What was examined.
+    verdict : str
+        The result in one sentence.
+    tone : {"good", "warn", "bad"}
+        Colour of the verdict; the sentence says the same without it.
+    summary : tuple of str
+        What the reader needs to know or do next.
+    sections : tuple of Section
+        The evidence, in the order of the data's way.
+    """
+
+    title: str
+    verdict: str
+    tone: Tone
+    summary: tuple[str, ...] = ()
+    sections: tuple[Section, ...] = ()
+
+
+def thinned(t: FloatArray, y: FloatArray, points: int = 3000) -> tuple[FloatArray, FloatArray]:
+    """Return at most about ``points`` rows that draw the same curve: the extremes of every bin are kept.
+
+    Parameters
+    ----------
+    t, y : (N,) array
+        Curve to draw.
+    points : int
+        Rows wanted.
+    """
+    if t.size <= points:
+        return t, y
+    width = int(np.ceil(2 * t.size / points))
+    bins = t.size // width
+    folded = np.where(np.isfinite(y), y, 0.0)[: bins * width].reshape(bins, width)
+    offset = np.arange(bins)[:, np.newaxis] * width
+    keep = np.sort(
+        np.concatenate([(offset + np.column_stack([folded.argmin(1), folded.argmax(1)])).ravel(), [0, t.size - 1]])
+    )
+    keep = np.unique(keep)
+    return t[keep], y[keep]
+
+
+def lines_figure(x_title: str, y_title: str, *, log_x: bool = False, log_y: bool = False) -> Any:
+    """Return an empty figure with titled axes, for traces to be added."""
+    figure = go.Figure()
+    figure.update_xaxes(title=x_title, type="log" if log_x else "linear")
+    figure.update_yaxes(title=y_title, type="log" if log_y else "linear")
+    return figure
+
+
+def add_line(
+    figure: Any,
+    x: FloatArray,
+    y: FloatArray,
+    name: str,
+    colour: str,
+    *,
+    dash: str = "solid",
+    width: float = 1.6,
+    **place: Any,
+) -> None:
+    """Add a curve; ``place`` takes plotly's ``row`` and ``col`` and trace settings such as ``showlegend``."""
+    at = {key: place.pop(key) for key in ("row", "col") if key in place}
+    trace = go.Scatter(x=x, y=y, name=name, mode="lines", line={"color": colour, "dash": dash, "width": width}, **place)
+    figure.add_trace(trace, **at)
+
+
+def write_page(page: Page, path: str | os.PathLike[str]) -> None:
+    """Write the page as one HTML file that needs no network.
+
+    Parameters
+    ----------
+    page : Page
+        What to show.
+    path : path
+        File to write.
+    """
+    body = [
+        f"<h1>{_text(page.title)}</h1>",
+        f'<p class="verdict {page.tone}">{_text(page.verdict)}</p>',
+        *(f"<p>{_text(line)}</p>" for line in page.summary),
+    ]
+    if len(page.sections) > 3:
+        links = (f'<a href="#s{i}">{_text(section.title)}</a>' for i, section in enumerate(page.sections))
+        body.append(f'<nav aria-label="Contents">{"".join(links)}</nav>')
+    for i, section in enumerate(page.sections):
+        body.append(_section(section, i))
+    Path(path).write_text(
+        _SHELL.replace("@TITLE@", _text(page.title))
+        .replace("@BODY@", "\n".join(body))
+        .replace("@PLOTLY@", get_plotlyjs() if any(section.figures for section in page.sections) else ""),
+        encoding="utf-8",
+    )
+
+
+def _text(text: str) -> str:
+    return html.escape(text, quote=False)
+
+
+def _section(section: Section, number: int) -> str:
+    parts = [f'<section id="s{number}"><h2>{_text(section.title)}</h2>']
+    parts += [f"<p>{_text(line)}</p>" for line in section.text]
+    parts += [_table(table) for table in section.tables]
+    parts += [_figure(figure, f"f{number}_{i}") for i, figure in enumerate(section.figures)]
+    return "\n".join([*parts, "</section>"])
+
+
+def _table(table: Table) -> str:
+    head = "".join(f'<th scope="col">{_text(cell)}</th>' for cell in table.header)
+    rows = "".join("<tr>" + "".join(f"<td>{_text(cell)}</td>" for cell in row) + "</tr>" for row in table.rows)
+    caption = f"<caption>{_text(table.caption)}</caption>" if table.caption else ""
+    return f'<div class="wide"><table>{caption}<thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table></div>'
+
+
+def _figure(figure: Figure, identity: str) -> str:
+    drawn = figure.figure
+    drawn.update_layout(
+        margin={"l": 60, "r": 14, "t": 30, "b": 50},
+        paper_bgcolor="rgba(0,0,0,0)",
+        plot_bgcolor="rgba(0,0,0,0)",
+        font={"size": 13},
+        legend={"orientation": "h", "y": 1.02, "yanchor": "bottom", "x": 0},
+        autosize=True,
+        height=figure.height_px,
+        template="none",
+    )
+    drawn.update_xaxes(gridcolor="rgba(128,128,128,0.25)", zerolinecolor="rgba(128,128,128,0.4)", automargin=True)
+    drawn.update_yaxes(gridcolor="rgba(128,128,128,0.25)", zerolinecolor="rgba(128,128,128,0.4)", automargin=True)
+    plot = drawn.to_html(
+        full_html=False,
+        include_plotlyjs=False,
+        div_id=identity,
+        config={"responsive": True, "displaylogo": False, "displayModeBar": False},
+    )
+    return f"<figure>{plot}<figcaption>{_text(figure.caption)}</figcaption></figure>"
+
+
+_SHELL = """<!doctype html>
+<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
+<title>@TITLE@</title>
+<style>
+:root { color-scheme: light dark; --ink: #1c1f23; --paper: #fff; --faint: #667; --line: #d5d8de; --card: #f6f7f9; }
+@media (prefers-color-scheme: dark) {
+  :root { --ink: #e4e6ea; --paper: #15171a; --faint: #9aa1ad; --line: #363b43; --card: #1e2126; } }
+* { box-sizing: border-box; }
+body { margin: 0 auto; max-width: 1180px; padding: 1.2rem clamp(0.7rem, 3vw, 2.2rem) 4rem; color: var(--ink);
+  background: var(--paper); font: 16px/1.55 system-ui, "Segoe UI", Roboto, "Helvetica Neue", Arial, sans-serif; }
+h1 { font-size: 1.65rem; line-height: 1.25; margin: 0.6rem 0 0.8rem; }
+h2 { font-size: 1.2rem; margin: 2.4rem 0 0.5rem; padding-top: 0.5rem; border-top: 1px solid var(--line); }
+p { max-width: 78ch; margin: 0.5rem 0; }
+.verdict { font-size: 1.1rem; font-weight: 600; padding: 0.7rem 1rem; border-left: 6px solid; background: var(--card); }
+.good { border-color: #0d9a72; } .warn { border-color: #d98200; } .bad { border-color: #d1495b; }
+nav { display: flex; flex-wrap: wrap; gap: 0.3rem 1rem; margin: 1rem 0; font-size: 0.93rem; }
+a { color: inherit; }
+.wide { overflow-x: auto; margin: 0.8rem 0; }
+table { border-collapse: collapse; font-variant-numeric: tabular-nums; font-size: 0.93rem; }
+caption { text-align: left; color: var(--faint); padding-bottom: 0.3rem; }
+th, td { text-align: left; padding: 0.3rem 0.9rem 0.3rem 0; border-bottom: 1px solid var(--line); vertical-align: top; }
+th { font-weight: 600; }
+figure { margin: 1.1rem 0 1.6rem; } figcaption { color: var(--faint); font-size: 0.9rem; max-width: 84ch; }
+@media (max-width: 520px) { body { font-size: 15px; } h1 { font-size: 1.35rem; } td, th { padding-right: 0.6rem; } }
+</style>
+<script>@PLOTLY@</script></head>
+<body><main>
+@BODY@
+</main>
+<script>
+function ink() {
+  if (typeof Plotly === "undefined") return;
+  const colour = getComputedStyle(document.body).color;
+  document.querySelectorAll(".js-plotly-plot").forEach(plot => Plotly.relayout(plot, {"font.color": colour}));
+}
+ink();
+matchMedia("(prefers-color-scheme: dark)").addEventListener("change", ink);
+</script>
+</body></html>
+"""
