@@ -1,0 +1,55 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from autotune.errors import InputError
+from autotune.points import FrequencyPoint, points_to_json, read_points, responses
+
+
+def test_points_read_back_in_their_fixed_form(tmp_path: Path) -> None:
+    point = FrequencyPoint(omega_rad_s=2.5, response=-3 + 4j, covariance=((0.04, 0.01), (0.01, 0.09)), source="relay")
+    entry = points_to_json([point])[0]
+    assert entry["gain"] == pytest.approx(5.0)
+    assert entry["phase_deg"] == pytest.approx(np.degrees(np.arctan2(4, -3)))
+    path = tmp_path / "points.json"
+    path.write_text(json.dumps({"points": [entry]}))
+    (back,) = read_points(path)
+    assert back.response == pytest.approx(point.response, rel=1e-12)
+    assert back.covariance == point.covariance
+
+
+def test_the_region_of_95_per_cent_holds_95_per_cent() -> None:
+    rng = np.random.default_rng(7)
+    covariance = np.array([[0.04, 0.03], [0.03, 0.09]])
+    point = FrequencyPoint(omega_rad_s=1.0, response=0j, covariance=((0.04, 0.03), (0.03, 0.09)))
+    radii, directions = point.region_radii(0.95)
+    draws = rng.multivariate_normal([0, 0], covariance, 100_000) @ directions / radii
+    assert np.mean(np.sum(draws**2, axis=1) < 1) == pytest.approx(0.95, abs=0.003)
+
+
+def test_responses_come_in_ascending_frequency() -> None:
+    cov = ((1.0, 0.0), (0.0, 1.0))
+    points = [FrequencyPoint(omega_rad_s=w, response=w * 1j, covariance=cov) for w in (3.0, 1.0, 2.0)]
+    omega, response = responses(points)
+    assert omega.tolist() == [1, 2, 3]
+    assert response.imag.tolist() == [1, 2, 3]
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [
+        ('{"points": [{"omega_rad_s": 1}]}', r"points\[0\]: needs"),
+        ('{"points": [{"omega_rad_s": -1, "gain": 1, "phase_deg": 0, "cov": [[1,0],[0,1]]}]}', "positive"),
+        ('{"points": [{"omega_rad_s": 1, "gain": 1, "phase_deg": 0, "cov": [[1,2],[2,1]]}]}', "semi-definite"),
+        ("[]", "is not a points file"),
+    ],
+)
+def test_a_wrong_points_file_is_refused(tmp_path: Path, content: str, says: str) -> None:
+    path = tmp_path / "points.json"
+    path.write_text(content)
+    with pytest.raises(InputError, match=says):
+        read_points(path)
