@@ -174,7 +174,7 @@ def read_recording(path: str | os.PathLike[str]) -> Recording:
     missing = [column for column in _REQUIRED if column not in header]
     if header_at is None or missing:
         raise InputError(
-            f"the header lacks {', '.join(missing or _REQUIRED)}",
+            f"the header lacks {', '.join(missing)}",
             where=str(path),
             mend="the first line that is no comment must name the columns t,u,y and any others",
         )
