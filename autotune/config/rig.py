@@ -7,17 +7,101 @@ from typing import Annotated, Literal, TypeAlias, get_args
 from pydantic import Field
 
 from autotune.config.procedure import Section
+from autotune.config.registers import RegisterMap
 
 
-class SimulatedRigSettings(Section):
-    """A plant in process, on a virtual clock."""
+class PlantSettings(Section):
+    """A simulated plant: which, and what is drawn for it."""
 
-    kind: Literal["simulated"]
     plant: Annotated[Literal["ball", "servo", "two_tank", "thermal"], Field(description="which simulated plant")]
     seed: Annotated[int, Field(ge=0, description="draws the hover voltage and the noise")] = 0
     noise: Annotated[float | None, Field(ge=0, description="half-width of the uniform noise on y [y unit]")] = None
 
 
-RigSettings: TypeAlias = Annotated[SimulatedRigSettings, Field(description="how the rig is reached")]
+class SimulatedRigSettings(PlantSettings):
+    """A plant in process, on a virtual clock."""
 
-RIG_KINDS = frozenset(get_args(model.model_fields["kind"].annotation)[0] for model in (SimulatedRigSettings,))
+    kind: Literal["simulated"]
+
+
+class ReplaySettings(Section):
+    """A recording as a rig: its rows come back on a virtual clock, and the commands must be the recorded ones."""
+
+    kind: Literal["replay"]
+    recording: Annotated[str, Field(description="recording to replay, NAME.csv")]
+    tolerance: Annotated[
+        float, Field(ge=0, description="largest difference between a command and the recorded one [u unit]")
+    ] = 1e-6
+
+
+class TwinSettings(PlantSettings):
+    """The simulated twin of a real rig: ``--dry-run`` runs it in process, ``autotune rig`` serves it."""
+
+    listen: Annotated[str, Field(description="address that autotune rig listens on; loopback by default")] = "127.0.0.1"
+    deadman_s: Annotated[
+        float, Field(gt=0, le=60, description="time without heartbeat after which the twin is safe [s], up to 60")
+    ] = 0.5
+    cert_file: Annotated[str | None, Field(description="certificate of the served twin, PEM (TLS)")] = None
+    key_file: Annotated[str | None, Field(description="private key of the served twin, PEM (TLS)")] = None
+
+
+class ModbusSettings(Section):
+    """What the Modbus transports have in common."""
+
+    unit_id: Annotated[int, Field(ge=0, le=247, description="unit (slave) id of the device, 0..247")] = 1
+    timeout_s: Annotated[float, Field(gt=0, le=60, description="longest wait for one answer [s], up to 60")] = 0.2
+    retries: Annotated[
+        int, Field(ge=0, le=10, description="further attempts of one request, 0..10; such a sample is marked suspect")
+    ] = 1
+    late_reply_s: Annotated[
+        float, Field(gt=0, le=60, description="longest time after which a late answer may still come [s], up to 60")
+    ] = 1.0
+    feed_s: Annotated[
+        float, Field(gt=0, le=60, description="longest time between two heartbeats while the host commands [s]")
+    ] = 0.1
+    registers: RegisterMap
+    twin: TwinSettings | None = None
+
+
+class ModbusTcpSettings(ModbusSettings):
+    """A device on Modbus TCP."""
+
+    kind: Literal["modbus_tcp"]
+    host: Annotated[str, Field(description="address of the device; loopback by default")] = "127.0.0.1"
+    port: Annotated[int, Field(ge=1, le=65535, description="TCP port, 1..65535")] = 502
+
+
+class ModbusTlsSettings(ModbusSettings):
+    """A device on Modbus/TCP Security: TLS with certificates on both sides."""
+
+    kind: Literal["modbus_tls"]
+    host: Annotated[str, Field(description="address of the device; loopback by default")] = "127.0.0.1"
+    port: Annotated[int, Field(ge=1, le=65535, description="TCP port, 1..65535")] = 802
+    ca_file: Annotated[str, Field(description="certificate authority that signed the device's certificate, PEM")]
+    cert_file: Annotated[str, Field(description="this host's certificate, PEM")]
+    key_file: Annotated[str, Field(description="this host's private key, PEM")]
+    server_name: Annotated[str | None, Field(description="name the device's certificate must carry; default: host")] = (
+        None
+    )
+
+
+class ModbusRtuSettings(ModbusSettings):
+    """A device on Modbus RTU, on a serial line."""
+
+    kind: Literal["modbus_rtu"]
+    device: Annotated[str, Field(description="serial device, e.g. /dev/ttyUSB0")]
+    baud: Annotated[int, Field(ge=300, le=4_000_000, description="line speed [bit/s], 300..4000000")] = 19200
+    parity: Annotated[Literal["N", "E", "O"], Field(description="none, even or odd parity")] = "E"
+    stop_bits: Annotated[Literal[1, 2], Field(description="stop bits, 1 or 2")] = 1
+
+
+_KINDS = (SimulatedRigSettings, ReplaySettings, ModbusTcpSettings, ModbusTlsSettings, ModbusRtuSettings)
+
+AnyModbusSettings: TypeAlias = ModbusTcpSettings | ModbusTlsSettings | ModbusRtuSettings
+
+RigSettings: TypeAlias = Annotated[
+    SimulatedRigSettings | ReplaySettings | ModbusTcpSettings | ModbusTlsSettings | ModbusRtuSettings,
+    Field(discriminator="kind", description="how the rig is reached"),
+]
+
+RIG_KINDS = frozenset(get_args(model.model_fields["kind"].annotation)[0] for model in _KINDS)
