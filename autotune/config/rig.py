@@ -16,6 +16,7 @@ class PlantSettings(Section):
     plant: Annotated[Literal["ball", "servo", "two_tank", "thermal"], Field(description="which simulated plant")]
     seed: Annotated[int, Field(ge=0, description="draws the hover voltage and the noise")] = 0
     noise: Annotated[float | None, Field(ge=0, description="half-width of the uniform noise on y [y unit]")] = None
+    start: Annotated[str | None, Field(description='where it starts, "floor" or "afloat" for the ball')] = None
 
 
 class SimulatedRigSettings(PlantSettings):
