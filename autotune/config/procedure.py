@@ -23,6 +23,9 @@ class SignalSettings(Section):
     sample_time_s: Annotated[float, Field(gt=0, le=3600, description="control period [s], above 0 up to 3600")]
     u_unit: Annotated[str, Field(description="unit of the command, as people say it")] = ""
     y_unit: Annotated[str, Field(description="unit of the measurement, as people say it")] = ""
+    u_step: Annotated[
+        float, Field(ge=0, description="resolution of the command, whose multiples are sent [u unit]; 0 for any value")
+    ] = 0.0
 
 
 class LimitSettings(Section):

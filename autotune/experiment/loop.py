@@ -1,0 +1,312 @@
+"""The one loop that talks to a rig: wait, read, check, write the row to disk, command; safe from every exit."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import signal
+import threading
+from array import array
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from types import FrameType, TracebackType
+from typing import Any, Self
+
+import numpy as np
+
+from autotune.arrays import FloatArray
+from autotune.errors import AutotuneError, LinkError, OperatorStop
+from autotune.experiment.limits import Envelope, Watch
+from autotune.experiment.monitor import ReadingMonitor
+from autotune.experiment.rig import Reading, Rig
+from autotune.recording import RecordingWriter
+
+#: longest wait without looking for a stop signal [s]
+SLICE_S = 0.1
+#: samples behind the schedule at which the loop gives up: a command that late belongs to another plant state
+LATE_SAMPLES = 10
+SAFE, UNSAFE = "safe output", "not confirmed: the link failed, the device's own dead-man timer has to act"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tick:
+    """One sample as a control law sees it.
+
+    Attributes
+    ----------
+    k : int
+        Row number.
+    t_s : float
+        Time since the loop began [s].
+    y : float
+        Measurement; where this sample was unusable, the last usable one [y unit].
+    usable : bool
+        Whether ``y`` is this sample's own; an unusable one is NaN in the recording.
+    u : float
+        Command held until now [u unit].
+    """
+
+    k: int
+    t_s: float
+    y: float
+    usable: bool
+    u: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Timing:
+    """Latency and lateness of the loop [s]: median, 99th percentile, worst; and the samples that were left out."""
+
+    latency_s: tuple[float, float, float]
+    lateness_s: tuple[float, float, float]
+    missed: int
+    unusable: int
+
+
+@dataclass(kw_only=True)
+class _Record:
+    """Rows kept in memory for estimates while the file grows."""
+
+    t: array[float] = field(default_factory=lambda: array("d"))
+    u: array[float] = field(default_factory=lambda: array("d"))
+    y: array[float] = field(default_factory=lambda: array("d"))
+    latency: array[float] = field(default_factory=lambda: array("d"))
+    lateness: array[float] = field(default_factory=lambda: array("d"))
+
+
+class ControlLoop:
+    """A session with a rig, as a context manager; every experiment and every verification runs in one.
+
+    Use it like this: the law asks for the allowed command nearest to what it wants (and feeds it back to its
+    anti-windup), then steps; a step returns at the next sample ::
+
+        with ControlLoop(rig=rig, envelope=envelope, writer=writer) as loop:
+            tick = loop.tick                                  # the first sample
+            while tick.t_s < 10.0:
+                u = loop.nearest(law(tick.y))
+                tick = loop.step(u, extra={"r": setpoint})
+
+    A step checks the command against the envelope, brings the row to disk, commands the rig, waits for the next
+    sample's absolute deadline, reads, and checks the reading and the limits on y that :attr:`watch` names. Leaving
+    the block in any way (end, limit, fault, exception, Ctrl-C, SIGTERM) commands the safe output, gives the actuator
+    back, and writes the reason into the recording's sidecar together with what was put into :attr:`metadata`.
+
+    Parameters
+    ----------
+    rig : Rig
+        Closed; the loop opens and closes it.
+    envelope : Envelope
+        Limits, sample time and command resolution.
+    writer : RecordingWriter
+        Opened with the columns ``t, u, y`` and the names of ``extra``; the loop finishes it.
+    extra : sequence of str
+        Names of further columns, in the writer's order; ``u_applied`` among them is filled by the loop itself: what
+        the device said it applied when the row's ``y`` was read, before the row's ``u`` acts.
+
+    Attributes
+    ----------
+    tick : Tick
+        The latest sample.
+    watch : Watch
+        Which limits on y apply; the procedure sets it as it goes from state to state.
+    monitor : ReadingMonitor
+        Judges readings; the procedure tells it what noise to expect.
+    metadata : dict
+        Goes into the sidecar at the end.
+
+    Raises
+    ------
+    ExperimentStopped, LinkError, OperatorStop
+        From any step, as named verdicts; the block's exit has made the rig safe before a caller sees them.
+    """
+
+    def __init__(self, *, rig: Rig, envelope: Envelope, writer: RecordingWriter, extra: Sequence[str] = ()) -> None:
+        self.rig = rig
+        self.envelope = envelope
+        self.watch = Watch()
+        self.monitor = ReadingMonitor(jump=envelope.settings.swing, bad_samples=envelope.bad_samples)
+        self.metadata: dict[str, Any] = {}
+        self._writer = writer
+        self._extra = tuple(extra)
+        self._record = _Record()
+        self._missed = 0
+        self._stop_signal = ""
+        self._start_s = 0.0
+        self._deadline_s = 0.0
+        self._exits = contextlib.ExitStack()
+        self.tick = Tick(k=-1, t_s=0.0, y=math.nan, usable=False, u=math.nan)
+        self._reading = Reading(t_s=0.0, y=math.nan)
+
+    @property
+    def sample_time_s(self) -> float:
+        """Control period [s]."""
+        return self.envelope.sample_time_s
+
+    def __enter__(self) -> Self:
+        self._exits.enter_context(_signals(self._on_signal))
+        try:
+            self.rig.open()
+            self._start_s = self._deadline_s = self.rig.clock.now()
+            limits = self.envelope.settings
+            self._reading = self.rig.read()
+            held = self._reading.u_applied if math.isfinite(self._reading.u_applied) else limits.u_safe
+            self.tick = self._judged(self._reading, u=min(max(held, limits.u_min), limits.u_max))
+        except BaseException as error:
+            self._leave(error)
+            if isinstance(error, KeyboardInterrupt):
+                raise OperatorStop("stopped by Ctrl-C", mend="run it again when ready") from error
+            raise
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._leave(error)
+        if isinstance(error, KeyboardInterrupt):  # a Ctrl-C that no handler of ours caught (not the main thread)
+            raise OperatorStop("stopped by Ctrl-C", mend="run it again when ready") from error
+        if error is None and self.metadata["ended"]["output"] != SAFE:
+            raise LinkError(
+                "the safe output could not be confirmed",
+                where="hand back",
+                mend="look at the rig: its dead-man timer has to act",
+            )
+
+    def nearest(self, u: float) -> float:
+        """Return the allowed command nearest to ``u``: range, rate, resolution [u unit]."""
+        return self.envelope.nearest(u, self.tick.u)
+
+    def step(self, u: float, *, extra: Mapping[str, float] | None = None) -> Tick:
+        """Hold ``u`` [u unit] until the next sample and return that sample."""
+        self.envelope.check_command(u, self.tick.u)
+        self._write_row(u, extra or {})
+        self.rig.write(u)
+        self._wait()
+        self._reading = self.rig.read()
+        self.tick = self._judged(self._reading, u=u)
+        return self.tick
+
+    def history(self, start: int = 0) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return t, u, y of the rows from number ``start`` on, (N,) each; y is NaN where a sample was unusable."""
+        record = self._record
+        return (
+            np.array(record.t[start:], dtype=np.float64),
+            np.array(record.u[start:], dtype=np.float64),
+            np.array(record.y[start:], dtype=np.float64),
+        )
+
+    @property
+    def timing(self) -> Timing:
+        """Latency, lateness and losses so far."""
+
+        def spread(values: array[float]) -> tuple[float, float, float]:
+            if not values:
+                return math.nan, math.nan, math.nan
+            data = np.array(values)
+            return float(np.median(data)), float(np.quantile(data, 0.99)), float(data.max())
+
+        return Timing(
+            latency_s=spread(self._record.latency),
+            lateness_s=spread(self._record.lateness),
+            missed=self._missed,
+            unusable=int(np.isnan(np.array(self._record.y)).sum()),
+        )
+
+    def comment(self, text: str) -> None:
+        """Write a line into the recording for a person who reads it."""
+        self._writer.comment(text)
+
+    def _write_row(self, u: float, extra: Mapping[str, float]) -> None:
+        y = self.tick.y if self.tick.usable else math.nan
+        known = {"u_applied": self._reading.u_applied, **extra}
+        self._writer.append((self.tick.t_s, u, y, *(known.get(name, math.nan) for name in self._extra)))
+        record = self._record
+        record.t.append(self.tick.t_s)
+        record.u.append(u)
+        record.y.append(y)
+
+    def _wait(self) -> None:
+        """Wait for the next absolute deadline; a missed one is counted and left out, the grid stays."""
+        clock, step = self.rig.clock, self.sample_time_s
+        self._deadline_s += step
+        behind = (clock.now() - self._deadline_s) / step
+        if behind > LATE_SAMPLES:
+            raise LinkError(
+                f"link too slow: {behind:.0f} samples of {step:g} s behind the schedule",
+                mend="raise signals.sample_time_s, or unload the computer or the link",
+            )
+        if behind > 1.0:
+            self._missed += int(behind)
+            self._deadline_s += step * int(behind)
+        while True:
+            if self._stop_signal:
+                raise OperatorStop(f"stopped by {self._stop_signal}", mend="run it again when ready")
+            clock.sleep_until(min(self._deadline_s, clock.now() + SLICE_S))
+            if clock.now() >= self._deadline_s - 1e-9:
+                break
+        self._record.lateness.append(max(0.0, clock.now() - self._deadline_s))
+
+    def _judged(self, reading: Reading, *, u: float) -> Tick:
+        self._record.latency.append(reading.latency_s)
+        t_s = reading.t_s - self._start_s
+        y, usable = self.monitor.judge(reading, u)
+        tick = Tick(k=self.tick.k + 1, t_s=t_s, y=y, usable=usable, u=u)
+        if self.monitor.recent:
+            self.envelope.check_measurement(self.monitor.recent, self.watch, self.monitor.noise)
+        self.envelope.check_time(t_s)
+        return tick
+
+    def _on_signal(self, name: str) -> None:
+        self._stop_signal = name
+
+    def _leave(self, error: BaseException | None) -> None:
+        output = SAFE
+        try:
+            self.rig.make_safe()
+        except AutotuneError:
+            output = UNSAFE
+        with contextlib.suppress(AutotuneError):
+            self.rig.close()
+        if self.tick.k >= 0:
+            # the last sample, which no command followed any more but the safe one
+            last = (self._reading.t_s - self._start_s, self.envelope.settings.u_safe, self._reading.y)
+            if not self._record.t or last[0] > self._record.t[-1]:
+                self._writer.append((*last, *(math.nan for _ in self._extra)))
+        self.metadata["ended"] = _reason(error) | {"output": output}
+        timing = self.timing
+        self.metadata["timing"] = {
+            "latency_s": [value for value in timing.latency_s if math.isfinite(value)],
+            "lateness_s": [value for value in timing.lateness_s if math.isfinite(value)],
+            "missed_samples": timing.missed,
+            "unusable_samples": timing.unusable,
+        }
+        self._writer.finish(self.metadata)
+        self._exits.close()
+
+
+def _reason(error: BaseException | None) -> dict[str, Any]:
+    if error is None:
+        return {"reason": "completed", "exit_status": 0}
+    if isinstance(error, AutotuneError):
+        return {"reason": str(error), "verdict": type(error).__name__, "exit_status": error.exit_status}
+    if isinstance(error, KeyboardInterrupt):
+        return {"reason": "stopped by Ctrl-C", "verdict": OperatorStop.__name__, "exit_status": 130}
+    return {"reason": f"{type(error).__name__}: {error}", "verdict": type(error).__name__, "exit_status": 1}
+
+
+@contextlib.contextmanager
+def _signals(on_signal: Any) -> Iterator[None]:
+    """Turn Ctrl-C and SIGTERM into a flag that the loop looks at, so that no frame on the link is torn in two."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    names = {signal.SIGINT: "Ctrl-C", signal.SIGTERM: "SIGTERM"}
+
+    def handle(number: int, _frame: FrameType | None) -> None:
+        on_signal(names[signal.Signals(number)])
+
+    before = {number: signal.signal(number, handle) for number in names}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

@@ -1,0 +1,120 @@
+"""Judges readings as they come: not a number, out of reach, frozen, garbled, and an actuator that does not follow."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+
+from autotune.errors import ExperimentStopped, LinkError
+from autotune.experiment.rig import Reading
+
+#: readings whose median stands for y where limits are judged
+RECENT = 5
+#: share of unusable readings among the last hundred at which the signal is called garbled
+GARBLED_SHARE = 0.25
+
+
+class ReadingMonitor:
+    """State of what the last readings were like.
+
+    Parameters
+    ----------
+    jump : float
+        Largest credible change of y within one sample [y unit]; a reading beyond it is unusable.
+    bad_samples : int
+        Unusable readings in a row that are ridden through.
+
+    Attributes
+    ----------
+    noise : float
+        Half-width of the measurement noise as far as known [y unit].
+    max_repeats : int or None
+        Equal readings in a row after which the sensor counts as frozen; None while nobody knows what to expect.
+    u_tolerance : float
+        Difference between commanded and applied output that is the device's rounding [u unit].
+    recent : tuple of float
+        The last usable readings, the newest last.
+    """
+
+    def __init__(self, *, jump: float, bad_samples: int) -> None:
+        self.noise = 0.0
+        self.max_repeats: int | None = None
+        self.u_tolerance = math.inf
+        self.recent: tuple[float, ...] = ()
+        self._jump = jump
+        self._bad_samples = bad_samples
+        self._bad_run = 0
+        self._repeats = 0
+        self._not_followed = 0
+        self._last_device_time_s = math.nan
+        self._usable: deque[bool] = deque(maxlen=100)
+
+    def judge(self, reading: Reading, u: float) -> tuple[float, bool]:
+        """Return the measurement to use, and whether it is this reading's own.
+
+        Parameters
+        ----------
+        reading : Reading
+            The new sample.
+        u : float
+            Command that was held until now [u unit].
+
+        Raises
+        ------
+        ExperimentStopped, LinkError
+            The verdict on a sensor, link or actuator that has failed.
+        """
+        reason = self._unusable(reading)
+        self._usable.append(not reason)
+        if reason:
+            self._bad_run += 1
+            if self._bad_run > self._bad_samples:
+                raise (LinkError if reading.suspect else ExperimentStopped)(
+                    f"{reason}, {self._bad_run} reading(s) in a row",
+                    where="sensor",
+                    mend="check the sensor, its wiring and its scaling in the configuration",
+                )
+            if len(self._usable) == 100 and self._usable.count(False) > 100 * GARBLED_SHARE:
+                raise ExperimentStopped(
+                    f"garbled sensor: {self._usable.count(False)} of the last 100 readings were unusable"
+                    f" (last: {reason})",
+                    where="sensor",
+                    mend="check the sensor's wiring and shielding",
+                )
+            return (self.recent[-1] if self.recent else math.nan), False
+        self._bad_run = 0
+        self._check_fresh(reading)
+        self._check_followed(reading, u)
+        self.recent = (*self.recent[1 - RECENT :], reading.y)
+        return reading.y, True
+
+    def _unusable(self, reading: Reading) -> str:
+        if not math.isfinite(reading.y):
+            return "the sensor answers not a number"
+        if reading.suspect:
+            return "the link answers doubtfully"
+        if self.recent and abs(reading.y - self.recent[-1]) > self._jump + 2.0 * self.noise:
+            return f"the sensor jumps from {self.recent[-1]:.4g} to {reading.y:.4g} within one sample"
+        return ""
+
+    def _check_fresh(self, reading: Reading) -> None:
+        old_stamp = reading.device_time_s == self._last_device_time_s
+        self._last_device_time_s = reading.device_time_s
+        same = old_stamp or bool(self.recent and reading.y == self.recent[-1])
+        self._repeats = self._repeats + 1 if same else 0
+        if self.max_repeats is not None and self._repeats >= self.max_repeats:
+            raise ExperimentStopped(
+                f"stale sensor: y = {reading.y:.6g} has not changed for {self._repeats} samples",
+                where="sensor",
+                mend="check that the sensor runs and that the device sends new values",
+            )
+
+    def _check_followed(self, reading: Reading, u: float) -> None:
+        off = math.isfinite(reading.u_applied) and abs(reading.u_applied - u) > self.u_tolerance
+        self._not_followed = self._not_followed + 1 if off else 0
+        if self._not_followed > 2 * self._bad_samples:
+            raise ExperimentStopped(
+                f"the actuator does not follow: commanded {u:.4g}, the device applies {reading.u_applied:.4g}",
+                where="actuator",
+                mend="look for saturation, a stuck actuator or a wrong scaling of the output",
+            )

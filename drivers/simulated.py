@@ -1,0 +1,125 @@
+"""A simulated plant as a rig, in process and on a virtual clock: as fast as the processor allows."""
+
+from __future__ import annotations
+
+import math
+
+from autotune.config.rig import SimulatedRigSettings
+from autotune.controller import PIDController
+from autotune.errors import LinkError
+from autotune.experiment.rig import Reading
+from sim.imperfections import FaultyPlant
+from sim.plant import Plant, make_plant
+
+
+class VirtualClock:
+    """Time that moves only when somebody waits; the plant lives on meanwhile under the command it holds."""
+
+    def __init__(self, rig: SimulatedRig) -> None:
+        self._rig = rig
+        self._now_s = 0.0
+
+    def now(self) -> float:
+        """Return the virtual time [s]."""
+        return self._now_s
+
+    def sleep_until(self, t_s: float) -> None:
+        """Let the plant live until ``t_s`` [s]; at once when that has passed."""
+        if t_s > self._now_s:
+            self._rig.live(t_s - self._now_s)
+            self._now_s = t_s
+
+
+class SimulatedRig:
+    """A rig around any simulated plant.
+
+    Parameters
+    ----------
+    plant : Plant
+        The plant, with or without faults.
+    u_safe : float
+        Command that ``make_safe`` leaves [u unit].
+    controller : PIDController, optional
+        Gains that the rig's own controller holds when it is delivered.
+    """
+
+    def __init__(self, plant: Plant, *, u_safe: float, controller: PIDController | None = None) -> None:
+        self.plant = plant
+        self._u = plant.u_applied
+        self._u_safe = u_safe
+        self._controller = controller if controller is not None else PIDController(K=0.0, Ti_s=math.inf)
+        self._clock = VirtualClock(self)
+        self._is_open = False
+
+    @property
+    def clock(self) -> VirtualClock:
+        """The virtual clock."""
+        return self._clock
+
+    @property
+    def command(self) -> float:
+        """Command the rig holds now [u unit]."""
+        return self._u
+
+    def live(self, dt_s: float) -> None:
+        """Let the plant live for ``dt_s`` [s] under the command it holds."""
+        self.plant.advance(self._u, dt_s)
+
+    def open(self) -> None:
+        """Take command."""
+        self._check_link()
+        self._is_open = True
+
+    def read(self) -> Reading:
+        """Take one sample."""
+        self._require_open()
+        self._check_link()
+        return Reading(
+            t_s=self._clock.now(),
+            y=self.plant.measure(),
+            u_applied=self.plant.u_applied,
+            device_time_s=self.plant.time_s,
+        )
+
+    def write(self, u: float) -> None:
+        """Hold ``u`` [u unit] from now on."""
+        self._require_open()
+        self._check_link()
+        self._u = u
+
+    def make_safe(self) -> None:
+        """Hold the safe output; a cut link cannot stop it, as the device's own dead-man would do it."""
+        self._u = self._u_safe
+
+    def close(self) -> None:
+        """Give the rig back."""
+        self._is_open = False
+
+    def read_gains(self) -> PIDController:
+        """Return the gains the rig's own controller holds."""
+        self._check_link()
+        return self._controller
+
+    def write_gains(self, controller: PIDController) -> None:
+        """Hand gains to the rig's own controller."""
+        self._check_link()
+        self._controller = controller
+
+    def _require_open(self) -> None:
+        if not self._is_open:
+            raise LinkError("the rig is not open", where="simulated rig", mend="open it before the first sample")
+
+    def _check_link(self) -> None:
+        if isinstance(self.plant, FaultyPlant):
+            try:
+                self.plant.check_link()
+            except ConnectionError as error:
+                raise LinkError(str(error), where="simulated rig", mend="check the cable and the device") from error
+
+
+def open_simulated(
+    settings: SimulatedRigSettings, *, u_safe: float, controller: PIDController | None = None
+) -> SimulatedRig:
+    """Return the rig that ``[rig] kind = "simulated"`` describes, not yet opened."""
+    plant = make_plant(settings.plant, seed=settings.seed, noise=settings.noise, start=settings.start)
+    return SimulatedRig(plant, u_safe=u_safe, controller=controller)
