@@ -1,0 +1,271 @@
+"""The loop with the new controller on the rig: a set-point step and a load step, measured against the prediction."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from autotune.arrays import FloatArray
+from autotune.config.procedure import LimitSettings, VerificationSettings
+from autotune.controller import PIDController
+from autotune.design.law import PILaw
+from autotune.experiment.limits import Watch
+from autotune.experiment.loop import ControlLoop
+from autotune.experiment.prediction import Prediction, predict
+from autotune.identification.parametric import PlantFit
+
+#: plants and noise sequences drawn for the prediction's band
+DRAWS = 60
+#: part of the predicted departure's rms that unmodelled dynamics may add before the loop counts as another one
+TOLERANCE = 0.15
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class StepTest:
+    """What is asked of the loop, sample by sample, around the operating point.
+
+    Attributes
+    ----------
+    t : (N,) array
+        Time [s]; the first sample is one sample time after the hand-over has settled.
+    setpoint, disturbance : (N,) array
+        Departure of r from the operating point [y unit]; what is added to the law's command [u unit].
+    settle : int
+        Samples of regulation before the test, not scored.
+    """
+
+    t: FloatArray
+    setpoint: FloatArray
+    disturbance: FloatArray
+    settle: int
+
+    @property
+    def disturbed_from(self) -> int:
+        """First sample of the load step."""
+        return int(np.argmax(self.disturbance != 0.0))
+
+
+@dataclass(frozen=True, kw_only=True)
+class StepFigures:
+    """What people look at in a step response.
+
+    Attributes
+    ----------
+    overshoot : float
+        Largest excess over the set-point step, as a share of it.
+    rise_s : float
+        Time to reach nine tenths of the set-point step [s]; NaN where it is not reached.
+    peak : float
+        Largest departure under the load step [y unit].
+    h2 : float
+        Root of the integral of y^2 over the load step, per unit of load: the criterion (11), over this time only.
+    """
+
+    overshoot: float
+    rise_s: float
+    peak: float
+    h2: float
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Verification:
+    """The measured loop beside the predicted one, and the decision.
+
+    Attributes
+    ----------
+    accepted : bool
+        Whether the loop behaves as predicted.
+    reason : str
+        Why, in one sentence.
+    test : StepTest
+        What was asked.
+    y, u : (N,) array
+        Measured departure from the operating point [y unit]; the law's command [u unit].
+    prediction : Prediction
+        What was expected.
+    misfit, allowed : float
+        Root mean square of measured less predicted, and the largest that prediction and noise explain [y unit].
+    measured, predicted : StepFigures
+        Of the measured and of the expected response; the measured ones contain the noise.
+    predicted_sd : StepFigures
+        Standard deviation of the figures over the drawn plants and noise.
+    """
+
+    accepted: bool
+    reason: str
+    test: StepTest
+    y: FloatArray
+    u: FloatArray
+    prediction: Prediction
+    misfit: float
+    allowed: float
+    measured: StepFigures
+    predicted: StepFigures
+    predicted_sd: StepFigures
+
+
+def plan_test(
+    settings: VerificationSettings, limits: LimitSettings, law: PILaw, fit: PlantFit, crossover_rad_s: float
+) -> StepTest:
+    """Choose steps that show well above the noise and stay within half of the allowed swing.
+
+    Parameters
+    ----------
+    settings, limits : VerificationSettings, LimitSettings
+        What the configuration asks for and allows.
+    law : PILaw
+        The law to be verified.
+    fit : PlantFit
+        Estimated plant.
+    crossover_rad_s : float
+        Gain crossover of the new loop [rad/s], which sets the duration.
+    """
+    T_s = law.sample_time_s
+    c = law.controller
+    slow = 4.0 * c.Ti_s if math.isfinite(c.Ti_s) else 0.0
+    duration = settings.duration_s if settings.duration_s is not None else max(12.0 / crossover_rad_s, slow)
+    count = math.ceil(duration / T_s)
+    step = settings.setpoint_step if settings.setpoint_step is not None else limits.swing / 3.0
+    load = settings.disturbance_step
+    if load is None:
+        quiet, unit = np.zeros(count), np.ones(count)
+        unit_response = predict(fit.plant, [fit.plant], law, quiet, unit, 0.0, np.random.default_rng(0)).y
+        load = 0.4 * limits.swing / float(np.abs(unit_response).max())
+    late = np.arange(2 * count) >= count
+    return StepTest(
+        t=np.arange(2 * count, dtype=np.float64) * T_s,
+        setpoint=np.full(2 * count, step),
+        disturbance=np.where(late, load, 0.0),
+        settle=count,
+    )
+
+
+def run_test(
+    loop: ControlLoop, law: PILaw, test: StepTest, operating_y: float, u_hold: float
+) -> tuple[FloatArray, FloatArray]:
+    """Close the loop with the new law, bumpless from ``u_hold``, let it settle, and run the test.
+
+    Parameters
+    ----------
+    loop : ControlLoop
+        Open, with the rig at its operating point.
+    law : PILaw
+        The new law.
+    test : StepTest
+        What to ask.
+    operating_y, u_hold : float
+        Operating point [y unit] and the command that holds it [u unit].
+
+    Returns
+    -------
+    y, u : (N,) array
+        Measurement as a departure from the operating point [y unit], NaN where unusable; the law's command [u unit].
+
+    Raises
+    ------
+    ExperimentStopped
+        From the loop: the new controller took the rig to a limit.
+    """
+    loop.watch = Watch(y_centre=operating_y, afloat=True)
+    count = test.settle + test.t.size
+    setpoint = operating_y + np.concatenate([np.zeros(test.settle), test.setpoint])
+    load = np.concatenate([np.zeros(test.settle), test.disturbance])
+    y, u = np.full(count, np.nan), np.empty(count)
+    state = law.initial(u_hold, operating_y, operating_y)
+    for k in range(count):
+        tick = loop.tick
+        y[k] = tick.y - operating_y if tick.usable else np.nan
+        u[k], state = law.step(state, float(setpoint[k]), tick.y)
+        loop.step(loop.nearest(u[k] + load[k]), extra={"r": float(setpoint[k])})
+    return y[test.settle :], u[test.settle :]
+
+
+def judge(
+    test: StepTest, y: FloatArray, u: FloatArray, law: PILaw, fit: PlantFit, noise_sd: float, seed: int = 0
+) -> Verification:
+    """Compare the measured responses with the prediction.
+
+    Parameters
+    ----------
+    test : StepTest
+        What was asked.
+    y, u : (N,) array
+        From :func:`run_test`.
+    law : PILaw
+        The law that ran.
+    fit : PlantFit
+        Estimated plant with its uncertainty.
+    noise_sd : float
+        Standard deviation of the measurement noise [y unit].
+    seed : int
+        Of the draws.
+
+    Returns
+    -------
+    Verification
+        Accepted where the misfit is within what drawn plants and noise give in 99 % of cases, widened by 15 % of the
+        predicted response's rms for dynamics that the fitted structure leaves out.
+    """
+    rng = np.random.default_rng(seed)
+    prediction = predict(fit.plant, fit.draws(DRAWS, rng), law, test.setpoint, test.disturbance, noise_sd, rng)
+    usable = np.isfinite(y)
+    misfit = _rms((y - prediction.y)[usable])
+    explained = float(np.quantile([_rms(draw - prediction.y) for draw in prediction.y_draws], 0.99))
+    # the response counts from the set-point, where the loop is to bring it
+    allowed = math.hypot(explained, TOLERANCE * _rms(prediction.y - test.setpoint))
+    accepted = misfit <= allowed
+    drawn = [_figures(test, draw) for draw in prediction.y_draws]
+    reason = (
+        f"the loop behaves as predicted: rms misfit {misfit:.3g}, up to {allowed:.3g} is explained"
+        if accepted
+        else f"the loop does not behave as predicted: rms misfit {misfit:.3g}, only {allowed:.3g} is explained"
+    )
+    return Verification(
+        accepted=accepted,
+        reason=reason,
+        test=test,
+        y=y,
+        u=u,
+        prediction=prediction,
+        misfit=misfit,
+        allowed=allowed,
+        measured=_figures(test, np.where(usable, y, prediction.y)),
+        predicted=_figures(test, prediction.y),
+        predicted_sd=StepFigures(
+            overshoot=float(np.std([figure.overshoot for figure in drawn])),
+            rise_s=float(np.nanstd([figure.rise_s for figure in drawn])),
+            peak=float(np.std([figure.peak for figure in drawn])),
+            h2=float(np.std([figure.h2 for figure in drawn])),
+        ),
+    )
+
+
+def law_for(controller: PIDController, limits: LimitSettings, sample_time_s: float, reserve: float = 0.0) -> PILaw:
+    """Return the law within the safety envelope; ``reserve`` [u unit] is kept for the load step."""
+    return PILaw(
+        controller=controller,
+        sample_time_s=sample_time_s,
+        u_min=limits.u_min + abs(reserve),
+        u_max=limits.u_max - abs(reserve),
+        u_rate=limits.u_rate,
+    )
+
+
+def _rms(values: FloatArray) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def _figures(test: StepTest, y: FloatArray) -> StepFigures:
+    split = test.disturbed_from
+    step, load = float(test.setpoint[0]), float(test.disturbance[-1])
+    rising, loaded = y[:split] / step, y[split:] - step
+    reached = rising >= 0.9
+    dt = float(test.t[1] - test.t[0])
+    return StepFigures(
+        overshoot=max(0.0, float(rising.max()) - 1.0),
+        rise_s=float(np.argmax(reached)) * dt if reached.any() else math.nan,
+        peak=float(np.abs(loaded).max()),
+        h2=float(np.sqrt(dt * np.sum(loaded**2))) / abs(load),
+    )
