@@ -1,0 +1,221 @@
+"""Margins of a loop: modulus, phase, gain and delay margin, noise amplification, H2 norm, stability."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from autotune.arrays import ComplexArray, FloatArray
+from autotune.controller import Controller, PIDController
+from autotune.design.loop import ContinuousLoop, OpenLoop, Plant, open_loop
+from autotune.design.norms import disturbance_h2
+
+_ZOOMS = 6
+
+
+@dataclass(frozen=True, kw_only=True)
+class Margins:
+    """How far a closed loop is from instability, and what it does to noise and disturbances.
+
+    Attributes
+    ----------
+    stable : bool
+        Whether the closed loop is stable. Where it is not, the other figures describe the Nyquist curve only.
+    modulus : float
+        M_m = min over omega of abs(1 + L), equation (12).
+    modulus_frequency_rad_s : float
+        Where that minimum is [rad/s].
+    phase_rad : float
+        Phase margin (13), the smallest over all crossovers, in (-pi, pi] [rad]; pi where abs(L) < 1 throughout.
+    delay_s : float
+        M_ret: dead time that may be added before the loop becomes unstable [s]; infinite without a crossover.
+    gain : float
+        Smallest factor above 1 by which L may grow before the curve meets -1; infinite where there is none.
+    gain_reduction : float
+        Largest factor below 1 likewise (a conditionally stable loop); 0 where there is none.
+    crossover_rad_s : float
+        omega_gc of (14), the highest one [rad/s]; NaN where abs(L) never is 1.
+    noise_gain : float
+        True amplification (15): max of abs(C/(1 + L)) over omega >= omega_n.
+    noise_gain_bound : float
+        Its bound by (16): largest abs(C) above the integral action, divided by M_m.
+    h2 : float
+        Norm (11) of H/(1 + H C)/s; infinite without integral action or stability.
+    """
+
+    stable: bool
+    modulus: float
+    modulus_frequency_rad_s: float
+    phase_rad: float
+    delay_s: float
+    gain: float
+    gain_reduction: float
+    crossover_rad_s: float
+    noise_gain: float
+    noise_gain_bound: float
+    h2: float
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the fixed form of ``margins.json``; what is infinite or does not exist is null."""
+        values = {
+            "modulus": self.modulus,
+            "phase_deg": math.degrees(self.phase_rad),
+            "delay_s": self.delay_s,
+            "gain": self.gain,
+            "crossover_rad_s": self.crossover_rad_s,
+            "noise_gain": self.noise_gain,
+            "h2": self.h2,
+            "noise_gain_bound": self.noise_gain_bound,
+            "gain_reduction": self.gain_reduction,
+        }
+        finite: dict[str, Any] = {key: value if math.isfinite(value) else None for key, value in values.items()}
+        return finite | {"stable": self.stable}
+
+
+def margins(plant: Plant, controller: Controller, *, noise_frequency_rad_s: float | None = None) -> Margins:
+    """Return the margins of the loop of ``plant`` and ``controller``.
+
+    Parameters
+    ----------
+    plant : TransferFunction or Model
+        H; of a model the blocks, without its effects.
+    controller : PIDController, TransferFunction or DiscreteController
+        C. A discrete one makes a sampled loop: H with its zero-order hold, discretised exactly.
+    noise_frequency_rad_s : float, optional
+        omega_n of (15): lowest frequency of the measurement noise [rad/s]; the crossover where absent.
+
+    Returns
+    -------
+    Margins
+        Frozen.
+
+    Notes
+    -----
+    Extremes are found on a grid that resolves poles, zeros, resonances and dead time, and refined between its nodes;
+    stability is counted (see :mod:`autotune.design.loop`). A feature narrower than the damping of every pole and zero
+    of H, C and the closed loop does not exist, so none is missed; with dead time the closed loop's poles are not known
+    beforehand and a margin below about 1e-3 can be overstated.
+
+    References
+    ----------
+    Le & Mendes 2010, equations (11) to (16).
+    """
+    loop = open_loop(plant, controller)
+    omega = loop.grid
+    L = loop.response(omega)
+    M_m, at = _modulus_margin(loop, omega, L)
+    phase, delay, crossover = _phase_and_delay_margin(loop, omega, L)
+    gain, reduction = _gain_margins(loop, omega, L)
+    start = noise_frequency_rad_s
+    if start is None:
+        start = crossover if math.isfinite(crossover) else omega[0]
+    return Margins(
+        stable=loop.is_stable,
+        modulus=M_m,
+        modulus_frequency_rad_s=at,
+        phase_rad=phase,
+        delay_s=delay,
+        gain=gain,
+        gain_reduction=reduction,
+        crossover_rad_s=crossover,
+        noise_gain=_noise_gain(loop, omega, start),
+        noise_gain_bound=high_frequency_gain(controller, loop, start) / M_m if M_m > 0.0 else math.inf,
+        h2=disturbance_h2(loop),
+    )
+
+
+def high_frequency_gain(controller: Controller, loop: OpenLoop, start_rad_s: float) -> float:
+    """Return the gain of (16): abs(C) above its integral action.
+
+    For PI it is abs(K); for PID the larger of abs(K) and abs(K) T_d/T_f; for other controllers the largest abs(C) at
+    and above ``start_rad_s``.
+    """
+    if isinstance(controller, PIDController):
+        if controller.Td_s == 0.0:
+            return abs(controller.K)
+        derivative = controller.Td_s / controller.Tf_s if controller.Tf_s > 0.0 else math.inf
+        return abs(controller.K) * max(1.0, derivative)
+    omega = np.append(loop.grid[loop.grid > start_rad_s], start_rad_s)
+    return float(np.max(np.abs(loop.controller_response(omega))))
+
+
+def refined_minimum(
+    f: Callable[[FloatArray], FloatArray], omega: FloatArray, values: FloatArray
+) -> tuple[float, float]:
+    """Return the minimum of f and where it is, given its values on a grid that resolves it.
+
+    The eight lowest local minima on the grid are each searched between their neighbours.
+    """
+    inner = np.flatnonzero((values[1:-1] <= values[:-2]) & (values[1:-1] <= values[2:])) + 1
+    best = int(np.argmin(values))
+    lowest, at = float(values[best]), float(omega[best])
+    for i in inner[np.argsort(values[inner])][:8]:
+        left, right = float(omega[i - 1]), float(omega[i + 1])
+        for _ in range(_ZOOMS):
+            x = np.linspace(left, right, 21)
+            fx = f(x)
+            k = int(np.argmin(fx))
+            if fx[k] < lowest:
+                lowest, at = float(fx[k]), float(x[k])
+            left, right = float(x[max(k - 1, 0)]), float(x[min(k + 1, 20)])
+    return lowest, at
+
+
+def _modulus_margin(loop: OpenLoop, omega: FloatArray, L: ComplexArray) -> tuple[float, float]:
+    lowest, at = refined_minimum(lambda x: np.abs(1.0 + loop.response(x)), omega, np.abs(1.0 + L))
+    if isinstance(loop, ContinuousLoop) and loop.transfer_function.delay_s > 0.0 and loop.gain_at_infinity > 0.0:
+        # dead time turns a gain that does not vanish through -180 deg for ever
+        limit = abs(1.0 - loop.gain_at_infinity)
+        if limit < lowest:
+            return limit, math.inf
+    return lowest, at
+
+
+def _roots(f: Callable[[FloatArray], FloatArray], omega: FloatArray, values: FloatArray) -> FloatArray:
+    """Return the frequencies where f changes sign, by bisection of all brackets at once, closed by a secant."""
+    i = np.flatnonzero(np.sign(values[:-1]) * np.sign(values[1:]) < 0)
+    if not len(i):
+        return omega[np.flatnonzero(values == 0.0)]
+    a, b, fa, fb = omega[i], omega[i + 1], values[i], values[i + 1]
+    for _ in range(40):
+        middle = 0.5 * (a + b)
+        fm = f(middle)
+        left = np.sign(fm) == np.sign(fa)
+        a, fa = np.where(left, middle, a), np.where(left, fm, fa)
+        b, fb = np.where(left, b, middle), np.where(left, fb, fm)
+    return np.asarray(np.concatenate((0.5 * (a + b), omega[np.flatnonzero(values == 0.0)])))
+
+
+def _phase_and_delay_margin(loop: OpenLoop, omega: FloatArray, L: ComplexArray) -> tuple[float, float, float]:
+    def f(x: FloatArray) -> FloatArray:
+        return np.log(np.abs(loop.response(x)))
+
+    crossings = _roots(f, omega, np.log(np.maximum(np.abs(L), 1e-300)))
+    if not len(crossings):
+        return math.pi, math.inf, math.nan
+    above = np.angle(-loop.response(crossings))  # arg L + pi, in (-pi, pi]
+    ahead = np.where(above > 0.0, above, above + 2.0 * np.pi)
+    return float(above[np.argmin(np.abs(above))]), float(np.min(ahead / crossings)), float(np.max(crossings))
+
+
+def _gain_margins(loop: OpenLoop, omega: FloatArray, L: ComplexArray) -> tuple[float, float]:
+    def f(x: FloatArray) -> FloatArray:
+        return loop.response(x).imag
+
+    at = loop.response(_roots(f, omega, L.imag))
+    factors = -1.0 / at.real[at.real < 0.0]
+    up, down = factors[factors > 1.0], factors[factors <= 1.0]
+    return float(np.min(up)) if len(up) else math.inf, float(np.max(down)) if len(down) else 0.0
+
+
+def _noise_gain(loop: OpenLoop, omega: FloatArray, start: float) -> float:
+    def f(x: FloatArray) -> FloatArray:
+        return -np.abs(loop.controller_response(x) / (1.0 + loop.response(x)))
+
+    above = np.concatenate(([start], omega[omega > start]))
+    lowest, _ = refined_minimum(f, above, f(above))
+    return -lowest
