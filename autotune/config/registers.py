@@ -73,6 +73,7 @@ class RegisterMap(Section):
         "last heartbeat the device took; identifies the answer, so place it next to y"
     )
     enable: RegisterSettings | None = _signal("1 while the host commands the actuator, 0 to give it back")
+    in_command: RegisterSettings | None = _signal("1 while the device lets the host's command act; place it next to y")
     safe: RegisterSettings | None = _signal("output that the device sets when the host falls silent [u unit]")
     automatic: RegisterSettings | None = _signal("1 while the device's own controller may run")
     setpoint: RegisterSettings | None = _signal("set-point of the device's own controller [y unit]")

@@ -1,0 +1,371 @@
+"""Requests and answers on Modbus TCP, TLS and RTU: an answer is the one that was asked for, or there is none.
+
+What can go wrong, and what is done about it:
+
+- TCP, TLS. A transaction id pairs answer and request, but only if no id is used twice: every attempt here is a new
+  request with a new id, so an answer to an earlier attempt is dropped. After a time-out the stream may stand in the
+  middle of a frame, so the connection is made anew.
+- RTU has no transaction id: an answer that comes after its time-out would be taken for the next request's. After
+  anything but a clean answer (also an interrupted request) the line is resynchronised, see :meth:`ModbusLink._flush`.
+- Every answer is checked against its request: function code, number of registers, echoed address and value.
+- An open but silent peer costs (retries + 1) x timeout_s, plus late_reply_s each on RTU; no wait is without end.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import socket
+import ssl
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import serial
+from pymodbus.client import ModbusSerialClient, ModbusTcpClient
+from pymodbus.exceptions import ConnectionException, ModbusException
+from pymodbus.framer.rtu import FramerRTU
+from pymodbus.pdu import ModbusPDU
+
+from autotune.config.rig import AnyModbusSettings, ModbusRtuSettings, ModbusTcpSettings, ModbusTlsSettings
+from autotune.errors import InputError, LinkError
+from drivers.registers import Block
+
+_LINE_ERRORS: tuple[type[Exception], ...] = (OSError,)
+try:
+    import termios
+
+    _LINE_ERRORS += (termios.error,)  # raised for line settings that the device refuses; it is no OSError
+except ImportError:  # there is none outside POSIX
+    pass
+
+# the library logs what is raised here anyway; without a handler Python would print it
+logging.getLogger("pymodbus").addHandler(logging.NullHandler())
+
+_EXCEPTIONS = {
+    1: ("does not know the function", "check table and type in the register map"),
+    2: ("does not have that address", "check the register map: addresses count from 0"),
+    3: ("refuses that value or count", "check type and scale in the register map"),
+    4: ("failed to do it", "look at the device's own fault display"),
+    5: ("acknowledges, and is not done yet", "raise retries or timeout_s"),
+    6: ("is busy", "raise retries or timeout_s"),
+    10: ("is behind a gateway that has no path to it", "check unit_id and the gateway"),
+    11: ("does not answer its gateway", "check unit_id and the gateway"),
+}
+_BUSY = (5, 6)
+_DIAGNOSTICS = 0x08
+_READ = {
+    "coil": (1, "read_coils"),
+    "discrete": (2, "read_discrete_inputs"),
+    "holding": (3, "read_holding_registers"),
+    "input": (4, "read_input_registers"),
+}
+
+
+class _TcpClient(ModbusTcpClient):
+    """The library's client, with TLS that checks the device's name, and frames cut by their length on TLS too."""
+
+    tls: ssl.SSLContext | None = None
+    server_name: str = ""
+
+    def connect(self) -> bool:
+        """Connect; return whether there is a connection."""
+        if self.socket is not None:
+            return True
+        address = (self.comm_params.host, self.comm_params.port)
+        try:
+            plain = socket.create_connection(address, timeout=self.comm_params.timeout_connect)
+            plain.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        except OSError as error:
+            raise ConnectionException(error.strerror or str(error)) from None
+        try:
+            self.socket = self.tls.wrap_socket(plain, server_hostname=self.server_name) if self.tls else plain
+        except OSError as error:  # an SSLError is one
+            plain.close()
+            raise ConnectionException(f"TLS: {error}") from None
+        return True
+
+
+class _RtuClient(ModbusSerialClient):
+    """The library's client, waiting in select() for the first byte where the library polls each millisecond."""
+
+    def connect(self) -> bool:
+        """Open the serial device; return whether it is open."""
+        if self.socket is None:
+            settings = self.comm_params
+            try:
+                self.socket = serial.Serial(
+                    settings.host,
+                    baudrate=settings.baudrate,
+                    parity=settings.parity,
+                    stopbits=settings.stopbits,
+                    timeout=settings.timeout_connect,
+                    write_timeout=settings.timeout_connect,
+                    exclusive=True,
+                )
+            except _LINE_ERRORS as error:
+                raise ConnectionException(str(error)) from None
+        return True
+
+    def recv(self, size: int | None) -> bytes:
+        """Return what has come, at the latest after the time-out nothing."""
+        if self.socket is None:
+            raise ConnectionException("the line is closed")
+        try:
+            first = bytes(self.socket.read(1))
+            return first + bytes(self.socket.read(self.socket.in_waiting)) if first else first
+        except OSError as error:
+            raise ConnectionException(str(error)) from None
+
+
+class ModbusLink:
+    """One device on Modbus.
+
+    Parameters
+    ----------
+    settings : ModbusTcpSettings, ModbusTlsSettings or ModbusRtuSettings
+        Transport, unit id, time-outs.
+    """
+
+    def __init__(self, settings: AnyModbusSettings) -> None:
+        self._settings = settings
+        self._unit = settings.unit_id
+        self._client: _TcpClient | _RtuClient | None = None
+        self._is_clean = False  # whether nothing but the next answer can come
+
+    @property
+    def where(self) -> str:
+        """The device, for messages."""
+        match self._settings:
+            case ModbusRtuSettings(device=device, unit_id=unit):
+                return f"Modbus RTU {device} unit {unit}"
+            case ModbusTcpSettings(host=host, port=port, unit_id=unit):
+                return f"Modbus TCP {host}:{port} unit {unit}"
+            case ModbusTlsSettings(host=host, port=port, unit_id=unit):
+                return f"Modbus TLS {host}:{port} unit {unit}"
+
+    def connect(self) -> None:
+        """Connect.
+
+        Raises
+        ------
+        InputError
+            A certificate cannot be read.
+        LinkError
+            Nothing answers there.
+        """
+        if self._client is None:
+            self._client = _client(self._settings)
+        try:
+            if not self._client.connect():
+                raise ConnectionException("cannot be opened")
+        except ConnectionException as error:
+            raise LinkError(
+                f"no connection ({_words(error)})", where=self.where, mend="check address, cable and power"
+            ) from None
+
+    def disconnect(self) -> None:
+        """Disconnect; may be called more than once."""
+        self._hang_up()
+        self._client = None
+        self._is_clean = False
+
+    def distrust(self) -> None:
+        """Have the link flushed before the next request: an answer was not what it should be."""
+        self._is_clean = False
+
+    def read(self, block: Block) -> tuple[Sequence[int], bool]:
+        """Read a block of registers.
+
+        Returns
+        -------
+        words : sequence of int
+            As many as the block counts; 0 or 1 each for bits.
+        suspect : bool
+            Whether it took more than one attempt.
+
+        Raises
+        ------
+        LinkError
+            No answer, or none that belongs to the request, in all attempts.
+        """
+        function, method = _READ[block.table]
+        is_bits = function < 3
+
+        def ask(client: Any) -> ModbusPDU:
+            answer: ModbusPDU = getattr(client, method)(block.address, count=block.count, device_id=self._unit)
+            return answer
+
+        def belongs(answer: ModbusPDU) -> bool:
+            if is_bits:
+                return len(answer.bits) == 8 * ((block.count + 7) // 8)
+            return len(answer.registers) == block.count
+
+        answer, attempts = self._exchange(ask, belongs, function, f"{block.table} {block.address}")
+        return ([int(bit) for bit in answer.bits[: block.count]] if is_bits else answer.registers), attempts > 1
+
+    def write(self, table: str, address: int, words: Sequence[int]) -> bool:
+        """Write side-by-side registers in one request, or one coil.
+
+        Returns
+        -------
+        suspect : bool
+            Whether it took more than one attempt, so that it may have acted more than once.
+
+        Raises
+        ------
+        LinkError
+            No answer, or none that belongs to the request, in all attempts; it may have acted nevertheless.
+        """
+        value = words[0]
+
+        def ask(client: Any) -> ModbusPDU:
+            answer: ModbusPDU
+            if table == "coil":
+                answer = client.write_coil(address, bool(value), device_id=self._unit)
+            elif len(words) == 1:
+                answer = client.write_register(address, value, device_id=self._unit)
+            else:
+                answer = client.write_registers(address, list(words), device_id=self._unit)
+            return answer
+
+        def belongs(answer: ModbusPDU) -> bool:
+            if answer.address != address:
+                return False
+            if table == "coil":
+                return bool(answer.bits[0]) == bool(value)
+            return answer.registers == [value] if len(words) == 1 else answer.count == len(words)
+
+        function = 5 if table == "coil" else 6 if len(words) == 1 else 16
+        _, attempts = self._exchange(ask, belongs, function, f"{table} {address}")
+        return attempts > 1
+
+    def _exchange(
+        self,
+        ask: Callable[[Any], ModbusPDU],
+        belongs: Callable[[ModbusPDU], bool],
+        function: int,
+        place: str,
+    ) -> tuple[ModbusPDU, int]:
+        """Ask until an answer belongs to the request; return it and the number of attempts."""
+        what, mend = "no answer", "check cable, power and unit_id, or raise timeout_s"
+        for attempt in range(1, self._settings.retries + 2):
+            try:
+                if not self._is_clean:
+                    self._flush()
+                # stays so if the request is interrupted: its answer would be the next one's
+                self._is_clean = False
+                answer = ask(self._client)
+            except LinkError as error:
+                what, mend = error.what, error.mend
+                continue
+            except ConnectionException as error:
+                what, mend = f"the connection was lost ({_words(error)})", "check cable and power of the device"
+                self._hang_up()
+                continue
+            except ModbusException:  # time-out, or bytes that are no frame
+                what, mend = "no answer", "check cable, power and unit_id, or raise timeout_s"
+                continue
+            if answer.function_code & 0x7F != function or not (answer.isError() or belongs(answer)):
+                what, mend = "the answer belongs to another request", "let only one master talk to the device"
+                continue
+            self._is_clean = True
+            if not answer.isError():
+                return answer, attempt
+            code = answer.exception_code
+            what, mend = _EXCEPTIONS.get(code, (f"answers with exception {code}", "see the device's manual"))
+            what = f"the device {what}"
+            if code not in _BUSY:
+                break
+        raise LinkError(what, where=f"{self.where}, {place}", mend=mend)
+
+    def _flush(self) -> None:
+        """Make sure that no earlier answer can be taken for the next one.
+
+        TCP and TLS: a new connection. RTU: wait for silence, then send a diagnostic echo (function 8, sub-function 0)
+        with random data. The line and the device keep the order, so when the echo has come, or the refusal of function
+        8, which nothing else can cause, every earlier answer has come before it. A device that ignores function 8 is
+        waited for ``late_reply_s``, after which no answer is still on its way.
+        """
+        if isinstance(self._client, _TcpClient):
+            self._hang_up()
+        self.connect()
+        if not isinstance(self._client, _RtuClient) or self._client.socket is None:
+            return
+        line = self._client.socket
+        settings = self._settings
+        try:
+            line.timeout = max(0.002, 3.5 * 11 / line.baudrate)
+            while line.read(1):
+                line.reset_input_buffer()
+            request = bytes((self._unit, _DIAGNOSTICS, 0, 0)) + os.urandom(2)
+            request += FramerRTU.compute_CRC(request).to_bytes(2, "big")
+            line.write(request)
+            deadline = time.monotonic() + settings.late_reply_s
+            received = b""
+            while (left := deadline - time.monotonic()) > 0 and not _echoed(received, request):
+                line.timeout = left
+                received += line.read(1) + line.read(line.in_waiting)
+            line.timeout = settings.timeout_s
+        except _LINE_ERRORS as error:
+            raise ConnectionException(str(error)) from None
+
+    def _hang_up(self) -> None:
+        if self._client is not None:
+            self._client.close()  # type: ignore[no-untyped-call]  # the library leaves it untyped
+
+
+def _echoed(received: bytes, request: bytes) -> bool:
+    """Return whether the echo of the request, or the refusal of its function, has come."""
+    if request in received:
+        return True
+    refusal = bytes((request[0], request[1] | 0x80))
+    at = received.find(refusal)
+    while at >= 0:
+        frame = received[at : at + 5]
+        if len(frame) == 5 and FramerRTU.compute_CRC(frame[:3]).to_bytes(2, "big") == frame[3:]:
+            return True
+        at = received.find(refusal, at + 1)
+    return False
+
+
+def _words(error: Exception) -> str:
+    """Return the library's message without its own prefix."""
+    return str(error).removeprefix("Modbus Error: ").removeprefix("[Connection] ").strip()
+
+
+def _client(settings: AnyModbusSettings) -> _TcpClient | _RtuClient:
+    match settings:
+        case ModbusRtuSettings():
+            return _RtuClient(
+                settings.device,
+                baudrate=settings.baud,
+                parity=settings.parity,
+                stopbits=settings.stop_bits,
+                timeout=settings.timeout_s,
+                retries=0,
+            )
+        case ModbusTcpSettings() | ModbusTlsSettings():
+            client = _TcpClient(settings.host, port=settings.port, timeout=settings.timeout_s, retries=0)
+            if isinstance(settings, ModbusTlsSettings):
+                client.tls = _tls_context(settings)
+                client.server_name = settings.server_name or settings.host
+            return client
+
+
+def _tls_context(settings: ModbusTlsSettings) -> ssl.SSLContext:
+    for path in (settings.ca_file, settings.cert_file, settings.key_file):
+        if not Path(path).is_file():
+            raise InputError("no such certificate or key", where=path, mend="give PEM files in [rig]")
+    try:
+        context = ssl.create_default_context(cafile=settings.ca_file)
+        context.minimum_version = ssl.TLSVersion.TLSv1_2
+        context.load_cert_chain(settings.cert_file, settings.key_file)
+    except ssl.SSLError as error:
+        raise InputError(
+            f"certificate or key refused ({error.reason or error})",
+            where=settings.cert_file,
+            mend="give the certificate and its own unencrypted key, both PEM",
+        ) from None
+    return context

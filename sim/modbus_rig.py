@@ -1,0 +1,241 @@
+"""The simulated device behind a real Modbus server, in real time: TCP, TLS, or RTU on a serial device."""
+
+from __future__ import annotations
+
+import asyncio
+import ssl
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Any, TypeAlias
+
+from pymodbus import FramerType
+from pymodbus.constants import ExcCodes
+from pymodbus.server import ModbusSerialServer, ModbusTcpServer, ModbusTlsServer
+from pymodbus.simulator import DataType, SimData, SimDevice
+
+from sim.register_device import IllegalAddress, RegisterDevice
+from sim.registers import RegisterSpec, Table
+
+_TABLE: dict[int, Table] = {
+    1: "coil",
+    2: "discrete",
+    3: "holding",
+    4: "input",
+    5: "coil",
+    6: "holding",
+    15: "coil",
+    16: "holding",
+    22: "holding",
+    23: "holding",
+}
+_TABLES: tuple[Table, ...] = ("coil", "discrete", "holding", "input")
+_LIVE_S = 0.02
+_START_S = 10.0
+
+#: Asked before each request is served (table, address, whether it writes); a code is answered as Modbus exception.
+Refusal: TypeAlias = Callable[[str, int, bool], int | None]
+
+
+@dataclass(frozen=True, kw_only=True)
+class TcpTransport:
+    """Where a TCP or TLS server listens; port 0 for any free one.
+
+    Attributes
+    ----------
+    address, port : str, int
+        Loopback unless asked otherwise.
+    ca_file, cert_file, key_file : str or None
+        PEM files; with them the server speaks TLS and wants a client certificate that the authority signed.
+    """
+
+    address: str = "127.0.0.1"
+    port: int = 0
+    ca_file: str | None = None
+    cert_file: str | None = None
+    key_file: str | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class RtuTransport:
+    """The serial device that an RTU server sits on."""
+
+    device: str
+    baud: int = 19200
+    parity: str = "E"
+    stop_bits: int = 1
+
+
+class ModbusRig:
+    """A device served in its own thread until the context ends.
+
+    Parameters
+    ----------
+    device : RegisterDevice
+        The device; its time runs with the wall clock from the start of the service.
+    transport : TcpTransport or RtuTransport
+        Where it is served.
+    unit_id : int
+        Unit id it answers to.
+    refuse : callable, optional
+        Injects Modbus exceptions, see :data:`Refusal`.
+    """
+
+    def __init__(
+        self,
+        device: RegisterDevice,
+        transport: TcpTransport | RtuTransport,
+        *,
+        unit_id: int = 1,
+        refuse: Refusal | None = None,
+    ) -> None:
+        self.device = device
+        self.port = 0
+        self._transport = transport
+        self._unit_id = unit_id
+        self._refuse = refuse
+        self._ready = threading.Event()
+        self._failure: BaseException | None = None
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._stop: asyncio.Event | None = None
+        self._start_s = 0.0
+        self._thread = threading.Thread(target=self._run, name="modbus rig", daemon=True)
+
+    def __enter__(self) -> ModbusRig:
+        self._thread.start()
+        self._ready.wait(_START_S)
+        if self._failure is not None:
+            raise ConnectionError(f"cannot serve on {self._transport}: {self._failure}") from self._failure
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        if self._loop is not None and self._stop is not None and self._thread.is_alive():
+            self._loop.call_soon_threadsafe(self._stop.set)
+        self._thread.join(_START_S)
+
+    @property
+    def now_s(self) -> float:
+        """Device time [s]."""
+        return time.perf_counter() - self._start_s
+
+    def _run(self) -> None:
+        try:
+            asyncio.run(self._serve())
+        except Exception as failure:  # whatever it is, the thread that waits raises it
+            self._failure = failure
+        finally:
+            self._ready.set()
+
+    async def _serve(self) -> None:
+        self._loop = asyncio.get_running_loop()
+        self._stop = asyncio.Event()
+        server = self._server()
+        self.device.live(1e-9)  # the plant's first step may have to be compiled
+        self._start_s = time.perf_counter()
+        await server.serve_forever(background=True)
+        if isinstance(self._transport, TcpTransport):
+            listening: Any = server.transport  # an asyncio.Server, which the library types as its transport
+            self.port = int(listening.sockets[0].getsockname()[1])
+        living = asyncio.create_task(self._live())
+        self._ready.set()
+        await self._stop.wait()
+        living.cancel()
+        await server.shutdown()  # type: ignore[no-untyped-call]  # the library leaves it untyped
+
+    async def _live(self) -> None:
+        """Keep the plant close to the wall clock also while nobody asks."""
+        while True:
+            self.device.live(self.now_s)
+            await asyncio.sleep(_LIVE_S)
+
+    def _server(self) -> ModbusTcpServer | ModbusSerialServer:
+        context = sim_device(self.device.registers, self._unit_id, self._serve_request)
+        match self._transport:
+            case RtuTransport(device=device, baud=baud, parity=parity, stop_bits=stop_bits):
+                return ModbusSerialServer(
+                    context,
+                    framer=FramerType.RTU,
+                    port=device,
+                    baudrate=baud,
+                    parity=parity,
+                    stopbits=stop_bits,
+                    ignore_missing_devices=True,
+                )
+            case TcpTransport(address=address, port=port, cert_file=None):
+                return ModbusTcpServer(context, address=(address, port))
+            case TcpTransport(address=address, port=port):
+                # frames are cut by their length, as on TCP: a TLS record may hold half a frame or two
+                tls = _tls_context(self._transport)
+                return ModbusTlsServer(context, framer=FramerType.SOCKET, address=(address, port), sslctx=tls)
+
+    async def _serve_request(
+        self,
+        function: int,
+        start: int,
+        address: int,
+        count: int,
+        memory: list[int],
+        values: list[int] | list[bool] | None,
+    ) -> ExcCodes | None:
+        """Answer one request out of the device; called by the server, which then reads ``memory``."""
+        table = _TABLE[function]
+        code = self._refuse(table, address, values is not None) if self._refuse else None
+        if code is not None:
+            return ExcCodes(code)
+        now_s = self.now_s
+        try:
+            if values is not None:
+                self.device.write(table, address, [int(value) for value in values], now_s)
+            elif table in ("coil", "discrete"):
+                self._show_bits(table, start, memory, now_s)
+            else:
+                memory[address - start : address - start + count] = self.device.read(table, address, count, now_s)
+        except IllegalAddress:
+            return ExcCodes.ILLEGAL_ADDRESS
+        return None
+
+    def _show_bits(self, table: Table, start: int, memory: list[int], now_s: float) -> None:
+        """Put the table's bits where the server looks for them: 16 to a register, from the lowest bit on."""
+        for spec in self.device.registers.values():
+            if spec.table == table:
+                (bit,) = self.device.read(table, spec.address, 1, now_s)
+                at, place = spec.address // 16 - start, spec.address % 16
+                memory[at] = memory[at] & ~(1 << place) | bit << place
+
+
+def sim_device(
+    registers: dict[str, RegisterSpec],
+    unit_id: int,
+    serve: Callable[..., object],
+) -> SimDevice:
+    """Return the server's memory for the registers; every request goes through ``serve``."""
+    rows: dict[Table, dict[int, SimData]] = {table: {} for table in _TABLES}
+    for spec in registers.values():
+        is_bit = spec.type == "bit"
+        rows[spec.table][spec.address] = SimData(
+            spec.address,
+            count=spec.size,
+            values=False if is_bit else 0,
+            datatype=DataType.BITS if is_bit else DataType.REGISTERS,
+        )
+    for table, held in rows.items():  # the library wants a row in every table; the device itself refuses this one
+        is_bits = table in ("coil", "discrete")
+        if not held:
+            held[0] = SimData(
+                0, values=False if is_bits else 0, datatype=DataType.BITS if is_bits else DataType.REGISTERS
+            )
+    coils, discretes, holdings, inputs = (list(rows[table].values()) for table in _TABLES)
+    return SimDevice(id=unit_id, simdata=(coils, discretes, holdings, inputs), action=serve)  # type: ignore[arg-type]  # its SimAction
+
+
+def _tls_context(transport: TcpTransport) -> ssl.SSLContext:
+    if transport.cert_file is None or transport.key_file is None or transport.ca_file is None:
+        raise RuntimeError("TLS needs ca_file, cert_file and key_file")
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.minimum_version = ssl.TLSVersion.TLSv1_2
+    context.load_cert_chain(transport.cert_file, transport.key_file)
+    context.load_verify_locations(transport.ca_file)
+    context.verify_mode = ssl.CERT_REQUIRED
+    return context

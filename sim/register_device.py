@@ -1,0 +1,232 @@
+"""A device between a register line and a plant: actuator, dead-man timer, a PI of its own. Time is told from outside.
+
+Who moves the actuator::
+
+    host         while ``enable`` is 1 (where it is not mapped: from the first command on); ``u`` is the output.
+    nobody       the dead-man ran out: the safe output; ``enable`` falls to 0 and has to be set again.
+    controller   ``enable`` is 0 and ``automatic`` is 1: the device's PI, u = K (1 + 1/(Ti s)) (setpoint - y).
+    nobody       both are 0: the safe output; before the first command the output that the plant came with.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from sim.plant import Plant
+from sim.registers import RegisterSpec, Table, from_words, to_words
+
+_TICK_S = 0.01
+_KEPT = 100_000
+
+
+class IllegalAddress(LookupError):  # noqa: N818 - Modbus calls it so
+    """A request touches a register that the device does not have."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class OutputChange:
+    """One change of what moves the actuator.
+
+    Attributes
+    ----------
+    t_s : float
+        Device time [s].
+    output : float
+        Output from then on [u unit].
+    cause : str
+        ``command``, ``dead-man``, ``given back``, ``controller``.
+    """
+
+    t_s: float
+    output: float
+    cause: str
+
+
+class RegisterDevice:
+    """The device.
+
+    Parameters
+    ----------
+    plant : Plant
+        What it moves and measures.
+    registers : mapping of str to RegisterSpec
+        Signals ``y``, ``u`` and any of ``u_applied``, ``device_time``, ``heartbeat``, ``heartbeat_echo``, ``enable``,
+        ``in_command``, ``safe``, ``automatic``, ``setpoint``, ``K``, ``Ti``.
+    u_safe : float
+        Safe output until the host writes another [u unit].
+    u_range : (float, float)
+        Range of the device's PI [u unit].
+    deadman_s : float
+        Time without a new heartbeat (where none is mapped: without a command) until the output is safe [s].
+    gains : (float, float)
+        K and Ti that the device's PI is delivered with.
+    """
+
+    def __init__(
+        self,
+        plant: Plant,
+        registers: Mapping[str, RegisterSpec],
+        *,
+        u_safe: float,
+        u_range: tuple[float, float],
+        deadman_s: float = 0.5,
+        gains: tuple[float, float] = (0.0, 1.0),
+    ) -> None:
+        self.plant = plant
+        self.registers = dict(registers)
+        self.history: deque[OutputChange] = deque(maxlen=_KEPT)
+        self.reads = 0
+        self._at = {
+            (spec.table, spec.address + i): (name, i) for name, spec in self.registers.items() for i in range(spec.size)
+        }
+        self._values = {
+            "u": plant.u_applied,
+            "safe": u_safe,
+            "heartbeat": 0.0,
+            "enable": 0.0,
+            "automatic": 0.0,
+            "setpoint": 0.0,
+            "K": gains[0],
+            "Ti": gains[1],
+        }
+        self._u_range = u_range
+        self._deadman_s = deadman_s
+        self._output = plant.u_applied
+        self._by_host = False
+        self._fed_s = -math.inf
+        self._now_s = 0.0
+        self._tick_s = 0.0
+        self._error = 0.0
+
+    @property
+    def output(self) -> float:
+        """What the actuator is moved with now [u unit]."""
+        return self._output
+
+    @property
+    def value(self) -> Mapping[str, float]:
+        """The values the host has written, by signal."""
+        return self._values
+
+    def live(self, now_s: float) -> None:
+        """Let the plant live until the device time ``now_s`` [s], through dead-man and controller ticks on the way."""
+        while self._now_s < now_s:
+            events = [now_s]
+            if self._by_host:
+                events.append(self._fed_s + self._deadman_s)
+            if self._is_automatic:
+                events.append(self._tick_s)
+            until = min(events)
+            if until > self._now_s:
+                self.plant.advance(self._output, until - self._now_s)
+                self._now_s = until
+            if self._by_host and until >= self._fed_s + self._deadman_s:
+                self._release("dead-man")
+            elif self._is_automatic and until >= self._tick_s:
+                self._control()
+
+    def read(self, table: Table, address: int, count: int, now_s: float) -> list[int]:
+        """Return the registers at the device time ``now_s`` [s]; one measurement per request.
+
+        Raises
+        ------
+        IllegalAddress
+            One of them does not exist.
+        """
+        parts = self._parts(table, address, count)
+        self.live(now_s)
+        self.reads += 1
+        shown = {name: to_words(self._shown(name), self.registers[name]) for name, _ in parts}
+        return [shown[name][i] for name, i in parts]
+
+    def write(self, table: Table, address: int, words: Sequence[int], now_s: float) -> None:
+        """Take registers from the host at the device time ``now_s`` [s].
+
+        Raises
+        ------
+        IllegalAddress
+            One of them does not exist, or is half of a value whose other half is not written.
+        """
+        parts = self._parts(table, address, len(words))
+        self.live(now_s)
+        written: dict[str, list[int]] = {}
+        for (name, _), word in zip(parts, words, strict=True):
+            written.setdefault(name, []).append(word)
+        if any(len(value) != self.registers[name].size for name, value in written.items()):
+            raise IllegalAddress(f"{table} {address}: half a value")
+        for name, value in written.items():
+            self._take(name, from_words(value, self.registers[name]))
+
+    @property
+    def _is_automatic(self) -> bool:
+        return not self._by_host and self._values["automatic"] == 1.0
+
+    def _parts(self, table: Table, address: int, count: int) -> list[tuple[str, int]]:
+        wanted = [(table, address + i) for i in range(count)]
+        if not all(place in self._at for place in wanted):
+            raise IllegalAddress(f"{table} {address}..{address + count - 1}")
+        return [self._at[place] for place in wanted]
+
+    def _shown(self, name: str) -> float:
+        match name:
+            case "y":
+                return self.plant.measure()
+            case "u_applied":
+                return self._output
+            case "device_time":
+                return self._now_s
+            case "heartbeat_echo":
+                return self._values["heartbeat"]
+            case "enable" | "in_command":
+                return float(self._by_host)
+        return self._values[name]
+
+    def _take(self, name: str, value: float) -> None:
+        if name == "heartbeat" and value != self._values["heartbeat"]:
+            self._fed_s = self._now_s
+        self._values[name] = value
+        match name:
+            case "u":
+                if "heartbeat" not in self.registers:
+                    self._fed_s = self._now_s
+                if self._by_host or "enable" not in self.registers:
+                    self._command()
+            case "enable" if value == 1.0:
+                self._fed_s = self._now_s
+                self._command()
+            case "enable" if self._by_host:
+                self._release("given back")
+            case "automatic" if not self._by_host:
+                self._release("given back")
+
+    def _command(self) -> None:
+        self._by_host = True
+        self._set(self._values["u"], "command")
+
+    def _release(self, cause: str) -> None:
+        """Leave the actuator to the device: to its controller without a bump, or to the safe output."""
+        self._by_host = False
+        if cause == "dead-man":
+            self._values["automatic"] = 0.0
+        if self._values["automatic"] == 1.0:
+            self._error = self._values["setpoint"] - self.plant.measure()
+            self._tick_s = self._now_s + _TICK_S
+        else:
+            self._set(self._values["safe"], cause)
+
+    def _control(self) -> None:
+        """One tick of the PI in velocity form, held within the actuator's range."""
+        error = self._values["setpoint"] - self.plant.measure()
+        K, Ti = self._values["K"], self._values["Ti"]
+        low, high = self._u_range
+        u = self._output + K * (error - self._error) + (K * _TICK_S / Ti * error if Ti > 0 else 0.0)
+        self._error = error
+        self._tick_s += _TICK_S
+        self._set(min(max(u, low), high), "controller")
+
+    def _set(self, output: float, cause: str) -> None:
+        self._output = output
+        self.history.append(OutputChange(t_s=self._now_s, output=output, cause=cause))
