@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import sys
+from typing import Any, NoReturn
 
 import typer
 from rich.console import Console
 
-from autotune.errors import AutotuneError
+from autotune.errors import AutotuneError, InputError, OperatorStop
+
+# typer brings click under a name that differs between its versions; its exported exception leads to the base classes
+UsageError: type[Any] = typer.BadParameter.__mro__[1]
+ClickException: type[Any] = typer.BadParameter.__mro__[2]
 
 app = typer.Typer(
     name="autotune",
@@ -37,7 +42,25 @@ from autotune.cli import (  # noqa: E402, F401, I001
 def main() -> None:
     """Run the command line; an error of the tool is one line on stderr and its exit status."""
     try:
-        app()
+        status = app(standalone_mode=False)
     except AutotuneError as error:
-        Console(stderr=True, highlight=False, soft_wrap=True).print(f"autotune: {error}", markup=False)
-        sys.exit(error.exit_status)
+        _leave(str(error), error.exit_status)
+    except ClickException as error:
+        _leave(_usage(error), InputError.exit_status)
+    except (typer.Abort, KeyboardInterrupt):
+        _leave("stopped by the operator", OperatorStop.exit_status)
+    sys.exit(status or 0)
+
+
+def _leave(line: str, status: int) -> NoReturn:
+    Console(stderr=True, highlight=False, soft_wrap=True).print(f"autotune: {line}", markup=False)
+    sys.exit(status)
+
+
+def _usage(error: Any) -> str:
+    """Return what was wrong with the call in one line, and where its help is; the help itself for an empty call."""
+    line = str(error.format_message())
+    if "\n" in line or not isinstance(error, UsageError):
+        return line
+    context = error.ctx
+    return f"{line} See: {context.command_path if context else 'autotune'} --help"

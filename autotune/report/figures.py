@@ -1,0 +1,242 @@
+"""Figures that several pages share: recordings, Bode diagram with regions, Nyquist, Nichols, sensitivity, steps."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+import plotly.graph_objects as go
+from plotly.subplots import make_subplots
+
+from autotune.arrays import ComplexArray, FloatArray
+from autotune.points import FrequencyPoint
+from autotune.recording import Recording
+from autotune.report.page import BLUE, GREY, ORANGE, RED, add_line, thinned
+
+
+class Responds(Protocol):
+    """Anything with a frequency response."""
+
+    def response(self, omega_rad_s: FloatArray) -> ComplexArray:
+        """Return the complex gain at the frequencies [rad/s]."""
+        ...
+
+
+@dataclass(frozen=True, kw_only=True)
+class Curve:
+    """A named frequency response with its colour and dash."""
+
+    name: str
+    system: Responds
+    colour: str
+    dash: str = "solid"
+
+
+def recording_figure(recording: Recording, u_unit: str, y_unit: str, *, marks: Sequence[tuple[float, str]] = ()) -> Any:
+    """Draw y over u against time, with instants marked by their names.
+
+    Parameters
+    ----------
+    recording : Recording
+        What to draw; a set-point column is drawn with y.
+    u_unit, y_unit : str
+        Units for the axes.
+    marks : sequence of (time [s], name)
+        Vertical lines.
+    """
+    figure = make_subplots(rows=2, cols=1, shared_xaxes=True, vertical_spacing=0.06, row_heights=[0.62, 0.38])
+    add_line(figure, *thinned(recording.t, recording.y), "y", BLUE, width=1.0, row=1, col=1)
+    if "r" in recording.extra:
+        add_line(figure, *thinned(recording.t, recording["r"]), "r", GREY, dash="dash", row=1, col=1)
+    held_t, held_u = thinned(recording.t, recording.u)
+    add_line(figure, held_t, held_u, "u", ORANGE, width=1.0, row=2, col=1, line_shape="hv")
+    figure.update_yaxes(title=_axis("y", y_unit), row=1, col=1)
+    figure.update_yaxes(title=_axis("u", u_unit), row=2, col=1)
+    figure.update_xaxes(title="time [s]", row=2, col=1)
+    for time_s, name in marks:
+        figure.add_vline(x=time_s, line={"color": GREY, "width": 1, "dash": "dot"})
+        figure.add_annotation(
+            x=time_s, y=1.0, yref="paper", text=name, showarrow=False, textangle=-90, xanchor="left", yanchor="top"
+        )
+    return figure
+
+
+def frequencies(points: Sequence[FrequencyPoint], decades: float = 0.7, count: int = 400) -> FloatArray:
+    """Return a logarithmic grid that covers the points and some decades beyond them [rad/s]."""
+    omega = [point.omega_rad_s for point in points]
+    return np.geomspace(min(omega) * 10**-decades, max(omega) * 10**decades, count, dtype=np.float64)
+
+
+def bode_figure(
+    estimates: Sequence[tuple[str, Sequence[FrequencyPoint], str]],
+    curves: Sequence[Curve],
+    omega: FloatArray,
+    sign: int,
+    gain_unit: str,
+) -> Any:
+    """Draw gain and phase as in figure 6 of Le & Mendes: points with their 95 % bars, and curves.
+
+    Parameters
+    ----------
+    estimates : sequence of (name, points, colour)
+        Kinds of points; bars where a covariance is known.
+    curves : sequence of Curve
+        Models.
+    omega : (N,) array
+        Grid for the curves [rad/s].
+    sign : int
+        Sign of the plant's gain; the phase is drawn for the positive gain, between -360 and 0 degrees.
+    gain_unit : str
+        Unit of the gain.
+    """
+    figure = make_subplots(rows=2, cols=1, shared_xaxes=True, vertical_spacing=0.05)
+    for curve in curves:
+        gain, phase_deg = _gain_phase(sign * curve.system.response(omega))
+        add_line(figure, omega, gain, curve.name, curve.colour, dash=curve.dash, row=1, col=1)
+        add_line(figure, omega, phase_deg, curve.name, curve.colour, dash=curve.dash, row=2, col=1, showlegend=False)
+    for name, points, colour in estimates:
+        at = np.array([point.omega_rad_s for point in points])
+        gain, phase_deg = _gain_phase(np.array([sign * point.response for point in points]))
+        bars = np.array([_gain_phase_bars(point) for point in points]).reshape(-1, 2)
+        for row, values, bar in ((1, gain, bars[:, 0]), (2, phase_deg, np.degrees(bars[:, 1]))):
+            figure.add_trace(
+                go.Scatter(
+                    x=at,
+                    y=values,
+                    name=name,
+                    mode="markers",
+                    marker={"color": colour, "size": 8, "symbol": "circle" if bars.any() else "x"},
+                    error_y={"type": "data", "array": bar, "color": colour, "visible": bool(bars.any())},
+                    showlegend=row == 1,
+                ),
+                row=row,
+                col=1,
+            )
+    figure.update_xaxes(type="log")
+    figure.update_xaxes(title="angular frequency [rad/s]", row=2, col=1)
+    figure.update_yaxes(type="log", title=_axis("gain", gain_unit), row=1, col=1)
+    figure.update_yaxes(title="phase [deg]", dtick=45, row=2, col=1)
+    return figure
+
+
+def nyquist_figure(
+    loops: Sequence[Curve],
+    points: Sequence[FrequencyPoint],
+    controller: Responds,
+    omega: FloatArray,
+    modulus_margin: float,
+) -> Any:
+    """Draw loops L = H C with the circle of the modulus margin, and the measured points times C with their regions.
+
+    Parameters
+    ----------
+    loops : sequence of Curve
+        Open loops.
+    points : sequence of FrequencyPoint
+        Of the plant; they are multiplied by the controller.
+    controller : Responds
+        C.
+    omega : (N,) array
+        Grid [rad/s].
+    modulus_margin : float
+        Radius of the circle around -1 that the loops must not enter.
+    """
+    figure = go.Figure()
+    angle = np.linspace(0, 2 * np.pi, 181)
+    circle = -1 + modulus_margin * np.exp(1j * angle)
+    add_line(figure, circle.real, circle.imag, f"modulus margin {modulus_margin:g}", RED, dash="dot")
+    add_line(figure, np.cos(angle), np.sin(angle), "gain 1", GREY, dash="dot", width=1.0)
+    for curve in loops:
+        response = curve.system.response(omega)
+        near = np.abs(response) < 6.0
+        add_line(figure, response.real[near], response.imag[near], curve.name, curve.colour, dash=curve.dash)
+    for i, point in enumerate(points):
+        C = complex(controller.response(np.array([point.omega_rad_s]))[0])
+        edge = _region(point, C)
+        add_line(figure, edge.real, edge.imag, "95 % regions of the points", BLUE, width=1.0, showlegend=i == 0)
+        figure.add_trace(
+            go.Scatter(
+                x=[(C * point.response).real],
+                y=[(C * point.response).imag],
+                mode="markers",
+                marker={"color": BLUE, "size": 6},
+                showlegend=False,
+                name="point",
+            )
+        )
+    figure.add_trace(
+        go.Scatter(x=[-1], y=[0], mode="markers", marker={"symbol": "cross", "color": RED, "size": 10}, name="-1")
+    )
+    figure.update_xaxes(title="real part of L", range=[-2.6, 1.2])
+    figure.update_yaxes(title="imaginary part of L", range=[-2.2, 1.2], scaleanchor="x", scaleratio=1)
+    return figure
+
+
+def nichols_figure(loops: Sequence[Curve], omega: FloatArray, modulus_margin: float, phase_margin_rad: float) -> Any:
+    """Draw loops in the Black-Nichols plane as in figures 7 and 8: gain in dB over phase, with the required margins."""
+    figure = go.Figure()
+    circle = -1 + modulus_margin * np.exp(1j * np.linspace(0, 2 * np.pi, 181))
+    phase_deg = np.degrees(np.angle(circle)) % 360 - 360
+    add_line(figure, phase_deg, 20 * np.log10(np.abs(circle)), f"modulus margin {modulus_margin:g}", RED, dash="dot")
+    for curve in loops:
+        gain, phase = _gain_phase(curve.system.response(omega))
+        add_line(figure, phase, 20 * np.log10(gain), curve.name, curve.colour, dash=curve.dash)
+    margin_deg = float(np.degrees(phase_margin_rad))
+    figure.add_trace(
+        go.Scatter(
+            x=[-180, -180 + margin_deg],
+            y=[0, 0],
+            mode="lines+markers",
+            line={"color": RED, "width": 3},
+            name=f"phase margin {margin_deg:.0f} deg",
+        )
+    )
+    figure.update_xaxes(title="phase of L [deg]", range=[-270, -80], dtick=45)
+    figure.update_yaxes(title="gain of L [dB]", range=[-30, 30])
+    return figure
+
+
+def sensitivity_figure(loops: Sequence[Curve], omega: FloatArray, modulus_margin: float) -> Any:
+    """Draw abs(S) in dB with the bound 1/M_m of (12)."""
+    figure = go.Figure()
+    for curve in loops:
+        S = 1.0 / (1.0 + curve.system.response(omega))
+        add_line(figure, omega, 20 * np.log10(np.abs(S)), curve.name, curve.colour, dash=curve.dash)
+    bound = np.full(2, -20 * np.log10(modulus_margin))
+    add_line(figure, omega[[0, -1]], bound, f"1/M_m for M_m = {modulus_margin:g}", RED, dash="dot")
+    figure.update_xaxes(title="angular frequency [rad/s]", type="log")
+    figure.update_yaxes(title="sensitivity |S| [dB]")
+    return figure
+
+
+def _axis(name: str, unit: str) -> str:
+    return f"{name} [{unit}]" if unit else name
+
+
+def _gain_phase(response: ComplexArray) -> tuple[FloatArray, FloatArray]:
+    """Return gain and continuous phase in degrees, the first value between -360 and 0."""
+    phase_deg = np.degrees(np.unwrap(np.angle(response)))
+    if phase_deg.size:
+        phase_deg = phase_deg - 360.0 * np.floor((phase_deg[0] - 1e-9) / 360.0) - 360.0
+    return np.abs(response), phase_deg
+
+
+def _gain_phase_bars(point: FrequencyPoint) -> tuple[float, float]:
+    """Return the half-lengths of the 95 % bars of gain and phase [rad], from the covariance along and across."""
+    along = np.array([point.response.real, point.response.imag]) / point.gain
+    across = np.array([-along[1], along[0]])
+    covariance = np.array(point.covariance)
+    return (
+        1.96 * float(np.sqrt(along @ covariance @ along)),
+        1.96 * float(np.sqrt(across @ covariance @ across)) / point.gain,
+    )
+
+
+def _region(point: FrequencyPoint, factor: complex) -> ComplexArray:
+    """Return the edge of the point's 95 % region times a complex factor."""
+    radii, directions = point.region_radii(0.95)
+    angle = np.linspace(0, 2 * np.pi, 49)
+    edge = directions @ (radii[:, np.newaxis] * np.array([np.cos(angle), np.sin(angle)]))
+    return np.asarray(factor * (point.response + edge[0] + 1j * edge[1]), dtype=np.complex128)

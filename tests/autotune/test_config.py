@@ -1,0 +1,113 @@
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from autotune.config import json_schema, load_config
+from autotune.errors import InputError
+
+COMPLETE = """
+name = "ball"
+[rig]
+kind = "simulated"
+plant = "ball"
+[signals]
+sample_time_s = 0.01
+[limits]
+u_min = 0.0
+u_max = 10.0
+u_safe = 0.0
+y_min = 1.0
+y_max = 9.0
+swing = 3.0
+[operating_point]
+y = 5.0
+u_guess = 5.0
+u_uncertainty = 0.5
+"""
+
+
+def write(tmp_path: Path, content: str) -> Path:
+    path = tmp_path / "config.toml"
+    path.write_text(content)
+    return path
+
+
+def test_what_is_left_out_has_a_default(tmp_path: Path) -> None:
+    config = load_config(write(tmp_path, COMPLETE))
+    assert config.experiment.points == 5
+    modulus, phase = config.design.margins
+    assert modulus == 0.5
+    assert phase == pytest.approx(0.785398, rel=1e-6)  # Spec1: 45 deg
+
+
+def test_margins_replace_those_of_the_named_specification(tmp_path: Path) -> None:
+    design = '[design]\nspecification = "Spec2"\nphase_margin_deg = 50\n'
+    modulus, phase = load_config(write(tmp_path, COMPLETE + design)).design.margins
+    assert (modulus, phase) == (0.8, pytest.approx(0.872665, rel=1e-6))
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "says"),
+    [
+        ("swing = 3.0", "swimg = 3.0", r"unknown key 'limits\.swimg'.*did you mean 'swing'\?"),
+        ("[limits]", "[limit]", r"unknown key 'limit'.*did you mean 'limits'\?"),
+        ('plant = "ball"', 'plant = "bowl"', r"rig\.plant = 'bowl'.*'ball', 'servo', 'two_tank' or 'thermal'"),
+        ('plant = "ball"', 'plants = "ball"', r"unknown key 'rig\.plants'.*did you mean 'plant'\?"),
+        (
+            "sample_time_s = 0.01",
+            "sample_time_s = 0",
+            r"signals\.sample_time_s = 0.*greater than 0.*control period \[s\]",
+        ),
+        ("swing = 3.0", "", r"'limits\.swing' is missing.*\[y unit\]"),
+        ("u_safe = 0.0", "u_safe = 11.0", r"u_safe = 11 must lie within u_min\.\.u_max"),
+        ("y_min = 1.0", "y_min = 9.5", r"y_min = 9\.5 must be below y_max = 9"),
+        ("u_max = 10.0", "u_max = nan", r"limits\.u_max = nan.*finite"),
+        ("u_max = 10.0", 'u_max = "ten"', r"limits\.u_max = 'ten'.*valid number"),
+        ("name = ", "name ", "not TOML"),
+    ],
+)
+def test_a_refused_key_is_named_with_its_path_range_and_nearest_name(
+    tmp_path: Path, before: str, after: str, says: str
+) -> None:
+    assert before in COMPLETE
+    path = write(tmp_path, COMPLETE.replace(before, after, 1))
+    with pytest.raises(InputError, match=says) as caught:
+        load_config(path)
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_every_key_of_the_schema_says_what_it_is() -> None:
+    schema = json_schema()
+    undescribed = [
+        f"{table}.{key}"
+        for table, definition in schema["$defs"].items()
+        for key, entry in definition.get("properties", {}).items()
+        if key != "kind" and not ({"description", "$ref"} & entry.keys() or "anyOf" in entry)
+    ]
+    assert undescribed == []
+
+
+def test_a_refusal_on_the_command_line_is_one_line_and_status_2(tmp_path: Path) -> None:
+    path = write(tmp_path, COMPLETE.replace("swing", "swimg"))
+    done = subprocess.run(
+        [sys.executable, "-m", "autotune.cli", "run", str(path), "--out", str(tmp_path / "out")],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 2
+    assert done.stderr.count("\n") == 1
+    assert "limits.swimg" in done.stderr
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_schema_command_writes_what_editors_read(tmp_path: Path) -> None:
+    out = tmp_path / "schema.json"
+    subprocess.run([sys.executable, "-m", "autotune.cli", "schema", "--out", str(out)], check=True, capture_output=True)
+    assert json.loads(out.read_text()) == json_schema()
