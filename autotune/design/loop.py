@@ -186,7 +186,8 @@ class ContinuousLoop:
         if np.min(np.abs(values)) < 1e-12 * np.max(np.abs(values)):
             return math.inf  # a pole on the axis to within rounding
         turned = float(np.sum(np.angle(values[1:] / values[:-1])))
-        # D/(s + a)^n tends to den[0] (1 + L(inf)), whose argument is within asin|L(inf)| of den[0]'s: rounding absorbs the rest
+        # D/(s + a)^n tends to den[0] (1 + L(inf)), whose argument is within asin|L(inf)| of den[0]'s: rounding
+        # absorbs the rest
         return max(0.0, round(-turned / np.pi))
 
     @property

@@ -1,0 +1,211 @@
+"""Inner loops of the synthesis, compiled: one controller on a sampled plant in some ten microseconds.
+
+The plant enters as q = 1/H at the grid's frequencies, so that 1 + L = (q + C)/q and H/(1 + L) = 1/(q + C).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+
+from autotune.arrays import ComplexArray, FloatArray
+from autotune.design.loop import characteristic_frequencies
+from autotune.errors import DesignError
+from autotune.models import TransferFunction
+
+_POINTS_PER_DECADE = 100
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SampledPlant:
+    """A plant at the frequencies that a synthesis looks at.
+
+    Attributes
+    ----------
+    omega : (N,) array
+        Angular frequencies [rad/s], ascending.
+    q : (N,) complex array
+        1/H(j omega) with the plant's sign taken out.
+    weights : (N,) array
+        Quadrature weights of the squared norm (11): sum of weights/abs(q + C)^2.
+    turn : float
+        Argument change of the open loop's denominator along the grid, integrator of C included [rad].
+    sign : float
+        Sign that the gain of a stabilising PI has: the low-frequency gain's, reversed by every unstable pole.
+    """
+
+    omega: FloatArray
+    q: ComplexArray
+    weights: FloatArray
+    turn: float
+    sign: float
+
+    @property
+    def phase(self) -> FloatArray:
+        """Unwrapped arg H [rad], sign taken out."""
+        return np.asarray(-np.unwrap(np.angle(self.q)))
+
+
+def sampled_plant(plant: TransferFunction) -> SampledPlant:
+    """Return the plant on a logarithmic grid, refined where dead time asks for it.
+
+    Raises
+    ------
+    DesignError
+        A plant that is zero, that differentiates, or whose dead time the grid cannot resolve.
+    """
+    num, den = np.array(plant.num), np.array(plant.den)
+    if not np.any(num):
+        raise DesignError("the plant is zero", where="plant", mend="check the model's numerators")
+    if num[-1] == 0.0:
+        raise DesignError(
+            "the plant has no gain at low frequency (a zero at s = 0)",
+            where="plant",
+            mend="integral action cannot remove a disturbance there; design another structure",
+        )
+    corners = characteristic_frequencies(plant)
+    low, high = corners[0] * 1e-4, corners[-1] * 1e2
+    omega = np.geomspace(low, high, int(_POINTS_PER_DECADE * math.log10(high / low)) + 1)
+    if plant.delay_s > 0.0:
+        step = 0.1 / plant.delay_s
+        fine = np.arange(step * _POINTS_PER_DECADE / math.log(10.0), 80.0 / plant.delay_s, step)
+        outer = omega[(omega < fine[0] - 0.5 * step) | (omega > fine[-1] + 0.5 * step)]
+        omega = np.sort(np.concatenate((outer, fine)))
+    for root in np.concatenate((plant.poles, plant.zeros)):
+        if abs(root.imag) > 3.0 * abs(root.real):
+            offsets = np.geomspace(0.05 * max(abs(root.real), 1e-6 * abs(root)), abs(root.imag), 80)
+            near = np.concatenate((abs(root.imag) - offsets, [abs(root.imag)], abs(root.imag) + offsets))
+            omega = np.unique(np.concatenate((omega, near[(near > low) & (near < high)])))
+    # s den + num K/T_I needs its last coefficient of its first one's sign: necessary for stability with integral action
+    sign = math.copysign(1.0, num[-1] * den[0])
+    q = sign / plant.response(omega)
+    if not np.all(np.isfinite(q)):
+        raise DesignError("the plant's response has a zero on the imaginary axis", where="plant", mend="move it aside")
+    return SampledPlant(
+        omega=omega, q=q, weights=_h2_weights(omega, plant), turn=_denominator_turn(omega, plant), sign=sign
+    )
+
+
+def _h2_weights(omega: FloatArray, plant: TransferFunction) -> FloatArray:
+    """Trapezoidal weights in log omega, tails folded into the ends; exponentially accurate on a uniform log grid."""
+    steps = np.diff(np.log(omega))
+    weights = np.zeros(len(omega))
+    weights[:-1] += 0.5 * steps
+    weights[1:] += 0.5 * steps
+    weights = weights * omega  # d omega = omega d(log omega)
+    weights[0] += omega[0]  # the integrand is its limit below the grid
+    weights[-1] += omega[-1] / (2 * (len(plant.den) - len(plant.num)) + 1)
+    return np.asarray(weights / (np.pi * omega**2))
+
+
+def _denominator_turn(omega: FloatArray, plant: TransferFunction) -> float:
+    """Argument change of s den(s)/(s + a)^(n+1) along the grid, root by root, so that no step can be missed."""
+    a = float(np.sqrt(omega[0] * omega[-1]))
+    roots = np.append(np.roots(plant.den), 0.0)
+
+    def change(root: complex) -> float:
+        end, start = 1j * omega[-1] - root, 1j * omega[0] - root
+        # along the axis the argument of j omega - root turns monotonically by less than pi
+        angle = float(np.angle(end / start))
+        return angle if root.real <= 0.0 or angle <= 0.0 else angle - 2.0 * np.pi
+
+    shift = float(np.angle((1j * omega[-1] + a) / (1j * omega[0] + a)))
+    return sum(change(complex(root)) for root in roots) - len(roots) * shift
+
+
+@njit(cache=True)
+def evaluate(
+    omega: FloatArray,
+    q: ComplexArray,
+    weights: FloatArray,
+    turn: float,
+    K: float,
+    Ti: float,
+    Td: float,
+    Tf: float,
+    omega_n: float,
+) -> tuple[float, float, float, float, float]:
+    """Return squared norm (11), modulus margin, phase margin, delay margin and true noise gain (15) of one controller.
+
+    The modulus margin is returned with a minus sign where the closed loop is unstable. ``omega_n`` below 0 stands for
+    the highest crossover.
+    """
+    n = len(omega)
+    h2 = 0.0
+    smallest = 1e300
+    phase = math.pi
+    delay = 1e300
+    noise = 0.0
+    crossings = 0
+    f0 = f1 = 1e300
+    before = 1.0 + 0.0j
+    first = 1.0 + 0.0j
+    L_before = 0.0j
+    for i in range(n):
+        s = 1j * omega[i]
+        C = K * (1.0 + 1.0 / (Ti * s) + Td * s) / (1.0 + Tf * s)
+        sum_ = q[i] + C
+        power = sum_.real * sum_.real + sum_.imag * sum_.imag
+        h2 += weights[i] / power
+        L = C / q[i]
+        F = 1.0 + L
+        f = F.real * F.real + F.imag * F.imag
+        if i >= 2 and f1 <= f0 and f1 <= f:
+            curvature = f - 2.0 * f1 + f0
+            value = f1 - (f - f0) ** 2 / (8.0 * curvature) if curvature > 0.0 else f1
+            smallest = min(smallest, max(value, 0.5 * f1))
+        smallest = min(smallest, f)
+        f0, f1 = f1, f
+        if i == 0:
+            first = F
+        else:
+            if (before.imag < 0.0) != (F.imag < 0.0):  # crossing of the real axis: left of 0 the argument wraps
+                real = before.real - before.imag * (F.real - before.real) / (F.imag - before.imag)
+                if real < 0.0:
+                    crossings += 1 if before.imag >= 0.0 else -1
+            a, b = abs(L_before), abs(L)
+            if (a < 1.0) != (b < 1.0):
+                share = math.log(a) / (math.log(a) - math.log(b))
+                angle = math.atan2(-L_before.imag, -L_before.real)
+                ratio = L / L_before
+                angle += share * math.atan2(ratio.imag, ratio.real)
+                if abs(angle) < abs(phase):
+                    phase = angle
+                at = omega[i - 1] * (omega[i] / omega[i - 1]) ** share
+                delay = min(delay, (angle if angle > 0.0 else angle + 2.0 * math.pi) / at)
+                if omega_n < 0.0:
+                    noise = 0.0
+        if omega_n < 0.0 or omega[i] >= omega_n:
+            noise = max(noise, abs(C) / math.sqrt(f))
+        before = F
+        L_before = L
+    turned = (
+        math.atan2(before.imag, before.real)
+        - math.atan2(first.imag, first.real)
+        + 2.0 * math.pi * crossings
+        + turn
+    )
+    modulus = math.sqrt(smallest)
+    if round(turned / math.pi) != 0:
+        modulus = -modulus
+    return h2, modulus, phase, delay, noise
+
+
+@njit(cache=True)
+def evaluate_grid(
+    omega: FloatArray,
+    q: ComplexArray,
+    weights: FloatArray,
+    turn: float,
+    parameters: FloatArray,
+    omega_n: float,
+) -> FloatArray:
+    """Return :func:`evaluate` for every row (K, Ti, Td, Tf) of ``parameters``, (M, 5)."""
+    out = np.empty((len(parameters), 5))
+    for k in range(len(parameters)):
+        K, Ti, Td, Tf = parameters[k]
+        out[k] = evaluate(omega, q, weights, turn, K, Ti, Td, Tf, omega_n)
+    return out

@@ -1,0 +1,138 @@
+"""What a controller is asked for, and what a synthesis answers."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, Literal, TypeAlias
+
+from autotune.controller import PIDController
+from autotune.design.margins import Margins
+from autotune.errors import DesignError
+
+Kind: TypeAlias = Literal["pi", "pid"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Specification:
+    """Constraints (18) on the loop.
+
+    Attributes
+    ----------
+    modulus_margin : float
+        M_m of (12), between 0 and 1.
+    phase_margin_rad : float
+        phi_d of (13) [rad], between 0 and pi/2.
+    noise_gain : float
+        N_max: largest amplification of measurement noise to command, input unit per output unit.
+    noise : {"bound", "true"}
+        ``bound`` keeps (16), abs(C) <= M_m N_max above the integral action (for PI abs(K) <= M_m N_max); ``true``
+        keeps (15) itself, abs(C/(1 + L)) <= N_max for omega >= omega_n, which never asks for more.
+    noise_frequency_rad_s : float, optional
+        omega_n of (15) [rad/s]; the crossover where absent. Used with ``true`` only.
+    delay_margin_s : float
+        Smallest delay margin [s]; 0 asks for none.
+    setpoint_command : float
+        Largest immediate command per unit step of the set-point, abs(K) times the set-point weight, which is lowered
+        where it has to be; infinite asks for nothing. It limits the actuator's jump, not its later excursion.
+
+    Raises
+    ------
+    DesignError
+        A value outside its range; names it.
+    """
+
+    modulus_margin: float = 0.5
+    phase_margin_rad: float = math.pi / 4.0
+    noise_gain: float = 0.1
+    noise: Literal["bound", "true"] = "bound"
+    noise_frequency_rad_s: float | None = None
+    delay_margin_s: float = 0.0
+    setpoint_command: float = math.inf
+
+    def __post_init__(self) -> None:
+        def refuse(name: str, value: float, allowed: str) -> None:
+            raise DesignError(f"{name} = {value:g}", where="specification", mend=f"it must be {allowed}")
+
+        if not 0.0 < self.modulus_margin < 1.0:
+            refuse("modulus margin", self.modulus_margin, "between 0 and 1")
+        if not 0.0 < self.phase_margin_rad < math.pi / 2.0:
+            refuse("phase margin", math.degrees(self.phase_margin_rad), "between 0 and 90 degrees")
+        if not 0.0 < self.noise_gain < math.inf:
+            refuse("noise gain", self.noise_gain, "a positive number")
+        if not 0.0 <= self.delay_margin_s < math.inf:
+            refuse("delay margin", self.delay_margin_s, "a time in s, not negative")
+        if not self.setpoint_command > 0.0:
+            refuse("set-point command", self.setpoint_command, "positive")
+
+    @property
+    def largest_gain(self) -> float:
+        """M_m N_max of (16)."""
+        return self.modulus_margin * self.noise_gain
+
+
+def spec1(noise_gain: float) -> Specification:
+    """Return Spec1: M_m = 0.5 and 45 degrees, for a plant that does not vary and a model held correct."""
+    return Specification(modulus_margin=0.5, phase_margin_rad=math.radians(45.0), noise_gain=noise_gain)
+
+
+def spec2(noise_gain: float) -> Specification:
+    """Return Spec2: M_m = 0.8 and 60 degrees, for a plant that varies."""
+    return Specification(modulus_margin=0.8, phase_margin_rad=math.radians(60.0), noise_gain=noise_gain)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Design:
+    """A controller that meets a specification, and how good it is.
+
+    Attributes
+    ----------
+    kind : {"pi", "pid"}
+        Structure asked for.
+    controller : PIDController
+        The controller.
+    specification : Specification
+        What was asked for.
+    h2 : float
+        Norm (11) with the plant that was designed on.
+    h2_lower_bound : float or None
+        No controller of this structure in the searched domain that meets the specification has a smaller norm; None
+        where no bound was computed.
+    binding : tuple of str
+        Constraints that hold with equality: ``modulus margin``, ``phase margin``, ``noise gain``, ``delay margin``.
+    margins : Margins
+        Margins with the plant that was designed on.
+    certificate : str
+        In a sentence, what the lower bound covers or why there is none.
+    """
+
+    kind: Kind
+    controller: PIDController
+    specification: Specification
+    h2: float
+    h2_lower_bound: float | None
+    binding: tuple[str, ...]
+    margins: Margins
+    certificate: str
+
+    @property
+    def gap(self) -> float | None:
+        """Relative distance between the norm and its lower bound."""
+        return None if self.h2_lower_bound is None else self.h2 / self.h2_lower_bound - 1.0
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the fixed form of ``design.json``."""
+        c = self.controller
+        return {
+            "kind": self.kind,
+            "K": c.K,
+            "Ti_s": c.Ti_s,
+            "Td_s": c.Td_s,
+            "Tf_s": c.Tf_s,
+            "h2": self.h2,
+            "h2_lower_bound": self.h2_lower_bound,
+            "binding": list(self.binding),
+            "margins": self.margins.to_json(),
+            "setpoint_weight": c.setpoint_weight,
+            "certificate": self.certificate,
+        }
