@@ -62,6 +62,13 @@ class OperatingPointSettings(Section):
         Field(description="ramp the command until y moves, or start where the rig is"),
     ] = "ramp"
     plant_sign: Annotated[Literal[-1, 0, 1], Field(description="sign of the plant's gain; 0 to have it measured")] = 0
+    ramp_rate: Annotated[
+        float | None,
+        Field(
+            gt=0,
+            description="change of the command per second on a ramp [u unit/s]; default u_uncertainty / 600 a sample",
+        ),
+    ] = None
 
 
 class ExperimentSettings(Section):

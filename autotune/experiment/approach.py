@@ -1,0 +1,299 @@
+"""The states before the sweep: preflight, approach to the operating point, search for the relay's mid-point."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from autotune.config import Config
+from autotune.errors import ExperimentStopped, IdentificationError, LinkError
+from autotune.experiment.limits import Watch
+from autotune.experiment.loop import ControlLoop
+from autotune.experiment.oscillation import Oscillation
+from autotune.experiment.relay import RelaySettings
+from autotune.identification.frequency import limit_cycle_points
+from autotune.points import FrequencyPoint
+
+PREFLIGHT_SAMPLES = 60
+#: readings that a movement is judged on
+LOOK_BACK = 8
+#: smoothing of the relay while nothing is known of the plant
+FIRST_SMOOTHING = 5
+#: how far below the lower end of the hover's bracket the ramp starts, and above the upper it ends, in u_uncertainty
+BRACKET = 1.1
+#: least share of readings in preflight that differ from the one before, for a sensor of which that can be expected
+RESTLESS = 0.05
+SMALL = 1e-9
+
+Tell = Callable[[str], None]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Known:
+    """What the procedure has learnt so far.
+
+    Attributes
+    ----------
+    noise_sd, noise_half : float
+        Standard deviation and half-width of the measurement noise [y unit].
+    y_rest : float
+        Mean measurement in preflight [y unit].
+    plant_sign : int
+        Sign of the plant's gain, 0 while unknown.
+    midpoint : float
+        Command that holds the plant, as far as known [u unit].
+    first_move_s : float
+        When the plant first answered [s].
+    y_moved, speed : float
+        Measurement [y unit] and speed [y unit/s] when it was seen to move.
+    points : tuple of FrequencyPoint
+        What is known of the plant.
+    warnings : tuple of str
+        What the reader should know.
+    """
+
+    noise_sd: float = 0.0
+    noise_half: float = 0.0
+    y_rest: float = math.nan
+    plant_sign: int = 0
+    midpoint: float = math.nan
+    first_move_s: float = 0.0
+    y_moved: float = math.nan
+    speed: float = 0.0
+    points: tuple[FrequencyPoint, ...] = ()
+    warnings: tuple[str, ...] = ()
+
+
+def preflight(loop: ControlLoop, config: Config, tell: Tell) -> Known:
+    """Look before anything moves: link, noise, a sensor that is alive and in range.
+
+    Raises
+    ------
+    ExperimentStopped, LinkError
+        Link too slow, sensor at its rail or frozen.
+    """
+    tell("looking at link and noise")
+    start_u = config.operating_point.u_guess if config.operating_point.approach == "hold" else loop.tick.u
+    for _ in range(PREFLIGHT_SAMPLES):
+        loop.step(loop.nearest(start_u))
+    y = loop.history()[2][1:]
+    y = y[np.isfinite(y)]
+    _, late, _ = loop.timing.latency_s
+    if late > 0.8 * loop.sample_time_s:
+        raise LinkError(
+            f"link too slow: a reading takes {1e3 * late:.3g} ms, the sample time is {1e3 * loop.sample_time_s:.3g} ms",
+            where="preflight",
+            mend="raise signals.sample_time_s, or use a faster link",
+        )
+    slope = np.polyfit(np.arange(y.size), y, 1)
+    left = y - np.polyval(slope, np.arange(y.size))
+    noise_sd, noise_half = float(np.std(left)), float(np.max(np.abs(left)))
+    if noise_half > 0.5 * config.limits.swing:
+        raise ExperimentStopped(
+            f"drowned in noise: y is restless by +-{noise_half:.3g} where limits.swing allows {config.limits.swing:g}",
+            where="preflight",
+            mend="filter the measurement at the device, or allow more swing",
+        )
+    changes = float(np.mean(np.diff(y) != 0.0))
+    loop.monitor.noise = noise_half
+    loop.monitor.u_tolerance = 0.02 * (config.limits.u_max - config.limits.u_min)
+    if changes > RESTLESS:
+        # so many equal readings in a row would come by chance once in 1e9 looks
+        loop.monitor.max_repeats = 2 + math.ceil(math.log(1e-9) / math.log(max(1.0 - changes, 1e-3)))
+    return Known(
+        noise_sd=noise_sd,
+        noise_half=noise_half,
+        y_rest=float(np.mean(y)),
+        plant_sign=config.operating_point.plant_sign,
+    )
+
+
+def approach(loop: ControlLoop, config: Config, known: Known, tell: Tell) -> Known:
+    """Bring the plant to where it answers, and learn the sign of its gain and a first guess of the mid-point.
+
+    Raises
+    ------
+    ExperimentStopped
+        The plant does not answer, answers before it should, or with the sign it should not have.
+    """
+    if config.operating_point.approach == "ramp":
+        return _ramp(loop, config, known, tell)
+    known = replace(known, midpoint=config.operating_point.u_guess, y_moved=config.operating_point.y)
+    known = replace(known, first_move_s=loop.tick.t_s)
+    return known if known.plant_sign != 0 else _find_sign(loop, config, known, tell)
+
+
+def _ramp(loop: ControlLoop, config: Config, known: Known, tell: Tell) -> Known:
+    """Ramp the command through the bracket until y leaves its rest."""
+    point = config.operating_point
+    rate = point.ramp_rate if point.ramp_rate is not None else point.u_uncertainty / 600.0 / loop.sample_time_s
+    low = max(point.u_guess - BRACKET * point.u_uncertainty, config.limits.u_min)
+    high = min(point.u_guess + BRACKET * point.u_uncertainty, config.limits.u_max)
+    distance = 2.0 * known.noise_half + 0.02 * config.limits.swing
+    tell(f"ramping the command from {low:.3g} to {high:.3g} until the plant moves")
+    u, start_s = low, math.nan
+    while True:
+        tick = loop.step(loop.nearest(u))
+        if abs(tick.u - low) < 2.0 * rate * loop.sample_time_s + loop.envelope.u_step and math.isnan(start_s):
+            start_s = tick.t_s
+        y = loop.history(max(0, tick.k - LOOK_BACK))[2]
+        moved = float(np.nanmedian(y)) - known.y_rest
+        if abs(moved) > distance:
+            break
+        if not math.isnan(start_s):
+            u = low + rate * (tick.t_s - start_s)
+        if u > high:
+            raise ExperimentStopped(
+                f"the plant does not answer: y stays at {known.y_rest:.4g} up to the command {high:.4g}",
+                where="approach",
+                mend="look for a stuck or saturated actuator; else correct operating_point.u_guess or u_uncertainty",
+            )
+    if math.isnan(start_s) or tick.u <= low + loop.envelope.u_step:
+        raise ExperimentStopped(
+            f"wrong sign, or the plant moves where it should rest: y went from {known.y_rest:.4g} to"
+            f" {known.y_rest + moved:.4g} at the command {tick.u:.4g}",
+            where="approach",
+            mend="check the wiring and scaling of the actuator; else lower operating_point.u_guess",
+        )
+    sign = 1 if moved > 0 else -1
+    if known.plant_sign not in (0, sign):
+        raise ExperimentStopped(
+            f"wrong sign: y moved by {moved:.3g} when the command rose, operating_point.plant_sign is {known.plant_sign}",
+            where="approach",
+            mend="correct plant_sign, or check the wiring of actuator and sensor",
+        )
+    t, _, y = loop.history(max(0, tick.k - 3 * LOOK_BACK))
+    good = np.isfinite(y)
+    speed = abs(float(np.polyfit(t[good] - t[-1], y[good], 1)[0]))
+    # y grows like the square to the cube of the time since it left: distance over speed is half to a third of that
+    since = min(2.5 * abs(moved) / max(speed, SMALL), tick.t_s - start_s)
+    return replace(
+        known,
+        plant_sign=sign,
+        midpoint=tick.u - rate * since,
+        first_move_s=tick.t_s - since,
+        y_moved=known.y_rest + moved,
+        speed=speed,
+    )
+
+
+def _find_sign(loop: ControlLoop, config: Config, known: Known, tell: Tell) -> Known:
+    """Push the command up, then down, and compare how y moves."""
+    tell("finding the sign of the plant's gain")
+    push = 0.5 * config.operating_point.u_uncertainty
+    distance = 4.0 * known.noise_half + 0.02 * config.limits.swing
+    patience = 0.1 * config.limits.time_s
+    slopes = []
+    for direction in (1.0, -1.0):
+        start = loop.tick
+        y0 = known.y_rest if direction > 0 else loop.monitor.recent[-1]
+        while abs(float(np.median(loop.monitor.recent)) - y0) < distance:
+            if loop.tick.t_s - start.t_s > patience:
+                break
+            loop.step(loop.nearest(known.midpoint + direction * push))
+        slopes.append((float(np.median(loop.monitor.recent)) - y0) / max(loop.tick.t_s - start.t_s, SMALL))
+    if abs(slopes[0] - slopes[1]) * patience < distance:
+        raise ExperimentStopped(
+            f"the plant does not answer: y stays within {distance:.3g} for commands {push:.3g} above and below u_guess",
+            where="approach",
+            mend="look for a stuck actuator; else raise operating_point.u_uncertainty",
+        )
+    return replace(known, plant_sign=1 if slopes[0] > slopes[1] else -1)
+
+
+def find_midpoint(loop: ControlLoop, config: Config, known: Known, tell: Tell) -> tuple[Known, Oscillation]:
+    """Catch the plant with a relay without inserted delay, lead it to the operating point, and find the mid-point.
+
+    Returns
+    -------
+    known : Known
+        With mid-point, noise afloat and the first point.
+    oscillation : Oscillation
+        The relay, running, for the sweep to go on with.
+    """
+    tell("catching the plant and finding the relay's mid-point")
+    point = config.operating_point
+    room = min(known.midpoint - config.limits.u_min, config.limits.u_max - known.midpoint)
+    amplitude = min(config.experiment.relay_amplitude or 0.5 * point.u_uncertainty, 0.9 * room)
+    if amplitude <= 0.0:
+        raise ExperimentStopped(
+            f"saturated: the mid-point {known.midpoint:.4g} is at the end of the command's range",
+            where="find the mid-point",
+            mend="choose another operating point, or widen limits.u_min..u_max",
+        )
+    settings = RelaySettings(
+        y_centre=known.y_moved,
+        midpoint=known.midpoint,
+        amplitude=amplitude,
+        hysteresis=2.5 * known.noise_sd / math.sqrt(FIRST_SMOOTHING),
+        smoothing=FIRST_SMOOTHING,
+        plant_sign=1 if known.plant_sign > 0 else -1,
+    )
+    oscillation = Oscillation(loop, settings, patience_s=0.25 * config.limits.time_s)
+    _lead(oscillation, config, known)
+    loop.watch = Watch(y_centre=point.y, afloat=True)
+    return _balance(oscillation, config, known, tell), oscillation
+
+
+def _lead(oscillation: Oscillation, config: Config, known: Known) -> None:
+    """Move the relay's centre from where the plant was caught to the operating point, at the speed it had."""
+    target = config.operating_point.y
+    centre = known.y_moved
+    step = max(known.speed, SMALL) * oscillation.loop.sample_time_s
+    while centre != target:
+        centre = min(centre + step, target) if centre < target else max(centre - step, target)
+        oscillation.move_centre(centre)
+        oscillation.step()
+    while abs(oscillation.loop.tick.y - target) > 0.8 * config.limits.swing:
+        oscillation.step()
+
+
+def _balance(oscillation: Oscillation, config: Config, known: Known, tell: Tell) -> Known:
+    """Oscillate until the duty is near one half and two whole periods agree; take the first point from them."""
+    loop = oscillation.loop
+    swing = config.limits.swing
+    oscillation.change(oscillation.settings, patience_s=0.25 * config.limits.time_s)
+    tries = 0
+    while True:
+        _, switched = oscillation.step()
+        edges = oscillation.edges
+        if not switched or len(edges) < 3:
+            continue
+        _, u, y = loop.history(edges[-3])
+        mean = float(np.mean(u[: edges[-1] - edges[-3]]))
+        asymmetry = (mean - oscillation.settings.midpoint) / oscillation.settings.amplitude
+        high = float(np.nanmax(y)) - float(np.nanmin(y)) - 2.0 * known.noise_half
+        if abs(asymmetry) > 0.3:
+            tries += 1
+            if tries > 12:
+                raise ExperimentStopped(
+                    f"asymmetric: the command is on one side for {50 + 50 * abs(asymmetry):.0f} % of the time"
+                    " in spite of a corrected mid-point",
+                    where="find the mid-point",
+                    mend="look for a drifting load or an actuator that answers up and down differently",
+                )
+            oscillation.move_midpoint(mean)
+            oscillation.edges = edges[-1:]
+        elif high > 1.7 * swing:
+            oscillation.settings = replace(oscillation.settings, amplitude=0.5 * oscillation.settings.amplitude)
+            oscillation.edges = edges[-1:]
+        elif len(edges) >= 6:
+            t, u, y = loop.history(edges[-5] - 2)
+            try:
+                cycle = limit_cycle_points(t, u, y, highest_harmonic=3)
+            except IdentificationError:
+                if len(edges) > 20:
+                    raise
+                continue
+            tell(f"mid-point {cycle.u_mean:.4g}, first oscillation {cycle.points[0].omega_rad_s:.3g} rad/s")
+            loop.monitor.noise = 2.0 * cycle.noise_sd
+            return replace(
+                known,
+                midpoint=cycle.u_mean,
+                noise_sd=cycle.noise_sd,
+                noise_half=2.0 * cycle.noise_sd,
+                points=(cycle.points[0],),
+            )

@@ -1,0 +1,209 @@
+"""Which relay setting comes next, and when a point is known well enough: pure functions of what is known so far."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from autotune.errors import IdentificationError
+from autotune.experiment.relay import RelaySettings, lag_samples
+from autotune.points import FrequencyPoint
+
+#: part of the half-range of phases that targets keep away from its ends: the reached phase is near its target only
+PHASE_MARGIN = 0.1
+#: part of a period that the relay may look back over; a longer average would blunt the crossing it looks for
+SMOOTHING_SHARE = 0.12
+#: hysteresis in standard deviations of the smoothed noise
+HYSTERESIS_SD = 2.5
+
+
+@dataclass(frozen=True, kw_only=True)
+class Goal:
+    """What the sweep works under.
+
+    Attributes
+    ----------
+    peak : float
+        Largest departure of y from its centre that a limit cycle is planned for [y unit].
+    noise_sd : float
+        Standard deviation of the measurement noise [y unit].
+    sample_time_s : float
+        Control period [s].
+    u_step : float
+        Resolution of the command [u unit]; 0 for any.
+    u_room : float
+        Largest relay amplitude that the command's range leaves around the mid-point [u unit].
+    amplitude : float or None
+        Relay amplitude that was asked for [u unit]; chosen from ``peak`` where None.
+    """
+
+    peak: float
+    noise_sd: float
+    sample_time_s: float
+    u_step: float
+    u_room: float
+    amplitude: float | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Choice:
+    """A relay setting and what it is expected to do.
+
+    Attributes
+    ----------
+    settings : RelaySettings
+        The relay.
+    phase_rad : float
+        Phase of the plant (positive gain) that it aims at.
+    omega_rad_s, y_amplitude : float
+        Expected frequency [rad/s] and amplitude of y's fundamental [y unit].
+    """
+
+    settings: RelaySettings
+    phase_rad: float
+    omega_rad_s: float
+    y_amplitude: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class LocalModel:
+    """k / (j omega (1 + j omega tau)) through one known point: enough to choose the next setting, no estimate."""
+
+    k: float
+    tau_s: float
+
+    @classmethod
+    def through(cls, omega_rad_s: float, gain: float, lag_rad: float) -> LocalModel:
+        """Return the model with this gain, and this phase lag beyond -90 deg [rad], at ``omega_rad_s``."""
+        tau = math.tan(lag_rad) / omega_rad_s
+        return cls(k=gain * omega_rad_s * math.hypot(1.0, tau * omega_rad_s), tau_s=tau)
+
+    def gain(self, omega_rad_s: float) -> float:
+        """Return the magnitude at ``omega_rad_s``."""
+        return self.k / (omega_rad_s * math.hypot(1.0, self.tau_s * omega_rad_s))
+
+    def crest(self, omega_rad_s: float) -> float:
+        """Return the ratio of peak to fundamental amplitude of its response to a relay's square wave."""
+        orders = np.arange(1, 30, 2)
+        s = 1j * orders * omega_rad_s
+        waves = 1.0 / (s * (1.0 + s * self.tau_s) * orders)
+        phase = np.exp(1j * np.multiply.outer(np.linspace(0.0, 2.0 * np.pi, 128), orders))
+        return float(np.max(np.imag(phase @ waves)) / abs(waves[0]))
+
+
+def phase_targets(first_deg: float, last_deg: float, count: int) -> tuple[float, ...]:
+    """Return the phases to aim at [rad], the most lagging first: short periods find the mid-point for the long ones.
+
+    Parameters
+    ----------
+    first_deg, last_deg : float
+        Ends of the wanted range, phase of the positive-gain plant [deg].
+    count : int
+        Number of points.
+    """
+    high, low = max(first_deg, last_deg), min(first_deg, last_deg)
+    margin = PHASE_MARGIN * (high - low)
+    return tuple(math.radians(phase) for phase in np.linspace(low + margin, high - margin, count))
+
+
+def lag_beyond_integrator(point: FrequencyPoint, plant_sign: int) -> float:
+    """Return by how much the positive-gain plant's phase lies below -90 deg, in (-pi/2, 3 pi/2) [rad]."""
+    phase = float(np.angle(point.response * plant_sign))
+    return (-phase - math.pi / 2.0 + math.pi / 2.0) % (2.0 * math.pi) - math.pi / 2.0
+
+
+def predicted(points: Sequence[FrequencyPoint], plant_sign: int, phase_rad: float) -> tuple[float, LocalModel]:
+    """Return the frequency [rad/s] at which the plant is expected to have the phase, and a model of it there.
+
+    The tangent of the lag beyond -90 deg is close to a power of omega for everything that lags: it is interpolated,
+    and beyond the known points extrapolated, on logarithmic axes.
+
+    Raises
+    ------
+    IdentificationError
+        No known point lags by more than -90 and less than -180 deg.
+    """
+    lags = [(point, lag_beyond_integrator(point, plant_sign)) for point in points]
+    usable = sorted(
+        ((math.log(p.omega_rad_s), math.log(math.tan(lag)), p) for p, lag in lags if 0.02 < lag < 1.55),
+        key=lambda entry: entry[1],
+    )
+    if not usable:
+        raise IdentificationError(
+            "the plant's phase at the first oscillation is not between -90 and -180 degrees",
+            where="relay experiment",
+            mend="the relay with delay suits plants that lag by more than an integrator; check plant_sign and filters",
+        )
+    wanted = math.log(math.tan(-phase_rad - math.pi / 2.0))
+    nearest = sorted(usable, key=lambda entry: abs(entry[1] - wanted))[:2]
+    slope = 1.0
+    if len(nearest) == 2 and abs(nearest[1][1] - nearest[0][1]) > 0.05:
+        slope = (nearest[1][0] - nearest[0][0]) / (nearest[1][1] - nearest[0][1])
+        slope = min(max(slope, 0.3), 1.5)
+    omega = math.exp(nearest[0][0] + slope * (wanted - nearest[0][1]))
+    known = nearest[0][2]
+    near = LocalModel.through(known.omega_rad_s, known.gain, lag_beyond_integrator(known, plant_sign))
+    return omega, LocalModel.through(omega, near.gain(omega), -phase_rad - math.pi / 2.0)
+
+
+def choose(
+    points: Sequence[FrequencyPoint], phase_rad: float, goal: Goal, *, midpoint: float, y_centre: float, plant_sign: int
+) -> Choice:
+    """Return the relay setting whose limit cycle is expected at the phase, as large as the swing allows.
+
+    Parameters
+    ----------
+    points : sequence of FrequencyPoint
+        Everything known so far, at least one point.
+    phase_rad : float
+        Phase of the positive-gain plant to aim at [rad].
+    goal : Goal
+        Swing, noise, resolution.
+    midpoint, y_centre : float
+        Mean command [u unit] and centre of the oscillation [y unit].
+    plant_sign : {-1, 1}
+        Sign of the plant's gain.
+    """
+    omega, model = predicted(points, plant_sign, phase_rad)
+    period = 2.0 * math.pi / omega / goal.sample_time_s
+    largest = goal.peak / (model.crest(omega) * model.gain(omega) * 4.0 / math.pi)
+    amplitude = goal.amplitude if goal.amplitude is not None else min(largest, goal.u_room)
+    if goal.u_step > 0.0:
+        amplitude = max(1.0, math.floor(amplitude / goal.u_step + 0.25)) * goal.u_step
+    y_amplitude = model.gain(omega) * 4.0 / math.pi * amplitude
+    wanted = (math.pi + phase_rad) / (2.0 * math.pi) * period
+    smoothing = max(1, min(int(SMOOTHING_SHARE * period), int(wanted)))
+    relay = RelaySettings(
+        y_centre=y_centre,
+        midpoint=midpoint,
+        amplitude=amplitude,
+        hysteresis=min(HYSTERESIS_SD * goal.noise_sd / math.sqrt(smoothing), 0.5 * y_amplitude),
+        smoothing=smoothing,
+        plant_sign=1 if plant_sign > 0 else -1,
+    )
+    delay = max(0.0, wanted - lag_samples(relay, period, y_amplitude))
+    return Choice(
+        settings=RelaySettings(**(vars(relay) | {"delay_samples": delay})),
+        phase_rad=phase_rad,
+        omega_rad_s=omega,
+        y_amplitude=y_amplitude,
+    )
+
+
+def expected_sd(noise_sd: float, y_amplitude: float, samples: float) -> float:
+    """Return the relative standard deviation of a gain (and of its phase [rad]) under white noise.
+
+    It is the Cramer-Rao bound of the fundamental of a periodic signal of this amplitude, the drift known.
+    """
+    return noise_sd / y_amplitude * math.sqrt(2.0 / max(samples, 1.0))
+
+
+def needed_time_s(choice: Choice, goal: Goal, gain_sd: float, least_periods: int) -> float:
+    """Return the rig time after which the point is expected to be known: whole periods, and half a one to settle [s]."""
+    period = 2.0 * math.pi / choice.omega_rad_s
+    samples = 2.0 * (goal.noise_sd / (gain_sd * choice.y_amplitude)) ** 2
+    periods = max(least_periods, math.ceil(samples * goal.sample_time_s / period))
+    return (periods + 0.5) * period

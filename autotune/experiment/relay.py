@@ -1,0 +1,159 @@
+"""Relay law: smoothed input, hysteresis, mid-point and an inserted delay of any length; a pure step.
+
+The relay of Le & Mendes 2010, figure 3: a delay T inserted before the plant moves the limit cycle to the frequency where
+arg P(j omega) = -180 deg + T omega, equation (20). The lag of smoothing, hysteresis and sampling counts towards that
+delay; none of it enters an estimate, which is made from the recorded command and measurement.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+from autotune.errors import InputError
+
+
+@dataclass(frozen=True, kw_only=True)
+class RelaySettings:
+    """One setting of the relay.
+
+    Attributes
+    ----------
+    y_centre : float
+        Measurement to oscillate around [y unit].
+    midpoint : float
+        Mean of the two levels [u unit].
+    amplitude : float
+        Half the distance between the two levels [u unit].
+    hysteresis : float
+        Half-width of the hysteresis on the smoothed measurement [y unit].
+    delay_samples : float
+        Time from a decision to its command, in samples; a fraction is allowed.
+    smoothing : int
+        Readings in the moving average that the relay looks at; an average of M delays by exactly (M - 1)/2 samples.
+    plant_sign : {-1, 1}
+        Sign of the plant's gain: 1 raises u to raise y.
+    """
+
+    y_centre: float
+    midpoint: float
+    amplitude: float
+    hysteresis: float = 0.0
+    delay_samples: float = 0.0
+    smoothing: int = 1
+    plant_sign: Literal[-1, 1] = 1
+
+    def __post_init__(self) -> None:
+        if not self.amplitude > 0.0:
+            raise InputError(f"amplitude = {self.amplitude:g}", where="relay", mend="it must be positive")
+        if self.hysteresis < 0.0 or self.delay_samples < 0.0 or self.smoothing < 1:
+            raise InputError("hysteresis and delay must not be negative, smoothing at least 1", where="relay")
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class RelayState:
+    """What the relay remembers.
+
+    Attributes
+    ----------
+    k : int
+        Number of the next sample.
+    recent : tuple of float
+        Last readings, the newest last [y unit].
+    decided : {-1, 1}
+        Side the relay has decided for.
+    level : {-1, 1}
+        Side that is commanded now.
+    pending : tuple of (float, int)
+        Decisions on their way to the command: when they arrive, in samples, and their side.
+    switches : int
+        Decisions taken so far.
+    """
+
+    k: int = 0
+    recent: tuple[float, ...] = ()
+    decided: int = 0
+    level: int = 0
+    pending: tuple[tuple[float, int], ...] = ()
+    switches: int = 0
+
+
+def relay_step(state: RelayState, settings: RelaySettings, y: float) -> tuple[RelayState, float]:
+    """Advance the relay by one sample.
+
+    Parameters
+    ----------
+    state, settings : RelayState, RelaySettings
+        The settings may change from one step to the next; decisions on their way keep their arrival.
+    y : float
+        Measurement of this sample [y unit].
+
+    Returns
+    -------
+    state : RelayState
+        The next state.
+    u : float
+        Command to hold until the next sample [u unit]. A switch that falls between two samples is made by one command
+        in between, whose area is that of the switch at its exact instant.
+    """
+    recent = (*state.recent[-(settings.smoothing - 1) :], y) if settings.smoothing > 1 else (y,)
+    error = settings.plant_sign * (settings.y_centre - sum(recent) / len(recent))
+    decided = state.decided
+    if decided == 0:
+        decided = 1 if error >= 0.0 else -1
+    elif error > settings.hysteresis:
+        decided = 1
+    elif error < -settings.hysteresis:
+        decided = -1
+    pending = state.pending
+    level = state.level if state.level != 0 else decided
+    switches = state.switches
+    if decided != state.decided and state.decided != 0:
+        pending = (*pending, (max(state.k + settings.delay_samples, pending[-1][0] if pending else 0.0), decided))
+        switches += 1
+    mean, level, pending = _mean_level(state.k, level, pending)
+    new = RelayState(k=state.k + 1, recent=recent, decided=decided, level=level, pending=pending, switches=switches)
+    return new, settings.midpoint + settings.amplitude * mean
+
+
+def _mean_level(
+    k: int, level: int, pending: tuple[tuple[float, int], ...]
+) -> tuple[float, int, tuple[tuple[float, int], ...]]:
+    """Return the mean side over sample k, the side at its end, and the decisions still on their way."""
+    if not pending or pending[0][0] >= k + 1:
+        return float(level), level, pending
+    mean, since = 0.0, float(k)
+    while pending and pending[0][0] < k + 1:
+        arrival = max(pending[0][0], since)
+        mean += level * (arrival - since)
+        since, level, pending = arrival, pending[0][1], pending[1:]
+    return mean + level * (k + 1 - since), level, pending
+
+
+def lag_samples(settings: RelaySettings, period_samples: float, y_amplitude: float) -> float:
+    """Return the whole lag of the relay in samples: what (20) calls T.
+
+    Parameters
+    ----------
+    settings : RelaySettings
+        The relay.
+    period_samples : float
+        Period of the limit cycle in samples.
+    y_amplitude : float
+        Amplitude of the fundamental of y [y unit].
+
+    Notes
+    -----
+    Smoothing (M - 1)/2, half a sample until a crossing is seen, asin(hysteresis/amplitude)/omega, and the inserted delay.
+    Used to choose settings, never in an estimate.
+    """
+    attenuated = y_amplitude * abs(_average_gain(settings.smoothing, period_samples))
+    hysteresis = math.asin(min(1.0, settings.hysteresis / attenuated)) / (2.0 * math.pi) * period_samples
+    return 0.5 * (settings.smoothing - 1) + 0.5 + hysteresis + settings.delay_samples
+
+
+def _average_gain(samples: int, period_samples: float) -> float:
+    """Return the gain of a moving average at the period."""
+    angle = math.pi / period_samples
+    return math.sin(samples * angle) / (samples * math.sin(angle))
