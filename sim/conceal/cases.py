@@ -1,0 +1,182 @@
+"""Concealed cases: search the size that has the drawn strength, record, and keep the answer apart."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sim.conceal.draw import Draw, RejectedError, draw
+from sim.conceal.effects import PROCESS
+from sim.conceal.physics import Floats, Physics
+from sim.conceal.record import Record, record, scale_of, sized_effects
+from sim.conceal.retune import Chain, forecast_error, misfit, retune
+from sim.conceal.rigs import linear_truth, model_file
+from sim.conceal.sizes import Scale, Sized
+
+FILES = ("rec1", "rec2", "unseen")
+#: Bands of the retuned structure's misfit over the noise.
+STRENGTHS = {"weak": (1.025, 1.06), "medium": (1.08, 1.25), "strong": (1.45, 3.0)}
+LAW_SIZES = {"weak": 0.5, "medium": 1.0, "strong": 2.5}
+NUISANCE = ["actuator.offset", "environment.step_load"]
+ACTS_AT_TIMES = ("plant.hard_stop", "actuator.saturation")
+
+
+def retuned_ratio(d: Draw, sizes: tuple[float, ...], scale: Scale) -> tuple[float, Chain]:
+    """Misfit of the retuned structure over the noise, and that structure."""
+    physics, made = sized_effects(d, sizes, scale)
+    records = [record(d, which, physics, made) for which in (0, 1)]
+    window = round(2.0 * d.rig.horizon / d.rig.Ts)
+    chain, rms = retune(d.rig.chain, [(r.u, r.y) for r in records], d.rig.Ts, window, 2e-4)
+    return rms / d.rig.noise_sd, chain
+
+
+def search_size(d: Draw, scale: Scale, low: float, high: float) -> float:
+    """Size of a single effect at which the retuned misfit lies in the band."""
+    target = float(np.exp(d.stream(5).uniform(np.log(low), np.log(high))))
+    size, below, above = 1.0, 0.0, np.inf
+    for _ in range(12):
+        try:
+            ratio = retuned_ratio(d, (size,), scale)[0]
+        except RejectedError:
+            ratio = np.inf
+        if low <= ratio <= high and (abs(ratio - target) < 0.3 * (target - 1.0)):
+            return size
+        below, above = (size, above) if ratio < target else (below, size)
+        guess = size * np.sqrt((target**2 - 1.0) / max(min(ratio, 10.0) ** 2 - 1.0, 1e-3))
+        guess = float(np.clip(guess, size / 4.0, size * 4.0))
+        inside = below < guess < above
+        size = guess if inside else float(np.sqrt(max(below, above / 16.0) * min(above, max(below, 1e-3) * 16.0)))
+        if size > 200.0 or size < 1e-3:
+            break
+    raise RejectedError("no size of the effect has the strength")
+
+
+def sizes_for(d: Draw, scale: Scale) -> tuple[float, ...]:
+    """Sizes of the case's effects: by strength for one, each plainly visible alone for two."""
+    if not d.effects:
+        return ()
+    if d.effects[0].name == "controller.law":
+        return (LAW_SIZES[d.strength or "medium"],)
+    if len(d.effects) == 1:
+        return (search_size(d, scale, *STRENGTHS[d.strength or "medium"]),)
+    alone = [replace(d, effects=(effect,)) for effect in d.effects]
+    return tuple(search_size(one, scale, 1.12, 1.5) for one in alone)
+
+
+def windows_of(d: Draw, records: list[Record]) -> dict[str, list[list[float]]]:
+    """List the times at which an effect that acts only at times does act."""
+    names = {e.name for e in d.effects}
+    out: dict[str, list[list[float]]] = {}
+    for file, r in zip(FILES, records, strict=True):
+        active = np.zeros(len(r.t), dtype=bool)
+        if names & set(ACTS_AT_TIMES):
+            active |= r.acts > 0.0
+        active |= (r.lost > 0.0) | (r.spike != 0.0)
+        edges = np.flatnonzero(np.diff(np.concatenate([[0], active.astype(int), [0]])))
+        pairs = [[round(float(r.t[a]), 4), round(float(r.t[b - 1]) + d.rig.Ts, 4)] for a, b in edges.reshape(-1, 2)]
+        if pairs:
+            out[file] = pairs[:60]
+    return out
+
+
+def unseen_errors(d: Draw, r: Record, physics: Physics, retuned: Chain) -> dict[str, float]:
+    """Forecast errors of the unseen recording over its standard deviation."""
+    H = round(d.rig.horizon / d.rig.Ts)
+    sd = float(np.std(r.y[2 * H :]))
+
+    def score(e: Floats) -> float:
+        return float(np.sqrt(np.mean(e**2))) / sd
+
+    perfect = replace(linear_truth(physics), u_offset=0.0, y_offset=0.0)
+    return {
+        "nominal": score(forecast_error(d.rig.chain, r.u, r.y, d.rig.Ts, H)),
+        "retuned": score(forecast_error(retuned, r.u, r.y, d.rig.Ts, H)),
+        # a perfect model errs by the noise and by what noise did to its starting state
+        "truth": score(forecast_error(perfect, np.zeros(len(r.u)), r.noise, d.rig.Ts, H)),
+        "noise": score(r.noise[2 * H :]),
+    }
+
+
+def make(seed: int) -> tuple[Draw, list[Record], dict[str, Any]]:
+    """Make the case of one seed: its draw, its three recordings and its answer."""
+    for attempt in range(60):
+        d = draw(seed, attempt)
+        try:
+            scale = scale_of(d)
+            sizes = sizes_for(d, scale)
+            physics, made = sized_effects(d, sizes, scale)
+            records = [record(d, which, physics, made) for which in (0, 1, 2)]
+            return d, records, _answer(d, records, physics, made)
+        except RejectedError:
+            continue
+    raise RuntimeError(f"seed {seed} gives no usable case in 60 draws")
+
+
+def _answer(d: Draw, records: list[Record], physics: Physics, made: tuple[Sized, ...]) -> dict[str, Any]:
+    window = round(2.0 * d.rig.horizon / d.rig.Ts)
+    train = [(r.u, r.y) for r in records[:2]]
+    retuned, rms = retune(d.rig.chain, train, d.rig.Ts, window)
+    nominal = np.concatenate([misfit(d.rig.chain, u, y, d.rig.Ts, window) for u, y in train])
+    nominal_ratio = float(np.sqrt(np.mean(nominal**2))) / d.rig.noise_sd
+    if d.kind == "parameters" and nominal_ratio < 1.15:
+        raise RejectedError("the numbers are wrong by less than shows")
+    errors = unseen_errors(d, records[2], physics, retuned)
+    clean = d.kind in ("exact", "coloured", "parameters")
+    verdict = {"exact": "none", "coloured": "none", "parameters": "parameters", "outside": "unexplained"}
+    places = {p for e in d.effects for p in (e.places if e.outside else (e.name.split(".")[0], *e.places))}
+    return {
+        "kind": "clean" if clean else d.kind,
+        "sub": d.kind if clean else None,
+        "rig": d.rig.rig,
+        "verdict": verdict.get(d.kind, "effect"),
+        "effects": [e.answer(s, d.rig.rig) for e, s in zip(d.effects, made, strict=True)],
+        "places": sorted(places),
+        "nuisance": NUISANCE if d.offset else [],
+        "strength": d.strength,
+        "improvable": bool(
+            d.kind in ("single", "double")
+            and all(e.forecastable for e in d.effects)
+            and errors["retuned"] > 1.1 * errors["truth"]
+        ),
+        "excitation": [e.name for e in d.excitations],
+        "noise_sd": d.rig.noise_sd,
+        "noise_rho": d.rho,
+        "Ts": d.rig.Ts,
+        "rows": d.rig.rows,
+        "horizon": d.rig.horizon,
+        "windows": windows_of(d, records),
+        "truth_parameters": {
+            **{name: getattr(physics, name) for name in ("K", "tau_actuator", "tau_plant", "tau_sensor", "delay")},
+            "u_offset": physics.u_offset,
+            "y_offset": physics.y_offset,
+        },
+        "nrmse_unseen": errors,
+        "retuned_train_ratio": round(rms / d.rig.noise_sd, 4),
+        "nominal_train_ratio": round(nominal_ratio, 4),
+        "seed": d.seed,
+    }
+
+
+def write(seed: int, folder: Path, answer_file: Path) -> dict[str, Any]:
+    """Write the case of one seed: model, recordings and sidecars to ``folder``, the answer to ``answer_file``."""
+    d, records, answer = make(seed)
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "model.toml").write_text(model_file(d.rig), encoding="utf-8")
+    digits = 1 if d.rig.rig == PROCESS else 3
+    for name, ex, r in zip(FILES, d.excitations, records, strict=True):
+        columns = [r.u, r.y, *([r.r] if ex.record_r else [])]
+        rows = ["t,u,y,r" if ex.record_r else "t,u,y"]
+        for k, t in enumerate(r.t):
+            rows.append(f"{t:.{digits}f}," + ",".join(f"{c[k]:.6g}" for c in columns))
+        (folder / f"{name}.csv").write_text("\n".join(rows) + "\n", encoding="utf-8")
+        stated = "".join(f"{k} = {json.dumps(v) if isinstance(v, str) else f'{v:g}'}\n" for k, v in ex.stated.items())
+        units = f'[units]\nt = "s"\nu = "{d.rig.unit_u}"\ny = "{d.rig.unit_y}"\n'
+        head = f'rig = "{d.rig.rig}"\nsample_time = {d.rig.Ts:g}\n'
+        (folder / f"{name}.toml").write_text(f"{head}{units}[controller]\n{stated}", encoding="utf-8")
+    answer_file.parent.mkdir(parents=True, exist_ok=True)
+    answer_file.write_text(json.dumps(answer, indent=1), encoding="utf-8")
+    return answer

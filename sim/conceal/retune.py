@@ -1,0 +1,215 @@
+"""How well the nominal structure does once its numbers are refitted: what strength is measured against.
+
+The misfit is that of free runs over windows of two horizons, the state at each window's start free; the forecast of
+the unseen recording starts every horizon from the state fitted to the two horizons before.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numba import njit
+
+from sim.conceal.physics import Floats
+
+
+@dataclass(frozen=True, kw_only=True)
+class Chain:
+    """Linear chain: gain, lags, delay and offsets of a rig's nominal structure."""
+
+    integrating: bool
+    K: float
+    tau_actuator: float
+    tau_plant: float
+    tau_sensor: float
+    delay: float
+    u_offset: float
+    y_offset: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Steps:
+    """Chain discretised for a held command that switches ``rows + fraction`` sample times late."""
+
+    A: Floats
+    b_before: Floats
+    b_after: Floats
+    c: Floats
+    rows: int
+
+
+def discretise(chain: Chain, Ts: float) -> Steps:
+    """Exact step of the chain over one sample time with the command's switch inside it."""
+    lags = [(chain.tau_actuator, 1.0), (chain.tau_plant, chain.K)]
+    if chain.integrating:
+        lags.append((np.inf, 1.0))
+    if chain.tau_sensor > 0.0:
+        lags.append((chain.tau_sensor, 1.0))
+    n = len(lags)
+    A, b = np.zeros((n, n)), np.zeros(n)
+    for i, (tau, gain) in enumerate(lags):
+        rate = 0.0 if tau == np.inf else 1.0 / tau
+        A[i, i] = -rate
+        entry = gain if tau == np.inf else gain * rate
+        if i == 0:
+            b[0] = entry
+        else:
+            A[i, i - 1] = entry
+    rows = int(chain.delay // Ts)
+    part = chain.delay - rows * Ts
+    M = np.zeros((n + 1, n + 1))
+    M[:n, :n], M[:n, n] = A, b
+    first, second = _exponential(M * part), _exponential(M * (Ts - part))
+    c = np.zeros(n)
+    c[-1] = 1.0
+    return Steps(
+        A=second[:n, :n] @ first[:n, :n], b_before=second[:n, :n] @ first[:n, n], b_after=second[:n, n], c=c, rows=rows
+    )
+
+
+@njit(cache=True)
+def _exponential(M: Floats) -> Floats:
+    """Matrix exponential of a small matrix: Taylor series of M / 2^k, squared k times."""
+    n = len(M)
+    size = 0.0
+    for i in range(n):
+        size = max(size, np.sum(np.abs(M[i])))
+    k = 0
+    while size > 0.125:
+        size, k = size / 2.0, k + 1
+    X = M / 2.0**k
+    total, term = np.eye(n) + X, X.copy()
+    for i in range(2, 11):
+        term = term @ X / i
+        total += term
+    for _ in range(k):
+        total = total @ total
+    return total
+
+
+@njit(cache=True)
+def _free_runs(A: Floats, b0: Floats, b1: Floats, u: Floats, rows: int, begin: int, count: int, length: int) -> Floats:
+    """Last state's run over ``count`` windows of ``length`` rows from zero state."""
+    n = len(b0)
+    out = np.empty((count, length))
+    x, z = np.zeros(n), np.zeros(n)
+    for w in range(count):
+        x[:] = 0.0
+        first = begin + w * length
+        for i in range(length):
+            out[w, i] = x[n - 1]
+            before = u[max(first + i - rows - 1, 0)]
+            after = u[max(first + i - rows, 0)]
+            for a in range(n):
+                z[a] = b0[a] * before + b1[a] * after
+                for b in range(a + 1):
+                    z[a] += A[a, b] * x[b]
+            x[:] = z
+    return out
+
+
+def observability(steps: Steps, length: int) -> Floats:
+    """Rows c A^k, shape (length, n)."""
+    out: Floats = _powers(steps.A, steps.c, length)
+    return out
+
+
+@njit(cache=True)
+def _powers(A: Floats, c: Floats, length: int) -> Floats:
+    n = len(c)
+    out = np.empty((length, n))
+    row, after = c.copy(), np.empty(n)
+    for k in range(length):
+        out[k] = row
+        for j in range(n):
+            after[j] = 0.0
+            for i in range(n):
+                after[j] += row[i] * A[i, j]
+        row[:] = after
+    return out
+
+
+def misfit(chain: Chain, u: Floats, y: Floats, Ts: float, window: int) -> Floats:
+    """Residuals of free runs over whole windows, each window's starting state fitted."""
+    steps = discretise(chain, Ts)
+    count = len(y) // window
+    runs = _free_runs(steps.A, steps.b_before, steps.b_after, u - chain.u_offset, steps.rows, 0, count, window)
+    e = y[: count * window].reshape(count, window) - chain.y_offset - runs
+    q, _ = np.linalg.qr(observability(steps, window))
+    out: Floats = (e - (e @ q) @ q.T).ravel()
+    return out
+
+
+def degrees_lost(chain: Chain, window: int) -> float:
+    """Factor that makes the misfit of white noise its standard deviation."""
+    n = 2 + int(chain.integrating) + int(chain.tau_sensor > 0.0)
+    return float(np.sqrt(window / (window - n)))
+
+
+def _moved(nominal: Chain, d: Floats) -> Chain:
+    """Nominal chain with its numbers moved: logarithms of factors, one offset last but for the delay."""
+    K, ta, tp = nominal.K * np.exp(d[0]), nominal.tau_actuator * np.exp(d[1]), nominal.tau_plant * np.exp(d[2])
+    if nominal.integrating:  # its output offset is the integrator's state
+        return replace(nominal, K=K, tau_actuator=ta, tau_plant=tp, u_offset=nominal.u_offset + d[3])
+    y_offset, delay = nominal.y_offset + d[3], nominal.delay * np.exp(d[4])
+    return replace(nominal, K=K, tau_actuator=ta, tau_plant=tp, y_offset=y_offset, delay=delay)
+
+
+def retune(
+    nominal: Chain, records: list[tuple[Floats, Floats]], Ts: float, window: int, tolerance: float = 1e-6
+) -> tuple[Chain, float]:
+    """Refit gain, lags, delay (each within a factor of two) and one offset by damped, projected Gauss-Newton.
+
+    Returns the refitted chain and its rms misfit.
+    """
+    count = 4 if nominal.integrating else 5
+    bound = np.full(5, np.log(2.0))
+    bound[3] = 10.0 * float(np.std(records[0][0 if nominal.integrating else 1]))
+
+    def residual(d: Floats) -> Floats:
+        return np.concatenate([misfit(_moved(nominal, d), u, y, Ts, window) for u, y in records])
+
+    at, damping = np.zeros(5), 1e-3
+    e = residual(at)
+    for _ in range(25):
+        J = np.empty((len(e), count))
+        for i in range(count):
+            d = at.copy()
+            d[i] += 1e-4 * bound[i]
+            J[:, i] = (residual(d) - e) / (d[i] - at[i])
+        H, g = J.T @ J, J.T @ e
+        gain = 0.0
+        held = (abs(at[:count]) >= bound[:count]) & (at[:count] * g < 0.0)
+        for _ in range(6):
+            M = H + damping * np.diag(np.diag(H))
+            M[held, :], M[:, held] = 0.0, 0.0
+            M[held, held] = 1.0
+            step = np.zeros(5)
+            step[:count] = -np.linalg.solve(M, np.where(held, 0.0, g))
+            trial = np.clip(at + step, -bound, bound)
+            e_trial = residual(trial)
+            if e_trial @ e_trial < e @ e:
+                gain = 1.0 - float(e_trial @ e_trial) / float(e @ e)
+                at, e, damping = trial, e_trial, damping / 5.0
+                break
+            damping *= 8.0
+        if gain < tolerance:
+            break
+    chain = _moved(nominal, at)
+    return chain, float(np.sqrt(np.mean(e**2)) * degrees_lost(nominal, window))
+
+
+def forecast_error(chain: Chain, u: Floats, y: Floats, Ts: float, horizon: int) -> Floats:
+    """Errors of forecasts over one horizon each, started from the state fitted to the two horizons before."""
+    steps = discretise(chain, Ts)
+    rows = observability(steps, 3 * horizon)
+    fit = np.linalg.pinv(rows[: 2 * horizon])
+    errors = []
+    du = u - chain.u_offset
+    for begin in range(0, len(y) - 2 * horizon, horizon):
+        length = min(3 * horizon, len(y) - begin)
+        run = _free_runs(steps.A, steps.b_before, steps.b_after, du, steps.rows, begin, 1, length)[0]
+        e = y[begin : begin + length] - chain.y_offset - run
+        errors.append((e - rows[:length] @ (fit @ e[: 2 * horizon]))[2 * horizon :])
+    return np.concatenate(errors)
