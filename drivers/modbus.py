@@ -63,6 +63,10 @@ _READ = {
 }
 
 
+class DeviceRefused(LinkError):  # noqa: N818 - a verdict, as its base
+    """The device answered, with a Modbus exception."""
+
+
 class _TcpClient(ModbusTcpClient):
     """The library's client, with TLS that checks the device's name, and frames cut by their length on TLS too."""
 
@@ -277,7 +281,7 @@ class ModbusLink:
             what, mend = _EXCEPTIONS.get(code, (f"answers with exception {code}", "see the device's manual"))
             what = f"the device {what}"
             if code not in _BUSY:
-                break
+                raise DeviceRefused(what, where=f"{self.where}, {place}", mend=mend)
         raise LinkError(what, where=f"{self.where}, {place}", mend=mend)
 
     def _flush(self) -> None:

@@ -73,4 +73,16 @@ def make_plant(name: str, *, seed: int = 0, noise: float | None = None, start: s
             from sim.ball import make_ball
 
             return make_ball(seed=seed, noise=noise, start=start)
+        case "servo":
+            from sim.servo import make_servo
+
+            return make_servo(seed=seed, noise=noise, start=start)
+        case "two_tank":
+            from sim.tank import make_two_tank
+
+            return make_two_tank(seed=seed, noise=noise, start=start)
+        case "thermal":
+            from sim.tank import make_heater
+
+            return make_heater(seed=seed, noise=noise, start=start)
     raise ValueError(f"no simulated plant {name!r}")

@@ -1,1 +1,142 @@
 """Commands: first contact with a rig, and simulated rigs behind real transports."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from autotune.cli import app
+
+if TYPE_CHECKING:
+    from autotune.config import Config
+    from autotune.config.registers import RegisterSettings
+    from autotune.config.rig import AnyModbusSettings
+
+_CONFIG = Annotated[Path, typer.Argument(metavar="CONFIG.toml", help="configuration of the rig")]
+
+
+@app.command()
+def rig(config: _CONFIG) -> None:
+    """Serve the config's simulated plant over its real transport, until stopped by Ctrl-C."""
+    from autotune.cli.served import device_of, modbus_settings, served
+    from autotune.config import load_config
+
+    content = load_config(config)
+    settings = modbus_settings(content)
+    console = Console(highlight=False)
+    stop = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
+    with served(content, device_of(content)) as server:
+        table = Table("signal", "table", "address", "type", "order", "scale", "offset", title=f"{content.name}")
+        for name, register in settings.registers.mapped().items():
+            table.add_row(name, *_row(register))
+        console.print(table)
+        console.print(f"serving {_address(settings, server.port)}, unit {settings.unit_id}; Ctrl-C ends it")
+        stop.wait()
+    console.print("stopped")
+
+
+@app.command()
+def probe(config: _CONFIG) -> None:
+    """Read every mapped register once, raw and engineering value side by side; nothing is written."""
+    from autotune.cli.served import modbus_settings
+    from autotune.config import load_config
+    from drivers.probe import probe as probe_registers
+
+    content = load_config(config)
+    found = probe_registers(modbus_settings(content), expected=_expected(content))
+    units = _units(content)
+    table = Table("signal", "table", "address", "type", "raw", "value", "unit", "look at", title=content.name)
+    for one in found:
+        register = one.register
+        table.add_row(
+            one.name,
+            register.table,
+            str(register.address),
+            register.type,
+            " ".join(f"{word:04X}" for word in one.words) or "-",
+            f"{one.value:.6g}" if one.words else "-",
+            units.get(one.name, ""),
+            "; ".join(one.warnings),
+        )
+    console = Console(highlight=False)
+    console.print(table)
+    doubtful = [one.name for one in found if one.warnings]
+    verdict = f"{', '.join(doubtful)} look implausible" if doubtful else "all values are plausible"
+    console.print(f"{len(found)} registers read, nothing written: {verdict}")
+
+
+@app.command()
+def ports(
+    ask: Annotated[
+        bool, typer.Option("--ask", help="send a Modbus identification request to each port (default: only list)")
+    ] = False,
+    unit: Annotated[int, typer.Option(min=1, max=247, help="unit id to ask for")] = 1,
+) -> None:
+    """List the serial ports, and with --ask what answers on them."""
+    from drivers.ports import answers_on, serial_ports
+
+    console = Console(highlight=False)
+    found = serial_ports()
+    table = Table("port", "description", "hardware", *(["answers"] if ask else []))
+    for port in found:
+        table.add_row(port.device, port.description, port.hardware, *([answers_on(port.device, unit)] if ask else []))
+    if found:
+        console.print(table)
+    console.print(f"{len(found)} serial port{'' if len(found) == 1 else 's'}")
+
+
+def _row(register: RegisterSettings) -> tuple[str, ...]:
+    order = "" if register.type == "bit" else f"{register.byte_order}/{register.word_order}"
+    return (
+        register.table,
+        str(register.address),
+        register.type,
+        order,
+        f"{register.scale:g}",
+        f"{register.offset:g}",
+    )
+
+
+def _address(settings: AnyModbusSettings, port: int) -> str:
+    from autotune.config.rig import ModbusRtuSettings
+
+    if isinstance(settings, ModbusRtuSettings):
+        return f"Modbus RTU on {settings.device}"
+    listen = settings.twin.listen if settings.twin else ""
+    return f"Modbus {'TLS' if settings.kind == 'modbus_tls' else 'TCP'} on {listen}:{port}"
+
+
+def _expected(config: Config) -> dict[str, tuple[float, float]]:
+    """Return where values are plausible; y may lie outside its limits while the rig is at rest."""
+    limits = config.limits
+    span = limits.y_max - limits.y_min
+    y = (limits.y_min - span, limits.y_max + span)
+    u = (limits.u_min, limits.u_max)
+    bit = (0.0, 1.0)
+    return {
+        "y": y,
+        "setpoint": (min(y[0], 0.0), max(y[1], 0.0)),
+        "u": u,
+        "u_applied": u,
+        "safe": u,
+        "in_command": bit,
+        "enable": bit,
+        "automatic": bit,
+        "device_time": (0.0, 1e9),
+        "Ti": (0.0, 1e6),
+    }
+
+
+def _units(config: Config) -> dict[str, str]:
+    u, y = config.signals.u_unit, config.signals.y_unit
+    gain = f"{u}/{y}" if u or y else ""
+    names = {"y": y, "setpoint": y, "u": u, "u_applied": u, "safe": u, "K": gain}
+    return names | {"Ti": "s", "device_time": "s"}

@@ -42,6 +42,10 @@ class TwinSettings(PlantSettings):
     deadman_s: Annotated[
         float, Field(gt=0, le=60, description="time without heartbeat after which the twin is safe [s], up to 60")
     ] = 0.5
+    device: Annotated[
+        str | None,
+        Field(description="serial device that autotune rig sits on; absent: a pseudo-terminal, linked at rig.device"),
+    ] = None
     cert_file: Annotated[str | None, Field(description="certificate of the served twin, PEM (TLS)")] = None
     key_file: Annotated[str | None, Field(description="private key of the served twin, PEM (TLS)")] = None
 
@@ -90,6 +94,9 @@ class ModbusRtuSettings(ModbusSettings):
     """A device on Modbus RTU, on a serial line."""
 
     kind: Literal["modbus_rtu"]
+    unit_id: Annotated[
+        int, Field(ge=1, le=247, description="unit (slave) id of the device, 1..247: nobody answers to 0 on a line")
+    ] = 1
     device: Annotated[str, Field(description="serial device, e.g. /dev/ttyUSB0")]
     baud: Annotated[int, Field(ge=300, le=4_000_000, description="line speed [bit/s], 300..4000000")] = 19200
     parity: Annotated[Literal["N", "E", "O"], Field(description="none, even or odd parity")] = "E"

@@ -1,0 +1,146 @@
+"""From a configuration to the simulated device that is served in the real one's place."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from autotune.config import Config
+from autotune.config.registers import RegisterSettings
+from autotune.config.rig import (
+    AnyModbusSettings,
+    ModbusRtuSettings,
+    ModbusTlsSettings,
+    ReplaySettings,
+    SimulatedRigSettings,
+    TwinSettings,
+)
+from autotune.errors import InputError
+from sim.modbus_rig import ModbusRig, Refusal, RtuTransport, TcpTransport
+from sim.plant import Plant, make_plant
+from sim.register_device import RegisterDevice
+from sim.registers import RegisterSpec
+from sim.serial_line import SerialLine
+
+
+def modbus_settings(config: Config) -> AnyModbusSettings:
+    """Return ``[rig]`` where it is a Modbus device.
+
+    Raises
+    ------
+    InputError
+        It is another kind.
+    """
+    if isinstance(config.rig, SimulatedRigSettings | ReplaySettings):
+        raise InputError(
+            f'kind = "{config.rig.kind}" has no registers',
+            where="rig",
+            mend='give a Modbus rig: kind = "modbus_tcp", "modbus_tls" or "modbus_rtu"',
+        )
+    return config.rig
+
+
+def spec_of(register: RegisterSettings) -> RegisterSpec:
+    """Return the simulated device's own description of a register."""
+    return RegisterSpec(
+        table=register.table,
+        address=register.address,
+        type=register.type,
+        byte_order=register.byte_order,
+        word_order=register.word_order,
+        scale=register.scale,
+        offset=register.offset,
+    )
+
+
+def device_of(config: Config, plant: Plant | None = None) -> RegisterDevice:
+    """Return the simulated device behind the configuration's register map.
+
+    Parameters
+    ----------
+    config : Config
+        With a Modbus rig that names its twin.
+    plant : Plant, optional
+        Replaces the twin's plant.
+    """
+    settings = modbus_settings(config)
+    twin = _twin(settings)
+    controller = config.controller
+    return RegisterDevice(
+        plant or make_plant(twin.plant, seed=twin.seed, noise=twin.noise, start=twin.start),
+        {name: spec_of(register) for name, register in settings.registers.mapped().items()},
+        u_safe=config.limits.u_safe,
+        u_range=(config.limits.u_min, config.limits.u_max),
+        deadman_s=twin.deadman_s,
+        gains=(controller.K, controller.Ti_s) if controller else (0.0, 1.0),
+    )
+
+
+@contextmanager
+def served(config: Config, device: RegisterDevice, *, refuse: Refusal | None = None) -> Iterator[ModbusRig]:
+    """Serve a device at the address of the configuration until the context ends.
+
+    Raises
+    ------
+    InputError
+        The address is taken, or the serial device cannot be opened.
+    """
+    settings = modbus_settings(config)
+    twin = _twin(settings)
+    if isinstance(settings, ModbusRtuSettings):
+        with _line_end(settings, twin) as end:
+            # a pseudo-terminal knows no parity
+            parity = settings.parity if twin.device else "N"
+            transport = RtuTransport(device=end, baud=settings.baud, parity=parity, stop_bits=settings.stop_bits)
+            with _started(ModbusRig(device, transport, unit_id=settings.unit_id, refuse=refuse)) as rig:
+                yield rig
+        return
+    ca_file = settings.ca_file if isinstance(settings, ModbusTlsSettings) else None
+    if isinstance(settings, ModbusTlsSettings) and not (twin.cert_file and twin.key_file):
+        raise InputError("the served twin has no certificate", where="rig.twin", mend="give cert_file and key_file")
+    transport_tcp = TcpTransport(
+        address=twin.listen, port=settings.port, ca_file=ca_file, cert_file=twin.cert_file, key_file=twin.key_file
+    )
+    with _started(ModbusRig(device, transport_tcp, unit_id=settings.unit_id, refuse=refuse)) as rig:
+        yield rig
+
+
+def _twin(settings: AnyModbusSettings) -> TwinSettings:
+    if settings.twin is None:
+        raise InputError("the rig has no simulated twin", where="rig.twin", mend='name one: [rig.twin] plant = "ball"')
+    return settings.twin
+
+
+@contextmanager
+def _started(rig: ModbusRig) -> Iterator[ModbusRig]:
+    try:
+        rig.__enter__()
+    except ConnectionError as error:
+        raise InputError(str(error), where="rig", mend="free the address or give another one") from None
+    try:
+        yield rig
+    finally:
+        rig.__exit__(None, None, None)
+
+
+@contextmanager
+def _line_end(settings: ModbusRtuSettings, twin: TwinSettings) -> Iterator[str]:
+    """Yield the serial device for the server; makes the line where the configuration names none."""
+    if twin.device is not None:
+        yield twin.device
+        return
+    path = Path(settings.device)
+    if path.exists():
+        raise InputError(
+            "exists already, so no pseudo-terminal can be linked there",
+            where=settings.device,
+            mend="remove it, or name the other end of the line: rig.twin.device",
+        )
+    with SerialLine() as line:
+        path.unlink(missing_ok=True)  # a link that an earlier run left behind
+        path.symlink_to(line.host_device)
+        try:
+            yield line.rig_device
+        finally:
+            path.unlink(missing_ok=True)
