@@ -83,7 +83,7 @@ class Rig(Protocol):
 
 
 @runtime_checkable
-class HoldsGains(Protocol):
+class HoldsGains(Rig, Protocol):
     """A rig whose own controller's gains can be read and written."""
 
     def read_gains(self) -> PIDController:

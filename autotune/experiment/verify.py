@@ -4,17 +4,23 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
 from autotune.arrays import FloatArray
+from autotune.config import Config
 from autotune.config.procedure import LimitSettings, VerificationSettings
 from autotune.controller import PIDController
 from autotune.design.law import PILaw
 from autotune.experiment.limits import Watch
 from autotune.experiment.loop import ControlLoop
 from autotune.experiment.prediction import Prediction, predict
+from autotune.experiment.result import Progress, State
+from autotune.experiment.rig import Rig
+from autotune.experiment.run import OnProgress, envelope_of, float_on, recording_metadata
 from autotune.identification.parametric import PlantFit
+from autotune.recording import RecordingWriter
 
 #: plants and noise sequences drawn for the prediction's band
 DRAWS = 60
@@ -143,7 +149,12 @@ def plan_test(
 
 
 def run_test(
-    loop: ControlLoop, law: PILaw, test: StepTest, operating_y: float, u_hold: float
+    loop: ControlLoop,
+    law: PILaw,
+    test: StepTest,
+    operating_y: float,
+    u_hold: float,
+    on_progress: OnProgress | None = None,
 ) -> tuple[FloatArray, FloatArray]:
     """Close the loop with the new law, bumpless from ``u_hold``, let it settle, and run the test.
 
@@ -157,6 +168,8 @@ def run_test(
         What to ask.
     operating_y, u_hold : float
         Operating point [y unit] and the command that holds it [u unit].
+    on_progress : callable, optional
+        Told where the test is.
 
     Returns
     -------
@@ -174,12 +187,67 @@ def run_test(
     load = np.concatenate([np.zeros(test.settle), test.disturbance])
     y, u = np.full(count, np.nan), np.empty(count)
     state = law.initial(u_hold, operating_y, operating_y)
+    every = max(1, round(0.5 / law.sample_time_s))
     for k in range(count):
         tick = loop.tick
+        if on_progress is not None and k % every == 0:
+            left_s = (count - k) * law.sample_time_s
+            on_progress(
+                Progress(state=State.VERIFY, elapsed_s=tick.t_s, remaining_s=left_s, message="steps with the new gains")
+            )
         y[k] = tick.y - operating_y if tick.usable else np.nan
         u[k], state = law.step(state, float(setpoint[k]), tick.y)
         loop.step(loop.nearest(u[k] + load[k]), extra={"r": float(setpoint[k])})
     return y[test.settle :], u[test.settle :]
+
+
+def run_verification(
+    rig: Rig,
+    config: Config,
+    controller: PIDController,
+    fit: PlantFit,
+    recording: str | Path,
+    *,
+    u_rest: float,
+    noise_sd: float,
+    crossover_rad_s: float,
+    on_progress: OnProgress | None = None,
+) -> Verification:
+    """Bring the rig to its operating point, close the loop with the new controller, test it and leave the rig safe.
+
+    Parameters
+    ----------
+    rig : Rig
+        Closed.
+    config : Config
+        Limits, operating point, verification.
+    controller : PIDController
+        New gains.
+    fit : PlantFit
+        Plant for the prediction.
+    recording : path
+        CSV to write.
+    u_rest, noise_sd : float
+        From the experiment: command that holds the operating point [u unit], noise of y [y unit].
+    crossover_rad_s : float
+        Of the new loop [rad/s].
+    on_progress : callable, optional
+        Told where the procedure is.
+
+    Raises
+    ------
+    ExperimentStopped, LinkError, OperatorStop
+        What ended it; the rig is safe and the recording readable.
+    """
+    law = law_for(controller, config.limits, config.signals.sample_time_s)
+    test = plan_test(config.verification, config.limits, law, fit, crossover_rad_s)
+    law = law_for(controller, config.limits, config.signals.sample_time_s, float(test.disturbance[-1]))
+    writer = RecordingWriter(recording, ("t", "u", "y", "r"), recording_metadata(config))
+    with ControlLoop(rig=rig, envelope=envelope_of(config), writer=writer, extra=("r",)) as loop:
+        loop.metadata["controller"] = {"kind": controller.kind, "K": controller.K, "Ti_s": controller.Ti_s}
+        known = float_on(loop, config, u_rest=u_rest)
+        y, u = run_test(loop, law, test, config.operating_point.y, known.midpoint, on_progress)
+    return judge(test, y, u, law, fit, noise_sd)
 
 
 def judge(

@@ -1,0 +1,267 @@
+"""The sections that any page of a design has: Bode points, reduced model, controller and margins."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from autotune.arrays import ComplexArray, FloatArray
+from autotune.config.procedure import SignalSettings
+from autotune.controller import PIDController
+from autotune.design.nugap import Validation
+from autotune.experiment.result import ExperimentResult
+from autotune.pipeline import Analysis
+from autotune.points import FrequencyPoint
+from autotune.report.figures import Curve, bode_figure, frequencies, nichols_figure, nyquist_figure, sensitivity_figure
+from autotune.report.page import BLUE, GREEN, GREY, PURPLE, Figure, Section, Table
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Loop:
+    """L = H C as something that responds."""
+
+    plant: Any
+    controller: PIDController
+
+    def response(self, omega_rad_s: FloatArray) -> ComplexArray:
+        product = self.plant.response(omega_rad_s) * self.controller.response(omega_rad_s)
+        return np.asarray(product, dtype=np.complex128)
+
+
+def analysis_sections(
+    analysis: Analysis, signals: SignalSettings, experiment: ExperimentResult | None
+) -> tuple[Section, ...]:
+    """Return the sections on points, model and loop.
+
+    Parameters
+    ----------
+    analysis : Analysis
+        What is shown.
+    signals : SignalSettings
+        Units.
+    experiment : ExperimentResult or None
+        The relay experiment the points came from, for the first-harmonic formulas.
+    """
+    return (
+        _points_section(analysis, signals, experiment),
+        _model_section(analysis),
+        _loop_section(analysis),
+    )
+
+
+def _points_section(analysis: Analysis, signals: SignalSettings, experiment: ExperimentResult | None) -> Section:
+    sign = analysis.fit.sign
+    omega = frequencies(analysis.points)
+    described = _described(experiment, sign) if experiment else ()
+    estimates = [("Fourier ratio, 95 %", analysis.points, BLUE)]
+    if described:
+        estimates.append(("describing function, (20)-(22)", described, PURPLE))
+    gain_unit = f"{signals.y_unit}/{signals.u_unit}" if signals.u_unit and signals.y_unit else ""
+    curves = (
+        Curve(name="fitted plant", system=analysis.fit.plant, colour=GREY, dash="dot"),
+        Curve(name="reduced model", system=analysis.reduced, colour=GREEN),
+    )
+    return Section(
+        title="Bode points",
+        text=(
+            "Each point is the ratio of the recorded measurement's Fourier coefficient to that of the recorded, held"
+            " command over whole periods; its region counts the noise that was found beside the oscillation."
+            + (
+                " The first-harmonic formulas (20)-(22), which trust the delay that was asked for and the relay's ideal"
+                " wave, are shown with their error against it."
+                if described
+                else ""
+            ),
+        ),
+        tables=(_points_table(analysis.points, sign, experiment),),
+        figures=(
+            Figure(
+                figure=bode_figure(estimates, curves, omega, sign, gain_unit),
+                caption="Gain and phase (of the positive-gain plant) as in figure 6 of the method's paper. The reduced"
+                " model lies above the gain and below the phase, which is what makes its margins a guarantee.",
+                height_px=560,
+            ),
+        ),
+    )
+
+
+def _described(experiment: ExperimentResult, sign: int) -> tuple[FrequencyPoint, ...]:
+    """Return the describing-function estimates as points without a region."""
+    return tuple(
+        FrequencyPoint(
+            omega_rad_s=segment.describing.omega_rad_s,
+            response=complex(sign * segment.describing.gain * np.exp(1j * segment.describing.phase_rad)),
+            covariance=((0.0, 0.0), (0.0, 0.0)),
+            source="describing function",
+        )
+        for segment in experiment.segments
+    )
+
+
+def _points_table(points: Sequence[FrequencyPoint], sign: int, experiment: ExperimentResult | None) -> Table:
+    described = {segment.point.omega_rad_s: segment.describing for segment in experiment.segments} if experiment else {}
+    rows = []
+    for point in points:
+        response = sign * point.response
+        phase = math.degrees(np.angle(response))
+        phase = phase - 360.0 if phase > 0 else phase
+        sd = math.sqrt(np.trace(np.array(point.covariance)) / 2.0) / point.gain
+        row = [
+            f"{point.omega_rad_s:.4g}",
+            f"{point.gain:.5g}",
+            f"{phase:.2f}",
+            f"{100 * 1.96 * sd:.2g} %",
+            f"{math.degrees(1.96 * sd):.2g}",
+            point.source,
+        ]
+        if described:
+            found = described.get(point.omega_rad_s)
+            row += (
+                [
+                    f"{100 * (found.gain / point.gain - 1):+.0f} %",
+                    f"{math.degrees(_wrapped(found.phase_rad - math.radians(phase))):+.1f}",
+                ]
+                if found
+                else ["", ""]
+            )
+        rows.append(tuple(row))
+    header = ("ω [rad/s]", "gain", "phase [deg]", "gain ±95 %", "phase ±95 % [deg]", "kind")
+    return Table(
+        header=(*header, "(21) gain error", "(20) phase error [deg]") if described else header, rows=tuple(rows)
+    )
+
+
+def _wrapped(angle_rad: float) -> float:
+    return (angle_rad + math.pi) % (2 * math.pi) - math.pi
+
+
+def _model_section(analysis: Analysis) -> Section:
+    reduced, fit = analysis.reduced, analysis.fit
+    lag = [] if reduced.omega_0r_rad_s is None else [("ω_0r [rad/s]", f"{reduced.omega_0r_rad_s:.4g}", "")]
+    ball_paper = ("-65", "5.17") if reduced.integrating else ("", "")
+    return Section(
+        title="Reduced model",
+        text=(
+            f"Structure: {'(24), integrating' if reduced.integrating else '(8), self-regulating'} ({reduced.evidence}),"
+            f" under the conditions (5) on the {reduced.conditions}.",
+            f"For predictions, a transfer function was fitted through the points: {_transfer_text(fit)};"
+            f" chi-square {fit.chi_square:.1f} with {fit.degrees_of_freedom} degrees of freedom.",
+        ),
+        tables=(
+            Table(
+                caption="Table I: reduced model (the paper's figures are those of its ball in a tube)",
+                header=("parameter", "this plant", "paper's ball"),
+                rows=(
+                    ("G_r", f"{reduced.G_r:.4g}", ball_paper[0]),
+                    *lag,
+                    ("ω_d [rad/s]", f"{reduced.omega_d_rad_s:.4g}", ball_paper[1]),
+                ),
+            ),
+            Table(
+                caption="Criterion (10): ν-gap(H, H_r) < b(C, H_r) ≤ b(C, H), on the fitted plant."
+                " Its numbers depend on the units of u and y; the second row weighs them as the loop does, k = |K|.",
+                header=("scaling k", "ν-gap", "b(C, H_r)", "b(C, H)", "(10) holds", "paper's ball"),
+                rows=(
+                    (*_validation_row(analysis.unscaled), "<0.004, 0.028, 0.038"),
+                    (*_validation_row(analysis.scaled), ""),
+                ),
+            ),
+        ),
+    )
+
+
+def _validation_row(validation: Validation) -> tuple[str, str, str, str, str]:
+    return (
+        f"{validation.scaling:.4g}",
+        f"{validation.nu_gap:.4f}",
+        f"{validation.b_reduced:.4f}",
+        f"{validation.b_rig:.4f}",
+        "yes" if validation.holds else "no",
+    )
+
+
+def _transfer_text(fit: Any) -> str:
+    lags = ", ".join(f"{math.exp(value):.3g} s" for value in fit.parameters[1:-1])
+    kind = "integrator" if fit.integrating else "no integrator"
+    return (
+        f"gain {fit.sign * math.exp(fit.parameters[0]):.4g}, {kind}, lags {lags or 'none'},"
+        f" dead time {fit.plant.delay_s:.3g} s"
+    )
+
+
+def _loop_section(analysis: Analysis) -> Section:
+    controller, spec = analysis.controller, analysis.design.specification
+    omega = frequencies(analysis.points, 1.3)
+    loops = (
+        Curve(name="fitted plant", system=_Loop(plant=analysis.fit.plant, controller=controller), colour=BLUE),
+        Curve(
+            name="reduced model", system=_Loop(plant=analysis.reduced, controller=controller), colour=GREEN, dash="dash"
+        ),
+    )
+    design, m, d = analysis.design, analysis.margins, analysis.design.margins
+    bound = f"{design.h2_lower_bound:.4g}" if design.h2_lower_bound is not None else "none"
+    binding = ", ".join(design.binding) or "none"
+    paper = ("-0.023", "3", "0.683", "48", "0.03", "0.61", "1.54", "56.8")
+    rows = (
+        ("K", f"{controller.K:.5g}", f"{controller.K:.5g}", paper[0]),
+        ("T_I [s]", f"{controller.Ti_s:.5g}", f"{controller.Ti_s:.5g}", paper[1]),
+        ("modulus margin M_m", f"{d.modulus:.4f}", f"{m.modulus:.4f}", paper[2]),
+        ("phase margin [deg]", f"{math.degrees(d.phase_rad):.2f}", f"{math.degrees(m.phase_rad):.2f}", paper[3]),
+        ("noise gain", f"{d.noise_gain:.4g}", f"{m.noise_gain:.4g}", paper[4]),
+        ("delay margin M_ret [s]", f"{d.delay_s:.3g}", f"{m.delay_s:.3g}", paper[5]),
+        ("crossover ω_gc [rad/s]", f"{d.crossover_rad_s:.4g}", f"{m.crossover_rad_s:.4g}", paper[6]),
+        ("H2 norm (11)", f"{d.h2:.4g}", f"{m.h2:.4g}", paper[7]),
+    )
+    return Section(
+        title="Controller and margins",
+        text=(
+            f"Asked for: modulus margin {spec.modulus_margin:g}, phase margin"
+            f" {math.degrees(spec.phase_margin_rad):g} deg, noise gain at most {spec.noise_gain:g}. Binding: {binding}."
+            f" No controller of this structure that meets this has an H2 norm below {bound} ({design.certificate}).",
+        ),
+        tables=(
+            Table(
+                caption="Table II: the controller on the model it was designed with and on the fitted plant"
+                " (the paper's figures are those of its ball, PI-MR)",
+                header=("", "designed on", "fitted plant", "paper's ball"),
+                rows=rows,
+            ),
+        ),
+        figures=(
+            Figure(
+                figure=nyquist_figure(loops, analysis.points, controller, omega, spec.modulus_margin),
+                caption="Nyquist: the loops stay outside the circle of the modulus margin; ellipses are the points'"
+                " 95 % regions times C.",
+                height_px=520,
+            ),
+            Figure(
+                figure=nichols_figure(loops, omega, spec.modulus_margin, spec.phase_margin_rad),
+                caption="Black-Nichols, as figures 7 and 8 of the paper: the required phase margin as a bar, the"
+                " modulus margin as a closed curve.",
+            ),
+            Figure(
+                figure=sensitivity_figure(loops, omega, spec.modulus_margin),
+                caption="Sensitivity: its peak is the inverse of the modulus margin.",
+            ),
+        ),
+    )
+
+
+def gains_text(controller: PIDController, signals: SignalSettings) -> str:
+    """Return a controller's gains in words, with units."""
+    unit = f" {signals.u_unit}/{signals.y_unit}" if signals.u_unit and signals.y_unit else ""
+    derivative = f", T_d = {controller.Td_s:.4g} s, T_f = {controller.Tf_s:.3g} s" if controller.kind == "pid" else ""
+    return f"{controller.kind.upper()} with K = {controller.K:.4g}{unit}, T_I = {controller.Ti_s:.4g} s{derivative}"
+
+
+def margins_sentence(analysis: Analysis) -> str:
+    """Return the margins on the fitted plant in a sentence."""
+    m = analysis.margins
+    return (
+        f"On the fitted plant: modulus margin {m.modulus:.3f}, phase margin {math.degrees(m.phase_rad):.1f} deg,"
+        f" delay margin {m.delay_s:.3g} s, crossover {m.crossover_rad_s:.3g} rad/s, H2 norm {m.h2:.4g}."
+    )

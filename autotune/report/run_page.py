@@ -1,0 +1,224 @@
+"""The page of a run: recording, limit cycles, Bode points, reduced model, margins, and the loop measured on the rig."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from plotly.subplots import make_subplots
+
+from autotune.config.procedure import SignalSettings
+from autotune.experiment.result import ExperimentResult, Segment
+from autotune.experiment.verify import Verification
+from autotune.pipeline import Analysis, Tuning
+from autotune.recording import Recording
+from autotune.report.analysis_sections import analysis_sections, gains_text, margins_sentence
+from autotune.report.figures import recording_figure
+from autotune.report.page import BLUE, GREEN, GREY, ORANGE, RED, Figure, Page, Section, Table, add_line, thinned
+
+
+def run_page(name: str, signals: SignalSettings, recording: Recording, tuning: Tuning) -> Page:
+    """Return the page of a whole run on a rig.
+
+    Parameters
+    ----------
+    name : str
+        Of the rig, from the configuration.
+    signals : SignalSettings
+        Units.
+    recording : Recording
+        The sweep's recording.
+    tuning : Tuning
+        What the run ended with.
+    """
+    experiment, verification = tuning.experiment, tuning.verification
+    sections = [
+        _experiment_section(recording, experiment, signals),
+        *analysis_sections(tuning.analysis, signals, experiment),
+    ]
+    if verification is not None:
+        sections.append(_verification_section(verification, signals))
+    sections.append(_warnings_section((*experiment.warnings, *tuning.analysis.warnings)))
+    verdict, good = _verdict(tuning, signals)
+    return Page(
+        title=f"Commissioning: {name}",
+        verdict=verdict,
+        tone="good" if good else "bad" if verification is not None else "warn",
+        summary=_summary(tuning, signals),
+        sections=tuple(sections),
+    )
+
+
+def analysis_page(name: str, signals: SignalSettings, recordings: Sequence[Recording], analysis: Analysis) -> Page:
+    """Return the page of a design from recordings, without a rig.
+
+    Parameters
+    ----------
+    name : str
+        Title.
+    signals : SignalSettings
+        Units.
+    recordings : sequence of Recording
+        What the points were made from; may be empty.
+    analysis : Analysis
+        Points, model and controller.
+    """
+    figures = tuple(
+        Figure(figure=recording_figure(recording, signals.u_unit, signals.y_unit), caption=recording.name)
+        for recording in recordings
+    )
+    first = (Section(title="Recordings", figures=figures),) if figures else ()
+    sections = (*first, *analysis_sections(analysis, signals, None), _warnings_section(analysis.warnings))
+    return Page(
+        title=f"Controller from recordings: {name}",
+        verdict=f"{gains_text(analysis.controller, signals)}: not yet tried on the rig.",
+        tone="warn",
+        summary=(margins_sentence(analysis), "Next: verify it on the rig before it is left alone with it."),
+        sections=sections,
+    )
+
+
+def _verdict(tuning: Tuning, signals: SignalSettings) -> tuple[str, bool]:
+    gains = gains_text(tuning.analysis.controller, signals)
+    if tuning.verification is None:
+        return f"{gains}: designed, not verified on the rig.", False
+    if tuning.verification.accepted:
+        where = "the rig holds it now" if tuning.deployed else "the controller file is ready to be entered"
+        return f"Accepted: {gains}; {tuning.verification.reason}; {where}.", True
+    return f"Not accepted: {gains}; {tuning.verification.reason}. The old gains were kept.", False
+
+
+def _summary(tuning: Tuning, signals: SignalSettings) -> tuple[str, ...]:
+    experiment = tuning.experiment
+    old = tuning.old_controller
+    lines = [
+        f"{len(experiment.points)} Bode points in {experiment.sweep_time_s:.0f} s after the plant first moved"
+        f" ({experiment.rig_time_s:.0f} s on the rig in all). The command that holds the operating point is"
+        f" {experiment.u_rest:.4g} ± {1.96 * experiment.u_rest_sd:.2g} {signals.u_unit}; the measurement's noise has a"
+        f" standard deviation of {experiment.noise_sd:.3g} {signals.y_unit}.",
+        margins_sentence(tuning.analysis),
+    ]
+    if old is not None:
+        lines.append(f"Before: {gains_text(old, signals)}. Now: {gains_text(tuning.analysis.controller, signals)}.")
+    if tuning.verification is None:
+        lines.append("Next: verify the controller on the rig.")
+    elif tuning.verification.accepted:
+        lines.append("Next: watch the loop through its usual operating range; the points were measured at one of them.")
+    else:
+        lines.append(
+            "Next: compare prediction and measurement below; diagnose the recording against the fitted model to find"
+            " which physics was left out."
+        )
+    return tuple(lines)
+
+
+def _experiment_section(recording: Recording, experiment: ExperimentResult, signals: SignalSettings) -> Section:
+    marks = [(segment.start_s, f"{i + 1}") for i, segment in enumerate(experiment.segments)]
+    timing = experiment.timing
+    return Section(
+        title="The experiment",
+        text=(
+            f"It ended because: {experiment.reason}. Link latency {_milliseconds(timing.latency_s)}, lateness of the"
+            f" loop {_milliseconds(timing.lateness_s)} (median, 99 %, worst);"
+            f" {timing.missed} sample(s) missed, {timing.unusable} unusable.",
+        ),
+        figures=(
+            Figure(
+                figure=recording_figure(recording, signals.u_unit, signals.y_unit, marks=marks),
+                caption="The whole recording. Numbers mark where each limit cycle's evaluation begins.",
+                height_px=460,
+            ),
+            Figure(
+                figure=_cycles_figure(recording, experiment.segments, signals),
+                caption="Two periods of every limit cycle that a point was made from: y above, u below.",
+                height_px=380,
+            ),
+        ),
+    )
+
+
+def _milliseconds(values: tuple[float, float, float]) -> str:
+    return " / ".join(f"{1e3 * value:.2g}" for value in values) + " ms"
+
+
+def _cycles_figure(recording: Recording, segments: Sequence[Segment], signals: SignalSettings) -> Any:
+    ordered = sorted(segments, key=lambda segment: segment.point.omega_rad_s)
+    titles = [f"{segment.point.omega_rad_s:.3g} rad/s" for segment in ordered]
+    figure = make_subplots(rows=2, cols=len(ordered), shared_xaxes=True, subplot_titles=titles, vertical_spacing=0.08)
+    for i, segment in enumerate(ordered, start=1):
+        span = 2 * 2 * math.pi / segment.point.omega_rad_s
+        part = recording.between(max(segment.start_s, segment.end_s - span), segment.end_s)
+        t = part.t - part.t[0]
+        add_line(figure, *thinned(t, part.y, 600), "y", BLUE, width=1.0, row=1, col=i, showlegend=False)
+        add_line(
+            figure, *thinned(t, part.u, 600), "u", ORANGE, width=1.0, row=2, col=i, showlegend=False, line_shape="hv"
+        )
+    figure.update_xaxes(title="s", row=2)
+    figure.update_yaxes(title=f"y [{signals.y_unit}]", row=1, col=1)
+    figure.update_yaxes(title=f"u [{signals.u_unit}]", row=2, col=1)
+    return figure
+
+
+def _verification_section(verification: Verification, signals: SignalSettings) -> Section:
+    measured, predicted, sd = verification.measured, verification.predicted, verification.predicted_sd
+    unit = signals.y_unit
+    rows = (
+        ("overshoot [%]", 100 * measured.overshoot, 100 * predicted.overshoot, 100 * sd.overshoot),
+        ("rise to 90 % [s]", measured.rise_s, predicted.rise_s, sd.rise_s),
+        (f"peak under load [{unit}]", measured.peak, predicted.peak, sd.peak),
+        ("H2 over the load step", measured.h2, predicted.h2, sd.h2),
+    )
+    return Section(
+        title="Verification on the rig",
+        text=(
+            f"Set-point step of {verification.test.setpoint[0]:.3g} {unit}, then a load of"
+            f" {verification.test.disturbance[-1]:.3g} {signals.u_unit} added to the command. {verification.reason}.",
+        ),
+        tables=(
+            Table(
+                header=("", "measured", "predicted without noise", "predicted scatter (sd)"),
+                rows=tuple((name, *(f"{value:.3g}" for value in values)) for name, *values in rows),
+                caption="Measured figures contain the noise; its effect is in the scatter.",
+            ),
+        ),
+        figures=(
+            Figure(
+                figure=_step_figure(verification, signals),
+                caption="Measured loop and the band that holds 95 % of what plant uncertainty and noise predict, as"
+                " figure 9 of the paper: set-point step on the left half, load step on the right.",
+                height_px=500,
+            ),
+        ),
+    )
+
+
+def _step_figure(verification: Verification, signals: SignalSettings) -> Any:
+    test, prediction = verification.test, verification.prediction
+    figure = make_subplots(rows=2, cols=1, shared_xaxes=True, vertical_spacing=0.06, row_heights=[0.65, 0.35])
+    low_t, low = thinned(test.t, prediction.low, 1200)
+    high_t, high = thinned(test.t, prediction.high, 1200)
+    add_line(figure, low_t, low, "95 % band", GREEN, width=0.6, row=1, col=1, showlegend=False)
+    add_line(
+        figure, np.concatenate([high_t, low_t[::-1]]), np.concatenate([high, low[::-1]]), "95 % band", GREEN,
+        width=0.4, row=1, col=1, fill="toself", fillcolor="rgba(13,154,114,0.18)",
+    )  # fmt: skip
+    add_line(figure, *thinned(test.t, verification.y), "measured", BLUE, width=1.0, row=1, col=1)
+    add_line(figure, test.t, prediction.y, "predicted", RED, row=1, col=1)
+    add_line(figure, test.t, test.setpoint, "set-point", GREY, dash="dash", row=1, col=1)
+    offset = float(
+        np.median(
+            verification.u[: max(test.disturbed_from // 10, 1)] - prediction.u[: max(test.disturbed_from // 10, 1)]
+        )
+    )
+    add_line(figure, *thinned(test.t, verification.u - offset), "u of the law", ORANGE, width=1.0, row=2, col=1)
+    add_line(figure, test.t, prediction.u, "predicted u", RED, row=2, col=1, showlegend=False)
+    figure.update_yaxes(title=f"y - operating point [{signals.y_unit}]", row=1, col=1)
+    figure.update_yaxes(title=f"Δu [{signals.u_unit}]", row=2, col=1)
+    figure.update_xaxes(title="time [s]", row=2, col=1)
+    return figure
+
+
+def _warnings_section(warnings: Sequence[str]) -> Section:
+    return Section(title="Warnings", text=tuple(warnings) or ("None.",))
