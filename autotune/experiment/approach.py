@@ -161,7 +161,7 @@ def _ramp(loop: ControlLoop, config: Config, known: Known, tell: Tell) -> Known:
     sign = 1 if moved > 0 else -1
     if known.plant_sign not in (0, sign):
         raise ExperimentStopped(
-            f"wrong sign: y moved by {moved:.3g} when the command rose, operating_point.plant_sign is {known.plant_sign}",
+            f"wrong sign: y moved by {moved:.3g} when the command rose, plant_sign is {known.plant_sign}",
             where="approach",
             mend="correct plant_sign, or check the wiring of actuator and sensor",
         )
@@ -280,7 +280,7 @@ def _balance(oscillation: Oscillation, config: Config, known: Known, tell: Tell)
         elif high > 1.7 * swing:
             oscillation.settings = replace(oscillation.settings, amplitude=0.5 * oscillation.settings.amplitude)
             oscillation.edges = edges[-1:]
-        elif len(edges) >= 6:
+        elif len(edges) >= 5:
             t, u, y = loop.history(edges[-5] - 2)
             try:
                 cycle = limit_cycle_points(t, u, y, highest_harmonic=3)

@@ -60,12 +60,15 @@ class Choice:
         Phase of the plant (positive gain) that it aims at.
     omega_rad_s, y_amplitude : float
         Expected frequency [rad/s] and amplitude of y's fundamental [y unit].
+    turning_s : float
+        Expected time from a switch to the extremum of y [s].
     """
 
     settings: RelaySettings
     phase_rad: float
     omega_rad_s: float
     y_amplitude: float
+    turning_s: float
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,6 +87,15 @@ class LocalModel:
     def gain(self, omega_rad_s: float) -> float:
         """Return the magnitude at ``omega_rad_s``."""
         return self.k / (omega_rad_s * math.hypot(1.0, self.tau_s * omega_rad_s))
+
+    def turning_time_s(self, omega_rad_s: float) -> float:
+        """Return the time from a switch of the relay to the extremum of y [s].
+
+        There the speed is zero and y is at its peak, in every limit cycle of the same peak: where one amplitude gives way
+        to another without a transient of position and speed.
+        """
+        quarter = 0.5 * math.pi / omega_rad_s
+        return self.tau_s * math.log(1.0 + math.tanh(quarter / self.tau_s))
 
     def crest(self, omega_rad_s: float) -> float:
         """Return the ratio of peak to fundamental amplitude of its response to a relay's square wave."""
@@ -139,10 +151,11 @@ def predicted(points: Sequence[FrequencyPoint], plant_sign: int, phase_rad: floa
         )
     wanted = math.log(math.tan(-phase_rad - math.pi / 2.0))
     nearest = sorted(usable, key=lambda entry: abs(entry[1] - wanted))[:2]
-    slope = 1.0
-    if len(nearest) == 2 and abs(nearest[1][1] - nearest[0][1]) > 0.05:
+    # one lag has slope 1; the more the phase lags, the more further lags and dead time take part
+    slope = 1.0 / (1.0 + 0.15 * math.exp(0.5 * (wanted + nearest[0][1])))
+    if len(nearest) == 2 and (nearest[0][1] - wanted) * (nearest[1][1] - wanted) < 0.0:
         slope = (nearest[1][0] - nearest[0][0]) / (nearest[1][1] - nearest[0][1])
-        slope = min(max(slope, 0.3), 1.5)
+        slope = min(max(slope, 0.3), 1.2)
     omega = math.exp(nearest[0][0] + slope * (wanted - nearest[0][1]))
     known = nearest[0][2]
     near = LocalModel.through(known.omega_rad_s, known.gain, lag_beyond_integrator(known, plant_sign))
@@ -190,6 +203,7 @@ def choose(
         phase_rad=phase_rad,
         omega_rad_s=omega,
         y_amplitude=y_amplitude,
+        turning_s=model.turning_time_s(omega),
     )
 
 
@@ -202,7 +216,7 @@ def expected_sd(noise_sd: float, y_amplitude: float, samples: float) -> float:
 
 
 def needed_time_s(choice: Choice, goal: Goal, gain_sd: float, least_periods: int) -> float:
-    """Return the rig time after which the point is expected to be known: whole periods, and half a one to settle [s]."""
+    """Return the rig time after which the point is expected to be known [s]: whole periods, and half a one to settle."""
     period = 2.0 * math.pi / choice.omega_rad_s
     samples = 2.0 * (goal.noise_sd / (gain_sd * choice.y_amplitude)) ** 2
     periods = max(least_periods, math.ceil(samples * goal.sample_time_s / period))

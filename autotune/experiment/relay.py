@@ -1,7 +1,7 @@
 """Relay law: smoothed input, hysteresis, mid-point and an inserted delay of any length; a pure step.
 
-The relay of Le & Mendes 2010, figure 3: a delay T inserted before the plant moves the limit cycle to the frequency where
-arg P(j omega) = -180 deg + T omega, equation (20). The lag of smoothing, hysteresis and sampling counts towards that
+The relay of Le & Mendes 2010, figure 3: a delay T inserted before the plant moves the limit cycle to the frequency
+where arg P(j omega) = -180 deg + T omega, equation (20). The lag of smoothing, hysteresis and sampling counts towards that
 delay; none of it enters an estimate, which is made from the recorded command and measurement.
 """
 
@@ -145,7 +145,7 @@ def lag_samples(settings: RelaySettings, period_samples: float, y_amplitude: flo
 
     Notes
     -----
-    Smoothing (M - 1)/2, half a sample until a crossing is seen, asin(hysteresis/amplitude)/omega, and the inserted delay.
+    Smoothing (M - 1)/2, half a sample until a crossing is seen, asin(hysteresis/amplitude)/omega, the inserted delay.
     Used to choose settings, never in an estimate.
     """
     attenuated = y_amplitude * abs(_average_gain(settings.smoothing, period_samples))

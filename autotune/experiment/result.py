@@ -22,6 +22,7 @@ class State(StrEnum):
     MIDPOINT = "find the mid-point"
     SWEEP = "relay sweep"
     HAND_BACK = "hand back"
+    VERIFY = "verify"
     SAFE = "safe"
 
 

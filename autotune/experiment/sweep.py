@@ -21,6 +21,7 @@ from autotune.identification.frequency import LimitCycle, limit_cycle_points
 #: part of limits.swing that a limit cycle is planned for: the rest is for a mid-point that is not quite right
 PEAK_SHARE = 0.88
 LEAST_PERIODS = 2
+FIRST_EDGE = 0
 #: asymmetry of the duty (part of the period, less one half) from which on the mid-point is corrected within a point
 LARGEST_ASYMMETRY = 0.12
 
@@ -71,8 +72,8 @@ def sweep(loop: ControlLoop, config: Config, known: Known, oscillation: Oscillat
         if sd > 1.1 * wanted.gain_sd:
             warnings = (
                 *warnings,
-                f"point at {segment.point.omega_rad_s:.3g} rad/s is known to {100 * sd:.2g} % only, {100 * wanted.gain_sd:.2g} %"
-                " was wanted: raise experiment.budget_s",
+                f"point at {segment.point.omega_rad_s:.3g} rad/s is known to {100 * sd:.2g} % only,"
+                f" {100 * wanted.gain_sd:.2g} % was wanted: raise experiment.budget_s",
             )
         known = replace(
             known,
@@ -115,7 +116,7 @@ def _measure(oscillation: Oscillation, config: Config, choice: Choice, until_s: 
     loop = oscillation.loop
     period_s = 2.0 * math.pi / choice.omega_rad_s
     oscillation.change(choice.settings, patience_s=PATIENCE * 0.5 * period_s)
-    first = 1
+    first = FIRST_EDGE
     while True:
         _, switched = oscillation.step()
         edges = oscillation.edges
@@ -140,7 +141,15 @@ def _measure(oscillation: Oscillation, config: Config, choice: Choice, until_s: 
         point = cycle.points[0]
         known_to = math.sqrt(float(np.trace(point.covariance)) / 2.0) / point.gain
         if over or known_to <= config.experiment.gain_sd:
+            _turn(oscillation, choice.turning_s)
             return cycle
+
+
+def _turn(oscillation: Oscillation, turning_s: float) -> None:
+    """Go on to the extremum of y, where the next setting's limit cycle joins this one's without a transient."""
+    last_row = oscillation.edges[-1]
+    while (oscillation.loop.tick.k - last_row) * oscillation.loop.sample_time_s < turning_s:
+        oscillation.step()
 
 
 def _noise(loop: ControlLoop) -> float:
