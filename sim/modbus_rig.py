@@ -142,7 +142,12 @@ class ModbusRig:
         self._ready.set()
         await self._stop.wait()
         living.cancel()
+        connections = [connection.transport for connection in server.active_connections.values()]
         await server.shutdown()  # type: ignore[no-untyped-call]  # the library leaves it untyped
+        for connection in connections:  # a TLS farewell would be waited for beyond the end of this loop
+            if isinstance(connection, asyncio.WriteTransport):
+                connection.abort()
+        await asyncio.sleep(0.01)
 
     async def _live(self) -> None:
         """Keep the plant close to the wall clock also while nobody asks."""

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 from sim.plant import Plant
@@ -78,7 +78,7 @@ class RegisterDevice:
         self.plant = plant
         self.registers = dict(registers)
         self.history: deque[OutputChange] = deque(maxlen=_KEPT)
-        self.reads = 0
+        self.on_change: Callable[[OutputChange], None] | None = None
         self._at = {
             (spec.table, spec.address + i): (name, i) for name, spec in self.registers.items() for i in range(spec.size)
         }
@@ -138,7 +138,6 @@ class RegisterDevice:
         """
         parts = self._parts(table, address, count)
         self.live(now_s)
-        self.reads += 1
         shown = {name: to_words(self._shown(name), self.registers[name]) for name, _ in parts}
         return [shown[name][i] for name, i in parts]
 
@@ -229,4 +228,7 @@ class RegisterDevice:
 
     def _set(self, output: float, cause: str) -> None:
         self._output = output
-        self.history.append(OutputChange(t_s=self._now_s, output=output, cause=cause))
+        change = OutputChange(t_s=self._now_s, output=output, cause=cause)
+        self.history.append(change)
+        if self.on_change is not None:
+            self.on_change(change)

@@ -1,0 +1,184 @@
+"""Rigs on the bench: every kind of rig around the same servo, with what the rig's own side says of it."""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from autotune.cli.served import spec_of
+from autotune.config.registers import RegisterMap
+from autotune.config.rig import AnyModbusSettings, ModbusRtuSettings, ModbusTcpSettings, ModbusTlsSettings
+from autotune.experiment.rig import Rig
+from autotune.recording import Recording
+from drivers import open_rig
+from drivers.replay import ReplayRig
+from drivers.simulated import SimulatedRig
+from sim.imperfections import Fault, FaultyPlant
+from sim.modbus_rig import ModbusRig, Refusal, RtuTransport, TcpTransport
+from sim.register_device import OutputChange, RegisterDevice
+from sim.serial_line import SerialLine, Tamper
+from sim.servo import Servo, ServoSettings
+
+U_RANGE = (-10.0, 10.0)
+U_SAFE = -0.5
+DEADMAN_S = 0.3
+LIMIT_S = 20.0  # no wait of a test is longer
+
+#: a sample in one request, a command in one request; one signal in each form that devices use
+REGISTERS = RegisterMap.model_validate(
+    {
+        "y": {"table": "input", "address": 0, "type": "float32"},
+        "u_applied": {"table": "input", "address": 2, "type": "int16", "scale": 1e-3},
+        "heartbeat_echo": {"table": "input", "address": 3, "type": "uint16"},
+        "in_command": {"table": "input", "address": 4, "type": "uint16"},
+        "device_time": {"table": "input", "address": 5, "type": "uint32", "scale": 1e-3, "word_order": "little"},
+        "u": {"address": 0, "type": "int16", "scale": 1e-3},
+        "heartbeat": {"address": 1, "type": "uint16"},
+        "safe": {"address": 2, "type": "int16", "scale": 1e-3},
+        "enable": {"table": "coil", "address": 17, "type": "bit"},
+        "automatic": {"table": "coil", "address": 18, "type": "bit"},
+        "K": {"address": 10, "type": "float32", "byte_order": "little"},
+        "Ti": {"address": 12, "type": "uint32", "scale": 1e-3, "word_order": "little"},
+        "setpoint": {"address": 20, "type": "int32", "scale": 1e-4},
+    }
+)
+
+
+@dataclass(kw_only=True)
+class Bench:
+    """A rig and the rig's own side.
+
+    ``output`` says what the actuator is moved with, ``cut`` breaks the link, ``commands`` are those that it can take.
+    """
+
+    rig: Rig
+    output: Callable[[], float]
+    cut: Callable[[], None]
+    device: RegisterDevice | None = None
+    commands: tuple[float, ...] = (0.25, -0.75, 0.5)
+    released: threading.Event = field(default_factory=threading.Event)
+
+    def watch(self) -> None:
+        """Set ``released`` as soon as the device's dead-man has acted."""
+        assert self.device is not None
+        self.device.on_change = self._on_change
+
+    def _on_change(self, change: OutputChange) -> None:
+        if change.cause == "dead-man":
+            self.released.set()
+
+
+def servo() -> Servo:
+    return Servo(ServoSettings(load=0.1, noise=0.001), seed=1)
+
+
+def register_device(registers: RegisterMap = REGISTERS, plant: Any = None) -> RegisterDevice:
+    return RegisterDevice(
+        plant if plant is not None else servo(),
+        {name: spec_of(register) for name, register in registers.mapped().items()},
+        u_safe=0.0,
+        u_range=U_RANGE,
+        deadman_s=DEADMAN_S,
+        gains=(1.5, 2.0),
+    )
+
+
+def rig_of(settings: AnyModbusSettings) -> Rig:
+    return open_rig(settings, u_range=U_RANGE, u_safe=U_SAFE)
+
+
+def tcp_settings(port: int, registers: RegisterMap = REGISTERS, **changes: Any) -> ModbusTcpSettings:
+    return ModbusTcpSettings.model_validate({"kind": "modbus_tcp", "port": port, "registers": registers} | changes)
+
+
+def rtu_settings(device: str, registers: RegisterMap = REGISTERS, **changes: Any) -> ModbusRtuSettings:
+    given = {"kind": "modbus_rtu", "device": device, "baud": 115200, "parity": "N", "registers": registers}
+    return ModbusRtuSettings.model_validate(given | changes)
+
+
+def tls_settings(port: int, certificates: Path, **changes: Any) -> ModbusTlsSettings:
+    given = {
+        "kind": "modbus_tls",
+        "port": port,
+        "ca_file": str(certificates / "ca.pem"),
+        "cert_file": str(certificates / "host.pem"),
+        "key_file": str(certificates / "host.key"),
+        "server_name": "ball-rig",
+        "registers": REGISTERS,
+    }
+    return ModbusTlsSettings.model_validate(given | changes)
+
+
+@contextmanager
+def tcp_bench(*, refuse: Refusal | None = None, **changes: Any) -> Iterator[Bench]:
+    device = register_device()
+    with ExitStack() as stack:
+        serving = stack.enter_context(ExitStack())
+        server = serving.enter_context(ModbusRig(device, TcpTransport(), refuse=refuse))
+        rig = rig_of(tcp_settings(server.port, **changes))
+        stack.callback(rig.close)
+        yield Bench(rig=rig, output=lambda: device.output, cut=serving.close, device=device)
+
+
+@contextmanager
+def tls_bench(certificates: Path, **changes: Any) -> Iterator[Bench]:
+    device = register_device()
+    transport = TcpTransport(
+        ca_file=str(certificates / "ca.pem"),
+        cert_file=str(certificates / "rig.pem"),
+        key_file=str(certificates / "rig.key"),
+    )
+    with ExitStack() as stack:
+        serving = stack.enter_context(ExitStack())
+        server = serving.enter_context(ModbusRig(device, transport))
+        rig = rig_of(tls_settings(server.port, certificates, **changes))
+        stack.callback(rig.close)
+        yield Bench(rig=rig, output=lambda: device.output, cut=serving.close, device=device)
+
+
+@contextmanager
+def rtu_bench(*, tamper: Tamper | None = None, **changes: Any) -> Iterator[Bench]:
+    device = register_device()
+    with SerialLine(tamper) as line, ModbusRig(device, RtuTransport(device=line.rig_device, parity="N")):
+        rig = rig_of(rtu_settings(line.host_device, **changes))
+        yield Bench(rig=rig, output=lambda: device.output, cut=line.cut, device=device)
+        rig.close()
+
+
+@contextmanager
+def simulated_bench() -> Iterator[Bench]:
+    plant = FaultyPlant(servo(), [Fault(kind="cut link", start_s=1000.0)])
+    rig = SimulatedRig(plant, u_safe=U_SAFE)
+    yield Bench(rig=rig, output=lambda: rig.command, cut=lambda: rig.clock.sleep_until(1001.0))
+
+
+@contextmanager
+def replay_bench() -> Iterator[Bench]:
+    t = 0.01 * np.arange(60)
+    u = np.array([0.25, -0.75, 0.5, *np.full(57, 0.5)])
+    recording = Recording(t=t, u=u, y=np.sin(t), name="recorded servo")
+    rig = ReplayRig(recording)
+
+    def wind() -> None:
+        """Run to the end, where a recording has nothing more to say."""
+        for _ in range(len(recording) - 1):
+            rig.read()
+
+    yield Bench(rig=rig, output=lambda: float("nan"), cut=wind)
+
+
+def certificates_by_the_book(folder: Path) -> Path:
+    """Make the certificates with the commands of docs/modbus_tls.md."""
+    import subprocess
+
+    text = (Path(__file__).parents[2] / "docs" / "modbus_tls.md").read_text()
+    script = text.split("```sh\n")[1].split("```")[0]
+    subprocess.run(["bash", "-euc", script], cwd=folder, check=True, capture_output=True, env=os.environ)
+    return folder / "certificates"
