@@ -1,6 +1,6 @@
 """Inner loops of the synthesis, compiled: one controller on a sampled plant in some ten microseconds.
 
-The plant enters as q = 1/H at the grid's frequencies, so that 1 + L = (q + C)/q and H/(1 + L) = 1/(q + C).
+H/(1 + L) = 1/(1/H + C): at one frequency a constraint is a circle in the plane of C, an ellipse in that of (K, K/T_I).
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ class SampledPlant:
     ----------
     omega : (N,) array
         Angular frequencies [rad/s], ascending.
-    q : (N,) complex array
-        1/H(j omega) with the plant's sign taken out.
+    h : (N,) complex array
+        H(j omega) with the plant's sign taken out.
     weights : (N,) array
-        Quadrature weights of the squared norm (11): sum of weights/abs(q + C)^2.
+        Quadrature weights of the squared norm (11): sum of weights abs(h/(1 + h C))^2.
     turn : float
         Argument change of the open loop's denominator along the grid, integrator of C included [rad].
     sign : float
@@ -38,15 +38,22 @@ class SampledPlant:
     """
 
     omega: FloatArray
-    q: ComplexArray
+    h: ComplexArray
     weights: FloatArray
     turn: float
     sign: float
 
+    def thinned(self, step: int) -> SampledPlant:
+        """Return the plant at every ``step``-th frequency, for a coarse look."""
+        kept = slice(None, None, step)
+        weights = np.add.reduceat(self.weights * self.omega**2, np.arange(0, len(self.omega), step))
+        omega = self.omega[kept]
+        return SampledPlant(omega=omega, h=self.h[kept], weights=weights / omega**2, turn=self.turn, sign=self.sign)
+
     @property
     def phase(self) -> FloatArray:
         """Unwrapped arg H [rad], sign taken out."""
-        return np.asarray(-np.unwrap(np.angle(self.q)))
+        return np.asarray(np.unwrap(np.angle(self.h)))
 
 
 def sampled_plant(plant: TransferFunction) -> SampledPlant:
@@ -79,13 +86,26 @@ def sampled_plant(plant: TransferFunction) -> SampledPlant:
             offsets = np.geomspace(0.05 * max(abs(root.real), 1e-6 * abs(root)), abs(root.imag), 80)
             near = np.concatenate((abs(root.imag) - offsets, [abs(root.imag)], abs(root.imag) + offsets))
             omega = np.unique(np.concatenate((omega, near[(near > low) & (near < high)])))
-    # s den + num K/T_I needs its last coefficient of its first one's sign: necessary for stability with integral action
+    # s den + num K/T_I needs its last coefficient of its first one's sign: necessary with integral action
     sign = math.copysign(1.0, num[-1] * den[0])
-    q = sign / plant.response(omega)
-    if not np.all(np.isfinite(q)):
-        raise DesignError("the plant's response has a zero on the imaginary axis", where="plant", mend="move it aside")
+    return on_grid(plant, omega, sign)
+
+
+def on_grid(plant: TransferFunction, omega: FloatArray, sign: float) -> SampledPlant:
+    """Return the plant at the given frequencies, which reach a decade beyond all its features.
+
+    Raises
+    ------
+    DesignError
+        A pole or a zero on the imaginary axis at one of them.
+    """
+    h = sign * plant.response(omega)
+    if not np.all(np.isfinite(h)) or not np.all(np.abs(h) > 0.0):
+        raise DesignError(
+            "the plant's response has a pole or a zero on the imaginary axis", where="plant", mend="move it aside"
+        )
     return SampledPlant(
-        omega=omega, q=q, weights=_h2_weights(omega, plant), turn=_denominator_turn(omega, plant), sign=sign
+        omega=omega, h=h, weights=_h2_weights(omega, plant), turn=_denominator_turn(omega, plant), sign=sign
     )
 
 
@@ -116,10 +136,10 @@ def _denominator_turn(omega: FloatArray, plant: TransferFunction) -> float:
     return sum(change(complex(root)) for root in roots) - len(roots) * shift
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def evaluate(
     omega: FloatArray,
-    q: ComplexArray,
+    h: ComplexArray,
     weights: FloatArray,
     turn: float,
     K: float,
@@ -133,7 +153,6 @@ def evaluate(
     The modulus margin is returned with a minus sign where the closed loop is unstable. ``omega_n`` below 0 stands for
     the highest crossover.
     """
-    n = len(omega)
     h2 = 0.0
     smallest = 1e300
     phase = math.pi
@@ -141,24 +160,27 @@ def evaluate(
     noise = 0.0
     crossings = 0
     f0 = f1 = 1e300
+    power0 = 0.0
     before = 1.0 + 0.0j
     first = 1.0 + 0.0j
     L_before = 0.0j
-    for i in range(n):
-        s = 1j * omega[i]
-        C = K * (1.0 + 1.0 / (Ti * s) + Td * s) / (1.0 + Tf * s)
-        sum_ = q[i] + C
-        power = sum_.real * sum_.real + sum_.imag * sum_.imag
-        h2 += weights[i] / power
-        L = C / q[i]
+    for i in range(len(omega)):
+        w = omega[i]
+        C = complex(K, K * (Td * w - 1.0 / (Ti * w)))
+        if Tf > 0.0:
+            C = C * complex(1.0, -Tf * w) / (1.0 + Tf * w * Tf * w)
+        L = C * h[i]
         F = 1.0 + L
         f = F.real * F.real + F.imag * F.imag
+        inverse = 1.0 / f
+        h2 += weights[i] * (h[i].real * h[i].real + h[i].imag * h[i].imag) * inverse
         if i >= 2 and f1 <= f0 and f1 <= f:
             curvature = f - 2.0 * f1 + f0
             value = f1 - (f - f0) ** 2 / (8.0 * curvature) if curvature > 0.0 else f1
             smallest = min(smallest, max(value, 0.5 * f1))
         smallest = min(smallest, f)
         f0, f1 = f1, f
+        power = L.real * L.real + L.imag * L.imag
         if i == 0:
             first = F
         else:
@@ -166,38 +188,30 @@ def evaluate(
                 real = before.real - before.imag * (F.real - before.real) / (F.imag - before.imag)
                 if real < 0.0:
                     crossings += 1 if before.imag >= 0.0 else -1
-            a, b = abs(L_before), abs(L)
-            if (a < 1.0) != (b < 1.0):
-                share = math.log(a) / (math.log(a) - math.log(b))
-                angle = math.atan2(-L_before.imag, -L_before.real)
+            if (power0 < 1.0) != (power < 1.0):
+                share = math.log(power0) / (math.log(power0) - math.log(power))
                 ratio = L / L_before
-                angle += share * math.atan2(ratio.imag, ratio.real)
+                angle = math.atan2(-L_before.imag, -L_before.real) + share * math.atan2(ratio.imag, ratio.real)
                 if abs(angle) < abs(phase):
                     phase = angle
-                at = omega[i - 1] * (omega[i] / omega[i - 1]) ** share
+                at = omega[i - 1] * (w / omega[i - 1]) ** share
                 delay = min(delay, (angle if angle > 0.0 else angle + 2.0 * math.pi) / at)
                 if omega_n < 0.0:
                     noise = 0.0
-        if omega_n < 0.0 or omega[i] >= omega_n:
-            noise = max(noise, abs(C) / math.sqrt(f))
-        before = F
-        L_before = L
-    turned = (
-        math.atan2(before.imag, before.real)
-        - math.atan2(first.imag, first.real)
-        + 2.0 * math.pi * crossings
-        + turn
-    )
+        if w >= omega_n:
+            noise = max(noise, (C.real * C.real + C.imag * C.imag) * inverse)
+        before, L_before, power0 = F, L, power
+    end = math.atan2(before.imag, before.real) - math.atan2(first.imag, first.real)
     modulus = math.sqrt(smallest)
-    if round(turned / math.pi) != 0:
+    if round((end + 2.0 * math.pi * crossings + turn) / math.pi) != 0:
         modulus = -modulus
-    return h2, modulus, phase, delay, noise
+    return h2, modulus, phase, delay, math.sqrt(noise)
 
 
 @njit(cache=True)
 def evaluate_grid(
     omega: FloatArray,
-    q: ComplexArray,
+    h: ComplexArray,
     weights: FloatArray,
     turn: float,
     parameters: FloatArray,
@@ -207,5 +221,5 @@ def evaluate_grid(
     out = np.empty((len(parameters), 5))
     for k in range(len(parameters)):
         K, Ti, Td, Tf = parameters[k]
-        out[k] = evaluate(omega, q, weights, turn, K, Ti, Td, Tf, omega_n)
+        out[k] = evaluate(omega, h, weights, turn, K, Ti, Td, Tf, omega_n)
     return out
