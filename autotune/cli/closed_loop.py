@@ -1,1 +1,114 @@
-"""Commands: identification of a plant under control."""
+"""``autotune identify closed-loop``: the plant from a recording of its loop under control."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.console import Console
+
+from autotune.cli import identify
+
+if TYPE_CHECKING:
+    from autotune.identification.closed_loop import ClosedLoopIdentification
+
+
+@identify.command("closed-loop")
+def closed_loop(
+    recording: Annotated[Path, typer.Argument(help="CSV with t,u,y, and r where it is known", metavar="REC.csv")],
+    out: Annotated[Path, typer.Option(help="JSON file to write the model and its response to")],
+    order: Annotated[
+        int | None, typer.Option(min=1, max=30, help="number of states; chosen from the data when absent")
+    ] = None,
+    delay: Annotated[
+        int | None,
+        typer.Option(min=0, help="dead time in whole samples beyond the first; with --order, default 0"),
+    ] = None,
+    controller: Annotated[
+        Path | None,
+        typer.Option(help="controller TOML: checked against the data, and says where the plant matters"),
+    ] = None,
+    max_order: Annotated[int, typer.Option(min=1, max=30, help="highest order tried without --order")] = 8,
+) -> None:
+    """Identify the plant from r, u and y recorded while its loop is closed."""
+    from autotune.controller import read_controller
+    from autotune.identification.closed_loop import identify_closed_loop
+    from autotune.recording import read_recording
+
+    console = Console(stderr=True, highlight=False)
+    data = read_recording(recording)
+    law = None if controller is None else read_controller(controller)
+    with console.status("reading the loop") as status:
+        result = identify_closed_loop(
+            data,
+            order=order,
+            delay=delay,
+            controller=law,
+            max_order=max_order,
+            progress=lambda text: status.update(f"fitting {text}"),
+        )
+    out.write_text(json.dumps(closed_loop_json(result), indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    for warning in result.warnings:
+        console.print(f"warning: {warning}", markup=False, soft_wrap=True)
+    typer.echo(summary(result))
+    typer.echo(f"wrote {out}")
+
+
+def closed_loop_json(result: ClosedLoopIdentification) -> dict[str, Any]:
+    """Return the content of ``closed_loop.json``.
+
+    ``response`` is that of the polynomials; ``points`` is the plant's own, without the command's hold, so that the
+    file can be given to ``autotune design --points`` as it is.
+    """
+    from autotune.points import points_to_json
+
+    model = result.estimate.model
+    num, den = model.polynomials()
+    verdict = result.excitation
+    content: dict[str, Any] = {
+        "order": model.order,
+        "input_delay": model.input_delay,
+        "sample_time_s": model.sample_time_s,
+        "num": num.tolist(),
+        "den": den.tolist(),
+        "poles": [[pole.real, pole.imag] for pole in result.poles],
+        "pole_cov": result.pole_covariance.tolist(),
+        "noise_variance": float(model.innovation_covariance[0, 0]),
+        "response": points_to_json(result.response),
+        "points": points_to_json(result.points),
+        "excitation": {
+            "enough": verdict.enough,
+            "band_rad_s": list(verdict.band_rad_s),
+            "relative_sd": verdict.relative_sd,
+            "amplitude_factor": verdict.amplitude_factor,
+            "length_factor": verdict.length_factor,
+            "verdict": verdict.sentence,
+        },
+        "residuals_white_probability": result.whiteness.probability,
+        "order_evidence": [
+            {"order": c.order, "delay": c.delay, "relative_innovation_sd": c.innovation_sd, "bic": c.bic}
+            for c in result.evidence
+        ],
+        "warnings": list(result.warnings),
+    }
+    if result.law is not None:
+        share = result.law.unexplained
+        content["controller"] = {
+            "unexplained": share if math.isfinite(share) else None,
+            "r_enters_at": result.law.summation,
+        }
+    return content
+
+
+def summary(result: ClosedLoopIdentification) -> str:
+    """Return what was found, in a sentence or two."""
+    model = result.estimate.model
+    poles = ", ".join(
+        f"{p.real:.4g}" + (f" ± {p.imag:.4g}i" if p.imag > 0 else "") for p in result.poles if p.imag >= 0
+    )
+    late = f" and {model.input_delay} samples of dead time" if model.input_delay else ""
+    sd = math.sqrt(float(model.innovation_covariance[0, 0]))
+    return f"order {model.order}{late}, poles {poles}, innovation sd {sd:.3g}; {result.excitation.sentence}"

@@ -1,0 +1,345 @@
+"""A plant identified from a recording of its loop: r, u and y as a person's own rig gives them.
+
+The method is direct: the response from u to y is estimated with a noise model, by PBSIDopt and a prediction-error
+polish, and the controller need not be known. The feedback does no harm because the noise is modelled; r, where it was
+recorded, tells whether the loop was moved from outside, and a controller file is checked against the data.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg import expm, logm
+
+from autotune.arrays import ComplexArray, FloatArray
+from autotune.controller import Controller
+from autotune.errors import IdentificationError, InputError
+from autotune.identification.confidence import (
+    Whiteness,
+    frequency_points,
+    pole_covariance,
+    residuals,
+    response_covariance,
+    whiteness,
+)
+from autotune.identification.control_law import CONTRADICTION, LawCheck, check_law
+from autotune.identification.excitation import ExcitationVerdict, judge, own_motion, require_excitation
+from autotune.identification.order import Candidate, choose_order, default_past_window, fixed_order
+from autotune.identification.prediction_error import PredictionErrorEstimate
+from autotune.identification.state_space import InnovationModel
+from autotune.identification.subspace_direct import lagged_data
+from autotune.points import FrequencyPoint
+from autotune.recording import Recording
+
+#: Rows that a first look at the excitation takes.
+_LOOK_ROWS = 20_000
+#: A point less certain than this says nothing to a design.
+_WORTHLESS = 0.5
+#: Time stamps may stray this far from the grid, as a share of the sample time.
+_JITTER = 0.25
+#: Fewest rows a closed-loop identification accepts.
+_FEWEST_ROWS = 60
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ClosedLoopIdentification:
+    """What a recording of the loop says about the plant.
+
+    Attributes
+    ----------
+    estimate : PredictionErrorEstimate
+        Polished model in the recording's units.
+    poles : (n,) array
+        In the z plane, slowest first.
+    pole_covariance : (n, 2, 2) array
+        Covariance of (re, im).
+    response : tuple of FrequencyPoint
+        G(exp(j omega Ts)), consistent with the polynomials.
+    points : tuple of FrequencyPoint
+        The plant's own response with the hold taken out, comparable with points from a relay; only where it is known
+        to better than 50 %.
+    evidence : tuple of Candidate
+        Orders and dead times tried, the best first; empty where the order was given.
+    excitation : ExcitationVerdict
+        Whether the loop was moved enough.
+    whiteness : Whiteness
+        Test of the residuals.
+    law : LawCheck or None
+        Agreement with the controller file.
+    warnings : tuple of str
+        What a reader should know before relying on the result.
+    """
+
+    estimate: PredictionErrorEstimate
+    poles: ComplexArray
+    pole_covariance: FloatArray
+    response: tuple[FrequencyPoint, ...]
+    points: tuple[FrequencyPoint, ...]
+    evidence: tuple[Candidate, ...]
+    excitation: ExcitationVerdict
+    whiteness: Whiteness
+    law: LawCheck | None
+    warnings: tuple[str, ...]
+
+
+def identify_closed_loop(
+    recording: Recording,
+    *,
+    order: int | None = None,
+    delay: int | None = None,
+    controller: Controller | None = None,
+    max_order: int = 8,
+    omega_rad_s: FloatArray | None = None,
+    progress: Callable[[str], None] = lambda text: None,
+) -> ClosedLoopIdentification:
+    """Identify the plant from a recording of the loop under control.
+
+    Parameters
+    ----------
+    recording : Recording
+        t, u, y, and r where it is known; equidistant. A column ``dither`` is what was added to the controller's output.
+    order : int, optional
+        Number of states; chosen from the data when absent.
+    delay : int, optional
+        Dead time in whole samples on top of the one that every sampled loop has; chosen with the order when absent,
+        0 where only the order is given.
+    controller : Controller, optional
+        Checked against the data, and used to say at which frequency the plant matters.
+    max_order : int
+        Highest order tried.
+    omega_rad_s : (W,) array, optional
+        Frequencies of the response [rad/s]; 40 from a period of a third of the record to 0.8 of Nyquist when absent.
+    progress : callable
+        Told what is being done.
+
+    Returns
+    -------
+    ClosedLoopIdentification
+
+    Raises
+    ------
+    InputError
+        Time stamps that are not equidistant, samples that are not numbers, a controller that contradicts the data.
+    IdentificationError
+        Too few rows, a command that does not move or only by the feedback, a plant of the asked order that the data
+        do not determine.
+
+    Notes
+    -----
+    Linear and time-invariant over the record; regions are asymptotic and presume white residuals (tested). Means are
+    removed and a constant is estimated, so operating points and integrators need no care.
+    """
+    warnings: list[str] = []
+    u, y, r = _columns(recording, warnings)
+    dt_s = recording.sample_time_s
+    law = _checked_law(recording, controller, r, warnings)
+    scale_u, scale_y = float(np.std(u)), float(np.std(y))
+    u_1, y_1 = ((u - u.mean()) / scale_u)[:, None], ((y - y.mean()) / scale_y)[:, None]
+    motion = _look(u_1, y_1, r)
+    evidence: tuple[Candidate, ...] = ()
+    if order is None:
+        choice = choose_order(u_1, y_1, max_order=max_order, progress=progress)
+        estimate, evidence = choice.estimate, choice.evidence
+    else:
+        if order < 1 or (delay or 0) < 0:
+            raise InputError(f"order {order}, delay {delay}", mend="the order is at least 1, the dead time at least 0")
+        progress(f"order {order}")
+        estimate = fixed_order(u_1, y_1, order, delay=delay or 0)
+    errors = residuals(estimate, u_1, y_1)
+    white = whiteness(estimate, errors)
+    estimate = in_units(estimate, scale_u, scale_y, dt_s)
+    omega = _grid(recording) if omega_rad_s is None else np.asarray(omega_rad_s, dtype=np.float64)
+    result = _report(estimate, omega, law, motion, white)
+    _further_warnings(result, evidence, r, warnings)
+    return replace(result, evidence=evidence, warnings=tuple(warnings))
+
+
+def _columns(recording: Recording, warnings: list[str]) -> tuple[FloatArray, FloatArray, FloatArray | None]:
+    recording.require_finite()
+    if len(recording) < _FEWEST_ROWS:
+        raise IdentificationError(
+            f"the record is too short: {len(recording)} rows",
+            where=recording.name,
+            mend=f"record at least {_FEWEST_ROWS} rows, better a thousand, with the set-point or a dither moving",
+        )
+    steps = np.diff(recording.t) / recording.sample_time_s
+    if not recording.is_uniform:
+        worst = int(np.argmax(np.abs(steps - 1.0)))
+        if abs(steps[worst] - 1.0) > _JITTER:
+            raise InputError(
+                f"the time stamps are not equidistant: {steps[worst]:.3g} sample times pass after "
+                f"t = {recording.t[worst]:g} s",
+                where=recording.name,
+                mend="cut the recording at the gap, or resample it",
+            )
+        warnings.append(f"time stamps stray by up to {100 * abs(steps[worst] - 1):.2g} % of the sample time")
+    for name, values in (("u", recording.u), ("y", recording.y)):
+        if np.ptp(values) <= 1e-12 * max(1.0, float(np.max(np.abs(values)))):
+            raise IdentificationError(
+                f"{name} does not move", where=recording.name, mend="move the set-point or add a dither"
+            )
+    r = recording.extra.get("r")
+    if r is not None and not np.all(np.isfinite(r)):
+        warnings.append("r holds rows that are not numbers and is left aside")
+        r = None
+    return recording.u, recording.y, r
+
+
+def _checked_law(
+    recording: Recording, controller: Controller | None, r: FloatArray | None, warnings: list[str]
+) -> LawCheck | None:
+    if controller is None:
+        return None
+    added = recording.extra.get("dither")
+    law = check_law(controller, recording.u, recording.y, r, recording.sample_time_s, added=added)
+    if law.contradicts and r is None:
+        warnings.append("r was not recorded, so the controller file cannot be checked against the data")
+        return law
+    if law.contradicts:
+        hint = f"; a gain {law.gain_ratio:.3g} times as large would explain most" if law.gain_ratio > 0 else ""
+        raise InputError(
+            f"the controller file contradicts the data: {100 * law.unexplained:.0f} % of the command's motion does not "
+            f"come from this law (at most {100 * CONTRADICTION:.0f} % may){hint}",
+            where=recording.name,
+            mend="mend the file, or leave --controller away: the plant is identified without it",
+        )
+    if law.unexplained > CONTRADICTION / 5.0:
+        warnings.append(f"the controller file leaves {100 * law.unexplained:.1f} % of the command's motion unexplained")
+    return law
+
+
+def _look(u: FloatArray, y: FloatArray, r: FloatArray | None) -> float:
+    rows = min(len(u), _LOOK_ROWS)
+    p = min(12, default_past_window(rows, 2))
+    motion = own_motion(lagged_data(u[:rows], y[:rows], p))
+    moves = r is not None and float(np.ptp(r)) > 1e-9 * max(1.0, float(np.max(np.abs(r))))
+    require_excitation(motion, r_recorded=r is not None, r_moves=moves)
+    return motion
+
+
+def in_units(
+    estimate: PredictionErrorEstimate, scale_u: float, scale_y: float, sample_time_s: float
+) -> PredictionErrorEstimate:
+    """Return an estimate made on scaled signals (u / scale_u, y / scale_y) in the signals' own units."""
+    model, ratio = estimate.model, scale_y / scale_u
+    scaled = InnovationModel(
+        A=model.A,
+        B=model.B / scale_u,
+        C=model.C * scale_y,
+        D=model.D * ratio,
+        K=model.K / scale_y,
+        innovation_covariance=model.innovation_covariance * scale_y**2,
+        sample_time_s=sample_time_s,
+        input_delay=model.input_delay,
+    )
+    return replace(
+        estimate,
+        model=scaled,
+        d_b=estimate.d_b / scale_u,
+        d_c=estimate.d_c * scale_y,
+        d_d=estimate.d_d * ratio,
+        d_k=estimate.d_k / scale_y,
+        offset_y=estimate.offset_y * scale_y,
+        log_det=estimate.log_det + 2.0 * math.log(scale_y) * model.C.shape[0],
+    )
+
+
+def _grid(recording: Recording) -> FloatArray:
+    nyquist = math.pi / recording.sample_time_s
+    lowest = min(6.0 * math.pi / recording.duration_s, 0.1 * nyquist)
+    return np.geomspace(lowest, 0.8 * nyquist, 40)
+
+
+def _report(
+    estimate: PredictionErrorEstimate, omega: FloatArray, law: LawCheck | None, motion: float, white: Whiteness
+) -> ClosedLoopIdentification:
+    covariance = response_covariance(estimate, omega)[:, 0, 0]
+    response = frequency_points(estimate, omega)
+    plant = estimate.model.response(omega)[:, 0, 0]
+    loop = None if law is None or law.contradicts else law.controller.response(omega)
+    return ClosedLoopIdentification(
+        estimate=estimate,
+        poles=estimate.model.poles,
+        pole_covariance=pole_covariance(estimate),
+        response=response,
+        points=without_hold(estimate.model, response),
+        evidence=(),
+        excitation=judge(omega, plant, covariance, controller=loop, motion=motion),
+        whiteness=white,
+        law=law,
+        warnings=(),
+    )
+
+
+def without_hold(model: InnovationModel, response: tuple[FrequencyPoint, ...]) -> tuple[FrequencyPoint, ...]:
+    """Return the points of the plant itself, with the hold of the command taken out.
+
+    Parameters
+    ----------
+    model : InnovationModel
+        One input, one output, identified from commands held over each sample.
+    response : tuple of FrequencyPoint
+        Its response G(exp(j omega Ts)).
+
+    Returns
+    -------
+    tuple of FrequencyPoint
+        P(j omega) of the continuous plant whose step-invariant equivalent the model is. Where it has none (a pole on
+        the negative real axis, which a sampled lag does not have) the response divided by that of the hold, up to half
+        the Nyquist frequency. Points known to less than 50 % are left out.
+    """
+    dt_s = model.sample_time_s
+    continuous = _continuous(model)
+    points = []
+    for point in response:
+        omega = point.omega_rad_s
+        if continuous is None:
+            if omega * dt_s > math.pi / 2.0:
+                continue
+            factor = complex(1j * omega * dt_s / (1.0 - np.exp(-1j * omega * dt_s)))
+        else:
+            A, B = continuous
+            inner = model.C @ np.linalg.solve(1j * omega * np.eye(len(A)) - A, B) + model.D
+            factor = complex(inner[0, 0]) * np.exp(-1j * omega * dt_s * model.input_delay) / point.response
+        turn = np.array([[factor.real, -factor.imag], [factor.imag, factor.real]])
+        c = turn @ np.array(point.covariance) @ turn.T
+        value = complex(point.response * factor)
+        if np.trace(c) / 2.0 < (_WORTHLESS * abs(value)) ** 2:
+            pair = ((float(c[0, 0]), float(c[0, 1])), (float(c[1, 0]), float(c[1, 1])))
+            points.append(replace(point, response=value, covariance=pair))
+    return tuple(points)
+
+
+def _continuous(model: InnovationModel) -> tuple[FloatArray, FloatArray] | None:
+    """Return (A, B) of the continuous model with the same samples under a held input, None where there is none."""
+    poles = model.poles
+    if np.any((np.abs(poles.imag) <= 1e-9) & (poles.real <= 1e-9)):
+        return None
+    n = model.order
+    joint = np.block([[model.A, model.B], [np.zeros((1, n)), np.ones((1, 1))]])
+    generator = logm(joint)
+    if not np.allclose(expm(generator), joint, rtol=1e-8, atol=1e-10) or np.max(np.abs(np.imag(generator))) > 1e-8:
+        return None
+    generator = np.real(generator) / model.sample_time_s
+    return generator[:n, :n], generator[:n, n:]
+
+
+def _further_warnings(
+    result: ClosedLoopIdentification, evidence: tuple[Candidate, ...], r: FloatArray | None, warnings: list[str]
+) -> None:
+    if r is None:
+        warnings.append("r was not recorded: the result relies on u being moved by more than the feedback")
+    if not result.excitation.enough:
+        warnings.append(result.excitation.sentence)
+    if result.whiteness.probability < 0.001:
+        warnings.append(
+            f"the residuals are not white (probability {result.whiteness.probability:.1g}): the model leaves dynamics "
+            "or a nonlinearity out, and its regions are too small"
+        )
+    if not result.estimate.converged:
+        warnings.append("the polish stopped before it converged; try a lower --order")
+    if evidence and result.estimate.model.order == max(candidate.order for candidate in evidence):
+        warnings.append(f"the best order is the highest tried, {result.estimate.model.order}: try --max-order")

@@ -1,0 +1,181 @@
+"""From the covariance of a polished model to what people ask for: regions of the frequency response and of the poles.
+
+Linearised (delta method) at the estimate, in coordinates of the behaviour, so that the choice of states drops out.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import chi2
+
+from autotune.arrays import ComplexArray, FloatArray
+from autotune.errors import IdentificationError
+from autotune.identification.prediction_error import PredictionErrorEstimate
+from autotune.identification.predictor_sweep import innovations
+from autotune.points import FrequencyPoint
+
+#: Information matrices worse than this hold directions that the data say nothing about.
+_CONDITION_LIMIT = 1e13
+
+
+def response_covariance(estimate: PredictionErrorEstimate, omega_rad_s: FloatArray) -> FloatArray:
+    """Return the covariance of (re, im) of every entry of G(exp(j omega Ts)).
+
+    Parameters
+    ----------
+    estimate : PredictionErrorEstimate
+        Polished model.
+    omega_rad_s : (W,) array
+        Angular frequencies [rad/s].
+
+    Returns
+    -------
+    (W, n_y, n_u, 2, 2) array
+        Covariances, (output unit per input unit)^2.
+
+    Raises
+    ------
+    IdentificationError
+        The data leave some direction of the model undetermined.
+    """
+    _require_information(estimate)
+    model = estimate.model
+    z = np.exp(1j * np.asarray(omega_rad_s, dtype=np.float64) * model.sample_time_s)
+    resolvent = np.linalg.inv(z[:, None, None] * np.eye(model.order) - model.A)
+    right, left = resolvent @ model.B, model.C @ resolvent
+    change = (
+        np.einsum("oip,wiu->woup", estimate.d_c, right)
+        + np.einsum("woi,ikp,wku->woup", left, estimate.d_a, right, optimize=True)
+        + np.einsum("woi,iup->woup", left, estimate.d_b)
+        + estimate.d_d
+    ) * (z ** -float(model.input_delay))[:, None, None, None]
+    return _real_covariance(change, estimate.covariance)
+
+
+def pole_covariance(estimate: PredictionErrorEstimate) -> FloatArray:
+    """Return the covariance of (re, im) of each of the model's poles, in their order, shape (n, 2, 2).
+
+    Notes
+    -----
+    A real pole's imaginary part has zero variance: its region is an interval. First-order: no good where two poles
+    nearly coincide.
+
+    Raises
+    ------
+    IdentificationError
+        The data leave some direction of the model undetermined.
+    """
+    _require_information(estimate)
+    values, vectors = np.linalg.eig(estimate.model.A)
+    rows = np.linalg.inv(vectors)
+    change = np.einsum("ni,ikp,kn->np", rows, estimate.d_a, vectors, optimize=True)
+    at = [int(np.argmin(np.abs(values - pole))) for pole in estimate.model.poles]
+    return _real_covariance(change[at], estimate.covariance)
+
+
+def _require_information(estimate: PredictionErrorEstimate) -> None:
+    if not estimate.condition < _CONDITION_LIMIT:
+        raise IdentificationError(
+            f"the data do not determine a model of order {estimate.model.order} "
+            f"(condition of the information {estimate.condition:.1e})",
+            mend="ask for a lower --order, or excite the loop with a richer set-point or dither",
+        )
+
+
+def _real_covariance(change: ComplexArray, covariance: FloatArray) -> FloatArray:
+    parts = np.stack([change.real, change.imag], axis=-2)
+    return np.asarray(parts @ covariance @ np.swapaxes(parts, -1, -2), dtype=np.float64)
+
+
+def inside_region(error: ComplexArray, covariance: FloatArray, probability: float = 0.95) -> FloatArray:
+    """Return whether errors lie in the region of the probability, 1.0 or 0.0, same shape as ``error``.
+
+    Parameters
+    ----------
+    error : (...) array
+        Complex differences between a true value and its estimate.
+    covariance : (..., 2, 2) array
+        Covariance of (re, im); singular where only one direction varies (a real pole): there the region is an interval.
+    probability : float
+        Of the region.
+    """
+    values, vectors = np.linalg.eigh(covariance)
+    parts = np.stack([error.real, error.imag], axis=-1)
+    turned = np.einsum("...ij,...i->...j", vectors, parts)
+    largest = np.maximum(values[..., -1:], np.finfo(np.float64).tiny)
+    varies = values > 1e-12 * largest
+    distance = np.sum(np.where(varies, turned**2 / np.where(varies, values, 1.0), 0.0), axis=-1)
+    quantile = np.where(varies.all(axis=-1), chi2.ppf(probability, 2), chi2.ppf(probability, 1))
+    return np.asarray(distance <= quantile, dtype=np.float64)
+
+
+def frequency_points(
+    estimate: PredictionErrorEstimate, omega_rad_s: FloatArray, *, inflation: float = 1.0
+) -> tuple[FrequencyPoint, ...]:
+    """Return the response of a single-input, single-output estimate as frequency points with their regions.
+
+    Parameters
+    ----------
+    estimate : PredictionErrorEstimate
+        Polished model.
+    omega_rad_s : (W,) array
+        Angular frequencies [rad/s].
+    inflation : float
+        Factor on the covariance, for residuals that are not white.
+    """
+    response = estimate.model.response(omega_rad_s)[:, 0, 0]
+    covariance = inflation * response_covariance(estimate, omega_rad_s)[:, 0, 0]
+    return tuple(
+        FrequencyPoint(
+            omega_rad_s=float(omega),
+            response=complex(value),
+            covariance=((float(c[0, 0]), float(c[0, 1])), (float(c[1, 0]), float(c[1, 1]))),
+            source="closed loop",
+        )
+        for omega, value, c in zip(omega_rad_s, response, covariance, strict=True)
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Whiteness:
+    """Portmanteau test of the residuals.
+
+    Attributes
+    ----------
+    probability : float
+        Probability of residuals at least as correlated, were the model right.
+    lags : int
+        Number of lags looked at.
+    """
+
+    probability: float
+    lags: int
+
+
+def residuals(estimate: PredictionErrorEstimate, u: FloatArray, y: FloatArray) -> FloatArray:
+    """Return the one-step prediction errors of the polished model on the data it came from, shape (rows, n_y)."""
+    model = estimate.model
+    F = np.hstack([model.A, model.B, model.K, estimate.offset_x[:, None]])
+    H = np.hstack([model.C, model.D, estimate.offset_y[:, None]])
+    delay = model.input_delay
+    past = np.ascontiguousarray(u[: len(u) - delay])
+    errors: FloatArray = innovations(F, H, estimate.initial_state, past, np.ascontiguousarray(y[delay:]))
+    return errors
+
+
+def whiteness(estimate: PredictionErrorEstimate, errors: FloatArray) -> Whiteness:
+    """Return the Ljung-Box test of the residuals' autocorrelation, each output for itself, the worst one counted."""
+    rows, n_y = errors.shape
+    n = estimate.model.order
+    lags = min(max(30, 4 * n), rows // 4)
+    worst = 1.0
+    for column in range(n_y):
+        e = errors[:, column] - errors[:, column].mean()
+        power = float(e @ e)
+        correlation = np.array([float(e[k:] @ e[:-k]) / power for k in range(1, lags + 1)])
+        statistic = rows * (rows + 2) * float(np.sum(correlation**2 / (rows - np.arange(1, lags + 1))))
+        worst = min(worst, float(chi2.sf(statistic, max(lags - n, 1))))
+    return Whiteness(probability=min(1.0, n_y * worst) if math.isfinite(worst) else 0.0, lags=lags)

@@ -1,0 +1,98 @@
+"""What kind of experiment a recording holds: relay limit cycles, a repeated command, or any other excitation."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from autotune.arrays import FloatArray
+from autotune.errors import IdentificationError
+from autotune.identification.limit_cycle import relay_edges
+from autotune.recording import Recording
+
+#: Periods of one relay setting agree to this part.
+_SAME_PERIOD = 0.15
+_LEAST_PERIODS = 3
+
+
+def relay_segments(recording: Recording) -> tuple[tuple[float, float], ...]:
+    """Return (start, end) [s] of the stretches in which a relay oscillates at one setting.
+
+    The sidecar's ``relay`` tables are taken where there are any; else stretches of at least three periods that agree
+    to 15 % are looked for in the command.
+    """
+    tables = recording.metadata.get("relay", ())
+    if isinstance(tables, list) and tables and all(isinstance(table, Mapping) for table in tables):
+        return _segments_of_sidecar(tables, recording)
+    try:
+        edges = relay_edges(recording.t, recording.u)
+    except IdentificationError:
+        return _segments_by_level(recording)
+    return _regular_stretches(edges.times_s[edges.rising])
+
+
+def _segments_of_sidecar(tables: list[Mapping[str, Any]], recording: Recording) -> tuple[tuple[float, float], ...]:
+    margin = 2.5 * recording.sample_time_s  # the switch itself, which may take two rows
+    return tuple(
+        (float(table["start_s"]) - margin, float(table["end_s"]) + margin)
+        for table in tables
+        if "start_s" in table and "end_s" in table
+    )
+
+
+def _regular_stretches(rises: FloatArray) -> tuple[tuple[float, float], ...]:
+    """Return maximal runs of periods within 15 % of their first neighbour, the first period left out."""
+    periods = np.diff(rises)
+    found = []
+    first = 0
+    for i in range(1, periods.size + 1):
+        if i < periods.size and abs(periods[i] - periods[i - 1]) <= _SAME_PERIOD * periods[i - 1]:
+            continue
+        if i - first >= _LEAST_PERIODS:
+            skip = 1 if i - first > _LEAST_PERIODS else 0
+            margin = 0.02 * float(periods[i - 1])
+            found.append((float(rises[first + skip]) - margin, float(rises[i]) + margin))
+        first = i
+    return tuple(found)
+
+
+def _segments_by_level(recording: Recording) -> tuple[tuple[float, float], ...]:
+    """Cut the record where the height of the switches changes, and look for relay oscillations in each part."""
+    jumps = np.abs(np.diff(recording.u))
+    big = np.flatnonzero(jumps > 0.02 * max(float(np.ptp(recording.u)), 1e-300))
+    if big.size < 2 * _LEAST_PERIODS or big.size > 0.5 * jumps.size:
+        return ()
+    changes = np.flatnonzero(np.abs(np.diff(jumps[big])) > 0.1 * jumps[big][:-1])
+    bounds = [0, *(int(big[i]) + 1 for i in changes), recording.t.size]
+    found: list[tuple[float, float]] = []
+    for low, high in zip(bounds[:-1], bounds[1:], strict=True):
+        if high - low < 8 * _LEAST_PERIODS:
+            continue
+        try:
+            edges = relay_edges(recording.t[low:high], recording.u[low:high])
+        except IdentificationError:
+            continue
+        found.extend(_regular_stretches(edges.times_s[edges.rising]))
+    return tuple(found)
+
+
+def repeat_length(recording: Recording) -> int | None:
+    """Return the number of rows after which the command repeats itself exactly, None where it does not.
+
+    At least two whole repeats are asked for, on uniform stamps, of a command that is not constant.
+    """
+    u = recording.u - recording.u.mean()
+    n = u.size
+    energy = float(u @ u)
+    if not recording.is_uniform or energy <= 0.0 or n < 32:
+        return None
+    padded = np.fft.rfft(u, 2 * n)
+    correlation = np.fft.irfft(np.abs(padded) ** 2, 2 * n)[: n // 2 + 1]
+    expected = energy * (1.0 - np.arange(n // 2 + 1) / n)
+    for lag in np.flatnonzero(correlation[8:] > 0.9 * expected[8:]) + 8:
+        mismatch = u[lag:] - u[:-lag]
+        if float(mismatch @ mismatch) < 1e-6 * energy:
+            return int(lag)
+    return None

@@ -1,0 +1,93 @@
+"""Triangular factors of lagged data, accumulated block by block: no block-Hankel matrix is ever in memory.
+
+Subspace methods need the data only through the R factor of the matrix whose rows are lagged samples. Orthogonal
+updating keeps the accuracy of a QR decomposition of the data themselves (a sum of lagged products would square the
+condition number) in time linear in the samples and memory that does not depend on them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from autotune.arrays import FloatArray
+from autotune.errors import IdentificationError
+
+#: Rows that are orthogonalised at once; a few thousand keep the block in cache and the overhead small.
+BLOCK_ROWS = 4096
+
+
+#: Singular values below this share of the largest are rounding: noise-free data have exact dependencies.
+_RANK = 1e-11
+
+
+def triangle(rows: FloatArray) -> FloatArray:
+    """Return the upper triangular factor of the QR decomposition."""
+    return np.asarray(np.linalg.qr(rows, mode="r"), dtype=np.float64)
+
+
+def least_squares(regressors: FloatArray, targets: FloatArray) -> FloatArray:
+    """Return the minimum-norm solution of regressors @ theta = targets, directions without data left at zero."""
+    return np.asarray(np.linalg.lstsq(regressors, targets, rcond=_RANK)[0], dtype=np.float64)
+
+
+def lagged_rows(signals: Sequence[tuple[FloatArray, Sequence[int]]], start: int, stop: int) -> FloatArray:
+    """Return the rows ``start <= t < stop`` of the lagged data.
+
+    Parameters
+    ----------
+    signals : sequence of (signal, offsets)
+        Signal (N, channels) and the offsets k, in order, of the samples s(t + k) that make its columns.
+    start, stop : int
+        Range of t; every t + k must lie in the signal.
+
+    Returns
+    -------
+    (stop - start, columns) array
+        For each signal, for each offset, its channels.
+    """
+    columns = [signal[start + k : stop + k] for signal, offsets in signals for k in offsets]
+    return np.hstack(columns)
+
+
+def lagged_range(signals: Sequence[tuple[FloatArray, Sequence[int]]]) -> tuple[int, int]:
+    """Return the first t and the end of the range in which every lagged sample exists."""
+    first = max(-min(offsets) for _, offsets in signals if len(offsets))
+    end = min(len(signal) - max(offsets) for signal, offsets in signals if len(offsets))
+    return max(first, 0), end
+
+
+def lagged_factor(signals: Sequence[tuple[FloatArray, Sequence[int]]]) -> tuple[FloatArray, int]:
+    """Return the upper triangular R of the QR decomposition of the lagged data, and the number of rows.
+
+    Parameters
+    ----------
+    signals : sequence of (signal, offsets)
+        As in :func:`lagged_rows`.
+
+    Returns
+    -------
+    R : (columns, columns) array
+        R^T R is the sum of lagged products; its transpose is the L of the papers' LQ (there: M).
+    rows : int
+        Number of rows j of the data.
+
+    Raises
+    ------
+    IdentificationError
+        Fewer rows than columns: the record is too short.
+    """
+    start, end = lagged_range(signals)
+    width = sum(signal.shape[1] * len(offsets) for signal, offsets in signals)
+    if end - start < width:
+        raise IdentificationError(
+            f"the record is too short: {max(end - start, 0)} usable rows for {width} lagged columns",
+            mend="record longer, or ask for a lower order",
+        )
+    R = np.zeros((0, width))
+    step = max(BLOCK_ROWS, 4 * width)
+    for at in range(start, end, step):
+        block = lagged_rows(signals, at, min(at + step, end))
+        R = triangle(np.vstack([R, block]))
+    return R, end - start

@@ -1,0 +1,273 @@
+"""Order and dead time of the plant: polished models of every order, compared by the Bayesian information criterion."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.stats import chi2
+
+from autotune.arrays import FloatArray
+from autotune.errors import IdentificationError
+from autotune.identification.prediction_error import PredictionErrorEstimate, prediction_error
+from autotune.identification.subspace_direct import (
+    LaggedData,
+    autoregression,
+    choose_past_window,
+    lagged_data,
+    pbsid_states,
+    regress_system,
+)
+
+#: A higher order, or a dead time, must earn this much in the criterion (strong evidence by Raftery's scale): otherwise
+#: a pole that a zero nearly cancels, placed where the noise happens to have a line, would pass for dynamics.
+_CLEAR_GAIN = 6.0
+#: Accepted steps for a candidate; only the chosen one is polished to the end.
+_CANDIDATE_STEPS = 25
+#: Rows that the choice looks at; longer records are polished whole once it is made.
+CHOICE_ROWS = 50_000
+
+
+@dataclass(frozen=True, kw_only=True)
+class Candidate:
+    """One order and dead time that was tried.
+
+    Attributes
+    ----------
+    order, delay : int
+        States and whole samples of dead time.
+    innovation_sd : float
+        Geometric mean of the standard deviations of the residuals, in the units of the (scaled) data.
+    bic : float
+        Criterion, relative to the best candidate.
+    """
+
+    order: int
+    delay: int
+    innovation_sd: float
+    bic: float
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class OrderChoice:
+    """The chosen estimate and the evidence.
+
+    Attributes
+    ----------
+    estimate : PredictionErrorEstimate
+        Polished model of the chosen order and dead time.
+    evidence : tuple of Candidate
+        Every candidate, the best first.
+    singular_values : (f n_y,) array
+        Of the predicted future (PBSIDopt), where a gap shows the order.
+    past_window : int
+        Lags of the long autoregression.
+    """
+
+    estimate: PredictionErrorEstimate
+    evidence: tuple[Candidate, ...]
+    singular_values: FloatArray
+    past_window: int
+
+
+def default_past_window(rows: int, channels: int) -> int:
+    """Return the longest past window worth trying: a twelfth of the rows per channel, 4 to 60 lags."""
+    return int(np.clip(rows // (12 * channels), 4, 60))
+
+
+def shifted(u: FloatArray, y: FloatArray, delay: int) -> tuple[FloatArray, FloatArray]:
+    """Return u and y with the dead time taken out: rows u(t - delay), y(t)."""
+    return u[: len(u) - delay], y[delay:]
+
+
+def start_and_polish(
+    data: LaggedData,
+    u: FloatArray,
+    y: FloatArray,
+    order: int,
+    *,
+    delay: int,
+    feedthrough: bool,
+    offset: bool,
+    max_iterations: int = 60,
+) -> PredictionErrorEstimate:
+    """Return the polished model of one order, started by PBSIDopt on the factor ``data`` of the shifted signals."""
+    f = min(data.p, max(10, -(-order // data.n_y) + 2))
+    states = pbsid_states(data, f, feedthrough=feedthrough)
+    start = replace(regress_system(data, states, order, feedthrough=feedthrough), input_delay=delay)
+    return prediction_error(start, u, y, feedthrough=feedthrough, offset=offset, max_iterations=max_iterations)
+
+
+def choose_order(
+    u: FloatArray,
+    y: FloatArray,
+    *,
+    max_order: int = 8,
+    feedthrough: bool = False,
+    offset: bool = True,
+    progress: Callable[[str], None] = lambda text: None,
+) -> OrderChoice:
+    """Choose order and dead time by the Bayesian information criterion over polished models.
+
+    Parameters
+    ----------
+    u, y : (N, n_u), (N, n_y) arrays
+        Input and output, mean removed and scaled alike.
+    max_order : int
+        Highest order tried; the record's length may lower it.
+    feedthrough, offset : bool
+        As in :func:`autotune.identification.prediction_error.prediction_error`.
+    progress : callable
+        Told what is tried.
+
+    Returns
+    -------
+    OrderChoice
+
+    Raises
+    ------
+    IdentificationError
+        The record is too short for order 1, or no order gave a model.
+
+    Notes
+    -----
+    Consistent as the record grows; on a short record a mode that the data do not show is left out. A dead time is
+    named only where it buys a lower order by a clear gain.
+    """
+    cut = min(len(u), CHOICE_ROWS)
+    u_cut, y_cut = u[:cut], y[:cut]
+    n_u, n_y = u.shape[1], y.shape[1]
+    data = _factor(u_cut, y_cut)
+    fits: dict[tuple[int, int], PredictionErrorEstimate] = {}
+
+    def try_order(order: int, delay: int, factor: LaggedData) -> None:
+        progress(f"order {order}, dead time {delay}")
+        try:
+            fits[order, delay] = start_and_polish(
+                factor,
+                u_cut,
+                y_cut,
+                order,
+                delay=delay,
+                feedthrough=feedthrough,
+                offset=offset,
+                max_iterations=_CANDIDATE_STEPS,
+            )
+        except IdentificationError:
+            return  # a candidate that has no model is no candidate
+
+    highest = min(max_order, data.p * (n_u + n_y) // 2, (cut // 4) // (n_u + 2 * n_y))
+    for order in range(1, highest + 1):
+        try_order(order, 0, data)
+    if not fits:
+        raise IdentificationError(
+            f"no model of order 1 to {max(highest, 1)} could be fitted to {cut} rows",
+            mend="record longer and excite the loop more",
+        )
+    best = _parsimonious(fits)
+    for delay in range(1, _dead_time(data, cut) + 1):
+        factor = _factor(*shifted(u_cut, y_cut, delay), p=data.p)
+        for order in range(1, best[0]):
+            try_order(order, delay, factor)
+    best = _parsimonious(fits)
+    evidence = _evidence(fits)
+    factor = _factor(*shifted(u, y, best[1]), p=data.p)
+    estimate = fits[best]
+    if cut < len(u) or not estimate.converged:
+        estimate = start_and_polish(factor, u, y, best[0], delay=best[1], feedthrough=feedthrough, offset=offset)
+    values = pbsid_states(factor, min(factor.p, 10), feedthrough=feedthrough).singular_values
+    return OrderChoice(estimate=estimate, evidence=evidence, singular_values=values, past_window=factor.p)
+
+
+def fixed_order(
+    u: FloatArray,
+    y: FloatArray,
+    order: int,
+    *,
+    delay: int = 0,
+    p: int | None = None,
+    feedthrough: bool = False,
+    offset: bool = True,
+) -> PredictionErrorEstimate:
+    """Return the polished model of a given order and dead time: PBSIDopt start, then prediction error.
+
+    Parameters
+    ----------
+    u, y : (N, n_u), (N, n_y) arrays
+        Input and output.
+    order, delay : int
+        States, and whole samples of dead time.
+    p : int, optional
+        Past window of the start; chosen by Akaike's criterion when absent.
+    feedthrough, offset : bool
+        As in :func:`autotune.identification.prediction_error.prediction_error`.
+    """
+    factor = _factor(*shifted(u, y, delay), p=p, least=order + 2)
+    return start_and_polish(factor, u, y, order, delay=delay, feedthrough=feedthrough, offset=offset)
+
+
+def _factor(u: FloatArray, y: FloatArray, p: int | None = None, least: int = 10) -> LaggedData:
+    channels = u.shape[1] + y.shape[1]
+    if p is not None:
+        return lagged_data(u, y, p)
+    data = lagged_data(u, y, default_past_window(len(u), channels))
+    wanted = max(choose_past_window(data), least)
+    return data if wanted >= data.p else data.window(wanted)
+
+
+def _dead_time(data: LaggedData, rows: int) -> int:
+    """Return how many first impulse-response terms the long autoregression cannot tell from zero (99 %)."""
+    past, now_y = data.past(), data.now[1]
+    left = data.R[past.stop :, now_y]
+    variance = left.T @ left / max(rows - past.stop, 1)
+    factor = data.R[past, past]
+    scale = np.abs(np.diag(factor))
+    if np.min(scale) <= 1e-9 * np.max(scale):
+        return 0
+    inverse = np.linalg.inv(factor)
+    phi, _ = autoregression(data, feedthrough=False)
+    n_u, n_z, n_y = data.n_u, data.n_u + data.n_y, data.n_y
+    count = 0
+    for k in range(1, data.p - 1):
+        at = np.concatenate([np.arange(i * n_z, i * n_z + n_u) for i in range(k)])
+        spread = inverse[at] @ inverse[at].T
+        terms = np.concatenate([phi[i, :, :n_u].T for i in range(k)])  # (k n_u, n_y)
+        statistic = float(np.trace(np.linalg.solve(spread, terms) @ np.linalg.solve(variance, terms.T)))
+        if statistic > chi2.ppf(0.99, k * n_u * n_y):
+            break
+        count = k
+    return count if count < data.p - 2 else 0
+
+
+def _parsimonious(fits: dict[tuple[int, int], PredictionErrorEstimate]) -> tuple[int, int]:
+    lowest = min(fit.bic for (_, delay), fit in fits.items() if delay == 0)
+    prompt = min(key for key, fit in fits.items() if key[1] == 0 and fit.bic < lowest + _CLEAR_GAIN)
+    late = [key for key in fits if key[1] > 0]
+    if not late:
+        return prompt
+    rows = min(estimate.rows for estimate in fits.values())
+    best_late = min(late, key=lambda key: _per_rows(fits[key], rows))
+    gain = _per_rows(fits[prompt], rows) - _per_rows(fits[best_late], rows)
+    return best_late if gain > _CLEAR_GAIN else prompt
+
+
+def _per_rows(estimate: PredictionErrorEstimate, rows: int) -> float:
+    """Return the criterion as if from ``rows`` rows: candidates with a dead time use a few rows fewer."""
+    return rows * estimate.log_det + (estimate.bic - estimate.rows * estimate.log_det)
+
+
+def _evidence(fits: dict[tuple[int, int], PredictionErrorEstimate]) -> tuple[Candidate, ...]:
+    rows = min(estimate.rows for estimate in fits.values())
+    criterion = {key: _per_rows(estimate, rows) for key, estimate in fits.items()}
+    lowest = min(criterion.values())
+    candidates = [
+        Candidate(
+            order=order,
+            delay=delay,
+            innovation_sd=float(np.exp(0.5 * fit.log_det / fit.model.C.shape[0])),
+            bic=criterion[order, delay] - lowest,
+        )
+        for (order, delay), fit in fits.items()
+    ]
+    return tuple(sorted(candidates, key=lambda candidate: candidate.bic))

@@ -1,0 +1,292 @@
+"""Prediction-error polish of an innovation model: the estimate that reaches the Cramer-Rao bound.
+
+From a consistent start (a subspace estimate) the determinant of the innovations' covariance is minimised over A, B, C,
+D, K, the initial state and a constant, by Levenberg-Marquardt steps with the exact gradient. The initial state must be
+free: with a controller of high gain at low frequency, residuals wrongly set to zero before the first row ruin the fit.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from autotune.arrays import FloatArray
+from autotune.errors import IdentificationError
+from autotune.identification.predictor_directions import Predictor, behaviour_directions
+from autotune.identification.predictor_sweep import innovations, normal_equations, scatter
+from autotune.identification.state_space import InnovationModel, balanced_predictor, spectral_radius
+
+#: A step that promises less than this in -2 log likelihood moves no parameter by 1 % of its standard deviation.
+_TOLERANCE = 1e-4
+#: Zeros of the noise model nearer to the unit circle than this have no finite memory worth the name.
+_RADIUS_LIMIT = 0.9999
+#: Smaller innovations, relative to the output, are rounding.
+_NOISE_FREE = 1e-11
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PredictionErrorEstimate:
+    """A polished model with the covariance of its behaviour.
+
+    Attributes
+    ----------
+    model : InnovationModel
+        The estimate, with the innovations' covariance (degrees of freedom counted).
+    d_a, d_b, d_c, d_d, d_k : arrays of shape (..., P)
+        Directions of the parameters: the model moves by their sum weighted with the coordinates.
+    covariance : (P, P) array
+        Asymptotic covariance of these coordinates (inverse information); right for Gaussian white innovations and
+        a sufficient order, too small where the residuals are not white.
+    offset_x, offset_y : (n,), (n_y,) arrays
+        Constants of the state and the output equation: operating point.
+    initial_state : (n,) array
+        Estimated state at the first row used.
+    rows : int
+        Rows used.
+    parameters : int
+        Free parameters, initial state and constants counted.
+    log_det : float
+        Log determinant of the innovations' covariance, not corrected for degrees of freedom.
+    iterations : int
+        Accepted steps.
+    converged : bool
+        Whether the last step promised less than the tolerance.
+    condition : float
+        Condition number of the information matrix with unit diagonal.
+    """
+
+    model: InnovationModel
+    d_a: FloatArray
+    d_b: FloatArray
+    d_c: FloatArray
+    d_d: FloatArray
+    d_k: FloatArray
+    covariance: FloatArray
+    offset_x: FloatArray
+    offset_y: FloatArray
+    initial_state: FloatArray
+    rows: int
+    parameters: int
+    log_det: float
+    iterations: int
+    converged: bool
+    condition: float
+
+    @property
+    def bic(self) -> float:
+        """Bayesian information criterion, rows log det + parameters log rows; the smaller the better.
+
+        The initial state is left out of the count: it does not grow more certain with the record.
+        """
+        count = self.parameters - self.model.order
+        return self.rows * self.log_det + count * float(np.log(self.rows))
+
+
+def prediction_error(
+    start: InnovationModel,
+    u: FloatArray,
+    y: FloatArray,
+    *,
+    feedthrough: bool = False,
+    offset: bool = True,
+    max_iterations: int = 60,
+) -> PredictionErrorEstimate:
+    """Polish a start by minimising the determinant of the one-step prediction errors' covariance.
+
+    Parameters
+    ----------
+    start : InnovationModel
+        Consistent start; its order and dead time are kept. Its predictor must be stable, the plant need not be.
+    u, y : (N, n_u), (N, n_y) arrays
+        Command as applied and measurement, equidistant.
+    feedthrough : bool
+        Estimate D; otherwise D is zero (y is measured before its row's u acts).
+    offset : bool
+        Estimate a constant, so that means and an integrator's bias need not be known.
+    max_iterations : int
+        Accepted steps after which the search ends unconverged.
+
+    Returns
+    -------
+    PredictionErrorEstimate
+
+    Raises
+    ------
+    IdentificationError
+        Fewer rows than parameters, or a start whose predictor is not stable.
+
+    Notes
+    -----
+    The minimum found is the one in whose valley the start lies. Efficient for Gaussian innovations.
+    """
+    delay = start.input_delay
+    u_past, y_now = np.ascontiguousarray(u[: len(u) - delay]), np.ascontiguousarray(y[delay:])
+    start = balanced_predictor(start)
+    predictor = _initial_predictor(start, u_past, y_now, feedthrough=feedthrough, offset=offset)
+    search = _search(predictor, u_past, y_now, feedthrough=feedthrough, offset=offset, max_iterations=max_iterations)
+    return _estimate(start, search, y_now)
+
+
+def _initial_predictor(
+    start: InnovationModel, u: FloatArray, y: FloatArray, *, feedthrough: bool, offset: bool
+) -> Predictor:
+    n, n_y = start.order, y.shape[1]
+    D = start.D if feedthrough else np.zeros_like(start.D)
+    F = np.hstack([start.A, start.B, start.K, np.zeros((n, 1))])
+    predictor = Predictor(F=F, H=np.hstack([start.C, D, np.zeros((n_y, 1))]), x0=np.zeros(n))
+    # the errors are linear in the initial state and, with A, C and K kept, in the constant: solve for these first
+    rows = min(len(y), 2000)
+    base = innovations(predictor.F, predictor.H, predictor.x0, u[:rows], y[:rows])
+    zero_u, zero_y = np.zeros((rows, u.shape[1])), np.zeros((rows, n_y))
+    columns = []
+    for i in range(n):
+        columns.append(innovations(F, predictor.H, np.eye(n)[i], zero_u, zero_y).ravel())
+    for o in range(n_y if offset else 0):
+        # a constant y_0 = -e_o acts as a constant measurement e_o does
+        columns.append(innovations(F, predictor.H, np.zeros(n), zero_u, zero_y + np.eye(n_y)[o]).ravel())
+    solution = np.linalg.lstsq(np.stack(columns, axis=1), -base.ravel(), rcond=1e-10)[0]
+    H = predictor.H.copy()
+    H[:, -1] = -solution[n:] if offset else 0.0
+    return replace(predictor, H=H, x0=solution[:n])
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Search:
+    predictor: Predictor
+    directions: FloatArray
+    information: FloatArray
+    scatter: FloatArray
+    iterations: int
+    converged: bool
+
+
+def _search(
+    predictor: Predictor, u: FloatArray, y: FloatArray, *, feedthrough: bool, offset: bool, max_iterations: int
+) -> _Search:
+    damping, iterations, converged = 0.0, 0, False
+    errors = scatter(predictor.F, predictor.H, predictor.x0, u, y)
+    floor = len(y) * (_NOISE_FREE * np.std(y, axis=0)) ** 2
+    while True:
+        directions = behaviour_directions(predictor, feedthrough=feedthrough, offset=offset)
+        if len(y) * y.shape[1] <= directions.shape[1]:
+            raise IdentificationError(
+                f"the record is too short: {len(y)} rows for {directions.shape[1]} parameters",
+                mend="record longer, or ask for a lower order",
+            )
+        total = _normal_equations(predictor, directions, u, y, errors)
+        information, gradient = total[:-1, :-1], total[:-1, -1]
+        converged = bool(np.all(np.diag(errors) <= floor))
+        if converged or iterations == max_iterations:
+            break
+        accepted = False
+        while not accepted:
+            step, promise = _step(information, gradient, damping)
+            if promise < _TOLERANCE:
+                converged = True
+                break
+            trial = predictor.moved(step, directions)
+            trial_errors = _stable_scatter(trial, u, y)
+            accepted = _log_det(trial_errors) < _log_det(errors)
+            damping = damping / 10.0 if accepted else max(10.0 * damping, 1e-4)
+            if damping > 1e8:
+                break
+        if not accepted:
+            break
+        predictor, errors, iterations = trial, trial_errors, iterations + 1
+    return _Search(
+        predictor=predictor,
+        directions=directions,
+        information=information,
+        scatter=errors,
+        iterations=iterations,
+        converged=converged,
+    )
+
+
+def _normal_equations(
+    predictor: Predictor, directions: FloatArray, u: FloatArray, y: FloatArray, errors: FloatArray
+) -> FloatArray:
+    P = directions.shape[1]
+    at = np.cumsum([predictor.F.size, predictor.H.size])
+    dF, dH, dx0 = np.split(directions, at)
+    covariance = errors / len(y) + np.finfo(np.float64).tiny * np.eye(len(errors))
+    whitening = np.linalg.inv(np.linalg.cholesky(covariance))
+    total: FloatArray = normal_equations(
+        predictor.F,
+        predictor.H,
+        predictor.x0,
+        u,
+        y,
+        np.ascontiguousarray(dF).reshape(*predictor.F.shape, P),
+        np.ascontiguousarray(dH).reshape(*predictor.H.shape, P),
+        np.ascontiguousarray(dx0),
+        whitening,
+    )
+    return total
+
+
+def _step(information: FloatArray, gradient: FloatArray, damping: float) -> tuple[FloatArray, float]:
+    """Return the damped Gauss-Newton step and the decrease of -2 log likelihood that it promises."""
+    scale = np.sqrt(np.maximum(np.diag(information), 1e-12 * np.max(np.diag(information))))
+    values, vectors = np.linalg.eigh(information / np.outer(scale, scale))
+    turned = vectors.T @ (gradient / scale)
+    kept = values > 1e-13 * values[-1]
+    turned = np.where(kept, turned, 0.0)
+    step = -(vectors @ (turned / (np.where(kept, values, 1.0) + damping))) / scale
+    return step, float(np.sum(turned**2 / np.where(kept, values, 1.0)))
+
+
+def _stable_scatter(trial: Predictor, u: FloatArray, y: FloatArray) -> FloatArray:
+    n, n_u, n_y = trial.sizes
+    A, K, C = trial.F[:, :n], trial.F[:, n + n_u : n + n_u + n_y], trial.H[:, :n]
+    if not np.all(np.isfinite(trial.F)) or spectral_radius(A - K @ C) > _RADIUS_LIMIT:
+        return np.full((n_y, n_y), np.inf)
+    result: FloatArray = scatter(trial.F, trial.H, trial.x0, u, y)
+    return result
+
+
+def _log_det(errors: FloatArray) -> float:
+    if not np.all(np.isfinite(errors)):
+        return float("inf")
+    return float(np.linalg.slogdet(errors)[1])
+
+
+def _estimate(start: InnovationModel, search: _Search, y: FloatArray) -> PredictionErrorEstimate:
+    predictor, rows = search.predictor, len(y)
+    n, n_u, n_y = predictor.sizes
+    P = search.directions.shape[1]
+    dF, dH, _ = np.split(search.directions, np.cumsum([predictor.F.size, predictor.H.size]))
+    dF, dH = dF.reshape(*predictor.F.shape, P), dH.reshape(*predictor.H.shape, P)
+    freedom = rows - P / n_y
+    scale = np.sqrt(np.maximum(np.diag(search.information), np.finfo(np.float64).tiny))
+    values, vectors = np.linalg.eigh(search.information / np.outer(scale, scale))
+    kept = values > 1e-14 * values[-1]
+    inverse = (vectors[:, kept] / values[kept]) @ vectors[:, kept].T / np.outer(scale, scale)
+    model = replace(
+        start,
+        A=predictor.F[:, :n],
+        B=predictor.F[:, n : n + n_u],
+        K=predictor.F[:, n + n_u : n + n_u + n_y],
+        C=predictor.H[:, :n],
+        D=predictor.H[:, n : n + n_u],
+        innovation_covariance=search.scatter / freedom,
+    )
+    return PredictionErrorEstimate(
+        model=model,
+        d_a=dF[:, :n],
+        d_b=dF[:, n : n + n_u],
+        d_k=dF[:, n + n_u : n + n_u + n_y],
+        d_c=dH[:, :n],
+        d_d=dH[:, n : n + n_u],
+        covariance=inverse * rows / freedom,
+        offset_x=predictor.F[:, -1],
+        offset_y=predictor.H[:, -1],
+        initial_state=predictor.x0,
+        rows=rows,
+        parameters=P,
+        log_det=_log_det(search.scatter / rows),
+        iterations=search.iterations,
+        converged=search.converged,
+        condition=float(values[-1] / max(values[0], np.finfo(np.float64).tiny)),
+    )

@@ -1,0 +1,269 @@
+"""State space in innovation form, discrete time: the model that subspace and prediction-error methods return.
+
+x(t+1) = A x(t) + B u(t - d) + K e(t),  y(t) = C x(t) + D u(t - d) + e(t), equation (2) of Pouliquen et al. 2011 with a
+whole number d of samples of dead time besides.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg import solve_discrete_lyapunov
+
+from autotune.arrays import ComplexArray, FloatArray
+from autotune.errors import IdentificationError, InputError
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class InnovationModel:
+    """Linear model with its noise spectrum.
+
+    Attributes
+    ----------
+    A, B, C, D, K : arrays of shape (n, n), (n, n_u), (n_y, n), (n_y, n_u), (n, n_y)
+        State matrices; K is the Kalman gain.
+    innovation_covariance : (n_y, n_y) array
+        Covariance of e, output units squared.
+    sample_time_s : float
+        Sample time [s].
+    input_delay : int
+        Dead time d in whole samples, on top of what A, B, C and D say.
+    """
+
+    A: FloatArray
+    B: FloatArray
+    C: FloatArray
+    D: FloatArray
+    K: FloatArray
+    innovation_covariance: FloatArray
+    sample_time_s: float = 1.0
+    input_delay: int = 0
+
+    def __post_init__(self) -> None:
+        n, n_u, n_y = self.order, self.B.shape[1], self.C.shape[0]
+        shapes = {"A": (n, n), "B": (n, n_u), "C": (n_y, n), "D": (n_y, n_u), "K": (n, n_y)}
+        for name, shape in shapes.items():
+            if getattr(self, name).shape != shape:
+                raise InputError(f"{name} has shape {getattr(self, name).shape}, not {shape}", where="state space")
+
+    @property
+    def order(self) -> int:
+        """Number of states, dead time not counted."""
+        return int(self.A.shape[0])
+
+    @property
+    def poles(self) -> ComplexArray:
+        """Eigenvalues of A in the z plane, slowest first; dead time not counted."""
+        values = np.asarray(np.linalg.eigvals(self.A), dtype=np.complex128)
+        return values[np.lexsort((-values.imag, np.abs(values - 1.0)))]
+
+    @property
+    def predictor_radius(self) -> float:
+        """Spectral radius of A - K C: below one, the one-step predictor forgets its initial state."""
+        return spectral_radius(self.A - self.K @ self.C)
+
+    def response(self, omega_rad_s: FloatArray) -> ComplexArray:
+        """Return G(exp(j omega Ts)).
+
+        Parameters
+        ----------
+        omega_rad_s : (W,) array
+            Angular frequencies [rad/s]; sensible up to the Nyquist frequency pi / Ts.
+
+        Returns
+        -------
+        (W, n_y, n_u) array
+            Complex gains, output unit per input unit, dead time included, hold not counted.
+        """
+        z = np.exp(1j * np.asarray(omega_rad_s, dtype=np.float64) * self.sample_time_s)
+        inner = self.C @ _resolvent(self.A, z) @ self.B + self.D
+        return np.asarray(inner * (z ** -float(self.input_delay))[:, None, None], dtype=np.complex128)
+
+    def noise_response(self, omega_rad_s: FloatArray) -> ComplexArray:
+        """Return H(exp(j omega Ts)), shape (W, n_y, n_y): the noise model, one at high frequency."""
+        z = np.exp(1j * np.asarray(omega_rad_s, dtype=np.float64) * self.sample_time_s)
+        return np.asarray(self.C @ _resolvent(self.A, z) @ self.K + np.eye(self.C.shape[0]), dtype=np.complex128)
+
+    def polynomials(self) -> tuple[FloatArray, FloatArray]:
+        """Return numerator and denominator in ascending powers of the delay operator, denominator first term 1.
+
+        Raises
+        ------
+        InputError
+            The model has several inputs or outputs.
+        """
+        if self.B.shape[1] != 1 or self.C.shape[0] != 1:
+            raise InputError("polynomials are written for one input and one output", where="state space")
+        den = np.real(np.poly(self.A)) if self.order else np.ones(1)
+        num = np.convolve(den, self.markov_parameters(self.order + 1)[:, 0, 0])[: self.order + 1]
+        return np.concatenate([np.zeros(self.input_delay), num]), den
+
+    def markov_parameters(self, count: int) -> FloatArray:
+        """Return the first ``count`` terms D, CB, CAB, ... of the impulse response, shape (count, n_y, n_u)."""
+        terms, x = [self.D], self.B
+        for _ in range(count - 1):
+            terms.append(self.C @ x)
+            x = self.A @ x
+        return np.stack(terms[:count])
+
+    def transformed(self, T: FloatArray) -> InnovationModel:
+        """Return the same model in the state coordinates T x; T is (n, n) and regular."""
+        inverse = np.linalg.inv(T)
+        return replace(self, A=T @ self.A @ inverse, B=T @ self.B, C=self.C @ inverse, K=T @ self.K)
+
+    def with_delay_as_states(self) -> InnovationModel:
+        """Return the same model with d = 0: the dead time is a chain of states."""
+        model, n_u = self, self.B.shape[1]
+        for _ in range(self.input_delay):
+            n = model.order
+            A = np.block([[model.A, model.B], [np.zeros((n_u, n + n_u))]])
+            B = np.vstack([np.zeros((n, n_u)), np.eye(n_u)])
+            C = np.hstack([model.C, model.D])
+            K = np.vstack([model.K, np.zeros((n_u, C.shape[0]))])
+            model = replace(model, A=A, B=B, C=C, D=np.zeros_like(model.D), K=K, input_delay=0)
+        return model
+
+
+def spectral_radius(A: FloatArray) -> float:
+    """Return the largest magnitude of the eigenvalues of A, 0 for an empty matrix."""
+    return float(np.max(np.abs(np.linalg.eigvals(A)), initial=0.0))
+
+
+def _resolvent(A: FloatArray, z: ComplexArray) -> ComplexArray:
+    eye = np.eye(A.shape[0])
+    return np.asarray(np.linalg.inv(z[:, None, None] * eye - A), dtype=np.complex128)
+
+
+def from_polynomials(
+    num: Sequence[float],
+    den: Sequence[float],
+    noise_num: Sequence[float] = (1.0,),
+    *,
+    variance: float = 0.0,
+    sample_time_s: float = 1.0,
+) -> InnovationModel:
+    """Return the observer canonical form of den(q) y = num(q) u + noise_num(q) e.
+
+    Parameters
+    ----------
+    num, den, noise_num : sequence of float
+        Ascending powers of the delay operator; ``den`` and ``noise_num`` begin with 1.
+    variance : float
+        Variance of e, output unit squared.
+    sample_time_s : float
+        Sample time [s].
+    """
+    n = max(len(num), len(den), len(noise_num)) - 1
+    b, a, c = (np.pad(np.asarray(p, dtype=np.float64), (0, n + 1 - len(p))) for p in (num, den, noise_num))
+    A = np.eye(n, k=1)
+    A[:, :1] -= a[1:, None]
+    return InnovationModel(
+        A=A,
+        B=(b[1:] - a[1:] * b[0])[:, None],
+        C=np.eye(1, n),
+        D=b[:1, None],
+        K=(c[1:] - a[1:])[:, None],
+        innovation_covariance=np.array([[variance]]),
+        sample_time_s=sample_time_s,
+    )
+
+
+def feedback(plant: InnovationModel, controller: InnovationModel) -> InnovationModel:
+    """Return the loop u = r - C y of equation (3), from r to y, with states (x, x_c).
+
+    Parameters
+    ----------
+    plant, controller : InnovationModel
+        G with n_u inputs and n_y outputs, C with n_y inputs and n_u outputs, same sample time.
+
+    Returns
+    -------
+    InnovationModel
+        G (1 + C G)^-1 with its noise; A holds the closed-loop poles.
+
+    Raises
+    ------
+    IdentificationError
+        The loop is not well posed: I + D D_c is singular.
+    """
+    plant, controller = plant.with_delay_as_states(), controller.with_delay_as_states()
+    B, C, D, Dc = plant.B, plant.C, plant.D, controller.D
+    loop = np.eye(D.shape[0]) + D @ Dc
+    if np.linalg.cond(loop) > 1e12:
+        raise IdentificationError("the loop is not well posed", where="feedback", mend="let D or D_c be zero")
+    M = np.linalg.inv(loop)
+    # y = M (C x + D C_c x_c + D r + e), with x_c driven by -y as in (3): C_c x_c of the plain C(q) has the other sign
+    Cy, Dr = np.asarray(M @ np.hstack([C, -D @ controller.C]), dtype=np.float64), M @ D
+    Cu, Du, De = np.hstack([np.zeros((B.shape[1], C.shape[1])), -controller.C]) - Dc @ Cy, np.eye(B.shape[1]), -Dc @ M
+    n, n_c = plant.order, controller.order
+    A = np.block([[plant.A, np.zeros((n, n_c))], [np.zeros((n_c, n + n_c))]])
+    A[:n] += B @ Cu
+    A[n:, n:] += controller.A
+    A[n:] += controller.B @ Cy
+    return InnovationModel(
+        A=A,
+        B=np.vstack([B @ (Du - Dc @ Dr), controller.B @ Dr]),
+        C=Cy,
+        D=Dr,
+        K=np.vstack([plant.K + B @ De, controller.B @ M]),
+        innovation_covariance=plant.innovation_covariance,
+        sample_time_s=plant.sample_time_s,
+    )
+
+
+def h2_norm(model: InnovationModel) -> float:
+    """Return the H2 norm of the deterministic part, sqrt(sum of squared Markov parameters).
+
+    Raises
+    ------
+    IdentificationError
+        A pole on or outside the unit circle: the norm is infinite.
+    """
+    radius = spectral_radius(model.A)
+    if radius >= 1.0:
+        raise IdentificationError(f"not stable (spectral radius {radius:.6g})", where="H2 norm")
+    gramian = solve_discrete_lyapunov(model.A, model.B @ model.B.T)
+    return float(np.sqrt(np.trace(model.C @ gramian @ model.C.T) + np.sum(model.D**2)))
+
+
+def difference(first: InnovationModel, second: InnovationModel) -> InnovationModel:
+    """Return the model whose response is the first's minus the second's (deterministic part)."""
+    first, second = first.with_delay_as_states(), second.with_delay_as_states()
+    n, k = first.order, second.order
+    return replace(
+        first,
+        A=np.block([[first.A, np.zeros((n, k))], [np.zeros((k, n)), second.A]]),
+        B=np.vstack([first.B, second.B]),
+        C=np.hstack([first.C, -second.C]),
+        D=first.D - second.D,
+        K=np.vstack([first.K, second.K]),
+    )
+
+
+def balanced_predictor(model: InnovationModel) -> InnovationModel:
+    """Return the model in coordinates that balance its one-step predictor (A - K C, [B - K D, K], C).
+
+    The predictor is stable even where the plant is not, so the coordinates exist for unstable and integrating plants.
+
+    Raises
+    ------
+    IdentificationError
+        The predictor is not stable.
+    """
+    if model.predictor_radius >= 1.0:
+        raise IdentificationError("the predictor is not stable", where="balancing")
+    A, B = model.A - model.K @ model.C, np.hstack([model.B - model.K @ model.D, model.K])
+    reach = _gramian_factor(A, B)
+    observe = _gramian_factor(A.T, model.C.T)
+    U, s, _ = np.linalg.svd(observe.T @ reach)
+    if s[-1] <= 1e-13 * s[0]:  # not minimal: any coordinates are as good
+        return model
+    root = np.sqrt(s)
+    return model.transformed((U / root).T @ observe.T)
+
+
+def _gramian_factor(A: FloatArray, B: FloatArray) -> FloatArray:
+    values, vectors = np.linalg.eigh(solve_discrete_lyapunov(A, B @ B.T))
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)), dtype=np.float64)

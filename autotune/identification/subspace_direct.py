@@ -1,0 +1,255 @@
+"""Direct closed-loop subspace methods: the feedback is met by a long autoregression, not by a controller model.
+
+Both estimate the state as a linear function of past data that predicts the future outputs, then A, B, C, D and K by
+two regressions. They are consistent with feedback as long as one sample of delay lies in the loop and the past window
+is long enough for (A - K C)^p to be forgotten; a window too short biases them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg import solve_discrete_are
+
+from autotune.arrays import FloatArray
+from autotune.errors import IdentificationError
+from autotune.identification.lagged import lagged_factor, least_squares, triangle
+from autotune.identification.state_space import InnovationModel
+
+#: Below this share of the largest a singular value is rounding.
+_RANK = 1e-11
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LaggedData:
+    """Triangular factor of [z(t-1) ... z(t-p), u(t), y(t)] with z = (u, y), which is all a direct method needs.
+
+    Attributes
+    ----------
+    R : (columns, columns) array
+        Upper triangular.
+    rows : int
+        Rows of data behind it.
+    p, n_u, n_y : int
+        Past window and numbers of inputs and outputs.
+    """
+
+    R: FloatArray
+    rows: int
+    p: int
+    n_u: int
+    n_y: int
+
+    def past(self, count: int | None = None) -> slice:
+        """Return the columns of the first ``count`` lags (all when absent)."""
+        return slice(0, (self.p if count is None else count) * (self.n_u + self.n_y))
+
+    @property
+    def now(self) -> tuple[slice, slice]:
+        """Return the columns of u(t) and of y(t)."""
+        at = self.past().stop
+        return slice(at, at + self.n_u), slice(at + self.n_u, at + self.n_u + self.n_y)
+
+    def window(self, count: int) -> LaggedData:
+        """Return the data with a shorter past of ``count`` lags, from the same rows."""
+        keep = np.r_[0 : self.past(count).stop, self.now[0].start : self.R.shape[1]]
+        return replace(self, R=triangle(self.R[:, keep]), p=count)
+
+
+def lagged_data(u: FloatArray, y: FloatArray, p: int) -> LaggedData:
+    """Return the factor of the past p samples and the present one; one pass, time linear in the rows."""
+    z = np.hstack([u, y])
+    R, rows = lagged_factor([(z, range(-1, -p - 1, -1)), (u, [0]), (y, [0])])
+    return LaggedData(R=R, rows=rows, p=p, n_u=u.shape[1], n_y=y.shape[1])
+
+
+def autoregression(data: LaggedData, *, feedthrough: bool) -> tuple[FloatArray, FloatArray]:
+    """Return the long ARX model y(t) = sum Phi_k z(t-k) + D u(t) + e.
+
+    Returns
+    -------
+    phi : (p, n_y, n_u + n_y) array
+        Markov parameters Phi_k = C (A - K C)^(k-1) [B - K D, K] of the predictor.
+    D : (n_y, n_u) array
+        Feedthrough, zero where not asked for.
+    """
+    now_u, now_y = data.now
+    regressors = slice(0, now_u.stop if feedthrough else data.past().stop)
+    theta = least_squares(data.R[:, regressors], data.R[:, now_y])
+    width = data.past().stop
+    phi = theta[:width].T.reshape(data.n_y, data.p, data.n_u + data.n_y).transpose(1, 0, 2)
+    return phi, theta[width:].T if feedthrough else np.zeros((data.n_y, data.n_u))
+
+
+def choose_past_window(data: LaggedData) -> int:
+    """Return the number of lags of the long autoregression that Akaike's criterion prefers.
+
+    One triangular factor holds the residuals of every shorter window: the recent lags come first.
+    """
+    _, now_y = data.now
+    best, choice = np.inf, 1
+    for k in range(1, data.p + 1):
+        left = data.R[data.past(k).stop :, now_y]
+        sign, log_det = np.linalg.slogdet(left.T @ left / data.rows)
+        criterion = data.rows * log_det + 2.0 * k * (data.n_u + data.n_y) * data.n_y
+        if sign > 0 and criterion < best:
+            best, choice = criterion, k
+    return choice
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class StateSelection:
+    """States as functions of the past, before their number is chosen.
+
+    Attributes
+    ----------
+    weights : (f n_y, p (n_u + n_y)) array
+        Row i gives the i-th candidate state from the lags z(t-1) ... z(t-p), the strongest first.
+    singular_values : (f n_y,) array
+        How much of the future each one predicts.
+    """
+
+    weights: FloatArray
+    singular_values: FloatArray
+
+
+def pbsid_states(data: LaggedData, f: int, *, feedthrough: bool = False) -> StateSelection:
+    """Return the states of PBSIDopt (Chiuso 2007): the SVD of the predicted outputs Gamma K Z_p.
+
+    Parameters
+    ----------
+    data : LaggedData
+        Past window p.
+    f : int
+        Future window, at most p.
+    feedthrough : bool
+        Whether u(t) acts on y(t).
+    """
+    phi, _ = autoregression(data, feedthrough=feedthrough)
+    n_z = data.n_u + data.n_y
+    gamma_k = np.zeros((f * data.n_y, data.p * n_z))
+    for i in range(f):
+        for k in range(data.p - i):
+            gamma_k[i * data.n_y : (i + 1) * data.n_y, k * n_z : (k + 1) * n_z] = phi[k + i]
+    past = data.past()
+    U, s, _ = np.linalg.svd(gamma_k @ data.R[past, past].T, full_matrices=False)
+    scale = np.sqrt(np.maximum(s, _RANK * max(s[0], np.finfo(np.float64).tiny)))
+    return StateSelection(weights=(U / scale).T @ gamma_k, singular_values=s / np.sqrt(data.rows))
+
+
+def regress_system(
+    data: LaggedData, states: StateSelection, order: int, *, feedthrough: bool = False
+) -> InnovationModel:
+    """Return A, B, C, D and K from two regressions on the states: the outputs, then the next states.
+
+    Raises
+    ------
+    IdentificationError
+        Fewer candidate states than ``order``.
+    """
+    if order > len(states.weights):
+        raise IdentificationError(f"order {order} needs a longer future window than {len(states.weights)}")
+    T = states.weights[:order]
+    now_u, now_y = data.now
+    n_z, R = data.n_u + data.n_y, data.R
+    past = data.past()
+    shifted = np.r_[now_u.start : now_y.stop, 0 : past.stop - n_z]  # z(t), z(t-1), ... z(t-p+1)
+    X, X_next, U, Y = R[:, past] @ T.T, R[:, shifted] @ T.T, R[:, now_u], R[:, now_y]
+    first = np.hstack([X, U]) if feedthrough else X
+    CD = least_squares(first, Y).T
+    E = Y - first @ CD.T
+    ABK = least_squares(np.hstack([X, U, E]), X_next).T
+    model = InnovationModel(
+        A=ABK[:, :order],
+        B=ABK[:, order : order + data.n_u],
+        C=CD[:, :order],
+        D=CD[:, order:] if feedthrough else np.zeros((data.n_y, data.n_u)),
+        K=ABK[:, order + data.n_u :],
+        innovation_covariance=E.T @ E / data.rows,
+    )
+    return with_stable_predictor(model)
+
+
+def with_stable_predictor(model: InnovationModel) -> InnovationModel:
+    """Return the model with a Kalman gain whose predictor is stable: the same noise spectrum, spectral factor mended.
+
+    Where no such gain is found (a pole on the unit circle that the noise does not reach) a little noise on every
+    state is supposed.
+    """
+    if model.predictor_radius < 0.9995:
+        return model
+    sigma = model.innovation_covariance + 1e-12 * np.eye(len(model.C)) * np.trace(model.innovation_covariance)
+    K, n = model.K, model.order
+    size = np.trace(K @ sigma @ K.T) / max(n, 1) + np.finfo(np.float64).tiny
+    for extra in (1e-6, 1e-3, 1.0, 1e3):
+        Q = K @ sigma @ K.T + extra * size * np.eye(n)
+        try:
+            P = solve_discrete_are(model.A.T, model.C.T, Q, sigma, s=K @ sigma)
+        except (np.linalg.LinAlgError, ValueError):
+            continue
+        gain = (model.A @ P @ model.C.T + K @ sigma) @ np.linalg.inv(model.C @ P @ model.C.T + sigma)
+        mended = replace(model, K=np.asarray(gain, dtype=np.float64))
+        if mended.predictor_radius < 0.9995:
+            return mended
+    raise IdentificationError("the start has no stable predictor", mend="ask for another --order")
+
+
+def pbsid_opt(
+    u: FloatArray, y: FloatArray, order: int, *, p: int, f: int, feedthrough: bool = False
+) -> InnovationModel:
+    """Identify by PBSIDopt (Chiuso 2007).
+
+    Parameters
+    ----------
+    u, y : (N, n_u), (N, n_y) arrays
+        Input and output, mean removed.
+    order : int
+        Number of states.
+    p, f : int
+        Past and future window, f <= p.
+    feedthrough : bool
+        Estimate D.
+
+    Notes
+    -----
+    Consistent with feedback for p growing with the record; a bias of the order of (A - K C)^p remains. Not efficient:
+    polish it with :func:`autotune.identification.prediction_error.prediction_error`.
+    """
+    data = lagged_data(u, y, p)
+    return regress_system(data, pbsid_states(data, f, feedthrough=feedthrough), order, feedthrough=feedthrough)
+
+
+def ssarx(u: FloatArray, y: FloatArray, order: int, *, p: int, f: int) -> InnovationModel:
+    """Identify by SSARX (Jansson 2003, 2005): future outputs freed of future inputs by a long ARX model, then CCA.
+
+    Parameters
+    ----------
+    u, y : (N, n_u), (N, n_y) arrays
+        Input and output, mean removed.
+    order : int
+        Number of states.
+    p, f : int
+        Past and future window.
+
+    Notes
+    -----
+    Asymptotically equivalent to PBSIDopt (Chiuso 2006); no feedthrough.
+    """
+    data = lagged_data(u, y, p)
+    phi, _ = autoregression(data, feedthrough=False)
+    n_u, n_y, n_z = data.n_u, data.n_y, data.n_u + data.n_y
+    z = np.hstack([u, y])
+    R, _ = lagged_factor([(z, range(-1, -p - 1, -1)), (z, range(f))])
+    width = p * n_z
+    past, future = R[:, :width], R[:, width:].reshape(len(R), f, n_z)
+    freed = future[:, :, n_u:].copy()
+    for i in range(f):
+        for k in range(i):  # z(t + k) acts on y(t + i) through Phi_(i-k)
+            freed[:, i] -= future[:, k] @ phi[i - k - 1].T if i - k <= p else 0.0
+    freed = freed.reshape(len(R), f * n_y)
+    Y_half, Z_half = np.linalg.qr(freed)[1], R[:width, :width]
+    cross = np.linalg.solve(Y_half.T, freed.T @ past) @ np.linalg.pinv(Z_half, rcond=_RANK)
+    _, s, Vt = np.linalg.svd(cross, full_matrices=False)
+    weights = least_squares(Z_half, Vt.T).T * np.sqrt(data.rows)
+    return regress_system(data, StateSelection(weights=weights, singular_values=s), order)
