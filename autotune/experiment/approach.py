@@ -23,7 +23,7 @@ LOOK_BACK = 8
 #: smoothing of the relay while nothing is known of the plant
 FIRST_SMOOTHING = 5
 #: how far below the lower end of the hover's bracket the ramp starts, and above the upper it ends, in u_uncertainty
-BRACKET = 1.1
+BRACKET = 1.2
 #: least share of readings in preflight that differ from the one before, for a sensor of which that can be expected
 RESTLESS = 0.05
 SMALL = 1e-9
@@ -51,6 +51,8 @@ class Known:
         Measurement [y unit] and speed [y unit/s] when it was seen to move.
     points : tuple of FrequencyPoint
         What is known of the plant.
+    swept : bool
+        Whether the points are the sweep's, and not a short look.
     warnings : tuple of str
         What the reader should know.
     """
@@ -64,6 +66,7 @@ class Known:
     y_moved: float = math.nan
     speed: float = 0.0
     points: tuple[FrequencyPoint, ...] = ()
+    swept: bool = False
     warnings: tuple[str, ...] = ()
 
 
@@ -77,9 +80,10 @@ def preflight(loop: ControlLoop, config: Config, tell: Tell) -> Known:
     """
     tell("looking at link and noise")
     start_u = config.operating_point.u_guess if config.operating_point.approach == "hold" else loop.tick.u
+    first = loop.tick.k
     for _ in range(PREFLIGHT_SAMPLES):
         loop.step(loop.nearest(start_u))
-    y = loop.history()[2][1:]
+    y = loop.history(first)[2][1:]
     y = y[np.isfinite(y)]
     _, late, _ = loop.timing.latency_s
     if late > 0.8 * loop.sample_time_s:
@@ -136,7 +140,7 @@ def _ramp(loop: ControlLoop, config: Config, known: Known, tell: Tell) -> Known:
     tell(f"ramping the command from {low:.3g} to {high:.3g} until the plant moves")
     u, start_s = low, math.nan
     while True:
-        tick = loop.step(loop.nearest(u))
+        tick = loop.step(loop.nearest(min(u, high)))
         if abs(tick.u - low) < 2.0 * rate * loop.sample_time_s + loop.envelope.u_step and math.isnan(start_s):
             start_s = tick.t_s
         y = loop.history(max(0, tick.k - LOOK_BACK))[2]
@@ -145,7 +149,7 @@ def _ramp(loop: ControlLoop, config: Config, known: Known, tell: Tell) -> Known:
             break
         if not math.isnan(start_s):
             u = low + rate * (tick.t_s - start_s)
-        if u > high:
+        if u > high + 2.0 * rate:  # two seconds' worth of ramp to move by, at the end of the bracket
             raise ExperimentStopped(
                 f"the plant does not answer: y stays at {known.y_rest:.4g} up to the command {high:.4g}",
                 where="approach",

@@ -8,8 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from autotune.arrays import FloatArray
 from autotune.errors import IdentificationError
-from autotune.experiment.relay import RelaySettings, lag_samples
+from autotune.experiment.relay import RelaySettings
 from autotune.points import FrequencyPoint
 
 #: part of the half-range of phases that targets keep away from its ends: the reached phase is near its target only
@@ -99,11 +100,38 @@ class LocalModel:
 
     def crest(self, omega_rad_s: float) -> float:
         """Return the ratio of peak to fundamental amplitude of its response to a relay's square wave."""
+        wave, fundamental = self._relay_response(omega_rad_s, 1.0, np.linspace(0.0, 2.0 * np.pi, 128))
+        return float(np.max(wave) / fundamental)
+
+    def crossing_s(self, omega_rad_s: float, amplitude: float, hysteresis: float, smoothing_s: float) -> float:
+        """Return how long before a switch the smoothed y crossed the hysteresis [s]: the lag the relay must have.
+
+        Parameters
+        ----------
+        omega_rad_s : float
+            Frequency of the limit cycle [rad/s].
+        amplitude, hysteresis : float
+            The relay's [u unit, y unit].
+        smoothing_s : float
+            Length of the moving average, whose own delay is not counted here [s].
+        """
+        # u rises at phase 0; before that y has fallen through minus the hysteresis
+        phase = np.linspace(-1.25 * np.pi, 0.0, 1000)
+        wave, _ = self._relay_response(omega_rad_s, amplitude, phase, smoothing_s)
+        below = wave < -hysteresis
+        first = int(np.argmax(below[1:] & ~below[:-1]))
+        return float(-phase[first + 1] / omega_rad_s) if below.any() else 0.0
+
+    def _relay_response(
+        self, omega_rad_s: float, amplitude: float, phase_rad: FloatArray, smoothing_s: float = 0.0
+    ) -> tuple[FloatArray, float]:
+        """Return y over the phase and the amplitude of its fundamental, u a square wave that rises at phase 0."""
         orders = np.arange(1, 30, 2)
         s = 1j * orders * omega_rad_s
-        waves = 1.0 / (s * (1.0 + s * self.tau_s) * orders)
-        phase = np.exp(1j * np.multiply.outer(np.linspace(0.0, 2.0 * np.pi, 128), orders))
-        return float(np.max(np.imag(phase @ waves)) / abs(waves[0]))
+        average = np.sinc(orders * omega_rad_s * smoothing_s / (2.0 * np.pi))
+        waves = 4.0 * amplitude / np.pi * self.k * average / (s * (1.0 + s * self.tau_s) * orders)
+        wave = np.imag(np.exp(1j * np.multiply.outer(phase_rad, orders)) @ waves)
+        return np.asarray(wave, dtype=np.float64), float(abs(waves[0]))
 
 
 def phase_targets(first_deg: float, last_deg: float, count: int) -> tuple[float, ...]:
@@ -187,19 +215,23 @@ def choose(
     if goal.u_step > 0.0:
         amplitude = max(1.0, math.floor(amplitude / goal.u_step + 0.25)) * goal.u_step
     y_amplitude = model.gain(omega) * 4.0 / math.pi * amplitude
-    wanted = (math.pi + phase_rad) / (2.0 * math.pi) * period
-    smoothing = max(1, min(int(SMOOTHING_SHARE * period), int(wanted)))
+    lag_s = (math.pi + phase_rad) / omega
+    smoothing = max(1, min(int(SMOOTHING_SHARE * period), int(lag_s / goal.sample_time_s)))
+    hysteresis = min(HYSTERESIS_SD * goal.noise_sd / math.sqrt(smoothing), 0.5 * y_amplitude)
+    lag_s = model.crossing_s(omega, amplitude, hysteresis, smoothing * goal.sample_time_s)
+    # a crossing is seen half a sample late on average, and an average of M readings is (M - 1)/2 samples old
+    delay = max(0.0, lag_s / goal.sample_time_s - 0.5 * (smoothing - 1) - 0.5)
     relay = RelaySettings(
         y_centre=y_centre,
         midpoint=midpoint,
         amplitude=amplitude,
-        hysteresis=min(HYSTERESIS_SD * goal.noise_sd / math.sqrt(smoothing), 0.5 * y_amplitude),
+        hysteresis=hysteresis,
+        delay_samples=delay,
         smoothing=smoothing,
         plant_sign=1 if plant_sign > 0 else -1,
     )
-    delay = max(0.0, wanted - lag_samples(relay, period, y_amplitude))
     return Choice(
-        settings=RelaySettings(**(vars(relay) | {"delay_samples": delay})),
+        settings=relay,
         phase_rad=phase_rad,
         omega_rad_s=omega,
         y_amplitude=y_amplitude,

@@ -7,7 +7,6 @@ delay; none of it enters an estimate, which is made from the recorded command an
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -129,31 +128,3 @@ def _mean_level(
         mean += level * (arrival - since)
         since, level, pending = arrival, pending[0][1], pending[1:]
     return mean + level * (k + 1 - since), level, pending
-
-
-def lag_samples(settings: RelaySettings, period_samples: float, y_amplitude: float) -> float:
-    """Return the whole lag of the relay in samples: what (20) calls T.
-
-    Parameters
-    ----------
-    settings : RelaySettings
-        The relay.
-    period_samples : float
-        Period of the limit cycle in samples.
-    y_amplitude : float
-        Amplitude of the fundamental of y [y unit].
-
-    Notes
-    -----
-    Smoothing (M - 1)/2, half a sample until a crossing is seen, asin(hysteresis/amplitude)/omega, the inserted delay.
-    Used to choose settings, never in an estimate.
-    """
-    attenuated = y_amplitude * abs(_average_gain(settings.smoothing, period_samples))
-    hysteresis = math.asin(min(1.0, settings.hysteresis / attenuated)) / (2.0 * math.pi) * period_samples
-    return 0.5 * (settings.smoothing - 1) + 0.5 + hysteresis + settings.delay_samples
-
-
-def _average_gain(samples: int, period_samples: float) -> float:
-    """Return the gain of a moving average at the period."""
-    angle = math.pi / period_samples
-    return math.sin(samples * angle) / (samples * math.sin(angle))

@@ -19,7 +19,9 @@ from autotune.identification.describing import describing_function
 from autotune.identification.frequency import LimitCycle, limit_cycle_points
 
 #: part of limits.swing that a limit cycle is planned for: the rest is for a mid-point that is not quite right
-PEAK_SHARE = 0.88
+PEAK_SHARE = 0.91
+#: the same for the first point, whose gain is foreseen from a short look at the plant
+FIRST_PEAK_SHARE = 0.84
 LEAST_PERIODS = 2
 FIRST_EDGE = 0
 #: asymmetry of the duty (part of the period, less one half) from which on the mid-point is corrected within a point
@@ -79,7 +81,8 @@ def sweep(loop: ControlLoop, config: Config, known: Known, oscillation: Oscillat
             known,
             midpoint=cycle.u_mean,
             noise_sd=cycle.noise_sd,
-            points=(*(known.points if i else ()), segment.point),
+            points=(*(known.points if known.swept else ()), segment.point),
+            swept=True,
             warnings=warnings,
         )
     return Swept(segments=tuple(segments), known=known)
@@ -88,7 +91,7 @@ def sweep(loop: ControlLoop, config: Config, known: Known, oscillation: Oscillat
 def _goal(config: Config, known: Known) -> Goal:
     limits = config.limits
     return Goal(
-        peak=PEAK_SHARE * limits.swing,
+        peak=(PEAK_SHARE if known.swept else FIRST_PEAK_SHARE) * limits.swing,
         noise_sd=known.noise_sd,
         sample_time_s=config.signals.sample_time_s,
         u_step=config.signals.u_step,
