@@ -13,6 +13,7 @@ from sim.conceal.physics import Floats, Physics
 from sim.conceal.rigs import Believed, believed, truth
 
 KINDS = {"exact": 0.06, "coloured": 0.04, "parameters": 0.1, "single": 0.54, "double": 0.14, "outside": 0.12}
+RIGS = {BALL: 0.4, SERVO: 0.3, PROCESS: 0.3}
 STRENGTHS = ("weak", "medium", "strong")
 DRY = {"plant.coulomb_friction", "plant.stribeck_friction", "plant.hysteresis"}
 
@@ -44,13 +45,13 @@ class Draw:
 def draw(seed: int, attempt: int) -> Draw:
     """Draw kind, strength, rig, effects and excitations of one case."""
     rng = np.random.default_rng([seed, attempt, 0])
-    kind_rng = np.random.default_rng([seed, 0, 99])  # the kind stays when a draw is rejected
-    kind = str(kind_rng.choice(list(KINDS), p=list(KINDS.values())))
-    strength = str(kind_rng.choice(STRENGTHS)) if kind in ("single", "outside") else None
+    fixed = np.random.default_rng([seed, 99])  # kind, strength and rig stay when a draw is rejected
+    kind = str(fixed.choice(list(KINDS), p=list(KINDS.values())))
+    strength = str(fixed.choice(STRENGTHS)) if kind in ("single", "outside") else None
     if kind == "outside" and strength == "weak":
         strength = "medium"
-    effects = _draw_effects(rng, kind)
-    rig_name = str(rng.choice(sorted(set.intersection(*(set(e.rigs) for e in effects)) if effects else EXCITATIONS)))
+    rig_name = str(fixed.choice(list(RIGS), p=list(RIGS.values())))
+    effects = _draw_effects(rng, kind, rig_name)
     variant = {BALL: "", SERVO: str(rng.choice(["rad", "mm"])), PROCESS: str(rng.choice(["level", "thermal"]))}[
         rig_name
     ]
@@ -70,7 +71,7 @@ def draw(seed: int, attempt: int) -> Draw:
         rng.shuffle(names)
     t = np.asarray((np.arange(rig.rows + rig.burn_in) - rig.burn_in) * rig.Ts, dtype=np.float64)
     excitations = tuple(_excitation(rng, rig, name, t) for name in names[:3])
-    rho = 0.5 if kind == "coloured" or (kind != "exact" and rng.random() < 0.35) else 0.0
+    rho = float(rng.uniform(0.7, 0.9)) if kind == "coloured" else float(rng.choice([0.0, 0.5], p=[0.65, 0.35]))
     return Draw(
         seed=seed,
         attempt=attempt,
@@ -85,10 +86,11 @@ def draw(seed: int, attempt: int) -> Draw:
     )
 
 
-def _draw_effects(rng: np.random.Generator, kind: str) -> tuple[Effect, ...]:
-    inside = [e for e in EFFECTS if not e.outside]
+def _draw_effects(rng: np.random.Generator, kind: str, rig: str) -> tuple[Effect, ...]:
+    possible = [e for e in EFFECTS if rig in e.rigs]
+    inside = [e for e in possible if not e.outside]
     if kind == "outside":
-        return (_one(rng, [e for e in EFFECTS if e.outside]),)
+        return (_one(rng, [e for e in possible if e.outside]),)
     if kind == "single":
         return (_one(rng, inside),)
     if kind != "double":
@@ -99,7 +101,6 @@ def _draw_effects(rng: np.random.Generator, kind: str) -> tuple[Effect, ...]:
         e
         for e in simple
         if e is not first
-        and set(e.rigs) & set(first.rigs)
         and not set(e.accept) & set(first.accept)
         and (not e.variant or not first.variant or e.variant == first.variant)
         and not ({e.name, first.name} <= DRY)

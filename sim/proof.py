@@ -1,0 +1,142 @@
+"""A campaign of concealed cases: make, seal, let the tool diagnose as a user would, reveal, mark.
+
+The tool is a command line: it is run as a program of its own and sees model and recordings, never an answer.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import subprocess
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sim.conceal.cases import write
+from sim.score import Mark, mark
+
+Json = dict[str, Any]
+FIRST_PROOF_SEED = 100_000  # below: calibration
+
+
+@dataclass(frozen=True, kw_only=True)
+class Campaign:
+    """Where a campaign lies and what it runs.
+
+    ``tool`` is the command that diagnoses, ``extra`` further arguments of its ``diagnose``.
+    """
+
+    out: Path
+    seeds: range
+    tool: tuple[str, ...]
+    extra: tuple[str, ...] = ()
+    workers: int = 2
+
+    def case(self, seed: int) -> Path:
+        """Folder of a case: model and recordings."""
+        return self.out / "cases" / f"case_{seed:06d}"
+
+    def answer(self, seed: int) -> Path:
+        """Sealed answer of a case."""
+        return self.out / "sealed" / f"case_{seed:06d}.json"
+
+    def diagnosis(self, seed: int) -> Path:
+        """Folder of the tool's output."""
+        return self.out / "diagnoses" / f"case_{seed:06d}"
+
+
+def conceal(campaign: Campaign) -> Iterator[int]:
+    """Make the campaign's cases that do not exist yet; yields each seed when its case lies there."""
+    for seed in campaign.seeds:
+        if not campaign.answer(seed).exists():
+            write(seed, campaign.case(seed), campaign.answer(seed))
+        yield seed
+
+
+def seal(campaign: Campaign) -> str:
+    """SHA-256 of all answers in order of their seeds, as hexadecimal digits."""
+    digest = hashlib.sha256()
+    for seed in campaign.seeds:
+        digest.update(campaign.answer(seed).read_bytes())
+    return digest.hexdigest()
+
+
+def diagnose_all(campaign: Campaign, chosen: Sequence[int], done: Callable[[int], None]) -> None:
+    """Diagnose the chosen cases that are not diagnosed yet, several at a time; ``done`` is told each seed."""
+    with ThreadPoolExecutor(campaign.workers) as pool:
+        running = {pool.submit(_diagnose, campaign, seed): seed for seed in chosen}
+        for future in as_completed(running):
+            future.result()
+            done(running[future])
+
+
+def _diagnose(campaign: Campaign, seed: int) -> None:
+    out, case = campaign.diagnosis(seed), campaign.case(seed)
+    if (out / "finished").exists():
+        return
+    out.mkdir(parents=True, exist_ok=True)
+    records = [str(case / "rec1.csv"), str(case / "rec2.csv")]
+    words = ["diagnose", "--model", str(case / "model.toml"), *records, "--out", str(out), *campaign.extra]
+    said = _run(campaign, words)
+    if said.returncode == 0:
+        horizon = f"{json.loads(campaign.answer(seed).read_text(encoding='utf-8'))['horizon']:g}"
+        words = ["simulate", "--model", str(out / "extended_model.toml"), str(case / "unseen.csv")]
+        said = _run(campaign, [*words, "--horizon", horizon, "--out", str(out / "unseen_sim.csv")])
+    (out / "stderr.txt").write_text(said.stderr, encoding="utf-8")
+    (out / "finished").write_text(f"{said.returncode}\n", encoding="utf-8")
+
+
+def _run(campaign: Campaign, words: list[str]) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([*campaign.tool, *words], capture_output=True, text=True, check=False)
+
+
+def mark_all(campaign: Campaign, chosen: Sequence[int]) -> list[Mark]:
+    """Reveal the answers and mark the chosen cases; a tool that failed on a case is marked as having said nothing."""
+    return [_mark(campaign, seed) for seed in chosen]
+
+
+def _mark(campaign: Campaign, seed: int) -> Mark:
+    out = campaign.diagnosis(seed)
+    answer = json.loads(campaign.answer(seed).read_text(encoding="utf-8"))
+    name = out.name
+    said = out / "diagnosis.json"
+    if not said.exists():
+        nothing: Json = {"verdict": "failed", "effects": [], "places": []}
+        return mark(name, answer, nothing, math.inf if answer["improvable"] else None)
+    diagnosis = json.loads(said.read_text(encoding="utf-8"))
+    simulated = out / "unseen_sim.csv"
+    error = forecast_nrmse(campaign.case(seed) / "unseen.csv", simulated, answer) if simulated.exists() else math.inf
+    return mark(name, answer, diagnosis, error)
+
+
+def forecast_nrmse(recording: Path, simulated: Path, answer: Json) -> float:
+    """Forecast error over the standard deviation of y, on the rows two horizons after the first."""
+    rows = np.loadtxt(recording, delimiter=",", skiprows=1)
+    forecast = np.loadtxt(simulated, delimiter=",", skiprows=1)
+    late = rows[:, 0] >= rows[0, 0] + 2.0 * answer["horizon"]
+    y = rows[late, 2]
+    e = y - np.interp(rows[late, 0], forecast[:, 0], forecast[:, 1])
+    return float(np.sqrt(np.mean(e**2)) / np.std(y))
+
+
+def keep_failures(campaign: Campaign, marks: Sequence[Mark]) -> Path:
+    """Write what was concealed and what was said for every failure, one line each, worst kind first."""
+    lines = []
+    for m in sorted((m for m in marks if m.failed), key=lambda m: (m.kind, m.true_names, m.case)):
+        answer = campaign.out / "sealed" / f"{m.case}.json"
+        a = json.loads(answer.read_text(encoding="utf-8"))
+        said = ", ".join(f"{n} ({p:.2f})" for n, p in zip(m.named, m.probabilities, strict=True)) or "-"
+        gap = "" if m.gap is None else f" gap {m.gap:.2f}"
+        truth = " + ".join(m.true_names) or m.kind
+        lines.append(
+            f"{m.case} {m.rig:12s} {m.strength or m.kind:9s} ratio {a['retuned_train_ratio']:7.3f}  "
+            f"{truth}  ->  {m.verdict}: {said}{'' if m.place_right or not a['places'] else ' (wrong place)'}{gap}"
+        )
+    path = campaign.out / "failures.txt"
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return path

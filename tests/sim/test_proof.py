@@ -1,0 +1,63 @@
+"""A campaign end to end, with a small program in the tool's place that always says the same."""
+
+import json
+import sys
+
+import pytest
+
+from sim.proof import Campaign, conceal, diagnose_all, keep_failures, mark_all, seal
+
+ALWAYS_NONE = """
+import json, pathlib, sys
+words = sys.argv[1:]
+out = pathlib.Path(words[words.index("--out") + 1])
+if words[0] == "diagnose":
+    (out / "diagnosis.json").write_text(json.dumps({"verdict": "none", "effects": [], "places": []}))
+    (out / "extended_model.toml").write_text("")
+else:
+    rows = pathlib.Path(words[3]).read_text().splitlines()[1:]
+    out.write_text("t,y_sim\\n" + "\\n".join(",".join(row.split(",")[i] for i in (0, 2)) for row in rows))
+"""
+
+
+@pytest.fixture
+def campaign(tmp_path):
+    tool = tmp_path / "tool.py"
+    tool.write_text(ALWAYS_NONE)
+    return Campaign(out=tmp_path / "proof", seeds=range(1003, 1006), tool=(sys.executable, str(tool)), workers=1)
+
+
+def test_a_campaign_is_sealed_diagnosed_and_marked_and_goes_on_where_it_was_stopped(campaign):
+    assert list(conceal(campaign)) == [1003, 1004, 1005]
+    before = seal(campaign)
+    done = []
+    diagnose_all(campaign, [1003], done.append)
+    diagnose_all(campaign, list(campaign.seeds), done.append)
+    assert sorted(done) == [1003, 1003, 1004, 1005]
+    assert seal(campaign) == before
+    marks = mark_all(campaign, list(campaign.seeds))
+    for m in marks:
+        answer = json.loads((campaign.out / "sealed" / f"{m.case}.json").read_text())
+        assert m.verdict_right == (answer["verdict"] == "none")
+        if answer["improvable"]:  # this program cheats: its forecast is the measurement itself
+            assert m.gap > 1.0
+    text = keep_failures(campaign, marks).read_text()
+    assert text.count("case_") == sum(m.failed for m in marks) > 0
+
+
+def test_the_seal_breaks_when_an_answer_changes(campaign):
+    list(conceal(campaign))
+    before = seal(campaign)
+    answer = campaign.answer(1004)
+    answer.write_text(answer.read_text().replace("rig", "rlg", 1))
+    assert seal(campaign) != before
+
+
+def test_a_tool_that_fails_on_a_case_has_said_nothing(campaign, tmp_path):
+    (tmp_path / "tool.py").write_text("import sys; sys.exit('no')")
+    list(conceal(campaign))
+    diagnose_all(campaign, [1003], lambda _seed: None)
+    (m,) = mark_all(campaign, [1003])
+    assert m.verdict == "failed"
+    assert m.failed
+    assert "no" in (campaign.diagnosis(1003) / "stderr.txt").read_text()
