@@ -28,6 +28,7 @@ def shared() -> Path:
 #: Debian package -> a program or file that shows it is there.
 SYSTEM_PACKAGES = {
     "chromium": "chromium",
+    "gcc": "gcc",
     "gcc-avr": "avr-gcc",
     "avr-libc": "/usr/lib/avr/include/avr/io.h",
     "libsimavr-dev": "/usr/include/simavr/sim_avr.h",

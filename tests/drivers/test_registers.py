@@ -1,0 +1,143 @@
+from __future__ import annotations
+
+import math
+import struct
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from autotune.cli.served import spec_of
+from autotune.config.registers import RegisterMap, RegisterSettings
+from autotune.errors import InputError
+from drivers.registers import MAX_WORDS, Codec, blocks
+from sim.registers import from_words, to_words
+
+ORDERS = st.sampled_from(["big", "little"])
+NUMERIC = st.sampled_from(["int16", "uint16", "int32", "uint32", "float32"])
+SCALES = st.sampled_from([1.0, 0.1, 1e-3, -0.5, 2.5, 10.0 / 4095.0])
+
+
+@st.composite
+def numeric_codecs(draw: st.DrawFn) -> Codec:
+    register = RegisterSettings(
+        address=draw(st.integers(0, 65534)),
+        type=draw(NUMERIC),
+        byte_order=draw(ORDERS),
+        word_order=draw(ORDERS),
+        scale=draw(SCALES),
+        offset=draw(st.sampled_from([0.0, -40.0, 5.0])),
+    )
+    return Codec(name="x", register=register)
+
+
+@pytest.mark.parametrize(
+    ("byte_order", "word_order", "words"),
+    [
+        ("big", "big", (0x40A0, 0x0000)),
+        ("big", "little", (0x0000, 0x40A0)),
+        ("little", "big", (0xA040, 0x0000)),
+        ("little", "little", (0x0000, 0xA040)),
+    ],
+)
+def test_the_four_orders_of_a_float(byte_order: str, word_order: str, words: tuple[int, int]) -> None:
+    register = RegisterSettings.model_validate(
+        {"address": 0, "type": "float32", "byte_order": byte_order, "word_order": word_order}
+    )
+    codec = Codec(name="x", register=register)
+    assert codec.encode(5.0) == words
+    assert codec.decode(words) == 5.0
+
+
+def test_the_example_of_the_modbus_specification() -> None:
+    # Modbus Application Protocol V1.1b3, 6.3: register 108 holds 022B hex = 555
+    codec = Codec(name="x", register=RegisterSettings(address=107, type="uint16"))
+    assert codec.decode([0x022B]) == 555.0
+
+
+@given(codec=numeric_codecs(), fraction=st.floats(0.0, 1.0))
+def test_what_is_written_reads_back_within_half_a_count(codec: Codec, fraction: float) -> None:
+    low, high = (-1e6, 1e6) if codec.register.type == "float32" else codec.span
+    value = low + fraction * (high - low)
+    back = codec.decode(codec.encode(value))
+    half_a_count = 0.5 * codec.resolution if codec.resolution else 1e-6 * (abs(value) + 50.0)
+    assert abs(back - value) <= half_a_count * (1.0 + 1e-6)
+
+
+@given(codec=numeric_codecs(), fraction=st.floats(0.0, 1.0))
+def test_two_codings_written_apart_agree(codec: Codec, fraction: float) -> None:
+    low, high = (-1e6, 1e6) if codec.register.type == "float32" else codec.span
+    value = low + fraction * (high - low)
+    words = codec.encode(value)
+    spec = spec_of(codec.register)
+    assert from_words(list(words), spec) == pytest.approx(codec.decode(words), rel=1e-12)
+    # ties of the rounding may differ by the last count
+    assert from_words(to_words(value, spec), spec) == pytest.approx(
+        codec.decode(words), abs=codec.resolution * 1.0001 + 1e-9, rel=1e-6
+    )
+
+
+@given(codec=numeric_codecs(), beyond=st.floats(0.51, 1e6))
+def test_a_value_that_does_not_fit_is_refused_and_never_clipped(codec: Codec, beyond: float) -> None:
+    low, high = codec.span
+    step = codec.resolution or 1e34  # beyond the largest float32
+    for value in (low - beyond * step, high + beyond * step):
+        with pytest.raises(InputError, match="does not fit"):
+            codec.encode(value)
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize("kind", ["int16", "uint32", "float32", "bit"])
+def test_what_is_no_number_is_never_written(kind: str, value: float) -> None:
+    table = "coil" if kind == "bit" else "holding"
+    codec = Codec(name="u", register=RegisterSettings.model_validate({"address": 0, "type": kind, "table": table}))
+    with pytest.raises(InputError, match="is not a value"):
+        codec.encode(value)
+
+
+def test_the_count_for_no_measurement_is_no_measurement() -> None:
+    codec = Codec(name="y", register=RegisterSettings(address=0, scale=0.1, not_a_value=-32768))
+    assert math.isnan(codec.decode([0x8000]))
+    assert codec.decode([0x7FFF]) == pytest.approx(3276.7)
+
+
+def test_a_device_that_answers_nan_is_heard() -> None:
+    codec = Codec(name="y", register=RegisterSettings(address=0, type="float32"))
+    assert math.isnan(codec.decode(struct.unpack(">HH", struct.pack(">f", math.nan))))
+
+
+@given(addresses=st.lists(st.integers(0, 400), min_size=1, max_size=30, unique=True), gap=st.integers(0, 5))
+def test_requests_cover_every_signal_once_and_stay_within_the_protocols_size(addresses: list[int], gap: int) -> None:
+    signals = [Codec(name=str(a), register=RegisterSettings(address=a)) for a in addresses]
+    found = blocks(signals, gap=gap)
+    covered = [codec.name for block in found for codec, _ in block.parts]
+    assert sorted(covered) == sorted(codec.name for codec in signals)
+    assert all(block.count <= MAX_WORDS for block in found)
+    assert signals[0].name in [codec.name for codec, _ in found[0].parts]  # the first signal's request goes first
+    memory = {address: address for address in range(450)}
+    for block in found:
+        words = [memory[block.address + i] for i in range(block.count)]
+        assert block.decode(words) == {codec.name: float(codec.name) for codec, _ in block.parts}
+
+
+def test_a_write_touches_no_register_in_between() -> None:
+    signals = [Codec(name=str(a), register=RegisterSettings(address=a)) for a in (0, 2)]
+    assert [(block.address, block.count) for block in blocks(signals)] == [(0, 1), (2, 1)]
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"u": {"address": 0, "table": "input"}}, "u is written by the host"),
+        ({"u": {"address": 1}}, "y and u overlap at holding 1"),
+        ({"K": {"address": 9}}, "K and Ti must be mapped together"),
+        ({"heartbeat_echo": {"address": 9}}, "heartbeat_echo needs heartbeat"),
+        ({"y": {"address": 0, "table": "coil"}}, "coils and discrete inputs hold a bit"),
+        ({"y": {"address": 65535, "type": "int32"}}, "ends beyond 65535"),
+        ({"y": {"address": 0, "scale": 0}}, "scale = 0"),
+    ],
+)
+def test_a_map_that_cannot_work_is_refused(changes: dict[str, object], says: str) -> None:
+    complete = {"y": {"address": 0, "type": "float32"}, "u": {"address": 5}}
+    with pytest.raises(ValueError, match=says):
+        RegisterMap.model_validate(complete | changes)
