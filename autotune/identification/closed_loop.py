@@ -26,7 +26,7 @@ from autotune.identification.confidence import (
     whiteness,
 )
 from autotune.identification.control_law import CONTRADICTION, LawCheck, check_law
-from autotune.identification.excitation import ExcitationVerdict, judge, own_motion, require_excitation
+from autotune.identification.loop_excitation import ExcitationVerdict, judge, own_motion, require_excitation
 from autotune.identification.order import Candidate, choose_order, default_past_window, fixed_order
 from autotune.identification.prediction_error import PredictionErrorEstimate
 from autotune.identification.state_space import InnovationModel

@@ -17,6 +17,8 @@ from autotune.errors import IdentificationError
 from autotune.identification.lagged import lagged_factor, least_squares, triangle
 from autotune.identification.state_space import InnovationModel
 
+#: Standard deviation of the white noise supposed on past samples, as a share of the signal's root mean square.
+_TRACE_OF_NOISE = 1e-6
 #: Below this share of the largest a singular value is rounding.
 _RANK = 1e-11
 
@@ -58,9 +60,17 @@ class LaggedData:
 
 
 def lagged_data(u: FloatArray, y: FloatArray, p: int) -> LaggedData:
-    """Return the factor of the past p samples and the present one; one pass, time linear in the rows."""
+    """Return the factor of the past p samples and the present one; one pass, time linear in the rows.
+
+    A trace of white noise (1e-6 of each signal) is supposed on the past: noise-free records, whose lags depend on each
+    other exactly, then have a predictor too.
+    """
     z = np.hstack([u, y])
     R, rows = lagged_factor([(z, range(-1, -p - 1, -1)), (u, [0]), (y, [0])])
+    width = p * z.shape[1]
+    trace = np.zeros((width, R.shape[1]))
+    np.fill_diagonal(trace, _TRACE_OF_NOISE * np.linalg.norm(R[:, :width], axis=0))
+    R = triangle(np.vstack([R, trace]))
     return LaggedData(R=R, rows=rows, p=p, n_u=u.shape[1], n_y=y.shape[1])
 
 
