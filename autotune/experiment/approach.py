@@ -5,9 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from statistics import median
 
 import numpy as np
 
+from autotune.arrays import FloatArray
 from autotune.config import Config
 from autotune.errors import ExperimentStopped, IdentificationError, LinkError
 from autotune.experiment.limits import Watch
@@ -105,8 +107,8 @@ def preflight(loop: ControlLoop, config: Config, tell: Tell) -> Known:
     loop.monitor.noise = noise_half
     loop.monitor.u_tolerance = 0.02 * (config.limits.u_max - config.limits.u_min)
     if changes > RESTLESS:
-        # so many equal readings in a row would come by chance once in 1e9 looks
-        loop.monitor.max_repeats = 2 + math.ceil(math.log(1e-9) / math.log(max(1.0 - changes, 1e-3)))
+        # a sensor at its rail repeats its full scale half of the time; the longest run seen says how it repeats itself
+        loop.monitor.max_repeats = 4 * _longest_run(y) + 20
     return Known(
         noise_sd=noise_sd,
         noise_half=noise_half,
@@ -115,8 +117,21 @@ def preflight(loop: ControlLoop, config: Config, tell: Tell) -> Known:
     )
 
 
-def approach(loop: ControlLoop, config: Config, known: Known, tell: Tell) -> Known:
+def _longest_run(y: FloatArray) -> int:
+    """Return the length of the longest run of equal readings."""
+    changes = np.flatnonzero(np.diff(y) != 0.0)
+    return int(np.max(np.diff(np.concatenate([[-1], changes, [y.size - 1]]))))
+
+
+def approach(loop: ControlLoop, config: Config, known: Known, tell: Tell, *, u_rest: float | None = None) -> Known:
     """Bring the plant to where it answers, and learn the sign of its gain and a first guess of the mid-point.
+
+    Parameters
+    ----------
+    loop, config, known, tell
+        The open loop, the settings, what is known, and who is told.
+    u_rest : float, optional
+        Command that holds the operating point, where it is known from before: makes the ramp short [u unit].
 
     Raises
     ------
@@ -124,18 +139,23 @@ def approach(loop: ControlLoop, config: Config, known: Known, tell: Tell) -> Kno
         The plant does not answer, answers before it should, or with the sign it should not have.
     """
     if config.operating_point.approach == "ramp":
-        return _ramp(loop, config, known, tell)
-    known = replace(known, midpoint=config.operating_point.u_guess, y_moved=config.operating_point.y)
+        point = config.operating_point
+        reach = BRACKET * point.u_uncertainty
+        bracket = (point.u_guess - reach, point.u_guess + reach)
+        if u_rest is not None:
+            bracket = (max(bracket[0], u_rest - 0.25 * reach), bracket[1])
+        return _ramp(loop, config, known, tell, bracket)
+    u_guess = u_rest if u_rest is not None else config.operating_point.u_guess
+    known = replace(known, midpoint=u_guess, y_moved=config.operating_point.y)
     known = replace(known, first_move_s=loop.tick.t_s)
     return known if known.plant_sign != 0 else _find_sign(loop, config, known, tell)
 
 
-def _ramp(loop: ControlLoop, config: Config, known: Known, tell: Tell) -> Known:
+def _ramp(loop: ControlLoop, config: Config, known: Known, tell: Tell, bracket: tuple[float, float]) -> Known:
     """Ramp the command through the bracket until y leaves its rest."""
     point = config.operating_point
     rate = point.ramp_rate if point.ramp_rate is not None else point.u_uncertainty / 600.0 / loop.sample_time_s
-    low = max(point.u_guess - BRACKET * point.u_uncertainty, config.limits.u_min)
-    high = min(point.u_guess + BRACKET * point.u_uncertainty, config.limits.u_max)
+    low, high = max(bracket[0], config.limits.u_min), min(bracket[1], config.limits.u_max)
     distance = 2.0 * known.noise_half + 0.02 * config.limits.swing
     tell(f"ramping the command from {low:.3g} to {high:.3g} until the plant moves")
     u, start_s = low, math.nan
@@ -143,8 +163,7 @@ def _ramp(loop: ControlLoop, config: Config, known: Known, tell: Tell) -> Known:
         tick = loop.step(loop.nearest(min(u, high)))
         if abs(tick.u - low) < 2.0 * rate * loop.sample_time_s + loop.envelope.u_step and math.isnan(start_s):
             start_s = tick.t_s
-        y = loop.history(max(0, tick.k - LOOK_BACK))[2]
-        moved = float(np.nanmedian(y)) - known.y_rest
+        moved = median(loop.monitor.recent) - known.y_rest
         if abs(moved) > distance:
             break
         if not math.isnan(start_s):
@@ -194,11 +213,11 @@ def _find_sign(loop: ControlLoop, config: Config, known: Known, tell: Tell) -> K
     for direction in (1.0, -1.0):
         start = loop.tick
         y0 = known.y_rest if direction > 0 else loop.monitor.recent[-1]
-        while abs(float(np.median(loop.monitor.recent)) - y0) < distance:
+        while abs(median(loop.monitor.recent) - y0) < distance:
             if loop.tick.t_s - start.t_s > patience:
                 break
             loop.step(loop.nearest(known.midpoint + direction * push))
-        slopes.append((float(np.median(loop.monitor.recent)) - y0) / max(loop.tick.t_s - start.t_s, SMALL))
+        slopes.append((median(loop.monitor.recent) - y0) / max(loop.tick.t_s - start.t_s, SMALL))
     if abs(slopes[0] - slopes[1]) * patience < distance:
         raise ExperimentStopped(
             f"the plant does not answer: y stays within {distance:.3g} for commands {push:.3g} above and below u_guess",

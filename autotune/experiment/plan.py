@@ -92,15 +92,15 @@ class LocalModel:
     def turning_time_s(self, omega_rad_s: float) -> float:
         """Return the time from a switch of the relay to the extremum of y [s].
 
-        There the speed is zero and y is at its peak, in every limit cycle of the same peak: where one amplitude gives way
-        to another without a transient of position and speed.
+        There the speed is zero and y is at its peak, in every limit cycle of the same peak: where one amplitude gives
+        way to another without a transient of position and speed.
         """
         quarter = 0.5 * math.pi / omega_rad_s
         return self.tau_s * math.log(1.0 + math.tanh(quarter / self.tau_s))
 
     def crest(self, omega_rad_s: float) -> float:
         """Return the ratio of peak to fundamental amplitude of its response to a relay's square wave."""
-        wave, fundamental = self._relay_response(omega_rad_s, 1.0, np.linspace(0.0, 2.0 * np.pi, 128))
+        wave, fundamental = self._relay_response(omega_rad_s, 1.0, np.linspace(0.0, 2.0 * np.pi, 96))
         return float(np.max(wave) / fundamental)
 
     def crossing_s(self, omega_rad_s: float, amplitude: float, hysteresis: float, smoothing_s: float) -> float:
@@ -116,7 +116,7 @@ class LocalModel:
             Length of the moving average, whose own delay is not counted here [s].
         """
         # u rises at phase 0; before that y has fallen through minus the hysteresis
-        phase = np.linspace(-1.25 * np.pi, 0.0, 1000)
+        phase = np.linspace(-1.25 * np.pi, 0.0, 300)
         wave, _ = self._relay_response(omega_rad_s, amplitude, phase, smoothing_s)
         below = wave < -hysteresis
         first = int(np.argmax(below[1:] & ~below[:-1]))
@@ -126,7 +126,7 @@ class LocalModel:
         self, omega_rad_s: float, amplitude: float, phase_rad: FloatArray, smoothing_s: float = 0.0
     ) -> tuple[FloatArray, float]:
         """Return y over the phase and the amplitude of its fundamental, u a square wave that rises at phase 0."""
-        orders = np.arange(1, 30, 2)
+        orders = np.arange(1, 20, 2)
         s = 1j * orders * omega_rad_s
         average = np.sinc(orders * omega_rad_s * smoothing_s / (2.0 * np.pi))
         waves = 4.0 * amplitude / np.pi * self.k * average / (s * (1.0 + s * self.tau_s) * orders)
@@ -247,9 +247,43 @@ def expected_sd(noise_sd: float, y_amplitude: float, samples: float) -> float:
     return noise_sd / y_amplitude * math.sqrt(2.0 / max(samples, 1.0))
 
 
-def needed_time_s(choice: Choice, goal: Goal, gain_sd: float, least_periods: int) -> float:
-    """Return the rig time after which the point is expected to be known [s]: whole periods, and half a one to settle."""
-    period = 2.0 * math.pi / choice.omega_rad_s
-    samples = 2.0 * (goal.noise_sd / (gain_sd * choice.y_amplitude)) ** 2
-    periods = max(least_periods, math.ceil(samples * goal.sample_time_s / period))
-    return (periods + 0.5) * period
+def time_s(choice: Choice, periods: int) -> float:
+    """Return the rig time that a limit cycle of so many whole periods is expected to take [s]: half a one to settle."""
+    return (periods + 0.5) * 2.0 * math.pi / choice.omega_rad_s
+
+
+def allot(choices: Sequence[Choice], goal: Goal, gain_sd: float, least_periods: int, left_s: float) -> tuple[int, ...]:
+    """Share the remaining rig time among the points to come, in whole periods.
+
+    Every point gets the least; then the point that would be known worst gets one more, until all are good enough or no
+    further period fits.
+
+    Parameters
+    ----------
+    choices : sequence of Choice
+        The settings to come.
+    goal : Goal
+        Noise and sample time.
+    gain_sd : float
+        Relative standard deviation at which a point is good enough.
+    least_periods : int
+        Whole periods that an estimate needs.
+    left_s : float
+        Rig time that is left [s].
+    """
+    periods = [least_periods] * len(choices)
+    left_s -= sum(time_s(choice, least_periods) for choice in choices)
+
+    def sd(i: int) -> float:
+        length_s = periods[i] * 2.0 * math.pi / choices[i].omega_rad_s
+        return expected_sd(goal.noise_sd, choices[i].y_amplitude, length_s / goal.sample_time_s)
+
+    while True:
+        fits = [
+            i for i, choice in enumerate(choices) if sd(i) > gain_sd and 2.0 * math.pi / choice.omega_rad_s <= left_s
+        ]
+        if not fits:
+            return tuple(periods)
+        worst = max(fits, key=sd)
+        periods[worst] += 1
+        left_s -= 2.0 * math.pi / choices[worst].omega_rad_s

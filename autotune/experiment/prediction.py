@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import expm
+from scipy.ndimage import uniform_filter1d
 from scipy.signal import lfilter, tf2ss
 
 from autotune.arrays import FloatArray
@@ -23,7 +24,8 @@ class Prediction:
     y : (N,) array
         Expected measurement, of the estimated plant without noise [y unit].
     low, high : (N,) array
-        Pointwise band that holds 95 % of the drawn measurements [y unit].
+        Pointwise band that holds 95 % of normally distributed measurements with the draws' scatter, which is averaged
+        over neighbouring samples [y unit].
     u : (N,) array
         Expected command, disturbance not included [u unit].
     y_draws : (D, N) array
@@ -114,8 +116,8 @@ def predict(
         noise = noise_sd * rng.standard_normal(2 * count)
         true, _ = _respond(drawn, law, np.concatenate([quiet, setpoint]), np.concatenate([quiet, disturbance]), noise)
         y_draws[i] = (true + noise)[count:]
-    low, high = np.quantile(y_draws, [0.025, 0.975], axis=0)
-    return Prediction(y=y, low=low, high=high, u=u, y_draws=y_draws)
+    scatter = np.sqrt(uniform_filter1d(np.mean((y_draws - y) ** 2, axis=0), max(1, count // 60), mode="nearest"))
+    return Prediction(y=y, low=y - 1.96 * scatter, high=y + 1.96 * scatter, u=u, y_draws=y_draws)
 
 
 def _respond(

@@ -1,8 +1,8 @@
 """Relay law: smoothed input, hysteresis, mid-point and an inserted delay of any length; a pure step.
 
 The relay of Le & Mendes 2010, figure 3: a delay T inserted before the plant moves the limit cycle to the frequency
-where arg P(j omega) = -180 deg + T omega, equation (20). The lag of smoothing, hysteresis and sampling counts towards that
-delay; none of it enters an estimate, which is made from the recorded command and measurement.
+where arg P(j omega) = -180 deg + T omega, equation (20). The lag of smoothing, hysteresis and sampling counts towards
+that delay; none of it enters an estimate, which is made from the recorded command and measurement.
 """
 
 from __future__ import annotations

@@ -114,7 +114,7 @@ def float_on(loop: ControlLoop, config: Config, *, u_rest: float | None = None) 
     def silent(_: str) -> None:
         return
 
-    known = approach(loop, config, preflight(loop, config, silent), silent)
+    known = approach(loop, config, preflight(loop, config, silent), silent, u_rest=u_rest)
     known, _ = find_midpoint(loop, config, known, silent)
     return known
 

@@ -13,7 +13,7 @@ from autotune.errors import ExperimentStopped, IdentificationError
 from autotune.experiment.approach import Known
 from autotune.experiment.loop import ControlLoop
 from autotune.experiment.oscillation import PATIENCE, Oscillation
-from autotune.experiment.plan import Choice, Goal, choose, expected_sd, needed_time_s, phase_targets
+from autotune.experiment.plan import Choice, Goal, allot, choose, phase_targets, time_s
 from autotune.experiment.result import Segment
 from autotune.identification.describing import describing_function
 from autotune.identification.frequency import LimitCycle, limit_cycle_points
@@ -23,7 +23,6 @@ PEAK_SHARE = 0.91
 #: the same for the first point, whose gain is foreseen from a short look at the plant
 FIRST_PEAK_SHARE = 0.84
 LEAST_PERIODS = 2
-FIRST_EDGE = 0
 #: asymmetry of the duty (part of the period, less one half) from which on the mid-point is corrected within a point
 LARGEST_ASYMMETRY = 0.12
 
@@ -60,12 +59,12 @@ def sweep(loop: ControlLoop, config: Config, known: Known, oscillation: Oscillat
     for i, _ in enumerate(targets):
         choices = [_choice(config, known, target) for target in targets[i:]]
         goal = _goal(config, known)
-        needs = [needed_time_s(choice, goal, wanted.gain_sd, LEAST_PERIODS) for choice in choices]
-        left = end_s - loop.tick.t_s
-        share = min(1.0, left / sum(needs))
-        show(f"point {i + 1} of {len(targets)}: {math.degrees(targets[i]):.0f} deg", min(left, sum(needs)))
-        until_s = loop.tick.t_s + (needs[0] * share if i + 1 < len(targets) else max(left, 0.0))
-        cycle = _measure(oscillation, config, choices[0], until_s)
+        left_s = end_s - loop.tick.t_s
+        periods = allot(choices, goal, wanted.gain_sd, LEAST_PERIODS, left_s)
+        expected_s = sum(time_s(choice, count) for choice, count in zip(choices, periods, strict=True))
+        show(f"point {i + 1} of {len(targets)}: {math.degrees(targets[i]):.0f} deg", expected_s)
+        reserved_s = sum(time_s(choice, LEAST_PERIODS) for choice in choices[1:])
+        cycle = _measure(oscillation, config, choices[0], periods[0], end_s - reserved_s)
         segment = _segment(cycle, oscillation, loop.sample_time_s)
         segments.append(segment)
         loop.metadata["relay"] = [one.metadata() for one in segments]
@@ -114,12 +113,13 @@ def _choice(config: Config, known: Known, phase_rad: float) -> Choice:
     )
 
 
-def _measure(oscillation: Oscillation, config: Config, choice: Choice, until_s: float) -> LimitCycle:
+def _measure(
+    oscillation: Oscillation, config: Config, choice: Choice, wanted_periods: int, until_s: float
+) -> LimitCycle:
     """Run one setting until its point is known well enough or its time is over."""
     loop = oscillation.loop
-    period_s = 2.0 * math.pi / choice.omega_rad_s
-    oscillation.change(choice.settings, patience_s=PATIENCE * 0.5 * period_s)
-    first = FIRST_EDGE
+    oscillation.change(choice.settings, patience_s=PATIENCE * math.pi / choice.omega_rad_s)
+    first = 0
     while True:
         _, switched = oscillation.step()
         edges = oscillation.edges
@@ -130,10 +130,9 @@ def _measure(oscillation: Oscillation, config: Config, choice: Choice, until_s: 
         periods = (len(edges) - 1 - first) // 2
         if periods < LEAST_PERIODS or (len(edges) - 1 - first) % 2:
             continue
-        length_s = (edges[-1] - edges[first]) * loop.sample_time_s
-        over = loop.tick.t_s + length_s / periods > until_s
-        sd = expected_sd(_noise(loop), choice.y_amplitude, edges[-1] - edges[first])
-        if not over and sd > config.experiment.gain_sd:
+        period_s = (edges[-1] - edges[first]) * loop.sample_time_s / periods
+        over = periods >= wanted_periods or loop.tick.t_s + period_s > until_s
+        if not over:
             continue
         oscillation.step()  # the row after the switch completes one that was made in two steps
         t, u, y = loop.history(edges[first] - 2)
@@ -141,11 +140,8 @@ def _measure(oscillation: Oscillation, config: Config, choice: Choice, until_s: 
             cycle = limit_cycle_points(t, u, y)
         except IdentificationError as error:
             raise ExperimentStopped(str(error), where="relay sweep", mend=error.mend) from error
-        point = cycle.points[0]
-        known_to = math.sqrt(float(np.trace(point.covariance)) / 2.0) / point.gain
-        if over or known_to <= config.experiment.gain_sd:
-            _turn(oscillation, choice.turning_s)
-            return cycle
+        _turn(oscillation, choice.turning_s)
+        return cycle
 
 
 def _turn(oscillation: Oscillation, turning_s: float) -> None:
@@ -153,10 +149,6 @@ def _turn(oscillation: Oscillation, turning_s: float) -> None:
     last_row = oscillation.edges[-1]
     while (oscillation.loop.tick.k - last_row) * oscillation.loop.sample_time_s < turning_s:
         oscillation.step()
-
-
-def _noise(loop: ControlLoop) -> float:
-    return 0.5 * loop.monitor.noise
 
 
 def _rebalanced(oscillation: Oscillation, edges: list[int], first: int) -> int:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from scipy.ndimage import uniform_filter1d
 
 from autotune.arrays import FloatArray
 from autotune.config import Config
@@ -41,12 +42,16 @@ class StepTest:
         Departure of r from the operating point [y unit]; what is added to the law's command [u unit].
     settle : int
         Samples of regulation before the test, not scored.
+    smoothing : int
+        Samples over which measured and predicted responses are averaged before they are compared: a third of the
+        crossover's radian, which hides noise and leaves the response.
     """
 
     t: FloatArray
     setpoint: FloatArray
     disturbance: FloatArray
     settle: int
+    smoothing: int
 
     @property
     def disturbed_from(self) -> int:
@@ -93,9 +98,10 @@ class Verification:
     prediction : Prediction
         What was expected.
     misfit, allowed : float
-        Root mean square of measured less predicted, and the largest that prediction and noise explain [y unit].
+        Root mean square of measured less predicted, both smoothed, and the largest that prediction and noise explain
+        [y unit].
     measured, predicted : StepFigures
-        Of the measured and of the expected response; the measured ones contain the noise.
+        Of the measured and of the expected response, both smoothed; the measured ones contain the rest of the noise.
     predicted_sd : StepFigures
         Standard deviation of the figures over the drawn plants and noise.
     """
@@ -146,6 +152,7 @@ def plan_test(
         setpoint=np.full(2 * count, step),
         disturbance=np.where(late, load, 0.0),
         settle=count,
+        smoothing=max(1, round(1.0 / (3.0 * crossover_rad_s * T_s))),
     )
 
 
@@ -315,12 +322,15 @@ def judge(
     rng = np.random.default_rng(seed)
     prediction = predict(fit.plant, fit.draws(DRAWS, rng), law, test.setpoint, test.disturbance, noise_sd, rng)
     usable = np.isfinite(y)
-    misfit = _rms((y - prediction.y)[usable])
-    explained = float(np.quantile([_rms(draw - prediction.y) for draw in prediction.y_draws], 0.99))
+    expected = smoothed(prediction.y, test)
+    measured = smoothed(np.where(usable, y, np.interp(test.t, test.t[usable], y[usable])), test)
+    draws = [smoothed(draw, test) for draw in prediction.y_draws]
+    misfit = _rms(measured - expected)
+    explained = float(np.quantile([_rms(draw - expected) for draw in draws], 0.99))
     # the response counts from the set-point, where the loop is to bring it
-    allowed = math.hypot(explained, TOLERANCE * _rms(prediction.y - test.setpoint))
+    allowed = math.hypot(explained, TOLERANCE * _rms(expected - test.setpoint))
     accepted = misfit <= allowed
-    drawn = [_figures(test, draw) for draw in prediction.y_draws]
+    drawn = [_figures(test, draw) for draw in draws]
     reason = (
         f"the loop behaves as predicted: rms misfit {misfit:.3g}, up to {allowed:.3g} is explained"
         if accepted
@@ -335,8 +345,8 @@ def judge(
         prediction=prediction,
         misfit=misfit,
         allowed=allowed,
-        measured=_figures(test, np.where(usable, y, prediction.y)),
-        predicted=_figures(test, prediction.y),
+        measured=_figures(test, measured),
+        predicted=_figures(test, expected),
         predicted_sd=StepFigures(
             overshoot=float(np.std([figure.overshoot for figure in drawn])),
             rise_s=float(np.nanstd([figure.rise_s for figure in drawn])),
@@ -355,6 +365,13 @@ def law_for(controller: PIDController, limits: LimitSettings, sample_time_s: flo
         u_max=limits.u_max - abs(reserve),
         u_rate=limits.u_rate,
     )
+
+
+def smoothed(y: FloatArray, test: StepTest) -> FloatArray:
+    """Return the centred moving average over the test's smoothing, step by step so that a step stays a step."""
+    split = test.disturbed_from
+    parts = (y[:split], y[split:])
+    return np.concatenate([uniform_filter1d(part, test.smoothing, mode="nearest") for part in parts])
 
 
 def _rms(values: FloatArray) -> float:
