@@ -1,1 +1,125 @@
 """Commands: design on a model or on points, and margins of a given controller."""
+
+from __future__ import annotations
+
+import json
+import math
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from autotune.cli import app
+from autotune.errors import InputError
+
+if TYPE_CHECKING:
+    from autotune.design.specification import Design
+
+
+class Kind(StrEnum):
+    """Structure of the controller."""
+
+    PI = "pi"
+    PID = "pid"
+
+
+class Noise(StrEnum):
+    """Which form of the noise constraint is kept."""
+
+    BOUND = "bound"
+    TRUE = "true"
+
+
+@app.command("design")
+def design_command(
+    out: Annotated[Path, typer.Option(help="file to write the design to (JSON)")],
+    model: Annotated[Path | None, typer.Option(help="model file (TOML) to design on")] = None,
+    points: Annotated[Path | None, typer.Option(help="points file (JSON) to design on, with its regions")] = None,
+    modulus_margin: Annotated[float, typer.Option(help="smallest distance of L from -1, between 0 and 1")] = 0.5,
+    phase_margin: Annotated[float, typer.Option(help="smallest phase margin [deg]")] = 45.0,
+    noise_gain: Annotated[float, typer.Option(help="largest noise amplification y to u, N_max [u/y unit]")] = 0.1,
+    noise: Annotated[
+        Noise, typer.Option(help="bound: |C| <= M_m N_max at high frequency (16); true: |C/(1+L)| <= N_max (15)")
+    ] = Noise.BOUND,
+    noise_frequency: Annotated[
+        float | None, typer.Option(help="lowest frequency of the noise for (15) [rad/s]; default the crossover")
+    ] = None,
+    delay_margin: Annotated[float, typer.Option(help="smallest delay margin [s]; 0 asks for none")] = 0.0,
+    setpoint_command: Annotated[
+        float | None, typer.Option(help="largest immediate command per unit set-point step [u/y unit]; default none")
+    ] = None,
+    kind: Annotated[Kind, typer.Option(help="structure of the controller")] = Kind.PI,
+    controller: Annotated[Path | None, typer.Option(help="also write the controller file (TOML) here")] = None,
+    certificate: Annotated[bool, typer.Option(help="prove a lower bound on the H2 norm (PI on a model)")] = True,
+) -> None:
+    """Design the PI or PID with the smallest H2 norm under margins, on a model or straight on measured points."""
+    from autotune.controller import write_controller
+    from autotune.design.specification import Specification
+
+    specification = Specification(
+        modulus_margin=modulus_margin,
+        phase_margin_rad=math.radians(phase_margin),
+        noise_gain=noise_gain,
+        noise="true" if noise is Noise.TRUE else "bound",
+        noise_frequency_rad_s=noise_frequency,
+        delay_margin_s=delay_margin,
+        setpoint_command=math.inf if setpoint_command is None else setpoint_command,
+    )
+    if (model is None) == (points is None):
+        raise InputError("give one of --model and --points", where="autotune design")
+    if model is not None:
+        from autotune.design.synthesis import design
+        from autotune.models import read_model
+
+        designed = design(read_model(model), specification, kind.value, certificate=certificate)
+    else:
+        from autotune.design.robust import design_on_points
+        from autotune.points import read_points
+
+        assert points is not None
+        designed = design_on_points(read_points(points), specification, kind.value)
+    out.write_text(json.dumps(designed.to_json(), indent=2) + "\n", encoding="utf-8")
+    if controller is not None:
+        write_controller(designed.controller, controller)
+    typer.echo(_sentence(designed))
+    typer.echo(f"wrote {out}" + (f" and {controller}" if controller is not None else ""))
+
+
+def _sentence(designed: Design) -> str:
+    c, m = designed.controller, designed.margins
+    gains = f"K = {c.K:.5g}, Ti = {c.Ti_s:.4g} s"
+    if designed.kind == "pid":
+        gains += f", Td = {c.Td_s:.4g} s, Tf = {c.Tf_s:.3g} s"
+    if c.setpoint_weight != 1.0:
+        gains += f", set-point weight {c.setpoint_weight:.3g}"
+    bound = f" (no smaller than {designed.h2_lower_bound:.5g})" if designed.h2_lower_bound is not None else ""
+    binding = ", ".join(designed.binding) or "none"
+    return (
+        f"{designed.kind.upper()} {gains}: H2 {designed.h2:.5g}{bound}, modulus margin {m.modulus:.3f}, "
+        f"phase margin {math.degrees(m.phase_rad):.1f} deg, delay margin {m.delay_s:.3g} s; binding: {binding}"
+    )
+
+
+@app.command("margins")
+def margins_command(
+    model: Annotated[Path, typer.Option(help="model file (TOML)")],
+    controller: Annotated[Path, typer.Option(help="controller file (TOML)")],
+    out: Annotated[Path, typer.Option(help="file to write the margins to (JSON)")],
+    noise_frequency: Annotated[
+        float | None, typer.Option(help="lowest frequency of the noise [rad/s]; default the crossover")
+    ] = None,
+) -> None:
+    """Compute the margins of a controller with a model; a sampled controller is taken with its hold."""
+    from autotune.controller import read_controller
+    from autotune.design.margins import margins
+    from autotune.models import read_model
+
+    m = margins(read_model(model), read_controller(controller), noise_frequency_rad_s=noise_frequency)
+    out.write_text(json.dumps(m.to_json(), indent=2) + "\n", encoding="utf-8")
+    state = "stable" if m.stable else "UNSTABLE: the figures describe the Nyquist curve, not margins"
+    typer.echo(
+        f"{state}; modulus margin {m.modulus:.4f}, phase margin {math.degrees(m.phase_rad):.2f} deg, "
+        f"delay margin {m.delay_s:.4g} s, gain margin {m.gain:.4g}, H2 {m.h2:.5g}"
+    )
+    typer.echo(f"wrote {out}")

@@ -20,13 +20,12 @@ from numba import njit
 from autotune.arrays import ComplexArray, FloatArray
 from autotune.controller import PIDController
 from autotune.design.kernels import SampledPlant, on_grid
-from autotune.design.loop import characteristic_frequencies
 from autotune.design.margins import Margins
 from autotune.design.specification import Specification
 from autotune.models import TransferFunction
 
 _GAP = 0.005
-_MOST_BOXES = 60_000
+_MOST_EVALUATIONS = 20_000_000  # boxes times frequencies
 _INTEGRAL_SPAN = 30.0
 
 
@@ -66,16 +65,17 @@ def lower_bound(
     points (refined around the crossover), and no point of 1/H between two of them further from the nearer one
     than three quarters of their distance.
     """
+    K_max = specification.largest_gain if specification.noise == "bound" else specification.noise_gain
     h2 = m.h2
     omega = sampled.omega[::2]
     if math.isfinite(m.crossover_rad_s):
         for span, count in ((1.6, 160), (1.1, 100)):
             omega = np.union1d(omega, np.geomspace(m.crossover_rad_s / span, m.crossover_rad_s * span, count))
     if H.delay_s > 0.0:  # where dead time still turns a gain that has not fallen
-        end = min(4.0 * float(characteristic_frequencies(H)[-1]), 600.0 / H.delay_s)
+        audible = sampled.omega[np.abs(sampled.h) * K_max > 1.0]
+        end = min(float(audible[-1]) if len(audible) else 0.0, 1000.0 / H.delay_s)
         omega = np.union1d(omega, np.arange(60.0 / H.delay_s, end, 0.15 / H.delay_s))
     plant = on_grid(H, omega, sampled.sign)
-    K_max = specification.largest_gain if specification.noise == "bound" else specification.noise_gain
     k_max = _INTEGRAL_SPAN * abs(controller.K) / controller.Ti_s
     omega_n = specification.noise_frequency_rad_s
     noise = specification.noise_gain if specification.noise == "true" and omega_n is not None else math.inf
@@ -97,7 +97,7 @@ def lower_bound(
         ),
         h2 * h2,
         _GAP,
-        _MOST_BOXES,
+        _MOST_EVALUATIONS // len(plant.omega),
     )
     lowest = min(math.sqrt(bound), h2)
     gap = h2 / lowest - 1.0
