@@ -53,7 +53,7 @@ def recording_figure(recording: Recording, u_unit: str, y_unit: str, *, marks: S
     held_t, held_u = thinned(recording.t, recording.u)
     add_line(figure, held_t, held_u, "u", ORANGE, width=1.0, row=2, col=1, line_shape="hv")
     figure.update_yaxes(title=_axis("y", y_unit), row=1, col=1)
-    figure.update_yaxes(title=_axis("u", u_unit), row=2, col=1)
+    figure.update_yaxes(title=_axis("u", u_unit), range=_usual_range(recording.u), row=2, col=1)
     figure.update_xaxes(title="time [s]", row=2, col=1)
     for time_s, name in marks:
         figure.add_vline(x=time_s, line={"color": GREY, "width": 1, "dash": "dot"})
@@ -209,6 +209,13 @@ def sensitivity_figure(loops: Sequence[Curve], omega: FloatArray, modulus_margin
     figure.update_xaxes(title="angular frequency [rad/s]", type="log")
     figure.update_yaxes(title="sensitivity |S| [dB]")
     return figure
+
+
+def _usual_range(values: FloatArray) -> list[float]:
+    """Return a range that shows the middle 90 % of the values well: an approach from rest would hide a small relay."""
+    low, high = np.quantile(values, [0.05, 0.95])
+    room = 0.6 * (high - low) or 1.0
+    return [float(low - room), float(high + room)]
 
 
 def _axis(name: str, unit: str) -> str:

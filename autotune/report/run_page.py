@@ -11,7 +11,7 @@ from plotly.subplots import make_subplots
 
 from autotune.config.procedure import SignalSettings
 from autotune.experiment.result import ExperimentResult, Segment
-from autotune.experiment.verify import Verification
+from autotune.experiment.verify import Verification, smoothed
 from autotune.pipeline import Analysis, Tuning
 from autotune.recording import Recording
 from autotune.report.analysis_sections import analysis_sections, gains_text, margins_sentence
@@ -155,6 +155,7 @@ def _cycles_figure(recording: Recording, segments: Sequence[Segment], signals: S
         add_line(
             figure, *thinned(t, part.u, 600), "u", ORANGE, width=1.0, row=2, col=i, showlegend=False, line_shape="hv"
         )
+        figure.update_yaxes(matches="y", showticklabels=i == 1, row=1, col=i)
     figure.update_xaxes(title="s", row=2)
     figure.update_yaxes(title=f"y [{signals.y_unit}]", row=1, col=1)
     figure.update_yaxes(title=f"u [{signals.u_unit}]", row=2, col=1)
@@ -174,13 +175,14 @@ def _verification_section(verification: Verification, signals: SignalSettings) -
         title="Verification on the rig",
         text=(
             f"Set-point step of {verification.test.setpoint[0]:.3g} {unit}, then a load of"
-            f" {verification.test.disturbance[-1]:.3g} {signals.u_unit} added to the command. {verification.reason}.",
+            f" {verification.test.disturbance[-1]:.3g} {signals.u_unit} added to the command.",
+            _sentence(verification.reason),
         ),
         tables=(
             Table(
-                header=("", "measured", "predicted without noise", "predicted scatter (sd)"),
+                header=("", "measured", "predicted", "predicted scatter (sd)"),
                 rows=tuple((name, *(f"{value:.3g}" for value in values)) for name, *values in rows),
-                caption="Measured figures contain the noise; its effect is in the scatter.",
+                caption="Of the smoothed responses; what is left of the noise is in the scatter.",
             ),
         ),
         figures=(
@@ -194,26 +196,29 @@ def _verification_section(verification: Verification, signals: SignalSettings) -
     )
 
 
+def _sentence(text: str) -> str:
+    return f"{text[0].upper()}{text[1:]}."
+
+
 def _step_figure(verification: Verification, signals: SignalSettings) -> Any:
     test, prediction = verification.test, verification.prediction
     figure = make_subplots(rows=2, cols=1, shared_xaxes=True, vertical_spacing=0.06, row_heights=[0.65, 0.35])
-    low_t, low = thinned(test.t, prediction.low, 1200)
-    high_t, high = thinned(test.t, prediction.high, 1200)
-    add_line(figure, low_t, low, "95 % band", GREEN, width=0.6, row=1, col=1, showlegend=False)
+    edge = slice(None, None, max(1, test.t.size // 600))
+    add_line(figure, test.t[edge], prediction.low[edge], "low", GREEN, width=0.4, row=1, col=1, showlegend=False)
     add_line(
-        figure, np.concatenate([high_t, low_t[::-1]]), np.concatenate([high, low[::-1]]), "95 % band", GREEN,
-        width=0.4, row=1, col=1, fill="toself", fillcolor="rgba(13,154,114,0.18)",
+        figure, test.t[edge], prediction.high[edge], "95 % band", GREEN, width=0.4, row=1, col=1,
+        fill="tonexty", fillcolor="rgba(13,154,114,0.18)",
     )  # fmt: skip
-    add_line(figure, *thinned(test.t, verification.y), "measured", BLUE, width=1.0, row=1, col=1)
-    add_line(figure, test.t, prediction.y, "predicted", RED, row=1, col=1)
-    add_line(figure, test.t, test.setpoint, "set-point", GREY, dash="dash", row=1, col=1)
-    offset = float(
-        np.median(
-            verification.u[: max(test.disturbed_from // 10, 1)] - prediction.u[: max(test.disturbed_from // 10, 1)]
-        )
-    )
-    add_line(figure, *thinned(test.t, verification.u - offset), "u of the law", ORANGE, width=1.0, row=2, col=1)
-    add_line(figure, test.t, prediction.u, "predicted u", RED, row=2, col=1, showlegend=False)
+    add_line(figure, *thinned(test.t, verification.y), "measured", "rgba(59,130,196,0.45)", width=0.8, row=1, col=1)
+    usable = np.isfinite(verification.y)
+    filled = np.interp(test.t, test.t[usable], verification.y[usable])
+    add_line(figure, *thinned(test.t, smoothed(filled, test)), "measured, smoothed", BLUE, row=1, col=1)
+    add_line(figure, *thinned(test.t, prediction.y), "predicted", RED, row=1, col=1)
+    add_line(figure, test.t[edge], test.setpoint[edge], "set-point", GREY, dash="dash", row=1, col=1)
+    early = slice(0, max(test.disturbed_from // 10, 1))
+    rest = float(np.median(verification.u[early] - prediction.u[early]))  # the command that holds the operating point
+    add_line(figure, *thinned(test.t, verification.u - rest), "u of the law", ORANGE, width=1.0, row=2, col=1)
+    add_line(figure, *thinned(test.t, prediction.u), "predicted u", RED, row=2, col=1, showlegend=False)
     figure.update_yaxes(title=f"y - operating point [{signals.y_unit}]", row=1, col=1)
     figure.update_yaxes(title=f"Δu [{signals.u_unit}]", row=2, col=1)
     figure.update_xaxes(title="time [s]", row=2, col=1)
