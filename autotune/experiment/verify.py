@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.ndimage import uniform_filter1d
@@ -101,7 +103,7 @@ class Verification:
         Root mean square of measured less predicted, both smoothed, and the largest that prediction and noise explain
         [y unit].
     measured, predicted : StepFigures
-        Of the measured and of the expected response, both smoothed; the measured ones contain the rest of the noise.
+        Of the smoothed measurement, and their means over the drawn plants and noise.
     predicted_sd : StepFigures
         Standard deviation of the figures over the drawn plants and noise.
     """
@@ -346,13 +348,18 @@ def judge(
         misfit=misfit,
         allowed=allowed,
         measured=_figures(test, measured),
-        predicted=_figures(test, expected),
-        predicted_sd=StepFigures(
-            overshoot=float(np.std([figure.overshoot for figure in drawn])),
-            rise_s=float(np.nanstd([figure.rise_s for figure in drawn])),
-            peak=float(np.std([figure.peak for figure in drawn])),
-            h2=float(np.std([figure.h2 for figure in drawn])),
-        ),
+        predicted=_over(drawn, np.nanmean),
+        predicted_sd=_over(drawn, np.nanstd),
+    )
+
+
+def _over(drawn: Sequence[StepFigures], statistic: Callable[[list[float]], Any]) -> StepFigures:
+    """Return a statistic of every figure over the draws."""
+    return StepFigures(
+        overshoot=float(statistic([figure.overshoot for figure in drawn])),
+        rise_s=float(statistic([figure.rise_s for figure in drawn])),
+        peak=float(statistic([figure.peak for figure in drawn])),
+        h2=float(statistic([figure.h2 for figure in drawn])),
     )
 
 

@@ -132,7 +132,7 @@ def _experiment_section(recording: Recording, experiment: ExperimentResult, sign
             ),
             Figure(
                 figure=_cycles_figure(recording, experiment.segments, signals),
-                caption="Two periods of every limit cycle that a point was made from: y above, u below.",
+                caption="Two periods of every limit cycle that a point was made from, y above u; the numbers are rad/s.",
                 height_px=380,
             ),
         ),
@@ -145,7 +145,7 @@ def _milliseconds(values: tuple[float, float, float]) -> str:
 
 def _cycles_figure(recording: Recording, segments: Sequence[Segment], signals: SignalSettings) -> Any:
     ordered = sorted(segments, key=lambda segment: segment.point.omega_rad_s)
-    titles = [f"{segment.point.omega_rad_s:.3g} rad/s" for segment in ordered]
+    titles = [f"{segment.point.omega_rad_s:.2g}" for segment in ordered]
     figure = make_subplots(rows=2, cols=len(ordered), shared_xaxes=True, subplot_titles=titles, vertical_spacing=0.08)
     for i, segment in enumerate(ordered, start=1):
         span = 2 * 2 * math.pi / segment.point.omega_rad_s
