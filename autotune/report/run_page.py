@@ -132,7 +132,7 @@ def _experiment_section(recording: Recording, experiment: ExperimentResult, sign
             ),
             Figure(
                 figure=_cycles_figure(recording, experiment.segments, signals),
-                caption="Two periods of every limit cycle that a point was made from, y above u; the numbers are rad/s.",
+                caption="Two periods of every limit cycle that a point was made from, y over u; the numbers are rad/s.",
                 height_px=380,
             ),
         ),
