@@ -1,0 +1,219 @@
+"""Synthesis straight from measured points: margins for every process that agrees with them, no reduced model between.
+
+The prior class and what it allows between and beyond the points are in :mod:`autotune.design.process_class`. At each
+frequency the plants form a convex set in the plane of (log gain, phase); the margins are required on the whole set, on
+a grid whose spacing is paid for by the class's own bound on curvature.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.optimize import minimize
+
+from autotune.arrays import FloatArray
+from autotune.controller import PIDController
+from autotune.design.kernels import evaluate, evaluate_grid
+from autotune.design.margins import Margins
+from autotune.design.specification import Design, Kind, Specification
+from autotune.design.uncertain import UncertainPlant, guaranteed, uncertain_plant
+from autotune.errors import DesignError
+from autotune.points import FrequencyPoint
+
+
+def design_on_points(
+    points: Sequence[FrequencyPoint],
+    specification: Specification,
+    kind: Kind = "pi",
+    *,
+    probability: float = 0.95,
+    inverse_response: bool = True,
+) -> Design:
+    """Return the controller of the smallest nominal H2 norm whose margins hold for every plant that fits the points.
+
+    Parameters
+    ----------
+    points : sequence of FrequencyPoint
+        At least three, with covariance; they should reach from above the crossover's phase to near -160 degrees.
+    specification : Specification
+        Constraints (18).
+    kind : {"pi", "pid"}
+        Structure.
+    probability : float
+        Of the joint region of all points; it contains each point's own region of at least this probability.
+    inverse_response : bool
+        Whether all-pass factors are among the plants to be guarded against.
+
+    Returns
+    -------
+    Design
+        Its margins are those that every member has at least; its norm and crossover are the nominal member's.
+
+    Raises
+    ------
+    DesignError
+        The points contradict each other, do not reach far enough, or no controller meets the specification for all
+        plants: the message names the nearest specification that can be met.
+
+    Notes
+    -----
+    The guarantee is conditional on the class: aperiodic processes with dead time, at most one integrator. Sets at
+    different frequencies are treated as independent, which can only make it stricter.
+    """
+    plant = uncertain_plant(points, probability=probability, inverse_response=inverse_response)
+    parameters = _search(plant, specification, kind)
+    return _answer(plant, specification, kind, parameters, probability)
+
+
+def _slacks(plant: UncertainPlant, specification: Specification, p: FloatArray) -> FloatArray:
+    """Return (4,) relative slacks of the guaranteed margins: modulus, phase, noise, delay."""
+    modulus, phase, delay, _, noise = guaranteed(plant.omega, plant.supports, p[0], p[1], p[2], p[3])
+    if specification.noise == "true":
+        noise_slack = 1.0 - noise / specification.noise_gain
+    else:
+        derivative = p[2] / p[3] if p[3] > 0.0 else 1.0
+        noise_slack = 1.0 - p[0] * max(1.0, derivative) / specification.largest_gain
+    asked = specification.delay_margin_s
+    return np.array(
+        [
+            modulus / specification.modulus_margin - 1.0,
+            phase / specification.phase_margin_rad - 1.0,
+            noise_slack,
+            delay / asked - 1.0 if asked > 0.0 else 10.0,
+        ]
+    )
+
+
+def _norm(plant: UncertainPlant, p: FloatArray) -> float:
+    n = plant.nominal
+    h2, modulus, *_ = evaluate(n.omega, n.h, n.weights, n.turn, p[0], p[1], p[2], p[3], -1.0)
+    return 0.5 * math.log(h2) if modulus > 0.0 else 1e3
+
+
+def _search(plant: UncertainPlant, specification: Specification, kind: Kind) -> FloatArray:
+    """Coarse grid on the nominal plant, the best nodes checked on the whole set, then a simplex with a steep wall."""
+    grid = _coarse_grid(plant, specification, kind)
+    n = plant.nominal
+    thin = n.thinned(4)
+    figures = evaluate_grid(thin.omega, thin.h, thin.weights, thin.turn, grid, -1.0)
+    promising = np.flatnonzero(
+        (figures[:, 1] >= 0.95 * specification.modulus_margin)
+        & (figures[:, 2] >= 0.95 * specification.phase_margin_rad)
+    )
+    order = promising[np.argsort(figures[promising, 0])]
+    best, share = None, -math.inf
+    for index in order:
+        slack = float(np.min(_slacks(plant, specification, grid[index])))
+        share = max(share, slack)
+        if slack >= 0.0:
+            best = grid[index]
+            break
+    if best is None:
+        raise _unreachable(plant, specification, kind, grid)
+    free = best > 0.0
+
+    def cost(x: FloatArray, start: FloatArray) -> float:
+        p = start.copy()
+        p[free] = start[free] * np.exp(x)
+        violated = np.minimum(_slacks(plant, specification, p), 0.0)
+        return _norm(plant, p) - 1e3 * float(np.min(violated)) * 10.0
+
+    for span in (0.3, 0.1, 0.03, 0.01):
+        size = int(np.sum(free))
+        simplex = np.vstack((np.zeros(size), span * (np.eye(size) - 0.5 / size)))
+        result = minimize(
+            cost,
+            np.zeros(size),
+            args=(best,),
+            method="Nelder-Mead",
+            options={"initial_simplex": simplex, "xatol": 1e-6, "fatol": 1e-9, "maxiter": 200 * size},
+        )
+        moved = best.copy()
+        moved[free] = best[free] * np.exp(result.x)
+        if np.min(_slacks(plant, specification, moved)) >= -1e-6 and _norm(plant, moved) <= _norm(plant, best):
+            best = moved
+    return np.asarray(best)
+
+
+def _coarse_grid(plant: UncertainPlant, specification: Specification, kind: Kind) -> FloatArray:
+    n = plant.nominal
+    at = int(np.argmin(np.abs(n.phase + 0.75 * np.pi)))
+    omega = float(np.clip(n.omega[at], plant.processes.omega_points[0], plant.processes.omega_points[-1]))
+    gain = float(np.interp(omega, n.omega, np.abs(n.h)))
+    K = min(specification.largest_gain, 3.0 / gain) * np.geomspace(2e-3, 1.0, 36)
+    if specification.noise == "true":
+        K = min(specification.noise_gain, 3.0 / gain) * np.geomspace(2e-3, 1.0, 36)
+    Ti = np.geomspace(0.1, 100.0, 36) / omega
+    if kind == "pi":
+        return np.array([(k, t, 0.0, 0.0) for k in K for t in Ti])
+    return np.array(
+        [
+            (k, t, t * share, t * share / ratio)
+            for k in K[::2]
+            for t in Ti[::2]
+            for share in np.geomspace(0.03, 1.5, 8)
+            for ratio in (0.7, 1.5, 3.0, 8.0, 20.0)
+        ]
+    )
+
+
+def _answer(
+    plant: UncertainPlant, specification: Specification, kind: Kind, p: FloatArray, probability: float
+) -> Design:
+    from autotune.design.synthesis import binding_constraints, weighted
+
+    n = plant.nominal
+    K, Ti, Td, Tf = (float(value) for value in p)
+    controller = PIDController(K=n.sign * K, Ti_s=Ti, Td_s=Td, Tf_s=Tf)
+    modulus, phase, delay, gain, noise = guaranteed(plant.omega, plant.supports, K, Ti, Td, Tf)
+    L = n.h * controller.response(n.omega) * n.sign
+    crossing = int(np.flatnonzero(np.abs(L) >= 1.0)[-1])
+    m = Margins(
+        stable=True,
+        modulus=modulus,
+        modulus_frequency_rad_s=float(n.omega[int(np.argmin(np.abs(1.0 + L)))]),
+        phase_rad=phase,
+        delay_s=delay,
+        gain=gain,
+        gain_reduction=0.0,
+        crossover_rad_s=float(n.omega[crossing]),
+        noise_gain=noise,
+        noise_gain_bound=K * max(1.0, Td / Tf if Tf > 0.0 else 1.0) / modulus,
+        h2=math.exp(_norm(plant, p)),
+    )
+    grown = plant.processes.inflation
+    remark = f"; the regions had to be taken {grown:.2f} times as large to be consistent" if grown > 1.0 else ""
+    return Design(
+        kind=kind,
+        controller=weighted(controller, specification),
+        specification=specification,
+        h2=m.h2,
+        h2_lower_bound=None,
+        binding=binding_constraints(m, specification),
+        margins=m,
+        certificate=(
+            f"margins hold for every aperiodic process with dead time through the joint {100 * probability:g} % region "
+            f"of the {len(plant.processes.omega_points)} points; no lower bound on the norm{remark}"
+        ),
+    )
+
+
+def _unreachable(plant: UncertainPlant, specification: Specification, kind: Kind, grid: FloatArray) -> DesignError:
+    within = [p for p in grid[:: 2 if kind == "pi" else 7] if _slacks(plant, specification, p)[2] >= 0.0]
+    share = max((1.0 + float(np.min(_slacks(plant, specification, p)[[0, 1, 3]])) for p in within), default=0.0)
+    if share <= 0.0:
+        return DesignError(
+            "the points do not reach the frequencies where the loop would cross over",
+            where="points",
+            mend="measure points with phases between -105 and -160 degrees, and beyond the crossover",
+        )
+    factor = math.floor(share * 100.0) / 100.0
+    return DesignError(
+        f"no {kind.upper()} keeps M_m {specification.modulus_margin:g} and "
+        f"{math.degrees(specification.phase_margin_rad):g} deg for all plants through the points",
+        where="synthesis",
+        mend=f"the nearest that one keeps is M_m {factor * specification.modulus_margin:.3f} and "
+        f"{factor * math.degrees(specification.phase_margin_rad):.1f} deg; or measure with smaller regions",
+    )

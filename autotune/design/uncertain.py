@@ -1,0 +1,182 @@
+"""The plants that measured points leave possible, sampled in frequency, and the margins that all of them have."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+
+from autotune.arrays import FloatArray
+from autotune.design.kernels import SampledPlant
+from autotune.design.process_class import DIRECTIONS, ConsistentProcesses, consistent_processes
+from autotune.points import FrequencyPoint
+
+_SUBNODES = 12
+_BELOW, _ABOVE = 8.0, 5.0  # how far the guarantee is checked beyond the points; bounds on gain take over from there
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class UncertainPlant:
+    """All plants that agree with the points, frequency by frequency, and the nominal one.
+
+    Attributes
+    ----------
+    omega : (M,) array
+        Frequencies at which the set is known [rad/s], ascending.
+    supports : (M, DIRECTIONS) array
+        Support values of the set in (log gain, phase), slack for the way to the neighbouring frequencies included.
+    nominal : SampledPlant
+        The member closest to the points, for the norm.
+    processes : ConsistentProcesses
+        Where it comes from.
+    """
+
+    omega: FloatArray
+    supports: FloatArray
+    nominal: SampledPlant
+    processes: ConsistentProcesses
+
+
+def uncertain_plant(
+    points: Sequence[FrequencyPoint], *, probability: float = 0.95, inverse_response: bool = True
+) -> UncertainPlant:
+    """Return what the points say about the plant, between and beyond them.
+
+    Parameters
+    ----------
+    points : sequence of FrequencyPoint
+        At least three, with covariance.
+    probability : float
+        Of the joint region of all points.
+    inverse_response : bool
+        Whether the class has all-pass factors besides lags, one integrator and dead time.
+
+    Raises
+    ------
+    DesignError
+        See :func:`autotune.design.process_class.consistent_processes`.
+    """
+    processes = consistent_processes(points, probability=probability, inverse_response=inverse_response)
+    first, last = processes.omega_points[0], processes.omega_points[-1]
+    inner = np.geomspace(0.7 * first, 1.5 * last, int(math.log(1.5 * last / (0.7 * first)) / 0.12) + 2)
+    below = np.geomspace(first / _BELOW, 0.7 * first, 7)[:-1]
+    above = np.geomspace(1.5 * last, _ABOVE * last, 6)[1:]
+    nodes = np.concatenate((below, inner, above))
+    supports, curvature = processes.supports(nodes), processes.curvatures(nodes)
+    share = np.arange(_SUBNODES) / _SUBNODES
+    steps = np.diff(np.log(nodes))
+    omega = np.append((nodes[:-1, None] * np.exp(share * steps[:, None])).ravel(), nodes[-1])
+    # a curve in (log gain, phase) leaves its chord by at most t (1 - t) step^2/2 times its second derivative
+    bend = np.maximum(curvature[:-1], curvature[1:])[:, None] * 0.5 * share * (1.0 - share) * steps[:, None] ** 2
+    between = supports[:-1, None, :] + share[:, None] * (supports[1:, None, :] - supports[:-1, None, :])
+    slack = bend + 0.125 * np.maximum(curvature[:-1], curvature[1:])[:, None] * (steps[:, None] / _SUBNODES) ** 2
+    values = (between + slack[:, :, None]).reshape(-1, DIRECTIONS)
+    return UncertainPlant(
+        omega=omega,
+        supports=np.vstack((values, supports[-1])),
+        nominal=_nominal(processes),
+        processes=processes,
+    )
+
+
+def _nominal(processes: ConsistentProcesses) -> SampledPlant:
+    omega = np.geomspace(processes.omega_points[0] * 1e-4, processes.omega_points[-1] * 1e2, 1200)
+    log_gain, phase = processes.nominal_log(omega)
+    steps = np.diff(np.log(omega))
+    weights = np.zeros(len(omega))
+    weights[:-1] += 0.5 * steps
+    weights[1:] += 0.5 * steps
+    weights[0] += 1.0
+    # open loop in the left half plane but for integrators: the curve starts at arg L and must end at 0 with no turn
+    turn = float(phase[0]) - 0.5 * np.pi
+    return SampledPlant(
+        omega=omega,
+        h=np.exp(log_gain + 1j * phase),
+        weights=weights / (np.pi * omega),
+        turn=turn,
+        sign=processes.sign,
+    )
+
+
+@njit(cache=True, error_model="numpy")
+def _lowest_phase_at_unit_gain(a: FloatArray, b: FloatArray, h: FloatArray, h_next: FloatArray) -> float:
+    """Return the lowest phase at log gain 0 in the hull of two sets given by their supports; 1e300 if none is there."""
+    lowest, highest = -1e300, 1e300
+    for d in range(len(a)):
+        H = max(h[d], h_next[d])
+        if b[d] < -1e-9:
+            lowest = max(lowest, H / b[d])
+        elif b[d] > 1e-9:
+            highest = min(highest, H / b[d])
+        elif H < 0.0:
+            return 1e300
+    return lowest if lowest <= highest else 1e300
+
+
+@njit(cache=True, error_model="numpy")
+def _nearest_to_critical(a: FloatArray, b: FloatArray, h: FloatArray) -> float:
+    """Return min abs(1 + L)^2 on the border of a set of L given by its supports."""
+    n = len(a)
+    sine = b[1]
+    nearest = 1e300
+    for d in range(n):
+        # vertex between the tangents d and d + 1, the next vertex, and two points on the edge between them
+        e, f = (d + 1) % n, (d + 2) % n
+        g0, p0 = (h[d] * b[e] - h[e] * b[d]) / sine, (h[e] * a[d] - h[d] * a[e]) / sine
+        g1, p1 = (h[e] * b[f] - h[f] * b[e]) / sine, (h[f] * a[e] - h[e] * a[f]) / sine
+        for k in range(3):
+            g, p = g0 + (g1 - g0) * k / 3.0, p0 + (p1 - p0) * k / 3.0
+            size = math.exp(g)
+            nearest = min(nearest, 1.0 + 2.0 * size * math.cos(p) + size * size)
+    return nearest
+
+
+@njit(cache=True, error_model="numpy")
+def guaranteed(
+    omega: FloatArray, supports: FloatArray, K: float, Ti: float, Td: float, Tf: float
+) -> tuple[float, float, float, float, float]:
+    """Return modulus, phase [rad], delay [s] and gain margin and noise gain that every plant of the set has at least.
+
+    The modulus margin is negative where the set does not decide: abs(L) is not surely above 1 + itself at the lowest
+    frequency and below 1 - itself at the highest.
+    """
+    directions = supports.shape[1]
+    step = 2.0 * math.pi / directions
+    a, b = np.cos(step * np.arange(directions)), np.sin(step * np.arange(directions))
+    modulus = 1e300
+    phase = math.pi
+    delay = 1e300
+    growth = -1e300
+    noise = 0.0
+    crossed = False
+    h = np.empty(directions)  # support values of L at this frequency, and at the one before
+    h_before = np.empty(directions)
+    for i in range(len(omega)):
+        w = omega[i]
+        C = complex(K, K * (Td * w - 1.0 / (Ti * w))) / complex(1.0, Tf * w)
+        h_before[:] = h
+        h[:] = supports[i] + a * math.log(abs(C)) + b * math.atan2(C.imag, C.real)
+        if i > 0:
+            angle = _lowest_phase_at_unit_gain(a, b, h_before, h) + math.pi
+            if angle < 1e299:
+                phase, delay, crossed = min(phase, angle), min(delay, angle / w), True
+        if -h[3 * directions // 4] <= -math.pi:
+            growth = max(growth, h[0])
+        smallest, largest = math.exp(-h[directions // 2]), math.exp(h[0])
+        nearest = max(smallest - 1.0, 1.0 - largest) ** 2
+        if smallest - 1.0 < modulus and 1.0 - largest < modulus:
+            nearest = _nearest_to_critical(a, b, h)
+            modulus = min(modulus, math.sqrt(nearest))
+        if crossed:
+            noise = max(noise, abs(C) / math.sqrt(max(nearest, 1e-300)))
+    C_low = complex(K, K * (Td * omega[0] - 1.0 / (Ti * omega[0]))) / complex(1.0, Tf * omega[0])
+    C_high = complex(K, K * (Td * omega[-1] - 1.0 / (Ti * omega[-1]))) / complex(1.0, Tf * omega[-1])
+    at_least = math.exp(-supports[0, directions // 2]) * abs(C_low)
+    at_most = math.exp(supports[-1, 0]) * max(abs(C_high), K * max(1.0, Td / Tf if Tf > 0.0 else 1.0))
+    if at_least < 1.0 + modulus or at_most > 1.0 - modulus:
+        modulus = min(modulus, at_least - 1.0, 1.0 - at_most)
+    gain = math.exp(-max(growth, math.log(at_most)))
+    return modulus, phase, delay, gain, noise
