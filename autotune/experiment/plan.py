@@ -248,8 +248,8 @@ def expected_sd(noise_sd: float, y_amplitude: float, samples: float) -> float:
 
 
 def time_s(choice: Choice, periods: int) -> float:
-    """Return the rig time that a limit cycle of so many whole periods is expected to take [s]: half a one to settle."""
-    return (periods + 0.5) * 2.0 * math.pi / choice.omega_rad_s
+    """Return the rig time that a limit cycle of so many whole periods is expected to take [s]."""
+    return (periods + 0.1) * 2.0 * math.pi / choice.omega_rad_s
 
 
 def allot(choices: Sequence[Choice], goal: Goal, gain_sd: float, least_periods: int, left_s: float) -> tuple[int, ...]:

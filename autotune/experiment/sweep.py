@@ -14,9 +14,11 @@ from autotune.experiment.approach import Known
 from autotune.experiment.loop import ControlLoop
 from autotune.experiment.oscillation import PATIENCE, Oscillation
 from autotune.experiment.plan import Choice, Goal, allot, choose, phase_targets, time_s
-from autotune.experiment.result import Segment
+from autotune.experiment.relay import RelaySettings
+from autotune.experiment.result import Segment, State
 from autotune.identification.describing import describing_function
 from autotune.identification.frequency import LimitCycle, limit_cycle_points
+from autotune.identification.limit_cycle import WholePeriods
 
 #: part of limits.swing that a limit cycle is planned for: the rest is for a mid-point that is not quite right
 PEAK_SHARE = 0.91
@@ -64,8 +66,8 @@ def sweep(loop: ControlLoop, config: Config, known: Known, oscillation: Oscillat
         expected_s = sum(time_s(choice, count) for choice, count in zip(choices, periods, strict=True))
         show(f"point {i + 1} of {len(targets)}: {math.degrees(targets[i]):.0f} deg", expected_s)
         reserved_s = sum(time_s(choice, LEAST_PERIODS) for choice in choices[1:])
-        cycle = _measure(oscillation, config, choices[0], periods[0], end_s - reserved_s)
-        segment = _segment(cycle, oscillation, loop.sample_time_s)
+        cycle = _measure(oscillation, choices[0], periods[0], end_s - reserved_s, known)
+        segment = _segment(cycle, oscillation.settings, loop.sample_time_s)
         segments.append(segment)
         loop.metadata["relay"] = [one.metadata() for one in segments]
         sd = math.sqrt(float(np.trace(segment.point.covariance)) / 2.0) / segment.point.gain
@@ -84,7 +86,21 @@ def sweep(loop: ControlLoop, config: Config, known: Known, oscillation: Oscillat
             swept=True,
             warnings=warnings,
         )
-    return Swept(segments=tuple(segments), known=known)
+    return _refined(loop, segments, known)
+
+
+def _refined(loop: ControlLoop, segments: list[Segment], known: Known) -> Swept:
+    """Estimate every cycle once more, now that the others make a better rough model of the plant."""
+    refined = []
+    for one in segments:
+        t, u, y = loop.history()
+        rows = (t >= one.start_s - 1e-9) & (t <= one.end_s + 2.0 * loop.sample_time_s)
+        window = WholePeriods(start_s=one.start_s, end_s=one.end_s, periods=one.periods)
+        others = [other.point for other in segments if other is not one]
+        cycle = limit_cycle_points(t[rows], u[rows], y[rows], window=window, known=others)
+        refined.append(_segment(cycle, one.settings, loop.sample_time_s))
+    points = tuple(one.point for one in refined)
+    return Swept(segments=tuple(refined), known=replace(known, points=points))
 
 
 def _goal(config: Config, known: Known) -> Goal:
@@ -113,63 +129,68 @@ def _choice(config: Config, known: Known, phase_rad: float) -> Choice:
     )
 
 
-def _measure(
-    oscillation: Oscillation, config: Config, choice: Choice, wanted_periods: int, until_s: float
-) -> LimitCycle:
-    """Run one setting until its point is known well enough or its time is over."""
+def _measure(oscillation: Oscillation, choice: Choice, wanted: int, until_s: float, known: Known) -> LimitCycle:
+    """Run one setting for whole periods, until its point is known well enough or its time is over.
+
+    Parameters
+    ----------
+    oscillation : Oscillation
+        The relay, at the extremum of y.
+    choice : Choice
+        The setting.
+    wanted : int
+        Whole periods to measure.
+    until_s : float
+        When to end with fewer, but with no fewer than the least [s].
+    known : Known
+        Points so far. Once the sweep has begun, the cycle before had the same peak: this one is settled from its first
+        row on.
+    """
     loop = oscillation.loop
+    step_s = loop.sample_time_s
     oscillation.change(choice.settings, patience_s=PATIENCE * math.pi / choice.omega_rad_s)
-    first = 0
+    start = oscillation.start_row if known.swept else -1
+    skip = 0  # edges before the cycle that is measured
     while True:
-        _, switched = oscillation.step()
-        edges = oscillation.edges
-        if not switched:
+        tick, switched = oscillation.step()
+        edges = oscillation.edges[skip:]
+        if switched and len(edges) > 2 and _rebalanced(oscillation, edges):
+            skip, start = len(oscillation.edges) - 1, edges[-1]
             continue
-        if len(edges) >= first + 3:
-            first = _rebalanced(oscillation, edges, first)
-        periods = (len(edges) - 1 - first) // 2
-        if periods < LEAST_PERIODS or (len(edges) - 1 - first) % 2:
+        if start < 0 and edges:
+            start = edges[0]
+        if len(edges) < 2 * LEAST_PERIODS:
             continue
-        period_s = (edges[-1] - edges[first]) * loop.sample_time_s / periods
-        over = periods >= wanted_periods or loop.tick.t_s + period_s > until_s
-        if not over:
+        period = (edges[-1] + edges[-2] - edges[1] - edges[0]) / (len(edges) - 2)
+        periods = max(LEAST_PERIODS, min(wanted, int((until_s / step_s - start) / period)))
+        turned = (tick.k - edges[-1]) * step_s >= choice.turning_s
+        if tick.k < start + periods * period + 1 or not turned:
             continue
-        oscillation.step()  # the row after the switch completes one that was made in two steps
-        t, u, y = loop.history(edges[first] - 2)
+        t, u, y = loop.history(start)
+        others = known.points if known.swept else ()
+        window = WholePeriods(start_s=float(t[0]), end_s=float(t[0]) + periods * period * step_s, periods=periods)
         try:
-            cycle = limit_cycle_points(t, u, y)
+            return limit_cycle_points(t, u, y, window=window, known=others)
         except IdentificationError as error:
-            raise ExperimentStopped(str(error), where="relay sweep", mend=error.mend) from error
-        _turn(oscillation, choice.turning_s)
-        return cycle
+            raise ExperimentStopped(error.what, where=State.SWEEP.value, mend=error.mend) from error
 
 
-def _turn(oscillation: Oscillation, turning_s: float) -> None:
-    """Go on to the extremum of y, where the next setting's limit cycle joins this one's without a transient."""
-    last_row = oscillation.edges[-1]
-    while (oscillation.loop.tick.k - last_row) * oscillation.loop.sample_time_s < turning_s:
-        oscillation.step()
-
-
-def _rebalanced(oscillation: Oscillation, edges: list[int], first: int) -> int:
-    """Correct the mid-point where the last period was lopsided; return the edge that the point starts from."""
-    if (len(edges) - 1 - first) % 2:
-        return first
+def _rebalanced(oscillation: Oscillation, edges: list[int]) -> bool:
+    """Correct the mid-point where the last period was lopsided, and say whether it was."""
     _, u, _ = oscillation.loop.history(edges[-3])
     settings = oscillation.settings
     mean = float(np.mean(u[: edges[-1] - edges[-3]]))
     if abs(mean - settings.midpoint) / settings.amplitude <= 2.0 * LARGEST_ASYMMETRY:
-        return first
+        return False
     step = oscillation.loop.envelope.u_step
     midpoint = step * round(mean / step) if step > 0.0 else mean
     if midpoint == settings.midpoint:
-        return first
+        return False
     oscillation.move_midpoint(midpoint)
-    return len(edges) - 1
+    return True
 
 
-def _segment(cycle: LimitCycle, oscillation: Oscillation, sample_time_s: float) -> Segment:
-    settings = oscillation.settings
+def _segment(cycle: LimitCycle, settings: RelaySettings, sample_time_s: float) -> Segment:
     delay_s = (settings.delay_samples + 0.5 * (settings.smoothing - 1)) * sample_time_s
     return Segment(
         start_s=cycle.start_s,

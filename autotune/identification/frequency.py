@@ -5,6 +5,7 @@ The phase comes from the recorded signals alone: hysteresis, hold, transport and
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -82,6 +83,8 @@ def limit_cycle_points(
     *,
     highest_harmonic: int = _HIGHEST_HARMONIC,
     largest_relative_sd: float = 0.1,
+    window: WholePeriods | None = None,
+    known: Sequence[FrequencyPoint] = (),
 ) -> LimitCycle:
     """Estimate the plant's complex gain at the fundamental and the odd harmonics of a settled relay limit cycle.
 
@@ -97,6 +100,10 @@ def limit_cycle_points(
         Highest odd harmonic tried; only those below 0.8 of the Nyquist frequency are.
     largest_relative_sd : float
         A harmonic is given when its standard deviation is below this part of its gain.
+    window : WholePeriods, optional
+        Window to use, beginning anywhere in the cycle; by default the longest one from switch to switch.
+    known : sequence of FrequencyPoint
+        Points of other cycles of the same plant: they make the rough model better, and enter the estimate no further.
 
     Returns
     -------
@@ -117,12 +124,12 @@ def limit_cycle_points(
     oscillation's, per sample in a switch, and is measured in ``tests/benchmarks/frequency_points.py``.
     """
     edges = relay_edges(t, u)
-    window = whole_periods(edges, float(t[-1]) + float(t[-1] - t[-2]))
+    window = window or whole_periods(edges, float(t[-1]) + float(t[-1] - t[-2]))
     slack = 1e-6 * window.period_s  # a stamp and a switch at one instant differ by rounding
     inside = (t >= window.start_s - slack) & (t < window.end_s - slack)
     good = inside & np.isfinite(y)
     orders = _orders(window, t, good, highest_harmonic)
-    fit, reference, outliers = _corrected_fit(t, u, y, good, window, orders)
+    fit, reference, outliers = _corrected_fit(t, u, y, good, window, orders, known)
     noise = noise_spectrum(fit.residual, window.period_s * window.periods / int(inside.sum()), fit.parameters)
     omega = window.omega_rad_s * np.array(orders)
     U = held_coefficients(t, u, omega, window.start_s, window.end_s)
@@ -143,7 +150,13 @@ def _orders(window: WholePeriods, t: FloatArray, good: BoolArray, highest: int) 
 
 
 def _corrected_fit(
-    t: FloatArray, u: FloatArray, y: FloatArray, good: BoolArray, window: WholePeriods, orders: Sequence[int]
+    t: FloatArray,
+    u: FloatArray,
+    y: FloatArray,
+    good: BoolArray,
+    window: WholePeriods,
+    orders: Sequence[int],
+    known: Sequence[FrequencyPoint],
 ) -> tuple[HarmonicFit, ReferenceModel | None, int]:
     """Fit the harmonics of y, then twice those of y less the rough model's response; leave outliers out."""
     omega = window.omega_rad_s * np.array(orders)
@@ -156,7 +169,12 @@ def _corrected_fit(
     outliers = 0
     for _ in range(2):
         sd = np.std(fit.residual) * np.sqrt(np.trace(fit.covariance_unit, axis1=1, axis2=2)) / np.abs(U)
-        trial = fit_reference(omega[excited], G[excited], sd[excited], np.abs(U[excited]))
+        trial = fit_reference(
+            np.concatenate([omega[excited], [point.omega_rad_s for point in known]]),
+            np.concatenate([G[excited], [point.response for point in known]]),
+            np.concatenate([sd[excited], [math.sqrt(0.5 * float(np.trace(point.covariance))) for point in known]]),
+            np.concatenate([np.abs(U[excited]), np.full(len(known), np.abs(U[0]))]),
+        )
         left = y - simulate_reference(t, centred, trial)
         transients = free_responses(t[good], trial)
         trial_fit = fit_harmonics(t[good], left[good], window.omega_rad_s, orders, transients=transients)
@@ -237,11 +255,10 @@ def _summary(
     plain = fit_harmonics(t[good], y[good], window.omega_rad_s, orders)
     phase = 2.0 * np.pi * np.arange(200) / 200
     wave = np.real(2.0 * np.exp(1j * np.multiply.outer(phase, np.array(orders))) @ plain.coefficients)
-    use = (edges.times_s >= window.start_s) & (edges.times_s <= window.end_s)
-    times, rising = edges.times_s[use], edges.rising[use]
-    high = np.sum(np.diff(times)[rising[:-1]]) / (window.end_s - window.start_s)
     knots = np.concatenate([[window.start_s], t[(t > window.start_s) & (t < window.end_s)], [window.end_s]])
     levels = u[np.clip(np.searchsorted(t, knots[:-1], side="right") - 1, 0, None)]
+    above = levels > 0.5 * (levels.min() + levels.max())
+    high = np.sum(np.diff(knots)[above]) / (window.end_s - window.start_s)
     return LimitCycle(
         points=points,
         period_s=window.period_s,
