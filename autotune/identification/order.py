@@ -26,7 +26,9 @@ _CLEAR_GAIN = 6.0
 #: Accepted steps for a candidate; only the chosen one is polished to the end.
 _CANDIDATE_STEPS = 25
 #: Rows that the choice looks at; longer records are polished whole once it is made.
-CHOICE_ROWS = 50_000
+CHOICE_ROWS = 20_000
+#: Residuals below this share of the signals are rounding: a higher order earns nothing by making them smaller still.
+_NOISE_FREE = 1e-7
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -241,20 +243,21 @@ def _dead_time(data: LaggedData, rows: int) -> int:
 
 
 def _parsimonious(fits: dict[tuple[int, int], PredictionErrorEstimate]) -> tuple[int, int]:
-    lowest = min(fit.bic for (_, delay), fit in fits.items() if delay == 0)
-    prompt = min(key for key, fit in fits.items() if key[1] == 0 and fit.bic < lowest + _CLEAR_GAIN)
+    rows = min(estimate.rows for estimate in fits.values())
+    criterion = {key: _per_rows(fit, rows) for key, fit in fits.items()}
+    lowest = min(value for (_, delay), value in criterion.items() if delay == 0)
+    prompt = min(key for key, value in criterion.items() if key[1] == 0 and value < lowest + _CLEAR_GAIN)
     late = [key for key in fits if key[1] > 0]
     if not late:
         return prompt
-    rows = min(estimate.rows for estimate in fits.values())
-    best_late = min(late, key=lambda key: _per_rows(fits[key], rows))
-    gain = _per_rows(fits[prompt], rows) - _per_rows(fits[best_late], rows)
-    return best_late if gain > _CLEAR_GAIN else prompt
+    best_late = min(late, key=lambda key: criterion[key])
+    return best_late if criterion[prompt] - criterion[best_late] > _CLEAR_GAIN else prompt
 
 
 def _per_rows(estimate: PredictionErrorEstimate, rows: int) -> float:
     """Return the criterion as if from ``rows`` rows: candidates with a dead time use a few rows fewer."""
-    return rows * estimate.log_det + (estimate.bic - estimate.rows * estimate.log_det)
+    floor = 2.0 * estimate.model.C.shape[0] * float(np.log(_NOISE_FREE))
+    return rows * max(estimate.log_det, floor) + (estimate.bic - estimate.rows * estimate.log_det)
 
 
 def _evidence(fits: dict[tuple[int, int], PredictionErrorEstimate]) -> tuple[Candidate, ...]:

@@ -15,14 +15,18 @@ from autotune.arrays import FloatArray
 from autotune.errors import IdentificationError
 from autotune.identification.predictor_directions import Predictor, behaviour_directions
 from autotune.identification.predictor_sweep import innovations, normal_equations, scatter
-from autotune.identification.state_space import InnovationModel, balanced_predictor, spectral_radius
+from autotune.identification.state_space import InnovationModel, balancing, spectral_radius
 
 #: A step that promises less than this in -2 log likelihood moves no parameter by 1 % of its standard deviation.
 _TOLERANCE = 1e-4
+#: A search that cannot move any more has converged if it could have gained less than this.
+_IMMATERIAL = 0.1
 #: Zeros of the noise model nearer to the unit circle than this have no finite memory worth the name.
 _RADIUS_LIMIT = 0.9999
 #: Smaller innovations, relative to the output, are rounding.
 _NOISE_FREE = 1e-11
+#: Innovations this small say that the record has no noise in it.
+_ROUNDING = 1e-8
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -53,7 +57,9 @@ class PredictionErrorEstimate:
     converged : bool
         Whether the last step promised less than the tolerance.
     condition : float
-        Condition number of the information matrix with unit diagonal.
+        Condition number of the information matrix with unit diagonal; 1 where there is no noise.
+    noise_free : bool
+        Whether the innovations are rounding: then K is arbitrary, and the covariance as good as zero.
     """
 
     model: InnovationModel
@@ -72,15 +78,15 @@ class PredictionErrorEstimate:
     iterations: int
     converged: bool
     condition: float
+    noise_free: bool
 
     @property
     def bic(self) -> float:
         """Bayesian information criterion, rows log det + parameters log rows; the smaller the better.
 
-        The initial state is left out of the count: it does not grow more certain with the record.
+        The initial state counts in full: a superfluous mode near the unit circle uses it throughout the record.
         """
-        count = self.parameters - self.model.order
-        return self.rows * self.log_det + count * float(np.log(self.rows))
+        return self.rows * self.log_det + self.parameters * float(np.log(self.rows))
 
 
 def prediction_error(
@@ -122,7 +128,8 @@ def prediction_error(
     """
     delay = start.input_delay
     u_past, y_now = np.ascontiguousarray(u[: len(u) - delay]), np.ascontiguousarray(y[delay:])
-    start = balanced_predictor(start)
+    if start.predictor_radius >= 1.0:
+        raise IdentificationError("the start's predictor is not stable", where="prediction error")
     predictor = _initial_predictor(start, u_past, y_now, feedthrough=feedthrough, offset=offset)
     search = _search(predictor, u_past, y_now, feedthrough=feedthrough, offset=offset, max_iterations=max_iterations)
     return _estimate(start, search, y_now)
@@ -168,6 +175,7 @@ def _search(
     errors = scatter(predictor.F, predictor.H, predictor.x0, u, y)
     floor = len(y) * (_NOISE_FREE * np.std(y, axis=0)) ** 2
     while True:
+        predictor = _balanced(predictor)
         directions = behaviour_directions(predictor, feedthrough=feedthrough, offset=offset)
         if len(y) * y.shape[1] <= directions.shape[1]:
             raise IdentificationError(
@@ -181,15 +189,20 @@ def _search(
             break
         accepted = False
         while not accepted:
-            step, promise = _step(information, gradient, damping)
+            step, promise, damping = _step(information, gradient, damping)
+            trial = predictor.moved(step, directions)
+            if _radius(trial) > _RADIUS_LIMIT:
+                step = _onto_boundary(predictor, directions, information, step)
+                promise = -float(step @ (2.0 * gradient + information @ step))
+                trial = predictor.moved(step, directions)
             if promise < _TOLERANCE:
                 converged = True
                 break
-            trial = predictor.moved(step, directions)
             trial_errors = _stable_scatter(trial, u, y)
             accepted = _log_det(trial_errors) < _log_det(errors)
-            damping = damping / 10.0 if accepted else max(10.0 * damping, 1e-4)
-            if damping > 1e8:
+            damping = damping / 10.0 if accepted else 10.0 * damping
+            if damping > 1e3:  # no step helps: the promise is below what rounding or the boundary lets through
+                converged = promise < _IMMATERIAL
                 break
         if not accepted:
             break
@@ -202,6 +215,18 @@ def _search(
         iterations=iterations,
         converged=converged,
     )
+
+
+def _balanced(predictor: Predictor) -> Predictor:
+    """Return the predictor in balanced coordinates, in which no direction is badly scaled."""
+    n, n_u, n_y = predictor.sizes
+    F, H = predictor.F, predictor.H
+    A, B, K, C, D = F[:, :n], F[:, n : n + n_u], F[:, n + n_u : n + n_u + n_y], H[:, :n], H[:, n : n + n_u]
+    T = balancing(InnovationModel(A=A, B=B, C=C, D=D, K=K, innovation_covariance=np.eye(n_y)))
+    inverse = np.linalg.inv(T)
+    moved = T @ F
+    moved[:, :n] = moved[:, :n] @ inverse
+    return Predictor(F=moved, H=np.hstack([C @ inverse, H[:, n:]]), x0=T @ predictor.x0)
 
 
 def _normal_equations(
@@ -226,21 +251,67 @@ def _normal_equations(
     return total
 
 
-def _step(information: FloatArray, gradient: FloatArray, damping: float) -> tuple[FloatArray, float]:
-    """Return the damped Gauss-Newton step and the decrease of -2 log likelihood that it promises."""
+def _step(information: FloatArray, gradient: FloatArray, damping: float) -> tuple[FloatArray, float, float]:
+    """Return the damped Gauss-Newton step, the decrease of -2 log likelihood an undamped one promises, the damping.
+
+    A damping below the smallest eigenvalue (unit diagonal) does nothing: it is replaced by that eigenvalue for the
+    next attempt.
+    """
     scale = np.sqrt(np.maximum(np.diag(information), 1e-12 * np.max(np.diag(information))))
     values, vectors = np.linalg.eigh(information / np.outer(scale, scale))
     turned = vectors.T @ (gradient / scale)
     kept = values > 1e-13 * values[-1]
     turned = np.where(kept, turned, 0.0)
-    step = -(vectors @ (turned / (np.where(kept, values, 1.0) + damping))) / scale
-    return step, float(np.sum(turned**2 / np.where(kept, values, 1.0)))
+    safe = np.where(kept, values, 1.0)
+    least = float(np.min(safe))
+    step = -(vectors @ (turned / (safe + (damping if damping > 0.1 * least else 0.0)))) / scale
+    return step, float(np.sum(turned**2 / safe)), max(damping, 0.1 * least)
+
+
+def _radius(predictor: Predictor) -> float:
+    n, n_u, n_y = predictor.sizes
+    if not np.all(np.isfinite(predictor.F)):
+        return float("inf")
+    return spectral_radius(predictor.F[:, :n] - predictor.F[:, n + n_u : n + n_u + n_y] @ predictor.H[:, :n])
+
+
+def _radius_gradient(predictor: Predictor, directions: FloatArray) -> FloatArray:
+    """Return the derivative of the predictor's spectral radius along the directions."""
+    n, n_u, n_y = predictor.sizes
+    K, C = predictor.F[:, n + n_u : n + n_u + n_y], predictor.H[:, :n]
+    values, vectors = np.linalg.eig(predictor.F[:, :n] - K @ C)
+    at = int(np.argmax(np.abs(values)))
+    dF, dH, _ = np.split(directions, np.cumsum([predictor.F.size, predictor.H.size]))
+    dF, dH = dF.reshape(*predictor.F.shape, -1), dH.reshape(*predictor.H.shape, -1)
+    change = (
+        dF[:, :n] - np.einsum("iop,ok->ikp", dF[:, n + n_u : n + n_u + n_y], C) - np.einsum("io,okp->ikp", K, dH[:, :n])
+    )
+    left = np.linalg.inv(vectors)[at]
+    moved = np.einsum("i,ikp,k->p", left, change, vectors[:, at])
+    return np.asarray(np.real(np.conj(values[at]) / abs(values[at]) * moved), dtype=np.float64)
+
+
+def _onto_boundary(
+    predictor: Predictor, directions: FloatArray, information: FloatArray, step: FloatArray
+) -> FloatArray:
+    """Return the step bent back onto the stability boundary, the nearest way in the metric of the information.
+
+    Zeros of the noise model do lie there: a trend taken out, or an integrating plant with white noise on its sensor.
+    """
+    for _ in range(3):
+        trial = predictor.moved(step, directions)
+        excess = _radius(trial) - (_RADIUS_LIMIT - 1e-7)
+        if not 0.0 < excess < 1.0:
+            break
+        outward = _radius_gradient(trial, directions)
+        across = np.linalg.lstsq(information, outward, rcond=1e-13)[0]
+        step = step - across * excess / max(float(outward @ across), np.finfo(np.float64).tiny)
+    return step
 
 
 def _stable_scatter(trial: Predictor, u: FloatArray, y: FloatArray) -> FloatArray:
-    n, n_u, n_y = trial.sizes
-    A, K, C = trial.F[:, :n], trial.F[:, n + n_u : n + n_u + n_y], trial.H[:, :n]
-    if not np.all(np.isfinite(trial.F)) or spectral_radius(A - K @ C) > _RADIUS_LIMIT:
+    n_y = trial.sizes[2]
+    if _radius(trial) > _RADIUS_LIMIT:
         return np.full((n_y, n_y), np.inf)
     result: FloatArray = scatter(trial.F, trial.H, trial.x0, u, y)
     return result
@@ -259,6 +330,7 @@ def _estimate(start: InnovationModel, search: _Search, y: FloatArray) -> Predict
     dF, dH, _ = np.split(search.directions, np.cumsum([predictor.F.size, predictor.H.size]))
     dF, dH = dF.reshape(*predictor.F.shape, P), dH.reshape(*predictor.H.shape, P)
     freedom = rows - P / n_y
+    noise_free = bool(np.all(np.diag(search.scatter) <= rows * (_ROUNDING * np.std(y, axis=0)) ** 2))
     scale = np.sqrt(np.maximum(np.diag(search.information), np.finfo(np.float64).tiny))
     values, vectors = np.linalg.eigh(search.information / np.outer(scale, scale))
     kept = values > 1e-14 * values[-1]
@@ -288,5 +360,6 @@ def _estimate(start: InnovationModel, search: _Search, y: FloatArray) -> Predict
         log_det=_log_det(search.scatter / rows),
         iterations=search.iterations,
         converged=search.converged,
-        condition=float(values[-1] / max(values[0], np.finfo(np.float64).tiny)),
+        condition=1.0 if noise_free else float(values[-1] / max(values[0], 1e-300 * values[-1])),
+        noise_free=noise_free,
     )

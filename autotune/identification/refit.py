@@ -45,7 +45,9 @@ def refit_inputs(model: InnovationModel, u: FloatArray, y: FloatArray, *, feedth
         columns += [_response(model, np.eye(n)[:, i : i + 1], signal, np.zeros(n), len(y)) for i in range(n)]
         if feedthrough:
             columns += [_through(model, signal, o) for o in range(n_y)]
-    base = innovations(_F(model, np.zeros((n, 0))), _H(model, 0), np.zeros(n), np.zeros((len(y), 0)), y)
+    base = innovations(
+        _state_map(model, np.zeros((n, 0))), _output_map(model, 0), np.zeros(n), np.zeros((len(y), 0)), y
+    )
     R = np.zeros((0, len(columns) + 1))
     for at in range(0, len(y), BLOCK_ROWS):
         part = [column[at : at + BLOCK_ROWS].ravel() for column in [*columns, base]]
@@ -61,18 +63,18 @@ def refit_inputs(model: InnovationModel, u: FloatArray, y: FloatArray, *, feedth
     )
 
 
-def _F(model: InnovationModel, B: FloatArray) -> FloatArray:
+def _state_map(model: InnovationModel, B: FloatArray) -> FloatArray:
     return np.hstack([model.A, B, model.K, np.zeros((model.order, 1))])
 
 
-def _H(model: InnovationModel, n_u: int) -> FloatArray:
+def _output_map(model: InnovationModel, n_u: int) -> FloatArray:
     return np.hstack([model.C, np.zeros((len(model.C), n_u + 1))])
 
 
 def _response(model: InnovationModel, B: FloatArray, u: FloatArray, x0: FloatArray, rows: int) -> FloatArray:
     """Return the change of the innovations that a B and an initial state make, y left out."""
     y = np.zeros((rows, len(model.C)))
-    errors: FloatArray = innovations(_F(model, B), _H(model, u.shape[1]), x0, u, y)
+    errors: FloatArray = innovations(_state_map(model, B), _output_map(model, u.shape[1]), x0, u, y)
     return errors
 
 
@@ -81,5 +83,7 @@ def _through(model: InnovationModel, u: FloatArray, output: int) -> FloatArray:
     y = np.zeros((len(u), len(model.C)))
     y[:, output] = -u[:, 0]
     nothing = np.zeros((model.order, 0))
-    errors: FloatArray = innovations(_F(model, nothing), _H(model, 0), np.zeros(model.order), np.zeros((len(u), 0)), y)
+    errors: FloatArray = innovations(
+        _state_map(model, nothing), _output_map(model, 0), np.zeros(model.order), np.zeros((len(u), 0)), y
+    )
     return errors

@@ -242,10 +242,11 @@ def difference(first: InnovationModel, second: InnovationModel) -> InnovationMod
     )
 
 
-def balanced_predictor(model: InnovationModel) -> InnovationModel:
-    """Return the model in coordinates that balance its one-step predictor (A - K C, [B - K D, K], C).
+def balancing(model: InnovationModel) -> FloatArray:
+    """Return the state transformation T that balances the one-step predictor (A - K C, [B - K D, K], C).
 
-    The predictor is stable even where the plant is not, so the coordinates exist for unstable and integrating plants.
+    The predictor is stable even where the plant is not, so the coordinates T x exist for unstable and integrating
+    plants. Where a state is hardly reached or hardly seen, it is scaled as if it were a little more.
 
     Raises
     ------
@@ -255,15 +256,11 @@ def balanced_predictor(model: InnovationModel) -> InnovationModel:
     if model.predictor_radius >= 1.0:
         raise IdentificationError("the predictor is not stable", where="balancing")
     A, B = model.A - model.K @ model.C, np.hstack([model.B - model.K @ model.D, model.K])
-    reach = _gramian_factor(A, B)
-    observe = _gramian_factor(A.T, model.C.T)
+    reach, observe = _gramian_factor(A, B), _gramian_factor(A.T, model.C.T)
     U, s, _ = np.linalg.svd(observe.T @ reach)
-    if s[-1] <= 1e-13 * s[0]:  # not minimal: any coordinates are as good
-        return model
-    root = np.sqrt(s)
-    return model.transformed((U / root).T @ observe.T)
+    return np.asarray((U / np.sqrt(s)).T @ observe.T, dtype=np.float64)
 
 
 def _gramian_factor(A: FloatArray, B: FloatArray) -> FloatArray:
     values, vectors = np.linalg.eigh(solve_discrete_lyapunov(A, B @ B.T))
-    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)), dtype=np.float64)
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 1e-12 * values[-1])), dtype=np.float64)

@@ -171,7 +171,7 @@ def _loop_order(s: FloatArray, order: int) -> int:
 
 
 def markov_from_null_space(free: FloatArray, right: FloatArray, M11: FloatArray, *, n_u: int, n_y: int) -> FloatArray:
-    """Return (f, n_y, n_u) Markov parameters L of free H(L) M11 = right, by least squares on free H(L) = right / M11."""
+    """Return (f, n_y, n_u) Markov parameters L of free H(L) M11 = right, by least squares."""
     f = free.shape[1] // n_y
     target = solve_triangular(M11, right.T, trans="T", lower=True).T
     blocks = free.reshape(len(free), f, n_y)
