@@ -1,0 +1,174 @@
+"""Identification of x^(n) = sum a_i x^(i) + b u(t - h) + d from a recording, without a starting value.
+
+The model class and its sign convention are those of Ollivier, Moutaouakil and Sadik (2007); the estimate is the
+output-error one their starred values are, reached from an instrumental-variable search over a grid of delays.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from autotune.errors import IdentificationError, InputError
+from autotune.identification.delay_data import DelayData, PastInput, prepare
+from autotune.identification.delay_model import DelayModel
+from autotune.identification.delay_search import binned, search
+from autotune.identification.output_error import Point, Structure, finish, minimise, polish, solve_linear
+from autotune.models import Hold
+from autotune.recording import Recording
+
+_MIDDLE_BINS = 6000
+_COMPARED = 3
+MAX_ORDER = 4
+
+
+def identify_delay(
+    recording: Recording,
+    order: int,
+    *,
+    max_delay_s: float | None = None,
+    hold: Hold | None = None,
+    past_input: PastInput = "unknown",
+    start_s: float | None = None,
+    integrator: bool = False,
+    offset: bool = True,
+    coloured: bool = True,
+    progress: Callable[[str], None] | None = None,
+) -> DelayModel:
+    """Estimate coefficients, gain, delay, operating point and initial state, with their covariance.
+
+    Parameters
+    ----------
+    recording : Recording
+        Rows of t, u, y; the stamps need not be uniform.
+    order : int
+        Order n, 1 to 4.
+    max_delay_s : float, optional
+        Largest delay considered [s]; half the record where not given.
+    hold : {"zero", "linear"}, optional
+        How u runs between rows; the sidecar's ``hold`` where not given, else zero-order hold.
+    past_input : {"unknown", "held", "zero"}
+        What u was before the first row; where unknown, rows of y that would need it are left out.
+    start_s : float, optional
+        Time stamp from which y is used [s]; earlier rows serve as the input's past.
+    integrator : bool
+        Whether a_0 = 0 is known.
+    offset : bool
+        Whether a constant d is estimated: an offset of y or u, or a constant load.
+    coloured : bool
+        Whether the noise may be autoregressive; white is assumed otherwise.
+    progress : callable, optional
+        Called with what is done next.
+
+    Returns
+    -------
+    DelayModel
+        The maximum-likelihood estimate under the noise model.
+
+    Raises
+    ------
+    InputError
+        An order outside 1 to 4, NaN, or a largest delay outside the record.
+    IdentificationError
+        Constant input, an output that does not move, a gap, or data that do not determine the parameters; names what
+        cannot be told apart and the experiment that would tell.
+
+    Notes
+    -----
+    The covariance is the inverse information at the estimate: asymptotic, and right only if the structure is. In
+    closed loop the estimate is consistent where the noise model is right and the loop has a delay.
+
+    References
+    ----------
+    F. Ollivier, S. Moutaouakil, B. Sadik, Une methode d'identification pour un systeme lineaire a retards, 2007,
+    section 3 and Table 1.
+    """
+    say = progress if progress is not None else lambda _: None
+    if not 1 <= order <= MAX_ORDER:
+        raise InputError(f"order {order}", where="order", mend=f"orders 1 to {MAX_ORDER} are supported")
+    structure = Structure(order=order, integrator=integrator, offset=offset)
+    data = prepare(recording, hold=hold, past_input=past_input, start_s=start_s, offset=offset)
+    largest = _largest_delay(data, max_delay_s)
+    if data.ty.size < 3 * structure.parameters:
+        raise _too_short(data, structure)
+    say("searching the delay")
+    candidates = search(data, structure, max_delay_s=largest)
+    finest = min(c.rows_per_bin for c in candidates)
+    middle = binned(data, max(_MIDDLE_BINS, 10 * data.ty.size // finest))
+    best = _best_on_common_rows(middle, structure, [c.point for c in candidates], largest)
+    say("fitting")
+    return _polish_on_all_rows(data, middle, structure, best, largest, coloured)
+
+
+def _largest_delay(data: DelayData, max_delay_s: float | None) -> float:
+    reach = float(data.ty[-1] - data.tu[0])
+    if max_delay_s is None:
+        return 0.5 * reach
+    if not 0.0 <= max_delay_s < reach:
+        raise InputError(
+            f"largest delay {max_delay_s:g} s lies outside the record of {reach:.4g} s",
+            where=data.name,
+            mend="record longer, or give a smaller --max-delay",
+        )
+    return max_delay_s
+
+
+def _best_on_common_rows(data: DelayData, structure: Structure, candidates: list[Point], largest: float) -> Point:
+    """Fit the candidates on finer bins, and compare them on the rows that all of them can explain."""
+    limit = min(max(c.h for c in candidates) * 1.02 + 0.01 * largest, largest)
+    common = data.usable_from(limit)
+    if common.ty.size < 3 * structure.parameters:
+        raise _too_short(data, structure)
+    starts = sorted((solve_linear(common, structure, c.a, c.h) for c in candidates), key=lambda point: point.cost)
+    fitted = [
+        minimise(common, structure, start, max_delay_s=limit, tolerance=1e-2)
+        for start in starts[:_COMPARED]
+        if start.cost < 4.0 * starts[0].cost
+    ]
+    best = min(fitted, key=lambda point: point.cost, default=starts[0])
+    if not np.isfinite(best.cost):
+        raise IdentificationError(
+            f"no model of order {structure.order} explains the record with a finite response",
+            where=data.name,
+            mend="an unstable plant needs a recording in closed loop that is short against its growth",
+        )
+    return best
+
+
+def _polish_on_all_rows(
+    data: DelayData, middle: DelayData, structure: Structure, best: Point, largest: float, coloured: bool
+) -> DelayModel:
+    step = float(np.median(np.diff(data.tu)))
+    for _ in range(4):
+        limit = min(best.h + max(0.05 * best.h, 5.0 * step), largest)
+        rough = middle.usable_from(limit)
+        if rough.ty.size < 3 * structure.parameters:
+            raise _too_short(data, structure)
+        best = minimise(
+            rough, structure, solve_linear(rough, structure, best.a, best.h), max_delay_s=limit, tolerance=1e-3
+        )
+        sd = finish(rough, structure, best).standard_deviations[structure.order + 1]
+        if best.h < limit or limit >= largest:
+            break
+    limit = min(best.h + 6.0 * float(sd) + 2.0 * step, largest)
+    model = polish(data.usable_from(limit), structure, best, max_delay_s=limit, coloured=coloured)
+    _require_inside(data, model, largest)
+    return model
+
+
+def _require_inside(data: DelayData, model: DelayModel, largest: float) -> None:
+    if model.delay_s >= largest * (1.0 - 1e-9):
+        raise IdentificationError(
+            f"the delay lies at or beyond the largest one considered, {largest:.4g} s",
+            where=data.name,
+            mend="give a larger --max-delay, and a record several times as long as the delay",
+        )
+
+
+def _too_short(data: DelayData, structure: Structure) -> IdentificationError:
+    return IdentificationError(
+        f"too few rows of y after the delay for {structure.parameters} parameters",
+        where=data.name,
+        mend="record longer than the delay, or say what u was before the record (--past-input)",
+    )

@@ -1,0 +1,332 @@
+"""Separable output-error fit of x^(n) = sum a_i x^(i) + b u(t - h) + d: maximum likelihood, with its covariance.
+
+For given (a, h) the response is linear in b, d and the initial state, which are solved for; (a, h) move by
+Levenberg-Marquardt steps with analytic sensitivities (variable projection in Kaufman's form: the normal equations
+of all parameters, damped in a and h only, give the same step). Under coloured noise the residual and its
+sensitivities pass the filter that whitens the noise, which is prediction-error identification with an
+autoregressive noise model independent of the plant.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import solve_toeplitz
+
+from autotune.arrays import BoolArray, FloatArray
+from autotune.errors import IdentificationError
+from autotune.identification.compiled import autocovariances, cholesky_solve
+from autotune.identification.delay_data import DelayData
+from autotune.identification.delay_model import DelayModel
+from autotune.identification.delay_response import linear_part, normal_matrix, output
+
+_WHITE = np.empty(0)
+_MAX_AR = 12
+
+
+@dataclass(frozen=True, kw_only=True)
+class Structure:
+    """Which parameters are free.
+
+    Attributes
+    ----------
+    order : int
+        Order n.
+    integrator : bool
+        Whether a_0 = 0 is known.
+    offset : bool
+        Whether the constant d is estimated.
+    """
+
+    order: int
+    integrator: bool = False
+    offset: bool = True
+
+    @property
+    def linear(self) -> BoolArray:
+        """Which of (b, d, initial state) are free."""
+        return np.array([True, self.offset, *[True] * self.order])
+
+    @property
+    def free(self) -> BoolArray:
+        """Which of (b, d, initial state, a, h) are free."""
+        return np.array([*self.linear, not self.integrator, *[True] * self.order])
+
+    @property
+    def parameters(self) -> int:
+        """How many there are."""
+        return int(self.free.sum())
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Point:
+    """A candidate: nonlinear parameters (a, h), what the linear ones (b, d, initial state) then are, and its cost."""
+
+    a: tuple[float, ...]
+    h: float
+    theta: FloatArray
+    cost: float
+    rows: int
+
+    @property
+    def variance(self) -> float:
+        """Residual variance with the degrees of freedom counted."""
+        return self.cost / max(self.rows - self.theta.size - len(self.a) - 1, 1)
+
+
+def solve_linear(
+    data: DelayData, structure: Structure, a: tuple[float, ...], h: float, whitening: FloatArray = _WHITE
+) -> Point:
+    """Return the best b, d and initial state for given (a, h); an unstable response that overflows costs infinity."""
+    before = 0.0 if data.before is None else data.before
+    theta, cost = linear_part(data.tu, data.u, before, data.linear, data.ty, data.y, a, h, structure.offset, whitening)
+    return Point(a=a, h=h, theta=theta, cost=cost, rows=data.ty.size - whitening.size)
+
+
+def minimise(
+    data: DelayData,
+    structure: Structure,
+    start: Point,
+    *,
+    max_delay_s: float,
+    whitening: FloatArray = _WHITE,
+    iterations: int = 30,
+    tolerance: float = 1e-4,
+) -> Point:
+    """Move (a, h) to the next minimum of the sum of squares.
+
+    Parameters
+    ----------
+    data : DelayData
+        Rows that any delay up to ``max_delay_s`` can explain.
+    structure : Structure
+        Which parameters are free.
+    start : Point
+        Where to begin, evaluated on the same data.
+    max_delay_s : float
+        Upper limit of h [s].
+    whitening : (p,) array
+        Whitening filter of the noise.
+    iterations : int
+        Largest number of accepted steps.
+    tolerance : float
+        Stops when a step gains less than this many residual variances: 1e-4 is 0.01 standard deviations.
+
+    Returns
+    -------
+    Point
+        Never costlier than ``start``.
+    """
+    n = structure.order
+    free = np.flatnonzero(structure.free)
+    moving = free >= 2 + n
+    damping = 1e-3
+    point = start
+    for _ in range(iterations):
+        gram, finite = _gram(data, point.a, point.h, point.theta, whitening)
+        if not finite:
+            return point
+        G, g = gram[np.ix_(free, free)], gram[free, -1]
+        for _trial in range(8):
+            step = np.zeros(2 * n + 3)
+            step[free], _, regular = cholesky_solve(G + np.diag(damping * moving * np.diag(G)), g, 1e-13)
+            if not regular:
+                damping *= 8.0
+                continue
+            a = tuple(float(value) for value in np.array(point.a) + step[2 + n : 2 + 2 * n])
+            h = float(min(max(point.h + step[-1], 0.0), max_delay_s))
+            trial = solve_linear(data, structure, a, h, whitening)
+            if trial.cost < point.cost:
+                break
+            damping *= 8.0
+        else:
+            return point
+        gained = (point.cost - trial.cost) / trial.variance
+        point = trial
+        damping = max(damping / 10.0, 1e-9)
+        if gained < tolerance:
+            break
+    return point
+
+
+def finish(data: DelayData, structure: Structure, point: Point, whitening: FloatArray = _WHITE) -> DelayModel:
+    """Return the model with its covariance at a minimum, the operating point added back.
+
+    Raises
+    ------
+    IdentificationError
+        The information matrix is singular: some combination of the parameters does not show in the data.
+    """
+    n = structure.order
+    free = np.flatnonzero(structure.free)
+    gram, finite = _gram(data, point.a, point.h, point.theta, whitening)
+    information = gram[np.ix_(free, free)]
+    scale = np.sqrt(np.diag(information))
+    if not finite or not np.all(scale > 0) or np.linalg.cond(information / np.outer(scale, scale)) > 1e13:
+        raise _singular(data, structure, information)
+    inner = np.zeros((2 * n + 3, 2 * n + 3))
+    inner[np.ix_(free, free)] = np.linalg.inv(information / np.outer(scale, scale)) / np.outer(scale, scale)
+    variance = point.cost / (point.rows - structure.parameters)
+    back = _to_parameters(data, structure, point)
+    b, d = float(point.theta[0]), float(point.theta[1])
+    initial = point.theta[2:].copy()
+    initial[0] += data.y_0
+    return DelayModel(
+        a=point.a,
+        b=b,
+        delay_s=point.h,
+        constant=d - b * data.u_0 - point.a[0] * data.y_0,
+        initial_time_s=float(data.ty[0]),
+        initial_state=tuple(float(value) for value in initial),
+        covariance=variance * back @ inner @ back.T,
+        noise_sd=float(np.sqrt(variance)),
+        noise_ar=tuple(float(value) for value in whitening),
+        rows=point.rows,
+    )
+
+
+def _to_parameters(data: DelayData, structure: Structure, point: Point) -> FloatArray:
+    """Return the matrix from the columns' coordinates to (a, b, h, constant, initial state).
+
+    The columns s^(i) and -x' differ from dx/da_i and dx/dh by the free responses to their own initial values:
+    moving a_i by 1 along s^(i) moves x^(l)(t_s) by s^(i+l)(t_s); moving h by 1 along -x' moves it by -x^(l+1)(t_s).
+    """
+    n = structure.order
+    a = np.array(point.a)
+    b, d = point.theta[0], point.theta[1]
+    x = point.theta[2:]
+    s = np.zeros(2 * n)
+    for k in range(n):
+        s[n + k] = a @ s[k : k + n] + x[k]
+    tau = data.ty[0] - point.h
+    row = int(np.searchsorted(data.tu, tau, side="right")) - 1
+    u_s = data.u[row] if row >= 0 else (data.before or 0.0)
+    if data.linear and row >= 0:
+        u_s = float(np.interp(tau, data.tu, data.u))
+    slopes = np.append(x[1:], a @ x + b * u_s + d)
+    matrix = np.zeros((2 * n + 3, 2 * n + 3))  # columns: b, d, initial state, a, h
+    matrix[:n, 2 + n : 2 + 2 * n] = np.eye(n)
+    matrix[n, 0] = 1.0
+    matrix[n + 1, 2 + 2 * n] = 1.0
+    matrix[n + 2, [0, 1, 2 + n]] = -data.u_0, 1.0, -data.y_0
+    matrix[n + 3 :, 2 : 2 + n] = np.eye(n)
+    for i in range(n):
+        matrix[n + 3 :, 2 + n + i] = s[i : i + n]
+    matrix[n + 3 :, 2 + 2 * n] = -slopes
+    return matrix
+
+
+def residuals(data: DelayData, point: Point) -> FloatArray:
+    """Return y - x at the output times [y unit]."""
+    before = 0.0 if data.before is None else data.before
+    return np.asarray(
+        data.y - output(data.tu, data.u, before, data.linear, data.ty, point.a, point.h, point.theta), dtype=np.float64
+    )
+
+
+def whitening_filter(residual: FloatArray, max_order: int = _MAX_AR) -> FloatArray:
+    """Return the autoregressive filter that makes the residual white, its order by the Bayes information criterion.
+
+    Parameters
+    ----------
+    residual : (N,) array
+        Residual, row by row.
+    max_order : int
+        Largest order tried.
+
+    Returns
+    -------
+    (p,) array
+        c_1..c_p of 1 + c_1 q^-1 + ..; empty where the residual is white.
+
+    Notes
+    -----
+    Rows are taken as equidistant; with jittered stamps the noise model is an approximation, the plant's is not.
+    """
+    N = residual.size
+    max_order = min(max_order, N // 20)
+    r = autocovariances(residual, max_order)
+    best, filter_best = N * np.log(r[0]), _WHITE
+    for order in range(1, max_order + 1):
+        c = -solve_toeplitz(r[:order], r[1 : order + 1])
+        variance = r[0] + c @ r[1 : order + 1]
+        if variance <= 0:
+            break
+        criterion = N * np.log(variance) + order * np.log(N)
+        if criterion < best:
+            best, filter_best = criterion, c
+    return np.asarray(filter_best, dtype=np.float64)
+
+
+def polish(
+    data: DelayData, structure: Structure, start: Point, *, max_delay_s: float, coloured: bool = True
+) -> DelayModel:
+    """Fit from a starting point, find the noise's colour, fit again under it, and return the model.
+
+    Parameters
+    ----------
+    data : DelayData
+        Rows that any delay up to ``max_delay_s`` can explain.
+    structure : Structure
+        Which parameters are free.
+    start : Point
+        Where to begin.
+    max_delay_s : float
+        Upper limit of h [s].
+    coloured : bool
+        Whether the noise may be coloured; white is assumed otherwise.
+
+    Raises
+    ------
+    IdentificationError
+        Fewer rows than parameters, or a singular information matrix.
+    """
+    if data.ty.size < 3 * structure.parameters:
+        raise IdentificationError(
+            f"{data.ty.size} rows of y remain for {structure.parameters} parameters",
+            where=data.name,
+            mend="record longer than the delay, or say what u was before the record",
+        )
+    point = minimise(
+        data, structure, solve_linear(data, structure, start.a, start.h), max_delay_s=max_delay_s, iterations=50
+    )
+    whitening = _WHITE
+    for _ in range(3 if coloured else 0):
+        before = whitening
+        whitening = whitening_filter(residuals(data, point))
+        if whitening.size == 0 and before.size == 0:
+            break
+        settled = whitening.size == before.size and np.max(np.abs(whitening - before)) < 1e-3
+        point = minimise(
+            data,
+            structure,
+            solve_linear(data, structure, point.a, point.h, whitening),
+            max_delay_s=max_delay_s,
+            whitening=whitening,
+        )
+        if settled:
+            break
+    return finish(data, structure, point, whitening)
+
+
+def _gram(
+    data: DelayData, a: tuple[float, ...], h: float, theta: FloatArray, whitening: FloatArray
+) -> tuple[FloatArray, bool]:
+    before = 0.0 if data.before is None else data.before
+    gram, finite = normal_matrix(data.tu, data.u, before, data.linear, data.ty, data.y, a, h, theta, True, whitening)
+    return gram, finite
+
+
+def _singular(data: DelayData, structure: Structure, information: FloatArray) -> IdentificationError:
+    n = structure.order
+    names = ["b", "constant", *(f"x^({i})(t_s)" for i in range(n)), *(f"a{i}" for i in range(n)), "delay"]
+    names = [name for name, free in zip(names, structure.free, strict=True) if free]
+    scale = np.sqrt(np.maximum(np.diag(information), 1e-300))
+    _, vectors = np.linalg.eigh(information / np.outer(scale, scale))
+    worst = [names[i] for i in np.argsort(-np.abs(vectors[:, 0]))[:3]]
+    return IdentificationError(
+        f"{', '.join(worst)} cannot be told apart: the input excites too few frequencies for order {n}",
+        where=data.name,
+        mend="record a step or a relay at two more delays, or ask for a lower order",
+    )

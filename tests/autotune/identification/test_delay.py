@@ -1,0 +1,275 @@
+"""Delay identification without a starting value: exactness, efficiency, honest intervals, refusals with reasons."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from autotune.errors import IdentificationError, InputError
+from autotune.identification.compiled import transition
+from autotune.identification.delay import identify_delay
+from autotune.identification.delay_data import prepare
+from autotune.identification.delay_model import DelayModel
+from autotune.identification.delay_response import normal_matrix, output
+from autotune.identification.output_error import Point, Structure, finish, solve_linear
+from autotune.recording import Recording, read_recording
+from tests.autotune.identification.delay_examples import X0, A, B, example_2, held_response
+
+TRUE = np.array([*A, B, 4.0])
+
+
+def noisy(recording: Recording, sd: float, seed: int, ar: float = 0.0) -> Recording:
+    """Add noise of the given sd where y is, white or first-order autoregressive."""
+    white = np.random.default_rng(seed).standard_normal(len(recording))
+    if ar:
+        from scipy.signal import lfilter
+
+        white = lfilter([np.sqrt(1 - ar**2)], [1.0, -ar], white)
+    return replace(recording, y=recording.y + sd * white)
+
+
+def relay_like(rows: int, dwell: tuple[int, int], seed: int) -> np.ndarray:
+    """Two-level input that switches after a random number of rows."""
+    rng = np.random.default_rng(seed)
+    levels = [np.full(rng.integers(*dwell), level) for level in np.tile([1.0, -1.0], rows // dwell[0] // 2 + 1)]
+    return 3.0 + np.concatenate(levels)[:rows]
+
+
+def test_transition_is_the_matrix_exponential():
+    from scipy.linalg import expm
+
+    for a in ([-3.0], [-0.35, -1.2], [-1e6, -2e4, -300.0], [0.0, -2.0, -3.0, -1.5]):
+        n = len(a)
+        M = np.zeros((2 * n + 2, 2 * n + 2))
+        M[: n - 1, 1:n] = M[n : 2 * n - 1, n + 1 : 2 * n] = np.eye(n - 1)
+        M[n - 1, :n] = M[2 * n - 1, n : 2 * n] = a
+        M[n - 1, n] = M[2 * n - 1, 2 * n] = M[2 * n, 2 * n + 1] = 1.0
+        for duration in (1e-5, 3e-3, 0.7):
+            expected = expm(M * duration)
+            assert np.allclose(transition(np.array(a), duration), expected, rtol=1e-8, atol=1e-12 * abs(expected).max())
+
+
+def test_response_equals_an_independent_solver():
+    record = example_2(past_s=5.0)
+    y = output(
+        record.t, record.u, 0.0, True, record.t[record.t >= 0], A, 4.0, np.array([B, 0.0, *X0])
+    )  # what is left is u taken as linear between rows
+    assert np.max(np.abs(y - record.y[record.t >= 0])) < 1e-4
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 4])
+def test_analytic_sensitivities_are_the_derivatives(n):
+    """Column by column against central differences of the response, with the initial state's share in place."""
+    rng = np.random.default_rng(n)
+    t = np.sort(rng.uniform(0.0, 20.0, 400))
+    u = np.cumsum(rng.standard_normal(400)) * 0.3
+    poles = np.array([-0.4, -0.9, -1.7, -3.0])[:n]
+    a = tuple(float(v) for v in -np.poly(poles)[:0:-1])
+    values = np.array([*a, 1.3, 2.05, 0.2, *rng.standard_normal(n)])
+
+    def x(p: np.ndarray) -> np.ndarray:
+        return output(t, u, 0.0, True, ty, tuple(p[:n]), p[n + 1], np.array([p[n], p[n + 2], *p[n + 3 :]]))
+
+    ty = t[t > 2.2]
+    J = np.array([(x(values + d) - x(values - d)) / 2e-6 for d in 1e-6 * np.eye(values.size)]).T
+    data = prepare(Recording(t=t, u=u, y=np.sin(t)), hold="linear", offset=True)
+    data = replace(data, u=u, u_0=0.0, ty=ty, y=x(values), y_0=0.0)
+    theta = np.array([values[n], values[n + 2], *values[n + 3 :]])
+    point = Point(a=a, h=values[n + 1], theta=theta, cost=float(ty.size - 2 * n - 3), rows=ty.size)
+    covariance = finish(data, Structure(order=n), point).covariance  # residual variance 1
+    expected = np.linalg.inv(J.T @ J)
+    scale = np.sqrt(np.diag(expected))
+    assert np.max(np.abs(covariance - expected) / np.outer(scale, scale)) < 1e-3
+
+
+def test_example_2_is_recovered_without_a_starting_value():
+    """FACTS: the Cramer-Rao bound at noise 5 is a1 .00205, a0 .00046, b .0025, x0 .35, x0' .49, h .00088."""
+    record = example_2(past_s=12.0)
+    model = identify_delay(noisy(record, 5.0, 1), 2, start_s=0.0, offset=False)
+    sd = model.standard_deviations
+    assert np.allclose(sd[[0, 1, 2, 3, 5, 6]], [0.00046, 0.00205, 0.0025, 0.00088, 0.35, 0.49], rtol=0.03)
+    truth = np.array([*TRUE, 0.0, *X0])
+    error = model.values - truth
+    assert np.all(np.abs(error) <= 4.0 * sd)
+    free = np.flatnonzero(sd)
+    assert error[free] @ np.linalg.solve(model.covariance[np.ix_(free, free)], error[free]) < 27.9  # chi2(6), 1e-4
+
+
+@pytest.mark.parametrize("delay_s", [0.05, 1.0, 6.0, 10.0])
+@pytest.mark.parametrize("past", ["known", "unknown"])
+def test_any_delay_is_found_at_noise_20(delay_s, past):
+    record = noisy(example_2(delay_s, past_s=12.0, rate_hz=100.0), 20.0, 2)
+    if past == "unknown":
+        record = record.between(0.0, np.inf)
+    model = identify_delay(record, 2, start_s=0.0)
+    truth = np.array([*A, B, delay_s])
+    assert np.all(np.abs(model.values[:4] - truth) < 5.0 * model.standard_deviations[:4])
+
+
+def test_a_short_record_with_a_long_delay():
+    record = noisy(example_2(4.0, duration_s=10.0, past_s=8.0), 5.0, 3)
+    model = identify_delay(record, 2, start_s=0.0, max_delay_s=8.0)
+    assert np.all(np.abs(model.values[:4] - TRUE) < 5.0 * model.standard_deviations[:4])
+    assert model.standard_deviations[3] < 0.1
+
+
+def test_intervals_are_honest_under_coloured_noise():
+    """White-noise intervals cover a fraction of what they promise under AR(1) noise; prewhitened ones keep it."""
+    record = example_2(rate_hz=100.0, past_s=6.0)
+    inside = {True: 0, False: 0}
+    runs = 25
+    for seed in range(runs):
+        data = noisy(record, 5.0, seed, ar=0.9)
+        for coloured in inside:
+            model = identify_delay(data, 2, start_s=0.0, max_delay_s=6.0, coloured=coloured)
+            inside[coloured] += int(np.sum(np.abs(model.values[:4] - TRUE) < 1.96 * model.standard_deviations[:4]))
+    assert inside[True] >= 0.86 * 4 * runs  # 95 % less 2.6 standard errors with the four fully correlated
+    assert inside[False] <= 0.75 * 4 * runs
+
+
+def test_jittered_stamps_cost_no_precision():
+    record = example_2(rate_hz=50.0, past_s=6.0)
+    rng = np.random.default_rng(4)
+    t = record.t + rng.uniform(-0.008, 0.008, len(record))
+    x = output(
+        np.arange(-7.0, 105.1, 0.002),
+        example_2(rate_hz=500.0, past_s=7.0).u[: np.arange(-7.0, 105.1, 0.002).size],
+        0.0,
+        True,
+        t[t >= 0],
+        A,
+        4.0,
+        np.array([B, 0.0, *X0]),
+    )
+    y = np.zeros(t.size)
+    y[t >= 0] = x + 2.0 * rng.standard_normal(x.size)
+    from tests.autotune.identification.delay_examples import u_example_2
+
+    jittered = Recording(t=t, u=u_example_2(t), y=y, metadata={"hold": "linear"})
+    model = identify_delay(jittered, 2, start_s=0.0, max_delay_s=6.0)
+    assert not jittered.is_uniform
+    assert np.all(np.abs(model.values[:4] - TRUE) < 5.0 * model.standard_deviations[:4])
+
+
+@pytest.mark.parametrize(
+    ("poles", "gain", "integrator"),
+    [
+        ((-0.5,), 0.5, False),
+        ((-0.4, -1.5), 0.6, False),
+        ((-0.3, -0.9, -2.0), 0.54, False),
+        ((-0.4, -0.8, -1.2, -2.5), 0.96, False),
+        ((0.0,), 0.2, True),
+        ((0.0, -0.7), 0.3, True),
+        ((0.0, -0.5, -1.5), -0.4, True),
+    ],
+)
+def test_orders_one_to_four_with_and_without_integrator(poles, gain, integrator):
+    """A held two-level input with an operating point: every parameter within its interval, at noise of 1 % of y."""
+    t = np.arange(6000) * 0.05
+    u = relay_like(t.size, (20, 120), seed=len(poles))
+    y = held_response(t, u, poles, gain, 1.23)
+    y = 7.0 + y + 0.01 * np.std(y) * np.random.default_rng(5).standard_normal(t.size)
+    model = identify_delay(Recording(t=t, u=u, y=y), len(poles), integrator=integrator, max_delay_s=20.0)
+    truth = np.array([*(-np.poly(poles).real[:0:-1]), gain, 1.23])
+    sd = model.standard_deviations[: truth.size]
+    free = sd > 0
+    assert np.all(np.abs(model.values[: truth.size] - truth)[free] < 5.0 * sd[free])
+    assert sd[-1] < 0.15
+
+
+def test_a_fast_plant_in_a_long_record_is_not_averaged_away():
+    """Poles at 60 rad/s in 100 s of record: on the whole record's bins of 0.17 s nothing of them is left."""
+    t = np.arange(20000) * 0.005
+    u = relay_like(t.size, (2, 12), seed=6)
+    y = held_response(t, u, (-60.0, -35.0), 2100.0, 0.037)
+    y = y + 0.05 * np.random.default_rng(6).standard_normal(t.size)
+    model = identify_delay(Recording(t=t, u=u, y=y), 2)
+    truth = np.array([-2100.0, -95.0, 2100.0, 0.037])
+    assert np.all(np.abs(model.values[:4] - truth) < 5.0 * model.standard_deviations[:4])
+
+
+def test_time_origin_and_units_do_not_matter():
+    record = noisy(example_2(rate_hz=50.0), 5.0, 7)
+    model = identify_delay(record, 2)
+    other = identify_delay(
+        replace(record, t=10.0 * record.t + 1000.0, u=record.u * 1e-3 + 5.0, y=1e4 * record.y - 3e6), 2
+    )
+    assert np.allclose(np.array(other.a) * [100.0, 10.0], model.a, rtol=1e-3)
+    assert other.delay_s == pytest.approx(10.0 * model.delay_s, rel=1e-3)
+    assert other.b == pytest.approx(model.b * 1e7 / 100.0, rel=1e-3)
+
+
+def test_the_hair_dryer(shared):
+    """Two lags of 0.27 s and 0.12 s and two samples of 0.08 s of transport fit others; only their sum is sharp."""
+    model = identify_delay(read_recording(shared / "data" / "hair_dryer_null" / "fit.csv"), 2)
+    assert model.delay_s == pytest.approx(0.16, abs=0.01)
+    assert model.a[1] / model.a[0] == pytest.approx(0.269 + 0.122, abs=0.03)
+
+
+def with_column(recording: Recording, **columns: np.ndarray) -> Recording:
+    return replace(recording, **columns)
+
+
+@pytest.mark.parametrize(
+    ("damage", "error", "reason"),
+    [
+        (lambda r: with_column(r, u=np.full(len(r), 2.0)), IdentificationError, "input is constant"),
+        (lambda r: with_column(r, y=np.zeros(len(r))), IdentificationError, "output is zero"),
+        (lambda r: with_column(r, y=np.full(len(r), 3.0)), IdentificationError, "output is constant"),
+        (lambda r: with_column(r, y=np.where(r.t > 50.0, np.nan, r.y)), InputError, "'y' is not a number"),
+        (lambda r: with_column(r, u=np.where(r.t == 50.0, np.nan, r.u)), InputError, "'u' is not a number"),
+        (lambda r: with_column(r, t=r.t + 20.0 * (r.t > 50.0)), IdentificationError, "gap of 20"),
+    ],
+)
+def test_what_cannot_be_identified_is_refused_with_its_reason(damage, error, reason):
+    record = noisy(example_2(rate_hz=20.0), 1.0, 8)
+    with pytest.raises(error, match=reason):
+        identify_delay(damage(record), 2)
+
+
+def test_a_delay_outside_the_record_is_refused():
+    record = noisy(example_2(rate_hz=20.0), 1.0, 9)
+    with pytest.raises(InputError, match="outside the record"):
+        identify_delay(record, 2, max_delay_s=200.0)
+    with pytest.raises(IdentificationError, match="at or beyond the largest"):
+        identify_delay(record, 2, max_delay_s=3.5)
+
+
+def test_more_parameters_than_rows_are_refused():
+    t = np.arange(14) * 0.5
+    u = np.where(t > 2, 1.0, 0.0)
+    with pytest.raises(IdentificationError, match="rows"):
+        identify_delay(Recording(t=t, u=u, y=np.sin(t)), 3)
+
+
+def test_cost_is_the_sum_of_squares_and_the_gram_matrix_is_linear_in_rows():
+    record = noisy(example_2(rate_hz=50.0, past_s=5.0), 5.0, 10)
+    data = prepare(record, start_s=0.0, offset=False)
+    structure = Structure(order=2, offset=False)
+    point = solve_linear(data, structure, A, 4.0)
+    x = output(data.tu, data.u, 0.0, True, data.ty, A, 4.0, point.theta)
+    assert point.cost == pytest.approx(np.sum((data.y - x) ** 2), rel=1e-9)
+    args = (data.tu, data.u, 0.0, True, data.ty, data.y, A, 4.0, point.theta, True)
+    gram, finite = normal_matrix(*args, np.empty(0))
+    assert finite
+    assert gram[-1, -1] == pytest.approx(point.cost, rel=1e-9)
+    whitened, _ = normal_matrix(*args, np.array([-0.5]))
+    residual = data.y - x
+    assert whitened[-1, -1] == pytest.approx(np.sum((residual[1:] - 0.5 * residual[:-1]) ** 2), rel=1e-9)
+
+
+def test_delay_model_file_round_trip(tmp_path):
+    from autotune.identification.delay_model import read_delay_model, write_delay_model
+
+    model = identify_delay(noisy(example_2(rate_hz=20.0), 2.0, 11), 2)
+    assert isinstance(model, DelayModel)
+    write_delay_model(model, tmp_path / "delay.json")
+    back = read_delay_model(tmp_path / "delay.json")
+    assert np.array_equal(back.values, model.values)
+    assert np.array_equal(back.covariance, model.covariance)
+    omega = np.array([0.1, 1.0])
+    s = 1j * omega
+    expected = model.b * np.exp(-s * model.delay_s) / (s**2 - model.a[1] * s - model.a[0])
+    assert np.allclose(model.transfer_function().response(omega), expected, rtol=1e-12)
