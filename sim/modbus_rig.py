@@ -13,6 +13,7 @@ from typing import Any, TypeAlias
 
 from pymodbus import FramerType
 from pymodbus.constants import ExcCodes
+from pymodbus.exceptions import NoSuchIdException
 from pymodbus.server import ModbusSerialServer, ModbusTcpServer, ModbusTlsServer
 from pymodbus.simulator import DataType, SimData, SimDevice
 
@@ -156,7 +157,11 @@ class ModbusRig:
             await asyncio.sleep(_LIVE_S)
 
     def _server(self) -> ModbusTcpServer | ModbusSerialServer:
-        context = sim_device(self.device.registers, self._unit_id, self._serve_request)
+        server = self._library_server(sim_device(self.device.registers, self._unit_id, self._serve_request))
+        server.context = _OneUnit(server.context)  # type: ignore[assignment]  # the two methods it is asked
+        return server
+
+    def _library_server(self, context: SimDevice) -> ModbusTcpServer | ModbusSerialServer:
         match self._transport:
             case RtuTransport(device=device, baud=baud, parity=parity, stop_bits=stop_bits):
                 return ModbusSerialServer(
@@ -208,6 +213,34 @@ class ModbusRig:
                 (bit,) = self.device.read(table, spec.address, 1, now_s)
                 at, place = spec.address // 16 - start, spec.address % 16
                 memory[at] = memory[at] & ~(1 << place) | bit << place
+
+
+class _OneUnit:
+    """The server's memory, without the library's habit of answering for units that are not there with a failure.
+
+    On TCP it then answers as a gateway that has no such unit, on a serial line it keeps silent.
+    """
+
+    def __init__(self, memory: Any) -> None:
+        self._memory = memory
+
+    def device_ids(self) -> list[int]:
+        """Return the unit ids."""
+        return list(self._memory.device_ids())
+
+    async def async_getValues(self, device_id: int, *request: Any) -> Any:  # noqa: N802 - the library's name
+        """Return what a request reads."""
+        self._check(device_id)
+        return await self._memory.async_getValues(device_id, *request)
+
+    async def async_setValues(self, device_id: int, *request: Any) -> Any:  # noqa: N802 - the library's name
+        """Take what a request writes."""
+        self._check(device_id)
+        return await self._memory.async_setValues(device_id, *request)
+
+    def _check(self, device_id: int) -> None:
+        if device_id not in self._memory.device_ids():
+            raise NoSuchIdException
 
 
 def sim_device(

@@ -138,7 +138,8 @@ class RegisterDevice:
         """
         parts = self._parts(table, address, count)
         self.live(now_s)
-        shown = {name: to_words(self._shown(name), self.registers[name]) for name, _ in parts}
+        names = dict.fromkeys(name for name, _ in parts)  # each once: a measurement must not change between its words
+        shown = {name: to_words(self._shown(name), self.registers[name]) for name in names}
         return [shown[name][i] for name, i in parts]
 
     def write(self, table: Table, address: int, words: Sequence[int], now_s: float) -> None:

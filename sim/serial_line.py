@@ -77,6 +77,7 @@ class SerialLine:
     def _carry(self) -> None:
         host, device = self._masters
         under_way: list[tuple[float, int, int, bytes]] = []
+        last_due = {host: 0.0, device: 0.0}  # a line keeps the order: what follows a late frame is late too
         sent = 0
         while True:
             wait = max(0.0, under_way[0][0] - time.monotonic()) if under_way else None
@@ -88,7 +89,8 @@ class SerialLine:
                 target = device if source == host else host
                 for delay_s, data in self._fate(frame, "to device" if source == host else "to host"):
                     sent += 1  # keeps the order of frames that are due at the same time
-                    heapq.heappush(under_way, (time.monotonic() + delay_s, sent, target, data))
+                    last_due[target] = max(last_due[target], time.monotonic() + delay_s)
+                    heapq.heappush(under_way, (last_due[target], sent, target, data))
             while under_way and under_way[0][0] <= time.monotonic():
                 _, _, target, data = heapq.heappop(under_way)
                 if not self._is_cut.is_set():
