@@ -79,9 +79,10 @@ class RegisterDevice:
         self.registers = dict(registers)
         self.history: deque[OutputChange] = deque(maxlen=_KEPT)
         self.on_change: Callable[[OutputChange], None] | None = None
-        self._at = {
-            (spec.table, spec.address + i): (name, i) for name, spec in self.registers.items() for i in range(spec.size)
-        }
+        self._at: dict[tuple[Table, int], tuple[str, int]] = {}
+        for name, spec in self.registers.items():
+            for i in range(spec.size):  # an echo may be mapped onto the very register that it echoes
+                self._at.setdefault((spec.table, spec.address + i), (name, i))
         self._values = {
             "u": plant.u_applied,
             "safe": u_safe,

@@ -53,21 +53,18 @@ def probe(config: _CONFIG) -> None:
     content = load_config(config)
     found = probe_registers(modbus_settings(content), expected=_expected(content))
     units = _units(content)
-    table = Table("signal", "table", "address", "type", "raw", "value", "unit", "look at", title=content.name)
+    table = Table("signal", "register", "type", "raw", "value", "unit", title=content.name)
     for one in found:
         register = one.register
-        table.add_row(
-            one.name,
-            register.table,
-            str(register.address),
-            register.type,
-            " ".join(f"{word:04X}" for word in one.words) or "-",
-            f"{one.value:.6g}" if one.words else "-",
-            units.get(one.name, ""),
-            "; ".join(one.warnings),
-        )
-    console = Console(highlight=False)
+        raw = " ".join(f"{word:04X}" for word in one.words) or "-"
+        value = f"{one.value:.6g}" if one.words else "-"
+        place = f"{register.table} {register.address}"
+        table.add_row(one.name, place, register.type, raw, value, units.get(one.name, ""))
+    console = Console(highlight=False, soft_wrap=True)
     console.print(table)
+    for one in found:
+        for warning in one.warnings:
+            console.print(f"{one.name}: {warning}", markup=False)
     doubtful = [one.name for one in found if one.warnings]
     verdict = f"{', '.join(doubtful)} look implausible" if doubtful else "all values are plausible"
     console.print(f"{len(found)} registers read, nothing written: {verdict}")

@@ -1,0 +1,131 @@
+"""First contact: what a wrong map looks like before anything is written."""
+
+from __future__ import annotations
+
+import math
+import struct
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from autotune.config.registers import RegisterMap, RegisterSettings
+from drivers.ports import answers_on
+from drivers.probe import implausible, probe
+from drivers.registers import Codec
+from sim.modbus_rig import ModbusRig, RtuTransport, TcpTransport
+from sim.serial_line import SerialLine
+from tests.drivers.bench import REGISTERS, register_device, rtu_settings, tcp_settings
+
+
+def codec(**settings: Any) -> Codec:
+    return Codec(name="y", register=RegisterSettings.model_validate({"address": 0} | settings))
+
+
+def words_of(value: float) -> tuple[int, ...]:
+    return struct.unpack(">HH", struct.pack(">f", value))
+
+
+@given(value=st.floats(0.5, 9.5, width=32))
+def test_a_plausible_value_is_not_warned_of(value: float) -> None:
+    assert implausible(codec(type="float32"), words_of(value), (0.0, 10.0)) == []
+
+
+@given(value=st.floats(1.0, 9.5, width=32).filter(lambda value: value != int(value)))
+def test_swapped_words_are_named_where_the_other_order_fits(value: float) -> None:
+    mapped = codec(type="float32", word_order="little")
+    words = words_of(value)
+    if 0.0 <= mapped.decode(words) <= 10.0 and mapped.decode(words) > 1e-9:
+        return  # this one fits both ways: nobody can tell
+    said = implausible(mapped, words, (0.0, 10.0))
+    assert any("word_order" in line and 'word_order = "big"' in line for line in said[1:])
+
+
+def test_swapped_words_are_named_without_any_range_too() -> None:
+    said = implausible(codec(type="float32", word_order="little"), words_of(5.25), None)
+    assert 'would be 5.25 with word_order = "big"' in said
+
+
+def test_an_integer_that_is_really_unsigned_is_named() -> None:
+    said = implausible(codec(type="int16", scale=1e-4), [50000], (0.0, 10.0))
+    assert 'would be 5 with type = "uint16"' in said
+
+
+def test_a_wrong_scale_leaves_only_the_advice_to_look() -> None:
+    said = implausible(codec(type="uint16", scale=1.0), [4095], (0.0, 10.0))
+    assert said == ["4095, expected 0..10", "check address, scale and offset"]
+
+
+def test_what_is_not_a_number_is_said() -> None:
+    said = implausible(codec(type="float32"), words_of(math.nan), (0.0, 10.0))
+    assert said[0].startswith("not a number")
+
+
+def test_probing_reads_everything_and_writes_nothing() -> None:
+    device = register_device()
+    writes: list[str] = []
+
+    def note(table: str, address: int, is_write: bool) -> None:
+        if is_write:
+            writes.append(table)
+
+    before = dict(device.value)
+    with ModbusRig(device, TcpTransport(), refuse=note) as server:
+        found = {one.name: one for one in probe(tcp_settings(server.port), expected={"y": (-1.0, 1.0)})}
+    assert set(found) == set(REGISTERS.mapped())
+    assert found["K"].value == 1.5
+    assert found["Ti"].value == pytest.approx(2.0)
+    assert found["u_applied"].words == (100,)
+    assert all(not one.warnings for one in found.values())
+    assert writes == []
+    assert dict(device.value) == before
+
+
+def test_a_register_that_is_refused_does_not_hide_the_others() -> None:
+    beyond = RegisterMap.model_validate(REGISTERS.model_dump() | {"setpoint": {"address": 500}})
+    with ModbusRig(register_device(), TcpTransport()) as server:
+        found = {one.name: one for one in probe(tcp_settings(server.port, beyond), expected={})}
+    assert found["setpoint"].words == ()
+    assert "does not have that address" in found["setpoint"].warnings[0]
+    assert found["K"].value == 1.5
+
+
+def test_a_device_whose_words_are_swapped_is_found_out() -> None:
+    swapped = RegisterMap.model_validate(
+        REGISTERS.model_dump() | {"y": {"table": "input", "address": 0, "type": "float32", "word_order": "little"}}
+    )
+    device = register_device()
+    for _ in range(100):
+        device.plant.advance(1.0, 0.01)
+    with ModbusRig(device, TcpTransport()) as server:
+        found = {one.name: one for one in probe(tcp_settings(server.port, swapped), expected={"y": (-5.0, 5.0)})}
+    assert any('word_order = "big"' in warning for warning in found["y"].warnings)
+
+
+def test_what_answers_on_a_serial_port_is_found_and_silence_is_too() -> None:
+    with SerialLine() as line, ModbusRig(register_device(), RtuTransport(device=line.rig_device, parity="N")):
+        assert answers_on(line.host_device) == "Modbus RTU unit 1 at 9600 bit/s, parity N"
+    with SerialLine() as silent:
+        assert answers_on(silent.host_device) == "nothing"
+
+
+def test_a_map_with_a_heartbeat_may_read_it_back_from_its_own_register() -> None:
+    own = RegisterMap.model_validate(
+        {
+            name: register
+            for name, register in REGISTERS.model_dump(exclude_none=True).items()
+            if name not in ("heartbeat_echo", "in_command")
+        }
+        | {"heartbeat_echo": {"address": 1, "type": "uint16"}}
+    )
+    with SerialLine() as line:
+        device = register_device(own)
+        with ModbusRig(device, RtuTransport(device=line.rig_device, parity="N")):
+            from tests.drivers.bench import rig_of
+
+            rig = rig_of(rtu_settings(line.host_device, own))
+            rig.open()
+            rig.write(0.25)
+            assert rig.read().u_applied == 0.25
+            rig.close()

@@ -1,0 +1,60 @@
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from autotune.config.rig import ReplaySettings
+from autotune.errors import InputError, LinkError
+from autotune.recording import Recording, RecordingWriter
+from drivers import open_rig
+from drivers.replay import ReplayRig
+
+T = np.array([0.0, 0.011, 0.019, 0.032])
+U = np.array([1.0, -1.0, 1.0, 0.0])
+Y = np.array([0.0, 0.1, math.nan, 0.3])
+
+
+def test_the_rows_come_back_as_they_were_recorded_stamps_and_all() -> None:
+    rig = ReplayRig(Recording(t=T, u=U, y=Y))
+    rig.open()
+    readings = [rig.read() for _ in T]
+    assert [reading.t_s for reading in readings] == T.tolist()
+    np.testing.assert_array_equal([reading.y for reading in readings], Y)
+    # what acted while y was measured is the command of the row before
+    np.testing.assert_array_equal([reading.u_applied for reading in readings], [math.nan, 1.0, -1.0, 1.0])
+    assert rig.clock.now() == T[-1]
+
+
+def test_another_command_than_the_recorded_one_ends_the_replay() -> None:
+    rig = ReplayRig(Recording(t=T, u=U, y=Y, name="bench.csv"))
+    rig.open()
+    rig.read()
+    rig.write(1.0)
+    rig.read()
+    with pytest.raises(LinkError, match=r"bench.csv: command 0.5 at t = 0.011 s, where -1 was recorded"):
+        rig.write(0.5)
+
+
+def test_the_end_of_the_recording_is_said() -> None:
+    rig = ReplayRig(Recording(t=T, u=U, y=Y))
+    rig.open()
+    for _ in T:
+        rig.read()
+    with pytest.raises(LinkError, match=r"ends at t = 0.032 s"):
+        rig.read()
+
+
+def test_a_replay_is_reached_like_any_other_rig(tmp_path: Path) -> None:
+    path = tmp_path / "bench.csv"
+    writer = RecordingWriter(path, ("t", "u", "y", "u_applied"), {})
+    for row in zip(T, U, (0.0, 0.1, 0.2, 0.3), (9.0, 8.0, 7.0, 6.0), strict=True):
+        writer.append(row)
+    writer.finish({})
+    rig = open_rig(ReplaySettings(kind="replay", recording=str(path)), u_range=(-1, 1), u_safe=0.0)
+    rig.open()
+    assert rig.read().u_applied == 9.0
+    with pytest.raises(InputError, match="cannot be read"):
+        open_rig(ReplaySettings(kind="replay", recording=str(tmp_path / "none.csv")), u_range=(-1, 1), u_safe=0.0)
