@@ -75,7 +75,7 @@ def test_agrees_with_python_control(plant: TransferFunction, K: float, Ti: float
 
 
 def test_dead_time_is_exact() -> None:
-    # integral control of a pure dead time, L = k exp(-s)/s: crossover k, phase margin 90 deg - k, delay margin pi/2k - 1
+    # integral control of a pure dead time, L = k exp(-s)/s
     k = 0.7
     m = margins(TransferFunction(num=(1.0,), den=(1.0,), delay_s=1.0), TransferFunction(num=(k,), den=(1.0, 0.0)))
     assert m.crossover_rad_s == pytest.approx(k)
@@ -125,7 +125,7 @@ def test_delay_with_gain_above_one_at_infinity_is_unstable() -> None:
 
 
 def test_norm_is_the_square_root_of_the_integral_of_the_squared_disturbance_response() -> None:
-    # exact for the first-order lag: y = exp(-t/2) sin-type response of 1/(s^2 + 2 s + 1): integral of t^2 exp(-2t) = 1/4
+    # y = t exp(-t), the response of 1/(s^2 + 2 s + 1): the integral of t^2 exp(-2 t) is 1/4
     m = margins(TransferFunction(num=(1.0,), den=(1.0, 1.0)), PIDController(K=1.0, Ti_s=1.0))
     assert m.h2 == pytest.approx(0.5)
     assert math.isinf(margins(TransferFunction(num=(1.0,), den=(1.0, 1.0)), PIDController(K=1.0, Ti_s=math.inf)).h2)
