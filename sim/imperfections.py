@@ -98,7 +98,7 @@ class FaultyPlant:
         y = self.plant.measure()
         for fault in self._active():
             match fault.kind:
-                case "frozen sensor":
+                case "frozen sensor" if not math.isnan(self._last_y):
                     y = self._last_y
                 case "not a number":
                     y = math.nan

@@ -14,6 +14,7 @@ from autotune.config import Config
 from autotune.errors import ExperimentStopped, IdentificationError, LinkError
 from autotune.experiment.limits import Watch
 from autotune.experiment.loop import ControlLoop
+from autotune.experiment.monitor import RECENT
 from autotune.experiment.oscillation import Oscillation
 from autotune.experiment.relay import RelaySettings
 from autotune.identification.frequency import limit_cycle_points
@@ -29,6 +30,10 @@ BRACKET = 1.2
 #: least share of readings in preflight that differ from the one before, for a sensor of which that can be expected
 RESTLESS = 0.05
 SMALL = 1e-9
+#: parts of limits.time_s to wait for a first switch in all, and before the mid-point is moved
+PATIENCE_SHARE, NUDGE_SHARE = 0.25, 0.02
+#: part of the way to the operating point that the relay's centre begins ahead of the plant
+LEAD = 0.4
 
 Tell = Callable[[str], None]
 
@@ -94,17 +99,20 @@ def preflight(loop: ControlLoop, config: Config, tell: Tell) -> Known:
             where="preflight",
             mend="raise signals.sample_time_s, or use a faster link",
         )
-    slope = np.polyfit(np.arange(y.size), y, 1)
-    left = y - np.polyval(slope, np.arange(y.size))
-    noise_sd, noise_half = float(np.std(left)), float(np.max(np.abs(left)))
-    if noise_half > 0.5 * config.limits.swing:
+    steps = np.diff(y)
+    # from differences: a plant that drifts is not taken for noise; from their median: nor are a few wild readings
+    typical = 1.4826 * float(np.median(np.abs(steps)))
+    noise_sd = min(float(np.std(steps)), typical if typical > 0.0 else math.inf) / math.sqrt(2.0)
+    noise_half = min(0.5 * float(np.max(np.abs(steps))), 3.0 * noise_sd)
+    if noise_half > 0.4 * config.limits.swing:
         raise ExperimentStopped(
             f"drowned in noise: y is restless by +-{noise_half:.3g} where limits.swing allows {config.limits.swing:g}",
             where="preflight",
             mend="filter the measurement at the device, or allow more swing",
         )
-    changes = float(np.mean(np.diff(y) != 0.0))
+    changes = float(np.mean(steps != 0.0))
     loop.monitor.noise = noise_half
+    loop.monitor.jump = 0.5 * config.limits.swing
     loop.monitor.u_tolerance = 0.02 * (config.limits.u_max - config.limits.u_min)
     if changes > RESTLESS:
         # a sensor at its rail repeats its full scale half of the time; the longest run seen says how it repeats itself
@@ -115,6 +123,20 @@ def preflight(loop: ControlLoop, config: Config, tell: Tell) -> Known:
         y_rest=float(np.mean(y)),
         plant_sign=config.operating_point.plant_sign,
     )
+
+
+def _check_at_rest(loop: ControlLoop, first: tuple[float, ...]) -> None:
+    """Stop where the plant moves under the command it should rest at."""
+    y = loop.history()[2]
+    if len(first) < RECENT or np.isfinite(y).sum() < RECENT:
+        return
+    moved = median(loop.monitor.recent) - median(first)
+    if abs(moved) > 0.2 * loop.envelope.settings.swing + float(np.nanmax(np.abs(np.diff(y)))):
+        raise ExperimentStopped(
+            f"wrong sign, or the plant moves where it should rest: y went by {moved:.3g} at u = {loop.tick.u:.4g}",
+            where="preflight",
+            mend="check the wiring and scaling of the actuator, and limits.u_safe",
+        )
 
 
 def _longest_run(y: FloatArray) -> int:
@@ -248,14 +270,21 @@ def find_midpoint(loop: ControlLoop, config: Config, known: Known, tell: Tell) -
             mend="choose another operating point, or widen limits.u_min..u_max",
         )
     settings = RelaySettings(
-        y_centre=known.y_moved,
+        y_centre=known.y_moved + LEAD * (point.y - known.y_moved),
         midpoint=known.midpoint,
         amplitude=amplitude,
         hysteresis=2.5 * known.noise_sd / math.sqrt(FIRST_SMOOTHING),
         smoothing=FIRST_SMOOTHING,
         plant_sign=1 if known.plant_sign > 0 else -1,
     )
-    oscillation = Oscillation(loop, settings, patience_s=0.25 * config.limits.time_s)
+    seen = point.approach == "ramp" or point.plant_sign == 0
+    oscillation = Oscillation(
+        loop,
+        settings,
+        patience_s=PATIENCE_SHARE * config.limits.time_s,
+        nudge_s=NUDGE_SHARE * config.limits.time_s,
+        sign_is_sure=seen,
+    )
     _lead(oscillation, config, known)
     loop.watch = Watch(y_centre=point.y, afloat=True)
     return _balance(oscillation, config, known, tell), oscillation
@@ -264,7 +293,8 @@ def find_midpoint(loop: ControlLoop, config: Config, known: Known, tell: Tell) -
 def _lead(oscillation: Oscillation, config: Config, known: Known) -> None:
     """Move the relay's centre from where the plant was caught to the operating point, at the speed it had."""
     target = config.operating_point.y
-    centre = known.y_moved
+    # ahead of the plant, so that the relay pulls it away from its rest at once
+    centre = known.y_moved + LEAD * (target - known.y_moved)
     step = max(known.speed, SMALL) * oscillation.loop.sample_time_s
     while centre != target:
         centre = min(centre + step, target) if centre < target else max(centre - step, target)
@@ -278,7 +308,11 @@ def _balance(oscillation: Oscillation, config: Config, known: Known, tell: Tell)
     """Oscillate until the duty is near one half and two whole periods agree; take the first point from them."""
     loop = oscillation.loop
     swing = config.limits.swing
-    oscillation.change(oscillation.settings, patience_s=0.25 * config.limits.time_s)
+    oscillation.change(
+        oscillation.settings,
+        patience_s=PATIENCE_SHARE * config.limits.time_s,
+        nudge_s=NUDGE_SHARE * config.limits.time_s,
+    )
     tries = 0
     while True:
         _, switched = oscillation.step()

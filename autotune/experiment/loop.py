@@ -124,7 +124,7 @@ class ControlLoop:
         self.rig = rig
         self.envelope = envelope
         self.watch = Watch()
-        self.monitor = ReadingMonitor(jump=envelope.settings.swing, bad_samples=envelope.bad_samples)
+        self.monitor = ReadingMonitor(bad_samples=envelope.bad_samples)
         self.metadata: dict[str, Any] = {}
         self._writer = writer
         self._extra = tuple(extra)
@@ -267,10 +267,7 @@ class ControlLoop:
         with contextlib.suppress(AutotuneError):
             self.rig.close()
         if self.tick.k >= 0:
-            # the last sample, which no command followed any more but the safe one
-            last = (self._reading.t_s - self._start_s, self.envelope.settings.u_safe, self._reading.y)
-            if not self._record.t or last[0] > self._record.t[-1]:
-                self._writer.append((*last, *(math.nan for _ in self._extra)))
+            self._write_last_row()
         self.metadata["ended"] = _reason(error) | {"output": output}
         timing = self.timing
         self.metadata["timing"] = {
@@ -281,6 +278,15 @@ class ControlLoop:
         }
         self._writer.finish(self.metadata)
         self._exits.close()
+
+    def _write_last_row(self) -> None:
+        """Write the last sample, which only the safe command followed; NaN where the link broke first."""
+        t_s, y = self._reading.t_s - self._start_s, self._reading.y
+        written_s = self._record.t[-1] if self._record.t else -math.inf
+        if t_s <= written_s:
+            t_s, y = self.rig.clock.now() - self._start_s, math.nan
+        if t_s > written_s:
+            self._writer.append((t_s, self.envelope.settings.u_safe, y, *(math.nan for _ in self._extra)))
 
 
 def _reason(error: BaseException | None) -> dict[str, Any]:

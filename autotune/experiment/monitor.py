@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from statistics import median
 
 from autotune.errors import ExperimentStopped, LinkError
 from autotune.experiment.rig import Reading
@@ -19,8 +20,6 @@ class ReadingMonitor:
 
     Parameters
     ----------
-    jump : float
-        Largest credible change of y within one sample [y unit]; a reading beyond it is unusable.
     bad_samples : int
         Unusable readings in a row that are ridden through.
 
@@ -28,6 +27,8 @@ class ReadingMonitor:
     ----------
     noise : float
         Half-width of the measurement noise as far as known [y unit].
+    jump : float
+        Largest credible change of y within a few samples, noise apart [y unit]; a reading beyond it is unusable.
     max_repeats : int or None
         Equal readings in a row after which the sensor counts as frozen; None while nobody knows what to expect.
     u_tolerance : float
@@ -36,12 +37,12 @@ class ReadingMonitor:
         The last usable readings, the newest last.
     """
 
-    def __init__(self, *, jump: float, bad_samples: int) -> None:
+    def __init__(self, *, bad_samples: int) -> None:
         self.noise = 0.0
+        self.jump = math.inf
         self.max_repeats: int | None = None
         self.u_tolerance = math.inf
         self.recent: tuple[float, ...] = ()
-        self._jump = jump
         self._bad_samples = bad_samples
         self._bad_run = 0
         self._repeats = 0
@@ -93,8 +94,9 @@ class ReadingMonitor:
             return "the sensor answers not a number"
         if reading.suspect:
             return "the link answers doubtfully"
-        if self.recent and abs(reading.y - self.recent[-1]) > self._jump + 2.0 * self.noise:
-            return f"the sensor jumps from {self.recent[-1]:.4g} to {reading.y:.4g} within one sample"
+        # compared with the median, so that one wild reading that was let through does not make the next good one wild
+        if self.recent and abs(reading.y - median(self.recent)) > self.jump + 2.0 * self.noise:
+            return f"the sensor jumps from {median(self.recent):.4g} to {reading.y:.4g}"
         return ""
 
     def _check_fresh(self, reading: Reading) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from statistics import median
 
 from autotune.errors import ExperimentStopped
 from autotune.experiment.loop import ControlLoop, Tick
@@ -24,6 +25,10 @@ class Oscillation:
         First setting.
     patience_s : float
         Time without a switch after which the experiment stops [s].
+    sign_is_sure : bool
+        Whether the sign of the plant's gain was seen on the rig; else a plant that runs away has the wrong one.
+    nudge_s : float
+        Time without a switch after which the mid-point moves by half an amplitude: for a first guess far off [s].
 
     Attributes
     ----------
@@ -31,7 +36,15 @@ class Oscillation:
         Rows at which the command switched since the setting was made, the row of the change first if it was a switch.
     """
 
-    def __init__(self, loop: ControlLoop, settings: RelaySettings, *, patience_s: float) -> None:
+    def __init__(
+        self,
+        loop: ControlLoop,
+        settings: RelaySettings,
+        *,
+        patience_s: float,
+        sign_is_sure: bool = True,
+        nudge_s: float = math.inf,
+    ) -> None:
         self.loop = loop
         self.settings = settings
         self.edges: list[int] = []
@@ -40,18 +53,22 @@ class Oscillation:
         self._patience_s = patience_s
         self._last_switch_s = loop.tick.t_s
         self._first_error = math.nan
+        self._sign_is_sure = sign_is_sure
+        self._nudge_s = nudge_s
+        self._last_nudge_s = loop.tick.t_s
 
     @property
     def switched(self) -> int:
         """Decisions the relay has taken in its life."""
         return self._state.switches
 
-    def change(self, settings: RelaySettings, *, patience_s: float) -> None:
+    def change(self, settings: RelaySettings, *, patience_s: float, nudge_s: float = math.inf) -> None:
         """Go on with another setting, from the next command on."""
         self.settings = settings
         self.edges = []
         self.start_row = self.loop.tick.k
         self._patience_s = patience_s
+        self._nudge_s = nudge_s
         self._last_switch_s = self.loop.tick.t_s
 
     def move_centre(self, y_centre: float) -> None:
@@ -83,23 +100,28 @@ class Oscillation:
         if switched:
             self.edges.append(tick.k)
             self._last_switch_s = tick.t_s
+        elif tick.t_s - max(self._last_switch_s, self._last_nudge_s) > self._nudge_s:
+            self._last_nudge_s = tick.t_s
+            self.move_midpoint(self.settings.midpoint + 0.5 * self._state.level * self.settings.amplitude)
         self._check_alive(tick)
         return self.loop.step(self.loop.nearest(u)), switched
 
     def _check_alive(self, tick: Tick) -> None:
-        error = abs(tick.y - self.settings.y_centre)
+        y = median(self.loop.monitor.recent)
+        error = abs(y - self.settings.y_centre)
         if math.isnan(self._first_error):
             self._first_error = error
-        if self._state.switches == 0 and error - self._first_error > 0.5 * self.loop.envelope.settings.swing:
+        doubtful = not self._sign_is_sure and self._state.switches == 0
+        if doubtful and error - self._first_error > 0.5 * self.loop.envelope.settings.swing:
             raise ExperimentStopped(
-                f"wrong sign: y = {tick.y:.4g} moves away from {self.settings.y_centre:.4g} under the command that"
+                f"wrong sign: y = {y:.4g} moves away from {self.settings.y_centre:.4g} under the command that"
                 " should bring it back",
                 mend="check operating_point.plant_sign and the wiring of the actuator",
             )
         waited = tick.t_s - self._last_switch_s
         if waited > self._patience_s:
             raise ExperimentStopped(
-                f"no oscillation: the relay has not switched for {waited:.3g} s, y = {tick.y:.4g} stays on one side of"
+                f"no oscillation: the relay has not switched for {waited:.3g} s, y = {y:.4g} stays on one side of"
                 f" {self.settings.y_centre:.4g}",
                 mend="look for a stuck actuator or a load; else check operating_point.u_guess and u_uncertainty",
             )

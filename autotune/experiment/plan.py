@@ -14,7 +14,7 @@ from autotune.experiment.relay import RelaySettings
 from autotune.points import FrequencyPoint
 
 #: part of the half-range of phases that targets keep away from its ends: the reached phase is near its target only
-PHASE_MARGIN = 0.1
+PHASE_MARGIN = 0.13
 #: part of a period that the relay may look back over; a longer average would blunt the crossing it looks for
 SMOOTHING_SHARE = 0.12
 #: hysteresis in standard deviations of the smoothed noise

@@ -23,8 +23,10 @@ from autotune.identification.limit_cycle import WholePeriods
 #: part of limits.swing that a limit cycle is planned for: the rest is for a mid-point that is not quite right
 PEAK_SHARE = 0.91
 #: the same for the first point, whose gain is foreseen from a short look at the plant
-FIRST_PEAK_SHARE = 0.84
+FIRST_PEAK_SHARE = 0.86
 LEAST_PERIODS = 2
+#: harmonics while the rig waits; the estimate that is kept is made with all of them at the end
+FEW_HARMONICS = 7
 #: asymmetry of the duty (part of the period, less one half) from which on the mid-point is corrected within a point
 LARGEST_ASYMMETRY = 0.12
 
@@ -170,7 +172,7 @@ def _measure(oscillation: Oscillation, choice: Choice, wanted: int, until_s: flo
         others = known.points if known.swept else ()
         window = WholePeriods(start_s=float(t[0]), end_s=float(t[0]) + periods * period * step_s, periods=periods)
         try:
-            return limit_cycle_points(t, u, y, window=window, known=others)
+            return limit_cycle_points(t, u, y, window=window, known=others, highest_harmonic=FEW_HARMONICS)
         except IdentificationError as error:
             raise ExperimentStopped(error.what, where=State.SWEEP.value, mend=error.mend) from error
 
