@@ -81,7 +81,8 @@ def generalized_stability_margin(plant: Plant, controller: Controller, *, scalin
     loop = open_loop(plant, controller)
     if not loop.is_stable:
         return 0.0
-    omega = loop.grid
+    # integral action alone moves b below every corner: look at the limit too
+    omega = np.append(loop.grid[0] * 1e-6, loop.grid)
 
     def f(x: FloatArray) -> FloatArray:
         return _local_margin(loop, x, scaling)
