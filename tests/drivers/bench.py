@@ -29,6 +29,7 @@ from sim.servo import Servo, ServoSettings
 U_RANGE = (-10.0, 10.0)
 U_SAFE = -0.5
 DEADMAN_S = 0.3
+#: no wait of a test is longer [s]
 LIMIT_S = 20.0  # no wait of a test is longer
 
 #: a sample in one request, a command in one request; one signal in each form that devices use

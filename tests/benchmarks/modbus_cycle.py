@@ -1,0 +1,92 @@
+"""The driver's control cycle against a bare read and write of the Modbus library, paired, on TCP loopback.
+
+The driver reads a sample of five signals in one request, checks it, writes command and heartbeat in one request and
+checks that too; the bare cycle reads two registers and writes one and checks nothing. Both talk to the same slave in C
+(libmodbus), in turns of one cycle each, so that the machine's load falls on both alike.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+from pymodbus.client import ModbusTcpClient
+from rich.console import Console
+from rich.table import Table
+
+from autotune.config.registers import RegisterMap
+from autotune.config.rig import ModbusTcpSettings
+from drivers import open_rig
+
+SLAVE = RegisterMap.model_validate(
+    {
+        "y": {"table": "input", "address": 0, "type": "float32"},
+        "u_applied": {"table": "input", "address": 2, "scale": 1e-3},
+        "heartbeat_echo": {"table": "input", "address": 3, "type": "uint16"},
+        "u": {"address": 0, "scale": 1e-3},
+        "heartbeat": {"address": 1, "type": "uint16"},
+    }
+)
+
+
+def paired_cycles(cycles: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the times of bare and of driven cycles [s], (N,) each, taken in turns."""
+    source = Path(__file__).parents[1] / "drivers" / "libmodbus_slave.c"
+    with tempfile.TemporaryDirectory() as folder:
+        program = Path(folder) / "slave"
+        compile_it = ["gcc", "-O2", "-I/usr/include/modbus", "-o", program, source, "-lmodbus"]
+        subprocess.run(compile_it, check=True)
+        slaves = [subprocess.Popen([program, "tcp"], stdout=subprocess.PIPE, text=True) for _ in range(2)]
+        try:
+            ports = [int(slave.stdout.readline().split()[1]) for slave in slaves if slave.stdout is not None]
+            return _measure(ports, cycles)
+        finally:
+            for slave in slaves:
+                slave.kill()
+                slave.communicate()
+
+
+def _measure(ports: list[int], cycles: int) -> tuple[np.ndarray, np.ndarray]:
+    client = ModbusTcpClient("127.0.0.1", port=ports[0], timeout=2.0)
+    client.connect()
+    settings = ModbusTcpSettings(kind="modbus_tcp", port=ports[1], timeout_s=2.0, registers=SLAVE)
+    rig = open_rig(settings, u_range=(-10.0, 10.0), u_safe=0.0)
+    rig.open()
+    times = np.empty((2, cycles))
+    for k in range(cycles):
+        start = time.perf_counter()
+        client.read_input_registers(0, count=2)
+        client.write_register(0, k % 1000)
+        middle = time.perf_counter()
+        rig.read()
+        rig.write(1e-3 * (k % 1000))
+        times[:, k] = middle - start, time.perf_counter() - middle
+    client.close()
+    rig.make_safe()
+    rig.close()
+    warm = cycles // 10
+    return times[0, warm:], times[1, warm:]
+
+
+def main() -> None:
+    """Print medians, 99th percentiles and the paired ratio."""
+    console = Console(highlight=False, soft_wrap=True)
+    if not Path("/usr/include/modbus/modbus.h").exists() or shutil.which("gcc") is None:
+        console.print("modbus_cycle needs gcc and libmodbus-dev: apt-get install gcc libmodbus-dev")
+        return
+    cycles = int(os.environ.get("MODBUS_CYCLES", "5000"))
+    bare, driven = paired_cycles(cycles)
+    table = Table("cycle: read and write, TCP loopback", "median [us]", "p99 [us]", title="Modbus control cycle")
+    for name, times in (("bare library", bare), ("driver", driven)):
+        table.add_row(name, f"{1e6 * np.median(times):.0f}", f"{1e6 * np.quantile(times, 0.99):.0f}")
+    console.print(table)
+    ratios = np.median(driven) / np.median(bare), float(np.median(driven / bare))
+    console.print(
+        f"ratio of medians {ratios[0]:.2f}, median of paired ratios {ratios[1]:.2f} (wanted: at most 1.3), "
+        f"{bare.size} pairs"
+    )

@@ -1,0 +1,333 @@
+"""The fault campaign: a short relay session on a real line, one fault at a random moment, and what came of it.
+
+A session runs the servo behind the simulated device for about a second at 100 Hz through the same loop as every
+experiment. Afterwards the rig's own side is asked: was the safe output reached, and when; was a command ever outside
+the limits; was every recorded sample measured at its time.
+"""
+
+from __future__ import annotations
+
+import random
+import tempfile
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from autotune.config.procedure import LimitSettings
+from autotune.errors import AutotuneError
+from autotune.experiment.limits import Envelope
+from autotune.experiment.loop import ControlLoop
+from autotune.experiment.rig import Rig
+from autotune.recording import RecordingWriter, read_recording
+from drivers import open_rig
+from sim.modbus_rig import ModbusRig, RtuTransport, TcpTransport
+from sim.register_device import RegisterDevice
+from sim.serial_line import SerialLine
+from sim.servo import Servo, ServoSettings
+from tests.drivers.bench import DEADMAN_S, U_SAFE, register_device, rtu_settings, tcp_settings
+from tests.drivers.tcp_relay import TcpRelay
+
+SAMPLE_S = 0.01
+SESSION_S = 1.2
+TIMEOUT_S = 0.06
+LIMITS = LimitSettings(u_min=-1.0, u_max=1.0, u_safe=U_SAFE, y_min=-3.0, y_max=3.0, swing=2.0, time_s=60.0)
+
+Fate = Sequence[tuple[float, bytes]]
+Harm = Callable[[bytes, str], Fate]
+
+
+class LoggedServo(Servo):
+    """A servo that remembers when it measured what; no two of its measurements are equal."""
+
+    def __init__(self, seed: int) -> None:
+        super().__init__(ServoSettings(load=0.05, noise=0.002, resolution=0.0), seed=seed)
+        self.measured: dict[float, float] = {}
+
+    def measure(self) -> float:
+        y = super().measure()
+        self.measured[float(np.float32(y))] = self.time_s
+        return y
+
+
+@dataclass(kw_only=True)
+class Line:
+    """A rig on a line, the device behind it, and the means to harm both."""
+
+    rig: Rig
+    device: RegisterDevice
+    plant: LoggedServo
+    random: random.Random
+    set_harm: Callable[[Harm], None] = lambda harm: None
+    reset: Callable[[], None] = lambda: None
+    refusing: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outcome:
+    """What came of one session.
+
+    Attributes
+    ----------
+    ended : str
+        ``completed``, or the one line that the loop ended with.
+    exit_status : int
+        0, or the error's.
+    safe_after_s : float
+        Device time from the fault (where the session outlived it: from its last command) to the safe output [s].
+    beyond_limits, bad_samples : int
+        Outputs outside the limits; recorded samples that nobody measured, or not then.
+    rows : int
+        Rows of the recording as it can be read.
+    """
+
+    ended: str
+    exit_status: int
+    safe_after_s: float
+    beyond_limits: int
+    bad_samples: int
+    rows: int
+
+    @property
+    def is_good(self) -> bool:
+        """Whether the rig and the data came through."""
+        return self.safe_after_s <= DEADMAN_S + 1e-6 and not self.beyond_limits and not self.bad_samples
+
+
+def _whole(frame: bytes, direction: str) -> Fate:
+    return ((0.0, frame),)
+
+
+@contextmanager
+def tcp_line(seed: int) -> Iterator[Line]:
+    """A rig on TCP with a relay in between."""
+    plant = LoggedServo(seed)
+    device = register_device(plant=plant)
+    refusing: dict[str, Any] = {}
+
+    def refuse(table: str, address: int, writes: bool) -> int | None:
+        if refusing.get("left", 0) <= 0:
+            return None
+        refusing["left"] -= 1
+        return int(refusing["code"])
+
+    with ModbusRig(device, TcpTransport(), refuse=refuse) as server, TcpRelay(server.port) as relay:
+        settings = tcp_settings(relay.port, timeout_s=TIMEOUT_S)
+        rig = open_rig(settings, u_range=(LIMITS.u_min, LIMITS.u_max), u_safe=U_SAFE)
+
+        def harm(how: Harm) -> None:
+            relay.tamper = how
+
+        yield Line(
+            rig=rig,
+            device=device,
+            plant=plant,
+            random=random.Random(seed),
+            set_harm=harm,
+            reset=relay.reset,
+            refusing=refusing,
+        )
+        rig.close()
+
+
+@contextmanager
+def rtu_line(seed: int) -> Iterator[Line]:
+    """A rig on a serial line."""
+    plant = LoggedServo(seed)
+    device = register_device(plant=plant)
+    with SerialLine(_whole) as line, ModbusRig(device, RtuTransport(device=line.rig_device, parity="N")):
+        settings = rtu_settings(line.host_device, timeout_s=TIMEOUT_S, late_reply_s=0.2)
+        rig = open_rig(settings, u_range=(LIMITS.u_min, LIMITS.u_max), u_safe=U_SAFE)
+
+        def harm(how: Harm) -> None:
+            line.tamper = how
+
+        yield Line(rig=rig, device=device, plant=plant, random=random.Random(seed), set_harm=harm)
+        rig.close()
+
+
+def run_session(line: Line, strike: Callable[[Line], None], moment_s: float) -> Outcome:
+    """Run one session and strike once at the moment [s]; return what came of it."""
+    released = threading.Event()
+    line.device.on_change = lambda change: released.set() if change.cause in ("dead-man", "given back") else None
+    struck_s = float("inf")
+    error: AutotuneError | None = None
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "session.csv"
+        writer = RecordingWriter(path, ("t", "u", "y", "u_applied"), {})
+        envelope = Envelope(settings=LIMITS, sample_time_s=SAMPLE_S)
+        try:
+            with ControlLoop(rig=line.rig, envelope=envelope, writer=writer, extra=("u_applied",)) as loop:
+                tick = loop.tick
+                while tick.t_s < SESSION_S:
+                    if tick.t_s >= moment_s and struck_s == float("inf"):
+                        struck_s = line.device.history[-1].t_s
+                        strike(line)
+                    tick = loop.step(loop.nearest(-0.4 if tick.y > 0.0 else 0.4))
+        except AutotuneError as caught:
+            error = caught
+        released.wait(10.0)
+        recording = read_recording(path)
+    return Outcome(
+        ended="completed" if error is None else str(error),
+        exit_status=0 if error is None else error.exit_status,
+        safe_after_s=_safe_after(line.device, 0.0 if struck_s == float("inf") else struck_s),
+        beyond_limits=beyond_limits(line.device),
+        bad_samples=bad_samples(line.plant, recording.t, recording.y),
+        rows=len(recording),
+    )
+
+
+def _safe_after(device: RegisterDevice, struck_s: float) -> float:
+    """Return the time from the last command that was taken to the safe output [s]; infinite if it is not there."""
+    history = list(device.history)
+    if abs(device.output - U_SAFE) > 1e-9:
+        return float("inf")
+    reached = next(i for i in range(len(history)) if all(abs(c.output - U_SAFE) < 1e-9 for c in history[i:]))
+    last_other = history[reached - 1].t_s if reached else history[reached].t_s
+    return history[reached].t_s - max(last_other, struck_s)
+
+
+def beyond_limits(device: RegisterDevice) -> int:
+    """Count outputs outside the limits, on the rig's side."""
+    return sum(not LIMITS.u_min <= change.output <= LIMITS.u_max for change in device.history)
+
+
+def bad_samples(plant: LoggedServo, t: Any, y: Any) -> int:
+    """Count samples that were not measured, or were measured longer ago than an answer may take."""
+    sent = [float(np.float32(value)) for value in y]  # the line carries floats of 32 bits, the file twelve digits
+    pairs = [(float(t_k), plant.measured.get(y_k)) for t_k, y_k in zip(t, sent, strict=True) if np.isfinite(y_k)]
+    delays = [t_k - at for t_k, at in pairs if at is not None]
+    newest = min(delays, default=0.0)  # the two clocks' difference
+    return sum(at is None for _, at in pairs) + sum(delay - newest > TIMEOUT_S for delay in delays)
+
+
+def repeatedly(harm: Callable[[random.Random], Harm]) -> Callable[[Line], None]:
+    """Return a strike that puts a harm on the line from the moment on."""
+    return lambda line: line.set_harm(harm(line.random))
+
+
+def _per_answer(share: float, fate: Callable[[bytes, random.Random], Fate]) -> Callable[[random.Random], Harm]:
+    def made(draw: random.Random) -> Harm:
+        def harm(frame: bytes, direction: str) -> Fate:
+            hit = direction == "to host" and draw.random() < share
+            return fate(frame, draw) if hit else ((0.0, frame),)
+
+        return harm
+
+    return made
+
+
+def _flip(frame: bytes, draw: random.Random) -> Fate:
+    at = draw.randrange(len(frame))
+    return ((0.0, frame[:at] + bytes((frame[at] ^ 1 << draw.randrange(8),)) + frame[at + 1 :]),)
+
+
+def _refuse(code: int, times: int) -> Callable[[Line], None]:
+    return lambda line: line.refusing.update(code=code, left=times)
+
+
+def _restart(line: Line) -> None:
+    """What a device's reset does: registers cleared, the actuator safe, nobody in command."""
+    line.device._values |= {"heartbeat": 0.0, "u": 0.0, "enable": 0.0}
+    line.device._release("given back")
+
+
+def _stale_first() -> Callable[[random.Random], Harm]:
+    def made(draw: random.Random) -> Harm:
+        kept: list[bytes] = []
+
+        def harm(frame: bytes, direction: str) -> Fate:
+            if direction == "to device":
+                return ((0.0, frame),)
+            kept.append(frame)
+            return [(0.0, old) for old in kept[-2:]]
+
+        return harm
+
+    return made
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fault:
+    """A fault, the line it belongs to, and the ends that are right for it (regular expressions of the one line)."""
+
+    name: str
+    line: Callable[[int], Any]
+    strike: Callable[[Line], None]
+    ends: tuple[str, ...]
+
+
+_LOST = (
+    "no answer",
+    "connection was lost",
+    "no connection",
+    "link too slow",
+    "answers doubtfully",
+    "took the actuator back",
+    "echoes heartbeat",
+)
+_RIDDEN = ("completed", *_LOST)
+
+
+def _jitter(frame: bytes, draw: random.Random) -> Fate:
+    return ((draw.uniform(0.0, 0.02), frame),)
+
+
+def _slices(frame: bytes, draw: random.Random) -> Fate:
+    return [(2e-4 * k, frame[k : k + 1]) for k in range(len(frame))]
+
+
+def _late(frame: bytes, draw: random.Random) -> Fate:
+    return ((draw.uniform(0.07, 0.15), frame),)
+
+
+def _twice(frame: bytes, draw: random.Random) -> Fate:
+    return ((0.0, frame), (0.0, frame))
+
+
+def _lost(frame: bytes, draw: random.Random) -> Fate:
+    return ()
+
+
+def _cut(line: Line) -> None:
+    line.set_harm(lambda frame, direction: ())
+
+
+def _always(fate: Callable[[bytes, random.Random], Fate]) -> Callable[[Line], None]:
+    return repeatedly(_per_answer(1.0, fate))
+
+
+def _sometimes(fate: Callable[[bytes, random.Random], Fate]) -> Callable[[Line], None]:
+    return repeatedly(_per_answer(0.05, fate))
+
+
+FAULTS = (
+    Fault(name="TCP latency 0-20 ms", line=tcp_line, ends=_RIDDEN, strike=_always(_jitter)),
+    Fault(name="TCP sliced byte by byte", line=tcp_line, ends=_RIDDEN, strike=_always(_slices)),
+    Fault(name="TCP late beyond time-out", line=tcp_line, ends=_RIDDEN, strike=_sometimes(_late)),
+    Fault(name="TCP doubled answers", line=tcp_line, ends=_RIDDEN, strike=_always(_twice)),
+    Fault(name="TCP older answers first", line=tcp_line, ends=_RIDDEN, strike=repeatedly(_stale_first())),
+    Fault(name="TCP connection reset", line=tcp_line, ends=_RIDDEN, strike=lambda line: line.reset()),
+    Fault(name="TCP half-open", line=tcp_line, ends=_LOST, strike=_always(_lost)),
+    Fault(name="Modbus exception 4", line=tcp_line, ends=("failed to do it",), strike=_refuse(4, 10**9)),
+    Fault(name="device busy once", line=tcp_line, ends=_RIDDEN, strike=_refuse(6, 1)),
+    Fault(name="device busy for good", line=tcp_line, ends=("is busy",), strike=_refuse(6, 10**9)),
+    Fault(name="device restarts", line=tcp_line, ends=_LOST[-2:], strike=_restart),
+    Fault(name="RTU late beyond time-out", line=rtu_line, ends=_RIDDEN, strike=_sometimes(_late)),
+    Fault(name="RTU lost answers", line=rtu_line, ends=_RIDDEN, strike=_sometimes(_lost)),
+    Fault(name="RTU bit flips", line=rtu_line, ends=_RIDDEN, strike=_sometimes(_flip)),
+    Fault(name="RTU cable cut", line=rtu_line, ends=_LOST, strike=_cut),
+)
+
+
+def run_fault(fault: Fault, seed: int) -> Outcome:
+    """Run one session with the fault at a moment drawn from the seed."""
+    moment_s = random.Random(seed).uniform(0.1, 0.8 * SESSION_S)
+    with ExitStack() as stack:
+        line = stack.enter_context(fault.line(seed))
+        return run_session(line, fault.strike, moment_s)

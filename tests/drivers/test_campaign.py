@@ -1,0 +1,33 @@
+"""The fault campaign's short form: each fault once; ``make bench`` strikes at many moments."""
+
+from __future__ import annotations
+
+import re
+import signal
+
+import pytest
+
+from tests.drivers.campaign import FAULTS, Fault, run_fault
+from tests.drivers.signals import SIGNALS, strike_process
+
+
+@pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.name)
+def test_the_rig_is_safe_and_no_bad_sample_is_kept(fault: Fault) -> None:
+    outcome = run_fault(fault, seed=5)
+    assert outcome.is_good, outcome
+    assert outcome.rows >= 5
+    assert any(re.search(end, outcome.ended) for end in fault.ends), outcome.ended
+    assert outcome.exit_status == (0 if outcome.ended == "completed" else 3)
+    assert "\n" not in outcome.ended
+
+
+@pytest.mark.parametrize(("number", "status", "line"), SIGNALS, ids=lambda value: getattr(value, "name", None))
+def test_a_stopped_or_killed_process_leaves_the_rig_safe_and_the_recording_readable(
+    number: signal.Signals, status: int, line: str
+) -> None:
+    outcome = strike_process(number, seed=2)
+    assert outcome.is_good, outcome
+    assert outcome.exit_status == status
+    assert outcome.ended.startswith(line)
+    assert "\n" not in outcome.ended
+    assert outcome.rows >= 5
