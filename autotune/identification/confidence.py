@@ -1,6 +1,7 @@
 """From the covariance of a polished model to what people ask for: regions of the frequency response and of the poles.
 
-Linearised (delta method) at the estimate, in coordinates of the behaviour, so that the choice of states drops out.
+At the estimate, in coordinates of the behaviour, so that the choice of states drops out: the response to second order,
+the poles to first.
 """
 
 from __future__ import annotations
@@ -40,19 +41,42 @@ def response_covariance(estimate: PredictionErrorEstimate, omega_rad_s: FloatArr
     ------
     IdentificationError
         The data leave some direction of the model undetermined.
+
+    Notes
+    -----
+    The model is moved by one standard deviation either way along each principal axis of its covariance. Half the
+    difference gives the first-order term; the curvature adds the second-order variance h^2 / 2 of h z^2 / 2, which
+    matters near a pole that is itself uncertain (an integrator seen at low frequency).
     """
     _require_information(estimate)
+    values, vectors = np.linalg.eigh(estimate.covariance)
+    axes = vectors * np.sqrt(np.maximum(values, 0.0))
+    middle = estimate.model.response(omega_rad_s)
+    ahead, behind = (_moved_responses(estimate, sign * axes, omega_rad_s) for sign in (1.0, -1.0))
+    return _outer((ahead - behind) / 2.0) + _outer((ahead + behind - 2.0 * middle[..., None]) / math.sqrt(2.0))
+
+
+def _moved_responses(estimate: PredictionErrorEstimate, steps: FloatArray, omega_rad_s: FloatArray) -> ComplexArray:
+    """Return the responses of the models moved along each column of ``steps`` (P, k), shape (W, n_y, n_u, k)."""
     model = estimate.model
     z = np.exp(1j * np.asarray(omega_rad_s, dtype=np.float64) * model.sample_time_s)
-    resolvent = np.linalg.inv(z[:, None, None] * np.eye(model.order) - model.A)
-    right, left = resolvent @ model.B, model.C @ resolvent
-    change = (
-        np.einsum("oip,wiu->woup", estimate.d_c, right)
-        + np.einsum("woi,ikp,wku->woup", left, estimate.d_a, right, optimize=True)
-        + np.einsum("woi,iup->woup", left, estimate.d_b)
-        + estimate.d_d
-    ) * (z ** -float(model.input_delay))[:, None, None, None]
-    return _real_covariance(change, estimate.covariance)
+    A, B, C, D = (
+        np.moveaxis(fixed[..., None] + change @ steps, -1, 0)
+        for fixed, change in (
+            (model.A, estimate.d_a),
+            (model.B, estimate.d_b),
+            (model.C, estimate.d_c),
+            (model.D, estimate.d_d),
+        )
+    )
+    resolvent = np.linalg.inv(z[:, None, None, None] * np.eye(model.order) - A)
+    late = (z ** -float(model.input_delay))[:, None, None, None]
+    return np.asarray(np.moveaxis((C @ resolvent @ B + D) * late, 1, -1), dtype=np.complex128)
+
+
+def _outer(change: ComplexArray) -> FloatArray:
+    parts = np.stack([change.real, change.imag], axis=-2)
+    return np.asarray(parts @ np.swapaxes(parts, -1, -2), dtype=np.float64)
 
 
 def pole_covariance(estimate: PredictionErrorEstimate) -> FloatArray:

@@ -74,8 +74,8 @@ class OrderChoice:
 
 
 def default_past_window(rows: int, channels: int) -> int:
-    """Return the longest past window worth trying: a twelfth of the rows per channel, 4 to 60 lags."""
-    return int(np.clip(rows // (12 * channels), 4, 60))
+    """Return the longest past window worth trying: a twentieth of the rows per channel, 4 to 60 lags."""
+    return int(np.clip(rows // (20 * channels), 4, 60))
 
 
 def shifted(u: FloatArray, y: FloatArray, delay: int) -> tuple[FloatArray, FloatArray]:
@@ -257,7 +257,7 @@ def _parsimonious(fits: dict[tuple[int, int], PredictionErrorEstimate]) -> tuple
 def _per_rows(estimate: PredictionErrorEstimate, rows: int) -> float:
     """Return the criterion as if from ``rows`` rows: candidates with a dead time use a few rows fewer."""
     floor = 2.0 * estimate.model.C.shape[0] * float(np.log(_NOISE_FREE))
-    return rows * max(estimate.log_det, floor) + (estimate.bic - estimate.rows * estimate.log_det)
+    return float(rows * max(estimate.log_det, floor) + (estimate.bic - estimate.rows * estimate.log_det))
 
 
 def _evidence(fits: dict[tuple[int, int], PredictionErrorEstimate]) -> tuple[Candidate, ...]:

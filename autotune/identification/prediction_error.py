@@ -17,8 +17,8 @@ from autotune.identification.predictor_directions import Predictor, behaviour_di
 from autotune.identification.predictor_sweep import innovations, normal_equations, scatter
 from autotune.identification.state_space import InnovationModel, balancing, spectral_radius
 
-#: A step that promises less than this in -2 log likelihood moves no parameter by 1 % of its standard deviation.
-_TOLERANCE = 1e-4
+#: A step that promises less than this in -2 log likelihood moves no parameter by 3 % of its standard deviation.
+_TOLERANCE = 1e-3
 #: A search that cannot move any more has converged if it could have gained less than this.
 _IMMATERIAL = 0.1
 #: Zeros of the noise model nearer to the unit circle than this have no finite memory worth the name.
@@ -175,7 +175,8 @@ def _search(
     errors = scatter(predictor.F, predictor.H, predictor.x0, u, y)
     floor = len(y) * (_NOISE_FREE * np.std(y, axis=0)) ** 2
     while True:
-        predictor = _balanced(predictor)
+        if iterations in (0, 2) or iterations % 5 == 4:
+            predictor = _balanced(predictor)
         directions = behaviour_directions(predictor, feedthrough=feedthrough, offset=offset)
         if len(y) * y.shape[1] <= directions.shape[1]:
             raise IdentificationError(

@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import qr
 
 from autotune.arrays import FloatArray, IntArray
 
@@ -62,23 +63,20 @@ def free_entries(predictor: Predictor, *, feedthrough: bool, offset: bool) -> In
 def renaming_directions(predictor: Predictor, *, offset: bool) -> FloatArray:
     """Return the directions that leave the input-output behaviour alone, shape (entries, n^2 + n or n^2)."""
     n, F, H, x0 = len(predictor.x0), predictor.F, predictor.H, predictor.x0
-    columns = []
-    for i in range(n):
-        for k in range(n):
-            dF, dH, dx0 = np.zeros_like(F), np.zeros_like(H), np.zeros(n)
-            dF[i] += F[k]  # E [A B K d] with E = e_i e_k'
-            dF[:, k] -= F[:, i]  # - A E
-            dH[:, k] -= H[:, i]  # - C E
-            dx0[i] = x0[k]
-            columns.append(np.concatenate([dF.ravel(), dH.ravel(), dx0]))
-    for i in range(n if offset else 0):  # x -> x + e_i
-        dF, dH, dx0 = np.zeros_like(F), np.zeros_like(H), np.zeros(n)
-        dF[:, -1] -= F[:, i]
-        dF[i, -1] += 1.0
-        dH[:, -1] -= H[:, i]
-        dx0[i] = 1.0
-        columns.append(np.concatenate([dF.ravel(), dH.ravel(), dx0]))
-    return np.stack(columns, axis=1)
+    count = n * n + (n if offset else 0)
+    dF, dH, dx0 = np.zeros((*F.shape, count)), np.zeros((*H.shape, count)), np.zeros((n, count))
+    k = np.arange(n)
+    for i in range(n):  # E = e_i e_k' for every k: E [A B K d] - [A E], - C E, E x0
+        column = i * n + k
+        dF[i][:, column] += F.T
+        dF[:, k, column] -= F[:, i, None]
+        dH[:, k, column] -= H[:, i, None]
+        dx0[i, column] += x0
+    if offset:  # x -> x + e_i
+        dF[:, -1, n * n :] = np.eye(n) - F[:, :n]
+        dH[:, -1, n * n :] = -H[:, :n]
+        dx0[:, n * n :] = np.eye(n)
+    return np.concatenate([dF.reshape(-1, count), dH.reshape(-1, count), dx0])
 
 
 def behaviour_directions(predictor: Predictor, *, feedthrough: bool, offset: bool) -> FloatArray:
@@ -92,7 +90,7 @@ def behaviour_directions(predictor: Predictor, *, feedthrough: bool, offset: boo
     """
     free = free_entries(predictor, feedthrough=feedthrough, offset=offset)
     renaming = renaming_directions(predictor, offset=offset)[free]
-    basis = np.linalg.qr(renaming, mode="complete")[0][:, renaming.shape[1] :]
+    basis = qr(renaming, check_finite=False)[0][:, renaming.shape[1] :]
     directions = np.zeros((predictor.packed().size, basis.shape[1]))
     directions[free] = basis
     return directions

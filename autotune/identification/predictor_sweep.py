@@ -69,7 +69,7 @@ def scatter(F: FloatArray, H: FloatArray, x0: FloatArray, u: FloatArray, y: Floa
     return total
 
 
-@njit(cache=True)
+@njit(cache=True, fastmath={"contract", "nsz"})  # fused multiply-add only: NaN and order of sums are kept
 def normal_equations(
     F: FloatArray,
     H: FloatArray,

@@ -262,5 +262,12 @@ def balancing(model: InnovationModel) -> FloatArray:
 
 
 def _gramian_factor(A: FloatArray, B: FloatArray) -> FloatArray:
-    values, vectors = np.linalg.eigh(solve_discrete_lyapunov(A, B @ B.T))
+    """Return L with L L^T the sum of A^k B B^T A^k^T, by doubling; A has spectral radius below one."""
+    gramian, power = B @ B.T, A
+    for _ in range(40):
+        gramian = gramian + power @ gramian @ power.T
+        power = power @ power
+        if np.max(np.abs(power)) < 1e-8:
+            break
+    values, vectors = np.linalg.eigh(gramian)
     return np.asarray(vectors * np.sqrt(np.maximum(values, 1e-12 * values[-1])), dtype=np.float64)

@@ -98,14 +98,12 @@ def choose_past_window(data: LaggedData) -> int:
     One triangular factor holds the residuals of every shorter window: the recent lags come first.
     """
     _, now_y = data.now
-    best, choice = np.inf, 1
-    for k in range(1, data.p + 1):
-        left = data.R[data.past(k).stop :, now_y]
-        sign, log_det = np.linalg.slogdet(left.T @ left / data.rows)
-        criterion = data.rows * log_det + 2.0 * k * (data.n_u + data.n_y) * data.n_y
-        if sign > 0 and criterion < best:
-            best, choice = criterion, k
-    return choice
+    rows_y = data.R[:, now_y]
+    left = np.cumsum((rows_y[:, :, None] * rows_y[:, None, :])[::-1], axis=0)[::-1] / data.rows
+    k = np.arange(1, data.p + 1)
+    signs, log_dets = np.linalg.slogdet(left[k * (data.n_u + data.n_y)])
+    criterion = data.rows * log_dets + 2.0 * k * (data.n_u + data.n_y) * data.n_y
+    return int(k[np.argmin(np.where(signs > 0, criterion, np.inf))])
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -17,7 +17,7 @@ from scipy.linalg import solve_triangular
 
 from autotune.arrays import FloatArray
 from autotune.errors import IdentificationError
-from autotune.identification.lagged import lagged_factor, lagged_range, lagged_rows, least_squares
+from autotune.identification.lagged import lagged_factor, lagged_range, lagged_rows, least_squares, triangle
 from autotune.identification.state_space import InnovationModel
 
 Instrument: TypeAlias = Literal["r", "r and y", "u and y"]
@@ -209,7 +209,7 @@ def _input_regressors(free: FloatArray, gamma: FloatArray, f: int, n_y: int) -> 
 def _noise_from(free: FloatArray, spread: FloatArray, gamma: FloatArray, *, n_y: int) -> tuple[FloatArray, FloatArray]:
     """Return K and sigma of section III-C: min | free P - free H_f^s(K, sigma) |, linear in (sigma, K sigma)."""
     f = spread.shape[0] // n_y
-    P = np.linalg.qr(spread.T, mode="r").T
+    P = triangle(spread.T).T
     P = P * np.where(np.diag(P) < 0.0, -1.0, 1.0)  # Cholesky factor of P P'
     target = np.vstack(np.split(free @ P, f, axis=1))
     solution = least_squares(_input_regressors(free, gamma, f, n_y), target)

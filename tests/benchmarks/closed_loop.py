@@ -1,0 +1,211 @@
+"""Closed-loop identification on the example of Pouliquen et al. 2011: efficiency, coverage, order choice, time.
+
+``python -m tests.benchmarks closed_loop``; SETS=500 in the environment for the count that shows rare failures
+(default 100), ROWS_MAX=1000000 for the longest record of the timing (default 300000).
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import time
+import tracemalloc
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from autotune.errors import IdentificationError
+from autotune.identification.confidence import inside_region, pole_covariance, response_covariance
+from autotune.identification.order import choose_order, fixed_order
+from autotune.identification.prediction_error import prediction_error
+from autotune.identification.refit import refit_inputs
+from autotune.identification.state_space import InnovationModel, difference, feedback, h2_norm, spectral_radius
+from autotune.identification.subspace_direct import pbsid_opt, ssarx
+from autotune.identification.subspace_indirect import indirect_subspace
+from autotune.identification.subspace_peers import oku_tanaka, orthogonal_decomposition, van_overschee_de_moor
+from tests.loop_example import CONTROLLER, PLANT, LoopData, example_set
+
+Method = Callable[[LoopData], InnovationModel]
+POLES = PLANT.poles[[3, 0, 1]]  # P1 = 0.7319+0.6007i, P2 = 1, P3 = 0.9681+0.1486i
+LOOP = feedback(PLANT, CONTROLLER)
+LOOP_NORM = h2_norm(LOOP)
+MARKOV = CONTROLLER.markov_parameters(20)
+
+#: RMSE of P1, P2, P3, median relative H2 error of G/(1+GC), models the true C does not stabilise: an independent
+#: computation of the same example with other seeds, for comparison.
+REFERENCE: dict[str, tuple[float, float, float, float | None, int | None]] = {
+    "Cramer-Rao bound": (0.0162, 0.0042, 0.0065, None, None),
+    "paper's method, n_cl = 9": (0.0238, 0.0056, 0.0111, 0.653, 22),
+    "  with B and D refitted": (0.0238, 0.0056, 0.0111, 0.127, 0),
+    "SSARX p=30 f=10": (0.0224, 0.0083, 0.0124, 0.129, 0),
+    "PBSIDopt p=30 f=10": (0.0212, 0.0074, 0.0119, 0.124, 0),
+    "ORT (Katayama) 20/20": (0.0661, 0.0120, 0.0102, 0.237, 4),
+    "PO-MOESP, feedback ignored": (0.0165, 0.0063, 0.0128, 0.326, 0),
+    "default (polished)": (0.0168, 0.0046, 0.0061, 0.102, 0),
+    "PARSIM-K (sippy_unipi)": (0.0180, 0.0048, 0.0060, 0.102, 0),
+}
+
+METHODS: dict[str, Method] = {
+    "paper's method, n_cl = 9": lambda d: _paper(d),
+    "  with B and D refitted": lambda d: refit_inputs(_paper(d), d.u, d.y),
+    "Van Overschee-De Moor 10/10": lambda d: van_overschee_de_moor(d.r, d.u, d.y, 5, controller_markov=MARKOV, f=10),
+    "Oku-Tanaka 20/20": lambda d: oku_tanaka(d.r, d.u, d.y, 5, f=20),
+    "ORT (Katayama) 20/20": lambda d: orthogonal_decomposition(d.r, d.u, d.y, 5, f=20),
+    "SSARX p=30 f=10": lambda d: ssarx(d.u, d.y, 5, p=30, f=10),
+    "PBSIDopt p=30 f=10": lambda d: pbsid_opt(d.u, d.y, 5, p=30, f=10),
+    "PO-MOESP, feedback ignored": lambda d: _open_loop(d),
+    "default (polished)": lambda d: fixed_order(d.u, d.y, 5).model,
+}
+
+
+def _paper(d: LoopData) -> InnovationModel:
+    return indirect_subspace(d.r, d.u, d.y, 5, controller_markov=MARKOV, f=15, loop_order=9).model
+
+
+def _open_loop(d: LoopData) -> InnovationModel:
+    nothing = np.zeros((15, 1, 1))
+    return indirect_subspace(
+        d.u, d.u, d.y, 5, controller_markov=nothing, f=15, loop_order=5, instrument="u and y"
+    ).model
+
+
+def parsim_k(d: LoopData) -> InnovationModel:
+    """PARSIM-K of sippy_unipi with its recommended windows."""
+    from sippy_unipi import system_identification
+
+    model = system_identification(
+        d.y[:, 0].copy(), d.u[:, 0].copy(), "PARSIM-K", SS_f=20, SS_p=20, SS_fixed_order=5, SS_D_required=False
+    )
+    return replace(PLANT, A=model.A, B=model.B, C=model.C, D=model.D, K=model.K)
+
+
+def nearest(model: InnovationModel) -> np.ndarray:
+    poles = model.poles
+    return np.array([poles[np.argmin(np.abs(poles - pole))] for pole in POLES])
+
+
+def bound(sets: Sequence[LoopData]) -> np.ndarray:
+    """Cramer-Rao bound of the poles: the information at the true model, averaged over the sets' covariances."""
+    total = np.zeros(3)
+    for d in sets:
+        at_truth = prediction_error(PLANT, d.u, d.y, offset=False, max_iterations=0)
+        freedom = (at_truth.rows - at_truth.parameters) / at_truth.rows
+        covariance = pole_covariance(at_truth)
+        total += freedom * np.trace(covariance[[3, 0, 1]], axis1=1, axis2=2)
+    return np.sqrt(total / len(sets))
+
+
+def score(method: Method, sets: Sequence[LoopData]) -> tuple[np.ndarray, float, int, int, float]:
+    """Return RMSE of the poles, median relative H2 error of the loop, unstable loops, failures, CPU per set [s]."""
+    errors, norms, unstable, failed = [], [], 0, 0
+    method(sets[0])  # compile and warm up
+    began = time.process_time()
+    models: list[InnovationModel] = []
+    for d in sets:
+        try:
+            models.append(method(d))
+        except IdentificationError:
+            failed += 1
+    spent = (time.process_time() - began) / len(sets)
+    for model in models:
+        errors.append(np.abs(nearest(model) - POLES) ** 2)
+        loop = feedback(model, CONTROLLER)
+        if spectral_radius(loop.A) < 1.0:
+            norms.append(h2_norm(difference(loop, LOOP)) / LOOP_NORM)
+        else:
+            unstable += 1
+            norms.append(np.inf)
+    return np.sqrt(np.mean(errors, axis=0)), float(np.median(norms)), unstable, failed, spent
+
+
+def _row(name: str, rmse: np.ndarray, norm: float | None, unstable: int | None, more: str = "") -> None:
+    own = " ".join(f"{value:.4f}" for value in rmse)
+    reference = REFERENCE.get(name)
+    beside = " " * 31
+    if reference is not None:
+        beside = " ".join(f"{value:.4f}" for value in reference[:3])
+        beside += "" if reference[3] is None else f" {reference[3]:.3f} {reference[4]:3d}"
+    shown = " " * 10 if norm is None else f"{norm:6.3f} {unstable:3d}"
+    print(f"{name:30s} {own} {shown}  | {beside:31s} {more}")
+
+
+def table(count: int) -> None:
+    sets = [example_set(seed) for seed in range(count)]
+    methods = dict(METHODS)
+    if importlib.util.find_spec("sippy_unipi") is not None:
+        methods["PARSIM-K (sippy_unipi)"] = parsim_k
+    else:
+        print("PARSIM-K is left out: pip install sippy_unipi (into an environment of its own, with this project)")
+    print(f"{count} sets of {len(sets[0].u)} rows, seeds 0 to {count - 1}")
+    print(f"{'':30s} RMSE P1, P2, P3, h2, destabilising | the same, independent reference (other seeds)")
+    limit = bound(sets)
+    _row("Cramer-Rao bound", limit, None, None)
+    spent = {}
+    for name, method in methods.items():
+        rmse, norm, unstable, failed, spent[name] = score(method, sets)
+        efficiency = " ".join(f"{value:.2f}" for value in (limit / rmse) ** 2)
+        _row(name, rmse, norm, unstable, f"efficiency {efficiency}, {1e3 * spent[name]:.1f} ms, {failed} failed")
+    if "PARSIM-K (sippy_unipi)" in spent:
+        ratio = spent["PARSIM-K (sippy_unipi)"] / spent["default (polished)"]
+        print(f"the default takes 1/{ratio:.1f} of PARSIM-K's CPU time")
+    variances = [_paper(d).innovation_covariance[0, 0] for d in sets]
+    print(f"mean variance of the paper's method {np.mean(variances):.4f} (paper 0.1023, reference 0.1074, true 0.1111)")
+
+
+def coverage(count: int) -> None:
+    omega = np.geomspace(0.02, 1.2, 12)
+    truth = PLANT.response(omega)[:, 0, 0]
+    response, poles, failed = [], [], 0
+    for seed in range(count):
+        d = example_set(seed)
+        try:
+            estimate = fixed_order(d.u, d.y, 5)
+            covariance = response_covariance(estimate, omega)[:, 0, 0]
+        except IdentificationError:
+            failed += 1
+            continue
+        response.append(inside_region(estimate.model.response(omega)[:, 0, 0] - truth, covariance))
+        found = estimate.model.poles
+        at = [int(np.argmin(np.abs(found - pole))) for pole in POLES]
+        poles.append(inside_region(found[at] - POLES, pole_covariance(estimate)[at]))
+    by_omega = " ".join(f"{100 * value:.0f}" for value in np.mean(response, axis=0))
+    print(f"95 % regions cover: response {100 * np.mean(response):.1f} % (per frequency {by_omega}),")
+    by_pole = " ".join(f"{100 * value:.1f}" for value in np.mean(poles, axis=0))
+    print(f"  poles P1 P2 P3 {by_pole} %; {failed} failures in {count} sets")
+
+
+def orders(count: int) -> None:
+    found: Counter[int] = Counter()
+    for seed in range(count):
+        d = example_set(seed)
+        found[choose_order(d.u, d.y).estimate.model.order] += 1
+    print(f"order chosen in {count} sets: " + ", ".join(f"{k}: {v}" for k, v in sorted(found.items())))
+
+
+def linear_time(rows_max: int) -> None:
+    print("rows      order 5, CPU s   per row us   peak of traced memory beyond the data, MB")
+    rows = rows_max // 100
+    while rows <= rows_max:
+        d = example_set(0, rows=rows)
+        tracemalloc.start()
+        began = time.process_time()
+        fixed_order(d.u, d.y, 5)
+        spent = time.process_time() - began
+        peak = tracemalloc.get_traced_memory()[1] / 1e6
+        tracemalloc.stop()
+        print(f"{rows:8d}  {spent:10.2f}  {1e6 * spent / rows:12.2f}  {peak:12.1f}")
+        rows *= 10
+
+
+def main() -> None:
+    count = int(os.environ.get("SETS", "100"))
+    table(min(count, 100))
+    coverage(count)
+    orders(min(count, 100))
+    linear_time(int(os.environ.get("ROWS_MAX", "300000")))
+
+
+if __name__ == "__main__":
+    main()
