@@ -67,8 +67,8 @@ def characteristic_frequencies(*systems: TransferFunction) -> FloatArray:
             found.extend(np.abs(np.roots(polynomial)) if np.any(polynomial) else [])
         if np.any(num):
             found.extend(_unit_gain_asymptotes(num, den))
-        if system.delay_s > 0.0:
-            found.append(1.0 / system.delay_s)
+        if system.delay_s > 0.0:  # a dead time a million times shorter than all else is no feature
+            found.append(min(1.0 / system.delay_s, 1e6 * max(found, default=math.inf)))
     values = np.array([value for value in found if value > 0.0 and math.isfinite(value)])
     return np.unique(values) if len(values) else np.array([1.0])
 

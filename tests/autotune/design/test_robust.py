@@ -1,0 +1,128 @@
+"""Design straight on points: every plant through the points keeps the margins, contradictions are named."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from autotune.design.margins import margins
+from autotune.design.process_class import DIRECTIONS, consistent_processes
+from autotune.design.robust import design_on_points
+from autotune.design.specification import Specification, spec1
+from autotune.design.synthesis import design
+from autotune.errors import DesignError
+from autotune.models import TransferFunction
+from tests.autotune.design.plants import BALL, EIGHT_LAGS, REDUCED, measured
+
+
+def _lags(constants: list[float], delay_s: float, integrator: bool) -> TransferFunction:
+    den = np.array([1.0, 0.0]) if integrator else np.array([1.0])
+    for T in constants:
+        den = np.polymul(den, [T, 1.0])
+    return TransferFunction(num=(2.0,), den=tuple(den), delay_s=delay_s)
+
+
+@given(
+    constants=st.lists(st.sampled_from([0.1, 0.4, 1.0, 1.3, 3.0]), min_size=2, max_size=4),
+    delay_s=st.sampled_from([0.0, 0.2, 1.0]),
+    integrator=st.booleans(),
+)
+@settings(max_examples=8)
+def test_the_true_plant_lies_in_the_set_between_and_beyond_its_exact_points(
+    constants: list[float], delay_s: float, integrator: bool
+) -> None:
+    plant = _lags(constants, delay_s, integrator)
+    points = measured(plant, None)
+    processes = consistent_processes(points, inverse_response=True)
+    omega = np.geomspace(0.3 * points[0].omega_rad_s, 3.0 * points[-1].omega_rad_s, 12)
+    response = plant.response(omega)
+    # unwrapped from far below, where the phase of a plant of this class is known
+    fine = np.geomspace(omega[0] * 1e-3, omega[-1], 5000)
+    phase = np.interp(omega, fine, np.unwrap(np.angle(plant.response(fine))))
+    angles = 2.0 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS
+    true = np.cos(angles) * np.log(np.abs(response))[:, None] + np.sin(angles) * phase[:, None]
+    assert np.all(true <= processes.supports(omega) + 1e-6)
+
+
+def test_points_of_the_reduced_model_are_in_the_class_with_inverse_response() -> None:
+    points = measured(REDUCED, None, gain_sd=1e-3, phase_sd_deg=0.05)
+    assert consistent_processes(points, inverse_response=True).inflation == 1.0
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_ball_keeps_its_margins_and_wins_back_the_price_of_the_reduced_model(seed: int) -> None:
+    found = design_on_points(measured(BALL, seed), spec1(0.1))
+    m = margins(BALL, found.controller)
+    assert m.stable
+    assert m.modulus >= max(0.5, found.margins.modulus)
+    assert m.phase_rad >= max(math.radians(45.0), found.margins.phase_rad)
+    assert m.delay_s >= found.margins.delay_s
+    assert m.gain >= found.margins.gain
+    # 56.7 with the reduced model, 40.86 with the true plant known
+    assert 40.86 < m.h2 < 45.0
+    assert found.h2 == pytest.approx(m.h2, rel=0.02)
+
+
+def test_uncertainty_costs_and_vanishes_with_the_regions() -> None:
+    norms = []
+    for sd in (0.01, 0.004, 0.0005):
+        points = measured(BALL, None, gain_sd=sd, phase_sd_deg=60.0 * sd)
+        norms.append(margins(BALL, design_on_points(points, spec1(0.1)).controller).h2)
+    assert norms[0] > norms[1] > norms[2]
+    assert norms[2] < 1.04 * design(BALL, spec1(0.1), certificate=False).h2
+
+
+def test_self_regulating_plant_of_eight_lags() -> None:
+    found = design_on_points(measured(EIGHT_LAGS, 3), spec1(10.0))
+    m = margins(EIGHT_LAGS, found.controller)
+    assert m.modulus >= 0.5
+    assert m.h2 <= 1.1 * design(EIGHT_LAGS, spec1(10.0), certificate=False).h2
+
+
+def test_pid_on_points_keeps_the_margins_and_is_better_than_the_pi() -> None:
+    points = measured(BALL, 1)
+    pid = design_on_points(points, spec1(0.1), "pid")
+    m = margins(BALL, pid.controller)
+    assert m.modulus >= 0.5
+    assert m.phase_rad >= math.radians(45.0)
+    assert pid.h2 < design_on_points(points, spec1(0.1)).h2
+
+
+def test_points_that_contradict_each_other_are_refused_by_name() -> None:
+    points = list(measured(BALL, 0))
+    points[2] = replace(points[2], response=points[2].response * 1.3)
+    with pytest.raises(DesignError, match="contradict"):
+        design_on_points(points, spec1(0.1))
+
+
+def test_a_resonant_plant_is_outside_the_class() -> None:
+    plant = TransferFunction(num=(1.0,), den=(1.0, 0.1, 1.0), delay_s=0.3)
+    omega = np.array([0.5, 0.9, 1.0, 1.1, 1.5])
+    template = measured(BALL, None)
+    points = [
+        replace(
+            point,
+            omega_rad_s=float(w),
+            response=complex(plant.response(np.array([w]))[0]),
+            covariance=((1e-6, 0.0), (0.0, 1e-6)),
+        )
+        for point, w in zip(template, omega, strict=True)
+    ]
+    with pytest.raises(DesignError, match="aperiodic"):
+        design_on_points(points, spec1(0.1))
+
+
+def test_wide_regions_are_answered_with_what_can_be_kept() -> None:
+    points = measured(BALL, None, gain_sd=0.15, phase_sd_deg=12.0)
+    with pytest.raises(DesignError, match="nearest that one keeps"):
+        design_on_points(points, Specification(modulus_margin=0.9, phase_margin_rad=math.radians(80.0), noise_gain=0.1))
+
+
+def test_too_few_points_are_refused() -> None:
+    with pytest.raises(DesignError, match="at least three"):
+        design_on_points(measured(BALL, 0)[:2], spec1(0.1))
