@@ -303,17 +303,26 @@ class ModbusLink:
             line.timeout = max(0.002, 3.5 * 11 / line.baudrate)
             while line.read(1):
                 line.reset_input_buffer()
-            request = bytes((self._unit, _DIAGNOSTICS, 0, 0)) + os.urandom(2)
-            request += FramerRTU.compute_CRC(request).to_bytes(2, "big")
-            line.write(request)
             deadline = time.monotonic() + settings.late_reply_s
-            received = b""
-            while (left := deadline - time.monotonic()) > 0 and not _echoed(received, request):
-                line.timeout = left
-                received += line.read(1) + line.read(line.in_waiting)
+            while time.monotonic() < deadline and not self._echo(line, deadline):
+                pass  # the echo itself may have been lost: ask again
             line.timeout = settings.timeout_s
         except _LINE_ERRORS as error:
             raise ConnectionException(str(error)) from None
+
+    def _echo(self, line: serial.Serial, deadline: float) -> bool:
+        """Send one diagnostic echo, and return whether it came back within the time-out."""
+        request = bytes((self._unit, _DIAGNOSTICS, 0, 0)) + os.urandom(2)
+        request += FramerRTU.compute_CRC(request).to_bytes(2, "big")
+        line.write(request)
+        until = min(deadline, time.monotonic() + self._settings.timeout_s)
+        received = b""
+        while (left := until - time.monotonic()) > 0:
+            line.timeout = left
+            received += line.read(1) + line.read(line.in_waiting)
+            if _echoed(received, request):
+                return True
+        return False
 
     def _hang_up(self) -> None:
         if self._client is not None:

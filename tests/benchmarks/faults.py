@@ -110,7 +110,7 @@ def main() -> None:
         )
     for kind, level, ends in PLANT_FAULTS:
         add(f"plant: {kind}", lambda seed, k=kind, v=level: plant_fault(k, v, seed), _ends_as(ends))  # type: ignore[misc]
-    console = Console(highlight=False, soft_wrap=True)
+    console = Console(highlight=False, width=110)
     console.print(table)
     for line in wrong:
         console.print(f"wrong end: {line}", markup=False)

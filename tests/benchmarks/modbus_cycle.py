@@ -75,7 +75,7 @@ def _measure(ports: list[int], cycles: int) -> tuple[np.ndarray, np.ndarray]:
 
 def main() -> None:
     """Print medians, 99th percentiles and the paired ratio."""
-    console = Console(highlight=False, soft_wrap=True)
+    console = Console(highlight=False, width=110)
     if not Path("/usr/include/modbus/modbus.h").exists() or shutil.which("gcc") is None:
         console.print("modbus_cycle needs gcc and libmodbus-dev: apt-get install gcc libmodbus-dev")
         return
