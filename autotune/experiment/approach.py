@@ -30,6 +30,10 @@ BRACKET = 1.2
 #: least share of readings in preflight that differ from the one before, for a sensor of which that can be expected
 RESTLESS = 0.05
 SMALL = 1e-9
+#: part of limits.swing that y moves by, beside the noise, before the plant counts as moving
+MOVED_SHARE = 0.15
+#: time that the plant gets to move at the end of the ramp [s of ramp]
+MARGIN_S = 2.0
 #: parts of limits.time_s to wait for a first switch in all, and before the mid-point is moved
 PATIENCE_SHARE, NUDGE_SHARE = 0.25, 0.02
 #: part of the way to the operating point that the relay's centre begins ahead of the plant
@@ -178,51 +182,53 @@ def _ramp(loop: ControlLoop, config: Config, known: Known, tell: Tell, bracket: 
     point = config.operating_point
     rate = point.ramp_rate if point.ramp_rate is not None else point.u_uncertainty / 600.0 / loop.sample_time_s
     low, high = max(bracket[0], config.limits.u_min), min(bracket[1], config.limits.u_max)
-    distance = 2.0 * known.noise_half + 0.02 * config.limits.swing
+    while abs(loop.tick.u - low) > rate * loop.sample_time_s + loop.envelope.u_step:
+        loop.step(loop.nearest(low))
     tell(f"ramping the command from {low:.3g} to {high:.3g} until the plant moves")
-    u, start_s = low, math.nan
-    while True:
-        tick = loop.step(loop.nearest(min(u, high)))
-        if abs(tick.u - low) < 2.0 * rate * loop.sample_time_s + loop.envelope.u_step and math.isnan(start_s):
-            start_s = tick.t_s
-        moved = median(loop.monitor.recent) - known.y_rest
-        if abs(moved) > distance:
-            break
-        if not math.isnan(start_s):
-            u = low + rate * (tick.t_s - start_s)
-        if u > high + 2.0 * rate:  # two seconds' worth of ramp to move by, at the end of the bracket
+    distance = 2.0 * known.noise_half + MOVED_SHARE * config.limits.swing
+    start_s = half_s = loop.tick.t_s
+    moved = 0.0
+    while abs(moved) < distance:
+        u = low + rate * (loop.tick.t_s - start_s)
+        if u > high + MARGIN_S * rate:
             raise ExperimentStopped(
                 f"the plant does not answer: y stays at {known.y_rest:.4g} up to the command {high:.4g}",
                 where="approach",
                 mend="look for a stuck or saturated actuator; else correct operating_point.u_guess or u_uncertainty",
             )
-    if math.isnan(start_s) or tick.u <= low + loop.envelope.u_step:
+        tick = loop.step(loop.nearest(min(u, high)))
+        moved = median(loop.monitor.recent) - known.y_rest
+        half_s = tick.t_s if abs(moved) < 0.5 * distance else half_s
+    # y leaves like time to the power 2 to 3: it has gone half of the way after 0.76 of the time
+    since = min((loop.tick.t_s - half_s) / 0.24, loop.tick.t_s - start_s)
+    sign = _sign_of(moved, rate * (loop.tick.t_s - start_s), loop, known)
+    return replace(
+        known,
+        plant_sign=sign,
+        midpoint=loop.tick.u - rate * since,
+        first_move_s=loop.tick.t_s - since,
+        y_moved=known.y_rest + moved,
+        speed=2.5 * distance / since,
+    )
+
+
+def _sign_of(moved: float, climbed: float, loop: ControlLoop, known: Known) -> int:
+    """Return the sign of the plant's gain from how y moved while the command climbed by ``climbed``."""
+    sign = 1 if moved > 0 else -1
+    if climbed <= 2.0 * loop.envelope.u_step:
         raise ExperimentStopped(
             f"wrong sign, or the plant moves where it should rest: y went from {known.y_rest:.4g} to"
-            f" {known.y_rest + moved:.4g} at the command {tick.u:.4g}",
+            f" {known.y_rest + moved:.4g} at the command {loop.tick.u:.4g}",
             where="approach",
             mend="check the wiring and scaling of the actuator; else lower operating_point.u_guess",
         )
-    sign = 1 if moved > 0 else -1
     if known.plant_sign not in (0, sign):
         raise ExperimentStopped(
             f"wrong sign: y moved by {moved:.3g} when the command rose, plant_sign is {known.plant_sign}",
             where="approach",
             mend="correct plant_sign, or check the wiring of actuator and sensor",
         )
-    t, _, y = loop.history(max(0, tick.k - 3 * LOOK_BACK))
-    good = np.isfinite(y)
-    speed = abs(float(np.polyfit(t[good] - t[-1], y[good], 1)[0]))
-    # y grows like the square to the cube of the time since it left: distance over speed is half to a third of that
-    since = min(2.5 * abs(moved) / max(speed, SMALL), tick.t_s - start_s)
-    return replace(
-        known,
-        plant_sign=sign,
-        midpoint=tick.u - rate * since,
-        first_move_s=tick.t_s - since,
-        y_moved=known.y_rest + moved,
-        speed=speed,
-    )
+    return sign
 
 
 def _find_sign(loop: ControlLoop, config: Config, known: Known, tell: Tell) -> Known:
