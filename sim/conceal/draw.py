@@ -13,8 +13,9 @@ from sim.conceal.physics import Floats, Physics
 from sim.conceal.rigs import Believed, believed, truth
 
 KINDS = {"exact": 0.06, "coloured": 0.04, "parameters": 0.1, "single": 0.54, "double": 0.14, "outside": 0.12}
-RIGS = {BALL: 0.4, SERVO: 0.3, PROCESS: 0.3}
+RIGS = {BALL: 0.5, SERVO: 0.25, PROCESS: 0.25}
 STRENGTHS = ("weak", "medium", "strong")
+SAME_EFFECTS = 5
 DRY = {"plant.coulomb_friction", "plant.stribeck_friction", "plant.hysteresis"}
 
 
@@ -45,13 +46,16 @@ class Draw:
 def draw(seed: int, attempt: int) -> Draw:
     """Draw kind, strength, rig, effects and excitations of one case."""
     rng = np.random.default_rng([seed, attempt, 0])
-    fixed = np.random.default_rng([seed, 99])  # kind, strength and rig stay when a draw is rejected
-    kind = str(fixed.choice(list(KINDS), p=list(KINDS.values())))
+    # kind, strength, rig and effects stay for a few rejected draws, so that effects hard to place are not crowded out
+    fixed = np.random.default_rng([seed, attempt // SAME_EFFECTS, 99])
+    kind = str(np.random.default_rng([seed, 98]).choice(list(KINDS), p=list(KINDS.values())))
     strength = str(fixed.choice(STRENGTHS)) if kind in ("single", "outside") else None
     if kind == "outside" and strength == "weak":
         strength = "medium"
-    rig_name = str(fixed.choice(list(RIGS), p=list(RIGS.values())))
-    effects = _draw_effects(rng, kind, rig_name)
+    effects = _draw_effects(fixed, kind)
+    rigs = [rig for rig in RIGS if all(rig in e.rigs for e in effects)]
+    shares = np.array([RIGS[rig] for rig in rigs])
+    rig_name = str(fixed.choice(rigs, p=shares / shares.sum()))
     variant = {BALL: "", SERVO: str(rng.choice(["rad", "mm"])), PROCESS: str(rng.choice(["level", "thermal"]))}[
         rig_name
     ]
@@ -86,11 +90,10 @@ def draw(seed: int, attempt: int) -> Draw:
     )
 
 
-def _draw_effects(rng: np.random.Generator, kind: str, rig: str) -> tuple[Effect, ...]:
-    possible = [e for e in EFFECTS if rig in e.rigs]
-    inside = [e for e in possible if not e.outside]
+def _draw_effects(rng: np.random.Generator, kind: str) -> tuple[Effect, ...]:
+    inside = [e for e in EFFECTS if not e.outside]
     if kind == "outside":
-        return (_one(rng, [e for e in possible if e.outside]),)
+        return (_one(rng, [e for e in EFFECTS if e.outside]),)
     if kind == "single":
         return (_one(rng, inside),)
     if kind != "double":
@@ -101,6 +104,7 @@ def _draw_effects(rng: np.random.Generator, kind: str, rig: str) -> tuple[Effect
         e
         for e in simple
         if e is not first
+        and set(e.rigs) & set(first.rigs)
         and not set(e.accept) & set(first.accept)
         and (not e.variant or not first.variant or e.variant == first.variant)
         and not ({e.name, first.name} <= DRY)

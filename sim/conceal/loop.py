@@ -60,7 +60,7 @@ def measure(k: int, clean: Floats, command: float, sampling: Sampling, last: flo
     if y < p.sensor_fold:
         y = 2.0 * p.sensor_fold - y
     y += p.sensor_rate * max(t, 0.0)
-    y = min(y + sampling.noise[k], p.sensor_high) + sampling.spike[k]
+    y = min(min(y, p.sensor_high) + sampling.noise[k], p.reading_high) + sampling.spike[k]
     if p.sensor_quantum > 0.0:
         y = p.sensor_quantum * np.round(y / p.sensor_quantum)
     if sampling.lost[k] > 0.0:

@@ -69,7 +69,8 @@ class Physics(NamedTuple):
     extra_sensor_lag: float = 0.0
     sensor_second_order: float = 0.0
     sensor_fold: float = -np.inf
-    sensor_high: float = np.inf
+    sensor_high: float = np.inf  # where the sensor ends, before its noise
+    reading_high: float = np.inf  # where the converter ends, after the noise
     sensor_rate: float = 0.0
     sensor_quantum: float = 0.0
     # environment

@@ -179,9 +179,13 @@ def sine_torque(a: float, p: Physics, s: Scale, rng: np.random.Generator) -> Siz
 
 
 # ----- sensor -----
-sensor_high = _plain(sensor_high=lambda a, p, s: 1.7 * s.dy / a)(
-    lambda f, p, s: {"upper": (p.y_offset + f["sensor_high"], s.unit_y)}
-)
+def sensor_high(a: float, p: Physics, s: Scale, rng: np.random.Generator) -> Sized:
+    """Conceal an upper end of the sensor (before its noise) or of its converter (after it)."""
+    level = 1.7 * s.dy / a
+    name = str(rng.choice(["sensor_high", "reading_high"]))
+    return Sized(physics={name: level}, parameters={"upper": (p.y_offset + level, s.unit_y)})
+
+
 sensor_lag = _plain(extra_sensor_lag=lambda a, p, s: 0.15 * a * p.tau_plant)(
     lambda f, p, s: {"time_constant": (f["extra_sensor_lag"], "s")}
 )
@@ -215,7 +219,8 @@ def dropout(a: float, p: Physics, s: Scale, rng: np.random.Generator) -> Sized:
 
 def outliers(a: float, p: Physics, s: Scale, rng: np.random.Generator) -> Sized:
     """Conceal single rows with a spike of either sign."""
-    share, size = float(rng.uniform(0.003, 0.02)), 8.0 * a * s.noise
+    size = float(rng.uniform(6.0, 15.0)) * s.noise
+    share = min(0.02 * a**2 * (s.noise / size) ** 2 * 50.0, 0.2)
     return Sized(spikes=share, spike_size=size, parameters={"share": (share, "-"), "size": (size, s.unit_y)})
 
 
