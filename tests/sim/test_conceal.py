@@ -160,7 +160,7 @@ PLANT = (
 SENSOR = "saturation lag quantisation nonlinear_gain absolute_value drift dropout outliers"
 
 
-@settings(max_examples=3)
+@settings(max_examples=2)
 @given(st.integers(0, 99_999))
 def test_a_case_keeps_its_promises(seed):
     d, records, answer = make(seed)
@@ -175,7 +175,7 @@ def test_a_case_keeps_its_promises(seed):
         assert answer["nominal_train_ratio"] == pytest.approx(1.0, abs=0.12)
     if answer["rig"] == SERVO:
         assert 0.8 <= answer["truth_parameters"]["K"] / d.rig.chain.K <= 1.2
-    assert answer["nrmse_unseen"]["noise"] <= answer["nrmse_unseen"]["truth"]
+    assert 0.95 < answer["nrmse_unseen"]["truth"] / answer["nrmse_unseen"]["noise"] < 1.5
 
 
 def test_files_of_a_case_have_the_fixed_layout(tmp_path):
