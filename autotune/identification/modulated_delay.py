@@ -270,8 +270,8 @@ def _interpolated(t: FloatArray, running: ComplexArray, at: FloatArray) -> Compl
 
 def _inside(recording: Recording, intervals: Sequence[Interval], h: float) -> BoolArray:
     """Return which intervals, shifted back by the delay, lie within the record."""
-    ends = np.array(intervals) - h
-    slack = 1.5 * recording.sample_time_s
+    ends = np.asarray(intervals, dtype=np.float64) - h
+    slack = 1.5 * (recording.t[-1] - recording.t[0]) / (len(recording) - 1)
     inside = (ends[:, 0] >= recording.t[0] - slack) & (ends[:, 1] <= recording.t[-1] + slack)
     return np.asarray(inside, dtype=np.bool_)
 

@@ -85,7 +85,7 @@ def test_analytic_sensitivities_are_the_derivatives(n):
 
 
 def test_example_2_is_recovered_without_a_starting_value():
-    """FACTS: the Cramer-Rao bound at noise 5 is a1 .00205, a0 .00046, b .0025, x0 .35, x0' .49, h .00088."""
+    """The Cramer-Rao bound at noise 5 is a1 .00205, a0 .00046, b .0025, x0 .35, x0' .49, h .00088."""
     record = example_2(past_s=12.0)
     model = identify_delay(noisy(record, 5.0, 1), 2, start_s=0.0, offset=False)
     sd = model.standard_deviations
