@@ -91,10 +91,14 @@ def preflight(loop: ControlLoop, config: Config, tell: Tell) -> Known:
     """
     tell("looking at link and noise")
     start_u = config.operating_point.u_guess if config.operating_point.approach == "hold" else loop.tick.u
-    first = loop.tick.k
+    first_row = loop.tick.k
+    first: tuple[float, ...] = ()
     for _ in range(PREFLIGHT_SAMPLES):
         loop.step(loop.nearest(start_u))
-    y = loop.history(first)[2][1:]
+        first = first if len(first) == RECENT else loop.monitor.recent
+        if config.operating_point.approach == "ramp":
+            _check_at_rest(loop, first_row, first)
+    y = loop.history(first_row)[2][1:]
     y = y[np.isfinite(y)]
     _, late, _ = loop.timing.latency_s
     if late > 0.8 * loop.sample_time_s:
@@ -129,9 +133,9 @@ def preflight(loop: ControlLoop, config: Config, tell: Tell) -> Known:
     )
 
 
-def _check_at_rest(loop: ControlLoop, first: tuple[float, ...]) -> None:
+def _check_at_rest(loop: ControlLoop, first_row: int, first: tuple[float, ...]) -> None:
     """Stop where the plant moves under the command it should rest at."""
-    y = loop.history()[2]
+    y = loop.history(first_row)[2]
     if len(first) < RECENT or np.isfinite(y).sum() < RECENT:
         return
     moved = median(loop.monitor.recent) - median(first)
