@@ -1,1 +1,101 @@
-"""Commands: frequency points from a recording."""
+"""Commands: frequency points from recordings, reduced model from points."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+
+from autotune.cli import app, identify
+
+if TYPE_CHECKING:
+    from autotune.identification.reduction import ReducedModel
+    from autotune.points import FrequencyPoint
+
+
+@identify.command("frequency")
+def frequency(
+    recordings: Annotated[list[Path], typer.Argument(help="recordings, CSV with columns t,u,y and r where it moved")],
+    out: Annotated[Path, typer.Option(help="points file to write (JSON)")],
+    largest_sd: Annotated[
+        float,
+        typer.Option(min=0.001, max=1.0, help="leave out points whose standard deviation is above this part of gain"),
+    ] = 0.5,
+) -> None:
+    """Estimate Bode points from recordings: relay, multisine, random binary or steps, open or closed loop."""
+    from rich.progress import track
+
+    from autotune.identification.recorded import combine, frequency_points
+    from autotune.points import points_to_json
+    from autotune.recording import read_recording
+
+    estimates = []
+    for path in track(recordings, description="recordings", transient=True, disable=len(recordings) < 2):
+        estimates.append(frequency_points(read_recording(path), largest_relative_sd=largest_sd))
+    for path, estimate in zip(recordings, estimates, strict=True):
+        typer.echo(f"{path}: {estimate.excitation}, {len(estimate.points)} point(s)")
+    combined = combine(estimates)
+    for point in combined.points:
+        typer.echo(f"  {_line(point)}")
+    for note in combined.notes:
+        typer.echo(f"note: {note}")
+    out.write_text(json.dumps({"points": points_to_json(combined.points)}, indent=2) + "\n", encoding="utf-8")
+    typer.echo(f"{len(combined.points)} frequency point(s) written to {out}")
+
+
+def _line(point: FrequencyPoint) -> str:
+    from autotune.identification.envelope import polar_sd
+
+    gain_sd, phase_sd = polar_sd(point)
+    return (
+        f"{point.omega_rad_s:9.4g} rad/s  gain {point.gain:.4g} (sd {100 * gain_sd:.2g} %)"
+        f"  phase {math.degrees(point.phase_rad):.2f} deg (sd {math.degrees(phase_sd):.2g})  {point.source}"
+    )
+
+
+@app.command("reduce")
+def reduce(
+    points: Annotated[Path, typer.Option(help="points file of identify frequency (JSON)")],
+    out: Annotated[Path, typer.Option(help="reduced model to write: a model file (TOML)")],
+    kind: Annotated[
+        Literal["auto", "self-regulating", "integrating"],
+        typer.Option(help="structure (8) or (24); auto lets the data decide"),
+    ] = "auto",
+    conditions: Annotated[
+        Literal["regions", "estimates"],
+        typer.Option(help="hold conditions (5) on the points' 95 % regions, or on the estimates as the paper does"),
+    ] = "regions",
+    static_gain: Annotated[
+        float | None, typer.Option(help="measured static gain with its sign [y unit/u unit]; none when absent")
+    ] = None,
+    static_gain_sd: Annotated[
+        float | None, typer.Option(min=0.0, help="its standard deviation; 1 % of it when absent")
+    ] = None,
+) -> None:
+    """Reduce measured points to the cautious low-order model that a robust PI is designed on."""
+    from autotune.identification.reduction import reduce_points
+    from autotune.points import read_points
+
+    known = None
+    if static_gain is not None:
+        known = (static_gain, static_gain_sd if static_gain_sd is not None else 0.01 * abs(static_gain))
+    reduced = reduce_points(
+        read_points(points), kind=None if kind == "auto" else kind, conditions=conditions, static_gain=known
+    )
+    _write(reduced, out)
+    lag = "" if reduced.omega_0r_rad_s is None else f", omega_0r = {reduced.omega_0r_rad_s:.4g} rad/s"
+    name = "integrating (24)" if reduced.integrating else "self-regulating (8)"
+    typer.echo(f"{name}: {reduced.evidence}")
+    typer.echo(f"G_r = {reduced.G_r:.4g}{lag}, omega_d = {reduced.omega_d_rad_s:.4g} rad/s; written to {out}")
+    for warning in reduced.warnings:
+        typer.echo(f"warning: {warning}")
+
+
+def _write(reduced: ReducedModel, out: Path) -> None:
+    from autotune.models import Block, Model, Port, write_model
+
+    block = Block(name="reduced model", place="plant", dynamics=reduced.transfer_function())
+    write_model(Model(name="reduced model", input=Port(), output=Port(), blocks=(block,)), out)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -67,7 +68,7 @@ def _segments_by_level(recording: Recording) -> tuple[tuple[float, float], ...]:
     changes = np.flatnonzero(np.abs(np.diff(jumps[big])) > 0.1 * jumps[big][:-1])
     bounds = [0, *(int(big[i]) + 1 for i in changes), recording.t.size]
     found: list[tuple[float, float]] = []
-    for low, high in zip(bounds[:-1], bounds[1:], strict=True):
+    for low, high in pairwise(bounds):
         if high - low < 8 * _LEAST_PERIODS:
             continue
         try:

@@ -42,8 +42,12 @@ _STATIC_GAIN_SD = 0.1
 #: and only while the lowest point's gain is above this part of it: beyond, the structure would decide, not the data.
 _STATIC_GAIN_PART = 0.5
 _PROBABILITY = 0.95
+#: Below this probability the points scatter more than their covariances allow.
+_CONTRADICTED = 0.01
 #: C2 is held until the plant's phase has fallen to this.
 _C2_UNTIL = -math.pi
+#: An all-pass carries less than half a turn.
+_LARGEST_REST = 0.95 * math.pi
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -159,9 +163,10 @@ def reduce_points(
     kind : {"self-regulating", "integrating"}, optional
         Structure; chosen from the data when absent.
     conditions : {"regions", "estimates"}
-        ``regions``: at each point over its 95 % region, and between and below the points over the 95 % band of the
-        plants (lags, integrator, dead time) that fit all of them. ``estimates``: at the point estimates only, as the
-        paper does: nothing is said below the lowest point.
+        ``regions``: at each point over its 95 % region, and at, between and below the points over the 95 % band of
+        the plants (lags, integrator, dead time) that fit all of them; over the band alone, with a warning, where
+        single points are too uncertain to bound the phase.
+        ``estimates``: at the point estimates only, as the paper does: nothing is said below the lowest point.
     static_gain : (float, float), optional
         Measured static gain with its sign, and its standard deviation: a relay experiment does not measure it.
 
@@ -193,11 +198,10 @@ def reduce_points(
     chosen, evidence, warnings = _choose(fitted, fit, kind)
     if conditions == "regions":
         _require_135(ordered, fit)
-    envelope = _known(ordered, fit, conditions)
-    spread = fit.draws(200, np.random.default_rng(1))
     gain = abs(fit.plant.num[0]) if chosen == "self-regulating" else None
-    G_r, omega_0r, omega_d = _by_conditions(envelope, gain, static_gain_known=conditions == "estimates")
-    if fit.p_value < 1e-3:
+    envelope, (G_r, omega_0r, omega_d), more = _reduced(ordered, fit, conditions, gain)
+    warnings = (*warnings, *more)
+    if fit.p_value < _CONTRADICTED:
         warnings = (
             *warnings,
             f"the points scatter more than their regions say (p = {fit.p_value:.1g}); the regions between them"
@@ -207,7 +211,7 @@ def reduce_points(
         G_r=fit.sign * G_r,
         omega_0r_rad_s=omega_0r,
         omega_d_rad_s=omega_d,
-        sd=_spread(spread, fit, envelope.omega_rad_s, chosen),
+        sd=_spread(fit.draws(200, np.random.default_rng(1)), fit, envelope.omega_rad_s, chosen),
         conditions=conditions,
         evidence=evidence,
         warnings=warnings,
@@ -217,9 +221,27 @@ def reduce_points(
 def _known(points: Sequence[FrequencyPoint], fit: PlantFit, conditions: Conditions) -> Envelope:
     if conditions == "estimates":
         return envelope_of_points(points, fit.sign, 0.0)
-    measured = envelope_of_points(points, fit.sign, _PROBABILITY)
     grid = np.geomspace(1e-3 * points[0].omega_rad_s, 3.0 * points[-1].omega_rad_s, 400)
-    return measured.joined(envelope_of_fit(fit, grid, _PROBABILITY))
+    return envelope_of_fit(fit, grid, _PROBABILITY)
+
+
+def _reduced(
+    points: Sequence[FrequencyPoint], fit: PlantFit, conditions: Conditions, gain: float | None
+) -> tuple[Envelope, tuple[float, float | None, float], tuple[str, ...]]:
+    """Return the bounds used, (|G_r|, omega_0r, omega_d), and what to warn of."""
+    known = _known(points, fit, conditions)
+    if conditions == "estimates":
+        return known, _by_conditions(known, gain), ()
+    # the structure chosen for the fit is itself uncertain: each point's own region stands beside the band
+    both = envelope_of_points(points, fit.sign, _PROBABILITY).joined(known)
+    try:
+        return both, _by_conditions(both, gain, static_gain_known=False), ()
+    except IdentificationError:
+        warning = (
+            "single points are too uncertain to bound the phase: conditions (5) hold on the band of the plants that"
+            " fit all of them, if the plant is one of lags, integrator and dead time"
+        )
+        return known, _by_conditions(known, gain, static_gain_known=False), (warning,)
 
 
 def _choose(fitted: Sequence[FrequencyPoint], fit: PlantFit, kind: Kind | None) -> tuple[Kind, str, tuple[str, ...]]:
@@ -293,19 +315,23 @@ def _by_conditions(
     else:
         G_r, omega_0r = _lag(envelope, static_gain, static_gain_known)
         lag = np.arctan(omega / omega_0r)
+    rest = -envelope.phase_rad - lag  # what the all-pass must carry: 2 atan(omega/omega_d) >= rest
     use = envelope.until_phase(_C2_UNTIL)
-    rest = -envelope.phase_rad[use] - lag[use]  # what the all-pass must carry: 2 atan(omega/omega_d) >= rest
-    if not np.any(rest > 1e-12):
+    if np.max(rest[use]) >= _LARGEST_REST:  # so uncertain that no all-pass reaches: the printed range then
+        use = envelope.until_phase(-0.75 * math.pi)
+    if not np.any(rest[use] > 1e-12):
         raise IdentificationError(
             "the phase never falls below that of the lag alone: omega_d is not determined",
             where=_WHERE,
             mend="measure points at higher frequencies",
         )
-    if np.max(rest) >= math.pi:
+    if np.max(rest[use]) >= _LARGEST_REST:
         raise IdentificationError(
-            "the phase falls faster than an all-pass can carry", where=_WHERE, mend="check the sign of the plant"
+            "the phase near -135 deg is known too poorly for an all-pass to bound it",
+            where=_WHERE,
+            mend="measure that range with more amplitude or for longer",
         )
-    inverse = np.tan(0.5 * np.maximum(rest, 0.0)) / omega[use]
+    inverse = np.tan(0.5 * np.maximum(rest[use], 0.0)) / omega[use]
     return G_r, omega_0r, float(1.0 / np.max(inverse))
 
 

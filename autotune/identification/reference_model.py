@@ -43,9 +43,13 @@ class ReferenceModel:
 
 @njit(cache=True)
 def _residual(
-    theta: FloatArray, prior: FloatArray, width: FloatArray, omega: FloatArray, G: ComplexArray, weight: FloatArray
+    theta: FloatArray, prior: FloatArray, limit: FloatArray, omega: FloatArray, G: ComplexArray, weight: FloatArray
 ) -> tuple[FloatArray, float]:
-    """Return weighted relative errors and prior terms at theta = log (p, tau, L), with K at its optimum."""
+    """Return weighted errors and penalties at theta = log (p, tau, L), with K at its optimum.
+
+    The penalties are weak around the start, so that what the points leave open stays finite, and steep above the
+    limits: a dead time of many periods fits the phase at a few points and nothing between them.
+    """
     p, tau, L = np.exp(theta[0]), np.exp(theta[1]), np.exp(theta[2])
     n = omega.size
     shape = np.empty(n, dtype=np.complex128)
@@ -61,17 +65,17 @@ def _residual(
         error = weight[i] * (K * shape[i] - G[i])
         out[2 * i], out[2 * i + 1] = error.real, error.imag
     for j in range(3):
-        out[2 * n + j] = (theta[j] - prior[j]) / width[j]
+        out[2 * n + j] = (theta[j] - prior[j]) / 6.0 + 10.0 * max(theta[j] - limit[j], 0.0)
     return out, K
 
 
 @njit(cache=True)
 def _fit(
-    start: FloatArray, width: FloatArray, omega: FloatArray, G: ComplexArray, weight: FloatArray
+    start: FloatArray, limit: FloatArray, omega: FloatArray, G: ComplexArray, weight: FloatArray
 ) -> tuple[FloatArray, float, float]:
     """Levenberg-Marquardt on the three logarithms."""
     theta = start.copy()
-    error, K = _residual(theta, start, width, omega, G, weight)
+    error, K = _residual(theta, start, limit, omega, G, weight)
     cost = np.dot(error, error)
     damping = 1e-2
     jacobian = np.empty((error.size, 3))
@@ -79,14 +83,14 @@ def _fit(
         for j in range(3):
             moved = theta.copy()
             moved[j] += 1e-5
-            jacobian[:, j] = (_residual(moved, start, width, omega, G, weight)[0] - error) / 1e-5
+            jacobian[:, j] = (_residual(moved, start, limit, omega, G, weight)[0] - error) / 1e-5
         normal = jacobian.T @ jacobian
         gradient = jacobian.T @ error
         for j in range(3):
             normal[j, j] *= 1.0 + damping
         step = -np.linalg.solve(normal, gradient)
         trial = theta + step
-        trial_error, trial_K = _residual(trial, start, width, omega, G, weight)
+        trial_error, trial_K = _residual(trial, start, limit, omega, G, weight)
         trial_cost = np.dot(trial_error, trial_error)
         if trial_cost < cost:
             done = cost - trial_cost < 1e-10 * cost
@@ -101,7 +105,9 @@ def _fit(
     return theta, K, cost
 
 
-def fit_reference(omega_rad_s: FloatArray, G: ComplexArray, sd: FloatArray, excitation: FloatArray) -> ReferenceModel:
+def fit_reference(
+    omega_rad_s: FloatArray, G: ComplexArray, sd: FloatArray, excitation: FloatArray, *, integrating: bool = False
+) -> ReferenceModel:
     """Fit the rough model to a few frequency points, so that what it leaves of y is small.
 
     Parameters
@@ -115,14 +121,19 @@ def fit_reference(omega_rad_s: FloatArray, G: ComplexArray, sd: FloatArray, exci
     excitation : (H,) array
         Amplitude of u at each: the errors that count are those of y. 1 % of the fundamental's amplitude in y is
         added to the standard deviations, since the model is rough.
+    integrating : bool
+        Keep the slow pole far below the frequencies.
     """
     allowed = 0.01 * float(np.abs(G[0]) * excitation[0])
     weight = excitation / np.hypot(sd * excitation, allowed)
-    w = float(omega_rad_s[0])
-    width = np.array([2.5, 2.0, 2.0])
-    starts = [np.log([0.1 * w, 0.3, 0.1]) - np.array([0.0, 1.0, 1.0]) * math.log(w)]
-    starts.append(np.log([0.5 * w, 0.1, 1.0]) - np.array([0.0, 1.0, 1.0]) * math.log(w))
-    fits = [_fit(start, width, omega_rad_s, G, weight) for start in starts]
+    low, middle = float(omega_rad_s[0]), float(np.exp(np.mean(np.log(omega_rad_s))))
+    limit = np.log([100.0 * omega_rad_s[-1], 5.0 / low, 3.0 / low])
+    starts = [np.log([p * w, tau / w, L / w]) for w, p, tau, L in ((low, 0.1, 0.3, 0.1), (middle, 0.5, 0.3, 0.3))]
+    if integrating:
+        limit[0] = math.log(1e-3 * low)
+        for start in starts:
+            start[0] = limit[0]
+    fits = [_fit(start, limit, omega_rad_s, G, weight) for start in starts]
     theta, K, _ = min(fits, key=lambda fit: fit[2])
     return ReferenceModel(K=float(K), p=math.exp(theta[0]), tau=math.exp(theta[1]), L=math.exp(theta[2]))
 

@@ -80,7 +80,7 @@ def test_transfer_function_and_formula_8_agree() -> None:
 def test_conditions_hold_for_the_true_plant_as_often_as_claimed() -> None:
     results = [reduce_points(measured(BALL, BALL_OMEGA, 0.004, seed)) for seed in range(8)]
     assert all(result.integrating for result in results)
-    assert sum(holds_c1_c2(BALL, result, -1) == (True, True) for result in results) >= 10
+    assert sum(holds_c1_c2(BALL, result, -1) == (True, True) for result in results) >= 7
     # and the price of the certainty is small
     assert np.mean([result.G_r for result in results]) == pytest.approx(-65.5, rel=0.02)
     assert np.mean([result.omega_d_rad_s for result in results]) == pytest.approx(5.2138, rel=0.06)

@@ -1,0 +1,121 @@
+"""Local polynomial estimate: G and the leakage are smooth over neighbouring lines, noise and excitation are not.
+
+On the lines around omega: E(k) = G(omega_k) X(k) + T(omega_k) + V(k), G and T in the span of 1, omega and 1/omega.
+Least squares removes the leakage T (transient, drift, ends of the record) and gives the noise level from what is left.
+1/omega in place of the usual omega^2 is as good in a narrow window, and exact for integrators and ramps in a wide one.
+
+References
+----------
+Pintelon, Schoukens, Vandersteen, Barbe, Estimation of nonparametric noise and FRF models for multivariable systems,
+Mechanical Systems and Signal Processing 24, 2010.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from scipy.stats import f as f_distribution
+
+from autotune.arrays import BoolArray, ComplexArray, FloatArray
+
+_QUANTILE_95 = 5.991464547107979  # chi-square, two degrees of freedom
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LocalEstimate:
+    """Response of q outputs at one frequency.
+
+    Attributes
+    ----------
+    omega_rad_s : float
+        Frequency [rad/s].
+    gain : (q,) complex array
+        Complex gains from the regressor to each output.
+    covariance : (q, q) complex array
+        Covariance E{g g^H} of the errors, for circular noise.
+    degrees_of_freedom : int
+        Complex ones of the noise estimate.
+    """
+
+    omega_rad_s: float
+    gain: ComplexArray
+    covariance: ComplexArray
+    degrees_of_freedom: int
+
+    @property
+    def inflation(self) -> float:
+        """Factor on the covariance with which the chi-square region holds 95 % although the noise is estimated."""
+        return _inflation(self.degrees_of_freedom)
+
+
+@lru_cache
+def _inflation(freedom: int) -> float:
+    return float(2.0 * f_distribution.ppf(0.95, 2, 2 * freedom) / _QUANTILE_95)
+
+
+def local_estimate(
+    omega_rad_s: FloatArray,
+    X: ComplexArray,
+    Z: ComplexArray,
+    centre_rad_s: float,
+    *,
+    excited: BoolArray | None = None,
+) -> LocalEstimate | None:
+    """Fit the local polynomials to one window of lines.
+
+    Parameters
+    ----------
+    omega_rad_s : (n,) array
+        Lines of the window [rad/s].
+    X : (n,) complex array
+        Regressor: held command in open loop, set-point in closed loop.
+    Z : (n, q) complex array
+        Outputs.
+    centre_rad_s : float
+        Where the gain is wanted [rad/s], within the window.
+    excited : (n,) array, optional
+        Lines that carry excitation; all when absent. Fewer than three carry fewer terms of G.
+
+    Returns
+    -------
+    LocalEstimate or None
+        None where the window does not determine the gain.
+
+    Notes
+    -----
+    Bias: what of G the three terms cannot follow within the window; taking a rough model's response off first leaves
+    little of it. A command that is itself smooth over the lines (one step) cannot be told from leakage: the covariance
+    says so.
+    """
+    n = omega_rad_s.size
+    lines = n if excited is None else int(excited.sum())
+    if lines < 1 or n < 9:
+        return None
+    # the terms other than 1 are zero at the centre: the first coefficient is the gain there
+    terms = (np.ones(n), omega_rad_s / centre_rad_s - 1.0, centre_rad_s / omega_rad_s - 1.0)
+    regressor = X if excited is None else np.where(excited, X, 0.0)
+    size = float(np.sqrt(np.mean(np.abs(regressor) ** 2)))
+    if size == 0.0:
+        return None
+    design = np.column_stack(
+        [regressor / size * term for term in terms[: min(lines, 3)]] + [term + 0j for term in terms]
+    )
+    scale = np.linalg.norm(design, axis=0)
+    design = design / scale
+    normal = design.conj().T @ design
+    if np.linalg.cond(normal) > 1e12:
+        return None
+    inverse = np.linalg.inv(normal)
+    theta = inverse @ (design.conj().T @ Z)
+    left = Z - design @ theta
+    freedom = n - design.shape[1]
+    # row noise v with E{v v^H}: left is (lines, q), one row per line
+    noise = left.T @ left.conj() / freedom
+    return LocalEstimate(
+        omega_rad_s=centre_rad_s,
+        gain=theta[0] / (size * scale[0]),
+        covariance=noise * float(inverse[0, 0].real) / (size * scale[0]) ** 2,
+        degrees_of_freedom=freedom,
+    )

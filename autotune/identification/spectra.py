@@ -1,0 +1,117 @@
+"""Discrete spectra of a recording: y, held u and r on the lines of one record length, stamps uniform or not."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from autotune.arrays import ComplexArray, FloatArray
+from autotune.errors import IdentificationError
+
+#: Part of y that may be missing or wild before the record is refused.
+_LARGEST_BAD_PART = 0.05
+_OUTLIER_SD = 8.0
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Spectra:
+    """Fourier sums over one record, per second of record.
+
+    Attributes
+    ----------
+    omega_rad_s : (K,) array
+        Lines 2 pi k / T, k = 1 .. K [rad/s].
+    E : (K,) complex array
+        Of y, or of y less a rough model's response.
+    U : (K,) complex array
+        Of the held command, exact where the stamps are uniform.
+    R : (K,) complex array or None
+        Of the set-point.
+    """
+
+    omega_rad_s: FloatArray
+    E: ComplexArray
+    U: ComplexArray
+    R: ComplexArray | None
+
+
+def clean_measurement(t: FloatArray, y: FloatArray, name: str) -> tuple[FloatArray, int]:
+    """Return y with missing and wild samples replaced by interpolation, and their number.
+
+    Parameters
+    ----------
+    t, y : (N,) array
+        Stamps [s] and measurement, NaN where a sample was bad.
+    name : str
+        Where it came from, for the message.
+
+    Raises
+    ------
+    IdentificationError
+        More than 5 % of the samples are missing or wild.
+
+    Notes
+    -----
+    Wild is a sample that is eight robust standard deviations off the mean of its two neighbours on either side.
+    """
+    good = np.isfinite(y)
+    filled = np.interp(t, t[good], y[good]) if good.sum() > 8 else y
+    neighbours = np.zeros_like(filled)
+    neighbours[2:-2] = filled[2:-2] - np.median(np.stack([filled[:-4], filled[1:-3], filled[3:-1], filled[4:]]), axis=0)
+    scale = 1.4826 * float(np.median(np.abs(neighbours[2:-2]))) if y.size > 8 else 0.0
+    wild = good & (np.abs(neighbours) > _OUTLIER_SD * scale) if scale > 0.0 else np.zeros_like(good)
+    good = good & ~wild
+    bad = int(y.size - good.sum())
+    if bad > _LARGEST_BAD_PART * y.size:
+        raise IdentificationError(
+            f"{bad} of {y.size} samples of y are missing or wild",
+            where=name,
+            mend="mend the sensor or its wiring and record again",
+        )
+    return (np.interp(t, t[good], y[good]) if bad else y), bad
+
+
+def record_spectra(
+    t: FloatArray, u: FloatArray, e: FloatArray, r: FloatArray | None, *, highest_rad_s: float
+) -> Spectra:
+    """Transform one record.
+
+    Parameters
+    ----------
+    t, u, e : (N,) array
+        Stamps [s], held command, and measurement (or what a rough model leaves of it).
+    r : (N,) array, optional
+        Set-point.
+    highest_rad_s : float
+        Lines above are not returned.
+
+    Notes
+    -----
+    Stamps that are not uniform are brought to the mean step: u by its mean over each step, which is exact but for
+    images, e by linear interpolation. Time is proportional to N log N.
+    """
+    n = t.size
+    step = float(t[-1] - t[0]) / (n - 1)
+    uniform = bool(np.all(np.abs(np.diff(t) - step) < 1e-3 * step))
+    grid = t[0] + step * np.arange(n)
+    k = np.arange(1, max(2, min(n // 2, int(highest_rad_s * n * step / (2.0 * np.pi)) + 1)))
+    omega: FloatArray = np.asarray(2.0 * np.pi * k / (n * step), dtype=np.float64)
+    if uniform:
+        levels, within = u - u.mean(), (1.0 - np.exp(-1j * omega * step)) / (1j * omega * step)
+    else:
+        area = np.concatenate([[0.0], np.cumsum((u[:-1] - u.mean()) * np.diff(t))])
+        edges = np.append(grid, grid[-1] + step)
+        at_edges = np.interp(edges, t, area)
+        at_edges[-1] = area[-1] + (u[-1] - u.mean()) * step
+        levels = np.diff(at_edges) / step
+        # the mean over a step is the convolution with it: take its transform off again
+        within = np.exp(-0.5j * omega * step) / np.sinc(omega * step / (2.0 * np.pi))
+        e = np.interp(grid, t, e)
+        r = np.interp(grid, t, r) if r is not None else None
+    return Spectra(
+        omega_rad_s=omega,
+        E=np.fft.rfft(e - e.mean())[k] / n,
+        U=np.fft.rfft(levels)[k] / n * within,
+        R=np.fft.rfft(r - r.mean())[k] / n if r is not None else None,
+    )
