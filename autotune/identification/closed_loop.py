@@ -12,7 +12,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.linalg import expm, logm
 
 from autotune.arrays import ComplexArray, FloatArray
 from autotune.controller import Controller
@@ -26,6 +25,7 @@ from autotune.identification.confidence import (
     whiteness,
 )
 from autotune.identification.control_law import CONTRADICTION, LawCheck, check_law
+from autotune.identification.hold import without_hold
 from autotune.identification.loop_excitation import ExcitationVerdict, judge, own_motion, require_excitation
 from autotune.identification.order import Candidate, choose_order, default_past_window, fixed_order
 from autotune.identification.prediction_error import PredictionErrorEstimate
@@ -36,8 +36,6 @@ from autotune.recording import Recording
 
 #: Rows that a first look at the excitation takes.
 _LOOK_ROWS = 20_000
-#: A point less certain than this says nothing to a design.
-_WORTHLESS = 0.5
 #: Time stamps may stray this far from the grid, as a share of the sample time.
 _JITTER = 0.25
 #: Fewest rows a closed-loop identification accepts.
@@ -100,7 +98,8 @@ def identify_closed_loop(
     Parameters
     ----------
     recording : Recording
-        t, u, y, and r where it is known; equidistant. A column ``dither`` is what was added to the controller's output.
+        t, u, y, and r where it is known; the longest equidistant stretch is used. A column ``dither`` is what was added
+        to the controller's output.
     order : int, optional
         Number of states; chosen from the data when absent.
     delay : int, optional
@@ -122,18 +121,19 @@ def identify_closed_loop(
     Raises
     ------
     InputError
-        Time stamps that are not equidistant, samples that are not numbers, a controller that contradicts the data.
+        A controller that contradicts the data.
     IdentificationError
-        Too few rows, a command that does not move or only by the feedback, a plant of the asked order that the data
-        do not determine.
+        Too few equidistant rows, a command that does not move or only by the feedback, a plant of the asked order
+        that the data do not determine.
 
     Notes
     -----
     Linear and time-invariant over the record; regions are asymptotic and presume white residuals (tested). Means are
     removed and a constant is estimated, so operating points and integrators need no care.
     """
-    warnings: list[str] = []
-    u, y, r = _columns(recording, warnings)
+    recording, left_out = usable_stretch(recording)
+    warnings = list(left_out)
+    u, y, r = _columns(recording)
     dt_s = recording.sample_time_s
     law = _checked_law(recording, controller, r, warnings)
     scale_u, scale_y = float(np.std(u)), float(np.std(y))
@@ -157,35 +157,64 @@ def identify_closed_loop(
     return replace(result, evidence=evidence, warnings=tuple(warnings))
 
 
-def _columns(recording: Recording, warnings: list[str]) -> tuple[FloatArray, FloatArray, FloatArray | None]:
-    recording.require_finite()
-    if len(recording) < _FEWEST_ROWS:
+def usable_stretch(recording: Recording) -> tuple[Recording, tuple[str, ...]]:
+    """Return the longest stretch of equidistant rows in which u, y, r and dither are numbers, and what was left out.
+
+    Parameters
+    ----------
+    recording : Recording
+        As a rig left it: unusable samples, missed deadlines, a start-up without set-point.
+
+    Returns
+    -------
+    stretch : Recording
+        At least 60 rows.
+    warnings : tuple of str
+        Which rows were left out, and time stamps that stray.
+
+    Raises
+    ------
+    IdentificationError
+        No stretch is long enough; names what cuts the recording.
+    """
+    columns = [recording.u, recording.y]
+    columns += [c for name, c in recording.extra.items() if name in ("r", "dither") and np.isfinite(c).any()]
+    good = np.all([np.isfinite(column) for column in columns], axis=0)
+    steps = np.diff(recording.t) / recording.sample_time_s
+    broken = np.abs(steps - 1.0) > _JITTER
+    group = np.cumsum(np.concatenate([[0], broken | (good[1:] != good[:-1])]))
+    sizes = np.bincount(group, weights=good)
+    rows = np.flatnonzero((group == int(np.argmax(sizes))) & good)
+    if len(rows) < _FEWEST_ROWS:
+        reasons = f"{int((~good).sum())} rows hold values that are not numbers, time jumps {int(broken.sum())} times"
+        cut = "" if len(rows) == len(good) else f" in one piece ({reasons})"
         raise IdentificationError(
-            f"the record is too short: {len(recording)} rows",
+            f"the record is too short: {len(rows)} equidistant rows{cut}",
             where=recording.name,
             mend=f"record at least {_FEWEST_ROWS} rows, better a thousand, with the set-point or a dither moving",
         )
-    steps = np.diff(recording.t) / recording.sample_time_s
-    if not recording.is_uniform:
-        worst = int(np.argmax(np.abs(steps - 1.0)))
-        if abs(steps[worst] - 1.0) > _JITTER:
-            raise InputError(
-                f"the time stamps are not equidistant: {steps[worst]:.3g} sample times pass after "
-                f"t = {recording.t[worst]:g} s",
-                where=recording.name,
-                mend="cut the recording at the gap, or resample it",
-            )
-        warnings.append(f"time stamps stray by up to {100 * abs(steps[worst] - 1):.2g} % of the sample time")
+    warnings = []
+    t = recording.t[rows]
+    if len(rows) < len(good):
+        warnings.append(
+            f"only t = {t[0]:g} to {t[-1]:g} s is used ({len(rows)} of {len(good)} rows): outside, values are not "
+            "numbers or time stamps are not equidistant"
+        )
+        recording = recording.between(float(t[0]), float(t[-1]) + 0.5 * recording.sample_time_s)
+    stray = float(np.max(np.abs(np.diff(t) / recording.sample_time_s - 1.0)))
+    if stray > 0.01:
+        warnings.append(f"time stamps stray by up to {100 * stray:.2g} % of the sample time")
+    return recording, tuple(warnings)
+
+
+def _columns(recording: Recording) -> tuple[FloatArray, FloatArray, FloatArray | None]:
     for name, values in (("u", recording.u), ("y", recording.y)):
         if np.ptp(values) <= 1e-12 * max(1.0, float(np.max(np.abs(values)))):
             raise IdentificationError(
                 f"{name} does not move", where=recording.name, mend="move the set-point or add a dither"
             )
     r = recording.extra.get("r")
-    if r is not None and not np.all(np.isfinite(r)):
-        warnings.append("r holds rows that are not numbers and is left aside")
-        r = None
-    return recording.u, recording.y, r
+    return recording.u, recording.y, r if r is not None and np.all(np.isfinite(r)) else None
 
 
 def _checked_law(
@@ -194,6 +223,7 @@ def _checked_law(
     if controller is None:
         return None
     added = recording.extra.get("dither")
+    added = added if added is not None and np.all(np.isfinite(added)) else None
     law = check_law(controller, recording.u, recording.y, r, recording.sample_time_s, added=added)
     if law.contradicts and r is None:
         warnings.append("r was not recorded, so the controller file cannot be checked against the data")
@@ -272,59 +302,6 @@ def _report(
         law=law,
         warnings=(),
     )
-
-
-def without_hold(model: InnovationModel, response: tuple[FrequencyPoint, ...]) -> tuple[FrequencyPoint, ...]:
-    """Return the points of the plant itself, with the hold of the command taken out.
-
-    Parameters
-    ----------
-    model : InnovationModel
-        One input, one output, identified from commands held over each sample.
-    response : tuple of FrequencyPoint
-        Its response G(exp(j omega Ts)).
-
-    Returns
-    -------
-    tuple of FrequencyPoint
-        P(j omega) of the continuous plant whose step-invariant equivalent the model is. Where it has none (a pole on
-        the negative real axis, which a sampled lag does not have) the response divided by that of the hold, up to half
-        the Nyquist frequency. Points known to less than 50 % are left out.
-    """
-    dt_s = model.sample_time_s
-    continuous = _continuous(model)
-    points = []
-    for point in response:
-        omega = point.omega_rad_s
-        if continuous is None:
-            if omega * dt_s > math.pi / 2.0:
-                continue
-            factor = complex(1j * omega * dt_s / (1.0 - np.exp(-1j * omega * dt_s)))
-        else:
-            A, B = continuous
-            inner = model.C @ np.linalg.solve(1j * omega * np.eye(len(A)) - A, B) + model.D
-            factor = complex(inner[0, 0]) * np.exp(-1j * omega * dt_s * model.input_delay) / point.response
-        turn = np.array([[factor.real, -factor.imag], [factor.imag, factor.real]])
-        c = turn @ np.array(point.covariance) @ turn.T
-        value = complex(point.response * factor)
-        if np.trace(c) / 2.0 < (_WORTHLESS * abs(value)) ** 2:
-            pair = ((float(c[0, 0]), float(c[0, 1])), (float(c[1, 0]), float(c[1, 1])))
-            points.append(replace(point, response=value, covariance=pair))
-    return tuple(points)
-
-
-def _continuous(model: InnovationModel) -> tuple[FloatArray, FloatArray] | None:
-    """Return (A, B) of the continuous model with the same samples under a held input, None where there is none."""
-    poles = model.poles
-    if np.any((np.abs(poles.imag) <= 1e-9) & (poles.real <= 1e-9)):
-        return None
-    n = model.order
-    joint = np.block([[model.A, model.B], [np.zeros((1, n)), np.ones((1, 1))]])
-    generator = logm(joint)
-    if not np.allclose(expm(generator), joint, rtol=1e-8, atol=1e-10) or np.max(np.abs(np.imag(generator))) > 1e-8:
-        return None
-    generator = np.real(generator) / model.sample_time_s
-    return generator[:n, :n], generator[:n, n:]
 
 
 def _further_warnings(

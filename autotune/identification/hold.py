@@ -1,0 +1,69 @@
+"""The command's hold taken out of an identified response, so that it compares with points measured otherwise."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+from scipy.linalg import expm, logm
+
+from autotune.arrays import FloatArray
+from autotune.identification.state_space import InnovationModel
+from autotune.points import FrequencyPoint
+
+#: A point less certain than this says nothing to a design.
+_WORTHLESS = 0.5
+
+
+def without_hold(model: InnovationModel, response: tuple[FrequencyPoint, ...]) -> tuple[FrequencyPoint, ...]:
+    """Return the points of the plant itself, with the hold of the command taken out.
+
+    Parameters
+    ----------
+    model : InnovationModel
+        One input, one output, identified from commands held over each sample.
+    response : tuple of FrequencyPoint
+        Its response G(exp(j omega Ts)).
+
+    Returns
+    -------
+    tuple of FrequencyPoint
+        P(j omega) of the continuous plant whose step-invariant equivalent the model is. Where it has none (a pole on
+        the negative real axis, which a sampled lag does not have) the response divided by that of the hold, up to half
+        the Nyquist frequency. Points known to less than 50 % are left out.
+    """
+    dt_s = model.sample_time_s
+    continuous = _continuous(model)
+    points = []
+    for point in response:
+        omega = point.omega_rad_s
+        if continuous is None:
+            if omega * dt_s > math.pi / 2.0:
+                continue
+            factor = complex(1j * omega * dt_s / (1.0 - np.exp(-1j * omega * dt_s)))
+        else:
+            A, B = continuous
+            inner = model.C @ np.linalg.solve(1j * omega * np.eye(len(A)) - A, B) + model.D
+            factor = complex(inner[0, 0]) * np.exp(-1j * omega * dt_s * model.input_delay) / point.response
+        turn = np.array([[factor.real, -factor.imag], [factor.imag, factor.real]])
+        c = turn @ np.array(point.covariance) @ turn.T
+        value = complex(point.response * factor)
+        if np.trace(c) / 2.0 < (_WORTHLESS * abs(value)) ** 2:
+            pair = ((float(c[0, 0]), float(c[0, 1])), (float(c[1, 0]), float(c[1, 1])))
+            points.append(replace(point, response=value, covariance=pair))
+    return tuple(points)
+
+
+def _continuous(model: InnovationModel) -> tuple[FloatArray, FloatArray] | None:
+    """Return (A, B) of the continuous model with the same samples under a held input, None where there is none."""
+    poles = model.poles
+    if np.any((np.abs(poles.imag) <= 1e-9) & (poles.real <= 1e-9)):
+        return None
+    n = model.order
+    joint = np.block([[model.A, model.B], [np.zeros((1, n)), np.ones((1, 1))]])
+    generator = logm(joint)
+    if not np.allclose(expm(generator), joint, rtol=1e-8, atol=1e-10) or np.max(np.abs(np.imag(generator))) > 1e-8:
+        return None
+    generator = np.real(generator) / model.sample_time_s
+    return generator[:n, :n], generator[:n, n:]

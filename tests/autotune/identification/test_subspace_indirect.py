@@ -1,0 +1,132 @@
+"""The method of Pouliquen et al. 2011 and its peers: exact without noise, the paper's figures with it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from autotune.errors import IdentificationError
+from autotune.identification.refit import refit_inputs
+from autotune.identification.state_space import difference, feedback, h2_norm, spectral_radius
+from autotune.identification.subspace_direct import pbsid_opt, ssarx
+from autotune.identification.subspace_indirect import (
+    controller_markov_parameters,
+    estimated_states,
+    indirect_subspace,
+)
+from autotune.identification.subspace_peers import oku_tanaka, orthogonal_decomposition, van_overschee_de_moor
+from tests.loop_example import CONTROLLER, PLANT, PLANT_DEN, PLANT_NUM, example_set, simulate_loop, two_by_two
+
+MARKOV = CONTROLLER.markov_parameters(20)
+OMEGA = np.geomspace(0.02, 1.2, 9)
+
+
+def test_loop_of_the_example_is_stable_with_the_published_spectral_radius() -> None:
+    assert spectral_radius(feedback(PLANT, CONTROLLER).A) == pytest.approx(0.98886, abs=5e-6)
+
+
+@pytest.mark.parametrize("instrument", ["r", "r and y"])
+def test_paper_method_is_exact_without_noise(instrument: str) -> None:
+    d = example_set(1, sd=0.0)
+    found = indirect_subspace(d.r, d.u, d.y, 5, controller_markov=MARKOV, f=15, instrument=instrument)
+    num, den = found.model.polynomials()
+    assert found.loop_order == 9  # n + n_c: the singular values fall by ten decades behind it
+    np.testing.assert_allclose(den, PLANT_DEN, atol=1e-10)
+    np.testing.assert_allclose(num, PLANT_NUM, atol=1e-10)
+
+
+def test_states_of_remark_2_follow_the_state_equation_without_noise() -> None:
+    d = example_set(2, sd=0.0, rows=3000)
+    found = indirect_subspace(d.r, d.u, d.y, 5, controller_markov=MARKOV, f=15)
+    states, start = estimated_states(found, d.r, d.y, f=15)
+    # X_t is the state less what future r explains, which is nothing for a causal loop and white r but for chance
+    output = states @ found.model.C.T
+    share = np.std(output - d.y[start : start + len(states)]) / np.std(d.y)
+    assert share < 0.15
+
+
+def test_controller_markov_parameters_follow_from_noisy_data_exactly() -> None:
+    d = simulate_loop(PLANT, CONTROLLER, *np.random.default_rng(3).standard_normal((2, 1500, 1)))
+    markov, order = controller_markov_parameters(d.r, d.u, d.y, 12)
+    assert order == 4
+    np.testing.assert_allclose(markov, CONTROLLER.markov_parameters(12), atol=1e-8)
+
+
+def test_controller_markov_parameters_are_refused_where_r_is_not_what_moved_u() -> None:
+    d = example_set(4)
+    other = np.random.default_rng(0).standard_normal(d.r.shape)
+    with pytest.raises(IdentificationError, match="not a linear function"):
+        controller_markov_parameters(other, d.u, d.y, 12)
+
+
+@pytest.mark.parametrize("instrument", ["r", "u and y"])
+def test_without_feedback_the_method_is_moesp(instrument: str) -> None:
+    """Remark 5: H_c = 0 and r = u; PI-MOESP with past u, PO-MOESP with past u and y, exact without noise."""
+    d = example_set(5, sd=0.0)
+    found = indirect_subspace(
+        d.u, d.u, d.y, 5, controller_markov=np.zeros((15, 1, 1)), f=15, loop_order=5, instrument=instrument
+    )
+    np.testing.assert_allclose(found.model.response(OMEGA), PLANT.response(OMEGA), rtol=1e-7)
+
+
+def test_every_peer_that_uses_r_is_exact_without_noise() -> None:
+    d = example_set(6, sd=0.0)
+    models = [
+        van_overschee_de_moor(d.r, d.u, d.y, 5, controller_markov=MARKOV, f=10),
+        oku_tanaka(d.r, d.u, d.y, 5, f=20),
+        orthogonal_decomposition(d.r, d.u, d.y, 5, f=20),
+    ]
+    for model in models:
+        np.testing.assert_allclose(model.response(OMEGA), PLANT.response(OMEGA), rtol=1e-6)
+
+
+def test_oku_and_orthogonal_decomposition_give_the_same_poles() -> None:
+    """As the paper remarks of its figures 3 and 4."""
+    d = example_set(7)
+    first, second = oku_tanaka(d.r, d.u, d.y, 5, f=20), orthogonal_decomposition(d.r, d.u, d.y, 5, f=20)
+    np.testing.assert_allclose(first.poles, second.poles, rtol=1e-8)
+
+
+@pytest.mark.parametrize("method", [pbsid_opt, ssarx])
+def test_direct_methods_tend_to_the_plant_with_the_record(method) -> None:
+    d = example_set(8, rows=60_000)
+    model = method(d.u, d.y, 5, p=40, f=10)
+    np.testing.assert_allclose(model.response(OMEGA)[1:], PLANT.response(OMEGA)[1:], rtol=0.1)
+
+
+def test_two_inputs_and_two_outputs_are_exact_without_noise() -> None:
+    plant, controller = two_by_two()
+    r = np.random.default_rng(9).standard_normal((1000, 2))
+    d = simulate_loop(plant, controller, r, np.zeros((1000, 2)))
+    markov, order = controller_markov_parameters(d.r, d.u, d.y, 10)
+    found = indirect_subspace(d.r, d.u, d.y, 4, controller_markov=markov, f=10)
+    assert (order, found.loop_order) == (2, 6)
+    np.testing.assert_allclose(found.model.response(OMEGA), plant.response(OMEGA), rtol=1e-9)
+
+
+def test_noise_variance_and_refit_on_the_example() -> None:
+    """Mean variance 0.107 (the paper prints 0.1023); refitting B and D brings every loop back to stability."""
+    variances, raw, refitted = [], [], []
+    loop = feedback(PLANT, CONTROLLER)
+    for seed in range(30):
+        d = example_set(seed)
+        model = indirect_subspace(d.r, d.u, d.y, 5, controller_markov=MARKOV, f=15, loop_order=9).model
+        variances.append(model.innovation_covariance[0, 0])
+        for found, errors in ((model, raw), (refit_inputs(model, d.u, d.y), refitted)):
+            closed = feedback(found, CONTROLLER)
+            stable = spectral_radius(closed.A) < 1.0
+            errors.append(h2_norm(difference(closed, loop)) / h2_norm(loop) if stable else np.inf)
+    assert np.mean(variances) == pytest.approx(0.1074, abs=0.003)
+    assert np.all(np.isfinite(refitted))
+    assert np.median(refitted) < 0.16
+    assert np.median(raw) > 2.0 * np.median(refitted)
+
+
+def test_refusals_name_their_reason() -> None:
+    d = example_set(10)
+    with pytest.raises(IdentificationError, match="too short"):
+        indirect_subspace(d.r[:60], d.u[:60], d.y[:60], 5, controller_markov=MARKOV, f=15)
+    with pytest.raises(IdentificationError, match="not persistently exciting"):
+        indirect_subspace(np.ones_like(d.r), d.u, d.y, 5, controller_markov=MARKOV, f=15)
+    with pytest.raises(IdentificationError, match="loop order"):
+        indirect_subspace(d.r, d.u, d.y, 5, controller_markov=MARKOV, f=6, loop_order=9)
