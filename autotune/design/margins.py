@@ -107,8 +107,8 @@ def margins(plant: Plant, controller: Controller, *, noise_frequency_rad_s: floa
     loop = open_loop(plant, controller)
     omega = loop.grid
     L = loop.response(omega)
-    M_m, at = _modulus_margin(loop, omega, L)
-    phase, delay, crossover = _phase_and_delay_margin(loop, omega, L)
+    M_m, at = modulus_margin(loop, omega, L)
+    phase, delay, crossover = phase_and_delay_margin(loop, omega, L)
     gain, reduction = _gain_margins(loop, omega, L)
     start = noise_frequency_rad_s
     if start is None:
@@ -122,7 +122,7 @@ def margins(plant: Plant, controller: Controller, *, noise_frequency_rad_s: floa
         gain=gain,
         gain_reduction=reduction,
         crossover_rad_s=crossover,
-        noise_gain=_noise_gain(loop, omega, start),
+        noise_gain=noise_amplification(loop, omega, start),
         noise_gain_bound=high_frequency_gain(controller, loop, start) / M_m if M_m > 0.0 else math.inf,
         h2=disturbance_h2(loop),
     )
@@ -165,7 +165,8 @@ def refined_minimum(
     return lowest, at
 
 
-def _modulus_margin(loop: OpenLoop, omega: FloatArray, L: ComplexArray) -> tuple[float, float]:
+def modulus_margin(loop: OpenLoop, omega: FloatArray, L: ComplexArray) -> tuple[float, float]:
+    """Return M_m of (12) and the frequency [rad/s] it is at, given L on the loop's grid."""
     lowest, at = refined_minimum(lambda x: np.abs(1.0 + loop.response(x)), omega, np.abs(1.0 + L))
     if isinstance(loop, ContinuousLoop) and loop.transfer_function.delay_s > 0.0 and loop.gain_at_infinity > 0.0:
         # dead time turns a gain that does not vanish through -180 deg for ever
@@ -190,7 +191,9 @@ def _roots(f: Callable[[FloatArray], FloatArray], omega: FloatArray, values: Flo
     return np.asarray(np.concatenate((0.5 * (a + b), omega[np.flatnonzero(values == 0.0)])))
 
 
-def _phase_and_delay_margin(loop: OpenLoop, omega: FloatArray, L: ComplexArray) -> tuple[float, float, float]:
+def phase_and_delay_margin(loop: OpenLoop, omega: FloatArray, L: ComplexArray) -> tuple[float, float, float]:
+    """Return phase margin (13) [rad], delay margin [s] and highest crossover (14) [rad/s], given L on the grid."""
+
     def f(x: FloatArray) -> FloatArray:
         return np.log(np.abs(loop.response(x)))
 
@@ -212,7 +215,9 @@ def _gain_margins(loop: OpenLoop, omega: FloatArray, L: ComplexArray) -> tuple[f
     return float(np.min(up)) if len(up) else math.inf, float(np.max(down)) if len(down) else 0.0
 
 
-def _noise_gain(loop: OpenLoop, omega: FloatArray, start: float) -> float:
+def noise_amplification(loop: OpenLoop, omega: FloatArray, start: float) -> float:
+    """Return max abs(C/(1 + L)) of (15) at and above ``start`` [rad/s]."""
+
     def f(x: FloatArray) -> FloatArray:
         return -np.abs(loop.controller_response(x) / (1.0 + loop.response(x)))
 
