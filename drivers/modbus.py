@@ -14,7 +14,6 @@ What can go wrong, and what is done about it:
 from __future__ import annotations
 
 import logging
-import os
 import socket
 import ssl
 import time
@@ -54,7 +53,6 @@ _EXCEPTIONS = {
     11: ("does not answer its gateway", "check unit_id and the gateway"),
 }
 _BUSY = (5, 6)
-_DIAGNOSTICS = 0x08
 _READ = {
     "coil": (1, "read_coils"),
     "discrete": (2, "read_discrete_inputs"),
@@ -137,6 +135,8 @@ class ModbusLink:
         self._unit = settings.unit_id
         self._client: _TcpClient | _RtuClient | None = None
         self._is_clean = False  # whether nothing but the next answer can come
+        used = {_READ[register.table][0] for register in settings.registers.mapped().values()}
+        self._marker = next((function for function in (2, 1, 4, 3) if function not in used), None)
 
     @property
     def where(self) -> str:
@@ -287,10 +287,11 @@ class ModbusLink:
     def _flush(self) -> None:
         """Make sure that no earlier answer can be taken for the next one.
 
-        TCP and TLS: a new connection. RTU: wait for silence, then send a diagnostic echo (function 8, sub-function 0)
-        with random data. The line and the device keep the order, so when the echo has come, or the refusal of function
-        8, which nothing else can cause, every earlier answer has come before it. A device that ignores function 8 is
-        waited for ``late_reply_s``, after which no answer is still on its way.
+        TCP and TLS: a new connection. RTU: wait for silence, then read with a function that the register map does not
+        use (2 where no discrete input is mapped). The line and the device keep the order, so when its answer or its
+        refusal has come, which nothing else can cause, every earlier answer has come before it. Where that does not
+        happen within ``late_reply_s``, no earlier answer is on its way any more. (The textbook's choice would be the
+        diagnostic echo, function 8; but common slaves cannot tell its length and take its tail for the next request.)
         """
         if isinstance(self._client, _TcpClient):
             self._hang_up()
@@ -303,44 +304,43 @@ class ModbusLink:
             line.timeout = max(0.002, 3.5 * 11 / line.baudrate)
             while line.read(1):
                 line.reset_input_buffer()
-            deadline = time.monotonic() + settings.late_reply_s
-            while time.monotonic() < deadline and not self._echo(line, deadline):
-                pass  # the echo itself may have been lost: ask again
+            self._await_markers(line, time.monotonic() + settings.late_reply_s)
             line.timeout = settings.timeout_s
         except _LINE_ERRORS as error:
             raise ConnectionException(str(error)) from None
 
-    def _echo(self, line: serial.Serial, deadline: float) -> bool:
-        """Send one diagnostic echo, and return whether it came back within the time-out."""
-        request = bytes((self._unit, _DIAGNOSTICS, 0, 0)) + os.urandom(2)
-        request += FramerRTU.compute_CRC(request).to_bytes(2, "big")
-        line.write(request)
-        until = min(deadline, time.monotonic() + self._settings.timeout_s)
+    def _await_markers(self, line: serial.Serial, deadline: float) -> None:
+        """Mark the end of earlier answers with reads of the unused function; return when all of them are answered."""
         received = b""
-        while (left := until - time.monotonic()) > 0:
-            line.timeout = left
-            received += line.read(1) + line.read(line.in_waiting)
-            if _echoed(received, request):
-                return True
-        return False
+        sent = 0
+        while (left := deadline - time.monotonic()) > 0:
+            if self._marker is not None:  # its answer may have been lost, so it is sent again at each time-out
+                request = bytes((self._unit, self._marker, 0, 0, 0, 1))
+                line.write(request + FramerRTU.compute_CRC(request).to_bytes(2, "big"))
+                sent += 1
+            until = min(deadline, time.monotonic() + (self._settings.timeout_s if self._marker else left))
+            while (left := until - time.monotonic()) > 0:
+                line.timeout = left
+                received += line.read(1) + line.read(line.in_waiting)
+                if self._marker is not None and _answers(received, self._unit, self._marker) >= sent:
+                    return
 
     def _hang_up(self) -> None:
         if self._client is not None:
             self._client.close()  # type: ignore[no-untyped-call]  # the library leaves it untyped
 
 
-def _echoed(received: bytes, request: bytes) -> bool:
-    """Return whether the echo of the request, or the refusal of its function, has come."""
-    if request in received:
-        return True
-    refusal = bytes((request[0], request[1] | 0x80))
-    at = received.find(refusal)
-    while at >= 0:
-        frame = received[at : at + 5]
-        if len(frame) == 5 and FramerRTU.compute_CRC(frame[:3]).to_bytes(2, "big") == frame[3:]:
-            return True
-        at = received.find(refusal, at + 1)
-    return False
+def _answers(received: bytes, unit: int, function: int) -> int:
+    """Return how many answers to a read of one register or bit, or refusals of it, are among the bytes."""
+    size = 1 if function < 3 else 2
+    count = 0
+    for head, length in ((bytes((unit, function, size)), 5 + size), (bytes((unit, function | 0x80)), 5)):
+        at = received.find(head)
+        while at >= 0:
+            frame = received[at : at + length]
+            count += len(frame) == length and FramerRTU.compute_CRC(frame[:-2]).to_bytes(2, "big") == frame[-2:]
+            at = received.find(head, at + 1)
+    return count
 
 
 def _words(error: Exception) -> str:
