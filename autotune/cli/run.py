@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 from rich.console import Console
@@ -43,6 +43,56 @@ def run(
     console = Console(highlight=False, soft_wrap=True)
     for warning in (*tuning.experiment.warnings, *tuning.analysis.warnings):
         console.print(f"warning: {warning}", markup=False)
+    console.print(page.verdict, markup=False)
+    console.print(f"report: {out / 'report.html'}", markup=False)
+
+
+@app.command()
+def tune(
+    recordings: Annotated[list[Path], typer.Argument(metavar="REC.csv ...", help="recordings of the plant, t,u,y")],
+    out: _OUT,
+    specification: Annotated[
+        Literal["Spec1", "Spec2"],
+        typer.Option(help="Spec1: modulus margin 0.5 and 45 deg; Spec2: 0.8 and 60 deg, for a plant that varies"),
+    ] = "Spec1",
+    modulus_margin: Annotated[float | None, typer.Option(help="replaces the named one, 0 to 1")] = None,
+    phase_margin: Annotated[float | None, typer.Option(help="replaces the named one [deg]")] = None,
+    noise_gain: Annotated[float, typer.Option(help="largest amplification of noise to command [u unit/y unit]")] = 0.1,
+    kind: Annotated[Literal["pi", "pid"], typer.Option(help="structure of the controller")] = "pi",
+    source: Annotated[Literal["reduced model", "points"], typer.Option(help="what to design on")] = "reduced model",
+) -> None:
+    """Design a controller from recordings, without a rig: Bode points, reduced model, controller, report."""
+    import json
+
+    from autotune.config.procedure import DesignSettings, SignalSettings
+    from autotune.identification.recorded import combine, frequency_points
+    from autotune.pipeline import RESULT, analyse, analysis_json
+    from autotune.recording import read_recording
+    from autotune.report.page import write_page
+    from autotune.report.run_page import analysis_page
+
+    read = [read_recording(path) for path in recordings]
+    _new_folder(out, RESULT)
+    combined = combine([frequency_points(recording) for recording in read])
+    settings = DesignSettings(
+        kind=kind,
+        specification=specification,
+        modulus_margin=modulus_margin,
+        phase_margin_deg=phase_margin,
+        noise_gain=noise_gain,
+        source=source,
+    )
+    analysis = analyse(combined.points, settings)
+    units = read[0].metadata.get("units", {})
+    signals = SignalSettings(
+        sample_time_s=read[0].sample_time_s, u_unit=str(units.get("u", "")), y_unit=str(units.get("y", ""))
+    )
+    (out / RESULT).write_text(json.dumps(analysis_json(analysis), indent=2) + "\n", encoding="utf-8")
+    page = analysis_page(", ".join(path.stem for path in recordings), signals, read, analysis, combined.notes)
+    write_page(page, out / "report.html")
+    console = Console(highlight=False, soft_wrap=True)
+    for note in (*combined.notes, *analysis.warnings):
+        console.print(f"note: {note}", markup=False)
     console.print(page.verdict, markup=False)
     console.print(f"report: {out / 'report.html'}", markup=False)
 

@@ -51,7 +51,9 @@ def run_page(name: str, signals: SignalSettings, recording: Recording, tuning: T
     )
 
 
-def analysis_page(name: str, signals: SignalSettings, recordings: Sequence[Recording], analysis: Analysis) -> Page:
+def analysis_page(
+    name: str, signals: SignalSettings, recordings: Sequence[Recording], analysis: Analysis, notes: Sequence[str] = ()
+) -> Page:
     """Return the page of a design from recordings, without a rig.
 
     Parameters
@@ -64,13 +66,15 @@ def analysis_page(name: str, signals: SignalSettings, recordings: Sequence[Recor
         What the points were made from; may be empty.
     analysis : Analysis
         Points, model and controller.
+    notes : sequence of str
+        What was left out or mended on the way to the points.
     """
     figures = tuple(
         Figure(figure=recording_figure(recording, signals.u_unit, signals.y_unit), caption=recording.name)
         for recording in recordings
     )
     first = (Section(title="Recordings", figures=figures),) if figures else ()
-    sections = (*first, *analysis_sections(analysis, signals, None), _warnings_section(analysis.warnings))
+    sections = (*first, *analysis_sections(analysis, signals, None), _warnings_section((*notes, *analysis.warnings)))
     return Page(
         title=f"Controller from recordings: {name}",
         verdict=f"{gains_text(analysis.controller, signals)}: not yet tried on the rig.",
