@@ -57,7 +57,7 @@ def _points_section(analysis: Analysis, signals: SignalSettings, experiment: Exp
     sign = analysis.fit.sign
     omega = frequencies(analysis.points)
     described = _described(experiment, sign) if experiment else ()
-    estimates = [("Fourier ratio, 95 %", analysis.points, BLUE)]
+    estimates = [("measured, 95 %", analysis.points, BLUE)]
     if described:
         estimates.append(("describing function, (20)-(22)", described, PURPLE))
     gain_unit = f"{signals.y_unit}/{signals.u_unit}" if signals.u_unit and signals.y_unit else ""
@@ -68,8 +68,13 @@ def _points_section(analysis: Analysis, signals: SignalSettings, experiment: Exp
     return Section(
         title="Bode points",
         text=(
-            "Each point is the ratio of the recorded measurement's Fourier coefficient to that of the recorded, held"
-            " command over whole periods; its region counts the noise that was found beside the oscillation."
+            (
+                "Each point is the ratio of the recorded measurement's Fourier coefficient to that of the recorded, held"
+                " command over whole periods; its region counts the noise that was found beside the oscillation."
+                if all(point.source in ("relay", "harmonic") for point in analysis.points)
+                else "Each point is estimated over a band of frequencies, leakage and drift removed; its region counts the"
+                " noise in that band."
+            )
             + (
                 " The first-harmonic formulas (20)-(22), which trust the delay that was asked for and the relay's ideal"
                 " wave, are shown with their error against it."
