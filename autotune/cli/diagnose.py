@@ -1,1 +1,87 @@
-"""Commands: simulation of a model on a recording, and diagnosis of where the two differ."""
+"""Commands that compare a model with recordings: simulate and diagnose."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from autotune.cli import app
+
+
+@app.command()
+def simulate(
+    recording: Annotated[Path, typer.Argument(help="recording whose u drives the model", metavar="REC.csv")],
+    model: Annotated[Path, typer.Option(help="model, nominal or extended", metavar="M.toml")],
+    out: Annotated[Path, typer.Option(help="file for the columns t,y_sim", metavar="SIM.csv")],
+    horizon: Annotated[
+        float | None,
+        typer.Option(help="length of the windows [s] before which the state is estimated anew; default: one free run"),
+    ] = None,
+) -> None:
+    """Simulate a model with a recording's u; with --horizon as a forecast, window after window."""
+    import numpy as np
+
+    from autotune.diagnosis.forecast import forecast
+    from autotune.models import read_model
+    from autotune.recording import read_recording
+
+    data = read_recording(recording)
+    y_sim = forecast(read_model(model), data, horizon)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    np.savetxt(out, np.column_stack([data.t, y_sim]), fmt="%.10g", delimiter=",", header="t,y_sim", comments="")
+    known = np.isfinite(data.y)
+    error = float(np.sqrt(np.mean((data.y - y_sim)[known] ** 2)) / max(float(np.std(data.y[known])), 1e-300))
+    typer.echo(f"simulated {len(data)} rows, error {error:.4g} of the spread of y, in {out}")
+
+
+@app.command()
+def diagnose(
+    recordings: Annotated[
+        list[Path], typer.Argument(help="recordings, best with different excitation", metavar="REC.csv...")
+    ],
+    model: Annotated[Path, typer.Option(help="nominal model", metavar="M.toml")],
+    out: Annotated[
+        Path, typer.Option(help="folder for diagnosis.json, extended_model.toml, report.html", metavar="DIR")
+    ],
+    controller: Annotated[
+        Path | None,
+        typer.Option(help="law that u was computed by; default: the recordings' sidecars", metavar="C.toml"),
+    ] = None,
+    without: Annotated[
+        list[str] | None, typer.Option(help="leave an effect out of the catalogue; may be given several times")
+    ] = None,
+) -> None:
+    """Find where and why recordings differ from the simulation: numbers, missing physics, or something else."""
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    from autotune.controller import read_controller
+    from autotune.diagnosis.diagnose import diagnose as find
+    from autotune.diagnosis.simulation import entry_of
+    from autotune.models import read_model, write_model
+    from autotune.recording import read_recording
+    from autotune.report.diagnosis_page import write_diagnosis_page
+
+    nominal = read_model(model)
+    data = [read_recording(path) for path in recordings]
+    law = None if controller is None else read_controller(controller)
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
+        task = progress.add_task("diagnosing", total=1.0)
+        found = find(
+            nominal,
+            data,
+            law,
+            without or (),
+            lambda what, share: progress.update(task, description=what, completed=share),
+        )
+    out.mkdir(parents=True, exist_ok=True)
+    found.write(out / "diagnosis.json")
+    equations = {effect.name: entry_of(effect.name).equation for effect in found.extended_model.effects}
+    write_model(found.extended_model, out / "extended_model.toml", equations)
+    write_diagnosis_page(found, out / "report.html")
+    for sentence in found.sentences:
+        typer.echo(sentence)
+    typer.echo(f"diagnosis.json, extended_model.toml and report.html are in {out}")

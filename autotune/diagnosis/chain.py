@@ -1,0 +1,187 @@
+"""The linear chain in state space, arranged so that physics can be put into it.
+
+Every first-order block's state is its output, so that speed, position and level are states; blocks of higher order
+are in controllable form. Forces enter at the input of the first plant block, in that input's unit.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from autotune.arrays import FloatArray, IntArray
+from autotune.diagnosis import kernel
+from autotune.errors import InputError
+from autotune.models import Block, Model
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Chain:
+    """State space of a chain with its signals.
+
+    Attributes
+    ----------
+    A : (n, n) array
+        Dynamics.
+    B : (n, 3) array
+        Columns: command, force at the first plant block's input, input of the last plant block.
+    taps : (5, n) array
+        Rows: plant input, speed, position (or level), output, first level.
+    gains : (4,) array
+        Gain of the first plant block from force to speed or level, of the last plant block, direct gain from command
+        to plant input and from command to output.
+    where : (4,) int array
+        State numbers of actuator lag, speed and position (-1 where there is none), and the number of levels.
+    delay_s : float
+        Dead time of all blocks together, which commutes with the linear chain.
+    plant : slice
+        The states of the plant's blocks.
+    """
+
+    A: FloatArray
+    B: FloatArray
+    taps: FloatArray
+    gains: FloatArray
+    where: IntArray
+    delay_s: float
+    plant: slice
+
+    @property
+    def order(self) -> int:
+        """Number of states."""
+        return int(self.A.shape[0])
+
+    @property
+    def is_mechanical(self) -> bool:
+        """Whether the plant has a speed and a position."""
+        return bool(self.taps[kernel.SPEED].any())
+
+    @property
+    def is_integrating(self) -> bool:
+        """Whether the chain has a pole at the origin."""
+        return bool(np.min(np.abs(np.linalg.eigvals(self.A))) < 1e-9) if self.order else False
+
+
+def _realise(block: Block) -> tuple[FloatArray, FloatArray, FloatArray, float]:
+    """Return A, b, c, d of one block."""
+    den = np.asarray(block.dynamics.den) / block.dynamics.den[0]
+    num = np.zeros(den.size)
+    num[den.size - len(block.dynamics.num) :] = np.asarray(block.dynamics.num) / block.dynamics.den[0]
+    n = den.size - 1
+    direct = float(num[0])
+    rest = num[1:] - direct * den[1:]
+    if n == 1:
+        if rest[0] == 0.0:
+            return np.array([[-den[1]]]), np.array([0.0]), np.array([1.0]), direct
+        return np.array([[-den[1]]]), np.array([rest[0]]), np.array([1.0]), direct
+    A = np.zeros((n, n))
+    b = np.zeros(n)
+    if n:
+        A[:-1, 1:] = np.eye(n - 1)
+        A[-1] = -den[:0:-1]
+        b[-1] = 1.0
+    return A, b, rest[::-1].copy(), direct
+
+
+def build_chain(model: Model) -> Chain:
+    """Arrange a model's blocks in state space.
+
+    Parameters
+    ----------
+    model : Model
+        The chain; its effects are not looked at.
+
+    Returns
+    -------
+    Chain
+        State space with taps.
+
+    Raises
+    ------
+    InputError
+        A chain without any dynamics, or of more than 12 states.
+    """
+    order = sum(len(block.dynamics.den) - 1 for block in model.blocks)
+    if not 1 <= order <= 12:
+        raise InputError(f"the chain has {order} states", where=model.name, mend="diagnosis handles 1 to 12 states")
+    plant = _plant_blocks(model)
+    A, B = np.zeros((order, order)), np.zeros((order, kernel.INPUTS))
+    taps, gains = np.zeros((5, order)), np.ones(4)
+    gains[2:] = 0.0
+    where = np.array([-1, -1, -1, 0], dtype=np.int64)
+    row, direct = np.zeros(order), np.array([1.0, 0.0, 0.0])
+    at = 0
+    edges = [order, 0]
+    for number, block in enumerate(model.blocks):
+        a, b, c, d = _realise(block)
+        n = b.size
+        if number == plant[0]:
+            taps[kernel.PLANT_IN], gains[2] = row, direct[0]
+            direct[1] = 1.0
+        if number == plant[-1] and number != plant[0]:
+            direct[2] = 1.0
+        states = slice(at, at + n)
+        A[states, states] = a
+        A[states] += np.outer(b, row)
+        B[states] += np.outer(b, direct)
+        row = d * row
+        row[states] += c
+        direct = d * direct
+        _note_signals(block, number, plant, at, c, taps, gains, where, row)
+        if block.place == "actuator" and n == 1 and number < plant[0] and where[kernel.I_ACTUATOR] < 0:
+            where[kernel.I_ACTUATOR] = at
+        if number in plant:
+            edges = [min(edges[0], at), at + n]
+        at += n
+    taps[kernel.OUTPUT], gains[3] = row, direct[0]
+    return Chain(A=A, B=B, taps=taps, gains=gains, where=where,
+                 delay_s=sum(block.dynamics.delay_s for block in model.blocks), plant=slice(*edges))  # fmt: skip
+
+
+def _plant_blocks(model: Model) -> list[int]:
+    """Return the numbers of the plant's dynamic blocks; without any, of the slowest block."""
+    dynamic = [i for i, b in enumerate(model.blocks) if len(b.dynamics.den) > 1]
+    plant = [i for i in dynamic if model.blocks[i].place == "plant"]
+
+    def slowness(i: int) -> float:
+        den = model.blocks[i].dynamics.den
+        return float("inf") if den[-1] == 0.0 else abs(den[0] / den[-1]) ** (1.0 / (len(den) - 1))
+
+    return plant or [max(dynamic, key=slowness)]
+
+
+def _note_signals(
+    block: Block,
+    number: int,
+    plant: list[int],
+    at: int,
+    c: FloatArray,
+    taps: FloatArray,
+    gains: FloatArray,
+    where: IntArray,
+    row: FloatArray,
+) -> None:
+    """Note which states are speed, position and level, and the gain from force to them."""
+    if number not in plant:
+        return
+    den, n = block.dynamics.den, c.size
+    static = block.dynamics.num[-1] / den[-1] if den[-1] != 0.0 else block.dynamics.num[-1] / den[0]
+    if number == plant[0]:
+        gains[0] = static
+        taps[kernel.FIRST_LEVEL] = row
+        if n == 2 and len(plant) == 1:
+            taps[kernel.SPEED, at + 1] = c[0]
+            where[kernel.I_SPEED] = at + 1
+            where[kernel.I_POSITION] = at
+            taps[kernel.POSITION, at] = c[0]
+            return
+    if number == plant[-1]:
+        gains[1] = static
+        taps[kernel.POSITION] = row
+        where[kernel.I_POSITION] = at if n == 1 else -1
+        if number != plant[0] and n == 1 and den[-1] == 0.0 and len(plant) >= 2:
+            taps[kernel.SPEED] = taps[kernel.FIRST_LEVEL]
+            where[kernel.I_SPEED] = at - 1
+        else:
+            where[kernel.I_LEVELS] = len(plant)

@@ -1,0 +1,98 @@
+"""Starting points for loads of the environment: when a step came, at which frequency a force swings."""
+
+from __future__ import annotations
+
+from concurrent.futures import Executor
+
+import numpy as np
+
+from autotune.arrays import FloatArray
+from autotune.diagnosis.fitting import Data, Fit
+from autotune.diagnosis.parameters import effect_with
+from autotune.diagnosis.search import Promise, promise
+from autotune.models import Effect
+
+#: Candidate times of a step per recording.
+STEP_TIMES = 24
+
+
+def step_load_starts(base: Fit, data: Data, pool: Executor) -> list[Effect]:
+    """Return the most promising step load: its time is searched on a grid, then around the best.
+
+    Parameters
+    ----------
+    base : Fit
+        What the load is added to.
+    data : Data
+        Recordings.
+    pool : Executor
+        Where simulations run.
+
+    Returns
+    -------
+    list of Effect
+        At most one ``environment.step_load``.
+    """
+    size = 0.02 * max(float(np.nanmax(np.abs(s[:, 3]))) for s in base.signals) or 1.0
+
+    def tried(times: list[tuple[int, float]]) -> Promise:
+        effects = [effect_with("environment.step_load", (size, t, 1e18, i)) for i, t in times]
+        return max(pool.map(lambda e: promise(base, e, data), effects), key=lambda p: p.decrease)
+
+    grid, step = [], 0.0
+    for i, r in enumerate(data.recordings):
+        step = r.duration_s / (STEP_TIMES + 1)
+        grid += [(i, step * (k + 1)) for k in range(STEP_TIMES)]
+    best = tried(grid)
+    for _ in range(3):
+        at, number = best.effect.parameters["time"].value, int(best.effect.parameters["recording"].value)
+        step /= 3.0
+        closer = tried([(number, at - 2 * step), (number, at - step), (number, at + step), (number, at + 2 * step)])
+        if closer.decrease > best.decrease:
+            best = closer
+    return [best.effect] if best.decrease > 0.0 else []
+
+
+def periodogram(base: Fit, data: Data) -> tuple[FloatArray, FloatArray]:
+    """Return frequencies [Hz] and the decrease of chi2 that a sinusoid common to all recordings brings at each.
+
+    Phases count from each recording's start, so that one load swings through all of them coherently. Rows are taken
+    as equidistant, which is good enough for a starting value.
+    """
+    dt = data.recordings[0].sample_time_s
+    size = 4 * int(2 ** np.ceil(np.log2(max(len(r) for r in data.recordings))))
+    total = np.zeros(size // 2 + 1, dtype=np.complex128)
+    for e in base.whitened:
+        total += np.fft.rfft(e, size)
+    rows = sum(e.size for e in base.whitened)
+    return np.asarray(np.fft.rfftfreq(size, dt)), np.asarray(2.0 * np.abs(total) ** 2 / rows)
+
+
+def periodic_load_starts(base: Fit, data: Data, lag_s: float, count: int = 3) -> list[Effect]:
+    """Return starts for a periodic load at the strongest lines of the residual.
+
+    Parameters
+    ----------
+    base : Fit
+        What the load is added to.
+    data : Data
+        Recordings.
+    lag_s : float
+        The plant's slowest lag [s]: far above its corner no load shows.
+    count : int
+        Number of lines, each with two phases.
+    """
+    duration = max(r.duration_s for r in data.recordings)
+    dt = data.recordings[0].sample_time_s
+    frequencies, power = periodogram(base, data)
+    use = (frequencies >= 1.0 / duration) & (frequencies <= min(0.2 / dt, 10.0 / lag_s))
+    frequencies, power = frequencies[use], power[use]
+    if frequencies.size < 3:
+        return []
+    inner = np.flatnonzero((power[1:-1] >= power[:-2]) & (power[1:-1] >= power[2:])) + 1
+    lines = inner[np.argsort(-power[inner])][:count]
+    size = 0.02 * max(float(np.nanmax(np.abs(s[:, 3]))) for s in base.signals) or 1.0
+    phases = ((size, 1e-3 * size), (1e-3 * size, size))
+    return [
+        effect_with("environment.periodic_load", (a, b, float(frequencies[line]))) for line in lines for a, b in phases
+    ]

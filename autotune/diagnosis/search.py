@@ -1,0 +1,187 @@
+"""Search over hypotheses: a cheap first-order look at every effect, then fits of those that promise most."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from autotune.arrays import FloatArray
+from autotune.diagnosis.catalogue import CATALOGUE, Entry, Range
+from autotune.diagnosis.fitting import Data, Fit, fit, residual_at
+from autotune.diagnosis.parameters import Parametrisation, effect_with, parametrise
+from autotune.diagnosis.simulation import Simulator
+from autotune.errors import AutotuneError
+from autotune.models import Effect, Model
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Hypothesis:
+    """Effects with the fit that has them; none for the retuned nominal structure."""
+
+    names: tuple[str, ...]
+    fit: Fit
+
+    @property
+    def parameters(self) -> int:
+        """Free numbers beyond those of the nominal structure."""
+        return sum(f.kind == "effect" for f in self.fit.parametrisation.free)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Promise:
+    """A starting point and the decrease of chi2 that the first order promises from it."""
+
+    effect: Effect
+    decrease: float
+
+
+def signal_ranges(base: Fit, data: Data) -> Range:
+    """Return the sizes of the signals in the recordings under a fitted model."""
+    sim = base.sim
+    w = np.concatenate([r.u for r in data.recordings]) - sim.u_offset
+    y = np.concatenate([r.y[g] for r, g in zip(data.recordings, data.good, strict=True)])
+    signals = np.concatenate(base.signals)
+    rates = np.abs(np.linalg.eigvals(sim.chain.A))
+    rates = rates[rates > 1e-9 * max(float(rates.max()), 1e-12)]
+    tiny = 1e-12
+
+    def largest(values: FloatArray) -> float:
+        return max(float(np.nanmax(np.abs(values))), tiny)
+
+    return Range(
+        w=largest(w),
+        f=largest(signals[:, 3]),
+        v=largest(signals[:, 1]),
+        x=largest(signals[:, 2]),
+        y=largest(y - sim.y_offset),
+        w_low=float(w.min() + sim.u_offset),
+        w_high=float(w.max() + sim.u_offset),
+        y_low=float(np.quantile(y, 0.001)),
+        y_high=float(np.quantile(y, 0.999)),
+        x_offset=sim.y_offset,
+        gain=float(sim.chain.gains[0]),
+        lag_s=1.0 / float(rates.min()),
+        dt_s=data.recordings[0].sample_time_s,
+        duration_s=max(r.duration_s for r in data.recordings),
+    )
+
+
+def applies(entry: Entry, sim: Simulator) -> bool:
+    """Whether an effect makes sense in a chain."""
+    chain = sim.chain
+    match entry.needs:
+        case "mechanical":
+            return chain.is_mechanical
+        case "level":
+            return not chain.is_mechanical and not chain.is_integrating
+        case "integrating":
+            return chain.is_integrating
+        case _:
+            return True
+
+
+def extended(base: Fit, effect: Effect, data: Data) -> tuple[Parametrisation, FloatArray, tuple[FloatArray, ...]]:
+    """Return parametrisation, starting point and start states of a fit with one more effect."""
+    old = base.parametrisation
+    fitted = base.model
+    effects = (*fitted.effects, effect)
+    size = float(np.std(np.concatenate([r.u for r in data.recordings]))) or 1.0
+    p = parametrise(replace(old.model, effects=()), effects, size, data.recordings[0].sample_time_s)
+    theta = p.centre.copy()
+    theta[: base.theta.size] = base.theta
+    # an effect's own centre is its starting value; those fitted already keep the scale of their search
+    free = (*old.free, *p.free[len(old.free) :])
+    p = replace(p, free=free, centre=np.concatenate([old.centre, p.centre[len(old.free) :]]))
+    return p, theta, carried_states(base, effect, p.with_values(theta), data)
+
+
+def carried_states(base: Fit, effect: Effect, model: Model, data: Data) -> tuple[FloatArray, ...]:
+    """Return a fit's start states with those of a block that the effect adds, at rest with its neighbour."""
+    lagged = effect.name == "actuator.asymmetric_lag" and base.sim.chain.where[0] < 0
+    if effect.name == "actuator.lag" or lagged:
+        pairs = zip(data.recordings, data.starts, strict=True)
+        first = [r.u[np.maximum(s - 1, 0)] - base.sim.u_offset for r, s in pairs]
+        return tuple(np.column_stack([u, x]) for u, x in zip(first, base.x0, strict=True))
+    if effect.name in ("sensor.lag", "plant.resonance"):
+        out = [x @ base.sim.chain.taps[3] for x in base.x0]
+        if effect.name == "sensor.lag":
+            return tuple(np.column_stack([x, y]) for x, y in zip(base.x0, out, strict=True))
+        omega = 2.0 * np.pi * effect.parameters["frequency"].value
+        return tuple(np.column_stack([x, y / omega**2, 0.0 * y]) for x, y in zip(base.x0, out, strict=True))
+    return base.x0
+
+
+def promise(base: Fit, effect: Effect, data: Data) -> Promise:
+    """Return what the first order promises when an effect is added to a fit.
+
+    The direction d = e(with effect) - e(without) is freed of what the numbers already free could explain; the decrease
+    of |e + a d|^2 over 0 <= a <= 4 is promised, at least what the effect attains as it stands.
+    """
+    p, theta, states = extended(base, effect, data)
+    try:
+        e = residual_at(p, data, theta, states)
+    except (AutotuneError, OverflowError):
+        return Promise(effect=effect, decrease=0.0)
+    if not np.all(np.isfinite(e)):
+        return Promise(effect=effect, decrease=0.0)
+    d = base.unexplained(e - base.e)
+    slope, curvature = -float(d @ base.e), float(d @ d)
+    if curvature <= 0.0:
+        return Promise(effect=effect, decrease=0.0)
+    signed = any(f.kind == "effect" and not f.positive for f in p.free[base.theta.size :])
+    a = float(np.clip(slope / curvature, -4.0 if signed else 0.0, 4.0))
+    return Promise(effect=effect, decrease=2.0 * a * slope - a * a * curvature)
+
+
+def starting_effects(entry: Entry, base: Fit, sizes: Range, data: Data) -> list[Effect]:
+    """Return the starting points of an entry for a fit on top of a base."""
+    units = {"u": base.parametrisation.model.input.unit, "y": base.parametrisation.model.output.unit}
+    plant_in = next((b.unit for b in base.parametrisation.model.blocks if b.place == "actuator" and b.unit), units["u"])
+    units |= {"f": plant_in, "v": f"{units['y']}/s"}
+    named = [q.unit.format(**units) for q in entry.parameters]
+    return [effect_with(entry.name, values, named) for values in entry.starts(sizes)]
+
+
+def best_promises(
+    base: Fit, data: Data, entries: Iterable[Entry], pool: Executor, extra: Sequence[Effect] = ()
+) -> dict[str, list[Promise]]:
+    """Return each entry's promises on top of a base, best first."""
+    sizes = signal_ranges(base, data)
+    present = {e.name for e in base.model.effects}
+    effects = [
+        effect
+        for entry in entries
+        if entry.name not in present and applies(entry, base.sim)
+        for effect in starting_effects(entry, base, sizes, data)
+    ]
+    effects += [e for e in extra if e.name not in present]
+    found: dict[str, list[Promise]] = {}
+    for result in pool.map(lambda effect: promise(base, effect, data), effects):
+        found.setdefault(result.effect.name, []).append(result)
+    return {name: sorted(group, key=lambda g: -g.decrease) for name, group in found.items()}
+
+
+def fit_extended(base: Fit, effect: Effect, data: Data, iterations: int = 30) -> Hypothesis:
+    """Fit a base with one more effect."""
+    p, theta, states = extended(base, effect, data)
+    result = fit(p, data, theta, states, iterations=iterations, inherit=base)
+    return Hypothesis(names=tuple(e.name for e in p.model.effects), fit=result)
+
+
+def extend(
+    base: Hypothesis, data: Data, pool: Executor, entries: Iterable[Entry] | None = None, most: int = 10,
+    extra: Sequence[Effect] = (),
+) -> list[Hypothesis]:  # fmt: skip
+    """Fit the most promising effects on top of a base, best first."""
+    promises = best_promises(base.fit, data, CATALOGUE.values() if entries is None else entries, pool, extra)
+    ranked = sorted(promises.values(), key=lambda group: -group[0].decrease)
+    starts = [p.effect for group in ranked[:most] for p in group[:2] if p.decrease > 0.0]
+    fits: dict[str, Hypothesis] = {}
+    for h in pool.map(lambda effect: fit_extended(base.fit, effect, data), starts):
+        known = fits.get(h.names[-1])
+        if known is None or h.fit.cost < known.fit.cost:
+            fits[h.names[-1]] = h
+    return sorted(fits.values(), key=lambda h: h.fit.cost)

@@ -1,0 +1,254 @@
+"""Which physics is missing: the nominal structure retuned, effects added in ones, twos and threes, then judged."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import Executor, ThreadPoolExecutor
+from dataclasses import dataclass, replace
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from autotune.arrays import BoolArray, FloatArray
+from autotune.diagnosis.catalogue import CATALOGUE, Entry
+from autotune.diagnosis.fitting import Data, Fit, fit, start_states
+from autotune.diagnosis.loads import periodic_load_starts, step_load_starts
+from autotune.diagnosis.noise import Noise, autoregressive, noise_from_differences
+from autotune.diagnosis.parameters import parametrise
+from autotune.diagnosis.search import Hypothesis, extend
+from autotune.diagnosis.windows import LAGS_PER_WINDOW, slowest_lag_s, window_rows
+from autotune.models import Model
+from autotune.recording import Recording
+
+#: Decrease of chi2 that an effect must bring: what chance brings among some eighty directions, with a margin for
+#: noise whose slow part is a fifth stronger than its fast part lets expect.
+LEAST_DECREASE = 30.0
+#: Rows on which hypotheses are screened; those that lead are fitted to all.
+SCREENING_ROWS = 4500
+Report = Callable[[str, float], None]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Search:
+    """Everything that the search found.
+
+    Attributes
+    ----------
+    data : Data
+        Recordings with windows and noise.
+    nominal : Fit
+        Nominal numbers, start states fitted.
+    retuned : Hypothesis
+        Nominal structure, numbers fitted.
+    singles, pairs, triples : tuple of Hypothesis
+        Hypotheses fitted, best first.
+    chosen : Hypothesis
+        The one that the data ask for; the retuned model where no effect is needed.
+    """
+
+    data: Data
+    nominal: Fit
+    retuned: Hypothesis
+    singles: tuple[Hypothesis, ...]
+    pairs: tuple[Hypothesis, ...]
+    triples: tuple[Hypothesis, ...]
+    chosen: Hypothesis
+
+
+def prepare(model: Model, recordings: Sequence[Recording], good: Sequence[BoolArray]) -> tuple[Data, Fit]:
+    """Retune the nominal structure, and estimate the noise from what it leaves.
+
+    Parameters
+    ----------
+    model : Model
+        Nominal model without effects.
+    recordings : sequence of Recording
+        What was measured.
+    good : sequence of (N,) bool array
+        Rows whose reading counts.
+
+    Returns
+    -------
+    data, retuned
+        Data with windows and noise, and the fit.
+    """
+    length = LAGS_PER_WINDOW * slowest_lag_s(model)
+    noise = floored(noise_from_differences([r.y for r in recordings], good), recordings)
+    windows = [window_rows(r, length) for r in recordings]
+    data = Data(
+        recordings=tuple(recordings),
+        good=tuple(good),
+        starts=tuple(starts for starts, _ in windows),
+        stops=tuple(stops for _, stops in windows),
+        noise=noise,
+    )
+    size = float(np.std(np.concatenate([r.u for r in recordings]))) or 1.0
+    p = parametrise(model, [], size, recordings[0].sample_time_s)
+    result: Fit | None = None
+    for _ in range(2):
+        result = fit(p, data, None if result is None else result.theta, None if result is None else result.x0)
+        data = replace(data, noise=floored(noise_from_differences(result.residuals, data.good), recordings))
+    assert result is not None
+    return data, fit(p, data, result.theta, result.x0)
+
+
+def floored(noise: Noise, recordings: Sequence[Recording]) -> Noise:
+    """Return the noise, at least a millionth of the signal's spread: recordings without noise must not divide by 0."""
+    spread = max(float(np.nanstd(r.y)) for r in recordings)
+    least = 1e-6 * spread or 1e-12
+    return noise if noise.sd >= least else Noise(sd=least)
+
+
+def polish(h: Hypothesis, data: Data, base: Fit, rounds: int = 4) -> Hypothesis:
+    """Fit a hypothesis of the screening to all data: the start states it has not seen first, then everything."""
+    p = h.fit.parametrisation
+    none = np.zeros(h.fit.theta.size, dtype=bool)
+    settled = fit(p, data, h.fit.theta, states_for(h.fit, data, base), free=none)
+    return replace(h, fit=fit(p, data, h.fit.theta, settled.x0, iterations=30, rounds=rounds))
+
+
+def states_for(result: Fit, data: Data, base: Fit) -> tuple[FloatArray, ...]:
+    """Return start states for all windows: a fit's own where it has the window, else the base's or rest."""
+    states = start_states(result.sim, data)
+    if states[0].shape == base.x0[0].shape:
+        states = [x.copy() for x in base.x0]
+    for full, starts, x0, known in zip(states, data.starts, result.x0, result.starts, strict=True):
+        full[np.searchsorted(starts, known)] = x0
+    return tuple(states)
+
+
+def search(
+    model: Model,
+    recordings: Sequence[Recording],
+    good: Sequence[BoolArray],
+    without: Sequence[str] = (),
+    report: Report = lambda what, share: None,
+) -> Search:
+    """Search for the physics that is missing.
+
+    Parameters
+    ----------
+    model : Model
+        Nominal model.
+    recordings, good : sequences
+        What was measured, and which rows count.
+    without : sequence of str
+        Effects left out of the catalogue.
+    report : callable
+        Told what is being done and the share done, 0 to 1.
+
+    Returns
+    -------
+    Search
+        All hypotheses with their fits.
+
+    Notes
+    -----
+    Forward search with a beam: pairs are built on the best four singles, whether or not these help alone, so that
+    partners that only help together are found as long as one of them is among the four.
+    """
+    entries = [entry for name, entry in CATALOGUE.items() if name not in without]
+    with threadpool_limits(1), ThreadPoolExecutor(2) as pool:
+        report("retuning", 0.0)
+        data, base = prepare(model, recordings, good)
+        nominal = fit(base.parametrisation, data, x0=base.x0, free=np.zeros(base.theta.size, dtype=bool))
+        retuned = Hypothesis(names=(), fit=base)
+        few = data.thinned(SCREENING_ROWS)
+        screen = retuned if few is data else Hypothesis(names=(), fit=fit(base.parametrisation, few, base.theta))
+        report("single effects", 0.1)
+        candidates = grown(screen, few, pool, entries, most=7)
+        singles = polished(candidates, 3, data, base, pool)
+        chosen = retuned
+        if not singles or not (worth(retuned, singles[0]) or misfit(base, data) > 1.1):
+            return _found(data, nominal, retuned, singles, (), (), chosen)
+        if worth(retuned, singles[0]):
+            chosen = singles[0]
+        report("pairs of effects", 0.4)
+        wider = _larger(candidates, 3, few, pool, entries)
+        pairs = polished(wider, 2, data, base, pool)
+        triples: list[Hypothesis] = []
+        if pairs and worth(singles[0], pairs[0]) and worth(retuned, pairs[0]):
+            chosen = pairs[0]
+            if misfit(pairs[0].fit, data) > 1.05:
+                report("three effects", 0.8)
+                triples = polished(_larger(wider, 1, few, pool, entries), 1, data, base, pool)
+            if triples and worth(pairs[0], triples[0]):
+                chosen = triples[0]
+        return _found(data, nominal, retuned, singles, pairs, triples, chosen)
+
+
+def polished(ranked: Sequence[Hypothesis], count: int, data: Data, base: Fit, pool: Executor) -> list[Hypothesis]:
+    """Return the best hypotheses fitted to all data, best first."""
+    return sorted(pool.map(lambda h: polish(h, data, base), ranked[:count]), key=score)
+
+
+def _found(
+    data: Data,
+    nominal: Fit,
+    retuned: Hypothesis,
+    singles: Sequence[Hypothesis],
+    pairs: Sequence[Hypothesis],
+    triples: Sequence[Hypothesis],
+    chosen: Hypothesis,
+) -> Search:
+    return Search(
+        data=data, nominal=nominal, retuned=retuned, singles=tuple(singles), pairs=tuple(pairs),
+        triples=tuple(triples), chosen=chosen,
+    )  # fmt: skip
+
+
+def grown(base: Hypothesis, data: Data, pool: Executor, entries: Sequence[Entry], most: int) -> list[Hypothesis]:
+    """Return fits of a base with one more effect, loads of the environment at times and frequencies of their own."""
+    names = {entry.name for entry in entries}
+    extra = []
+    if "environment.step_load" in names:
+        extra += step_load_starts(base.fit, data, pool)
+    if "environment.periodic_load" in names:
+        extra += periodic_load_starts(base.fit, data, slowest_lag_s(base.fit.parametrisation.model))
+    return extend(base, data, pool, entries, most=most, extra=extra)
+
+
+def _larger(
+    bases: Sequence[Hypothesis], beam: int, data: Data, pool: Executor, entries: Sequence[Entry]
+) -> list[Hypothesis]:
+    """Return fits with one effect more than the best bases have, best first."""
+    found: dict[frozenset[str], Hypothesis] = {}
+    for base in bases[:beam]:
+        for h in grown(base, data, pool, entries, most=4):
+            key = frozenset(h.names)
+            if key not in found or score(h) < score(found[key]):
+                found[key] = h
+    return sorted(found.values(), key=score)
+
+
+def score(h: Hypothesis) -> float:
+    """Return the cost with what the effects' free numbers have to pay: ln N each."""
+    return h.fit.cost + h.parameters * float(np.log(h.fit.rows))
+
+
+def worth(smaller: Hypothesis, larger: Hypothesis) -> bool:
+    """Whether a larger hypothesis explains enough more to be believed."""
+    excess = max(1.0, larger.fit.chi2 / larger.fit.rows)
+    return score(smaller) - score(larger) > LEAST_DECREASE * excess
+
+
+def misfit(result: Fit, data: Data) -> float:
+    """Return the residual's variance in units of the noise that its own row-to-row jitter shows."""
+    noise = floored(noise_from_differences(result.residuals, data.good), data.recordings)
+    e = np.concatenate(replace(data, noise=noise).whitened(list(result.residuals)))
+    states = sum(Q.shape[1] for Q in result.states_explain)
+    return float(e @ e) / max(data.rows - states - result.theta.size, 1)
+
+
+def whiteness(result: Fit, data: Data) -> float:
+    """Return the residual's slow power in units of what noise has, after an AR(2) has taken its share."""
+    noise = floored(autoregressive(result.residuals, data.good), data.recordings)
+    slow = expected = 0.0
+    for e, starts in zip(replace(data, noise=noise).whitened(list(result.residuals)), data.starts, strict=True):
+        for part in np.split(e, starts[1:]):
+            width = max(4, part.size // 24)
+            count = part.size // width
+            means = part[: count * width].reshape(count, width).mean(axis=1) * np.sqrt(width)
+            slow += float(means @ means)
+            expected += count
+    return float(slow / max(expected, 1.0))
