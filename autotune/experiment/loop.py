@@ -25,6 +25,8 @@ from autotune.recording import RecordingWriter
 SLICE_S = 0.1
 #: samples behind the schedule at which the loop gives up: a command that late belongs to another plant state
 LATE_SAMPLES = 10
+#: what lies at least between two rows [s], where a virtual clock stands still
+SHORTLY_S = 1e-6
 SAFE, UNSAFE = "safe output", "not confirmed: the link failed, the device's own dead-man timer has to act"
 
 
@@ -284,9 +286,8 @@ class ControlLoop:
         t_s, y = self._reading.t_s - self._start_s, self._reading.y
         written_s = self._record.t[-1] if self._record.t else -math.inf
         if t_s <= written_s:
-            t_s, y = self.rig.clock.now() - self._start_s, math.nan
-        if t_s > written_s:
-            self._writer.append((t_s, self.envelope.settings.u_safe, y, *(math.nan for _ in self._extra)))
+            t_s, y = max(self.rig.clock.now() - self._start_s, written_s + SHORTLY_S), math.nan
+        self._writer.append((t_s, self.envelope.settings.u_safe, y, *(math.nan for _ in self._extra)))
 
 
 def _reason(error: BaseException | None) -> dict[str, Any]:

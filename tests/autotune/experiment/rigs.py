@@ -1,0 +1,36 @@
+"""Ball rigs and configurations that the experiment's tests share."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from autotune.config import Config, load_config
+from autotune.experiment.loop import ControlLoop
+from autotune.experiment.run import envelope_of
+from autotune.recording import RecordingWriter
+from drivers.simulated import SimulatedRig
+from sim.ball import make_ball
+from sim.imperfections import Fault, FaultyPlant
+
+CONFIG = Path(__file__).resolve().parents[3] / "configs" / "ball_sim.toml"
+
+
+def ball_config(**sections: dict[str, Any]) -> Config:
+    """Return the ball's configuration with some keys of some sections replaced."""
+    config = load_config(CONFIG)
+    return config.model_copy(
+        update={name: getattr(config, name).model_copy(update=keys) for name, keys in sections.items()}
+    )
+
+
+def ball_rig(*, seed: int = 1, noise: float = 0.35, faults: Sequence[Fault] = ()) -> SimulatedRig:
+    """Return a ball on the floor, behind faults."""
+    return SimulatedRig(FaultyPlant(make_ball(seed=seed, noise=noise), faults), u_safe=0.0)
+
+
+def open_loop(rig: SimulatedRig, recording: Path, config: Config | None = None) -> ControlLoop:
+    """Return a control loop on the rig that writes the recording, not yet entered."""
+    writer = RecordingWriter(recording, ("t", "u", "y"))
+    return ControlLoop(rig=rig, envelope=envelope_of(config or ball_config()), writer=writer)

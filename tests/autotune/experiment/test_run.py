@@ -1,0 +1,216 @@
+from __future__ import annotations
+
+import math
+import signal
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from autotune.errors import ExperimentStopped, LinkError
+from autotune.experiment.result import ExperimentResult, Progress, State
+from autotune.experiment.run import float_on, run_experiment
+from autotune.recording import read_recording
+from drivers.simulated import SimulatedRig
+from sim.imperfections import Fault
+from tests.autotune.experiment.rigs import CONFIG, ball_config, ball_rig, open_loop
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> tuple[ExperimentResult, SimulatedRig, Path, list[Progress]]:
+    recording = tmp_path_factory.mktemp("run") / "recording.csv"
+    rig = ball_rig(seed=7)
+    told: list[Progress] = []
+    return run_experiment(rig, ball_config(), recording, on_progress=told.append), rig, recording, told
+
+
+Finished = tuple[ExperimentResult, SimulatedRig, Path, list[Progress]]
+
+
+def test_five_points_in_the_wanted_range_within_their_regions(finished: Finished) -> None:
+    result, rig, _, _ = finished
+    omega = np.array([point.omega_rad_s for point in result.points])
+    truth = rig.plant.response(omega)
+    assert len(omega) == 5
+    assert np.all((np.degrees(np.angle(-truth)) < -105.0) & (np.degrees(np.angle(-truth)) > -160.0))
+    for point, value in zip(result.points, truth, strict=True):
+        miss = point.response - value
+        vector = np.array([miss.real, miss.imag])
+        # all five regions together hold with 99.99 %
+        assert vector @ np.linalg.solve(np.array(point.covariance), vector) < -2.0 * math.log(2e-5)
+        assert abs(miss) < 0.03 * abs(value)
+
+
+def test_the_hover_voltage_the_noise_and_the_sign_are_found(finished: Finished) -> None:
+    result, rig, _, _ = finished
+    assert result.u_rest == pytest.approx(rig.plant.u_rest, abs=0.002)
+    assert result.u_rest_sd < 0.001
+    assert result.noise_sd == pytest.approx(0.35 / math.sqrt(3.0), rel=0.1)
+    assert result.plant_sign == -1
+    assert result.sweep_time_s <= 60.0
+
+
+def test_the_recording_tells_the_whole_procedure(finished: Finished) -> None:
+    result, _, path, _ = finished
+    recording = read_recording(path)
+    states = [state["name"] for state in recording.metadata["states"]]
+    assert states == ["preflight", "approach", "find the mid-point", "relay sweep", "hand back"]
+    assert [one["start_s"] for one in recording.metadata["relay"]] == [s.start_s for s in result.segments]
+    assert recording.metadata["ended"]["reason"] == "completed"
+    # every command lies on the converter's grid
+    steps = recording.u / ball_config().signals.u_step
+    assert steps == pytest.approx(np.round(steps), abs=1e-6)
+
+
+def test_the_ball_stays_within_the_swing(finished: Finished) -> None:
+    result, _, path, _ = finished
+    recording = read_recording(path).between(result.segments[0].start_s, result.segments[-1].end_s)
+    assert np.abs(recording.y - 5.0).max() < 3.0 + 0.36
+
+
+def test_progress_says_how_long_it_will_take(finished: Finished) -> None:
+    _, _, _, told = finished
+    sweeping = [one for one in told if one.state is State.SWEEP and math.isfinite(one.remaining_s)]
+    assert len(sweeping) >= 5
+    assert all(0.0 <= one.fraction <= 1.0 for one in told)
+    assert sweeping[0].remaining_s == pytest.approx(55.0, abs=8.0)
+
+
+def test_the_describing_function_is_shown_with_its_error(finished: Finished) -> None:
+    result, _, _, _ = finished
+    for segment in result.segments:
+        # first-harmonic formulas: the hysteresis and the hold turn the phase, the relay's third harmonic the gain
+        assert 0.0 < segment.describing.gain_error < 0.6
+        assert segment.describing.phase_error_rad < 0.0
+
+
+def test_without_noise_the_points_are_exact(tmp_path: Path) -> None:
+    rig = ball_rig(noise=0.0)
+    result = run_experiment(rig, ball_config(), tmp_path / "r.csv")
+    for point in result.points:
+        ratio = point.response / rig.plant.response(np.array([point.omega_rad_s]))[0]
+        assert abs(abs(ratio) - 1.0) < 1e-3
+        assert abs(math.degrees(math.atan2(ratio.imag, ratio.real))) < 0.1
+
+
+def test_a_ball_left_on_the_floor_is_floated_again_from_a_known_hover_voltage(tmp_path: Path) -> None:
+    rig = ball_rig(seed=3)
+    with open_loop(rig, tmp_path / "r.csv") as loop:
+        known = float_on(loop, ball_config(), u_rest=rig.plant.u_rest)
+        assert abs(rig.plant.y_true - 5.0) < 3.0
+        assert known.midpoint == pytest.approx(rig.plant.u_rest, abs=0.03)
+
+
+FAULTS = {
+    "stale sensor": [Fault(kind="frozen sensor", start_s=20.0)],
+    "not a number": [Fault(kind="not a number", start_s=20.0)],
+    "the sensor jumps": [Fault(kind="sensor at full scale", start_s=20.0, value=10.0)],
+    "does not follow": [Fault(kind="stuck actuator", start_s=20.0)],
+    "the device applies": [Fault(kind="saturated actuator", value=4.0)],
+    "does not answer": [Fault(kind="frozen sensor")],
+    "wrong sign": [Fault(kind="inverted actuator", value=5.0)],
+    "link cut": [Fault(kind="cut link", start_s=20.0)],
+}
+
+
+@pytest.mark.parametrize("verdict", FAULTS)
+def test_every_fault_has_its_verdict_ends_safe_and_keeps_the_recording(verdict: str, tmp_path: Path) -> None:
+    rig = ball_rig(faults=FAULTS[verdict])
+    with pytest.raises(ExperimentStopped, match=verdict) as stop:
+        run_experiment(rig, ball_config(), tmp_path / "r.csv")
+    assert stop.value.exit_status == 3
+    assert "\n" not in str(stop.value)
+    assert stop.value.mend
+    assert rig.command == 0.0
+    recording = read_recording(tmp_path / "r.csv")
+    assert recording.u[-1] == 0.0
+    assert recording.metadata["ended"]["reason"] == str(stop.value)
+
+
+@pytest.mark.parametrize("value", [0.0, 10.0])
+def test_spikes_of_the_sensor_are_survived(value: float, tmp_path: Path) -> None:
+    rig = ball_rig(seed=2, faults=[Fault(kind="spikes", value=value)])
+    result = run_experiment(rig, ball_config(), tmp_path / "r.csv")
+    for point in result.points:
+        truth = rig.plant.response(np.array([point.omega_rad_s]))[0]
+        assert abs(point.response - truth) < 0.05 * abs(truth)
+    assert result.timing.unusable > 100
+
+
+def test_a_sign_that_contradicts_the_configuration_is_named(tmp_path: Path) -> None:
+    with pytest.raises(ExperimentStopped, match="wrong sign"):
+        run_experiment(ball_rig(), ball_config(operating_point={"plant_sign": 1}), tmp_path / "r.csv")
+
+
+def test_a_sensor_that_is_more_noise_than_swing_is_named(tmp_path: Path) -> None:
+    with pytest.raises(ExperimentStopped, match="drowned in noise"):
+        run_experiment(ball_rig(noise=3.0), ball_config(), tmp_path / "r.csv")
+
+
+def test_a_hover_voltage_outside_its_bracket_is_named(tmp_path: Path) -> None:
+    with pytest.raises(ExperimentStopped, match="does not answer"):
+        run_experiment(ball_rig(), ball_config(operating_point={"u_guess": 3.5}), tmp_path / "r.csv")
+
+
+def test_a_link_that_is_cut_from_the_start_refuses_before_anything_moves(tmp_path: Path) -> None:
+    with pytest.raises(LinkError):
+        run_experiment(ball_rig(faults=[Fault(kind="cut link")]), ball_config(), tmp_path / "r.csv")
+    assert "link cut" in (tmp_path / "r.toml").read_text()
+
+
+CHILD = """
+import sys
+from autotune.errors import AutotuneError
+from autotune.config import load_config
+from autotune.experiment.run import run_experiment
+from drivers.simulated import SimulatedRig
+from sim.ball import make_ball
+
+def wait(progress):
+    if progress.state.value == "relay sweep":
+        print("sweeping", flush=True)
+        sys.stdin.readline()
+
+rig = SimulatedRig(make_ball(seed=1), u_safe=0.0)
+try:
+    run_experiment(rig, load_config(sys.argv[1]), sys.argv[2], on_progress=wait)
+except AutotuneError as error:
+    print(error, rig.command, flush=True)
+    sys.exit(error.exit_status)
+"""
+
+
+def stopped_by(number: signal.Signals, recording: Path) -> tuple[int, str]:
+    """Start an experiment in a child, stop it in its sweep, and return its exit status and last words."""
+    command: Sequence[str] = (sys.executable, "-c", CHILD, str(CONFIG), str(recording))
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as child:
+        assert child.stdout is not None
+        assert child.stdout.readline() == "sweeping\n"
+        child.send_signal(number)
+        words, _ = child.communicate("\n")
+        return child.returncode, words
+
+
+@pytest.mark.parametrize(("number", "name"), [(signal.SIGINT, "Ctrl-C"), (signal.SIGTERM, "SIGTERM")])
+def test_a_stopped_process_leaves_the_rig_safe_with_status_130(
+    number: signal.Signals, name: str, tmp_path: Path
+) -> None:
+    status, words = stopped_by(number, tmp_path / "r.csv")
+    assert status == 130
+    assert words.startswith(f"relay sweep: stopped by {name}")
+    assert words.endswith("0.0\n")  # the rig's command
+    recording = read_recording(tmp_path / "r.csv")
+    assert recording.u[-1] == 0.0
+    assert recording.metadata["ended"]["exit_status"] == 130
+
+
+def test_a_killed_process_leaves_a_readable_recording(tmp_path: Path) -> None:
+    status, _ = stopped_by(signal.SIGKILL, tmp_path / "r.csv")
+    assert status == -signal.SIGKILL
+    recording = read_recording(tmp_path / "r.csv")
+    assert len(recording) > 500
+    assert np.all(np.isfinite(recording.y))
+    assert "killed" in recording.metadata["ended"]["reason"]
