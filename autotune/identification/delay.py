@@ -11,7 +11,7 @@ from collections.abc import Callable
 import numpy as np
 
 from autotune.errors import IdentificationError, InputError
-from autotune.identification.delay_data import DelayData, PastInput, prepare
+from autotune.identification.delay_data import DelayData, PastInput, input_period, prepare
 from autotune.identification.delay_model import DelayModel
 from autotune.identification.delay_search import binned, search
 from autotune.identification.output_error import Point, Structure, finish, minimise, polish, solve_linear
@@ -19,7 +19,9 @@ from autotune.models import Hold
 from autotune.recording import Recording
 
 _MIDDLE_BINS = 6000
+_UNDETERMINED = 0.5  # relative standard deviation of b
 _COMPARED = 3
+_ALIKE = 6.0  # residual variances: a hundredth of the rightful minimum's chance
 MAX_ORDER = 4
 
 
@@ -34,6 +36,7 @@ def identify_delay(
     integrator: bool = False,
     offset: bool = True,
     coloured: bool = True,
+    start: DelayModel | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> DelayModel:
     """Estimate coefficients, gain, delay, operating point and initial state, with their covariance.
@@ -45,7 +48,8 @@ def identify_delay(
     order : int
         Order n, 1 to 4.
     max_delay_s : float, optional
-        Largest delay considered [s]; half the record where not given.
+        Largest delay considered [s]. Where not given, half the record, or half the period where u is periodic: a
+        relay's limit cycle looks the same with half a period more of delay and b reversed.
     hold : {"zero", "linear"}, optional
         How u runs between rows; the sidecar's ``hold`` where not given, else zero-order hold.
     past_input : {"unknown", "held", "zero"}
@@ -58,6 +62,8 @@ def identify_delay(
         Whether a constant d is estimated: an offset of y or u, or a constant load.
     coloured : bool
         Whether the noise may be autoregressive; white is assumed otherwise.
+    start : DelayModel, optional
+        A model to begin with instead of the search, as when a window of a record follows another.
     progress : callable, optional
         Called with what is done next.
 
@@ -92,6 +98,9 @@ def identify_delay(
     largest = _largest_delay(data, max_delay_s)
     if data.ty.size < 3 * structure.parameters:
         raise _too_short(data, structure)
+    if start is not None:
+        near = Point(a=start.a, h=start.delay_s, theta=np.zeros(2 + order), cost=np.inf, rows=0)
+        return _polish_on_all_rows(data, data, structure, near, largest, coloured)
     say("searching the delay")
     candidates = search(data, structure, max_delay_s=largest)
     finest = min(c.rows_per_bin for c in candidates)
@@ -104,7 +113,8 @@ def identify_delay(
 def _largest_delay(data: DelayData, max_delay_s: float | None) -> float:
     reach = float(data.ty[-1] - data.tu[0])
     if max_delay_s is None:
-        return 0.5 * reach
+        period = input_period(data)
+        return 0.5 * reach if np.isnan(period) else min(0.5 * reach, 0.5 * period)
     if not 0.0 <= max_delay_s < reach:
         raise InputError(
             f"largest delay {max_delay_s:g} s lies outside the record of {reach:.4g} s",
@@ -127,6 +137,9 @@ def _best_on_common_rows(data: DelayData, structure: Structure, candidates: list
         if start.cost < 4.0 * starts[0].cost
     ]
     best = min(fitted, key=lambda point: point.cost, default=starts[0])
+    # of those that explain the record alike, as under a periodic input, the shortest delay
+    alike = [point for point in fitted if point.cost <= best.cost * (1.0 + _ALIKE / best.rows)]
+    best = min(alike, key=lambda point: point.h, default=best)
     if not np.isfinite(best.cost):
         raise IdentificationError(
             f"no model of order {structure.order} explains the record with a finite response",
@@ -154,6 +167,7 @@ def _polish_on_all_rows(
     limit = min(best.h + 6.0 * float(sd) + 2.0 * step, largest)
     model = polish(data.usable_from(limit), structure, best, max_delay_s=limit, coloured=coloured)
     _require_inside(data, model, largest)
+    _require_determined(data, model)
     return model
 
 
@@ -163,6 +177,20 @@ def _require_inside(data: DelayData, model: DelayModel, largest: float) -> None:
             f"the delay lies at or beyond the largest one considered, {largest:.4g} s",
             where=data.name,
             mend="give a larger --max-delay, and a record several times as long as the delay",
+        )
+
+
+def _require_determined(data: DelayData, model: DelayModel) -> None:
+    sd = model.standard_deviations
+    n = model.order
+    if sd[n] > _UNDETERMINED * abs(model.b):
+        period = input_period(data)
+        excites = "" if np.isnan(period) else f"; u repeats every {period:.3g} s and excites few frequencies"
+        raise IdentificationError(
+            f"the record does not determine order {n}: b = {model.b:.3g} with a standard deviation of {sd[n]:.2g}, "
+            f"delay {model.delay_s:.3g} +- {1.96 * sd[n + 1]:.2g} s{excites}",
+            where=data.name,
+            mend="ask for a lower order, move u further, or add a step or relay cycles at two more inserted delays",
         )
 
 

@@ -156,3 +156,32 @@ def _require_motion(u: FloatArray, y: FloatArray, name: str) -> None:
             where=name,
             mend="check the sensor and the actuator, or move u further than the sensor's resolution",
         )
+
+
+def input_period(data: DelayData) -> float:
+    """Return the period u nearly repeats with [s], or NaN; h is then known up to half of it, with b's sign reversed.
+
+    Notes
+    -----
+    Correlation above 0.9 with itself a period later, or below -0.9 half a period later, as in a limit cycle under a
+    relay. Records are looked at in 8192 bins: shorter periods go unnoticed.
+    """
+    count = min(8192, data.tu.size)
+    grid = np.linspace(data.tu[0], data.tu[-1], count)
+    held = np.clip(np.searchsorted(data.tu, grid, side="right") - 1, 0, None)
+    u = data.u[held] - np.mean(data.u[held])
+    spectrum = np.fft.rfft(u, 2 * count)
+    products = np.fft.irfft(np.abs(spectrum) ** 2)[: count // 2]
+    energy = np.concatenate([[0.0], np.cumsum(u**2)])
+    lags = np.arange(count // 2)
+    correlation = products / np.sqrt((energy[count - lags]) * (energy[-1] - energy[lags]) + 1e-300)
+    fallen = np.flatnonzero(np.abs(correlation) < 0.5)
+    if fallen.size == 0:
+        return float("nan")
+    again = np.flatnonzero(np.abs(correlation[fallen[0] :]) > 0.9)
+    if again.size == 0:
+        return float("nan")
+    first = fallen[0] + int(again[0])
+    while first + 1 < correlation.size and abs(correlation[first + 1]) > abs(correlation[first]):
+        first += 1
+    return float((2.0 if correlation[first] < 0 else 1.0) * first * (grid[1] - grid[0]))

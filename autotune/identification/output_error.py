@@ -326,7 +326,7 @@ def _singular(data: DelayData, structure: Structure, information: FloatArray) ->
     _, vectors = np.linalg.eigh(information / np.outer(scale, scale))
     worst = [names[i] for i in np.argsort(-np.abs(vectors[:, 0]))[:3]]
     return IdentificationError(
-        f"{', '.join(worst)} cannot be told apart: the input excites too few frequencies for order {n}",
+        f"the record does not determine order {n}: {', '.join(worst)} cannot be told apart",
         where=data.name,
-        mend="record a step or a relay at two more delays, or ask for a lower order",
+        mend="ask for a lower order, or excite more frequencies: a step, or relay cycles at two more inserted delays",
     )

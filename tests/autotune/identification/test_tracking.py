@@ -1,0 +1,120 @@
+"""The watched loop: parameters over time, their bands, the advice, and the commands."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from autotune.cli import app
+from autotune.controller import PIDController, write_controller
+from autotune.errors import InputError
+from autotune.identification.delay import identify_delay
+from autotune.identification.tracking import quantities, track
+from autotune.recording import Recording, write_recording
+from autotune.watch import advise
+
+
+def loop_in_operation(seed: int = 0, delay_after: float = 0.4) -> Recording:
+    """A PI loop around 2 exp(-0.4 s)/((1 + 2 s)(1 + 0.5 s)) under set-point changes; the dead time moves at 150 s."""
+    from scipy.signal import cont2discrete, tf2ss
+
+    dt = 0.02
+    rng = np.random.default_rng(seed)
+    A, B, C, _, _ = cont2discrete(tf2ss([2.0], np.polymul([2.0, 1.0], [0.5, 1.0])), dt)
+    t = np.arange(15000) * dt
+    r = np.repeat(rng.uniform(-1.0, 1.0, t.size // 250), 250)
+    u, y, x, integral = np.zeros(t.size), np.zeros(t.size), np.zeros(2), 0.0
+    for k in range(t.size):
+        y[k] = float((C @ x)[0]) + 0.01 * rng.standard_normal()
+        e = r[k] - y[k]
+        integral += dt * e
+        u[k] = 0.8 * (e + integral / 2.2)
+        lag = round((0.4 if t[k] < 150.0 else delay_after) / dt)
+        x = A @ x + B[:, 0] * (u[k - lag] if k >= lag else 0.0)
+    return Recording(t=t, u=u + 4.0, y=y + 10.0, name="loop")
+
+
+DEPLOYED = PIDController(K=0.8, Ti_s=2.2)
+
+
+@pytest.fixture(scope="module")
+def drifting() -> Recording:
+    return loop_in_operation(delay_after=1.2)
+
+
+def test_windows_follow_a_dead_time_that_moves_in_closed_loop(drifting):
+    fits = list(track(drifting, 2, window_s=60.0, every_s=30.0, max_delay_s=5.0))
+    models = {fit.end_s: fit.model for fit in fits}
+    for end_s, delay_s in ((60.0, 0.4), (120.0, 0.4), (240.0, 1.2), (270.0, 1.2)):
+        model = models[end_s]
+        assert model is not None
+        found = {q.name: q for q in quantities(model)}
+        truth = {"gain": 2.0, "dead time": delay_s, "time constant 1": 2.0, "time constant 2": 0.5}
+        for name, value in truth.items():
+            assert abs(found[name].value - value) < 5.0 * found[name].sd
+            assert found[name].sd < 0.1 * value
+
+
+def test_advice_changes_with_the_plant(drifting):
+    before = identify_delay(drifting.between(0.0, 140.0), 2, max_delay_s=5.0)
+    after = identify_delay(drifting.between(160.0, 300.0), 2, max_delay_s=5.0)
+    required = {"modulus_margin": 0.5, "phase_margin_rad": np.pi / 4}
+    assert advise(before, DEPLOYED, **required).verdict == "keep"
+    assert advise(after, DEPLOYED, **required).verdict == "retune"
+    assert advise(before, PIDController(K=-0.8, Ti_s=2.2), **required).verdict == "retune"  # unstable: wrong sign
+
+
+def test_bands_cover_the_truth():
+    """95 % intervals of gain, dead time and time constants over loops with their own noise and set-points."""
+    truth = np.array([2.0, 0.4, 2.0, 0.5])
+    inside = []
+    for seed in range(20):
+        record = loop_in_operation(seed).between(0.0, 60.0)
+        found = quantities(identify_delay(record, 2, max_delay_s=3.0))
+        value, sd = np.array([q.value for q in found]), np.array([q.sd for q in found])
+        inside.append(np.abs(value - truth) < 1.96 * sd)
+    assert np.mean(inside) > 0.86
+
+
+def test_an_unexcited_window_is_reported_with_its_reason():
+    record = loop_in_operation()
+    still = Recording(t=record.t, u=np.where(record.t > 100.0, 4.0, record.u), y=record.y)
+    fits = list(track(still, 2, window_s=40.0, every_s=40.0, max_delay_s=5.0))
+    assert fits[0].model is not None
+    assert fits[-1].model is None
+    assert "constant" in fits[-1].reason
+
+
+def test_a_window_longer_than_the_record_is_refused():
+    with pytest.raises(InputError, match="window 1000 s"):
+        next(track(loop_in_operation(), 2, window_s=1000.0, every_s=10.0))
+
+
+def test_commands_on_files(tmp_path, drifting):
+    write_recording(drifting, tmp_path / "loop.csv")
+    write_controller(DEPLOYED, tmp_path / "pi.toml")
+    runner = CliRunner()
+    watched = runner.invoke(
+        app,
+        ["watch", str(tmp_path / "loop.csv"), "--controller", str(tmp_path / "pi.toml"), "--window", "60",
+         "--every", "60", "--max-delay", "5", "--out", str(tmp_path / "watch.csv")],
+    )  # fmt: skip
+    assert watched.exit_code == 0, watched.output
+    assert "retune: " in watched.output
+    table = (tmp_path / "watch.csv").read_text().splitlines()
+    assert table[0].startswith("t,gain,gain_sd,dead_time,dead_time_sd,time_constant_1")
+    assert table[1].endswith("keep")
+    assert table[-1].endswith("retune")
+    identified = runner.invoke(
+        app, ["identify", "delay", str(tmp_path / "loop.csv"), "--order", "2", "--start", "170", "--max-delay", "5",
+              "--out", str(tmp_path / "delay.json")],
+    )  # fmt: skip
+    assert identified.exit_code == 0, identified.output
+    content = json.loads((tmp_path / "delay.json").read_text())
+    assert set(content) >= {"order", "a", "b", "delay_s", "initial_state", "sd"}
+    assert set(content["sd"]) == {"a", "b", "delay_s"}
+    assert content["delay_s"] == pytest.approx(1.2, abs=0.05)
+    assert len(content["a"]) == len(content["initial_state"]) == content["order"] == 2
