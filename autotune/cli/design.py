@@ -123,3 +123,64 @@ def margins_command(
         f"delay margin {m.delay_s:.4g} s, gain margin {m.gain:.4g}, H2 {m.h2:.5g}"
     )
     typer.echo(f"wrote {out}")
+
+
+class Target(StrEnum):
+    """What the controller is written as."""
+
+    ISA = "isa"
+    PARALLEL = "parallel"
+    SERIES = "series"
+    VELOCITY = "velocity"
+    SIEMENS = "siemens"
+    ROCKWELL_DEPENDENT = "rockwell-dependent"
+    ROCKWELL_INDEPENDENT = "rockwell-independent"
+    SCHNEIDER_MIXED = "schneider-mixed"
+    SCHNEIDER_PARALLEL = "schneider-parallel"
+    C = "c"
+    ST = "st"
+
+
+@app.command("controller")
+def controller_command(
+    controller: Annotated[Path, typer.Option(help="controller file (TOML) of kind pi or pid")],
+    form: Annotated[Target, typer.Option(help="a maker's form, or c or st for the law as code")] = Target.ISA,
+    sample_time: Annotated[float, typer.Option(help="time between samples, for velocity, c and st [s]")] = 0.01,
+    u_span: Annotated[float, typer.Option(help="engineering span of the output, for percent forms [u unit]")] = 1.0,
+    y_span: Annotated[float, typer.Option(help="engineering span of the measurement [y unit]")] = 1.0,
+    u_min: Annotated[float | None, typer.Option(help="lowest command, for c and st [u unit]; default none")] = None,
+    u_max: Annotated[float | None, typer.Option(help="highest command, for c and st [u unit]; default none")] = None,
+    u_rate: Annotated[float | None, typer.Option(help="fastest change, for c and st [u unit/s]; default none")] = None,
+    out: Annotated[Path | None, typer.Option(help="file to write code to; default the screen")] = None,
+) -> None:
+    """Show a controller's gains as a maker's block takes them, or write its law as C or Structured Text."""
+    from autotune.controller import PIDController, read_controller
+
+    c = read_controller(controller)
+    if not isinstance(c, PIDController):
+        raise InputError(
+            "has num and den", where=str(controller), mend='forms are of controllers of kind "pi" or "pid"'
+        )
+    if form in (Target.C, Target.ST):
+        from autotune.design.codegen import c_source, structured_text
+        from autotune.design.law import PILaw
+
+        law = PILaw(
+            controller=c,
+            sample_time_s=sample_time,
+            u_min=-math.inf if u_min is None else u_min,
+            u_max=math.inf if u_max is None else u_max,
+            u_rate=math.inf if u_rate is None else u_rate,
+        )
+        text = c_source(law) if form is Target.C else structured_text(law)
+    else:
+        from autotune.design.forms import FORMS, to_form
+
+        named = next(name for name in FORMS if name == form.value)
+        found = to_form(c, named, u_span=u_span, y_span=y_span, sample_time_s=sample_time)
+        text = "".join(f"{name} = {value:.6g}\n" for name, value in found.values.items())
+    if out is None:
+        typer.echo(text, nl=False)
+    else:
+        out.write_text(text, encoding="utf-8")
+        typer.echo(f"wrote {out}")

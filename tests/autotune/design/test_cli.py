@@ -76,3 +76,16 @@ def test_margins_of_an_unstable_loop_say_so(model: Path, tmp_path: Path) -> None
     content = json.loads(out.read_text())
     assert content["stable"] is False
     assert content["h2"] is None
+
+
+@pytest.mark.parametrize(
+    ("form", "expected"),
+    [("siemens", "Gain = 0.025"), ("rockwell-dependent", "IGain_min = 0.06"), ("c", "control_step"), ("st", "LIMIT(")],
+)
+def test_controller_in_a_makers_form_and_as_code(form: str, expected: str, tmp_path: Path) -> None:
+    path = tmp_path / "controller.toml"
+    write_controller(PIDController(K=-0.025, Ti_s=3.6), path)
+    result = CliRunner().invoke(app, ["controller", "--controller", str(path), "--form", form], catch_exceptions=False)
+    assert expected in result.output
+    if form == "siemens":
+        assert "reverse_acting = 0" in result.output
