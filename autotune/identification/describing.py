@@ -18,7 +18,7 @@ class DescribingFunctionEstimate:
     omega_rad_s : float
         omega_u = 2 pi / T_u, (22) [rad/s].
     gain : float
-        pi a / (4 d), (21), with a and d the peak-to-peak values of y and u.
+        pi a / (4 d), (21), with a and d the peak-to-peak values of y and u as read off the recording.
     phase_rad : float
         -180 deg + T omega_u, (20), of the positive-gain plant [rad].
     gain_error : float

@@ -15,6 +15,7 @@ from autotune.recording import Recording
 
 #: Periods of one relay setting agree to this part.
 _SAME_PERIOD = 0.15
+_STEADY_PERIOD = 0.05
 _LEAST_PERIODS = 3
 
 
@@ -44,17 +45,22 @@ def _segments_of_sidecar(tables: list[Mapping[str, Any]], recording: Recording) 
 
 
 def _regular_stretches(rises: FloatArray) -> tuple[tuple[float, float], ...]:
-    """Return maximal runs of periods within 15 % of their first neighbour, the first period left out."""
+    """Return maximal runs of periods within 15 % of their neighbour, the periods at both ends that differ left out."""
     periods = np.diff(rises)
     found = []
     first = 0
     for i in range(1, periods.size + 1):
         if i < periods.size and abs(periods[i] - periods[i - 1]) <= _SAME_PERIOD * periods[i - 1]:
             continue
-        if i - first >= _LEAST_PERIODS:
-            skip = 1 if i - first > _LEAST_PERIODS else 0
-            margin = 0.02 * float(periods[i - 1])
-            found.append((float(rises[first + skip]) - margin, float(rises[i]) + margin))
+        run = periods[first:i]
+        steady = np.flatnonzero(np.abs(run - np.median(run)) <= _STEADY_PERIOD * np.median(run))
+        if run.size >= _LEAST_PERIODS and steady.size:
+            low, high = first + int(steady[0]), first + int(steady[-1]) + 1
+            low += high - low > _LEAST_PERIODS  # the first period still settles
+            high -= high - low > _LEAST_PERIODS  # the last one may already belong to another setting
+            margin = 0.02 * float(np.median(run))
+            if high - low >= _LEAST_PERIODS - 1:
+                found.append((float(rises[low]) - margin, float(rises[high]) + margin))
         first = i
     return tuple(found)
 

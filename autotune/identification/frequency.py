@@ -46,7 +46,7 @@ class LimitCycle:
     y_amplitude : float
         Amplitude of the fundamental of y [y unit].
     y_peak_to_peak : float
-        Peak to peak of the fitted oscillation, noise apart [y unit].
+        Mean over the periods of highest less lowest sample, noise included: what is read off a plot [y unit].
     asymmetry : float
         Part of the period the command is high, less one half.
     drift : float
@@ -239,6 +239,12 @@ def _points(
     return tuple(points)
 
 
+def _peak_to_peak(t: FloatArray, y: FloatArray, window: WholePeriods) -> float:
+    which = np.clip(((t - window.start_s) / window.period_s + 1e-9).astype(int), 0, window.periods - 1)
+    starts = np.unique(np.searchsorted(which, np.arange(window.periods)))
+    return float(np.mean(np.maximum.reduceat(y, starts) - np.minimum.reduceat(y, starts)))
+
+
 def _summary(
     t: FloatArray,
     u: FloatArray,
@@ -253,8 +259,6 @@ def _summary(
 ) -> LimitCycle:
     orders = range(1, len(fit.coefficients) + 1)
     plain = fit_harmonics(t[good], y[good], window.omega_rad_s, orders)
-    phase = 2.0 * np.pi * np.arange(200) / 200
-    wave = np.real(2.0 * np.exp(1j * np.multiply.outer(phase, np.array(orders))) @ plain.coefficients)
     knots = np.concatenate([[window.start_s], t[(t > window.start_s) & (t < window.end_s)], [window.end_s]])
     levels = u[np.clip(np.searchsorted(t, knots[:-1], side="right") - 1, 0, None)]
     above = levels > 0.5 * (levels.min() + levels.max())
@@ -269,7 +273,7 @@ def _summary(
         u_amplitude=0.5 * edges.jump,
         y_mean=float(np.mean(y[good])),
         y_amplitude=float(2.0 * abs(plain.coefficients[0])),
-        y_peak_to_peak=float(np.ptp(wave)),
+        y_peak_to_peak=_peak_to_peak(t[good], y[good], window),
         asymmetry=float(high - 0.5),
         drift=fit.slope,
         noise_sd=noise.sd,

@@ -1,0 +1,201 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from autotune.cli import app
+from autotune.errors import IdentificationError
+from autotune.identification.recorded import FrequencyEstimate, combine, frequency_points
+from autotune.models import TransferFunction, read_model
+from autotune.points import read_points
+from autotune.recording import Recording, read_recording, write_recording
+from tests.autotune.identification.relay_loop import BALL, drive, held, relay_loop
+
+LAGS = TransferFunction(num=(2.0,), den=(1.0, 3.0, 1.0))
+DT = 0.05
+ROWS = 3000
+
+
+def random_binary(rng: np.random.Generator, hold: int) -> np.ndarray:
+    return np.repeat(rng.choice([-1.0, 1.0], ROWS // hold + 1), hold)[:ROWS]
+
+
+def multisine(rng: np.random.Generator) -> np.ndarray:
+    t = np.arange(500)
+    phases = rng.uniform(0.0, 2.0 * np.pi, 20)
+    return np.tile(sum(np.cos(2 * np.pi * (2 * k + 1) * t / 500 + phase) for k, phase in enumerate(phases)), 6)
+
+
+def open_loop(u: np.ndarray, rng: np.random.Generator, sd: float = 0.05) -> Recording:
+    return Recording(t=DT * np.arange(u.size), u=u, y=drive(LAGS, u, DT) + rng.normal(0.0, sd, u.size))
+
+
+def closed_loop(rng: np.random.Generator, sd: float) -> Recording:
+    a, b, c = held(LAGS, DT)
+    x, integral = np.zeros(2), 0.0
+    r = random_binary(rng, 40)
+    u, y = np.empty(ROWS), np.empty(ROWS)
+    noise = rng.normal(0.0, sd, ROWS)
+    for k in range(ROWS):
+        y[k] = c @ x + noise[k]
+        error = r[k] - y[k]
+        integral += 0.4 * error * DT
+        u[k] = 0.8 * error + integral
+        x = a @ x + b * u[k]
+    return Recording(t=DT * np.arange(ROWS), u=u, y=y, extra={"r": r})
+
+
+def coverage(estimates: list[FrequencyEstimate]) -> float:
+    inside = []
+    for estimate in estimates:
+        for point in estimate.points:
+            error = point.response - complex(LAGS.response(np.array([point.omega_rad_s]))[0])
+            parts = np.array([error.real, error.imag])
+            inside.append(parts @ np.linalg.solve(np.array(point.covariance), parts) < 5.99)
+    return float(np.mean(inside))
+
+
+def test_regions_hold_the_truth_under_a_random_binary_command() -> None:
+    rngs = [np.random.default_rng(seed) for seed in range(12)]
+    estimates = [frequency_points(open_loop(random_binary(rng, 10), rng)) for rng in rngs]
+    assert {one.excitation for one in estimates} == {"random or steps"}
+    assert min(len(one.points) for one in estimates) >= 6
+    assert 0.88 <= coverage(estimates) <= 1.0
+
+
+def test_regions_hold_the_truth_under_a_multisine() -> None:
+    rngs = [np.random.default_rng(seed) for seed in range(10)]
+    estimates = [frequency_points(open_loop(multisine(rng), rng)) for rng in rngs]
+    assert {one.excitation for one in estimates} == {"repeated command"}
+    lines = 2 * np.pi / (500 * DT) * (2 * np.arange(20) + 1)
+    for one in estimates:
+        for point in one.points:
+            assert np.min(np.abs(lines - point.omega_rad_s)) < 1e-9
+    assert 0.9 <= coverage(estimates) <= 0.99
+
+
+def test_in_closed_loop_the_way_over_r_is_unbiased_where_y_over_u_is_not() -> None:
+    recordings = [closed_loop(np.random.default_rng(seed), 0.3) for seed in range(12)]
+    by_r = [frequency_points(recording) for recording in recordings]
+    assert {one.excitation for one in by_r} == {"closed loop by way of r"}
+    direct = [frequency_points(Recording(t=one.t, u=one.u, y=one.y)) for one in recordings]
+    assert coverage(by_r) >= 0.88
+    assert coverage(direct) < coverage(by_r)
+
+
+def test_an_integrating_plant_with_drift_is_estimated_from_random_steps() -> None:
+    rng = np.random.default_rng(3)
+    u = np.repeat(rng.uniform(-0.02, 0.02, 40), 100)
+    t = 0.01 * np.arange(u.size)
+    y = drive(BALL, u, 0.01) + 0.05 * t + rng.normal(0.0, 0.1, u.size)
+    estimate = frequency_points(Recording(t=t, u=u, y=y))
+    for point in estimate.points:
+        error = point.response / complex(BALL.response(np.array([point.omega_rad_s]))[0]) - 1
+        assert abs(error) < 4.0 * np.sqrt(2 * point.covariance[0][0]) / point.gain
+    assert len(estimate.points) >= 2
+
+
+def test_a_relay_recording_gives_a_point_per_setting() -> None:
+    parts, start = [], 0.0
+    for delay in (20.0, 45.0):
+        t, u, y = relay_loop(BALL, d=0.06, hysteresis=0.4, delay=delay, noise=np.zeros(2000))
+        parts.append((t + start, u, y))
+        start += 20.0
+    t, u, y = (np.concatenate([part[i] for part in parts]) for i in range(3))
+    estimate = frequency_points(Recording(t=t, u=u, y=y))
+    assert estimate.excitation == "relay"
+    assert len(estimate.cycles) == 2
+    for cycle in estimate.cycles:
+        point = cycle.points[0]
+        assert abs(point.response / complex(BALL.response(np.array([point.omega_rad_s]))[0]) - 1) < 2e-3
+
+
+def test_the_sidecar_says_where_the_relay_settings_are() -> None:
+    t, u, y = relay_loop(BALL, d=0.06, hysteresis=0.4, delay=20.0, noise=np.zeros(2000))
+    rises = t[1:][np.diff(u) > 0.06]
+    metadata = {"relay": [{"start_s": float(rises[-5]), "end_s": float(rises[-1])}]}
+    estimate = frequency_points(Recording(t=t, u=u, y=y, metadata=metadata))
+    assert [cycle.periods for cycle in estimate.cycles] == [4]
+
+
+def test_recordings_that_agree_are_merged_and_a_plant_that_changed_is_said() -> None:
+    def estimate(seed: int, gain: float) -> FrequencyEstimate:
+        rng = np.random.default_rng(seed)
+        recording = open_loop(random_binary(rng, 10), rng)
+        return frequency_points(Recording(t=recording.t, u=recording.u, y=gain * recording.y))
+
+    same = combine([estimate(1, 1.0), estimate(2, 1.0)])
+    assert any("agree" in note for note in same.notes)
+    assert same.points[0].covariance[0][0] < estimate(1, 1.0).points[0].covariance[0][0]
+    changed = combine([estimate(1, 1.0), estimate(2, 1.3)])
+    assert any("contradict" in note for note in changed.notes)
+    assert changed.points[0].covariance[0][0] > same.points[0].covariance[0][0]
+
+
+def test_gaps_and_spikes_in_y_are_mended_and_said() -> None:
+    rng = np.random.default_rng(4)
+    recording = open_loop(random_binary(rng, 10), rng)
+    y = recording.y.copy()
+    y[100:104] = np.nan
+    y[500] += 50.0
+    estimate = frequency_points(Recording(t=recording.t, u=recording.u, y=y))
+    assert any("5 wild or missing" in note for note in estimate.notes)
+    assert coverage([estimate]) >= 0.8
+
+
+def test_a_broken_sensor_and_a_dead_command_are_refused() -> None:
+    rng = np.random.default_rng(4)
+    recording = open_loop(random_binary(rng, 10), rng)
+    y = recording.y.copy()
+    y[: y.size // 4] = np.nan
+    with pytest.raises(IdentificationError, match="missing or wild"):
+        frequency_points(Recording(t=recording.t, u=recording.u, y=y))
+    with pytest.raises(IdentificationError, match="never changes"):
+        frequency_points(Recording(t=recording.t, u=np.full(ROWS, 3.0), y=recording.y))
+
+
+def test_noise_alone_gives_no_points() -> None:
+    rng = np.random.default_rng(5)
+    u = random_binary(rng, 10)
+    with pytest.raises(IdentificationError, match="above the noise"):
+        frequency_points(Recording(t=DT * np.arange(ROWS), u=u, y=rng.normal(size=ROWS)), largest_relative_sd=0.2)
+
+
+def test_the_commands_write_points_and_a_reduced_model(tmp_path: Path) -> None:
+    names = []
+    for i, delay in enumerate((2.0, 20.0, 45.0, 80.0)):
+        noise = np.random.default_rng(i).normal(0.0, 0.02, 6000)
+        t, u, y = relay_loop(BALL, d=0.06, hysteresis=0.1, delay=delay, noise=noise)
+        names.append(tmp_path / f"r{i}.csv")
+        write_recording(Recording(t=t, u=u, y=y), names[-1])
+    out, model = tmp_path / "points.json", tmp_path / "reduced.toml"
+    runner = CliRunner()
+    result = runner.invoke(app, ["identify", "frequency", *map(str, names), "--out", str(out)])
+    assert result.exit_code == 0, result.output
+    entries = json.loads(out.read_text())["points"]
+    assert {"omega_rad_s", "gain", "phase_deg", "cov", "source"} <= set(entries[0])
+    points = read_points(out)
+    for point in points:
+        error = point.response - complex(BALL.response(np.array([point.omega_rad_s]))[0])
+        assert abs(error) < 5.0 * np.sqrt(point.covariance[0][0] + point.covariance[1][1])
+    result = runner.invoke(app, ["reduce", "--points", str(out), "--out", str(model)])
+    assert result.exit_code == 0, result.output
+    reduced = read_model(model).transfer_function()
+    assert reduced.num[-1] == pytest.approx(-65.5, rel=0.05)
+
+
+def test_two_halves_of_a_real_recording_give_points_of_the_right_size(shared: Path) -> None:
+    folder = shared / "data" / "floatshield"
+    for name, model in (("1", "model.toml"), ("2", "model_2.toml")):
+        estimates = [frequency_points(read_recording(folder / f"{part}_{name}.csv")) for part in ("fit", "test")]
+        combined = combine(estimates)
+        assert len(combined.points) >= 3
+        believed = read_model(folder / model).transfer_function()
+        lowest = combined.points[0]
+        ratio = lowest.response / complex(believed.response(np.array([lowest.omega_rad_s]))[0])
+        assert 0.5 < abs(ratio) < 2.0
+        assert abs(np.angle(ratio)) < 0.5
