@@ -69,11 +69,11 @@ def _points_section(analysis: Analysis, signals: SignalSettings, experiment: Exp
         title="Bode points",
         text=(
             (
-                "Each point is the ratio of the recorded measurement's Fourier coefficient to that of the recorded, held"
-                " command over whole periods; its region counts the noise that was found beside the oscillation."
+                "Each point is the ratio of the recorded measurement's Fourier coefficient to that of the recorded,"
+                " held command over whole periods; its region counts the noise that was found beside the oscillation."
                 if all(point.source in ("relay", "harmonic") for point in analysis.points)
-                else "Each point is estimated over a band of frequencies, leakage and drift removed; its region counts the"
-                " noise in that band."
+                else "Each point is estimated over a band of frequencies, leakage and drift removed; its region counts"
+                " the noise in that band."
             )
             + (
                 " The first-harmonic formulas (20)-(22), which trust the delay that was asked for and the relay's ideal"
