@@ -21,6 +21,7 @@ from autotune.config.registers import RegisterSettings
 from autotune.errors import InputError
 
 _FORMATS = {"int16": ">h", "uint16": ">H", "int32": ">i", "uint32": ">I", "float32": ">f"}
+_BIG = {1: struct.Struct(">H"), 2: struct.Struct(">HH")}
 _FLOAT32_MAX = struct.unpack(">f", b"\x7f\x7f\xff\xff")[0]
 
 #: Largest count of one request (Modbus Application Protocol V1.1b3, 6.1 to 6.4).
@@ -43,12 +44,27 @@ class Codec:
     register: RegisterSettings
     _words: struct.Struct = field(init=False, repr=False)
     _count: struct.Struct | None = field(init=False, repr=False)
+    _is_reversed: bool = field(init=False, repr=False)
+    _is_plain: bool = field(init=False, repr=False)
+    _scale: float = field(init=False, repr=False)
+    _offset: float = field(init=False, repr=False)
+    _none: int | None = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        order = ">" if self.register.byte_order == "big" else "<"
-        object.__setattr__(self, "_words", struct.Struct(order + "H" * self.register.words))
-        form = _FORMATS.get(self.register.type)
-        object.__setattr__(self, "_count", struct.Struct(form) if form else None)
+        register = self.register
+        order = ">" if register.byte_order == "big" else "<"
+        form = _FORMATS.get(register.type)
+        prepared = {  # a sample is decoded in every control cycle
+            "_words": struct.Struct(order + "H" * register.words),
+            "_count": struct.Struct(form) if form else None,
+            "_is_reversed": register.word_order == "little",
+            "_is_plain": register.byte_order == "big" and (register.word_order == "big" or register.words == 1),
+            "_scale": register.scale,
+            "_offset": register.offset,
+            "_none": register.not_a_value,
+        }
+        for name, value in prepared.items():
+            object.__setattr__(self, name, value)
 
     @property
     def span(self) -> tuple[float, float]:
@@ -73,15 +89,20 @@ class Codec:
 
     def decode(self, words: Sequence[int]) -> float:
         """Return the engineering value of the words, NaN where the device says that it has none."""
-        register = self.register
+        return self.decode_from(struct.pack(f">{len(words)}H", *words), 0)
+
+    def decode_from(self, data: bytes, at: int) -> float:
+        """Return the engineering value at a place [bytes] in registers as they came over the line."""
         if self._count is None:
-            return float(words[0])
-        if register.word_order == "little":
-            words = words[::-1]
-        (count,) = self._count.unpack(self._words.pack(*words))
-        if count == register.not_a_value:
+            return float(data[at + 1])
+        if self._is_plain:
+            (count,) = self._count.unpack_from(data, at)
+        else:
+            words = self._words.unpack_from(data, at)
+            (count,) = self._count.unpack(_BIG[len(words)].pack(*(words[::-1] if self._is_reversed else words)))
+        if count == self._none:
             return math.nan
-        return float(register.scale * count + register.offset)
+        return float(self._scale * count + self._offset)
 
     def encode(self, value: float) -> tuple[int, ...]:
         """Return the words of the engineering value, rounded to the nearest count.
@@ -110,7 +131,7 @@ class Codec:
                 mend=f"stay within {low:g}..{high:g}, or correct type, scale and offset in the register map",
             ) from None
         words = self._words.unpack(packed)
-        return words[::-1] if register.word_order == "little" else words
+        return words[::-1] if self._is_reversed else words
 
 
 def codecs(registers: Mapping[str, RegisterSettings]) -> dict[str, Codec]:
@@ -137,9 +158,15 @@ class Block:
     count: int
     parts: tuple[tuple[Codec, int], ...]
 
+    _words: struct.Struct = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "_words", struct.Struct(f">{self.count}H"))
+
     def decode(self, words: Sequence[int]) -> dict[str, float]:
         """Return the engineering values by signal."""
-        return {codec.name: codec.decode(words[offset : offset + codec.register.words]) for codec, offset in self.parts}
+        data = self._words.pack(*words)
+        return {codec.name: codec.decode_from(data, 2 * at) for codec, at in self.parts}
 
 
 def blocks(signals: Sequence[Codec], *, gap: int = 0) -> tuple[Block, ...]:

@@ -1,6 +1,6 @@
-"""The driver's control cycle against a bare read and write of the Modbus library, paired, on TCP loopback.
+"""The driver's control cycle against a bare read and write of the Modbus library, paired, on TCP loopback; and on RTU.
 
-The driver reads a sample of five signals in one request, checks it, writes command and heartbeat in one request and
+The driver reads a sample of three signals (four registers) in one request, checks it, writes command and heartbeat in one request and
 checks that too; the bare cycle reads two registers and writes one and checks nothing. Both talk to the same slave in C
 (libmodbus), in turns of one cycle each, so that the machine's load falls on both alike.
 """
@@ -12,16 +12,23 @@ import shutil
 import subprocess
 import tempfile
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 from pymodbus.client import ModbusTcpClient
 from rich.console import Console
 from rich.table import Table
 
 from autotune.config.registers import RegisterMap
-from autotune.config.rig import ModbusTcpSettings
+from autotune.config.rig import ModbusRtuSettings, ModbusTcpSettings
 from drivers import open_rig
+from sim.serial_line import SerialLine
+
+Times: TypeAlias = NDArray[np.float64]
 
 SLAVE = RegisterMap.model_validate(
     {
@@ -34,24 +41,49 @@ SLAVE = RegisterMap.model_validate(
 )
 
 
-def paired_cycles(cycles: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the times of bare and of driven cycles [s], (N,) each, taken in turns."""
+@contextmanager
+def slave(*words: str) -> Iterator[int]:
+    """Compile and run the slave in C; yield its port."""
     source = Path(__file__).parents[1] / "drivers" / "libmodbus_slave.c"
     with tempfile.TemporaryDirectory() as folder:
         program = Path(folder) / "slave"
-        compile_it = ["gcc", "-O2", "-I/usr/include/modbus", "-o", program, source, "-lmodbus"]
-        subprocess.run(compile_it, check=True)
-        slaves = [subprocess.Popen([program, "tcp"], stdout=subprocess.PIPE, text=True) for _ in range(2)]
-        try:
-            ports = [int(slave.stdout.readline().split()[1]) for slave in slaves if slave.stdout is not None]
-            return _measure(ports, cycles)
-        finally:
-            for slave in slaves:
-                slave.kill()
-                slave.communicate()
+        subprocess.run(["gcc", "-O2", "-I/usr/include/modbus", "-o", program, source, "-lmodbus"], check=True)
+        with subprocess.Popen([program, *words], stdout=subprocess.PIPE, text=True) as process:
+            assert process.stdout is not None
+            yield int(process.stdout.readline().split()[1])
+            process.kill()
 
 
-def _measure(ports: list[int], cycles: int) -> tuple[np.ndarray, np.ndarray]:
+def paired_cycles(cycles: int) -> tuple[Times, Times]:
+    """Return the times of bare and of driven cycles on TCP [s], (N,) each, taken in turns."""
+    with slave("tcp") as bare_port, slave("tcp") as driven_port:
+        return _measure([bare_port, driven_port], cycles)
+
+
+def serial_cycles(cycles: int) -> Times:
+    """Return the times of driven cycles on a pseudo-terminal, whose bytes take no time of their own [s], (N,)."""
+    with SerialLine() as line, slave("rtu", line.rig_device):
+        settings = ModbusRtuSettings(
+            kind="modbus_rtu", device=line.host_device, baud=115200, parity="N", timeout_s=2.0, registers=SLAVE
+        )
+        rig = open_rig(settings, u_range=(-10.0, 10.0), u_safe=0.0)
+        rig.open()
+        times = np.empty(cycles)
+        for k in range(cycles):
+            start = time.perf_counter()
+            rig.read()
+            rig.write(1e-3 * (k % 1000))
+            times[k] = time.perf_counter() - start
+        rig.make_safe()
+        rig.close()
+        return times[cycles // 10 :]
+
+
+#: read of four registers (8 + 13 bytes), write of two (13 + 8), 10 bits a byte, silences of 1.75 ms between frames
+WIRE_S = 42 * 10 / 115200 + 4 * 1.75e-3
+
+
+def _measure(ports: list[int], cycles: int) -> tuple[Times, Times]:
     client = ModbusTcpClient("127.0.0.1", port=ports[0], timeout=2.0)
     client.connect()
     settings = ModbusTcpSettings(kind="modbus_tcp", port=ports[1], timeout_s=2.0, registers=SLAVE)
@@ -81,8 +113,9 @@ def main() -> None:
         return
     cycles = int(os.environ.get("MODBUS_CYCLES", "5000"))
     bare, driven = paired_cycles(cycles)
-    table = Table("cycle: read and write, TCP loopback", "median [us]", "p99 [us]", title="Modbus control cycle")
-    for name, times in (("bare library", bare), ("driver", driven)):
+    table = Table("cycle: read and write", "median [us]", "p99 [us]", title="Modbus control cycle")
+    serial_times = serial_cycles(cycles // 5)
+    for name, times in (("bare library", bare), ("driver", driven), ("driver, RTU on a pty", serial_times)):
         table.add_row(name, f"{1e6 * np.median(times):.0f}", f"{1e6 * np.quantile(times, 0.99):.0f}")
     console.print(table)
     ratios = np.median(driven) / np.median(bare), float(np.median(driven / bare))
@@ -90,3 +123,4 @@ def main() -> None:
         f"ratio of medians {ratios[0]:.2f}, median of paired ratios {ratios[1]:.2f} (wanted: at most 1.3), "
         f"{bare.size} pairs"
     )
+    console.print(f"the same RTU cycle takes {1e6 * WIRE_S:.0f} us of wire at 115200 bit/s")

@@ -6,8 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from autotune.config import load_config
 from autotune.config.rig import ReplaySettings
 from autotune.errors import InputError, LinkError
+from autotune.experiment.run import run_experiment
 from autotune.recording import Recording, RecordingWriter
 from drivers import open_rig
 from drivers.replay import ReplayRig
@@ -58,3 +60,17 @@ def test_a_replay_is_reached_like_any_other_rig(tmp_path: Path) -> None:
     assert rig.read().u_applied == 9.0
     with pytest.raises(InputError, match="cannot be read"):
         open_rig(ReplaySettings(kind="replay", recording=str(tmp_path / "none.csv")), u_range=(-1, 1), u_safe=0.0)
+
+
+def test_a_replayed_experiment_gives_the_points_that_were_measured(tmp_path: Path) -> None:
+    config = load_config(Path(__file__).parents[2] / "configs" / "ball_sim.toml")
+    live = open_rig(config.rig, u_range=(0.0, 10.0), u_safe=0.0)
+    measured = run_experiment(live, config, tmp_path / "live.csv").points
+    settings = ReplaySettings(kind="replay", recording=str(tmp_path / "live.csv"))
+    replayed = run_experiment(
+        open_rig(settings, u_range=(0.0, 10.0), u_safe=0.0), config, tmp_path / "replayed.csv"
+    ).points
+    assert len(replayed) == len(measured)
+    for one, other in zip(measured, replayed, strict=True):
+        assert other.omega_rad_s == pytest.approx(one.omega_rad_s, rel=1e-9)
+        assert abs(other.response / one.response - 1.0) < 1e-8  # twelve digits in the file
