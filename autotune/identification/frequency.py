@@ -161,6 +161,7 @@ def _corrected_fit(
     """Fit the harmonics of y, then twice those of y less the rough model's response; leave outliers out."""
     omega = window.omega_rad_s * np.array(orders)
     U = held_coefficients(t, u, omega, window.start_s, window.end_s)
+    U[np.abs(U) < 1e-12 * np.abs(U[0])] = 1e-12 * np.abs(U[0])  # the even orders of a symmetric cycle may be exactly 0
     centred = u - np.mean(u[good])
     excited = np.abs(U) > 0.05 * np.abs(U[0])
     fit = fit_harmonics(t[good], y[good], window.omega_rad_s, orders)

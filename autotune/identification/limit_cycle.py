@@ -108,6 +108,8 @@ def relay_edges(t: FloatArray, u: FloatArray) -> RelayEdges:
     times, rising = _switches(t, u, jump)
     if times.size:
         settled = t >= times[0]
+        # a row within which the command switched holds neither level
+        settled[np.searchsorted(t, times[times > t[0]], side="right") - 1] = False
         level = np.where(np.searchsorted(times, t[settled], side="right") % 2 == 1, 1.0, -1.0)
         basis = np.column_stack([level, np.ones_like(level), t[settled] - t[-1]])
         left = u[settled] - basis @ np.linalg.lstsq(basis, u[settled], rcond=None)[0]
