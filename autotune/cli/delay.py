@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, TextIO
+from typing import TYPE_CHECKING, Annotated, Literal, TextIO
 
 import typer
 
 from autotune.cli import app, identify
 
 if TYPE_CHECKING:
+    from autotune.config.loader import Config
     from autotune.controller import Controller
     from autotune.identification.delay_model import DelayModel
     from autotune.identification.tracking import Window
+    from autotune.recording import Recording
 
 
 class Hold(StrEnum):
@@ -88,12 +92,31 @@ def describe(model: DelayModel) -> str:
     return f"{', '.join(parts)} (95 %), noise {colour}, sd {model.noise_sd:.3g}"
 
 
+@dataclass(frozen=True, kw_only=True)
+class _Tracking:
+    """What is tracked and judged; times in s, None where they follow from the record's length."""
+
+    order: int
+    window_s: float | None
+    every_s: float | None
+    max_delay_s: float | None
+    hold: Literal["zero", "linear"] | None
+    integrator: bool
+    controller: Controller | None
+    modulus_margin: float
+    phase_margin_rad: float
+
+
 @app.command()
 def watch(
-    recording: Annotated[
-        Path, typer.Argument(help="recording of normal operation, CSV with t,u,y; it may still be growing (--follow)")
+    source: Annotated[
+        Path,
+        typer.Argument(
+            metavar="REC.csv|CONFIG.toml",
+            help="recording of normal operation, or configuration of a rig whose present loop is to run and be watched",
+        ),
     ],
-    out: Annotated[Path, typer.Option(help="CSV file for the parameters over time with their standard deviations")],
+    out: Annotated[Path, typer.Option(help="CSV file for the parameters over time; with CONFIG a new folder")],
     controller: Annotated[
         Path | None, typer.Option(help="the deployed controller, TOML; its margins are judged on the tracked model")
     ] = None,
@@ -106,56 +129,117 @@ def watch(
     hold: Annotated[Hold | None, typer.Option(help="u between rows; default the sidecar's hold, else zero")] = None,
     integrator: Annotated[bool, typer.Option("--integrator", help="the plant integrates: a0 = 0")] = False,
     follow: Annotated[
-        float, typer.Option(help="go on while the file grows, until it has not for this long [s]; 0: do not wait")
+        float, typer.Option(help="go on while the recording grows, until it has not for this long [s]; 0: do not wait")
     ] = 0.0,
+    duration: Annotated[float, typer.Option(help="with CONFIG: time on the rig [s]")] = 300.0,
+    dither: Annotated[
+        float | None, typer.Option(help="with CONFIG: half-amplitude added to the command [u unit]; found when absent")
+    ] = None,
 ) -> None:
-    """Track gain, time constants and dead time over a recording, and say when the controller wants retuning."""
+    """Track gain, time constants and dead time, and say when the controller wants retuning.
+
+    With a recording, one that another program is still writing included, nothing is commanded. With a configuration
+    the present controller runs the rig with a small dither, without which a loop at rest tells nothing.
+    """
+    from autotune.controller import PIDController, read_controller
+
+    law: Controller | None = None if controller is None else read_controller(controller)
+    settings = _Tracking(
+        order=order,
+        window_s=window,
+        every_s=every,
+        max_delay_s=max_delay,
+        hold=None if hold is None else hold.value,
+        integrator=integrator,
+        controller=law,
+        modulus_margin=modulus_margin,
+        phase_margin_rad=math.radians(phase_margin),
+    )
+    if source.suffix.lower() != ".toml":
+        _follow(source, out, settings, follow)
+        return
+    from autotune.config import load_config
+
+    config = load_config(source)
+    if law is None and config.controller is not None:
+        settings = replace(settings, controller=PIDController(K=config.controller.K, Ti_s=config.controller.Ti_s))
+    length = 0.2 * duration if window is None else window
+    _watch_rig(config, out, replace(settings, window_s=length), duration, dither)
+
+
+def _watch_rig(config: Config, out: Path, settings: _Tracking, duration_s: float, dither: float | None) -> None:
+    """Run the present loop here and fit in another process, so that no fit ever delays a command."""
+    import multiprocessing
+
+    from autotune.cli.run import _new_folder, _rig
+    from autotune.experiment.dither import run_dither
+
+    _new_folder(out, "recording.csv")
+    recording = out / "recording.csv"
+    quiet_s = max(5.0, 20.0 * config.signals.sample_time_s)
+    fits = multiprocessing.get_context("spawn").Process(
+        target=_follow, args=(recording, out / "watch.csv", settings, quiet_s)
+    )
+    fits.start()
+    try:
+        run_dither(_rig(config, False), config, recording, duration_s=duration_s, amplitude=dither)
+    finally:
+        fits.join()
+
+
+def _follow(recording: Path, out: Path, settings: _Tracking, quiet_s: float) -> None:
+    """Fit window after window of a recording that may be growing, until it has been quiet for so long [s]."""
     import time
 
-    from autotune.controller import read_controller
     from autotune.identification.tracking import track
     from autotune.recording import read_recording
 
-    law = None if controller is None else read_controller(controller)
-    record = read_recording(recording)
-    length = window if window is not None else 0.2 * record.duration_s
-    step = every if every is not None else 0.25 * length
-    required = (modulus_margin, phase_margin)
-    done, quiet_since, rows, retune_at = -float("inf"), time.monotonic(), len(record), None
+    while quiet_s > 0.0 and not recording.exists():
+        time.sleep(0.1)
+    done, retune_at, rows = -math.inf, None, -1
+    quiet_since = time.monotonic()
     with out.open("w", encoding="utf-8") as table:
         while True:
-            fits = track(
-                record,
-                order,
-                window_s=length,
-                every_s=step,
-                max_delay_s=max_delay,
-                hold=None if hold is None else hold.value,
-                integrator=integrator,
-                after_s=done,
-            )
-            for fitted in fits:
-                verdict = _report(fitted, law, required, table, header=table.tell() == 0)
-                done = fitted.end_s
-                if verdict == "retune" and retune_at is None:
-                    retune_at = fitted.end_s
-            if time.monotonic() - quiet_since >= follow:
-                break
-            time.sleep(min(1.0, step))
-            record = read_recording(recording)
-            if len(record) > rows:
+            record = read_recording(recording) if quiet_s == 0.0 else _readable(recording)
+            if record is not None and len(record) > rows:
                 rows, quiet_since = len(record), time.monotonic()
+                length = settings.window_s if settings.window_s is not None else 0.2 * record.duration_s
+                if quiet_s == 0.0 or record.t[-1] - record.t[0] >= length:
+                    for fitted in track(
+                        record,
+                        settings.order,
+                        window_s=length,
+                        every_s=settings.every_s if settings.every_s is not None else 0.25 * length,
+                        max_delay_s=settings.max_delay_s,
+                        hold=settings.hold,
+                        integrator=settings.integrator,
+                        after_s=done,
+                    ):
+                        verdict = _report(fitted, settings, table)
+                        done = fitted.end_s
+                        if verdict == "retune" and retune_at is None:
+                            retune_at = fitted.end_s
+            if time.monotonic() - quiet_since >= quiet_s:
+                break
+            time.sleep(0.2)
     if retune_at is not None:
         typer.echo(f"retune: the controller misses its margins on the tracked model since t = {retune_at:.4g} s")
     typer.echo(f"wrote {out}")
 
 
-def _report(
-    fitted: Window, law: Controller | None, required: tuple[float, float], table: TextIO, *, header: bool
-) -> str:
-    """Write one window to the table and to the terminal, and return the verdict on the controller, empty without."""
-    import math
+def _readable(recording: Path) -> Recording | None:
+    """Return what a growing recording holds, None while it holds less than two rows."""
+    from autotune.errors import InputError
+    from autotune.recording import read_recording
 
+    try:
+        return read_recording(recording)
+    except InputError:
+        return None
+
+
+def _report(fitted: Window, settings: _Tracking, table: TextIO) -> str:
+    """Write one window to the table and to the terminal, and return the verdict on the controller, empty without."""
     from autotune.identification.tracking import quantities
     from autotune.watch import advise
 
@@ -167,15 +251,20 @@ def _report(
     cells = [fitted.end_s, *(value for q in found for value in (q.value, q.sd))]
     names = ["t", *(name for q in found for name in (q.name.replace(" ", "_"), f"{q.name.replace(' ', '_')}_sd"))]
     verdict = ""
-    if law is not None:
-        advice = advise(fitted.model, law, modulus_margin=required[0], phase_margin_rad=math.radians(required[1]))
+    if settings.controller is not None:
+        advice = advise(
+            fitted.model,
+            settings.controller,
+            modulus_margin=settings.modulus_margin,
+            phase_margin_rad=settings.phase_margin_rad,
+        )
         verdict = advice.verdict
         phase, phase_sd = math.degrees(advice.phase_rad), math.degrees(advice.phase_sd_rad)
         line += f"; modulus {advice.modulus:.3f} +- {1.96 * advice.modulus_sd:.2g}"
         line += f", phase {phase:.1f} +- {1.96 * phase_sd:.2g} deg: {verdict}"
         cells += [advice.modulus, advice.modulus_sd, phase, phase_sd]
         names += ["modulus", "modulus_sd", "phase_deg", "phase_deg_sd"]
-    if header:
+    if table.tell() == 0:
         table.write(",".join([*names, *(["verdict"] if verdict else [])]) + "\n")
     table.write(",".join([*(f"{value:.9g}" for value in cells), *([verdict] if verdict else [])]) + "\n")
     table.flush()

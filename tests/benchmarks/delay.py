@@ -128,14 +128,14 @@ def second_table() -> None:
 def coverage() -> None:
     print(
         "\nCoverage of 95 % intervals of a0, a1, b, h (Example 2 at 500 Hz, noise 5; a share of n runs has sd"
-        f" {100 * np.sqrt(0.05 * 0.95 / RUNS):.1f} points)"
+        f" {100 * np.sqrt(0.05 * 0.95 / (3 * RUNS)):.1f} points)"
     )
     record = example_2(past_s=8.0)
     truth = np.array([*A, B, 4.0])
     for ar in (0.0, 0.5, 0.9, 0.98):
         rng = np.random.default_rng(int(100 * ar))
         inside: dict[bool, list[np.ndarray]] = {True: [], False: []}
-        for _ in range(RUNS):
+        for _ in range(3 * RUNS):
             run = replace(record, y=record.y + noise(len(record), 5.0, rng, ar))
             for coloured in inside:
                 model = identify_delay(run, 2, start_s=0.0, max_delay_s=8.0, offset=False, coloured=coloured)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -118,3 +119,18 @@ def test_commands_on_files(tmp_path, drifting):
     assert set(content["sd"]) == {"a", "b", "delay_s"}
     assert content["delay_s"] == pytest.approx(1.2, abs=0.05)
     assert len(content["a"]) == len(content["initial_state"]) == content["order"] == 2
+
+
+def test_a_rig_is_watched_while_its_present_loop_runs(tmp_path):
+    """The servo is 2/(s (1 + 0.08 s)) with a hold of 2 ms; fits run in a process of their own."""
+    config = Path(__file__).resolve().parents[3] / "configs" / "servo_sim.toml"
+    out = tmp_path / "watched"
+    command = ["watch", str(config), "--integrator", "--duration", "12", "--window", "6", "--max-delay", "0.2"]
+    watched = CliRunner().invoke(app, [*command, "--out", str(out)])
+    assert watched.exit_code == 0, watched.output
+    header, *rows = (out / "watch.csv").read_text().splitlines()
+    last = dict(zip(header.split(","), rows[-1].split(","), strict=True))
+    assert float(last["gain"]) == pytest.approx(2.0, rel=0.02)
+    assert float(last["time_constant_1"]) == pytest.approx(0.08, rel=0.05)
+    assert last["verdict"] == "keep"
+    assert (out / "recording.csv").is_file()
