@@ -1,8 +1,8 @@
 """The driver's control cycle against a bare read and write of the Modbus library, paired, on TCP loopback; and on RTU.
 
-The driver reads a sample of three signals (four registers) in one request, checks it, writes command and heartbeat in one request and
-checks that too; the bare cycle reads two registers and writes one and checks nothing. Both talk to the same slave in C
-(libmodbus), in turns of one cycle each, so that the machine's load falls on both alike.
+The driver reads a sample of three signals (four registers) in one request, checks it, writes command and heartbeat in
+one request and checks that too; the bare cycle reads two registers and writes one and checks nothing. Both talk to the
+same slave in C (libmodbus), in turns of one cycle each, so that the machine's load falls on both alike.
 """
 
 from __future__ import annotations
