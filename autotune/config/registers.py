@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
@@ -24,7 +24,7 @@ class RegisterSettings(Section):
     address: Annotated[int, Field(ge=0, le=65535, description="address as sent on the line, counted from 0, 0..65535")]
     type: Annotated[
         RegisterType,
-        Field(description="int16, uint16, int32, uint32, float32; bit for a coil or a discrete input"),
+        Field(description="int16, uint16, int32, uint32, float32; a coil or a discrete input is a bit"),
     ] = "int16"
     byte_order: Annotated[Literal["big", "little"], Field(description="order of the bytes within a word")] = "big"
     word_order: Annotated[Literal["big", "little"], Field(description="order of the words of a 32-bit value")] = "big"
@@ -33,6 +33,14 @@ class RegisterSettings(Section):
     not_a_value: Annotated[
         int | None, Field(description="raw count by which the device says that it has no measurement")
     ] = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _bits(cls, given: Any) -> Any:
+        """Take the type that a coil or a discrete input can only have."""
+        if isinstance(given, dict) and given.get("table") in _BIT_TABLES:
+            return {"type": "bit"} | given
+        return given
 
     @model_validator(mode="after")
     def _consistent(self) -> RegisterSettings:

@@ -132,7 +132,7 @@ def test_a_write_touches_no_register_in_between() -> None:
         ({"u": {"address": 1}}, "y and u overlap at holding 1"),
         ({"K": {"address": 9}}, "K and Ti must be mapped together"),
         ({"heartbeat_echo": {"address": 9}}, "heartbeat_echo needs heartbeat"),
-        ({"y": {"address": 0, "table": "coil"}}, "coils and discrete inputs hold a bit"),
+        ({"y": {"address": 0, "table": "coil", "type": "int16"}}, "coils and discrete inputs hold a bit"),
         ({"y": {"address": 65535, "type": "int32"}}, "ends beyond 65535"),
         ({"y": {"address": 0, "scale": 0}}, "scale = 0"),
     ],
@@ -141,3 +141,7 @@ def test_a_map_that_cannot_work_is_refused(changes: dict[str, object], says: str
     complete = {"y": {"address": 0, "type": "float32"}, "u": {"address": 5}}
     with pytest.raises(ValueError, match=says):
         RegisterMap.model_validate(complete | changes)
+
+
+def test_a_coil_is_a_bit_without_being_told() -> None:
+    assert RegisterSettings(table="coil", address=3).type == "bit"
