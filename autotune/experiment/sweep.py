@@ -152,21 +152,24 @@ def _measure(oscillation: Oscillation, choice: Choice, wanted: int, until_s: flo
     step_s = loop.sample_time_s
     oscillation.change(choice.settings, patience_s=PATIENCE * math.pi / choice.omega_rad_s)
     start = oscillation.start_row if known.swept else -1
+    turning = round(choice.turning_s / step_s)
     skip = 0  # edges before the cycle that is measured
     while True:
         tick, switched = oscillation.step()
         edges = oscillation.edges[skip:]
         if switched and len(edges) > 2 and _rebalanced(oscillation, edges):
-            skip, start = len(oscillation.edges) - 1, edges[-1]
+            skip, start = len(oscillation.edges) - 1, -1
             continue
         if start < 0 and edges:
-            start = edges[0]
+            start = edges[0] + turning
         if len(edges) < 2 * LEAST_PERIODS:
             continue
         period = (edges[-1] + edges[-2] - edges[1] - edges[0]) / (len(edges) - 2)
         periods = max(LEAST_PERIODS, min(wanted, int((until_s / step_s - start) / period)))
-        turned = (tick.k - edges[-1]) * step_s >= choice.turning_s
-        if tick.k < start + periods * period + 1 or not turned:
+        # the next setting takes over at the extremum of y: not before it, and not when the next switch is near
+        since_switch = tick.k - edges[-1]
+        at_extremum = turning <= since_switch <= turning + 0.15 * period
+        if tick.k < start + periods * period + 1 or not at_extremum:
             continue
         t, u, y = loop.history(start)
         others = known.points if known.swept else ()
