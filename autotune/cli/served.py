@@ -63,9 +63,20 @@ def device_of(config: Config, plant: Plant | None = None) -> RegisterDevice:
         With a Modbus rig that names its twin.
     plant : Plant, optional
         Replaces the twin's plant.
+
+    Raises
+    ------
+    InputError
+        The dead-man would run out between two samples.
     """
     settings = modbus_settings(config)
     twin = _twin(settings)
+    if twin.deadman_s <= config.signals.sample_time_s:
+        raise InputError(
+            f"a dead-man of {twin.deadman_s:g} s runs out between two samples of {config.signals.sample_time_s:g} s",
+            where="rig.twin.deadman_s",
+            mend="give it several sample times",
+        )
     controller = config.controller
     return RegisterDevice(
         plant or make_plant(twin.plant, seed=twin.seed, noise=twin.noise, start=twin.start),
