@@ -149,7 +149,7 @@ def _actuator() -> tuple[Entry, ...]:
             name="actuator.dead_zone",
             equation="w = 0 for |u - u0| < half_width, else u - u0 -+ half_width",
             parameters=(Quantity(name="half_width", unit="{u}", slot=k.A_DEAD_ZONE),),
-            starts=lambda s: [(c * s.w,) for c in (0.03, 0.12, 0.3)],
+            starts=lambda s: [(c * s.w,) for c in (0.01, 0.04, 0.12, 0.3)],
             confusable=("plant.coulomb_friction", "actuator.nonlinear_gain"),
             reference=astrom,
         ),
@@ -239,7 +239,7 @@ def _plant() -> tuple[Entry, ...]:
             name="plant.coulomb_friction",
             equation="force = -level sign(speed), sticking at rest",
             parameters=(Quantity(name="level", unit="{f}", slot=k.COULOMB),),
-            starts=lambda s: [(c * s.f,) for c in (0.01, 0.05, 0.2)],
+            starts=lambda s: [(c * s.f,) for c in (0.003, 0.015, 0.06, 0.2)],
             needs="mechanical",
             forced=True,
             confusable=("plant.stribeck_friction", "actuator.dead_zone", "plant.quadratic_drag"),
@@ -361,9 +361,7 @@ def _plant() -> tuple[Entry, ...]:
                 Quantity(name="phase", unit="rad", scale="real", slot=k.SINE_PHASE),
             ),
             starts=lambda s: [
-                (0.05 * s.f, p, a)
-                for p in (0.2 * s.x, 0.35 * s.x, 0.6 * s.x, s.x, 1.7 * s.x, 3.0 * s.x)
-                for a in (0.0, 1.57)
+                (0.05 * s.f, p, a) for p in (0.3 * 1.25**i * s.x for i in range(13)) for a in (0.0, 1.57)
             ],
             needs="mechanical",
             forced=True,

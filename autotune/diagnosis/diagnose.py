@@ -76,12 +76,17 @@ def diagnose(
             raise InputError(f"{len(r)} rows", where=r.name, mend="a diagnosis needs at least 100 finite readings")
     report("looking at the samples", 0.0)
     good, seen = inspect(recordings)
-    found = search(model, recordings, good, without, report)
-    jitter = jitter_effect(found.chosen.fit, recordings)
-    law = law_effect(recordings, controller)
-    samples = [s for s in (*seen, jitter, law) if s is not None and s.name not in without]
+    left_out = [*without, *(effect.name for effect in seen)]
+    found = search(model, recordings, good, left_out, report)
+    also = (jitter_effect(found.retuned.fit, recordings), law_effect(recordings, controller))
+    strong = [s for s in also if s is not None and s.name not in without]
+    # what the samples show explains the residual better than an effect of the chain does, or not at all
+    gained = score(found.retuned) - score(found.chosen)
+    strong = [s for s in strong if s.evidence > 0.5 * gained]
+    if any(s.name == "timing.jitter" for s in strong):
+        found = replace(found, chosen=found.retuned)
     report("checking on held-out rows", 0.9)
-    return _judge(found, samples, model)
+    return _judge(found, [s for s in (*seen, *strong) if s.name not in without], model)
 
 
 def _judge(found: Search, samples: list[SampleEffect], model: Model) -> Diagnosis:
@@ -95,7 +100,8 @@ def _judge(found: Search, samples: list[SampleEffect], model: Model) -> Diagnosi
     places = _places(effects) if verdict == "effect" else (_suspected(found) if verdict == "unexplained" else ())
     use = chosen if extended_is_better and verdict in ("effect", "unexplained") else found.retuned
     extended = model if verdict == "none" else use.fit.model
-    extended = replace(extended, effects=_with_uncertainty(use, extended.effects))
+    clips = [Effect(name=s.name, parameters=s.parameters) for s in samples if s.name == "sensor.saturation"]
+    extended = replace(extended, effects=(*_with_uncertainty(use, extended.effects), *clips))
     return Diagnosis(
         verdict=verdict,
         effects=effects,
@@ -116,7 +122,7 @@ def is_adequate(result: Fit, data: Data) -> bool:
 
 
 def _verdict(found: Search, samples: list[SampleEffect], adequate: bool, offset: bool) -> Verdict:
-    if found.chosen.names:
+    if found.chosen.names and not samples:
         return "effect" if adequate or dominates(found) else "unexplained"
     if samples or (offset and adequate):
         return "effect"

@@ -256,7 +256,8 @@ class _Problem:
             for x in shifted:
                 x[:, j] += h
             moved = _whiten(_simulate(spot.sim, shifted, self.data)[0], self.data)[1]
-            Jx[:, j] = (moved - spot.e) * (self.scales[j] / h)
+            column = (moved - spot.e) * (self.scales[j] / h)
+            Jx[:, j] = np.where(np.isfinite(column), column, 0.0)
         return J, Jx
 
     def inherited(self, theta: FloatArray, x0: list[FloatArray], e: FloatArray, base: Fit) -> _Derivatives:
@@ -272,7 +273,8 @@ class _Problem:
         h = 1e-3 if self.parametrisation.free[i].kind != "effect" else 1e-2
         moved = theta.copy()
         moved[i] += h
-        return (self.spot(moved, x0).e - e) / h
+        column = (self.spot(moved, x0).e - e) / h
+        return column if np.all(np.isfinite(column)) else np.zeros_like(column)
 
     scales: FloatArray
     reach: FloatArray
@@ -390,6 +392,8 @@ def _descend(
         if derivatives is None:
             derivatives, fresh = problem.jacobian(spot, may), True
         e_left, J_left, back = _eliminate(*derivatives, spot.e, windows)
+        if not (np.all(np.isfinite(J_left)) and np.all(np.isfinite(e_left))):
+            return spot, None  # a derivative ran out of the model's range: the last good point stands
         step, promised = _step(problem, spot, e_left, J_left, prior, damping, may)
         trial = [x.copy() for x in spot.x0]
         for (i, w, _, _), (gain_e, gain_J) in zip(windows, back, strict=True):

@@ -6,7 +6,7 @@ are left out of every fit.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,7 +30,7 @@ class SampleEffect:
     ----------
     name, equation : str
         Name in the catalogue and what it does.
-    parameters : dict
+    parameters : mapping
         Values with units.
     evidence : float
         Decrease of chi2 that it is worth, comparable with a fit's.
@@ -40,7 +40,7 @@ class SampleEffect:
 
     name: str
     equation: str
-    parameters: dict[str, Parameter]
+    parameters: Mapping[str, Parameter]
     evidence: float
     windows: tuple[tuple[int, float, float], ...] = ()
 
@@ -107,7 +107,11 @@ def inspect(recordings: Sequence[Recording]) -> tuple[list[BoolArray], list[Samp
     step = lattice_step(np.concatenate([r.y for r in recordings]))
     if step > 0.0:
         return good, [*_quantisation(recordings, step, unit)]
-    frozen = [frozen_rows(r.y) for r in recordings]
+    clipped, levels = _clipped(recordings)
+    if levels:
+        effects.append(_saturation(recordings, clipped, levels, unit))
+        good = [g & ~c for g, c in zip(good, clipped, strict=True)]
+    frozen = [frozen_rows(r.y) & ~c for r, c in zip(recordings, clipped, strict=True)]
     count = sum(int(f.sum()) for f in frozen)
     total = sum(len(r) for r in recordings)
     if count >= 6 and count > 1e-3 * total:
@@ -122,6 +126,35 @@ def inspect(recordings: Sequence[Recording]) -> tuple[list[BoolArray], list[Samp
         effects.append(_outliers(recordings, lone, count / total, float(np.median(heights)), unit))
         good = [g & ~s for g, s in zip(good, lone, strict=True)]
     return good, effects
+
+
+def _clipped(recordings: Sequence[Recording]) -> tuple[list[BoolArray], dict[str, float]]:
+    """Return the rows that stand at the readings' largest or smallest value, where that value is an end stop.
+
+    Continuous readings hardly ever take their extreme value twice; a converter's end takes it again and again.
+    """
+    y = np.concatenate([r.y for r in recordings])
+    rows = [np.zeros(len(r), dtype=bool) for r in recordings]
+    levels: dict[str, float] = {}
+    for key, level in (("low", float(np.nanmin(y))), ("high", float(np.nanmax(y)))):
+        at = [r.y == level for r in recordings]
+        runs = sum(int(np.sum(a[1:] & ~a[:-1]) + a[0]) for a in at)
+        if sum(int(a.sum()) for a in at) >= 5 and runs >= 2:
+            levels[key] = level
+            rows = [a | b for a, b in zip(rows, at, strict=True)]
+    return rows, levels
+
+
+def _saturation(
+    recordings: Sequence[Recording], rows: Sequence[BoolArray], levels: dict[str, float], unit: str
+) -> SampleEffect:
+    return SampleEffect(
+        name="sensor.saturation",
+        equation="y = min(max(z, low), high)",
+        parameters={key: Parameter(value=v, unit=unit, sd=1e-5 * abs(v)) for key, v in levels.items()},
+        evidence=20.0 * sum(int(r.sum()) for r in rows),
+        windows=tuple(_runs(recordings, rows)),
+    )
 
 
 def _neighbours(y: FloatArray, good: BoolArray) -> FloatArray:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 
 import numpy as np
 
@@ -133,7 +134,25 @@ def promise(base: Fit, effect: Effect, data: Data) -> Promise:
         return Promise(effect=effect, decrease=0.0)
     signed = any(f.kind == "effect" and not f.positive for f in p.free[base.theta.size :])
     a = float(np.clip(slope / curvature, -4.0 if signed else 0.0, 4.0))
-    return Promise(effect=effect, decrease=2.0 * a * slope - a * a * curvature)
+    return Promise(effect=_scaled(effect, a), decrease=2.0 * a * slope - a * a * curvature)
+
+
+#: Parameters that an effect is about proportional to: the first order tells their size.
+AMPLITUDES = frozenset(
+    ("level", "breakaway", "half_width", "width", "band", "time_constant", "delay", "second_order", "third_order",
+     "coefficient", "slope", "amplitude", "in_phase", "quadrature", "error")
+)  # fmt: skip
+
+
+def _scaled(effect: Effect, a: float) -> Effect:
+    """Return the effect with its amplitudes multiplied, where that is a step one can trust."""
+    if effect.name in ("plant.hysteresis", "plant.hard_stop") or a == 0.0:
+        return effect
+    factor = float(np.sign(a) * np.clip(abs(a), 0.05, 2.0))
+    parameters = {
+        key: replace(q, value=q.value * factor) if key in AMPLITUDES else q for key, q in effect.parameters.items()
+    }
+    return replace(effect, parameters=MappingProxyType(parameters))
 
 
 def starting_effects(entry: Entry, base: Fit, sizes: Range, data: Data) -> list[Effect]:
@@ -174,11 +193,13 @@ def fit_extended(base: Fit, effect: Effect, data: Data, iterations: int = 30) ->
 def extend(
     base: Hypothesis, data: Data, pool: Executor, entries: Iterable[Entry] | None = None, most: int = 10,
     extra: Sequence[Effect] = (),
+    starts_each: int = 2,
+    least: float = 3.0,
 ) -> list[Hypothesis]:  # fmt: skip
     """Fit the most promising effects on top of a base, best first."""
     promises = best_promises(base.fit, data, CATALOGUE.values() if entries is None else entries, pool, extra)
     ranked = sorted(promises.values(), key=lambda group: -group[0].decrease)
-    starts = [p.effect for group in ranked[:most] for p in group[:2] if p.decrease > 0.0]
+    starts = [p.effect for group in ranked[:most] for p in group[:starts_each] if p.decrease > least]
     fits: dict[str, Hypothesis] = {}
     for h in pool.map(lambda effect: fit_extended(base.fit, effect, data), starts):
         known = fits.get(h.names[-1])

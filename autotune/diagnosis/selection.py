@@ -197,7 +197,15 @@ def _found(
     )  # fmt: skip
 
 
-def grown(base: Hypothesis, data: Data, pool: Executor, entries: Sequence[Entry], most: int) -> list[Hypothesis]:
+def grown(
+    base: Hypothesis,
+    data: Data,
+    pool: Executor,
+    entries: Sequence[Entry],
+    most: int,
+    starts_each: int = 2,
+    least: float = 3.0,
+) -> list[Hypothesis]:
     """Return fits of a base with one more effect, loads of the environment at times and frequencies of their own."""
     names = {entry.name for entry in entries}
     extra = []
@@ -205,7 +213,7 @@ def grown(base: Hypothesis, data: Data, pool: Executor, entries: Sequence[Entry]
         extra += step_load_starts(base.fit, data, pool)
     if "environment.periodic_load" in names:
         extra += periodic_load_starts(base.fit, data, slowest_lag_s(base.fit.parametrisation.model))
-    return extend(base, data, pool, entries, most=most, extra=extra)
+    return extend(base, data, pool, entries, most=most, extra=extra, starts_each=starts_each, least=least)
 
 
 def _larger(
@@ -214,7 +222,7 @@ def _larger(
     """Return fits with one effect more than the best bases have, best first."""
     found: dict[frozenset[str], Hypothesis] = {}
     for base in bases[:beam]:
-        for h in grown(base, data, pool, entries, most=4):
+        for h in grown(base, data, pool, entries, most=4, starts_each=1, least=0.5 * LEAST_DECREASE):
             key = frozenset(h.names)
             if key not in found or score(h) < score(found[key]):
                 found[key] = h
@@ -223,13 +231,13 @@ def _larger(
 
 def score(h: Hypothesis) -> float:
     """Return the cost with what the effects' free numbers have to pay: ln N each."""
-    return h.fit.cost + h.parameters * float(np.log(h.fit.rows))
+    return float(h.fit.cost + h.parameters * np.log(h.fit.rows))
 
 
 def worth(smaller: Hypothesis, larger: Hypothesis) -> bool:
     """Whether a larger hypothesis explains enough more to be believed."""
     excess = max(1.0, larger.fit.chi2 / larger.fit.rows)
-    return score(smaller) - score(larger) > LEAST_DECREASE * excess
+    return bool(score(smaller) - score(larger) > LEAST_DECREASE * excess)
 
 
 def misfit(result: Fit, data: Data) -> float:
@@ -237,7 +245,8 @@ def misfit(result: Fit, data: Data) -> float:
     noise = floored(noise_from_differences(result.residuals, data.good), data.recordings)
     e = np.concatenate(replace(data, noise=noise).whitened(list(result.residuals)))
     states = sum(Q.shape[1] for Q in result.states_explain)
-    return float(e @ e) / max(data.rows - states - result.theta.size, 1)
+    freedom = max(data.rows - states - result.theta.size, 1)
+    return float(e @ e / freedom)
 
 
 def whiteness(result: Fit, data: Data) -> float:

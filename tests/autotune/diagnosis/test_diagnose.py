@@ -1,0 +1,122 @@
+"""Diagnoses of rigs written down here by their own equations, and of recordings beside the checkout."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from autotune.cli import app
+from autotune.diagnosis.diagnose import diagnose
+from autotune.diagnosis.fitting import fit
+from autotune.diagnosis.samples import inspect
+from autotune.diagnosis.selection import prepare
+from autotune.models import Block, Model, Port, TransferFunction, read_model
+from autotune.recording import Recording, read_recording
+
+
+def servo(gain: float = 5.0, tau: float = 0.25) -> Model:
+    return Model(
+        name="servo",
+        input=Port(unit="V"),
+        output=Port(unit="rad"),
+        blocks=(
+            Block(name="mass", place="plant", dynamics=TransferFunction(num=(gain,), den=(tau, 1.0))),
+            Block(name="position", place="plant", dynamics=TransferFunction(num=(1.0,), den=(1.0, 0.0))),
+        ),
+    )
+
+
+def rig(seed: int, drag: float = 0.0, rows: int = 1500, noise: float = 0.01) -> Recording:
+    """tau dv/dt = -v - drag v |v| + gain u under a P controller, by RK4 in steps of a fifth of the sample time."""
+    rng = np.random.default_rng(seed)
+    dt, gain, tau, K = 0.02, 5.4, 0.23, 0.9
+    v = x = 0.0
+    u, y = np.empty(rows), np.empty(rows)
+    aim = np.repeat(rng.uniform(-2.0, 2.0, rows // 100 + 1), 100)[:rows]
+    for k in range(rows):
+        y[k] = x + noise * rng.normal()
+        u[k] = K * (aim[k] - y[k]) + 0.3 * np.sin(5.0 * k * dt)
+
+        def slope(v: float, push: float = u[k]) -> float:
+            return (-v - drag * v * abs(v) + gain * push) / tau
+
+        for _ in range(5):
+            h = dt / 5
+            k1 = slope(v)
+            k2 = slope(v + 0.5 * h * k1)
+            k3 = slope(v + 0.5 * h * k2)
+            k4 = slope(v + h * k3)
+            x += h * (v + h / 6.0 * (k1 + k2 + k3))
+            v += h / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
+    return Recording(t=dt * np.arange(rows), u=u, y=y)
+
+
+def test_wrong_numbers_are_called_parameters_and_the_extended_model_has_the_right_ones() -> None:
+    found = diagnose(servo(), [rig(1), rig(2)])
+    assert found.verdict == "parameters"
+    assert found.effects == ()
+    gain = found.extended_model.blocks[0].dynamics.num[0]
+    assert gain == pytest.approx(5.4, rel=0.01)
+
+
+def test_a_drag_left_out_is_named_with_its_coefficient() -> None:
+    found = diagnose(servo(), [rig(3, drag=0.15), rig(4, drag=0.15)])
+    assert found.verdict == "effect"
+    assert found.effects[0].name == "plant.quadratic_drag"
+    coefficient = found.effects[0].parameters["coefficient"]
+    assert abs(coefficient.value - 0.15) < 4.0 * coefficient.sd + 0.005
+    assert found.fit.extended < 1.1 * found.fit.noise_floor < found.fit.retuned
+
+
+def test_intervals_of_the_retuned_gain_cover_the_truth_in_closed_loop() -> None:
+    inside = 0
+    for seed in range(30):
+        r = rig(100 + seed, rows=600)
+        _, result = prepare(servo(), [r], inspect([r])[0])
+        gain, sd = result.theta[0], np.sqrt(result.covariance[0, 0])
+        inside += bool(abs(gain - np.log(5.4 / 5.0)) < 1.96 * sd)
+    assert 25 <= inside <= 30  # 95 % of 30 are 28.5; fewer than 25 have a chance of 0.3 %
+
+
+def test_a_fit_with_nothing_free_but_the_start_states_leaves_the_numbers_alone() -> None:
+    r = rig(7, rows=600)
+    data, result = prepare(servo(), [r], inspect([r])[0])
+    none = np.zeros(result.theta.size, dtype=bool)
+    fixed = fit(result.parametrisation, data, free=none)
+    np.testing.assert_array_equal(fixed.theta, result.parametrisation.centre)
+    assert fixed.chi2 > result.chi2
+
+
+def test_a_clean_practice_case_needs_nothing(shared: Path, tmp_path: Path) -> None:
+    case = shared / "practice_cases" / "case_001"
+    given = [
+        "diagnose",
+        "--model",
+        f"{case}/model.toml",
+        f"{case}/rec1.csv",
+        f"{case}/rec2.csv",
+        "--out",
+        f"{tmp_path}/d",
+    ]
+    assert CliRunner().invoke(app, given).exit_code == 0
+    said = json.loads((tmp_path / "d" / "diagnosis.json").read_text())
+    assert said["verdict"] == "none"
+    assert said["effects"] == []
+    assert (tmp_path / "d" / "report.html").stat().st_size > 10_000
+    unseen = ["simulate", "--model", f"{tmp_path}/d/extended_model.toml", f"{case}/unseen.csv", "--horizon", "2"]
+    assert CliRunner().invoke(app, [*unseen, "--out", f"{tmp_path}/sim.csv"]).exit_code == 0
+    sim = np.genfromtxt(tmp_path / "sim.csv", delimiter=",", names=True)
+    y = read_recording(case / "unseen.csv").y
+    assert np.std((sim["y_sim"] - y)[200:]) / np.std(y[200:]) < 0.033  # the answer's figure for the truth is 0.0312
+
+
+def test_a_lag_is_named_with_all_the_places_it_may_sit(shared: Path) -> None:
+    case = shared / "practice_cases" / "case_009"
+    found = diagnose(read_model(case / "model.toml"), [read_recording(case / f"rec{k}.csv") for k in (1, 2)])
+    assert found.effects[0].name in ("actuator.lag", "sensor.lag")
+    assert {"actuator", "sensor"} <= set(found.places)
+    assert found.next_experiment is not None
