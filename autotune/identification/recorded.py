@@ -22,7 +22,7 @@ from autotune.recording import Recording
 Excitation: TypeAlias = Literal["relay", "repeated command", "random or steps", "closed loop by way of r"]
 
 #: Frequencies per decade: the finer grid where it gives enough points, wider windows where the data are poorer.
-_PER_DECADE = (5, 3, 2)
+_PER_DECADE = (10, 5, 3, 2)
 _ENOUGH_POINTS = 4
 _LEAST_LINES = 13
 _HIGHEST_PART = 0.1  # of the sampling frequency: the images of the hold and the noise of the stamps stay below
@@ -133,7 +133,12 @@ def _of_spectra(recording: Recording, largest_relative_sd: float) -> FrequencyEs
     for per_decade in _PER_DECADE:
         estimates, reference = _corrected(t, u, y, r, highest, repeat=repeat, per_decade=per_decade)
         points = [point for one in estimates if (point := _point(one, reference, source)) is not None]
-        enough = tuple(point for point in points if _relative_sd(point, reference) <= largest_relative_sd)
+        enough = tuple(
+            point
+            for point in points
+            if _relative_sd(point, reference) <= largest_relative_sd
+            and _relative_sd(point) <= 2.0 * largest_relative_sd
+        )
         if len(enough) > len(kept):
             kept, tried = enough, len(estimates)
         if repeat is not None or len(kept) >= _ENOUGH_POINTS:
