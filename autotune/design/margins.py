@@ -14,7 +14,8 @@ from autotune.controller import Controller, PIDController
 from autotune.design.loop import ContinuousLoop, OpenLoop, Plant, open_loop
 from autotune.design.norms import disturbance_h2
 
-_ZOOMS = 6
+_ZOOMS = 4
+_SECANTS = 30
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -148,11 +149,13 @@ def refined_minimum(
 ) -> tuple[float, float]:
     """Return the minimum of f and where it is, given its values on a grid that resolves it.
 
-    The eight lowest local minima on the grid are each searched between their neighbours.
+    Of the local minima on the grid those within a tenth of the lowest, eight at most, are searched between their
+    neighbours.
     """
     inner = np.flatnonzero((values[1:-1] <= values[:-2]) & (values[1:-1] <= values[2:])) + 1
     best = int(np.argmin(values))
     lowest, at = float(values[best]), float(omega[best])
+    inner = inner[values[inner] <= lowest + 0.1 * abs(lowest)]
     for i in inner[np.argsort(values[inner])][:8]:
         left, right = float(omega[i - 1]), float(omega[i + 1])
         for _ in range(_ZOOMS):
@@ -177,18 +180,21 @@ def modulus_margin(loop: OpenLoop, omega: FloatArray, L: ComplexArray) -> tuple[
 
 
 def _roots(f: Callable[[FloatArray], FloatArray], omega: FloatArray, values: FloatArray) -> FloatArray:
-    """Return the frequencies where f changes sign, by bisection of all brackets at once, closed by a secant."""
+    """Return the frequencies where f changes sign, by bracketed secants, all brackets at once."""
     i = np.flatnonzero(np.sign(values[:-1]) * np.sign(values[1:]) < 0)
     if not len(i):
         return omega[np.flatnonzero(values == 0.0)]
     a, b, fa, fb = omega[i], omega[i + 1], values[i], values[i + 1]
-    for _ in range(40):
-        middle = 0.5 * (a + b)
-        fm = f(middle)
-        left = np.sign(fm) == np.sign(fa)
-        a, fa = np.where(left, middle, a), np.where(left, fm, fa)
-        b, fb = np.where(left, b, middle), np.where(left, fb, fm)
-    return np.asarray(np.concatenate((0.5 * (a + b), omega[np.flatnonzero(values == 0.0)])))
+    for _ in range(_SECANTS):
+        x = (a * fb - b * fa) / (fb - fa)
+        fx = f(x)
+        same = np.sign(fx) == np.sign(fb)
+        # Illinois: the end that stays counts half, so that neither end is kept for ever
+        a, fa = np.where(same, a, b), np.where(same, 0.5 * fa, fb)
+        b, fb = x, np.where(fx == 0.0, 1e-300, fx)
+        if np.all(np.abs(fx) < 1e-14):
+            break
+    return np.asarray(np.concatenate((b, omega[np.flatnonzero(values == 0.0)])))
 
 
 def phase_and_delay_margin(loop: OpenLoop, omega: FloatArray, L: ComplexArray) -> tuple[float, float, float]:

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import Phase, assume, given, settings
+from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 
 from autotune.controller import PIDController
@@ -87,7 +87,7 @@ plants = st.builds(
 
 
 @given(P1=plants, P2=plants, P3=plants)
-@settings(max_examples=25, phases=(Phase.generate,))
+@settings(max_examples=25, suppress_health_check=[HealthCheck.filter_too_much])
 def test_nu_gap_is_a_metric(P1: TransferFunction, P2: TransferFunction, P3: TransferFunction) -> None:
     d12, d23, d13 = nu_gap(P1, P2), nu_gap(P2, P3), nu_gap(P1, P3)
     assert nu_gap(P1, P1) == pytest.approx(0.0, abs=1e-12)
@@ -105,7 +105,7 @@ def test_nu_gap_is_a_metric(P1: TransferFunction, P2: TransferFunction, P3: Tran
     shift=st.integers(-20, 20).map(lambda value: value / 100.0),
     later=st.sampled_from([0.0, 0.01, 0.03]),
 )
-@settings(max_examples=25, phases=(Phase.generate,))
+@settings(max_examples=25, suppress_health_check=[HealthCheck.filter_too_much])
 def test_stability_and_margin_carry_over_within_the_distance(
     P: TransferFunction, K: float, Ti: float, gain: float, shift: float, later: float
 ) -> None:
@@ -114,11 +114,11 @@ def test_stability_and_margin_carry_over_within_the_distance(
     P2 = _first_order(P.num[0] * gain, -P.den[1] + shift, P.delay_s + later)
     b, distance = generalized_stability_margin(P, controller), nu_gap(P, P2)
     assume(distance < b)
-    assert math.asin(generalized_stability_margin(P2, controller)) >= math.asin(b) - math.asin(distance) - 1e-9
+    assert math.asin(generalized_stability_margin(P2, controller)) >= math.asin(b) - math.asin(distance) - 1e-7
 
 
 @given(P=plants, K=st.floats(0.5, 5.0), Ti=st.floats(1.0, 10.0))
-@settings(max_examples=15, phases=(Phase.generate,))
+@settings(max_examples=15, suppress_health_check=[HealthCheck.filter_too_much])
 def test_margin_is_the_inverse_norm_of_the_gang_of_four(P: TransferFunction, K: float, Ti: float) -> None:
     # b = 1/||[P; I](1 + C P)^-1 [C I]||_inf: a rank-one matrix, by its singular value at every frequency
     controller = PIDController(K=K, Ti_s=Ti)
