@@ -60,7 +60,8 @@ def frequency_points(recording: Recording, *, largest_relative_sd: float = 0.5) 
     recording : Recording
         Columns t, u, y, and r where the loop was closed; y may have gaps.
     largest_relative_sd : float
-        Points whose standard deviation is above this part of the gain are left out.
+        Points whose standard deviation is above this part of the gain (the rough model's, where there is one) are left
+        out.
 
     Returns
     -------
@@ -133,12 +134,7 @@ def _of_spectra(recording: Recording, largest_relative_sd: float) -> FrequencyEs
     for per_decade in _PER_DECADE:
         estimates, reference = _corrected(t, u, y, r, highest, repeat=repeat, per_decade=per_decade)
         points = [point for one in estimates if (point := _point(one, reference, source)) is not None]
-        enough = tuple(
-            point
-            for point in points
-            if _relative_sd(point, reference) <= largest_relative_sd
-            and _relative_sd(point) <= 2.0 * largest_relative_sd
-        )
+        enough = tuple(point for point in points if _relative_sd(point, reference) <= largest_relative_sd)
         if len(enough) > len(kept):
             kept, tried = enough, len(estimates)
         if repeat is not None or len(kept) >= _ENOUGH_POINTS:
