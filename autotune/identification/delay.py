@@ -19,7 +19,8 @@ from autotune.models import Hold
 from autotune.recording import Recording
 
 _MIDDLE_BINS = 6000
-_UNDETERMINED = 0.5  # relative standard deviation of b
+#: relative standard deviation of b above which the order is refused: from order 3 on, linearised intervals fail earlier
+_UNDETERMINED = {1: 0.5, 2: 0.5, 3: 0.2, 4: 0.2}
 _COMPARED = 3
 _ALIKE = 6.0  # residual variances: a hundredth of the rightful minimum's chance
 MAX_ORDER = 4
@@ -183,7 +184,7 @@ def _require_inside(data: DelayData, model: DelayModel, largest: float) -> None:
 def _require_determined(data: DelayData, model: DelayModel) -> None:
     sd = model.standard_deviations
     n = model.order
-    if sd[n] > _UNDETERMINED * abs(model.b):
+    if sd[n] > _UNDETERMINED[n] * abs(model.b):
         period = input_period(data)
         excites = "" if np.isnan(period) else f"; u repeats every {period:.3g} s and excites few frequencies"
         raise IdentificationError(
