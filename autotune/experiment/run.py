@@ -17,6 +17,7 @@ from autotune.experiment.loop import ControlLoop
 from autotune.experiment.result import ExperimentResult, Progress, State
 from autotune.experiment.rig import Rig
 from autotune.experiment.sweep import Swept, sweep
+from autotune.experiment.warm import warm_up
 from autotune.recording import RecordingWriter
 
 OnProgress = Callable[[Progress], None]
@@ -60,6 +61,7 @@ def run_experiment(
         What ended it; the rig is safe and the recording readable.
     """
     writer = RecordingWriter(recording, ("t", "u", "y"), recording_metadata(config))
+    warm_up()
     with ControlLoop(rig=rig, envelope=envelope_of(config), writer=writer) as loop:
         return experiment_on(loop, config, on_progress=on_progress)
 

@@ -1,0 +1,26 @@
+"""Bring the estimators into memory before a rig is touched: their first call takes longer than many samples."""
+
+from __future__ import annotations
+
+import contextlib
+
+import numpy as np
+
+from autotune.errors import IdentificationError
+from autotune.identification.frequency import limit_cycle_points
+from autotune.identification.limit_cycle import WholePeriods
+
+
+def warm_up() -> None:
+    """Estimate the points of a made-up limit cycle, and forget them.
+
+    The first call in a process imports, and loads or compiles what is compiled: a third of a second, or several after
+    an installation. In the middle of a loop at 100 Hz that would be a link too slow.
+    """
+    t = 0.01 * np.arange(900, dtype=np.float64)
+    u = np.where(np.sin(np.pi * t) >= 0.0, 1.0, -1.0)
+    y = np.cumsum(u) * 0.01 + 0.01 * np.random.default_rng(1).standard_normal(t.size)
+    with contextlib.suppress(IdentificationError):
+        points = limit_cycle_points(t, u, y, highest_harmonic=3).points
+        window = WholePeriods(start_s=2.0, end_s=8.0, periods=3)
+        limit_cycle_points(t, u, y, window=window, known=points)
