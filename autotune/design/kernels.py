@@ -56,8 +56,10 @@ class SampledPlant:
         return np.asarray(np.unwrap(np.angle(self.h)))
 
 
-def sampled_plant(plant: TransferFunction) -> SampledPlant:
+def sampled_plant(plant: TransferFunction, largest_gain: float = 1.0) -> SampledPlant:
     """Return the plant on a logarithmic grid, refined where dead time asks for it.
+
+    The grid covers the plant's features and the crossovers that gains up to ``largest_gain`` give it.
 
     Raises
     ------
@@ -73,7 +75,8 @@ def sampled_plant(plant: TransferFunction) -> SampledPlant:
             where="plant",
             mend="integral action cannot remove a disturbance there; design another structure",
         )
-    corners = characteristic_frequencies(plant)
+    loudest = TransferFunction(num=tuple(largest_gain * b for b in plant.num), den=plant.den, delay_s=plant.delay_s)
+    corners = characteristic_frequencies(loudest)
     low, high = corners[0] * 1e-4, corners[-1] * 1e2
     omega = np.geomspace(low, high, int(_POINTS_PER_DECADE * math.log10(high / low)) + 1)
     if plant.delay_s > 0.0:

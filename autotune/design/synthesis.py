@@ -60,7 +60,8 @@ def design(plant: Plant, specification: Specification, kind: Kind = "pi", *, cer
     Le & Mendes 2010, equations (11) to (18) and (25).
     """
     H = transfer_function_of(plant)
-    sampled = sampled_plant(H)
+    most = specification.largest_gain if specification.noise == "bound" else specification.noise_gain
+    sampled = sampled_plant(H, most)
     pi = _best_pi(H, sampled, specification)
     if kind == "pid":
         from autotune.design.pid import best_pid

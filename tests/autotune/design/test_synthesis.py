@@ -163,8 +163,9 @@ def test_design_scales_with_time_gain_and_sign(scale: float, gain: float, negati
     plant = TransferFunction(num=(k,), den=(scale**2, 2.0 * scale, 1.0), delay_s=0.5 * scale)
     reference = design(TransferFunction(num=(1.0,), den=(1.0, 2.0, 1.0), delay_s=0.5), spec1(20.0), certificate=False)
     found = design(plant, spec1(20.0 / gain), certificate=False)
-    assert found.controller.K * k == pytest.approx(reference.controller.K, rel=1e-3)
-    assert found.controller.Ti_s == pytest.approx(reference.controller.Ti_s * scale, rel=1e-3)
+    # the norm is flat around its minimum, so the gains are known to its square root only
+    assert found.controller.K * k == pytest.approx(reference.controller.K, rel=5e-3)
+    assert found.controller.Ti_s == pytest.approx(reference.controller.Ti_s * scale, rel=5e-3)
     assert found.h2 == pytest.approx(reference.h2 * gain * math.sqrt(scale), rel=1e-5)
 
 
