@@ -239,12 +239,12 @@ def _find_sign(loop: ControlLoop, config: Config, known: Known, tell: Tell) -> K
     """Push the command up, then down, and compare how y moves."""
     tell("finding the sign of the plant's gain")
     push = 0.5 * config.operating_point.u_uncertainty
-    distance = 4.0 * known.noise_half + 0.02 * config.limits.swing
+    distance = 4.0 * known.noise_half + 0.1 * config.limits.swing
     patience = 0.1 * config.limits.time_s
     slopes = []
     for direction in (1.0, -1.0):
         start = loop.tick
-        y0 = known.y_rest if direction > 0 else loop.monitor.recent[-1]
+        y0 = median(loop.monitor.recent)
         while abs(median(loop.monitor.recent) - y0) < distance:
             if loop.tick.t_s - start.t_s > patience:
                 break
@@ -256,7 +256,10 @@ def _find_sign(loop: ControlLoop, config: Config, known: Known, tell: Tell) -> K
             where="approach",
             mend="look for a stuck actuator; else raise operating_point.u_uncertainty",
         )
-    return replace(known, plant_sign=1 if slopes[0] > slopes[1] else -1)
+    # the command between the two at which y would have stood still
+    balance = -(slopes[0] + slopes[1]) / (slopes[0] - slopes[1])
+    midpoint = known.midpoint + push * min(max(balance, -2.0), 2.0)
+    return replace(known, plant_sign=1 if slopes[0] > slopes[1] else -1, midpoint=midpoint)
 
 
 def find_midpoint(loop: ControlLoop, config: Config, known: Known, tell: Tell) -> tuple[Known, Oscillation]:
@@ -272,7 +275,9 @@ def find_midpoint(loop: ControlLoop, config: Config, known: Known, tell: Tell) -
     tell("catching the plant and finding the relay's mid-point")
     point = config.operating_point
     room = min(known.midpoint - config.limits.u_min, config.limits.u_max - known.midpoint)
-    amplitude = min(config.experiment.relay_amplitude or 0.5 * point.u_uncertainty, 0.9 * room)
+    # where ramp or pushes have told the mid-point roughly, the relay need not reach across all of its uncertainty
+    reach = 0.5 if point.approach == "ramp" or point.plant_sign == 0 else BRACKET
+    amplitude = min(config.experiment.relay_amplitude or reach * point.u_uncertainty, 0.9 * room)
     if amplitude <= 0.0:
         raise ExperimentStopped(
             f"saturated: the mid-point {known.midpoint:.4g} is at the end of the command's range",
