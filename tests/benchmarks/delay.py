@@ -182,9 +182,7 @@ def examples_4_and_5() -> None:
             error = np.abs(found.delay_s - 0.5)
             errors.append([error[(t > 20) & (t < 30)].max(), np.median(error[t > 30]), error[t > 30].max()])
         worst = np.median(errors, axis=0)
-        print(
-            f"  noise {sd:g}: largest 20 to 30 s {worst[0]:.3f}, after 30 s median {worst[1]:.4f}, largest {worst[2]:.3f}"
-        )
+        print(f"  noise {sd:g}: 20-30 s up to {worst[0]:.3f}, then median {worst[1]:.4f}, up to {worst[2]:.3f}")
     print("Example 5, on line with a varying h (the paper prints no profile: ramps and sines of our choice), noise 5")
     t = np.arange(12001) / 100.0
     profiles: dict[str, Callable[[float], float]] = {
