@@ -1,4 +1,4 @@
-"""``autotune identify closed-loop``: the plant from a recording of its loop under control."""
+"""``autotune identify closed-loop``: the plant from a recording of its loop. ``autotune dither``: make the recording."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.console import Console
 
-from autotune.cli import identify
+from autotune.cli import app, identify
 
 if TYPE_CHECKING:
     from autotune.identification.closed_loop import ClosedLoopIdentification
@@ -112,3 +112,32 @@ def summary(result: ClosedLoopIdentification) -> str:
     late = f" and {model.input_delay} samples of dead time" if model.input_delay else ""
     sd = math.sqrt(float(model.innovation_covariance[0, 0]))
     return f"order {model.order}{late}, poles {poles}, innovation sd {sd:.3g}; {result.excitation.sentence}"
+
+
+@app.command()
+def dither(
+    config: Annotated[Path, typer.Argument(metavar="CONFIG.toml", help="configuration of the rig, with [controller]")],
+    out: Annotated[Path, typer.Option(help="CSV to write: t,u,y,r,dither")],
+    duration: Annotated[
+        float | None, typer.Option(min=1.0, help="time under dither [s]; experiment.budget_s when absent")
+    ] = None,
+    amplitude: Annotated[
+        float | None, typer.Option(help="half-amplitude of the dither [u unit]; found on the rig when absent")
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="of the random dwell times")] = 0,
+) -> None:
+    """Add a dither to the rig's present controller and record r, u and y, within the limits of the config."""
+    from autotune.cli.run import _Bar, _rig
+    from autotune.config import load_config
+    from autotune.experiment.dither import run_dither
+
+    content = load_config(config)
+    rig = _rig(content, dry_run=False)
+    with _Bar() as bar:
+        done = run_dither(rig, content, out, duration_s=duration, amplitude=amplitude, seed=seed, on_progress=bar.show)
+    unit_u, unit_y = content.signals.u_unit, content.signals.y_unit
+    typer.echo(
+        f"{done.duration_s:g} s under K = {done.controller.K:g}, Ti = {done.controller.Ti_s:g} s with a dither of "
+        f"{done.amplitude:.3g} {unit_u}; y stayed within {done.departure:.3g} {unit_y} of the set-point"
+    )
+    typer.echo(f"wrote {out}; now: autotune identify closed-loop {out} --out closed_loop.json")

@@ -196,9 +196,14 @@ def usable_stretch(recording: Recording) -> tuple[Recording, tuple[str, ...]]:
     warnings = []
     t = recording.t[rows]
     if len(rows) < len(good):
-        warnings.append(
-            f"only t = {t[0]:g} to {t[-1]:g} s is used ({len(rows)} of {len(good)} rows): outside, values are not "
-            "numbers or time stamps are not equidistant"
+        spared = len(good) - len(rows) == 1 and not good[-1]  # a rig's last row holds the safe command and nothing else
+        warnings += (
+            []
+            if spared
+            else [
+                f"only t = {t[0]:g} to {t[-1]:g} s is used ({len(rows)} of {len(good)} rows): outside, values are not "
+                "numbers or time stamps are not equidistant"
+            ]
         )
         recording = recording.between(float(t[0]), float(t[-1]) + 0.5 * recording.sample_time_s)
     stray = float(np.max(np.abs(np.diff(t) / recording.sample_time_s - 1.0)))

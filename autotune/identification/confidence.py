@@ -44,39 +44,31 @@ def response_covariance(estimate: PredictionErrorEstimate, omega_rad_s: FloatArr
 
     Notes
     -----
-    The model is moved by one standard deviation either way along each principal axis of its covariance. Half the
-    difference gives the first-order term; the curvature adds the second-order variance h^2 / 2 of h z^2 / 2, which
-    matters near a pole that is itself uncertain (an integrator seen at low frequency).
+    With G = B(z)/A(z) and alpha the relative error of A(z), the error is dG - alpha dG to second order. The second
+    term matters near a pole that is itself uncertain (an integrator seen at low frequency); its mean square, for
+    Gaussian parameters, is added alike to both directions.
     """
     _require_information(estimate)
-    values, vectors = np.linalg.eigh(estimate.covariance)
-    axes = vectors * np.sqrt(np.maximum(values, 0.0))
-    middle = estimate.model.response(omega_rad_s)
-    ahead, behind = (_moved_responses(estimate, sign * axes, omega_rad_s) for sign in (1.0, -1.0))
-    return _outer((ahead - behind) / 2.0) + _outer((ahead + behind - 2.0 * middle[..., None]) / math.sqrt(2.0))
-
-
-def _moved_responses(estimate: PredictionErrorEstimate, steps: FloatArray, omega_rad_s: FloatArray) -> ComplexArray:
-    """Return the responses of the models moved along each column of ``steps`` (P, k), shape (W, n_y, n_u, k)."""
     model = estimate.model
     z = np.exp(1j * np.asarray(omega_rad_s, dtype=np.float64) * model.sample_time_s)
-    A, B, C, D = (
-        np.moveaxis(fixed[..., None] + change @ steps, -1, 0)
-        for fixed, change in (
-            (model.A, estimate.d_a),
-            (model.B, estimate.d_b),
-            (model.C, estimate.d_c),
-            (model.D, estimate.d_d),
-        )
-    )
-    resolvent = np.linalg.inv(z[:, None, None, None] * np.eye(model.order) - A)
-    late = (z ** -float(model.input_delay))[:, None, None, None]
-    return np.asarray(np.moveaxis((C @ resolvent @ B + D) * late, 1, -1), dtype=np.complex128)
+    resolvent = np.linalg.inv(z[:, None, None] * np.eye(model.order) - model.A)
+    right, left = resolvent @ model.B, model.C @ resolvent
+    change = (
+        np.einsum("oip,wiu->woup", estimate.d_c, right)
+        + np.einsum("woi,ikp,wku->woup", left, estimate.d_a, right, optimize=True)
+        + np.einsum("woi,iup->woup", left, estimate.d_b)
+        + estimate.d_d
+    ) * (z ** -float(model.input_delay))[:, None, None, None]
+    alpha = -np.einsum("wki,ikp->wp", resolvent, estimate.d_a)[:, None, None]
+    P = estimate.covariance
+    second = _mean(alpha, alpha, P).real * _mean(change, change, P).real
+    second = second + np.abs(_mean(alpha, change, P)) ** 2 + np.abs(_mean(alpha, change.conj(), P)) ** 2
+    return np.asarray(_real_covariance(change, P) + 0.5 * second[..., None, None] * np.eye(2), dtype=np.float64)
 
 
-def _outer(change: ComplexArray) -> FloatArray:
-    parts = np.stack([change.real, change.imag], axis=-2)
-    return np.asarray(parts @ np.swapaxes(parts, -1, -2), dtype=np.float64)
+def _mean(a: ComplexArray, b: ComplexArray, covariance: FloatArray) -> ComplexArray:
+    """Return the mean of a times the conjugate of b, both linear (..., P) in the parameters."""
+    return np.asarray(np.einsum("...p,...p->...", a @ covariance, b.conj()), dtype=np.complex128)
 
 
 def pole_covariance(estimate: PredictionErrorEstimate) -> FloatArray:

@@ -19,6 +19,8 @@ from autotune.identification.state_space import InnovationModel, balancing, spec
 
 #: A step that promises less than this in -2 log likelihood moves no parameter by 3 % of its standard deviation.
 _TOLERANCE = 1e-3
+#: Rows that initial state and constant of the start are fitted on.
+_LINEAR_ROWS = 2000
 #: A search that cannot move any more has converged if it could have gained less than this.
 _IMMATERIAL = 0.1
 #: Zeros of the noise model nearer to the unit circle than this have no finite memory worth the name.
@@ -142,20 +144,24 @@ def _initial_predictor(
     D = start.D if feedthrough else np.zeros_like(start.D)
     F = np.hstack([start.A, start.B, start.K, np.zeros((n, 1))])
     predictor = Predictor(F=F, H=np.hstack([start.C, D, np.zeros((n_y, 1))]), x0=np.zeros(n))
-    # the errors are linear in the initial state and, with A, C and K kept, in the constant: solve for these first
-    rows = min(len(y), 2000)
-    base = innovations(predictor.F, predictor.H, predictor.x0, u[:rows], y[:rows])
-    zero_u, zero_y = np.zeros((rows, u.shape[1])), np.zeros((rows, n_y))
-    columns = []
-    for i in range(n):
-        columns.append(innovations(F, predictor.H, np.eye(n)[i], zero_u, zero_y).ravel())
-    for o in range(n_y if offset else 0):
-        # a constant y_0 = -e_o acts as a constant measurement e_o does
-        columns.append(innovations(F, predictor.H, np.zeros(n), zero_u, zero_y + np.eye(n_y)[o]).ravel())
-    solution = np.linalg.lstsq(np.stack(columns, axis=1), -base.ravel(), rcond=1e-10)[0]
-    H = predictor.H.copy()
-    H[:, -1] = -solution[n:] if offset else 0.0
-    return replace(predictor, H=H, x0=solution[:n])
+    return _with_linear_part(predictor, u, y, offset=offset)
+
+
+def _with_linear_part(predictor: Predictor, u: FloatArray, y: FloatArray, *, offset: bool) -> Predictor:
+    """Return the predictor with initial state and output constant fitted: the errors are linear in these."""
+    n, n_u, n_y = predictor.sizes
+    rows = min(len(y), _LINEAR_ROWS)
+    F, H = predictor.F.copy(), predictor.H.copy()
+    F[:, -1] = H[:, -1] = 0.0
+    none, no_u, no_y = np.zeros(n), np.zeros((rows, n_u)), np.zeros((rows, n_y))
+    columns = [innovations(F, H, unit, no_u, no_y).ravel() for unit in np.eye(n)]
+    for unit in np.eye(n_y) if offset else ():  # a constant y_0 acts as its negative, measured, does
+        columns.append(innovations(F, H, none, no_u, no_y + unit).ravel())
+    base = innovations(F, H, none, u[:rows], y[:rows]).ravel()
+    solution = np.linalg.lstsq(np.stack(columns, axis=1), -base, rcond=1e-10)[0]
+    if offset:
+        H[:, -1] = -solution[n:]
+    return Predictor(F=F, H=H, x0=solution[:n])
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -1,0 +1,55 @@
+"""Dither under the present controller: the signal, the envelope, and the plant that comes out."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from autotune.config import load_config
+from autotune.errors import InputError
+from autotune.experiment.dither import random_dwells, run_dither
+from autotune.identification.closed_loop import identify_closed_loop
+from autotune.recording import read_recording
+from drivers import open_rig
+
+CONFIGS = Path(__file__).resolve().parents[3] / "configs"
+
+
+@given(rows=st.integers(1, 500), longest=st.integers(2, 50), seed=st.integers(0, 99))
+@settings(max_examples=30)
+def test_dither_is_binary_and_never_dwells_longer_than_asked(rows: int, longest: int, seed: int) -> None:
+    signal = random_dwells(rows, longest, seed)
+    assert set(np.unique(signal)) <= {-1.0, 1.0}
+    changes = np.flatnonzero(np.diff(signal)) + 1
+    assert np.max(np.diff(np.concatenate([[0], changes, [rows]]))) <= longest
+
+
+def test_ball_under_its_slow_controller_tells_its_gain_within_its_limits(tmp_path: Path) -> None:
+    config = load_config(CONFIGS / "ball_sim.toml")
+    limits = config.limits
+    rig = open_rig(config.rig, u_range=(limits.u_min, limits.u_max), u_safe=limits.u_safe)
+    done = run_dither(rig, config, tmp_path / "d.csv", duration_s=40.0)
+    recording = read_recording(tmp_path / "d.csv")
+    assert done.departure < limits.swing
+    assert np.all((recording.u >= limits.u_min) & (recording.u <= limits.u_max))
+    found = identify_closed_loop(recording, controller=done.controller, order=2)
+    assert found.law is not None
+    assert found.law.unexplained < 1e-6  # the recorded dither is what the law did not ask for
+    near = [point for point in found.points if 1.0 < point.omega_rad_s < 6.0]
+    assert near
+    for point in near:
+        s = 1j * point.omega_rad_s
+        truth = -65.5 / (2.02e-5 * s**4 + 0.007328 * s**3 + 0.3836 * s**2 + s)
+        assert abs(point.response / truth - 1.0) < 0.12
+
+
+def test_amplitude_without_room_is_refused(tmp_path: Path) -> None:
+    config = load_config(CONFIGS / "servo_sim.toml")
+    limits = config.limits
+    rig = open_rig(config.rig, u_range=(limits.u_min, limits.u_max), u_safe=limits.u_safe)
+    with pytest.raises(InputError, match="amplitude"):
+        run_dither(rig, config, tmp_path / "d.csv", duration_s=1.0, amplitude=1e6)
