@@ -1,4 +1,4 @@
-"""``autotune identify closed-loop``: the plant from a recording of its loop. ``autotune dither``: make the recording."""
+"""``autotune identify closed-loop``: the plant from a recording of its loop. ``autotune dither``: make such a one."""
 
 from __future__ import annotations
 
