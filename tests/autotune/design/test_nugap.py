@@ -123,7 +123,7 @@ def test_margin_is_the_inverse_norm_of_the_gang_of_four(P: TransferFunction, K: 
     # b = 1/||[P; I](1 + C P)^-1 [C I]||_inf: a rank-one matrix, by its singular value at every frequency
     controller = PIDController(K=K, Ti_s=Ti)
     b = generalized_stability_margin(P, controller)
-    assume(b > 0.0)
+    assume(b > 0.05)  # a curve that grazes -1 falls between the points of the plain grid below
     omega = np.geomspace(1e-7, 1e4, 4000)
     p, c = P.response(omega), controller.response(omega)
     S = 1.0 / (1.0 + p * c)
