@@ -262,7 +262,7 @@ def _plant() -> tuple[Entry, ...]:
         Entry(
             name="plant.quadratic_drag",
             equation="tau dv/dt = -v - coefficient v |v| + gain w",
-            parameters=(Quantity(name="coefficient", unit="1/({v})", scale="real", slot=k.DRAG),),
+            parameters=(Quantity(name="coefficient", unit="1/({v})", slot=k.DRAG),),
             starts=lambda s: [(0.05 / s.v,), (0.5 / s.v,)],
             needs="mechanical",
             forced=True,
@@ -438,7 +438,7 @@ def _rest() -> tuple[Entry, ...]:
             name="timing.dead_time",
             equation="u(t - delay)",
             parameters=(Quantity(name="delay", unit="s"),),
-            starts=lambda s: [(c,) for c in (0.5 * s.dt_s, 2.5 * s.dt_s, 0.1 * s.lag_s)],
+            starts=lambda s: [(c,) for c in (0.5 * s.dt_s, 2.5 * s.dt_s, 6.0 * s.dt_s, 14.0 * s.dt_s, 0.3 * s.lag_s)],
             confusable=("sensor.lag", "actuator.lag", "actuator.backlash"),
             places=("timing", "actuator", "sensor"),
             reference=ljung,

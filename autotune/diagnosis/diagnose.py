@@ -9,16 +9,18 @@ from types import MappingProxyType
 
 import numpy as np
 
+from autotune.arrays import FloatArray
 from autotune.controller import Controller
 from autotune.diagnosis.discriminate import next_experiment
-from autotune.diagnosis.fitting import Data, Fit, fit, start_states
+from autotune.diagnosis.fitting import Data, Fit, fit
 from autotune.diagnosis.law import law_effect
+from autotune.diagnosis.noise import noise_from_differences
 from autotune.diagnosis.result import Candidate, Diagnosis, FitQuality, FoundEffect, OperatingRange, Verdict
 from autotune.diagnosis.samples import SampleEffect, inspect, jitter_effect
 from autotune.diagnosis.search import Hypothesis
-from autotune.diagnosis.selection import Report, Search, misfit, score, search, whiteness, worth
+from autotune.diagnosis.selection import COARSE, Report, Search, misfit, score, search, whiteness, worth
 from autotune.diagnosis.simulation import entry_of
-from autotune.errors import InputError
+from autotune.errors import IdentificationError, InputError
 from autotune.models import Effect, Model, Parameter
 from autotune.recording import Recording
 
@@ -31,7 +33,9 @@ NUMBERS_DECREASE = 25.0
 #: An operating point that lies this many standard deviations from the nominal one is an offset.
 OFFSET_SIGMAS = 6.0
 #: Share of the retuned model's excess misfit that an effect must explain where nothing explains all of it.
-DOMINANT = 0.6
+DOMINANT = 0.4
+#: Correlation of the noise from which on it is a disturbance of the plant's, not of single samples.
+SLOW_NOISE = 0.8
 #: Scale of the log-odds: one unit of chi2 counts this much less than for ideal noise.
 TEMPERATURE = 3.0
 
@@ -82,7 +86,9 @@ def diagnose(
     strong = [s for s in also if s is not None and s.name not in without]
     # what the samples show explains the residual better than an effect of the chain does, or not at all
     gained = score(found.retuned) - score(found.chosen)
-    strong = [s for s in strong if s.evidence > 0.5 * gained]
+    quick = not found.data.noise.ar or found.data.noise.ar[0] < SLOW_NOISE
+    near = misfit(found.retuned.fit, found.data) < COARSE
+    strong = [s for s in strong if s.evidence > gained and (s.name != "timing.jitter" or (quick and near))]
     if any(s.name == "timing.jitter" for s in strong):
         found = replace(found, chosen=found.retuned)
     report("checking on held-out rows", 0.9)
@@ -93,8 +99,8 @@ def _judge(found: Search, samples: list[SampleEffect], model: Model) -> Diagnosi
     chosen = found.chosen
     adequate = is_adequate(chosen.fit, found.data)
     offset = _offset(chosen.fit)
-    verdict = _verdict(found, samples, adequate, offset is not None)
     quality, extended_is_better = held_out(found)
+    verdict = _verdict(found, samples, adequate or dominates(quality), offset is not None)
     effects = _effects(found, samples, offset, adequate) if verdict == "effect" else ()
     candidates = rivals(found, adequate)
     places = _places(effects) if verdict == "effect" else (_suspected(found) if verdict == "unexplained" else ())
@@ -123,7 +129,7 @@ def is_adequate(result: Fit, data: Data) -> bool:
 
 def _verdict(found: Search, samples: list[SampleEffect], adequate: bool, offset: bool) -> Verdict:
     if found.chosen.names and not samples:
-        return "effect" if adequate or dominates(found) else "unexplained"
+        return "effect" if adequate else "unexplained"
     if samples or (offset and adequate):
         return "effect"
     if not adequate:
@@ -136,14 +142,14 @@ def _numbers(found: Search) -> Verdict:
     return "parameters" if gained > NUMBERS_DECREASE else "none"
 
 
-def dominates(found: Search) -> bool:
+def dominates(quality: FitQuality) -> bool:
     """Whether the chosen effects explain most of a misfit that nothing explains whole.
 
-    On real rigs something always remains; an effect is named all the same when it takes away most of what retuning
-    leaves, in a regime where the misfit is far above the noise.
+    On real rigs something always remains; an effect is named all the same when on rows that were not fitted it takes
+    away most of the variance that retuning leaves above the noise.
     """
-    before, after = misfit(found.retuned.fit, found.data), misfit(found.chosen.fit, found.data)
-    return before > 25.0 and after < before and (before - after) > DOMINANT * (before - 1.0)
+    left = quality.retuned**2 - quality.noise_floor**2
+    return left > 0.0 and quality.retuned**2 - quality.extended**2 > DOMINANT * left
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -309,16 +315,26 @@ def held_out(found: Search) -> tuple[FitQuality, bool]:
         p, none = h.fit.parametrisation, np.zeros(h.fit.theta.size, dtype=bool)
         theta = h.fit.theta if tune else p.centre
         if tune:
-            theta = fit(p, even, theta, start_states(h.fit.sim, even), iterations=6, rounds=1).theta
-        tested = fit(p, odd, theta, start_states(h.fit.sim, odd), free=none, iterations=8)
+            theta = fit(p, even, theta, _states_of(h.fit, even), iterations=6, rounds=1).theta
+        try:
+            tested = fit(p, odd, theta, _states_of(h.fit, odd), free=none, iterations=8)
+        except IdentificationError:
+            # numbers from half the windows can run away on the other half: then those of all windows count
+            tested = fit(p, odd, h.fit.theta, _states_of(h.fit, odd), free=none, iterations=8)
         squares = sum(float(e @ e) for e in tested.residuals)
         return math.sqrt(squares / max(odd.rows - sum(Q.shape[1] for Q in tested.states_explain), 1)) / spread
 
     nominal, retuned = error(found.retuned, tune=False), error(found.retuned, tune=True)
     extended = error(found.chosen, tune=True) if found.chosen.names else retuned
-    noise = data.noise.total_sd / spread
+    noise = noise_from_differences(found.chosen.fit.residuals, data.good).total_sd / spread
     quality = FitQuality(nominal=nominal, retuned=retuned, extended=extended, noise_floor=noise)
     return quality, extended <= retuned
+
+
+def _states_of(result: Fit, data: Data) -> list[FloatArray]:
+    """Return a fit's start states of the windows that the data have."""
+    pairs = zip(result.x0, result.starts, data.starts, strict=True)
+    return [x0[np.searchsorted(known, starts)] for x0, known, starts in pairs]
 
 
 def _half(data: Data, which: int) -> Data:

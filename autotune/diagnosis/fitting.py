@@ -18,9 +18,12 @@ from autotune.arrays import BoolArray, FloatArray, IntArray
 from autotune.diagnosis.noise import Noise
 from autotune.diagnosis.parameters import Parametrisation
 from autotune.diagnosis.simulation import Simulator, assemble
-from autotune.errors import AutotuneError
+from autotune.errors import AutotuneError, IdentificationError
 from autotune.models import Model
 from autotune.recording import Recording
+
+#: Windows of a recording that thinning leaves: fewer would miss a direction or a level of the motion.
+LEAST_WINDOWS_KEPT = 6
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -57,7 +60,8 @@ class Data:
             return self
         starts, stops, good = [], [], []
         for a, b, ok in zip(self.starts, self.stops, self.good, strict=True):
-            keep = np.unique((np.arange(max(2, round(len(a) / share))) * share).astype(np.int64).clip(0, len(a) - 1))
+            count = min(len(a), max(LEAST_WINDOWS_KEPT, round(len(a) / share)))
+            keep = np.unique(np.linspace(0, len(a) - 1, count).round().astype(np.int64))
             inside = np.zeros(ok.size, dtype=bool)
             for first, last in zip(a[keep], b[keep], strict=True):
                 inside[first:last] = True
@@ -257,7 +261,7 @@ class _Problem:
                 x[:, j] += h
             moved = _whiten(_simulate(spot.sim, shifted, self.data)[0], self.data)[1]
             column = (moved - spot.e) * (self.scales[j] / h)
-            Jx[:, j] = np.where(np.isfinite(column), column, 0.0)
+            Jx[:, j] = column if _bounded(column) else 0.0
         return J, Jx
 
     def inherited(self, theta: FloatArray, x0: list[FloatArray], e: FloatArray, base: Fit) -> _Derivatives:
@@ -274,7 +278,7 @@ class _Problem:
         moved = theta.copy()
         moved[i] += h
         column = (self.spot(moved, x0).e - e) / h
-        return column if np.all(np.isfinite(column)) else np.zeros_like(column)
+        return column if _bounded(column) else np.zeros_like(column)
 
     scales: FloatArray
     reach: FloatArray
@@ -288,7 +292,9 @@ def _eliminate(
     back = []
     for _, _, a, b in windows:
         X = Jx[a:b]
-        G = X.T @ X + 1e-2 * np.eye(X.shape[1])
+        # a little of the prior that start states are of the signals' size keeps unfelt ones in place
+        G = X.T @ X
+        G += (1e-2 + 1e-10 * float(np.trace(G))) * np.eye(X.shape[1])
         solve = np.linalg.solve(G, X.T)
         gain_e, gain_J = solve @ e[a:b], solve @ J[a:b]
         e_left[a:b] -= X @ gain_e
@@ -336,6 +342,11 @@ def fit(
     Fit
         Estimate with covariance, residuals and signals.
 
+    Raises
+    ------
+    IdentificationError
+        The simulation diverges at the starting point.
+
     Notes
     -----
     A local search: effects with thresholds need several starts. The covariance is the linearised one.
@@ -350,8 +361,11 @@ def fit(
     states = [x.copy() for x in x0] if x0 is not None and fits_in else start_states(sim, data)
     may = np.ones(point.size, dtype=bool) if free is None else free
     spot = problem.spot(point, states)
+    if not _bounded(spot.e):
+        raise IdentificationError("the simulation runs away at the starting point", where="fit")
     derivatives = None
-    if inherit is not None and inherit.jacobian[1].shape[1] == sim.chain.order:
+    near = inherit is not None and float(spot.e @ spot.e) < 2.0 * inherit.chi2
+    if inherit is not None and near and inherit.jacobian[1].shape[1] == sim.chain.order:
         derivatives = problem.inherited(point, states, spot.e, inherit)
     for _ in range(rounds):
         spot, derivatives = _descend(problem, spot, derivatives, may, iterations, tolerance)
@@ -461,13 +475,18 @@ def residual_at(
     return _Problem(parametrisation, data).spot(theta, list(x0)).e
 
 
+def _bounded(values: FloatArray) -> bool:
+    """Whether a simulation stayed within bounds: one that runs away is finite for a while."""
+    return bool(np.max(np.abs(values), initial=0.0) < 1e15)  # NaN compares false
+
+
 def _attempted(problem: _Problem, theta: FloatArray, x0: list[FloatArray]) -> _Spot | None:
     """Return a trial point, None where the model there is refused or the simulation diverges."""
     try:
         spot = problem.spot(theta, x0)
     except (AutotuneError, OverflowError):
         return None
-    return spot if np.all(np.isfinite(spot.e)) else None
+    return spot if _bounded(spot.e) else None
 
 
 def _finish(problem: _Problem, spot: _Spot, derivatives: _Derivatives, may: BoolArray) -> Fit:

@@ -52,13 +52,20 @@ def lattice_step(y: FloatArray) -> float:
     were only rounded when they were written take many.
     """
     values = np.unique(y[np.isfinite(y)])
-    if values.size < 3 or values.size > 0.25 * y.size:
+    if values.size < 3:
         return 0.0
     gaps = np.diff(values)
     gaps = gaps[gaps > 1e-4 * np.max(gaps)]
     step = float(np.median(gaps[gaps <= 1.5 * np.min(gaps)]))
     multiples = gaps / step
-    return step if float(np.mean(np.abs(multiples - np.round(multiples)) < 0.05)) > 0.97 else 0.0
+    regular = float(np.mean(np.abs(multiples - np.round(multiples)) < 0.05)) > 0.97
+    return step if regular and step > 0.02 * jitter_of(y) else 0.0
+
+
+def jitter_of(y: FloatArray) -> float:
+    """Return a robust standard deviation of what changes from row to row beyond a straight line."""
+    d = np.diff(y[np.isfinite(y)], 2)
+    return float(np.sqrt(np.mean(np.minimum(d**2, np.quantile(d**2, 0.99))) / 6.0)) if d.size else 0.0
 
 
 def frozen_rows(y: FloatArray) -> BoolArray:
@@ -106,7 +113,8 @@ def inspect(recordings: Sequence[Recording]) -> tuple[list[BoolArray], list[Samp
     effects: list[SampleEffect] = []
     step = lattice_step(np.concatenate([r.y for r in recordings]))
     if step > 0.0:
-        return good, [*_quantisation(recordings, step, unit)]
+        # on a lattice equal readings are no dropout, and a spike is measured in steps
+        return good, _quantisation(recordings, step, unit)
     clipped, levels = _clipped(recordings)
     if levels:
         effects.append(_saturation(recordings, clipped, levels, unit))
@@ -165,8 +173,9 @@ def _neighbours(y: FloatArray, good: BoolArray) -> FloatArray:
 def _quantisation(recordings: Sequence[Recording], step: float, unit: str) -> list[SampleEffect]:
     jitter = np.concatenate([np.diff(r.y) for r in recordings])
     share = float(np.mean(jitter == 0.0))
-    if share < 0.02:
-        return []
+    noise = jitter_of(np.concatenate([r.y for r in recordings]))
+    if share < 0.02 or step**2 / 12.0 < 0.05 * noise**2:
+        return []  # too fine to matter beside the noise
     rows = sum(len(r) for r in recordings)
     return [
         SampleEffect(

@@ -12,6 +12,7 @@ import numpy as np
 from autotune.arrays import FloatArray
 from autotune.diagnosis.catalogue import CATALOGUE, Entry, Range
 from autotune.diagnosis.fitting import Data, Fit, fit, residual_at
+from autotune.diagnosis.kernel import I_LEVELS
 from autotune.diagnosis.parameters import Parametrisation, effect_with, parametrise
 from autotune.diagnosis.simulation import Simulator
 from autotune.errors import AutotuneError
@@ -33,10 +34,11 @@ class Hypothesis:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Promise:
-    """A starting point and the decrease of chi2 that the first order promises from it."""
+    """A starting point, the decrease of chi2 that the first order promises from it, and the size it promises it at."""
 
     effect: Effect
     decrease: float
+    scaled: Effect
 
 
 def signal_ranges(base: Fit, data: Data) -> Range:
@@ -125,16 +127,16 @@ def promise(base: Fit, effect: Effect, data: Data) -> Promise:
     try:
         e = residual_at(p, data, theta, states)
     except (AutotuneError, OverflowError):
-        return Promise(effect=effect, decrease=0.0)
-    if not np.all(np.isfinite(e)):
-        return Promise(effect=effect, decrease=0.0)
+        return Promise(effect=effect, decrease=0.0, scaled=effect)
+    if not np.max(np.abs(e), initial=0.0) < 1e15:
+        return Promise(effect=effect, decrease=0.0, scaled=effect)
     d = base.unexplained(e - base.e)
     slope, curvature = -float(d @ base.e), float(d @ d)
     if curvature <= 0.0:
-        return Promise(effect=effect, decrease=0.0)
+        return Promise(effect=effect, decrease=0.0, scaled=effect)
     signed = any(f.kind == "effect" and not f.positive for f in p.free[base.theta.size :])
     a = float(np.clip(slope / curvature, -4.0 if signed else 0.0, 4.0))
-    return Promise(effect=_scaled(effect, a), decrease=2.0 * a * slope - a * a * curvature)
+    return Promise(effect=effect, decrease=2.0 * a * slope - a * a * curvature, scaled=_scaled(effect, a))
 
 
 #: Parameters that an effect is about proportional to: the first order tells their size.
@@ -161,7 +163,16 @@ def starting_effects(entry: Entry, base: Fit, sizes: Range, data: Data) -> list[
     plant_in = next((b.unit for b in base.parametrisation.model.blocks if b.place == "actuator" and b.unit), units["u"])
     units |= {"f": plant_in, "v": f"{units['y']}/s"}
     named = [q.unit.format(**units) for q in entry.parameters]
-    return [effect_with(entry.name, values, named) for values in entry.starts(sizes)]
+    effects = [effect_with(entry.name, values, named) for values in entry.starts(sizes)]
+    if entry.name == "plant.sqrt_outflow" and base.sim.chain.where[I_LEVELS] == 2:
+        # two tanks above each other: both outflows go with the root of their level
+        return [
+            replace(
+                e, parameters=MappingProxyType({**e.parameters, "operating_level_2": e.parameters["operating_level"]})
+            )
+            for e in effects
+        ]
+    return effects
 
 
 def best_promises(
@@ -190,18 +201,33 @@ def fit_extended(base: Fit, effect: Effect, data: Data, iterations: int = 30) ->
     return Hypothesis(names=tuple(e.name for e in p.model.effects), fit=result)
 
 
+def _fit_or_nothing(base: Fit, effect: Effect, data: Data) -> Hypothesis | None:
+    """Return the fit, nothing where the simulation runs away: that start is no hypothesis."""
+    try:
+        return fit_extended(base, effect, data)
+    except (AutotuneError, OverflowError, np.linalg.LinAlgError):
+        return None
+
+
 def extend(
     base: Hypothesis, data: Data, pool: Executor, entries: Iterable[Entry] | None = None, most: int = 10,
     extra: Sequence[Effect] = (),
-    starts_each: int = 2,
+    starts_each: int = 3,
     least: float = 3.0,
 ) -> list[Hypothesis]:  # fmt: skip
     """Fit the most promising effects on top of a base, best first."""
     promises = best_promises(base.fit, data, CATALOGUE.values() if entries is None else entries, pool, extra)
     ranked = sorted(promises.values(), key=lambda group: -group[0].decrease)
-    starts = [p.effect for group in ranked[:most] for p in group[:starts_each] if p.decrease > least]
+    starts = [
+        effect
+        for group in ranked[:most]
+        if group[0].decrease > least
+        for effect in (group[0].scaled, group[0].effect, *(p.effect for p in group[1:]))[:starts_each]
+    ]
     fits: dict[str, Hypothesis] = {}
-    for h in pool.map(lambda effect: fit_extended(base.fit, effect, data), starts):
+    for h in pool.map(lambda effect: _fit_or_nothing(base.fit, effect, data), starts):
+        if h is None:
+            continue
         known = fits.get(h.names[-1])
         if known is None or h.fit.cost < known.fit.cost:
             fits[h.names[-1]] = h

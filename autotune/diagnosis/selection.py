@@ -23,6 +23,13 @@ from autotune.recording import Recording
 #: Decrease of chi2 that an effect must bring: what chance brings among some eighty directions, with a margin for
 #: noise whose slow part is a fifth stronger than its fast part lets expect.
 LEAST_DECREASE = 30.0
+#: Residual variance over the noise's from which on the misfit itself is taken for white noise: the jitter of a clean
+#: recording says nothing of how well a model can do.
+COARSE = 25.0
+#: Shift of an effect's size, as a logarithm, that gets a fit out of a crease.
+NUDGE = 0.06
+#: Score that a hypothesis with more free numbers must be ahead of one with fewer.
+SIMPLER = 15.0
 #: Rows on which hypotheses are screened; those that lead are fitted to all.
 SCREENING_ROWS = 4500
 Report = Callable[[str, float], None]
@@ -84,12 +91,15 @@ def prepare(model: Model, recordings: Sequence[Recording], good: Sequence[BoolAr
     )
     size = float(np.std(np.concatenate([r.u for r in recordings]))) or 1.0
     p = parametrise(model, [], size, recordings[0].sample_time_s)
-    result: Fit | None = None
+    result = fit(p, data)
     for _ in range(2):
-        result = fit(p, data, None if result is None else result.theta, None if result is None else result.x0)
-        data = replace(data, noise=floored(noise_from_differences(result.residuals, data.good), recordings))
-    assert result is not None
-    return data, fit(p, data, result.theta, result.x0)
+        coarse = misfit(result, data) > COARSE
+        noise = noise_from_differences(result.residuals, data.good)
+        if coarse:
+            noise = Noise(sd=float(np.sqrt(np.mean(np.concatenate(result.residuals) ** 2))))
+        data = replace(data, noise=floored(noise, recordings))
+        result = fit(p, data, result.theta, result.x0, iterations=20)
+    return data, result
 
 
 def floored(noise: Noise, recordings: Sequence[Recording]) -> Noise:
@@ -104,7 +114,13 @@ def polish(h: Hypothesis, data: Data, base: Fit, rounds: int = 4) -> Hypothesis:
     p = h.fit.parametrisation
     none = np.zeros(h.fit.theta.size, dtype=bool)
     settled = fit(p, data, h.fit.theta, states_for(h.fit, data, base), free=none)
-    return replace(h, fit=fit(p, data, h.fit.theta, settled.x0, iterations=30, rounds=rounds))
+    best = fit(p, data, h.fit.theta, settled.x0, iterations=30, rounds=rounds)
+    positive = np.array([f.kind == "effect" and f.positive for f in p.free])
+    for shift in (-NUDGE, NUDGE) if positive.any() else ():
+        # thresholds make the criterion rough: a nudge gets a fit out of a crease
+        again = fit(p, data, best.theta + shift * positive, best.x0, iterations=15, rounds=2)
+        best = again if again.cost < best.cost else best
+    return replace(h, fit=best)
 
 
 def states_for(result: Fit, data: Data, base: Fit) -> tuple[FloatArray, ...]:
@@ -157,29 +173,114 @@ def search(
         screen = retuned if few is data else Hypothesis(names=(), fit=fit(base.parametrisation, few, base.theta))
         report("single effects", 0.1)
         candidates = grown(screen, few, pool, entries, most=7)
+        if bent(base):
+            candidates = merged(candidates, grown(_unbent(base, few), few, pool, entries, most=7))
         singles = polished(candidates, 3, data, base, pool)
         chosen = retuned
+        if singles and misfit(base, data) > COARSE:
+            data, base, few = _finer(singles[0], base, data)
+            retuned = Hypothesis(names=(), fit=base)
+            candidates = [_again(h, few) for h in candidates[:3]]
+            singles = polished(candidates, 3, data, base, pool)
         if not singles or not (worth(retuned, singles[0]) or misfit(base, data) > 1.1):
             return _found(data, nominal, retuned, singles, (), (), chosen)
         if worth(retuned, singles[0]):
             chosen = singles[0]
         report("pairs of effects", 0.4)
-        wider = _larger(candidates, 3, few, pool, entries)
+        # a single effect that leaves noise alone is given one chance to be half of a pair, a bad one three
+        settled = misfit(singles[0].fit, data) < 1.03
+        lead = [h for h in candidates if h.names == singles[0].names]
+        bases = [*lead, *(h for h in candidates[:3] if h not in lead)]
+        wider = _larger(bases, 1 if settled else 3, few, pool, entries)
+        wider = [h for h in wider if score(lead[0]) - score(h) > 5.0]
         pairs = polished(wider, 2, data, base, pool)
         triples: list[Hypothesis] = []
-        if pairs and worth(singles[0], pairs[0]) and worth(retuned, pairs[0]):
+        if pairs and worth(retuned, pairs[0]) and needed(singles[0], pairs[0], data):
             chosen = pairs[0]
             if misfit(pairs[0].fit, data) > 1.05:
                 report("three effects", 0.8)
                 triples = polished(_larger(wider, 1, few, pool, entries), 1, data, base, pool)
-            if triples and worth(pairs[0], triples[0]):
+            if triples and needed(pairs[0], triples[0], data):
                 chosen = triples[0]
+        if len(chosen.names) > 1:
+            report("dropping what is not needed", 0.85)
+            chosen = _pruned(chosen, singles, data, pool)
         return _found(data, nominal, retuned, singles, pairs, triples, chosen)
+
+
+def _pruned(chosen: Hypothesis, singles: list[Hypothesis], data: Data, pool: Executor) -> Hypothesis:
+    """Drop effects whose removal costs less than they are worth; single effects found so join the singles."""
+    while len(chosen.names) > 1:
+        smaller = list(pool.map(lambda i, h=chosen: _without(h, i, data), range(len(chosen.names))))
+        singles += [h for h in smaller if len(h.names) == 1]
+        singles.sort(key=score)
+        best = min(smaller, key=score)
+        if needed(best, chosen, data):
+            break
+        chosen = best
+    return chosen
+
+
+def _without(h: Hypothesis, index: int, data: Data) -> Hypothesis:
+    """Fit a hypothesis again with one of its effects left out."""
+    p = h.fit.parametrisation
+    keep = [i for i, f in enumerate(p.free) if f.kind != "effect" or f.index[0] != index]
+    moved = [
+        replace(f, index=(f.index[0] - 1, f.index[1])) if f.kind == "effect" and f.index[0] > index else f
+        for f in (p.free[i] for i in keep)
+    ]
+    effects = tuple(e for i, e in enumerate(p.model.effects) if i != index)
+    smaller = replace(p, model=replace(p.model, effects=effects), free=tuple(moved), centre=p.centre[keep])
+    result = fit(smaller, data, h.fit.theta[keep], h.fit.x0, iterations=20, rounds=2)
+    return Hypothesis(names=tuple(e.name for e in effects), fit=result)
+
+
+def _finer(best: Hypothesis, base: Fit, data: Data) -> tuple[Data, Fit, Data]:
+    """Return data with the noise that the best hypothesis leaves, the retuned model under it, and the thinned data."""
+    noise = noise_from_differences(best.fit.residuals, data.good)
+    if misfit(best.fit, data) > COARSE:
+        noise = Noise(sd=float(np.sqrt(np.mean(np.concatenate(best.fit.residuals) ** 2))))
+    data = replace(data, noise=floored(noise, data.recordings))
+    return data, fit(base.parametrisation, data, base.theta, base.x0, iterations=20), data.thinned(SCREENING_ROWS)
+
+
+def _again(h: Hypothesis, data: Data) -> Hypothesis:
+    """Fit a hypothesis again under another noise."""
+    return replace(h, fit=fit(h.fit.parametrisation, data, h.fit.theta, h.fit.x0, iterations=20))
+
+
+def bent(result: Fit) -> bool:
+    """Whether retuning moved a gain or lag so far that it must stand for something else."""
+    away = np.abs(result.theta - result.parametrisation.centre) / result.parametrisation.spreads
+    return bool(np.max(away, initial=0.0) > 2.0)
+
+
+def _unbent(base: Fit, data: Data) -> Hypothesis:
+    """Return the nominal structure with nominal numbers, the operating point alone fitted."""
+    free = np.array([f.kind == "u_offset" for f in base.parametrisation.free])
+    return Hypothesis(names=(), fit=fit(base.parametrisation, data, free=free))
+
+
+def merged(first: Sequence[Hypothesis], second: Sequence[Hypothesis]) -> list[Hypothesis]:
+    """Return the better fit of every combination of effects, best first."""
+    best: dict[frozenset[str], Hypothesis] = {}
+    for h in (*first, *second):
+        key = frozenset(h.names)
+        if key not in best or score(h) < score(best[key]):
+            best[key] = h
+    return sorted(best.values(), key=score)
 
 
 def polished(ranked: Sequence[Hypothesis], count: int, data: Data, base: Fit, pool: Executor) -> list[Hypothesis]:
     """Return the best hypotheses fitted to all data, best first."""
-    return sorted(pool.map(lambda h: polish(h, data, base), ranked[:count]), key=score)
+    done = sorted(pool.map(lambda h: polish(h, data, base), ranked[:count]), key=score)
+    if done:
+        near = [h for h in done if score(h) - score(done[0]) < SIMPLER]
+        simplest = min(near, key=lambda h: (h.parameters, score(h)))
+        if simplest.parameters < done[0].parameters:
+            done.remove(simplest)
+            done.insert(0, simplest)
+    return done
 
 
 def _found(
@@ -203,7 +304,7 @@ def grown(
     pool: Executor,
     entries: Sequence[Entry],
     most: int,
-    starts_each: int = 2,
+    starts_each: int = 3,
     least: float = 3.0,
 ) -> list[Hypothesis]:
     """Return fits of a base with one more effect, loads of the environment at times and frequencies of their own."""
@@ -238,6 +339,15 @@ def worth(smaller: Hypothesis, larger: Hypothesis) -> bool:
     """Whether a larger hypothesis explains enough more to be believed."""
     excess = max(1.0, larger.fit.chi2 / larger.fit.rows)
     return bool(score(smaller) - score(larger) > LEAST_DECREASE * excess)
+
+
+def needed(smaller: Hypothesis, larger: Hypothesis, data: Data) -> bool:
+    """Whether one more effect is worth it and brings the residual to noise, or most of the way there.
+
+    On a rig with disturbances of its own every further effect explains a little; that little is not physics.
+    """
+    before, after = misfit(smaller.fit, data) - 1.0, misfit(larger.fit, data) - 1.0
+    return worth(smaller, larger) and (after < 0.08 or after < 0.5 * before)
 
 
 def misfit(result: Fit, data: Data) -> float:
