@@ -80,7 +80,8 @@ def _refusal(error: ValidationError, where: str) -> InputError:
         return InputError(f"{path!r} is missing{more}", where=where, mend=_describe(_key_path(first)))
     value = first.get("input")
     shown = f" = {value!r}" if isinstance(value, str | int | float | bool) else ""
-    return InputError(f"{path}{shown}: {first['msg']}{more}", where=where, mend=_describe(_key_path(first)))
+    reason = first["msg"].removeprefix("Value error, ")
+    return InputError(f"{path}{shown}: {reason}{more}", where=where, mend=_describe(_key_path(first)))
 
 
 def _key_path(detail: ErrorDetails) -> tuple[str | int, ...]:

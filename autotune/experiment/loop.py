@@ -15,7 +15,7 @@ from typing import Any, Self
 import numpy as np
 
 from autotune.arrays import FloatArray
-from autotune.errors import AutotuneError, LinkError, OperatorStop
+from autotune.errors import AutotuneError, ExperimentStopped, LinkError, OperatorStop
 from autotune.experiment.limits import Envelope, Watch
 from autotune.experiment.monitor import ReadingMonitor
 from autotune.experiment.rig import Reading, Rig
@@ -220,7 +220,14 @@ class ControlLoop:
     def _write_row(self, u: float, extra: Mapping[str, float]) -> None:
         y = self.tick.y if self.tick.usable else math.nan
         known = {"u_applied": self._reading.u_applied, **extra}
-        self._writer.append((self.tick.t_s, u, y, *(known.get(name, math.nan) for name in self._extra)))
+        try:
+            self._writer.append((self.tick.t_s, u, y, *(known.get(name, math.nan) for name in self._extra)))
+        except OSError as error:
+            raise ExperimentStopped(
+                f"the recording cannot be written ({error.strerror})",
+                where=str(self._writer.path),
+                mend="free space on the disk; no command is sent that is not on it first",
+            ) from error
         record = self._record
         record.t.append(self.tick.t_s)
         record.u.append(u)
@@ -278,7 +285,8 @@ class ControlLoop:
             "missed_samples": timing.missed,
             "unusable_samples": timing.unusable,
         }
-        self._writer.finish(self.metadata)
+        with contextlib.suppress(OSError):  # a full disk must not hide why the loop ended
+            self._writer.finish(self.metadata)
         self._exits.close()
 
     def _write_last_row(self) -> None:
