@@ -276,7 +276,8 @@ class ControlLoop:
         with contextlib.suppress(AutotuneError):
             self.rig.close()
         if self.tick.k >= 0:
-            self._write_last_row()
+            with contextlib.suppress(OSError):
+                self._write_last_row()
         self.metadata["ended"] = _reason(error) | {"output": output}
         timing = self.timing
         self.metadata["timing"] = {
