@@ -2,6 +2,7 @@
 
 import json
 import sys
+from dataclasses import replace
 
 import pytest
 
@@ -24,16 +25,16 @@ else:
 def campaign(tmp_path):
     tool = tmp_path / "tool.py"
     tool.write_text(ALWAYS_NONE)
-    return Campaign(out=tmp_path / "proof", seeds=range(1003, 1006), tool=(sys.executable, str(tool)), workers=1)
+    return Campaign(out=tmp_path / "proof", seeds=range(66, 69), tool=(sys.executable, str(tool)), workers=1)
 
 
 def test_a_campaign_is_sealed_diagnosed_and_marked_and_goes_on_where_it_was_stopped(campaign):
-    assert list(conceal(campaign)) == [1003, 1004, 1005]
+    assert list(conceal(campaign)) == [66, 67, 68]
     before = seal(campaign)
     done = []
-    diagnose_all(campaign, [1003], done.append)
+    diagnose_all(campaign, [66], done.append)
     diagnose_all(campaign, list(campaign.seeds), done.append)
-    assert sorted(done) == [1003, 1003, 1004, 1005]
+    assert sorted(done) == [66, 66, 67, 68]
     assert seal(campaign) == before
     marks = mark_all(campaign, list(campaign.seeds))
     for m in marks:
@@ -46,18 +47,20 @@ def test_a_campaign_is_sealed_diagnosed_and_marked_and_goes_on_where_it_was_stop
 
 
 def test_the_seal_breaks_when_an_answer_changes(campaign):
+    campaign = replace(campaign, seeds=range(67, 68))
     list(conceal(campaign))
     before = seal(campaign)
-    answer = campaign.answer(1004)
+    answer = campaign.answer(67)
     answer.write_text(answer.read_text().replace("rig", "rlg", 1))
     assert seal(campaign) != before
 
 
 def test_a_tool_that_fails_on_a_case_has_said_nothing(campaign, tmp_path):
     (tmp_path / "tool.py").write_text("import sys; sys.exit('no')")
+    campaign = replace(campaign, seeds=range(67, 68))
     list(conceal(campaign))
-    diagnose_all(campaign, [1003], lambda _seed: None)
-    (m,) = mark_all(campaign, [1003])
+    diagnose_all(campaign, [67], lambda _seed: None)
+    (m,) = mark_all(campaign, [67])
     assert m.verdict == "failed"
     assert m.failed
-    assert "no" in (campaign.diagnosis(1003) / "stderr.txt").read_text()
+    assert "no" in (campaign.diagnosis(67) / "stderr.txt").read_text()
