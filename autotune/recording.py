@@ -277,8 +277,10 @@ class RecordingWriter:
     def close(self) -> None:
         """Bring the file to the disk and close it; harmless when closed already."""
         if not self._file.closed:
-            os.fsync(self._file.fileno())
-            self._file.close()
+            try:
+                os.fsync(self._file.fileno())
+            finally:
+                self._file.close()
 
     def _write_sidecar(self) -> None:
         sidecar = self.path.with_suffix(".toml")

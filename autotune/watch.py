@@ -10,7 +10,7 @@ import numpy as np
 from autotune.arrays import FloatArray
 from autotune.controller import Controller
 from autotune.design.margins import margins
-from autotune.identification.delay_model import DelayModel
+from autotune.identification.delay.model import DelayModel
 from autotune.models import TransferFunction
 
 _CONFIDENT = 1.645  # standard deviations: one-sided 95 %

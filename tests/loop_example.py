@@ -8,7 +8,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 from autotune.arrays import FloatArray
-from autotune.identification.state_space import InnovationModel, feedback, from_polynomials
+from autotune.identification.closed_loop.state_space import InnovationModel, feedback, from_polynomials
 
 PLANT_NUM = 1e-3 * np.array([0.0, 0.98, 12.99, 18.59, 3.3, -0.02])
 PLANT_DEN = np.array([1.0, -4.4, 8.09, -7.83, 4.0, -0.86])

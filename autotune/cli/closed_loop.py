@@ -13,7 +13,7 @@ from rich.console import Console
 from autotune.cli import app, identify
 
 if TYPE_CHECKING:
-    from autotune.identification.closed_loop import ClosedLoopIdentification
+    from autotune.identification.closed_loop.identify import ClosedLoopIdentification
 
 
 @identify.command("closed-loop")
@@ -35,7 +35,7 @@ def closed_loop(
 ) -> None:
     """Identify the plant from r, u and y recorded while its loop is closed."""
     from autotune.controller import read_controller
-    from autotune.identification.closed_loop import identify_closed_loop
+    from autotune.identification.closed_loop.identify import identify_closed_loop
     from autotune.recording import read_recording
 
     console = Console(stderr=True, highlight=False)

@@ -15,8 +15,8 @@ from autotune.cli import app, identify
 if TYPE_CHECKING:
     from autotune.config.loader import Config
     from autotune.controller import Controller
-    from autotune.identification.delay_model import DelayModel
-    from autotune.identification.tracking import Window
+    from autotune.identification.delay.model import DelayModel
+    from autotune.identification.delay.tracking import Window
     from autotune.recording import Recording
 
 
@@ -59,8 +59,8 @@ def identify_delay_command(
     """Identify x^(n) = sum a_i x^(i) + b u(t - h) from a recording; no starting value is needed."""
     from rich.console import Console
 
-    from autotune.identification.delay import identify_delay
-    from autotune.identification.delay_model import write_delay_model
+    from autotune.identification.delay.identify import identify_delay
+    from autotune.identification.delay.model import write_delay_model
     from autotune.recording import read_recording
 
     record = read_recording(recording)
@@ -191,7 +191,7 @@ def _follow(recording: Path, out: Path, settings: _Tracking, quiet_s: float) -> 
     """Fit window after window of a recording that may be growing, until it has been quiet for so long [s]."""
     import time
 
-    from autotune.identification.tracking import track
+    from autotune.identification.delay.tracking import track
     from autotune.recording import read_recording
 
     while quiet_s > 0.0 and not recording.exists():
@@ -240,7 +240,7 @@ def _readable(recording: Path) -> Recording | None:
 
 def _report(fitted: Window, settings: _Tracking, table: TextIO) -> str:
     """Write one window to the table and to the terminal, and return the verdict on the controller, empty without."""
-    from autotune.identification.tracking import quantities
+    from autotune.identification.delay.tracking import quantities
     from autotune.watch import advise
 
     if fitted.model is None:

@@ -28,7 +28,7 @@ def frequency(
     """Estimate Bode points from recordings: relay, multisine, random binary or steps, open or closed loop."""
     from rich.progress import track
 
-    from autotune.identification.recorded import combine, frequency_points
+    from autotune.identification.frequency.recorded import combine, frequency_points
     from autotune.points import points_to_json
     from autotune.recording import read_recording
 

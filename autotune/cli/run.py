@@ -65,7 +65,7 @@ def tune(
     import json
 
     from autotune.config.procedure import DesignSettings, SignalSettings
-    from autotune.identification.recorded import combine, frequency_points
+    from autotune.identification.frequency.recorded import combine, frequency_points
     from autotune.pipeline import RESULT, analyse, analysis_json
     from autotune.recording import read_recording
     from autotune.report.page import write_page

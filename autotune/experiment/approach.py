@@ -17,7 +17,7 @@ from autotune.experiment.loop import ControlLoop
 from autotune.experiment.monitor import RECENT
 from autotune.experiment.oscillation import Oscillation
 from autotune.experiment.relay import RelaySettings
-from autotune.identification.frequency import limit_cycle_points
+from autotune.identification.frequency.limit_cycle_points import limit_cycle_points
 from autotune.points import FrequencyPoint
 
 PREFLIGHT_SAMPLES = 60

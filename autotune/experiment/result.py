@@ -9,7 +9,7 @@ from typing import Any
 
 from autotune.experiment.loop import Timing
 from autotune.experiment.relay import RelaySettings
-from autotune.identification.describing import DescribingFunctionEstimate
+from autotune.identification.frequency.describing import DescribingFunctionEstimate
 from autotune.points import FrequencyPoint
 
 

@@ -16,9 +16,9 @@ from autotune.experiment.oscillation import PATIENCE, Oscillation
 from autotune.experiment.plan import Choice, Goal, allot, choose, phase_targets, time_s
 from autotune.experiment.relay import RelaySettings
 from autotune.experiment.result import Segment, State
-from autotune.identification.describing import describing_function
-from autotune.identification.frequency import LimitCycle, limit_cycle_points
-from autotune.identification.limit_cycle import WholePeriods
+from autotune.identification.frequency.describing import describing_function
+from autotune.identification.frequency.limit_cycle import WholePeriods
+from autotune.identification.frequency.limit_cycle_points import LimitCycle, limit_cycle_points
 
 #: part of limits.swing that a limit cycle is planned for: the rest is for a mid-point that is not quite right
 PEAK_SHARE = 0.9

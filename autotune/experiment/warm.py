@@ -7,8 +7,8 @@ import contextlib
 import numpy as np
 
 from autotune.errors import IdentificationError
-from autotune.identification.frequency import limit_cycle_points
-from autotune.identification.limit_cycle import WholePeriods
+from autotune.identification.frequency.limit_cycle import WholePeriods
+from autotune.identification.frequency.limit_cycle_points import limit_cycle_points
 
 
 def warm_up() -> None:

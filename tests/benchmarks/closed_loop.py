@@ -17,14 +17,24 @@ from dataclasses import replace
 import numpy as np
 
 from autotune.errors import IdentificationError
-from autotune.identification.confidence import inside_region, pole_covariance, response_covariance
-from autotune.identification.order import choose_order, fixed_order
-from autotune.identification.prediction_error import prediction_error
-from autotune.identification.refit import refit_inputs
-from autotune.identification.state_space import InnovationModel, difference, feedback, h2_norm, spectral_radius
-from autotune.identification.subspace_direct import pbsid_opt, ssarx
-from autotune.identification.subspace_indirect import indirect_subspace
-from autotune.identification.subspace_peers import oku_tanaka, orthogonal_decomposition, van_overschee_de_moor
+from autotune.identification.closed_loop.confidence import inside_region, pole_covariance, response_covariance
+from autotune.identification.closed_loop.order import choose_order, fixed_order
+from autotune.identification.closed_loop.prediction_error import prediction_error
+from autotune.identification.closed_loop.refit import refit_inputs
+from autotune.identification.closed_loop.state_space import (
+    InnovationModel,
+    difference,
+    feedback,
+    h2_norm,
+    spectral_radius,
+)
+from autotune.identification.closed_loop.subspace_direct import pbsid_opt, ssarx
+from autotune.identification.closed_loop.subspace_indirect import indirect_subspace
+from autotune.identification.closed_loop.subspace_peers import (
+    oku_tanaka,
+    orthogonal_decomposition,
+    van_overschee_de_moor,
+)
 from tests.loop_example import CONTROLLER, PLANT, LoopData, example_set
 
 Method = Callable[[LoopData], InnovationModel]

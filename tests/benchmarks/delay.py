@@ -14,10 +14,10 @@ import numpy as np
 from scipy.signal import lfilter
 
 from autotune.errors import AutotuneError
-from autotune.identification.delay import identify_delay
-from autotune.identification.modulated_delay import modulated_delay
-from autotune.identification.online_modulating import DelayTracking, follow
-from autotune.identification.two_delays import two_delays
+from autotune.identification.delay.identify import identify_delay
+from autotune.identification.delay.modulated_delay import modulated_delay
+from autotune.identification.delay.online_modulating import DelayTracking, follow
+from autotune.identification.delay.two_delays import two_delays
 from autotune.recording import Recording
 from tests.autotune.identification.delay_examples import A, B, example_2, response, u_example_1
 from tests.autotune.identification.test_modulating import INTERVALS, a1_of_example_1, example_3

@@ -8,8 +8,8 @@ import time
 
 import numpy as np
 
-from autotune.identification.frequency import limit_cycle_points
-from autotune.identification.recorded import frequency_points
+from autotune.identification.frequency.limit_cycle_points import limit_cycle_points
+from autotune.identification.frequency.recorded import frequency_points
 from autotune.identification.reduction import reduce_points
 from autotune.models import TransferFunction
 from autotune.points import FrequencyPoint

@@ -19,7 +19,7 @@ from autotune.config import load_config
 from autotune.errors import AutotuneError
 from autotune.experiment.result import ExperimentResult, Segment
 from autotune.experiment.run import run_experiment
-from autotune.identification.harmonics import held_coefficients
+from autotune.identification.frequency.harmonics import held_coefficients
 from autotune.recording import read_recording
 from drivers.simulated import SimulatedRig
 from sim.ball import FLOOR, Ball, make_ball

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from autotune.config import load_config
 from autotune.errors import InputError
 from autotune.experiment.dither import random_dwells, run_dither
-from autotune.identification.closed_loop import identify_closed_loop
+from autotune.identification.closed_loop.identify import identify_closed_loop
 from autotune.recording import read_recording
 from drivers import open_rig
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from autotune.errors import InputError
 from autotune.experiment.relay import RelaySettings, RelayState, relay_step
-from autotune.identification.frequency import limit_cycle_points
+from autotune.identification.frequency.limit_cycle_points import limit_cycle_points
 from sim.ball import linear_ball
 
 IDEAL = RelaySettings(y_centre=0.0, midpoint=0.0, amplitude=1.0)

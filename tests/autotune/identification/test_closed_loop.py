@@ -15,8 +15,8 @@ from typer.testing import CliRunner
 from autotune.cli import app
 from autotune.controller import DiscreteController, PIDController, write_controller
 from autotune.errors import IdentificationError, InputError
-from autotune.identification.closed_loop import identify_closed_loop
-from autotune.identification.control_law import check_law
+from autotune.identification.closed_loop.control_law import check_law
+from autotune.identification.closed_loop.identify import identify_closed_loop
 from autotune.points import read_points
 from autotune.recording import Recording, write_recording
 from tests.loop_example import CONTROLLER_DEN, CONTROLLER_NUM, PLANT, PLANT_DEN, PLANT_NUM, example_set

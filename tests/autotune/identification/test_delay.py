@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from autotune.errors import IdentificationError, InputError
-from autotune.identification.compiled import transition
-from autotune.identification.delay import identify_delay
-from autotune.identification.delay_data import prepare
-from autotune.identification.delay_model import DelayModel
-from autotune.identification.delay_response import normal_matrix, output
-from autotune.identification.output_error import Point, Structure, finish, solve_linear
+from autotune.identification.delay.compiled import transition
+from autotune.identification.delay.data import prepare
+from autotune.identification.delay.identify import identify_delay
+from autotune.identification.delay.model import DelayModel
+from autotune.identification.delay.output_error import Point, Structure, finish, solve_linear
+from autotune.identification.delay.response import normal_matrix, output
 from autotune.recording import Recording, read_recording
 from tests.autotune.identification.delay_examples import X0, A, B, example_2, held_response
 
@@ -261,7 +261,7 @@ def test_cost_is_the_sum_of_squares_and_the_gram_matrix_is_linear_in_rows():
 
 
 def test_delay_model_file_round_trip(tmp_path):
-    from autotune.identification.delay_model import read_delay_model, write_delay_model
+    from autotune.identification.delay.model import read_delay_model, write_delay_model
 
     model = identify_delay(noisy(example_2(rate_hz=20.0), 2.0, 11), 2)
     assert isinstance(model, DelayModel)

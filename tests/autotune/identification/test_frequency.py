@@ -8,11 +8,11 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from autotune.errors import IdentificationError
-from autotune.identification.describing import describing_function
-from autotune.identification.frequency import LimitCycle, limit_cycle_points
-from autotune.identification.harmonics import held_coefficients
-from autotune.identification.noise import noise_spectrum
-from autotune.identification.settling import settling
+from autotune.identification.frequency.describing import describing_function
+from autotune.identification.frequency.harmonics import held_coefficients
+from autotune.identification.frequency.limit_cycle_points import LimitCycle, limit_cycle_points
+from autotune.identification.frequency.noise import noise_spectrum
+from autotune.identification.frequency.settling import settling
 from autotune.models import TransferFunction
 from tests.autotune.identification.relay_loop import BALL, last_periods, relay_loop
 

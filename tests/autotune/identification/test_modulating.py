@@ -10,10 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from autotune.errors import IdentificationError, InputError
-from autotune.identification.modulated_delay import modulated_delay
-from autotune.identification.modulating import PolynomialWindow, SinePower
-from autotune.identification.online_modulating import DelayTracking, follow
-from autotune.identification.two_delays import two_delays
+from autotune.identification.delay.modulated_delay import modulated_delay
+from autotune.identification.delay.modulating import PolynomialWindow, SinePower
+from autotune.identification.delay.online_modulating import DelayTracking, follow
+from autotune.identification.delay.two_delays import two_delays
 from autotune.recording import Recording
 from tests.autotune.identification.delay_examples import A, B, example_2, response, u_example_1
 
@@ -176,7 +176,7 @@ def test_example_5_on_line_with_a_slowly_varying_delay(profile):
 
 def test_the_forgetting_chain_is_exact_for_linear_input():
     """J_0 of a unit step is (1 - exp(-lambda t))/lambda, J_1 its integral; jittered stamps change nothing."""
-    from autotune.identification.online_modulating import _advance
+    from autotune.identification.delay.online_modulating import _advance
 
     t = np.sort(np.random.default_rng(4).uniform(0.0, 5.0, 300))
     J, new = np.zeros(3), np.zeros(3)

@@ -11,13 +11,19 @@ from hypothesis import strategies as st
 
 from autotune.arrays import FloatArray
 from autotune.errors import IdentificationError
-from autotune.identification.confidence import inside_region, pole_covariance, residuals, response_covariance, whiteness
-from autotune.identification.lagged import lagged_factor, lagged_range, lagged_rows
-from autotune.identification.order import choose_order, fixed_order
-from autotune.identification.prediction_error import prediction_error
-from autotune.identification.predictor_directions import Predictor, behaviour_directions
-from autotune.identification.predictor_sweep import innovations, normal_equations
-from autotune.identification.state_space import InnovationModel, feedback, from_polynomials, spectral_radius
+from autotune.identification.closed_loop.confidence import (
+    inside_region,
+    pole_covariance,
+    residuals,
+    response_covariance,
+    whiteness,
+)
+from autotune.identification.closed_loop.lagged import lagged_factor, lagged_range, lagged_rows
+from autotune.identification.closed_loop.order import choose_order, fixed_order
+from autotune.identification.closed_loop.prediction_error import prediction_error
+from autotune.identification.closed_loop.predictor_directions import Predictor, behaviour_directions
+from autotune.identification.closed_loop.predictor_sweep import innovations, normal_equations
+from autotune.identification.closed_loop.state_space import InnovationModel, feedback, from_polynomials, spectral_radius
 from tests.loop_example import CONTROLLER, PLANT, PLANT_DEN, PLANT_NUM, example_set, simulate_loop, two_by_two
 
 OMEGA = np.geomspace(0.05, 1.2, 9)

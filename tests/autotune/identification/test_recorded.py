@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 
 from autotune.cli import app
 from autotune.errors import IdentificationError
-from autotune.identification.recorded import FrequencyEstimate, combine, frequency_points
+from autotune.identification.frequency.recorded import FrequencyEstimate, combine, frequency_points
 from autotune.models import TransferFunction, read_model
 from autotune.points import read_points
 from autotune.recording import Recording, read_recording, write_recording

@@ -6,15 +6,19 @@ import numpy as np
 import pytest
 
 from autotune.errors import IdentificationError
-from autotune.identification.refit import refit_inputs
-from autotune.identification.state_space import difference, feedback, h2_norm, spectral_radius
-from autotune.identification.subspace_direct import pbsid_opt, ssarx
-from autotune.identification.subspace_indirect import (
+from autotune.identification.closed_loop.refit import refit_inputs
+from autotune.identification.closed_loop.state_space import difference, feedback, h2_norm, spectral_radius
+from autotune.identification.closed_loop.subspace_direct import pbsid_opt, ssarx
+from autotune.identification.closed_loop.subspace_indirect import (
     controller_markov_parameters,
     estimated_states,
     indirect_subspace,
 )
-from autotune.identification.subspace_peers import oku_tanaka, orthogonal_decomposition, van_overschee_de_moor
+from autotune.identification.closed_loop.subspace_peers import (
+    oku_tanaka,
+    orthogonal_decomposition,
+    van_overschee_de_moor,
+)
 from tests.loop_example import CONTROLLER, PLANT, PLANT_DEN, PLANT_NUM, example_set, simulate_loop, two_by_two
 
 MARKOV = CONTROLLER.markov_parameters(20)

@@ -12,8 +12,8 @@ from typer.testing import CliRunner
 from autotune.cli import app
 from autotune.controller import PIDController, write_controller
 from autotune.errors import InputError
-from autotune.identification.delay import identify_delay
-from autotune.identification.tracking import quantities, track
+from autotune.identification.delay.identify import identify_delay
+from autotune.identification.delay.tracking import quantities, track
 from autotune.recording import Recording, write_recording
 from autotune.watch import advise
 

@@ -20,7 +20,7 @@ from numba import njit
 
 from autotune.arrays import FloatArray
 from autotune.errors import IdentificationError, InputError
-from autotune.identification.compiled import cholesky_solve
+from autotune.identification.delay.compiled import cholesky_solve
 from autotune.recording import Recording
 
 
@@ -107,7 +107,7 @@ def follow(
     Notes
     -----
     The estimate carries no covariance, and noise on y stands in its regressors; where bands are needed, fit windows
-    by output error (:mod:`autotune.identification.tracking`).
+    by output error (:mod:`autotune.identification.delay.tracking`).
 
     References
     ----------

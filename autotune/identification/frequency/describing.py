@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from autotune.identification.frequency import LimitCycle
+from autotune.identification.frequency.limit_cycle_points import LimitCycle
 from autotune.points import FrequencyPoint
 
 

@@ -11,11 +11,11 @@ import numpy as np
 
 from autotune.arrays import BoolArray, ComplexArray, FloatArray
 from autotune.errors import IdentificationError
-from autotune.identification.excitation import relay_segments, repeat_length
-from autotune.identification.frequency import LimitCycle, limit_cycle_points
-from autotune.identification.local_polynomial import LocalEstimate, local_estimate
-from autotune.identification.reference_model import ReferenceModel, fit_reference, simulate_reference
-from autotune.identification.spectra import Spectra, clean_measurement, record_spectra
+from autotune.identification.frequency.excitation import relay_segments, repeat_length
+from autotune.identification.frequency.limit_cycle_points import LimitCycle, limit_cycle_points
+from autotune.identification.frequency.local_polynomial import LocalEstimate, local_estimate
+from autotune.identification.frequency.reference_model import ReferenceModel, fit_reference, simulate_reference
+from autotune.identification.frequency.spectra import Spectra, clean_measurement, record_spectra
 from autotune.points import FrequencyPoint
 from autotune.recording import Recording
 

@@ -14,8 +14,8 @@ from scipy.linalg import solve_discrete_are
 
 from autotune.arrays import FloatArray
 from autotune.errors import IdentificationError
-from autotune.identification.lagged import lagged_factor, least_squares, triangle
-from autotune.identification.state_space import InnovationModel
+from autotune.identification.closed_loop.lagged import lagged_factor, least_squares, triangle
+from autotune.identification.closed_loop.state_space import InnovationModel
 
 #: Standard deviation of the white noise supposed on past samples, as a share of the signal's root mean square.
 _TRACE_OF_NOISE = 1e-6
@@ -222,7 +222,7 @@ def pbsid_opt(
     Notes
     -----
     Consistent with feedback for p growing with the record; a bias of the order of (A - K C)^p remains. Not efficient:
-    polish it with :func:`autotune.identification.prediction_error.prediction_error`.
+    polish it with :func:`autotune.identification.closed_loop.prediction_error.prediction_error`.
     """
     data = lagged_data(u, y, p)
     return regress_system(data, pbsid_states(data, f, feedthrough=feedthrough), order, feedthrough=feedthrough)

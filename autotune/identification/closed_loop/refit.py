@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 
 from autotune.arrays import FloatArray
-from autotune.identification.lagged import BLOCK_ROWS, least_squares, triangle
-from autotune.identification.predictor_sweep import innovations
-from autotune.identification.state_space import InnovationModel
-from autotune.identification.subspace_direct import with_stable_predictor
+from autotune.identification.closed_loop.lagged import BLOCK_ROWS, least_squares, triangle
+from autotune.identification.closed_loop.predictor_sweep import innovations
+from autotune.identification.closed_loop.state_space import InnovationModel
+from autotune.identification.closed_loop.subspace_direct import with_stable_predictor
 
 
 def refit_inputs(model: InnovationModel, u: FloatArray, y: FloatArray, *, feedthrough: bool = False) -> InnovationModel:

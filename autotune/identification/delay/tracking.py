@@ -9,8 +9,8 @@ import numpy as np
 
 from autotune.arrays import FloatArray
 from autotune.errors import IdentificationError, InputError
-from autotune.identification.delay import identify_delay
-from autotune.identification.delay_model import DelayModel
+from autotune.identification.delay.identify import identify_delay
+from autotune.identification.delay.model import DelayModel
 from autotune.models import Hold
 from autotune.recording import Recording
 

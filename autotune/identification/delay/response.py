@@ -19,7 +19,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from autotune.arrays import FloatArray
-from autotune.identification.compiled import cholesky_solve, transition
+from autotune.identification.delay.compiled import cholesky_solve, transition
 
 _OVERFLOW = 1e100
 _BLOCK = 2048  # pieces that are carried at once

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.linalg import expm, logm
 
 from autotune.arrays import FloatArray
-from autotune.identification.state_space import InnovationModel
+from autotune.identification.closed_loop.state_space import InnovationModel
 from autotune.points import FrequencyPoint
 
 #: A point less certain than this says nothing to a design.

@@ -10,8 +10,8 @@ from scipy.stats import chi2
 
 from autotune.arrays import FloatArray
 from autotune.errors import IdentificationError
-from autotune.identification.prediction_error import PredictionErrorEstimate, prediction_error
-from autotune.identification.subspace_direct import (
+from autotune.identification.closed_loop.prediction_error import PredictionErrorEstimate, prediction_error
+from autotune.identification.closed_loop.subspace_direct import (
     LaggedData,
     autoregression,
     choose_past_window,
@@ -119,7 +119,7 @@ def choose_order(
     max_order : int
         Highest order tried; the record's length may lower it.
     feedthrough, offset : bool
-        As in :func:`autotune.identification.prediction_error.prediction_error`.
+        As in :func:`autotune.identification.closed_loop.prediction_error.prediction_error`.
     progress : callable
         Told what is tried.
 
@@ -203,7 +203,7 @@ def fixed_order(
     p : int, optional
         Past window of the start; chosen by Akaike's criterion when absent.
     feedthrough, offset : bool
-        As in :func:`autotune.identification.prediction_error.prediction_error`.
+        As in :func:`autotune.identification.closed_loop.prediction_error.prediction_error`.
     """
     factor = _factor(*shifted(u, y, delay), p=p, least=order + 2)
     return start_and_polish(factor, u, y, order, delay=delay, feedthrough=feedthrough, offset=offset)

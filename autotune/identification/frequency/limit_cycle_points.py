@@ -13,10 +13,15 @@ import numpy as np
 
 from autotune.arrays import BoolArray, ComplexArray, FloatArray
 from autotune.errors import IdentificationError
-from autotune.identification.harmonics import HarmonicFit, fit_harmonics, held_coefficients
-from autotune.identification.limit_cycle import RelayEdges, WholePeriods, relay_edges, whole_periods
-from autotune.identification.noise import NoiseSpectrum, noise_spectrum
-from autotune.identification.reference_model import ReferenceModel, fit_reference, free_responses, simulate_reference
+from autotune.identification.frequency.harmonics import HarmonicFit, fit_harmonics, held_coefficients
+from autotune.identification.frequency.limit_cycle import RelayEdges, WholePeriods, relay_edges, whole_periods
+from autotune.identification.frequency.noise import NoiseSpectrum, noise_spectrum
+from autotune.identification.frequency.reference_model import (
+    ReferenceModel,
+    fit_reference,
+    free_responses,
+    simulate_reference,
+)
 from autotune.points import FrequencyPoint
 
 _HIGHEST_HARMONIC = 9

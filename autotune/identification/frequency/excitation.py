@@ -10,7 +10,7 @@ import numpy as np
 
 from autotune.arrays import FloatArray
 from autotune.errors import IdentificationError
-from autotune.identification.limit_cycle import relay_edges
+from autotune.identification.frequency.limit_cycle import relay_edges
 from autotune.recording import Recording
 
 #: Periods of one relay setting agree to this part.

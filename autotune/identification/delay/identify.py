@@ -11,10 +11,10 @@ from collections.abc import Callable
 import numpy as np
 
 from autotune.errors import IdentificationError, InputError
-from autotune.identification.delay_data import DelayData, PastInput, input_period, prepare
-from autotune.identification.delay_model import DelayModel
-from autotune.identification.delay_search import binned, search
-from autotune.identification.output_error import Point, Structure, finish, minimise, polish, solve_linear
+from autotune.identification.delay.data import DelayData, PastInput, input_period, prepare
+from autotune.identification.delay.model import DelayModel
+from autotune.identification.delay.output_error import Point, Structure, finish, minimise, polish, solve_linear
+from autotune.identification.delay.search import binned, search
 from autotune.models import Hold
 from autotune.recording import Recording
 

@@ -86,7 +86,7 @@ def normal_equations(
     Parameters
     ----------
     F, H, x0 : arrays
-        The predictor, as in :class:`autotune.identification.predictor_directions.Predictor`.
+        The predictor, as in :class:`autotune.identification.closed_loop.predictor_directions.Predictor`.
     u, y : (N, n_u), (N, n_y) arrays
         Data.
     dF, dH, dx0 : (n, ..., P), (n_y, ..., P), (n, P) arrays

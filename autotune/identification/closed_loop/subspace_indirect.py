@@ -4,7 +4,7 @@ The loop u = r - C y is analysed from r to y first (its extended observability m
 Gamma is freed from it with the controller's Markov parameters. Everything is done on the triangular factor of
 [R_f; Psi; Y_f; U_f], so the data are read once, whatever their length; M_ij below are blocks of its transpose.
 
-Its weak step is B and D (step 6): refit them with :func:`autotune.identification.refit.refit_inputs`.
+Its weak step is B and D (step 6): refit them with :func:`autotune.identification.closed_loop.refit.refit_inputs`.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from scipy.linalg import solve_triangular
 
 from autotune.arrays import FloatArray
 from autotune.errors import IdentificationError
-from autotune.identification.lagged import lagged_factor, lagged_range, lagged_rows, least_squares, triangle
-from autotune.identification.state_space import InnovationModel
+from autotune.identification.closed_loop.lagged import lagged_factor, lagged_range, lagged_rows, least_squares, triangle
+from autotune.identification.closed_loop.state_space import InnovationModel
 
 Instrument: TypeAlias = Literal["r", "r and y", "u and y"]
 #: Singular values below this share of the largest are rounding in noise-free data.

@@ -14,8 +14,8 @@ from scipy.stats import chi2
 
 from autotune.arrays import ComplexArray, FloatArray
 from autotune.errors import IdentificationError
-from autotune.identification.prediction_error import PredictionErrorEstimate
-from autotune.identification.predictor_sweep import innovations
+from autotune.identification.closed_loop.prediction_error import PredictionErrorEstimate
+from autotune.identification.closed_loop.predictor_sweep import innovations
 from autotune.points import FrequencyPoint
 
 #: Information matrices worse than this hold directions that the data say nothing about.

@@ -16,7 +16,7 @@ import numpy as np
 from autotune.arrays import ComplexArray, FloatArray
 from autotune.controller import Controller
 from autotune.errors import IdentificationError, InputError
-from autotune.identification.confidence import (
+from autotune.identification.closed_loop.confidence import (
     Whiteness,
     frequency_points,
     pole_covariance,
@@ -24,13 +24,13 @@ from autotune.identification.confidence import (
     response_covariance,
     whiteness,
 )
-from autotune.identification.control_law import CONTRADICTION, LawCheck, check_law
-from autotune.identification.hold import without_hold
-from autotune.identification.loop_excitation import ExcitationVerdict, judge, own_motion, require_excitation
-from autotune.identification.order import Candidate, choose_order, default_past_window, fixed_order
-from autotune.identification.prediction_error import PredictionErrorEstimate
-from autotune.identification.state_space import InnovationModel
-from autotune.identification.subspace_direct import lagged_data
+from autotune.identification.closed_loop.control_law import CONTRADICTION, LawCheck, check_law
+from autotune.identification.closed_loop.hold import without_hold
+from autotune.identification.closed_loop.loop_excitation import ExcitationVerdict, judge, own_motion, require_excitation
+from autotune.identification.closed_loop.order import Candidate, choose_order, default_past_window, fixed_order
+from autotune.identification.closed_loop.prediction_error import PredictionErrorEstimate
+from autotune.identification.closed_loop.state_space import InnovationModel
+from autotune.identification.closed_loop.subspace_direct import lagged_data
 from autotune.points import FrequencyPoint
 from autotune.recording import Recording
 

@@ -16,10 +16,10 @@ from scipy.linalg import solve_toeplitz
 
 from autotune.arrays import BoolArray, FloatArray
 from autotune.errors import IdentificationError
-from autotune.identification.compiled import autocovariances, cholesky_solve
-from autotune.identification.delay_data import DelayData
-from autotune.identification.delay_model import DelayModel
-from autotune.identification.delay_response import linear_part, normal_matrix, output
+from autotune.identification.delay.compiled import autocovariances, cholesky_solve
+from autotune.identification.delay.data import DelayData
+from autotune.identification.delay.model import DelayModel
+from autotune.identification.delay.response import linear_part, normal_matrix, output
 
 _WHITE = np.empty(0)
 _MAX_AR = 12

@@ -9,8 +9,8 @@ import numpy as np
 
 from autotune.arrays import ComplexArray, FloatArray
 from autotune.errors import IdentificationError
-from autotune.identification.lagged import triangle
-from autotune.identification.subspace_direct import LaggedData
+from autotune.identification.closed_loop.lagged import triangle
+from autotune.identification.closed_loop.subspace_direct import LaggedData
 
 #: Relative standard deviation of the response that a design can live with.
 PRECISION_WANTED = 0.05

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from autotune.arrays import BoolArray, ComplexArray, FloatArray
 from autotune.errors import IdentificationError
-from autotune.identification.delay_data import DelayData
-from autotune.identification.modulating import SinePower
-from autotune.identification.output_error import Point, Structure, minimise, solve_linear
+from autotune.identification.delay.data import DelayData
+from autotune.identification.delay.modulating import SinePower
+from autotune.identification.delay.output_error import Point, Structure, minimise, solve_linear
 
 _BINS = 600
 _WINDOWS = (1 / 4, 1 / 10, 1 / 25)  # lengths, in records

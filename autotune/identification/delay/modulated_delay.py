@@ -18,7 +18,7 @@ from numba import njit
 
 from autotune.arrays import BoolArray, ComplexArray, FloatArray
 from autotune.errors import IdentificationError, InputError
-from autotune.identification.modulating import SinePower, Window, require_window
+from autotune.identification.delay.modulating import SinePower, Window, require_window
 from autotune.recording import Recording
 
 Interval = tuple[float, float]

@@ -10,9 +10,13 @@ from __future__ import annotations
 import numpy as np
 
 from autotune.arrays import FloatArray
-from autotune.identification.lagged import lagged_factor, least_squares, triangle
-from autotune.identification.state_space import InnovationModel
-from autotune.identification.subspace_indirect import input_matrices, markov_from_null_space, toeplitz_blocks
+from autotune.identification.closed_loop.lagged import lagged_factor, least_squares, triangle
+from autotune.identification.closed_loop.state_space import InnovationModel
+from autotune.identification.closed_loop.subspace_indirect import (
+    input_matrices,
+    markov_from_null_space,
+    toeplitz_blocks,
+)
 
 
 def van_overschee_de_moor(

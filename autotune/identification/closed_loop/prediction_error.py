@@ -13,9 +13,9 @@ import numpy as np
 
 from autotune.arrays import FloatArray
 from autotune.errors import IdentificationError
-from autotune.identification.predictor_directions import Predictor, behaviour_directions
-from autotune.identification.predictor_sweep import innovations, normal_equations, scatter
-from autotune.identification.state_space import InnovationModel, balancing, spectral_radius
+from autotune.identification.closed_loop.predictor_directions import Predictor, behaviour_directions
+from autotune.identification.closed_loop.predictor_sweep import innovations, normal_equations, scatter
+from autotune.identification.closed_loop.state_space import InnovationModel, balancing, spectral_radius
 
 #: A step that promises less than this in -2 log likelihood moves no parameter by 3 % of its standard deviation.
 _TOLERANCE = 1e-3

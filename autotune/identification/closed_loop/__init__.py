@@ -1,0 +1,1 @@
+"""Identification of a plant under control: subspace methods, prediction error, regions."""

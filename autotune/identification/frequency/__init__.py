@@ -1,0 +1,1 @@
+"""Frequency points of recordings: relay limit cycles, and any other excitation."""
