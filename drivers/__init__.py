@@ -8,6 +8,7 @@ from autotune.config.rig import (
     ModbusTlsSettings,
     ReplaySettings,
     RigSettings,
+    SerialSettings,
     SimulatedRigSettings,
 )
 from autotune.controller import PIDController
@@ -52,6 +53,10 @@ def open_rig(
             from drivers.replay import open_replay
 
             return open_replay(settings)
+        case SerialSettings():
+            from drivers.serial_rig import SerialLineRig
+
+            return SerialLineRig(settings, u_range=u_range, u_safe=u_safe)
         case ModbusTcpSettings() | ModbusTlsSettings() | ModbusRtuSettings():
             from drivers.modbus import ModbusLink
             from drivers.register_rig import GainRegisterRig, RegisterRig
@@ -73,7 +78,12 @@ def twin_of(settings: RigSettings) -> SimulatedRigSettings:
     match settings:
         case SimulatedRigSettings():
             return settings
-        case ModbusTcpSettings(twin=twin) | ModbusTlsSettings(twin=twin) | ModbusRtuSettings(twin=twin) if twin:
+        case (
+            ModbusTcpSettings(twin=twin)
+            | ModbusTlsSettings(twin=twin)
+            | ModbusRtuSettings(twin=twin)
+            | SerialSettings(twin=twin)
+        ) if twin:
             return SimulatedRigSettings(
                 kind="simulated", plant=twin.plant, seed=twin.seed, noise=twin.noise, start=twin.start
             )

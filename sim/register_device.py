@@ -94,7 +94,7 @@ class RegisterDevice:
             "Ti": gains[1],
         }
         self._u_range = u_range
-        self._deadman_s = deadman_s
+        self.deadman_s = deadman_s
         self._output = plant.u_applied
         self._by_host = False
         self._fed_s = -math.inf
@@ -108,6 +108,11 @@ class RegisterDevice:
         return self._output
 
     @property
+    def by_host(self) -> bool:
+        """Whether the host moves the actuator."""
+        return self._by_host
+
+    @property
     def value(self) -> Mapping[str, float]:
         """The values the host has written, by signal."""
         return self._values
@@ -117,14 +122,14 @@ class RegisterDevice:
         while self._now_s < now_s:
             events = [now_s]
             if self._by_host:
-                events.append(self._fed_s + self._deadman_s)
+                events.append(self._fed_s + self.deadman_s)
             if self._is_automatic:
                 events.append(self._tick_s)
             until = min(events)
             if until > self._now_s:
                 self.plant.advance(self._output, until - self._now_s)
                 self._now_s = until
-            if self._by_host and until >= self._fed_s + self._deadman_s:
+            if self._by_host and until >= self._fed_s + self.deadman_s:
                 self._release("dead-man")
             elif self._is_automatic and until >= self._tick_s:
                 self._control()

@@ -24,15 +24,22 @@ _CONFIG = Annotated[Path, typer.Argument(metavar="CONFIG.toml", help="configurat
 @app.command()
 def rig(config: _CONFIG) -> None:
     """Serve the config's simulated plant over its real transport, until stopped by Ctrl-C."""
-    from autotune.cli.served import device_of, modbus_settings, served
+    from autotune.cli.served import device_of, modbus_settings, served, served_on_line
     from autotune.config import load_config
+    from autotune.config.rig import SerialSettings
 
     content = load_config(config)
-    settings = modbus_settings(content)
     console = Console(highlight=False)
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
+    if isinstance(content.rig, SerialSettings):
+        with served_on_line(content, content.rig):
+            console.print(f"serving a microcontroller on {content.rig.device}; Ctrl-C ends it")
+            stop.wait()
+        console.print("stopped")
+        return
+    settings = modbus_settings(content)
     with served(content, device_of(content)) as server:
         table = Table("signal", "table", "address", "type", "order", "scale", "offset", title=f"{content.name}")
         for name, register in settings.registers.mapped().items():

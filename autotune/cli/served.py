@@ -13,6 +13,7 @@ from autotune.config.rig import (
     ModbusRtuSettings,
     ModbusTlsSettings,
     ReplaySettings,
+    SerialSettings,
     SimulatedRigSettings,
     TwinSettings,
 )
@@ -22,6 +23,7 @@ from sim.plant import Plant, make_plant
 from sim.register_device import RegisterDevice
 from sim.registers import RegisterSpec
 from sim.serial_line import SerialLine
+from sim.serial_rig import SerialRig, device_on_line
 
 
 def modbus_settings(config: Config) -> AnyModbusSettings:
@@ -32,7 +34,7 @@ def modbus_settings(config: Config) -> AnyModbusSettings:
     InputError
         It is another kind.
     """
-    if isinstance(config.rig, SimulatedRigSettings | ReplaySettings):
+    if isinstance(config.rig, SimulatedRigSettings | ReplaySettings | SerialSettings):
         raise InputError(
             f'kind = "{config.rig.kind}" has no registers',
             where="rig",
@@ -117,7 +119,32 @@ def served(config: Config, device: RegisterDevice, *, refuse: Refusal | None = N
         yield rig
 
 
-def _twin(settings: AnyModbusSettings) -> TwinSettings:
+@contextmanager
+def served_on_line(config: Config, settings: SerialSettings) -> Iterator[SerialRig]:
+    """Serve the configuration's twin as a microcontroller on a serial line until the context ends.
+
+    Raises
+    ------
+    InputError
+        There is no twin, or the serial device cannot be opened.
+    """
+    twin, controller = _twin(settings), config.controller
+    device = device_on_line(
+        make_plant(twin.plant, seed=twin.seed, noise=twin.noise, start=twin.start),
+        u_range=(config.limits.u_min, config.limits.u_max),
+        u_safe=config.limits.u_safe,
+        gains=(controller.K, controller.Ti_s) if controller else (0.0, 1.0),
+    )
+    with _line_end(settings, twin) as end:
+        try:
+            rig = SerialRig(device, end, y_span=settings.y_span, u_span=settings.u_span)
+        except OSError as error:
+            raise InputError(f"cannot be opened ({error.strerror})", where=end, mend="give rig.twin.device") from None
+        with rig:
+            yield rig
+
+
+def _twin(settings: AnyModbusSettings | SerialSettings) -> TwinSettings:
     if settings.twin is None:
         raise InputError("the rig has no simulated twin", where="rig.twin", mend='name one: [rig.twin] plant = "ball"')
     return settings.twin
@@ -136,7 +163,7 @@ def _started(rig: ModbusRig) -> Iterator[ModbusRig]:
 
 
 @contextmanager
-def _line_end(settings: ModbusRtuSettings, twin: TwinSettings) -> Iterator[str]:
+def _line_end(settings: ModbusRtuSettings | SerialSettings, twin: TwinSettings) -> Iterator[str]:
     """Yield the serial device for the server; makes the line where the configuration names none."""
     if twin.device is not None:
         yield twin.device

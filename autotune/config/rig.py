@@ -103,12 +103,40 @@ class ModbusRtuSettings(ModbusSettings):
     stop_bits: Annotated[Literal[1, 2], Field(description="stop bits, 1 or 2")] = 1
 
 
-_KINDS = (SimulatedRigSettings, ReplaySettings, ModbusTcpSettings, ModbusTlsSettings, ModbusRtuSettings)
+class SerialSettings(Section):
+    """A microcontroller on a serial line, with the framed protocol of this project."""
+
+    kind: Literal["serial"]
+    device: Annotated[str, Field(description="serial device, e.g. /dev/ttyACM0")]
+    baud: Annotated[int, Field(ge=300, le=4_000_000, description="line speed [bit/s], 300..4000000")] = 115200
+    timeout_s: Annotated[float, Field(gt=0, le=60, description="longest wait for one answer [s], up to 60")] = 0.1
+    retries: Annotated[
+        int, Field(ge=0, le=10, description="further attempts of one request, 0..10; such a sample is marked suspect")
+    ] = 1
+    start_s: Annotated[
+        float, Field(gt=0, le=60, description="time the device may take to start after the line was opened [s]")
+    ] = 3.0
+    deadman_s: Annotated[
+        float, Field(ge=0.002, le=60, description="silence of the host after which the device is safe [s], 0.002..60")
+    ] = 0.5
+    y_span: Annotated[tuple[float, float], Field(description="y at count 0 and at full scale [y unit]")]
+    u_span: Annotated[tuple[float, float], Field(description="u at count 0 and at full scale [u unit]")]
+    twin: TwinSettings | None = None
+
+
+_KINDS = (
+    SimulatedRigSettings,
+    ReplaySettings,
+    ModbusTcpSettings,
+    ModbusTlsSettings,
+    ModbusRtuSettings,
+    SerialSettings,
+)
 
 AnyModbusSettings: TypeAlias = ModbusTcpSettings | ModbusTlsSettings | ModbusRtuSettings
 
 RigSettings: TypeAlias = Annotated[
-    SimulatedRigSettings | ReplaySettings | ModbusTcpSettings | ModbusTlsSettings | ModbusRtuSettings,
+    SimulatedRigSettings | ReplaySettings | ModbusTcpSettings | ModbusTlsSettings | ModbusRtuSettings | SerialSettings,
     Field(discriminator="kind", description="how the rig is reached"),
 ]
 

@@ -14,7 +14,13 @@ import numpy as np
 
 from autotune.cli.served import spec_of
 from autotune.config.registers import RegisterMap
-from autotune.config.rig import AnyModbusSettings, ModbusRtuSettings, ModbusTcpSettings, ModbusTlsSettings
+from autotune.config.rig import (
+    AnyModbusSettings,
+    ModbusRtuSettings,
+    ModbusTcpSettings,
+    ModbusTlsSettings,
+    SerialSettings,
+)
 from autotune.experiment.rig import Rig
 from autotune.recording import Recording
 from drivers import open_rig
@@ -24,6 +30,7 @@ from sim.imperfections import Fault, FaultyPlant
 from sim.modbus_rig import ModbusRig, Refusal, RtuTransport, TcpTransport
 from sim.register_device import OutputChange, RegisterDevice
 from sim.serial_line import SerialLine, Tamper
+from sim.serial_rig import SerialRig, device_on_line
 from sim.servo import Servo, ServoSettings
 
 U_RANGE = (-10.0, 10.0)
@@ -64,6 +71,7 @@ class Bench:
     cut: Callable[[], None]
     device: RegisterDevice | None = None
     commands: tuple[float, ...] = (0.25, -0.75, 0.5)
+    restart: Callable[[], None] = lambda: None
     released: threading.Event = field(default_factory=threading.Event)
 
     def watch(self) -> None:
@@ -91,7 +99,7 @@ def register_device(registers: RegisterMap = REGISTERS, plant: Any = None) -> Re
     )
 
 
-def rig_of(settings: AnyModbusSettings) -> Rig:
+def rig_of(settings: AnyModbusSettings | SerialSettings) -> Rig:
     return open_rig(settings, u_range=U_RANGE, u_safe=U_SAFE)
 
 
@@ -150,6 +158,23 @@ def rtu_bench(*, tamper: Tamper | None = None, **changes: Any) -> Iterator[Bench
     with SerialLine(tamper) as line, ModbusRig(device, RtuTransport(device=line.rig_device, parity="N")):
         rig = rig_of(rtu_settings(line.host_device, **changes))
         yield Bench(rig=rig, output=lambda: device.output, cut=line.cut, device=device)
+        rig.close()
+
+
+def serial_settings(device: str, **changes: Any) -> SerialSettings:
+    given = {"kind": "serial", "device": device, "timeout_s": 2.0, "deadman_s": DEADMAN_S, "y_span": (-10.0, 10.0)}
+    return SerialSettings.model_validate(given | {"u_span": U_RANGE} | changes)
+
+
+@contextmanager
+def serial_bench(*, tamper: Tamper | None = None, **changes: Any) -> Iterator[Bench]:
+    device = device_on_line(servo(), u_range=U_RANGE, u_safe=0.0, gains=(1.5, 2.0))
+    with (
+        SerialLine(tamper) as line,
+        SerialRig(device, line.rig_device, y_span=U_RANGE, u_span=U_RANGE) as served,
+    ):
+        rig = rig_of(serial_settings(line.host_device, **changes))
+        yield Bench(rig=rig, output=lambda: device.output, cut=line.cut, device=device, restart=served.restart)
         rig.close()
 
 

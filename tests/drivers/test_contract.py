@@ -1,4 +1,4 @@
-"""What every rig keeps to, whatever it is reached by: the same statements in process, replayed, over TCP, RTU, TLS."""
+"""What every rig keeps to, whatever it is reached by: the same statements in process, replayed, on any line."""
 
 from __future__ import annotations
 
@@ -18,14 +18,15 @@ from tests.drivers.bench import (
     Bench,
     replay_bench,
     rtu_bench,
+    serial_bench,
     simulated_bench,
     tcp_bench,
     tls_bench,
 )
 
-ALL = ("simulated", "replay", "tcp", "rtu", "tls")
-MOVING = ("simulated", "tcp", "rtu", "tls")
-REAL = ("tcp", "rtu", "tls")
+ALL = ("simulated", "replay", "tcp", "rtu", "tls", "serial")
+MOVING = ("simulated", "tcp", "rtu", "tls", "serial")
+REAL = ("tcp", "rtu", "tls", "serial")
 
 
 @pytest.fixture
@@ -39,6 +40,8 @@ def bench(request: pytest.FixtureRequest) -> Iterator[Bench]:
             context = tcp_bench()
         case "rtu":
             context = rtu_bench()
+        case "serial":
+            context = serial_bench()
         case _:
             certificates: Path = request.getfixturevalue("certificates")
             context = tls_bench(certificates)

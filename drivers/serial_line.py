@@ -1,0 +1,201 @@
+"""Requests and answers on a serial line: an answer is the one that was asked for, or there is none.
+
+An answer is taken only for the request whose sequence number it carries: a late one is dropped, and a request can be
+repeated. What was torn or hit by noise is no frame and costs a repetition. No wait is without end.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import random
+import time
+from collections import deque
+
+import serial
+
+from autotune.config.rig import SerialSettings
+from autotune.errors import LinkError
+from drivers.line_protocol import VERSION, Decoder, Frame, Kind, encode
+
+_LINE_ERRORS: tuple[type[Exception], ...] = (OSError,)
+try:
+    import termios
+
+    _LINE_ERRORS += (termios.error,)  # raised for line settings that the device refuses; it is no OSError
+except ImportError:  # there is none outside POSIX
+    pass
+
+_OPEN_ERRORS: tuple[type[Exception], ...] = (
+    *_LINE_ERRORS,
+    ValueError,
+)  # the latter for a speed that the port cannot run at
+
+_FLASH = "flash the firmware that belongs to this version"
+_REASONS = {
+    1: ("does not know the request", _FLASH),
+    2: ("finds the request too long or too short", _FLASH),
+    3: ("does not let the host command", "open the rig again"),
+    4: ("refuses the value", "check y_span, u_span and the gains"),
+}
+_CABLE = "check cable, power and [rig] device"
+
+
+class DeviceRefused(LinkError):  # noqa: N818 - a verdict, as its base
+    """The device answered that it does not do it."""
+
+
+class SerialLink:
+    """One device on a serial line.
+
+    Parameters
+    ----------
+    settings : SerialSettings
+        Line, time-outs, repetitions.
+    """
+
+    def __init__(self, settings: SerialSettings) -> None:
+        self._settings = settings
+        self._port: serial.Serial | None = None
+        self._decoder = Decoder()
+        self._arrived: deque[Frame] = deque()
+        # a device that answers an earlier session's request must not seem to answer this one's
+        self._sequence = random.randrange(0x10000)
+
+    @property
+    def where(self) -> str:
+        """The device, for messages."""
+        return f"serial line {self._settings.device}"
+
+    @property
+    def is_connected(self) -> bool:
+        """Whether the line is open."""
+        return self._port is not None
+
+    def connect(self) -> Frame:
+        """Open the line and wait until the device says HELLO; return its INFO.
+
+        Raises
+        ------
+        LinkError
+            The line cannot be opened, nobody answers, or the device speaks another version.
+        """
+        settings = self._settings
+        if self._port is None:
+            try:
+                self._port = serial.Serial(
+                    settings.device,
+                    settings.baud,
+                    timeout=settings.timeout_s,
+                    write_timeout=settings.timeout_s,
+                    exclusive=True,
+                )
+            except _OPEN_ERRORS as error:
+                raise LinkError(f"cannot be opened ({error})", where=self.where, mend=_CABLE) from None
+        until = time.monotonic() + settings.start_s  # opening restarts a board whose reset hangs on DTR
+        while True:
+            try:
+                return self.ask(Kind.HELLO, retries=0)[0]
+            except LinkError as error:
+                if time.monotonic() > until or self._port is None or isinstance(error, DeviceRefused):
+                    self.disconnect()
+                    raise
+
+    def disconnect(self) -> None:
+        """Close the line; may be called more than once."""
+        port, self._port = self._port, None
+        self._arrived.clear()
+        self._decoder.clear()
+        if port is not None:
+            with contextlib.suppress(*_LINE_ERRORS):  # it is gone already
+                port.close()
+
+    def ask(self, kind: Kind, *values: float, retries: int | None = None) -> tuple[Frame, float, bool]:
+        """Ask until an answer carries the request's number.
+
+        Returns
+        -------
+        answer : Frame
+            Not a refusal.
+        sent_s : float
+            When the answered request was sent, on ``time.perf_counter`` [s].
+        suspect : bool
+            Whether it took more than one attempt.
+
+        Raises
+        ------
+        DeviceRefused
+            The device does not do it.
+        LinkError
+            No answer in all attempts, or the line is gone.
+        """
+        attempts = 1 + (self._settings.retries if retries is None else retries)
+        for attempt in range(attempts):
+            self._sequence = (self._sequence + 1) & 0xFFFF
+            sent_s = time.perf_counter()
+            # a zero byte first ends what noise has left on the device's side
+            start = b"\0" if attempt else b""
+            self._write(start + encode(Frame(kind=kind, sequence=self._sequence, values=values)))
+            answer = self._answer(kind)
+            if answer is not None:
+                return answer, sent_s, attempt > 0
+        raise LinkError(f"no answer to {kind.name}", where=self.where, mend=_CABLE)
+
+    def send(self, kind: Kind, *values: float) -> None:
+        """Send a request whose answer arrives among the streamed rows."""
+        self._sequence = (self._sequence + 1) & 0xFFFF
+        self._write(encode(Frame(kind=kind, sequence=self._sequence, values=values)))
+
+    def arrived(self, timeout_s: float) -> Frame | None:
+        """Return the next frame that the device sent by itself, None where none comes within ``timeout_s`` [s]."""
+        until = time.monotonic() + timeout_s
+        while not self._arrived:
+            if time.monotonic() >= until:
+                return None
+            self._arrived.extend(self._receive(until))
+        return self._arrived.popleft()
+
+    def forget(self) -> None:
+        """Drop the frames that the device sent by itself so far."""
+        self._arrived.clear()
+
+    def _answer(self, kind: Kind) -> Frame | None:
+        until = time.monotonic() + self._settings.timeout_s
+        answer: Frame | None = None
+        while answer is None and time.monotonic() < until:
+            for frame in self._receive(until):
+                if frame.version != VERSION:
+                    raise DeviceRefused(
+                        f"speaks version {frame.version} of the protocol", where=self.where, mend=_FLASH
+                    )
+                if frame.kind == Kind.ROW:
+                    self._arrived.append(frame)
+                elif frame.sequence == self._sequence:
+                    answer = frame
+        if answer is not None and answer.kind == Kind.REFUSED:
+            what, mend = _REASONS.get(int(answer.values[1]), ("refuses the request", _FLASH))
+            raise DeviceRefused(f"the device {what} ({kind.name})", where=self.where, mend=mend)
+        return answer
+
+    def _receive(self, until: float) -> list[Frame]:
+        """Return the frames that are complete with the next bytes."""
+        port = self._opened
+        try:
+            port.timeout = max(0.0, until - time.monotonic())
+            return self._decoder.feed(port.read(port.in_waiting or 1))
+        except _LINE_ERRORS as error:
+            self.disconnect()
+            raise LinkError(f"the line is gone ({error})", where=self.where, mend=_CABLE) from None
+
+    def _write(self, data: bytes) -> None:
+        port = self._opened
+        try:
+            port.write(data)
+        except _LINE_ERRORS as error:
+            self.disconnect()
+            raise LinkError(f"the line takes nothing ({error})", where=self.where, mend=_CABLE) from None
+
+    @property
+    def _opened(self) -> serial.Serial:
+        if self._port is None:
+            raise LinkError("the line is not open", where=self.where, mend="open the rig first")
+        return self._port
