@@ -338,11 +338,13 @@ def _states_of(result: Fit, data: Data) -> list[FloatArray]:
 
 
 def _half(data: Data, which: int) -> Data:
-    """Return every second window of the data."""
+    """Return every second window of the data, or block of windows where there are few."""
     starts, stops, good = [], [], []
     number = which
     for a, b, ok in zip(data.starts, data.stops, data.good, strict=True):
-        keep = np.arange(len(a)) % 2 == number % 2
+        # few windows may go by direction one and one: then blocks of them are taken
+        block = 1 if len(a) >= 8 else max(1, len(a) // 2)
+        keep = (np.arange(len(a)) // block) % 2 == number % 2
         if not keep.any():
             keep[:] = True
         inside = np.zeros(ok.size, dtype=bool)

@@ -28,7 +28,8 @@ LEAST_DECREASE = 30.0
 COARSE = 25.0
 #: Shift of an effect's size, as a logarithm, that gets a fit out of a crease.
 NUDGE = 0.06
-#: Score that a hypothesis with more free numbers must be ahead of one with fewer.
+#: Score that a hypothesis with more free numbers must be ahead of one with fewer, at least; a hundredth of what it
+#: explains where that is more.
 SIMPLER = 15.0
 #: Rows on which hypotheses are screened; those that lead are fitted to all.
 SCREENING_ROWS = 4500
@@ -275,7 +276,8 @@ def polished(ranked: Sequence[Hypothesis], count: int, data: Data, base: Fit, po
     """Return the best hypotheses fitted to all data, best first."""
     done = sorted(pool.map(lambda h: polish(h, data, base), ranked[:count]), key=score)
     if done:
-        near = [h for h in done if score(h) - score(done[0]) < SIMPLER]
+        lead = max(SIMPLER, 0.01 * (base.cost - done[0].fit.cost))
+        near = [h for h in done if score(h) - score(done[0]) < lead]
         simplest = min(near, key=lambda h: (h.parameters, score(h)))
         if simplest.parameters < done[0].parameters:
             done.remove(simplest)
