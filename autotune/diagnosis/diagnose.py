@@ -36,6 +36,9 @@ OFFSET_SIGMAS = 6.0
 DOMINANT = 0.4
 #: Correlation of the noise from which on it is a disturbance of the plant's, not of single samples.
 SLOW_NOISE = 0.8
+#: Weight of a cause outside the catalogue, beside the best hypothesis's 1, where that explains the recordings or most
+#: of what retuning leaves; elsewhere it weighs as much as the best.
+UNKNOWN = 0.03
 #: Scale of the log-odds: one unit of chi2 counts this much less than for ideal noise.
 TEMPERATURE = 3.0
 
@@ -100,7 +103,8 @@ def _judge(found: Search, samples: list[SampleEffect], model: Model) -> Diagnosi
     adequate = is_adequate(chosen.fit, found.data)
     offset = _offset(chosen.fit)
     quality, extended_is_better = held_out(found)
-    verdict = _verdict(found, samples, adequate or dominates(quality), offset is not None)
+    adequate |= dominates(quality)
+    verdict = _verdict(found, samples, adequate, offset is not None)
     effects = _effects(found, samples, offset, adequate) if verdict == "effect" else ()
     candidates = rivals(found, adequate)
     places = _places(effects) if verdict == "effect" else (_suspected(found) if verdict == "unexplained" else ())
@@ -178,7 +182,7 @@ def rivals(found: Search, adequate: bool) -> tuple[Candidate, ...]:
     for h in pool:
         name = "+".join(h.names) if h.names else "none"
         weights[name] = max(weights.get(name, 0.0), math.exp(-(score(h) - best) / (2.0 * scale)))
-    weights["unknown"] = 0.02 if adequate else 1.0
+    weights["unknown"] = UNKNOWN if adequate else 1.0
     total = sum(weights.values())
     ranked = sorted(weights.items(), key=lambda item: -item[1])
     return tuple(Candidate(name=name, probability=w / total) for name, w in ranked if w / total > 1e-4)[:12]

@@ -14,13 +14,14 @@ import numpy as np
 from autotune.arrays import FloatArray, IntArray
 from autotune.diagnosis.fitting import state_scales
 from autotune.diagnosis.simulation import Simulator, assemble
-from autotune.diagnosis.windows import slowest_lag_s
 from autotune.errors import InputError
 from autotune.models import Model
 from autotune.recording import Recording
 
 #: Past used for a state, in horizons.
-PASTS = (0.5, 1.0, 2.0, 4.0, 8.0)
+PASTS = (0.1, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
+#: Rows that a state estimate needs at least.
+LEAST_PAST = 30
 #: How fast old forecasts lose their say in which past is used, per window.
 MEMORY = 0.9
 
@@ -112,10 +113,10 @@ def forecast(model: Model, recording: Recording, horizon_s: float | None = None)
         return estimator.run(0, len(recording), estimator.estimate(0, rows, bias=False))
     if not horizon_s >= 2.0 * recording.sample_time_s:
         raise InputError(f"horizon = {horizon_s:g} s", where="--horizon", mend="give at least two sample times")
-    return _windowed(estimator, horizon_s, slowest_lag_s(model))
+    return _windowed(estimator, horizon_s)
 
 
-def _windowed(estimator: _Estimator, horizon_s: float, lag_s: float) -> FloatArray:
+def _windowed(estimator: _Estimator, horizon_s: float) -> FloatArray:
     """Forecast window by window."""
     t = estimator.recording.t
     count = int(np.floor((t[-1] - t[0]) / horizon_s + 1e-9)) + 1
@@ -133,8 +134,7 @@ def _windowed(estimator: _Estimator, horizon_s: float, lag_s: float) -> FloatArr
         forecasts: list[FloatArray] = []
         done: dict[tuple[int, bool], FloatArray] = {}
         for past, bias in choices:
-            length = max(past * horizon_s, 2.0 * lag_s)
-            start = min(int(np.searchsorted(t, t[a] - length)), max(a - 20, 0))
+            start = min(int(np.searchsorted(t, t[a] - past * horizon_s)), max(a - LEAST_PAST, 0))
             if (start, bias) not in done:
                 z = estimator.estimate(start, a, bias)
                 done[start, bias] = estimator.run(start, b, z)[a - start :]
