@@ -121,7 +121,7 @@ def promise(base: Fit, effect: Effect, data: Data) -> Promise:
     """Return what the first order promises when an effect is added to a fit.
 
     The direction d = e(with effect) - e(without) is freed of what the numbers already free could explain; the decrease
-    of |e + a d|^2 over 0 <= a <= 4 is promised, at least what the effect attains as it stands.
+    of |e + a d|^2 over 0 <= a <= 4 is promised, over -20 <= a <= 20 for an effect of either sign.
     """
     p, theta, states = extended(base, effect, data)
     try:
@@ -135,8 +135,10 @@ def promise(base: Fit, effect: Effect, data: Data) -> Promise:
     if curvature <= 0.0:
         return Promise(effect=effect, decrease=0.0, scaled=effect)
     signed = any(f.kind == "effect" and not f.positive for f in p.free[base.theta.size :])
-    a = float(np.clip(slope / curvature, -4.0 if signed else 0.0, 4.0))
-    return Promise(effect=effect, decrease=2.0 * a * slope - a * a * curvature, scaled=_scaled(effect, a))
+    a = float(np.clip(slope / curvature, -20.0 if signed else 0.0, 20.0 if signed else 4.0))
+    return Promise(
+        effect=effect, decrease=2.0 * a * slope - a * a * curvature, scaled=_scaled(effect, a, 20.0 if signed else 2.0)
+    )
 
 
 #: Parameters that an effect is about proportional to: the first order tells their size.
@@ -146,11 +148,11 @@ AMPLITUDES = frozenset(
 )  # fmt: skip
 
 
-def _scaled(effect: Effect, a: float) -> Effect:
+def _scaled(effect: Effect, a: float, most: float) -> Effect:
     """Return the effect with its amplitudes multiplied, where that is a step one can trust."""
     if effect.name in ("plant.hysteresis", "plant.hard_stop") or a == 0.0:
         return effect
-    factor = float(np.sign(a) * np.clip(abs(a), 0.05, 2.0))
+    factor = float(np.sign(a) * np.clip(abs(a), 0.05, most))
     parameters = {
         key: replace(q, value=q.value * factor) if key in AMPLITUDES else q for key, q in effect.parameters.items()
     }
