@@ -37,6 +37,7 @@ class Physics(NamedTuple):
     command_offset: float = 0.0
     command_second_order: float = 0.0
     command_quantum: float = 0.0
+    quantum_origin: float = 0.0  # deviation through which the lattice passes
     dead_zone: float = 0.0
     backlash: float = 0.0
     stiction: float = 0.0
@@ -103,7 +104,7 @@ def command_static(du: float, before: float, p: Physics) -> float:
     """Apply the actuator's static and memory effects to one new command; it put out ``before`` until now."""
     e = du + p.command_offset + p.command_second_order * du * du
     if p.command_quantum > 0.0:
-        e = p.command_quantum * np.round(e / p.command_quantum)
+        e = p.quantum_origin + p.command_quantum * np.round((e - p.quantum_origin) / p.command_quantum)
     if p.dead_zone > 0.0:
         e = np.sign(e) * max(abs(e) - p.dead_zone, 0.0)
     e = min(max(e, -p.command_limit), p.command_limit)

@@ -98,9 +98,12 @@ def gain_drift(a: float, p: Physics, s: Scale, rng: np.random.Generator) -> Size
     return Sized(physics={"gain_rate": rate}, parameters={"rate": (rate, "1/s")})
 
 
-command_quantum = _plain(command_quantum=lambda a, p, s: 0.5 * a * s.du)(
-    lambda f, p, s: {"step": (f["command_quantum"], s.unit_u)}
-)
+def command_quantum(a: float, p: Physics, s: Scale, rng: np.random.Generator) -> Sized:
+    """Conceal a converter's step; its lattice passes through the operating point or through zero."""
+    step = 0.5 * a * s.du
+    origin = -p.u_offset if rng.random() < 0.5 else 0.0
+    fields = {"command_quantum": step, "quantum_origin": origin}
+    return Sized(physics=fields, parameters={"step": (step, s.unit_u)})
 
 
 # ----- plant -----
