@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ from autotune.config.procedure import DesignSettings
 from autotune.controller import PIDController
 from autotune.design.margins import Margins, margins
 from autotune.design.nugap import Validation, loop_scaling, validate
+from autotune.design.robust import design_on_points
 from autotune.design.specification import Design, Specification
 from autotune.design.synthesis import design
 from autotune.errors import AutotuneError
@@ -43,6 +44,8 @@ class Analysis:
         Model whose margins are a guarantee.
     design : Design
         Controller, by default on the reduced model.
+    alternatives : tuple of (str, Design or str)
+        What other bases of the design give: the reduced model, the points, the fitted plant held for true; or why not.
     margins : Margins
         Of the controller on the fitted plant.
     unscaled, scaled : Validation
@@ -55,6 +58,7 @@ class Analysis:
     fit: PlantFit
     reduced: ReducedModel
     design: Design
+    alternatives: tuple[tuple[str, Design | str], ...]
     margins: Margins
     unscaled: Validation
     scaled: Validation
@@ -115,12 +119,13 @@ def analyse(points: Sequence[FrequencyPoint], settings: DesignSettings) -> Analy
     fit = fit_plant(points)
     reduced = reduce_points(points)
     H_r = reduced.transfer_function()
-    if settings.source == "points":
-        from autotune.design.robust import design_on_points
-
-        designed = design_on_points(points, specification(settings), settings.kind)
-    else:
-        designed = design(H_r, specification(settings), settings.kind)
+    wanted, kind = specification(settings), settings.kind
+    bases: dict[str, Callable[[], Design]] = {
+        "reduced model": lambda: design(H_r, wanted, kind),
+        "points": lambda: design_on_points(points, wanted, kind),
+        "fitted plant": lambda: design(fit.plant, wanted, kind, certificate=False),
+    }
+    designed = bases.pop(settings.source)()
     controller = designed.controller
     achieved = margins(fit.plant, controller)
     return Analysis(
@@ -128,11 +133,20 @@ def analyse(points: Sequence[FrequencyPoint], settings: DesignSettings) -> Analy
         fit=fit,
         reduced=reduced,
         design=designed,
+        alternatives=tuple((name, _or_reason(make)) for name, make in bases.items()),
         margins=achieved,
         unscaled=validate(fit.plant, H_r, controller),
         scaled=validate(fit.plant, H_r, controller, scaling=loop_scaling(H_r, controller)),
         warnings=reduced.warnings,
     )
+
+
+def _or_reason(make: Callable[[], Design]) -> Design | str:
+    """Return a design for comparison, or why there is none; only the one asked for may stop a run."""
+    try:
+        return make()
+    except AutotuneError as error:
+        return str(error)
 
 
 def tune(

@@ -127,13 +127,13 @@ def dither(
     seed: Annotated[int, typer.Option(min=0, help="of the random dwell times")] = 0,
 ) -> None:
     """Add a dither to the rig's present controller and record r, u and y, within the limits of the config."""
-    from autotune.cli.run import _Bar, _rig
+    from autotune.cli.common import ProgressBar, rig_of
     from autotune.config import load_config
     from autotune.experiment.dither import run_dither
 
     content = load_config(config)
-    rig = _rig(content, dry_run=False)
-    with _Bar() as bar:
+    rig = rig_of(content)
+    with ProgressBar() as bar:
         done = run_dither(rig, content, out, duration_s=duration, amplitude=amplitude, seed=seed, on_progress=bar.show)
     unit_u, unit_y = content.signals.u_unit, content.signals.y_unit
     typer.echo(

@@ -171,10 +171,10 @@ def _watch_rig(config: Config, out: Path, settings: _Tracking, duration_s: float
     """Run the present loop here and fit in another process, so that no fit ever delays a command."""
     import multiprocessing
 
-    from autotune.cli.run import _new_folder, _rig
+    from autotune.cli.common import new_folder, rig_of
     from autotune.experiment.dither import run_dither
 
-    _new_folder(out, "recording.csv")
+    new_folder(out, "recording.csv")
     recording = out / "recording.csv"
     quiet_s = max(5.0, 20.0 * config.signals.sample_time_s)
     fits = multiprocessing.get_context("spawn").Process(
@@ -182,7 +182,7 @@ def _watch_rig(config: Config, out: Path, settings: _Tracking, duration_s: float
     )
     fits.start()
     try:
-        run_dither(_rig(config, False), config, recording, duration_s=duration_s, amplitude=dither)
+        run_dither(rig_of(config), config, recording, duration_s=duration_s, amplitude=dither)
     finally:
         fits.join()
 

@@ -12,6 +12,7 @@ import numpy as np
 from autotune.arrays import ComplexArray, FloatArray
 from autotune.config.procedure import SignalSettings
 from autotune.controller import PIDController
+from autotune.design.margins import margins
 from autotune.design.nugap import Validation
 from autotune.experiment.result import ExperimentResult
 from autotune.pipeline import Analysis
@@ -236,6 +237,7 @@ def _loop_section(analysis: Analysis) -> Section:
                 header=("", "designed on", "fitted plant", "paper's ball"),
                 rows=rows,
             ),
+            _price_table(analysis),
         ),
         figures=(
             Figure(
@@ -254,6 +256,40 @@ def _loop_section(analysis: Analysis) -> Section:
                 caption="Sensitivity: its peak is the inverse of the modulus margin.",
             ),
         ),
+    )
+
+
+_PROMISES = {
+    "reduced model": "margins of every plant of class (1) that (5) bounds by the reduced model",
+    "points": "margins of every aperiodic plant through the points' 95 % regions",
+    "fitted plant": "nothing beyond the fitted plant itself",
+}
+
+
+def _price_table(analysis: Analysis) -> Table:
+    """Return what each guarantee costs: every design judged on the fitted plant."""
+    source = next(name for name in _PROMISES if name not in dict(analysis.alternatives))
+    rows = []
+    for name, found in ((source, analysis.design), *analysis.alternatives):
+        if isinstance(found, str):
+            rows.append((name, _PROMISES[name], found, "", "", "", ""))
+            continue
+        m = margins(analysis.fit.plant, found.controller)
+        rows.append(
+            (
+                name + (" (chosen)" if name == source else ""),
+                _PROMISES[name],
+                f"{found.controller.K:.4g}",
+                f"{found.controller.Ti_s:.4g}",
+                f"{m.h2:.4g}",
+                f"{m.modulus:.3f}",
+                f"{math.degrees(m.phase_rad):.1f}",
+            )
+        )
+    return Table(
+        caption="The price of each guarantee: designs of the same specification, judged on the fitted plant",
+        header=("designed on", "what is promised", "K", "T_I [s]", "H2 norm", "M_m", "phase margin [deg]"),
+        rows=tuple(rows),
     )
 
 

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +11,7 @@ from autotune.config import load_config
 from autotune.config.procedure import DesignSettings
 from autotune.controller import PIDController
 from autotune.errors import IdentificationError, LinkError
+from autotune.experiment.rig import Reading
 from autotune.models import TransferFunction
 from autotune.pipeline import analyse, hand_over, tune
 from autotune.points import FrequencyPoint
@@ -37,12 +40,15 @@ class Changing(SimulatedRig):
 
     stronger = 1.0
 
+    def read(self) -> Reading:
+        return replace(super().read(), u_applied=math.nan)  # this rig does not say what it applies
+
     def live(self, dt_s: float) -> None:
         self.plant.advance(4.9 + self.stronger * (self.command - 4.9), dt_s)
 
     def close(self) -> None:
         super().close()
-        self.stronger = 1.8
+        self.stronger = 1.4
 
 
 class RefusesGains(SimulatedRig):
