@@ -179,6 +179,24 @@ def serial_bench(*, tamper: Tamper | None = None, **changes: Any) -> Iterator[Be
 
 
 @contextmanager
+def firmware_bench(elf: Path, **changes: Any) -> Iterator[Bench]:
+    """Yield the firmware, executed, with the servo behind its converters."""
+    from tests.drivers.simavr_bench import U_FULL, Uno, UnoOnLine
+
+    plant, low, span = servo(), U_RANGE[0], U_RANGE[1] - U_RANGE[0]
+
+    def live(count: int) -> int:
+        plant.advance(low + span * count / U_FULL, 1e-3)
+        return round(min(max((plant.measure() + 10.0) / 20.0, 0.0), 1.0) * 5000)
+
+    uno = Uno(elf, elf.parent, live)
+    with SerialLine() as line, UnoOnLine(uno, line.rig_device) as served:
+        rig = rig_of(serial_settings(line.host_device, **changes))
+        yield Bench(rig=rig, output=lambda: low + span * uno.duty / U_FULL, cut=line.cut, restart=served.restart)
+        rig.close()
+
+
+@contextmanager
 def simulated_bench() -> Iterator[Bench]:
     plant = FaultyPlant(servo(), [Fault(kind="cut link", start_s=1000.0)])
     rig = SimulatedRig(plant, u_safe=U_SAFE)

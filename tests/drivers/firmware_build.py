@@ -96,6 +96,6 @@ def _p(values: FloatArray) -> ctypes.c_void_p:
 
 def build_uno(folder: Path) -> Path:
     """Build the firmware of the Arduino Uno; return its .elf, beside which lies the .hex."""
-    folder.mkdir(exist_ok=True)
+    folder.mkdir(parents=True, exist_ok=True)
     subprocess.run(["make", "-s", "-C", FIRMWARE, f"OUT={folder}"], check=True, capture_output=True)
     return folder / "uno.elf"

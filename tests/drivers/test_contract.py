@@ -16,6 +16,7 @@ from tests.drivers.bench import (
     LIMIT_S,
     U_SAFE,
     Bench,
+    firmware_bench,
     replay_bench,
     rtu_bench,
     serial_bench,
@@ -24,8 +25,11 @@ from tests.drivers.bench import (
     tls_bench,
 )
 
-ALL = ("simulated", "replay", "tcp", "rtu", "tls", "serial")
-MOVING = ("simulated", "tcp", "rtu", "tls", "serial")
+FIRMWARE = pytest.param(
+    "firmware", marks=pytest.mark.system("gcc", "gcc-avr", "avr-libc", "libsimavr-dev", "libelf-dev")
+)
+ALL = ("simulated", "replay", "tcp", "rtu", "tls", "serial", FIRMWARE)
+MOVING = ("simulated", "tcp", "rtu", "tls", "serial", FIRMWARE)
 REAL = ("tcp", "rtu", "tls", "serial")
 
 
@@ -42,6 +46,8 @@ def bench(request: pytest.FixtureRequest) -> Iterator[Bench]:
             context = rtu_bench()
         case "serial":
             context = serial_bench()
+        case "firmware":
+            context = firmware_bench(request.getfixturevalue("uno_elf"))
         case _:
             certificates: Path = request.getfixturevalue("certificates")
             context = tls_bench(certificates)
