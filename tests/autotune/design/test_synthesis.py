@@ -148,7 +148,7 @@ def _fine_grid_optimum(plant: TransferFunction, specification: Specification, ar
     return best
 
 
-@pytest.mark.parametrize("problem", ["reduced, Spec2"])
+@pytest.mark.parametrize("problem", ["reduced, Spec1", "reduced, Spec2", "ball, Spec1", "ball, Spec2"])
 def test_optimum_is_within_a_thousandth_of_an_independent_fine_grid(problem: str) -> None:
     plant, specification = PROBLEMS[problem]
     found = design(plant, specification, certificate=False)
