@@ -16,11 +16,12 @@ from autotune.diagnosis.fitting import Data, Fit, fit
 from autotune.diagnosis.law import law_effect
 from autotune.diagnosis.noise import noise_from_differences
 from autotune.diagnosis.result import Candidate, Diagnosis, FitQuality, FoundEffect, OperatingRange, Verdict
+from autotune.diagnosis.retuning import COARSE, misfit, whiteness
 from autotune.diagnosis.samples import SampleEffect, inspect, jitter_effect
-from autotune.diagnosis.search import Hypothesis
-from autotune.diagnosis.selection import COARSE, Report, Search, misfit, score, search, whiteness, worth
+from autotune.diagnosis.search import RUNAWAY, Hypothesis
+from autotune.diagnosis.selection import Report, Search, score, search, worth
 from autotune.diagnosis.simulation import entry_of
-from autotune.errors import IdentificationError, InputError
+from autotune.errors import InputError
 from autotune.models import Effect, Model, Parameter
 from autotune.recording import Recording
 
@@ -318,11 +319,11 @@ def held_out(found: Search) -> tuple[FitQuality, bool]:
     def error(h: Hypothesis, tune: bool) -> float:
         p, none = h.fit.parametrisation, np.zeros(h.fit.theta.size, dtype=bool)
         theta = h.fit.theta if tune else p.centre
-        if tune:
-            theta = fit(p, even, theta, _states_of(h.fit, even), iterations=6, rounds=1).theta
         try:
+            if tune:
+                theta = fit(p, even, theta, _states_of(h.fit, even), iterations=6, rounds=1).theta
             tested = fit(p, odd, theta, _states_of(h.fit, odd), free=none, iterations=8)
-        except IdentificationError:
+        except RUNAWAY:
             # numbers from half the windows can run away on the other half: then those of all windows count
             tested = fit(p, odd, h.fit.theta, _states_of(h.fit, odd), free=none, iterations=8)
         squares = sum(float(e @ e) for e in tested.residuals)

@@ -295,7 +295,10 @@ def _eliminate(
         # a little of the prior that start states are of the signals' size keeps unfelt ones in place
         G = X.T @ X
         G += (1e-2 + 1e-10 * float(np.trace(G))) * np.eye(X.shape[1])
-        solve = np.linalg.solve(G, X.T)
+        try:
+            solve = np.linalg.solve(G, X.T)
+        except np.linalg.LinAlgError as failure:
+            raise IdentificationError("the start states cannot be told from the data", where="fit") from failure
         gain_e, gain_J = solve @ e[a:b], solve @ J[a:b]
         e_left[a:b] -= X @ gain_e
         J_left[a:b] -= X @ gain_J
@@ -345,7 +348,7 @@ def fit(
     Raises
     ------
     IdentificationError
-        The simulation diverges at the starting point.
+        The simulation diverges at the starting point, or derivatives leave the range of numbers.
 
     Notes
     -----
@@ -496,7 +499,10 @@ def _finish(problem: _Problem, spot: _Spot, derivatives: _Derivatives, may: Bool
     prior = problem.prior(spot.e, may)
     believed = np.where(may, 1.0 / problem.parametrisation.spreads, 0.0)
     excess = max(1.0, chi2 / max(problem.data.rows - spot.theta.size, 1))
-    H = J_left.T @ J_left / excess + np.diag(believed**2)
+    with np.errstate(over="ignore", invalid="ignore"):
+        H = J_left.T @ J_left / excess + np.diag(believed**2)
+    if not np.all(np.isfinite(H)):
+        raise IdentificationError("derivatives leave the range of numbers", where="fit")
     edges = np.cumsum([len(r) for r in problem.data.recordings])[:-1]
     return Fit(
         parametrisation=problem.parametrisation,

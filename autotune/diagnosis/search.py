@@ -18,6 +18,9 @@ from autotune.diagnosis.simulation import Simulator
 from autotune.errors import AutotuneError
 from autotune.models import Effect, Model
 
+#: What a fit raises where the simulation runs away: that start is no hypothesis.
+RUNAWAY = (AutotuneError, OverflowError, np.linalg.LinAlgError)
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Hypothesis:
@@ -207,7 +210,7 @@ def _fit_or_nothing(base: Fit, effect: Effect, data: Data) -> Hypothesis | None:
     """Return the fit, nothing where the simulation runs away: that start is no hypothesis."""
     try:
         return fit_extended(base, effect, data)
-    except (AutotuneError, OverflowError, np.linalg.LinAlgError):
+    except RUNAWAY:
         return None
 
 

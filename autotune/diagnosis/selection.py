@@ -13,19 +13,16 @@ from autotune.arrays import BoolArray, FloatArray
 from autotune.diagnosis.catalogue import CATALOGUE, Entry
 from autotune.diagnosis.fitting import Data, Fit, fit, start_states
 from autotune.diagnosis.loads import periodic_load_starts, step_load_starts
-from autotune.diagnosis.noise import Noise, autoregressive, noise_from_differences
-from autotune.diagnosis.parameters import parametrise
-from autotune.diagnosis.search import Hypothesis, extend
-from autotune.diagnosis.windows import LAGS_PER_WINDOW, slowest_lag_s, window_rows
+from autotune.diagnosis.noise import Noise, noise_from_differences
+from autotune.diagnosis.retuning import COARSE, floored, misfit, prepare
+from autotune.diagnosis.search import RUNAWAY, Hypothesis, extend
+from autotune.diagnosis.windows import slowest_lag_s
 from autotune.models import Model
 from autotune.recording import Recording
 
 #: Decrease of chi2 that an effect must bring: what chance brings among some eighty directions, with a margin for
 #: noise whose slow part is a fifth stronger than its fast part lets expect.
 LEAST_DECREASE = 30.0
-#: Residual variance over the noise's from which on the misfit itself is taken for white noise: the jitter of a clean
-#: recording says nothing of how well a model can do.
-COARSE = 25.0
 #: Shift of an effect's size, as a logarithm, that gets a fit out of a crease.
 NUDGE = 0.06
 #: Score that a hypothesis with more free numbers must be ahead of one with fewer, at least; a hundredth of what it
@@ -63,55 +60,16 @@ class Search:
     chosen: Hypothesis
 
 
-def prepare(model: Model, recordings: Sequence[Recording], good: Sequence[BoolArray]) -> tuple[Data, Fit]:
-    """Retune the nominal structure, and estimate the noise from what it leaves.
-
-    Parameters
-    ----------
-    model : Model
-        Nominal model without effects.
-    recordings : sequence of Recording
-        What was measured.
-    good : sequence of (N,) bool array
-        Rows whose reading counts.
-
-    Returns
-    -------
-    data, retuned
-        Data with windows and noise, and the fit.
-    """
-    length = LAGS_PER_WINDOW * slowest_lag_s(model)
-    noise = floored(noise_from_differences([r.y for r in recordings], good), recordings)
-    windows = [window_rows(r, length) for r in recordings]
-    data = Data(
-        recordings=tuple(recordings),
-        good=tuple(good),
-        starts=tuple(starts for starts, _ in windows),
-        stops=tuple(stops for _, stops in windows),
-        noise=noise,
-    )
-    size = float(np.std(np.concatenate([r.u for r in recordings]))) or 1.0
-    p = parametrise(model, [], size, recordings[0].sample_time_s)
-    result = fit(p, data)
-    for _ in range(2):
-        coarse = misfit(result, data) > COARSE
-        noise = noise_from_differences(result.residuals, data.good)
-        if coarse:
-            noise = Noise(sd=float(np.sqrt(np.mean(np.concatenate(result.residuals) ** 2))))
-        data = replace(data, noise=floored(noise, recordings))
-        result = fit(p, data, result.theta, result.x0, iterations=20)
-    return data, result
+def polish(h: Hypothesis, data: Data, base: Fit, rounds: int = 4) -> Hypothesis | None:
+    """Fit a hypothesis of the screening to all data; nothing where its simulation runs away on rows not screened."""
+    try:
+        return _polish(h, data, base, rounds)
+    except RUNAWAY:
+        return None
 
 
-def floored(noise: Noise, recordings: Sequence[Recording]) -> Noise:
-    """Return the noise, at least a millionth of the signal's spread: recordings without noise must not divide by 0."""
-    spread = max(float(np.nanstd(r.y)) for r in recordings)
-    least = 1e-6 * spread or 1e-12
-    return noise if noise.sd >= least else Noise(sd=least)
-
-
-def polish(h: Hypothesis, data: Data, base: Fit, rounds: int = 4) -> Hypothesis:
-    """Fit a hypothesis of the screening to all data: the start states it has not seen first, then everything."""
+def _polish(h: Hypothesis, data: Data, base: Fit, rounds: int) -> Hypothesis:
+    """Fit the start states that the screening has not seen first, then everything."""
     p = h.fit.parametrisation
     none = np.zeros(h.fit.theta.size, dtype=bool)
     settled = fit(p, data, h.fit.theta, states_for(h.fit, data, base), free=none)
@@ -169,50 +127,74 @@ def search(
         report("retuning", 0.0)
         data, base = prepare(model, recordings, good)
         nominal = fit(base.parametrisation, data, x0=base.x0, free=np.zeros(base.theta.size, dtype=bool))
-        retuned = Hypothesis(names=(), fit=base)
-        few = data.thinned(SCREENING_ROWS)
-        screen = retuned if few is data else Hypothesis(names=(), fit=fit(base.parametrisation, few, base.theta))
-        report("single effects", 0.1)
-        candidates = grown(screen, few, pool, entries, most=7)
-        if bent(base):
-            candidates = merged(candidates, grown(_unbent(base, few), few, pool, entries, most=7))
+        try:
+            return _searched(data, base, nominal, entries, pool, report)
+        except RUNAWAY:
+            # what breaks off explains nothing: the retuned model stands, and is judged by its misfit
+            return _found(data, nominal, Hypothesis(names=(), fit=base))
+
+
+def _searched(data: Data, base: Fit, nominal: Fit, entries: Sequence[Entry], pool: Executor, report: Report) -> Search:
+    """Add effects in ones, twos and threes as far as the residual asks for them."""
+    chosen = retuned = Hypothesis(names=(), fit=base)
+    report("single effects", 0.1)
+    few = data.thinned(SCREENING_ROWS)
+    screen = retuned if few is data else Hypothesis(names=(), fit=fit(base.parametrisation, few, base.theta))
+    candidates = grown(screen, few, pool, entries, most=7)
+    if bent(base):
+        candidates = merged(candidates, grown(_unbent(base, few), few, pool, entries, most=7))
+    singles = polished(candidates, 3, data, base, pool)
+    if singles and misfit(base, data) > COARSE:
+        data, base, few = _finer(singles[0], base, data)
+        retuned = chosen = Hypothesis(names=(), fit=base)
+        candidates = [_again(h, few) for h in candidates[:3]]
         singles = polished(candidates, 3, data, base, pool)
-        chosen = retuned
-        if singles and misfit(base, data) > COARSE:
-            data, base, few = _finer(singles[0], base, data)
-            retuned = Hypothesis(names=(), fit=base)
-            candidates = [_again(h, few) for h in candidates[:3]]
-            singles = polished(candidates, 3, data, base, pool)
-        if not singles or not (worth(retuned, singles[0]) or misfit(base, data) > 1.1):
-            return _found(data, nominal, retuned, singles, (), (), chosen)
-        if worth(retuned, singles[0]):
-            chosen = singles[0]
-        report("pairs of effects", 0.4)
-        # a single effect that leaves noise alone is given one chance to be half of a pair, a bad one three
-        settled = misfit(singles[0].fit, data) < 1.03
-        lead = [h for h in candidates if h.names == singles[0].names]
-        bases = [*lead, *(h for h in candidates[:3] if h not in lead)]
-        wider = _larger(bases, 1 if settled else 3, few, pool, entries)
-        wider = [h for h in wider if score(lead[0]) - score(h) > 5.0]
-        pairs = polished(wider, 2, data, base, pool)
-        triples: list[Hypothesis] = []
-        if pairs and worth(retuned, pairs[0]) and needed(singles[0], pairs[0], data):
-            chosen = pairs[0]
-            if misfit(pairs[0].fit, data) > 1.05:
-                report("three effects", 0.8)
-                triples = polished(_larger(wider, 1, few, pool, entries), 1, data, base, pool)
-            if triples and needed(pairs[0], triples[0], data):
-                chosen = triples[0]
-        if len(chosen.names) > 1:
-            report("dropping what is not needed", 0.85)
-            chosen = _pruned(chosen, singles, data, pool)
-        return _found(data, nominal, retuned, singles, pairs, triples, chosen)
+    if not singles or not (worth(retuned, singles[0]) or misfit(base, data) > 1.1):
+        return _found(data, nominal, retuned, singles)
+    if worth(retuned, singles[0]):
+        chosen = singles[0]
+    report("pairs of effects", 0.4)
+    wider = _paired(singles, candidates, data, few, pool, entries)
+    pairs, triples = polished(wider, 2, data, base, pool), list[Hypothesis]()
+    if pairs and worth(retuned, pairs[0]) and needed(singles[0], pairs[0], data):
+        chosen = pairs[0]
+        if misfit(pairs[0].fit, data) > 1.05:
+            report("three effects", 0.8)
+            triples = polished(_larger(wider, 1, few, pool, entries), 1, data, base, pool)
+        if triples and needed(pairs[0], triples[0], data):
+            chosen = triples[0]
+    if len(chosen.names) > 1:
+        report("dropping what is not needed", 0.85)
+        chosen = _pruned(chosen, singles, data, pool)
+    return replace(_found(data, nominal, retuned, singles), pairs=tuple(pairs), triples=tuple(triples), chosen=chosen)
+
+
+def _paired(
+    singles: list[Hypothesis],
+    candidates: list[Hypothesis],
+    data: Data,
+    few: Data,
+    pool: Executor,
+    entries: Sequence[Entry],
+) -> list[Hypothesis]:
+    """Return pairs built on the best singles.
+
+    A single effect that leaves noise alone is given one chance to be half of a pair, a bad one three.
+    """
+    settled = misfit(singles[0].fit, data) < 1.03
+    lead = [h for h in candidates if h.names == singles[0].names]
+    bases = [*lead, *(h for h in candidates[:3] if h not in lead)]
+    wider = _larger(bases, 1 if settled else 3, few, pool, entries)
+    return [h for h in wider if score(lead[0]) - score(h) > 5.0]
 
 
 def _pruned(chosen: Hypothesis, singles: list[Hypothesis], data: Data, pool: Executor) -> Hypothesis:
     """Drop effects whose removal costs less than they are worth; single effects found so join the singles."""
     while len(chosen.names) > 1:
-        smaller = list(pool.map(lambda i, h=chosen: _without(h, i, data), range(len(chosen.names))))
+        tried = pool.map(lambda i, h=chosen: _without(h, i, data), range(len(chosen.names)))
+        smaller = [h for h in tried if h is not None]
+        if not smaller:
+            break
         singles += [h for h in smaller if len(h.names) == 1]
         singles.sort(key=score)
         best = min(smaller, key=score)
@@ -222,8 +204,8 @@ def _pruned(chosen: Hypothesis, singles: list[Hypothesis], data: Data, pool: Exe
     return chosen
 
 
-def _without(h: Hypothesis, index: int, data: Data) -> Hypothesis:
-    """Fit a hypothesis again with one of its effects left out."""
+def _without(h: Hypothesis, index: int, data: Data) -> Hypothesis | None:
+    """Fit a hypothesis again with one of its effects left out; nothing where the simulation runs away without it."""
     p = h.fit.parametrisation
     keep = [i for i, f in enumerate(p.free) if f.kind != "effect" or f.index[0] != index]
     moved = [
@@ -232,7 +214,10 @@ def _without(h: Hypothesis, index: int, data: Data) -> Hypothesis:
     ]
     effects = tuple(e for i, e in enumerate(p.model.effects) if i != index)
     smaller = replace(p, model=replace(p.model, effects=effects), free=tuple(moved), centre=p.centre[keep])
-    result = fit(smaller, data, h.fit.theta[keep], h.fit.x0, iterations=20, rounds=2)
+    try:
+        result = fit(smaller, data, h.fit.theta[keep], h.fit.x0, iterations=20, rounds=2)
+    except RUNAWAY:
+        return None
     return Hypothesis(names=tuple(e.name for e in effects), fit=result)
 
 
@@ -274,7 +259,8 @@ def merged(first: Sequence[Hypothesis], second: Sequence[Hypothesis]) -> list[Hy
 
 def polished(ranked: Sequence[Hypothesis], count: int, data: Data, base: Fit, pool: Executor) -> list[Hypothesis]:
     """Return the best hypotheses fitted to all data, best first."""
-    done = sorted(pool.map(lambda h: polish(h, data, base), ranked[:count]), key=score)
+    fits = pool.map(lambda h: polish(h, data, base), ranked[:count])
+    done = sorted((h for h in fits if h is not None), key=score)
     if done:
         lead = max(SIMPLER, 0.01 * (base.cost - done[0].fit.cost))
         near = [h for h in done if score(h) - score(done[0]) < lead]
@@ -285,19 +271,11 @@ def polished(ranked: Sequence[Hypothesis], count: int, data: Data, base: Fit, po
     return done
 
 
-def _found(
-    data: Data,
-    nominal: Fit,
-    retuned: Hypothesis,
-    singles: Sequence[Hypothesis],
-    pairs: Sequence[Hypothesis],
-    triples: Sequence[Hypothesis],
-    chosen: Hypothesis,
-) -> Search:
+def _found(data: Data, nominal: Fit, retuned: Hypothesis, singles: Sequence[Hypothesis] = ()) -> Search:
+    chosen = singles[0] if singles and worth(retuned, singles[0]) else retuned
     return Search(
-        data=data, nominal=nominal, retuned=retuned, singles=tuple(singles), pairs=tuple(pairs),
-        triples=tuple(triples), chosen=chosen,
-    )  # fmt: skip
+        data=data, nominal=nominal, retuned=retuned, singles=tuple(singles), pairs=(), triples=(), chosen=chosen
+    )
 
 
 def grown(
@@ -350,26 +328,3 @@ def needed(smaller: Hypothesis, larger: Hypothesis, data: Data) -> bool:
     """
     before, after = misfit(smaller.fit, data) - 1.0, misfit(larger.fit, data) - 1.0
     return worth(smaller, larger) and (after < 0.08 or after < 0.5 * before)
-
-
-def misfit(result: Fit, data: Data) -> float:
-    """Return the residual's variance in units of the noise that its own row-to-row jitter shows."""
-    noise = floored(noise_from_differences(result.residuals, data.good), data.recordings)
-    e = np.concatenate(replace(data, noise=noise).whitened(list(result.residuals)))
-    states = sum(Q.shape[1] for Q in result.states_explain)
-    freedom = max(data.rows - states - result.theta.size, 1)
-    return float(e @ e / freedom)
-
-
-def whiteness(result: Fit, data: Data) -> float:
-    """Return the residual's slow power in units of what noise has, after an AR(2) has taken its share."""
-    noise = floored(autoregressive(result.residuals, data.good), data.recordings)
-    slow = expected = 0.0
-    for e, starts in zip(replace(data, noise=noise).whitened(list(result.residuals)), data.starts, strict=True):
-        for part in np.split(e, starts[1:]):
-            width = max(4, part.size // 24)
-            count = part.size // width
-            means = part[: count * width].reshape(count, width).mean(axis=1) * np.sqrt(width)
-            slow += float(means @ means)
-            expected += count
-    return float(slow / max(expected, 1.0))

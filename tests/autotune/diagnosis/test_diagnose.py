@@ -12,8 +12,8 @@ from typer.testing import CliRunner
 from autotune.cli import app
 from autotune.diagnosis.diagnose import diagnose
 from autotune.diagnosis.fitting import fit
+from autotune.diagnosis.retuning import prepare
 from autotune.diagnosis.samples import inspect
-from autotune.diagnosis.selection import prepare
 from autotune.models import Block, Model, Port, TransferFunction, read_model
 from autotune.recording import Recording, read_recording
 

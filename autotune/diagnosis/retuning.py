@@ -1,0 +1,90 @@
+"""The nominal structure retuned, the noise that it leaves, and how far a residual is from noise."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from autotune.arrays import BoolArray
+from autotune.diagnosis.fitting import Data, Fit, fit
+from autotune.diagnosis.noise import Noise, autoregressive, noise_from_differences
+from autotune.diagnosis.parameters import parametrise
+from autotune.diagnosis.windows import LAGS_PER_WINDOW, slowest_lag_s, window_rows
+from autotune.models import Model
+from autotune.recording import Recording
+
+#: Residual variance over the noise's from which on the misfit itself is taken for white noise: the jitter of a clean
+#: recording says nothing of how well a model can do.
+COARSE = 25.0
+
+
+def prepare(model: Model, recordings: Sequence[Recording], good: Sequence[BoolArray]) -> tuple[Data, Fit]:
+    """Retune the nominal structure, and estimate the noise from what it leaves.
+
+    Parameters
+    ----------
+    model : Model
+        Nominal model without effects.
+    recordings : sequence of Recording
+        What was measured.
+    good : sequence of (N,) bool array
+        Rows whose reading counts.
+
+    Returns
+    -------
+    data, retuned
+        Data with windows and noise, and the fit.
+    """
+    length = LAGS_PER_WINDOW * slowest_lag_s(model)
+    noise = floored(noise_from_differences([r.y for r in recordings], good), recordings)
+    windows = [window_rows(r, length) for r in recordings]
+    data = Data(
+        recordings=tuple(recordings),
+        good=tuple(good),
+        starts=tuple(starts for starts, _ in windows),
+        stops=tuple(stops for _, stops in windows),
+        noise=noise,
+    )
+    size = float(np.std(np.concatenate([r.u for r in recordings]))) or 1.0
+    p = parametrise(model, [], size, recordings[0].sample_time_s)
+    result = fit(p, data)
+    for _ in range(2):
+        coarse = misfit(result, data) > COARSE
+        noise = noise_from_differences(result.residuals, data.good)
+        if coarse:
+            noise = Noise(sd=float(np.sqrt(np.mean(np.concatenate(result.residuals) ** 2))))
+        data = replace(data, noise=floored(noise, recordings))
+        result = fit(p, data, result.theta, result.x0, iterations=20)
+    return data, result
+
+
+def floored(noise: Noise, recordings: Sequence[Recording]) -> Noise:
+    """Return the noise, at least a millionth of the signal's spread: recordings without noise must not divide by 0."""
+    spread = max(float(np.nanstd(r.y)) for r in recordings)
+    least = 1e-6 * spread or 1e-12
+    return noise if noise.sd >= least else Noise(sd=least)
+
+
+def misfit(result: Fit, data: Data) -> float:
+    """Return the residual's variance in units of the noise that its own row-to-row jitter shows."""
+    noise = floored(noise_from_differences(result.residuals, data.good), data.recordings)
+    e = np.concatenate(replace(data, noise=noise).whitened(list(result.residuals)))
+    states = sum(Q.shape[1] for Q in result.states_explain)
+    freedom = max(data.rows - states - result.theta.size, 1)
+    return float(e @ e / freedom)
+
+
+def whiteness(result: Fit, data: Data) -> float:
+    """Return the residual's slow power in units of what noise has, after an AR(2) has taken its share."""
+    noise = floored(autoregressive(result.residuals, data.good), data.recordings)
+    slow = expected = 0.0
+    for e, starts in zip(replace(data, noise=noise).whitened(list(result.residuals)), data.starts, strict=True):
+        for part in np.split(e, starts[1:]):
+            width = max(4, part.size // 24)
+            count = part.size // width
+            means = part[: count * width].reshape(count, width).mean(axis=1) * np.sqrt(width)
+            slow += float(means @ means)
+            expected += count
+    return float(slow / max(expected, 1.0))
