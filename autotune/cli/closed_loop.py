@@ -60,8 +60,9 @@ def closed_loop(
 def closed_loop_json(result: ClosedLoopIdentification) -> dict[str, Any]:
     """Return the content of ``closed_loop.json``.
 
-    ``response`` is that of the polynomials; ``points`` is the plant's own, without the command's hold, so that the
-    file can be given to ``autotune design --points`` as it is.
+    ``response`` is that of the polynomials; ``points`` is the plant's own, without the command's hold, at as many
+    frequencies as are independent, so that the file can be given to ``autotune design --points`` and to
+    ``autotune tune --points`` as it is.
     """
     from autotune.points import points_to_json
 
@@ -78,7 +79,7 @@ def closed_loop_json(result: ClosedLoopIdentification) -> dict[str, Any]:
         "pole_cov": result.pole_covariance.tolist(),
         "noise_variance": float(model.innovation_covariance[0, 0]),
         "response": points_to_json(result.response),
-        "points": points_to_json(result.points),
+        "points": points_to_json(result.design_points),
         "excitation": {
             "enough": verdict.enough,
             "band_rad_s": list(verdict.band_rad_s),

@@ -45,8 +45,17 @@ def run(
 
 @app.command()
 def tune(
-    recordings: Annotated[list[Path], typer.Argument(metavar="REC.csv ...", help="recordings of the plant, t,u,y")],
     out: _OUT,
+    recordings: Annotated[
+        list[Path] | None, typer.Argument(metavar="[REC.csv ...]", help="recordings of the plant, t,u,y")
+    ] = None,
+    points: Annotated[
+        list[Path] | None,
+        typer.Option(
+            metavar="FILE.json",
+            help="points.json or closed_loop.json, joined with the recordings' points; may be given more than once",
+        ),
+    ] = None,
     specification: Annotated[
         Literal["Spec1", "Spec2"],
         typer.Option(help="Spec1: modulus margin 0.5 and 45 deg; Spec2: 0.8 and 60 deg, for a plant that varies"),
@@ -57,19 +66,26 @@ def tune(
     kind: Annotated[Literal["pi", "pid"], typer.Option(help="structure of the controller")] = "pi",
     source: Annotated[Literal["reduced model", "points"], typer.Option(help="what to design on")] = "reduced model",
 ) -> None:
-    """Design a controller from recordings, without a rig: Bode points, reduced model, controller, report."""
+    """Design a controller from recordings and points, without a rig: Bode points, reduced model, controller, report."""
     import json
 
     from autotune.config.procedure import DesignSettings, SignalSettings
+    from autotune.errors import InputError
     from autotune.identification.frequency.recorded import combine, frequency_points
     from autotune.pipeline import RESULT, analyse, analysis_json
+    from autotune.points import read_points
     from autotune.recording import read_recording
     from autotune.report.page import write_page
     from autotune.report.run_page import analysis_page
 
+    recordings, files = recordings or [], points or []
+    if not recordings and not files:
+        raise InputError("give recordings or --points", where="autotune tune")
     read = [read_recording(path) for path in recordings]
+    given = [point for path in files for point in read_points(path)]
     new_folder(out, RESULT)
-    combined = combine([frequency_points(recording) for recording in read])
+    combined = combine([frequency_points(recording) for recording in read]) if read else None
+    notes = combined.notes if combined else ()
     settings = DesignSettings(
         kind=kind,
         specification=specification,
@@ -78,16 +94,18 @@ def tune(
         noise_gain=noise_gain,
         source=source,
     )
-    analysis = analyse(combined.points, settings)
-    units = read[0].metadata.get("units", {})
+    analysis = analyse([*(combined.points if combined else ()), *given], settings)
+    units = read[0].metadata.get("units", {}) if read else {}
     signals = SignalSettings(
-        sample_time_s=read[0].sample_time_s, u_unit=str(units.get("u", "")), y_unit=str(units.get("y", ""))
+        sample_time_s=read[0].sample_time_s if read else 1.0,  # the page shows units only
+        u_unit=str(units.get("u", "")),
+        y_unit=str(units.get("y", "")),
     )
     (out / RESULT).write_text(json.dumps(analysis_json(analysis), indent=2) + "\n", encoding="utf-8")
-    page = analysis_page(", ".join(path.stem for path in recordings), signals, read, analysis, combined.notes)
+    page = analysis_page(", ".join(path.stem for path in (*recordings, *files)), signals, read, analysis, notes)
     write_page(page, out / "report.html")
     console = Console(highlight=False, soft_wrap=True)
-    for note in (*combined.notes, *analysis.warnings):
+    for note in (*notes, *analysis.warnings):
         console.print(f"note: {note}", markup=False)
     console.print(page.verdict, markup=False)
     console.print(f"report: {out / 'report.html'}", markup=False)

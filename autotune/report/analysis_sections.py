@@ -18,7 +18,7 @@ from autotune.experiment.result import ExperimentResult
 from autotune.pipeline import Analysis
 from autotune.points import FrequencyPoint
 from autotune.report.figures import Curve, bode_figure, frequencies, nichols_figure, nyquist_figure, sensitivity_figure
-from autotune.report.page import BLUE, GREEN, GREY, PURPLE, Figure, Section, Table
+from autotune.report.page import BLUE, GREEN, GREY, ORANGE, PURPLE, RED, Figure, Section, Table
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,7 +58,7 @@ def _points_section(analysis: Analysis, signals: SignalSettings, experiment: Exp
     sign = analysis.fit.sign
     omega = frequencies(analysis.points)
     described = _described(experiment, sign) if experiment else ()
-    estimates = [("measured, 95 %", analysis.points, BLUE)]
+    estimates = _by_source(analysis.points)
     if described:
         estimates.append(("describing function, (20)-(22)", described, PURPLE))
     gain_unit = f"{signals.y_unit}/{signals.u_unit}" if signals.u_unit and signals.y_unit else ""
@@ -72,7 +72,11 @@ def _points_section(analysis: Analysis, signals: SignalSettings, experiment: Exp
             (
                 "Each point is the ratio of the recorded measurement's Fourier coefficient to that of the recorded,"
                 " held command over whole periods; its region counts the noise that was found beside the oscillation."
-                if all(point.source in ("relay", "harmonic") for point in analysis.points)
+                if all(point.source in _RELAY_SOURCES for point in analysis.points)
+                else "Colours tell the estimates apart: relay points come from whole periods of a limit cycle,"
+                " closed-loop points from a model of the loop under control, others from a band of frequencies. Each"
+                " region counts the noise of its own experiment."
+                if len({point.source in _RELAY_SOURCES for point in analysis.points}) > 1
                 else "Each point is estimated over a band of frequencies, leakage and drift removed; its region counts"
                 " the noise in that band."
             )
@@ -93,6 +97,20 @@ def _points_section(analysis: Analysis, signals: SignalSettings, experiment: Exp
             ),
         ),
     )
+
+
+_RELAY_SOURCES = ("relay", "harmonic")
+_SOURCE_COLOURS = {"relay": BLUE, "harmonic": BLUE, "closed loop": ORANGE, "local polynomial": RED, "spectral": PURPLE}
+
+
+def _by_source(points: Sequence[FrequencyPoint]) -> list[tuple[str, Sequence[FrequencyPoint], str]]:
+    """Return the points in groups of one source and colour, a relay's harmonics with it."""
+    groups: dict[str, list[FrequencyPoint]] = {}
+    for point in points:
+        groups.setdefault("relay" if point.source in _RELAY_SOURCES else point.source, []).append(point)
+    if len(groups) == 1:
+        return [("measured, 95 %", points, BLUE)]
+    return [(f"{name}, 95 %", group, _SOURCE_COLOURS.get(name, GREY)) for name, group in groups.items()]
 
 
 def _described(experiment: ExperimentResult, sign: int) -> tuple[FrequencyPoint, ...]:

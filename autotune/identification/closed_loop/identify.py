@@ -25,6 +25,7 @@ from autotune.identification.closed_loop.confidence import (
     whiteness,
 )
 from autotune.identification.closed_loop.control_law import CONTRADICTION, LawCheck, check_law
+from autotune.identification.closed_loop.design_points import design_points
 from autotune.identification.closed_loop.hold import without_hold
 from autotune.identification.closed_loop.loop_excitation import ExcitationVerdict, judge, own_motion, require_excitation
 from autotune.identification.closed_loop.order import Candidate, choose_order, default_past_window, fixed_order
@@ -59,6 +60,8 @@ class ClosedLoopIdentification:
     points : tuple of FrequencyPoint
         The plant's own response with the hold taken out, comparable with points from a relay; only where it is known
         to better than 50 %.
+    design_points : tuple of FrequencyPoint
+        As many of these as are independent, around the frequency of -135 degrees.
     evidence : tuple of Candidate
         Orders and dead times tried, the best first; empty where the order was given.
     excitation : ExcitationVerdict
@@ -76,6 +79,7 @@ class ClosedLoopIdentification:
     pole_covariance: FloatArray
     response: tuple[FrequencyPoint, ...]
     points: tuple[FrequencyPoint, ...]
+    design_points: tuple[FrequencyPoint, ...]
     evidence: tuple[Candidate, ...]
     excitation: ExcitationVerdict
     whiteness: Whiteness
@@ -301,6 +305,7 @@ def _report(
         pole_covariance=pole_covariance(estimate),
         response=response,
         points=without_hold(estimate.model, response),
+        design_points=design_points(estimate, omega),
         evidence=(),
         excitation=judge(omega, plant, covariance, controller=loop, motion=motion),
         whiteness=white,

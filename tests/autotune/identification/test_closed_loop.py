@@ -67,6 +67,15 @@ def test_integrating_rig_under_its_pi_gives_the_plants_own_points() -> None:
     assert found.excitation.band_rad_s[0] < 1.384 < found.excitation.band_rad_s[1]
 
 
+def test_points_for_a_design_are_no_more_than_the_model_determines() -> None:
+    found = identify_closed_loop(ball_loop(), order=2)
+    assert len(found.design_points) == 3
+    critical = 1.0 / 0.3836  # the phase of -90 - atan(0.3836 w) is -135 degrees there
+    omega = [point.omega_rad_s for point in found.design_points]
+    assert omega[0] == pytest.approx(critical / 3.0, rel=0.2)
+    assert omega[-1] == pytest.approx(critical * 2.0, rel=0.2)
+
+
 def test_response_is_that_of_the_polynomials() -> None:
     found = identify_closed_loop(ball_loop(), order=2)
     num, den = found.estimate.model.polynomials()
