@@ -21,9 +21,9 @@ from autotune.identification.frequency.limit_cycle import WholePeriods
 from autotune.identification.frequency.limit_cycle_points import LimitCycle, limit_cycle_points
 
 #: part of limits.swing that a limit cycle is planned for: the rest is for a mid-point that is not quite right
-PEAK_SHARE = 0.88
+PEAK_SHARE = 0.87
 #: the same for the first point, whose gain is foreseen from a short look at the plant
-FIRST_PEAK_SHARE = 0.83
+FIRST_PEAK_SHARE = 0.79
 LEAST_PERIODS = 2
 #: harmonics while the rig waits; the estimate that is kept is made with all of them at the end
 FEW_HARMONICS = 7
