@@ -1,6 +1,6 @@
 """A simulated device on a serial line: the microcontroller's protocol, spoken by a codec of its own.
 
-The protocol is described in drivers/firmware/README.md. Of the device's own laws only the PI is simulated here; the
+Requests and answers are those of drivers/firmware/README.md. Of the device's own laws only the PI is simulated here; the
 firmware itself can be executed.
 """
 

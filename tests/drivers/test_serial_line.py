@@ -4,9 +4,14 @@ from __future__ import annotations
 
 import math
 import random
+import signal
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 
+from autotune.config import load_config
 from autotune.controller import PIDController
 from autotune.errors import InputError, LinkError
 from drivers import open_rig
@@ -130,6 +135,29 @@ def test_nobody_there_is_said_in_one_line() -> None:
     with pytest.raises(LinkError, match="cannot be opened") as caught:
         rig.open()
     assert "\n" not in str(caught.value)
+
+
+def test_autotune_rig_serves_the_configurations_microcontroller(tmp_path: Path) -> None:
+    line = tmp_path / "line"
+    text = (Path(__file__).parents[2] / "configs" / "ball_serial.toml").read_text()
+    path = tmp_path / "ball_serial.toml"
+    path.write_text(text.replace("/tmp/autotune-ball-serial", str(line)))
+    config = load_config(path)
+    with subprocess.Popen(
+        [sys.executable, "-m", "autotune.cli", "rig", str(path)], stdout=subprocess.PIPE, text=True
+    ) as process:
+        try:
+            assert process.stdout is not None
+            assert process.stdout.readline().startswith("serving a microcontroller")
+            rig = open_rig(config.rig, u_range=(0.0, 10.0), u_safe=0.0)
+            rig.open()
+            assert rig.read().y == pytest.approx(10.0, abs=0.4)  # on the floor
+            rig.make_safe()
+            rig.close()
+        finally:
+            process.send_signal(signal.SIGTERM)
+            process.wait(20)
+    assert not line.exists()
 
 
 def test_only_a_pi_fits_into_the_device() -> None:
