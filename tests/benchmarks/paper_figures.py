@@ -51,6 +51,7 @@ SETTLE_S, STEP_S, LOAD_S = 20.0, 25.0, 25.0
 #: set-point step [y unit] and load step [u unit]; both move the ball by about a volt
 STEP, LOAD = 1.0, 0.04
 REST = 5.0
+SEEN = "Set-point step at 0 s, load step at 25 s; above the true height of the ball, below u with the load added to it."
 OMEGA = np.geomspace(0.05, 100.0, 1200)
 
 
@@ -258,11 +259,12 @@ def responses_table(outcomes: Sequence[Outcome], T_s: float) -> Table:
     rows = []
     for o in outcomes:
         alone = vars(figures_of(o.contender, o.linear, T_s)).values()
-        rows.append((f"{o.contender.name}, (23)", *(f"{round(value, 5):.3g}" for value in alone)))
+        rows.append((f"{o.contender.name}, (23)", *(f"{round(value, 4):.3g}" for value in alone)))
         drawn = np.array([list(vars(figures_of(o.contender, r, T_s)).values()) for r in o.rigs])
         cells = (f"{np.mean(d):.3g} ± {np.std(d, ddof=1):.1g}" for d in drawn.T)
         rows.append((f"{o.contender.name}, full rig", *cells))
-    caption = f"Set-point step {STEP:g} V, then load step {LOAD:g} V; full rig: mean ± sd of {len(outcomes[0].rigs)}."
+    count = len(outcomes[0].rigs)
+    caption = f"Set-point step {STEP:g} V, load step {LOAD:g} V; full rig: mean ± sd of {count}, noise included."
     return Table(header=RESPONSES, rows=tuple(rows), caption=caption)
 
 
@@ -279,9 +281,9 @@ def responses_figure(outcomes: Sequence[Outcome], T_s: float) -> Any:
     thin = slice(None, None, 4)
     for o in outcomes:
         for col, result in ((1, o.linear), (2, o.rigs[0])):
-            t, look = T_s * np.arange(result.y.size), {"name": o.contender.name, "colour": o.contender.colour}
-            add_line(figure, t[thin], result.y[thin], **look, row=1, col=col, showlegend=col == 1)
-            add_line(figure, t[thin], result.u[thin], **look, row=2, col=col, showlegend=False, width=0.9)
+            t, look = T_s * np.arange(result.y.size), (o.contender.name, o.contender.colour)
+            add_line(figure, t[thin], result.y[thin], *look, row=1, col=col, showlegend=col == 1)
+            add_line(figure, t[thin], result.u[thin], *look, row=2, col=col, showlegend=False, width=0.9)
     figure.update_yaxes(title="y - 5 V [V]", row=1, col=1)
     figure.update_yaxes(title="u - hover [V]", row=2, col=1)
     figure.update_yaxes(range=[-0.1, 0.08], row=2)
@@ -323,18 +325,14 @@ def page(
         f" below the PI on the reduced model of the same points ({on_reduced.continuous.h2:.1f}); the RST, which needs"
         f" the full model, reaches {rst.continuous.h2:.1f}.",
         tone="good",
-        summary=("Spec1: M_m 0.5, 45 degrees, N_max 0.1. Points of one relay experiment at +-0.35 V of noise.",),
+        summary=("Spec1: M_m 0.5, 45 degrees, N_max 0.1. Points of one relay experiment at ±0.35 V of noise.",),
         sections=(
             Section(title="Margins and responses", tables=(tables["margins"], tables["responses"])),
             Section(title="Figure 7: the PI on the reduced model and on the plant", figures=robust(seven)),
             Section(title="Figure 8: the controllers on the plant", figures=robust(eight)),
             Section(
                 title="Figure 9: set-point step and load step",
-                figures=(
-                    Figure(
-                        figure=nine, caption="Set-point at 0 s, load at 25 s; true height of the ball.", height_px=560
-                    ),
-                ),
+                figures=(Figure(figure=nine, caption=SEEN, height_px=560),),
             ),
             Section(
                 title="Two degrees of freedom: the PI on the points with and without a shaped set-point",
@@ -345,7 +343,7 @@ def page(
                     " fitted to the points, with no more command than the plain step takes on (23).",
                 ),
                 tables=(tables["degrees"],),
-                figures=(Figure(figure=two, caption="Set-point at 0 s, load at 25 s.", height_px=560),),
+                figures=(Figure(figure=two, caption=SEEN, height_px=560),),
             ),
         ),
     )
