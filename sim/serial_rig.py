@@ -1,7 +1,7 @@
 """A simulated device on a serial line: the microcontroller's protocol, spoken by a codec of its own.
 
-Requests and answers are those of drivers/firmware/README.md. Of the device's own laws only the PI is simulated here; the
-firmware itself can be executed.
+Requests and answers are those of drivers/firmware/README.md. Of the device's own laws only the PI is simulated here;
+the firmware itself can be executed.
 """
 
 from __future__ import annotations
