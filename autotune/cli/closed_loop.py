@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -13,6 +14,7 @@ from rich.console import Console
 from autotune.cli import app, identify
 
 if TYPE_CHECKING:
+    from autotune.identification.closed_loop.dither_proposal import DitherLimits
     from autotune.identification.closed_loop.identify import ClosedLoopIdentification
 
 
@@ -32,6 +34,9 @@ def closed_loop(
         typer.Option(help="controller TOML: checked against the data, and says where the plant matters"),
     ] = None,
     max_order: Annotated[int, typer.Option(min=1, max=30, help="highest order tried without --order")] = 8,
+    config: Annotated[
+        Path | None, typer.Option(help="configuration of the rig: a dither is proposed within its limits")
+    ] = None,
 ) -> None:
     """Identify the plant from r, u and y recorded while its loop is closed."""
     from autotune.controller import read_controller
@@ -48,6 +53,7 @@ def closed_loop(
             delay=delay,
             controller=law,
             max_order=max_order,
+            limits=None if config is None else _limits(config),
             progress=lambda text: status.update(f"fitting {text}"),
         )
     out.write_text(json.dumps(closed_loop_json(result), indent=1, allow_nan=False) + "\n", encoding="utf-8")
@@ -55,6 +61,19 @@ def closed_loop(
         console.print(f"warning: {warning}", markup=False, soft_wrap=True)
     typer.echo(summary(result))
     typer.echo(f"wrote {out}")
+
+
+def _limits(config: Path) -> DitherLimits:
+    from autotune.config import load_config
+    from autotune.experiment.dither import LARGEST_DEPARTURE, LARGEST_SHARE
+    from autotune.identification.closed_loop.dither_proposal import DitherLimits
+
+    limits = load_config(config).limits
+    return DitherLimits(
+        amplitude=LARGEST_SHARE * 0.5 * (limits.u_max - limits.u_min),
+        departure=LARGEST_DEPARTURE * limits.swing,
+        source="a third of the rig's limits",
+    )
 
 
 def closed_loop_json(result: ClosedLoopIdentification) -> dict[str, Any]:
@@ -88,6 +107,7 @@ def closed_loop_json(result: ClosedLoopIdentification) -> dict[str, Any]:
             "length_factor": verdict.length_factor,
             "verdict": verdict.sentence,
         },
+        "dither_proposal": None if result.proposal is None else asdict(result.proposal),
         "residuals_white_probability": result.whiteness.probability,
         "order_evidence": [
             {"order": c.order, "delay": c.delay, "relative_innovation_sd": c.innovation_sd, "bic": c.bic}

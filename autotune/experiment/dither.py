@@ -27,9 +27,9 @@ from autotune.experiment.verify import law_for
 from autotune.recording import RecordingWriter
 
 #: First dither, and the largest one, as shares of the command's room on its narrower side.
-_FIRST, _LARGEST = 0.002, 0.33
+_FIRST, LARGEST_SHARE = 0.002, 0.33
 #: Departure of y that is enough, as a share of the allowed swing.
-_DEPARTURE = 0.33
+LARGEST_DEPARTURE = 0.33
 #: Largest change of the amplitude between two looks.
 _GROWTH = 2.0
 #: Departure at which the dither is halved at once, as a share of the allowed swing.
@@ -149,7 +149,7 @@ def run_dither(
             raise InputError(
                 f"amplitude = {amplitude:g}", where="dither", mend=f"choose it above 0 and below {0.9 * room:.3g}"
             )
-        largest = _LARGEST * room if amplitude is None else amplitude
+        largest = LARGEST_SHARE * room if amplitude is None else amplitude
         law = law_for(controller, limits, dt_s, largest)
         state = law.initial(u_hold, centre, centre)
         loop.watch = Watch(y_centre=centre, afloat=True)
@@ -199,7 +199,7 @@ def _settle(loop: ControlLoop, law: PILaw, state: LawState, centre: float, longe
 
 def _next(amplitude: float, departure: float, swing: float, largest: float) -> float:
     """Return the amplitude for the next look, by the ratio of the wanted departure to the one seen."""
-    ratio = _DEPARTURE * swing / max(departure, 1e-9 * swing)
+    ratio = LARGEST_DEPARTURE * swing / max(departure, 1e-9 * swing)
     return min(amplitude * min(max(ratio, 1.0 / _GROWTH), _GROWTH), largest)
 
 

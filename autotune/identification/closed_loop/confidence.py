@@ -49,21 +49,34 @@ def response_covariance(estimate: PredictionErrorEstimate, omega_rad_s: FloatArr
     Gaussian parameters, is added alike to both directions.
     """
     _require_information(estimate)
+    change = response_gradient(estimate, omega_rad_s)
+    resolvent = _resolvent(estimate, omega_rad_s)
+    alpha = -np.einsum("wki,ikp->wp", resolvent, estimate.d_a)[:, None, None]
+    P = estimate.covariance
+    second = _mean(alpha, alpha, P).real * _mean(change, change, P).real
+    second = second + np.abs(_mean(alpha, change, P)) ** 2 + np.abs(_mean(alpha, change.conj(), P)) ** 2
+    return np.asarray(_real_covariance(change, P) + 0.5 * second[..., None, None] * np.eye(2), dtype=np.float64)
+
+
+def response_gradient(estimate: PredictionErrorEstimate, omega_rad_s: FloatArray) -> ComplexArray:
+    """Return the sensitivity of every entry of G(exp(j omega Ts)) to the parameters, shape (W, n_y, n_u, P)."""
     model = estimate.model
-    z = np.exp(1j * np.asarray(omega_rad_s, dtype=np.float64) * model.sample_time_s)
-    resolvent = np.linalg.inv(z[:, None, None] * np.eye(model.order) - model.A)
+    resolvent = _resolvent(estimate, omega_rad_s)
     right, left = resolvent @ model.B, model.C @ resolvent
     change = (
         np.einsum("oip,wiu->woup", estimate.d_c, right)
         + np.einsum("woi,ikp,wku->woup", left, estimate.d_a, right, optimize=True)
         + np.einsum("woi,iup->woup", left, estimate.d_b)
         + estimate.d_d
-    ) * (z ** -float(model.input_delay))[:, None, None, None]
-    alpha = -np.einsum("wki,ikp->wp", resolvent, estimate.d_a)[:, None, None]
-    P = estimate.covariance
-    second = _mean(alpha, alpha, P).real * _mean(change, change, P).real
-    second = second + np.abs(_mean(alpha, change, P)) ** 2 + np.abs(_mean(alpha, change.conj(), P)) ** 2
-    return np.asarray(_real_covariance(change, P) + 0.5 * second[..., None, None] * np.eye(2), dtype=np.float64)
+    )
+    late = np.exp(-1j * np.asarray(omega_rad_s, dtype=np.float64) * model.sample_time_s * model.input_delay)
+    return np.asarray(change * late[:, None, None, None], dtype=np.complex128)
+
+
+def _resolvent(estimate: PredictionErrorEstimate, omega_rad_s: FloatArray) -> ComplexArray:
+    model = estimate.model
+    z = np.exp(1j * np.asarray(omega_rad_s, dtype=np.float64) * model.sample_time_s)
+    return np.asarray(np.linalg.inv(z[:, None, None] * np.eye(model.order) - model.A), dtype=np.complex128)
 
 
 def _mean(a: ComplexArray, b: ComplexArray, covariance: FloatArray) -> ComplexArray:

@@ -26,6 +26,7 @@ from autotune.identification.closed_loop.confidence import (
 )
 from autotune.identification.closed_loop.control_law import CONTRADICTION, LawCheck, check_law
 from autotune.identification.closed_loop.design_points import design_points
+from autotune.identification.closed_loop.dither_proposal import DitherLimits, DitherProposal, propose_dither
 from autotune.identification.closed_loop.hold import without_hold
 from autotune.identification.closed_loop.loop_excitation import ExcitationVerdict, judge, own_motion, require_excitation
 from autotune.identification.closed_loop.order import Candidate, choose_order, default_past_window, fixed_order
@@ -66,6 +67,8 @@ class ClosedLoopIdentification:
         Orders and dead times tried, the best first; empty where the order was given.
     excitation : ExcitationVerdict
         Whether the loop was moved enough.
+    proposal : DitherProposal or None
+        Dither that would be enough; None where the loop was excited enough.
     whiteness : Whiteness
         Test of the residuals.
     law : LawCheck or None
@@ -82,6 +85,7 @@ class ClosedLoopIdentification:
     design_points: tuple[FrequencyPoint, ...]
     evidence: tuple[Candidate, ...]
     excitation: ExcitationVerdict
+    proposal: DitherProposal | None
     whiteness: Whiteness
     law: LawCheck | None
     warnings: tuple[str, ...]
@@ -95,6 +99,7 @@ def identify_closed_loop(
     controller: Controller | None = None,
     max_order: int = 8,
     omega_rad_s: FloatArray | None = None,
+    limits: DitherLimits | None = None,
     progress: Callable[[str], None] = lambda text: None,
 ) -> ClosedLoopIdentification:
     """Identify the plant from a recording of the loop under control.
@@ -115,6 +120,9 @@ def identify_closed_loop(
         Highest order tried.
     omega_rad_s : (W,) array, optional
         Frequencies of the response [rad/s]; 40 from a period of a third of the record to 0.8 of Nyquist when absent.
+    limits : DitherLimits, optional
+        Of the rig, for the dither that is proposed where the loop was not excited enough; what u and y did in the
+        recording when absent.
     progress : callable
         Told what is being done.
 
@@ -157,6 +165,8 @@ def identify_closed_loop(
     estimate = in_units(estimate, scale_u, scale_y, dt_s)
     omega = _grid(recording) if omega_rad_s is None else np.asarray(omega_rad_s, dtype=np.float64)
     result = _report(estimate, omega, law, motion, white)
+    if not result.excitation.enough:
+        result = replace(result, proposal=_proposal(result, limits or recorded_limits(u, y)))
     _further_warnings(result, evidence, r, warnings)
     return replace(result, evidence=evidence, warnings=tuple(warnings))
 
@@ -308,10 +318,23 @@ def _report(
         design_points=design_points(estimate, omega),
         evidence=(),
         excitation=judge(omega, plant, covariance, controller=loop, motion=motion),
+        proposal=None,
         whiteness=white,
         law=law,
         warnings=(),
     )
+
+
+def recorded_limits(u: FloatArray, y: FloatArray) -> DitherLimits:
+    """Return limits that keep a dither within what command and measurement did in a recording."""
+    amplitude, departure = (float(np.max(np.abs(x - np.mean(x)))) for x in (u, y))
+    return DitherLimits(amplitude=amplitude, departure=departure, source="what u and y did in this recording")
+
+
+def _proposal(result: ClosedLoopIdentification, limits: DitherLimits) -> DitherProposal:
+    known = result.law is not None and not result.law.contradicts
+    law = result.law.controller if result.law is not None and known else None
+    return propose_dither(result.estimate, result.excitation.band_rad_s, limits, controller=law)
 
 
 def _further_warnings(
@@ -321,6 +344,8 @@ def _further_warnings(
         warnings.append("r was not recorded: the result relies on u being moved by more than the feedback")
     if not result.excitation.enough:
         warnings.append(result.excitation.sentence)
+    if result.proposal is not None:
+        warnings.append(result.proposal.sentence)
     if result.whiteness.probability < 0.001:
         warnings.append(
             f"the residuals are not white (probability {result.whiteness.probability:.1g}): the model leaves dynamics "

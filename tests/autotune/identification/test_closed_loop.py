@@ -12,10 +12,12 @@ import pytest
 from scipy.signal import cont2discrete, lfilter
 from typer.testing import CliRunner
 
+from autotune.arrays import FloatArray
 from autotune.cli import app
 from autotune.controller import DiscreteController, PIDController, write_controller
 from autotune.errors import IdentificationError, InputError
 from autotune.identification.closed_loop.control_law import check_law
+from autotune.identification.closed_loop.dither_proposal import DitherLimits, dwell_spectrum
 from autotune.identification.closed_loop.identify import identify_closed_loop
 from autotune.points import read_points
 from autotune.recording import Recording, write_recording
@@ -26,7 +28,14 @@ LAW = PIDController(K=-0.023, Ti_s=3.0)
 
 
 def ball_loop(
-    *, rows: int = 3000, noise: float = 0.05, period: int = 100, dither: float = 0.0, seed: int = 0, gain: float = 1.0
+    *,
+    rows: int = 3000,
+    noise: float = 0.05,
+    period: int = 100,
+    dither: float = 0.0,
+    seed: int = 0,
+    gain: float = 1.0,
+    added: FloatArray | None = None,
 ) -> Recording:
     """Return a recording of -65.5/(s (0.3836 s + 1)) under its PI, set-point steps about 5, command about 5."""
     rng = np.random.default_rng(seed)
@@ -34,7 +43,8 @@ def ball_loop(
     b, a = np.ravel(num), den
     x, u, y = np.zeros(rows + 2), np.zeros(rows + 2), np.zeros(rows)
     r = 5.0 + np.where((np.arange(rows) // max(period, 1)) % 2 == 1, 0.5, -0.5) * (period > 0)
-    added = dither * (2.0 * rng.integers(0, 2, rows) - 1.0)
+    if added is None:
+        added = dither * (2.0 * rng.integers(0, 2, rows) - 1.0)
     integral = 0.0
     for t in range(rows):
         x[t + 2] = b[1] * u[t + 1] + b[2] * u[t] - a[1] * x[t + 1] - a[2] * x[t]
@@ -42,7 +52,7 @@ def ball_loop(
         error = r[t] - y[t]
         integral += gain * LAW.K * DT / LAW.Ti_s * error
         u[t + 2] = gain * LAW.K * error + integral + added[t]
-    extra = {"r": r} | ({"dither": added} if dither else {})
+    extra = {"r": r} | ({"dither": added} if np.any(added) else {})
     return Recording(t=DT * np.arange(rows), u=5.0 + u[2:], y=y, extra=extra)
 
 
@@ -113,6 +123,57 @@ def test_poor_excitation_says_how_much_more_is_needed() -> None:
     assert "not excited enough" in weak.excitation.sentence
     assert weak.excitation.length_factor == pytest.approx(weak.excitation.amplitude_factor**2)
     assert strong.excitation.relative_sd < weak.excitation.relative_sd / 3.0
+
+
+def binary(dwell_s: tuple[float, float], rows: int, seed: int) -> FloatArray:
+    """Return +-1 with dwell times log-uniform between two bounds."""
+    rng = np.random.default_rng(seed)
+    dwells = np.exp(rng.uniform(*np.log(dwell_s), rows)) / DT
+    switches = np.searchsorted(np.cumsum(dwells), np.arange(rows), side="right")
+    return np.where(switches % 2 == 0, 1.0, -1.0)
+
+
+@pytest.mark.parametrize("law", [None, LAW])
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_proposed_dither_is_enough_when_it_is_run(seed: int, law: PIDController | None) -> None:
+    weak = identify_closed_loop(ball_loop(period=0, dither=0.0015, seed=seed), order=2, controller=law)
+    proposal = weak.proposal
+    assert proposal is not None
+    rows = round(proposal.length_s / DT)
+    added = proposal.amplitude * binary(proposal.dwell_s, rows, seed + 100)
+    recording = ball_loop(rows=rows, period=0, seed=seed + 50, added=added)
+    found = identify_closed_loop(recording, order=2, controller=law)
+    # the weak record does not know the plant better than to some 10 %, nor its critical frequency
+    assert 0.015 < found.excitation.relative_sd < 0.06
+    noise = 0.06  # of the loop without a dither
+    assert np.std(recording.y) < 1.3 * math.hypot(proposal.departure / 3.0, noise)
+
+
+def test_spectrum_of_the_proposed_dither_is_that_of_its_signal() -> None:
+    rows, segment = 2**17, 2**10
+    signal = binary((0.4, 3.0), rows, 5).reshape(-1, segment)
+    omega = 2.0 * math.pi * np.arange(1, 60) / (segment * DT)
+    window = np.hanning(segment)
+    power = np.mean(np.abs(np.fft.rfft(signal * window, axis=1)) ** 2, axis=0)[1:60] * DT / np.sum(window**2)
+    ratio = dwell_spectrum(omega, 0.4, 3.0)[3:] / power[3:]
+    assert np.mean(np.abs(np.log(ratio))) < 0.12
+    assert np.mean(ratio) == pytest.approx(1.0, abs=0.08)
+
+
+def test_proposal_keeps_the_limits_it_is_given() -> None:
+    recording = ball_loop(period=0, dither=0.0015)
+    tight = DitherLimits(amplitude=0.001, departure=10.0, source="the rig's limits")
+    by_u = identify_closed_loop(recording, order=2, limits=tight).proposal
+    by_y = identify_closed_loop(
+        recording, order=2, limits=DitherLimits(amplitude=1.0, departure=0.05, source="the rig's limits")
+    ).proposal
+    assert by_u is not None
+    assert by_y is not None
+    assert by_u.amplitude == pytest.approx(0.001)
+    assert by_y.departure == pytest.approx(0.05)
+    energies = [p.amplitude**2 * p.length_s for p in (by_u, by_y)]
+    assert energies[0] == pytest.approx(energies[1])  # half the amplitude takes four times as long
+    assert "the rig's limits" in by_u.sentence
 
 
 def test_controller_that_contradicts_the_data_is_refused_with_the_gain_that_would_fit() -> None:
