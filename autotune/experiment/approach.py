@@ -276,7 +276,7 @@ def find_midpoint(loop: ControlLoop, config: Config, known: Known, tell: Tell) -
     point = config.operating_point
     room = min(known.midpoint - config.limits.u_min, config.limits.u_max - known.midpoint)
     # where ramp or pushes have told the mid-point roughly, the relay need not reach across all of its uncertainty
-    reach = 0.5 if point.approach == "ramp" or point.plant_sign == 0 else BRACKET
+    reach = 0.4 if point.approach == "ramp" or point.plant_sign == 0 else BRACKET
     amplitude = min(config.experiment.relay_amplitude or reach * point.u_uncertainty, 0.9 * room)
     if amplitude <= 0.0:
         raise ExperimentStopped(
