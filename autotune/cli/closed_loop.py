@@ -145,6 +145,10 @@ def dither(
     amplitude: Annotated[
         float | None, typer.Option(help="half-amplitude of the dither [u unit]; found on the rig when absent")
     ] = None,
+    dwell: Annotated[
+        tuple[float, float] | None,
+        typer.Option(help="shortest and longest dwell [s]; a sample and a fiftieth of the duration when absent"),
+    ] = None,
     seed: Annotated[int, typer.Option(min=0, help="of the random dwell times")] = 0,
 ) -> None:
     """Add a dither to the rig's present controller and record r, u and y, within the limits of the config."""
@@ -155,7 +159,9 @@ def dither(
     content = load_config(config)
     rig = rig_of(content)
     with ProgressBar() as bar:
-        done = run_dither(rig, content, out, duration_s=duration, amplitude=amplitude, seed=seed, on_progress=bar.show)
+        done = run_dither(
+            rig, content, out, duration_s=duration, amplitude=amplitude, dwell_s=dwell, seed=seed, on_progress=bar.show
+        )
     unit_u, unit_y = content.signals.u_unit, content.signals.y_unit
     typer.echo(
         f"{done.duration_s:g} s under K = {done.controller.K:g}, Ti = {done.controller.Ti_s:g} s with a dither of "

@@ -84,13 +84,13 @@ def present_controller(rig: Rig, config: Config) -> PIDController:
     )
 
 
-def random_dwells(rows: int, longest: int, seed: int) -> FloatArray:
-    """Return a random binary signal (rows,) of +-1 whose dwell times are log-uniform from 1 to ``longest`` samples."""
+def random_dwells(rows: int, longest: int, seed: int, shortest: int = 1) -> FloatArray:
+    """Return a random binary signal (rows,) of +-1 with dwell times log-uniform from shortest to longest, in samples."""
     rng = np.random.default_rng(seed)
     signal = np.empty(rows)
     at, sign = 0, 1.0
     while at < rows:
-        dwell = max(1, round(float(longest ** rng.random())))
+        dwell = max(1, round(float(shortest * (longest / shortest) ** rng.random())))
         signal[at : at + dwell] = sign
         at, sign = at + dwell, -sign
     return signal
@@ -103,6 +103,7 @@ def run_dither(
     *,
     duration_s: float | None = None,
     amplitude: float | None = None,
+    dwell_s: tuple[float, float] | None = None,
     seed: int = 0,
     on_progress: OnProgress | None = None,
 ) -> DitherExperiment:
@@ -120,6 +121,8 @@ def run_dither(
         Time under dither [s]; the experiment's budget when absent.
     amplitude : float, optional
         Half-amplitude [u unit]; found by the experiment when absent.
+    dwell_s : (float, float), optional
+        Shortest and longest dwell [s]; a sample and a fiftieth of the experiment when absent.
     seed : int
         Of the dither.
     on_progress : callable, optional
@@ -132,13 +135,15 @@ def run_dither(
     Raises
     ------
     InputError
-        The present controller is not known, or the asked amplitude leaves the controller no room.
+        The present controller is not known, the asked amplitude leaves the controller no room, or the dwell times are
+        not in order.
     ExperimentStopped, LinkError, OperatorStop
         What ended it; the rig is safe and the recording readable.
     """
     duration_s = config.experiment.budget_s if duration_s is None else duration_s
     dt_s = config.signals.sample_time_s
     rows = math.ceil(duration_s / dt_s)
+    shortest, longest = _dwell_rows(dwell_s, rows, dt_s)
     limits, centre = config.limits, config.operating_point.y
     writer = RecordingWriter(recording, ("t", "u", "y", "r", "dither"), recording_metadata(config))
     with ControlLoop(rig=rig, envelope=envelope_of(config), writer=writer, extra=("r", "dither")) as loop:
@@ -154,7 +159,7 @@ def run_dither(
         state = law.initial(u_hold, centre, centre)
         loop.watch = Watch(y_centre=centre, afloat=True)
         state = _settle(loop, law, state, centre, math.ceil(_SETTLE * rows))
-        pattern = random_dwells(rows, max(2, round(_LONGEST_DWELL * rows)), seed)
+        pattern = random_dwells(rows, longest, seed, shortest)
         now, departure, worst = _FIRST * room if amplitude is None else amplitude, 0.0, 0.0
         look, alarmed = max(1, rows // (2 * _LOOKS)), -rows
         for k in range(rows):
@@ -181,6 +186,19 @@ def run_dither(
         departure=max(worst, departure),
         duration_s=rows * dt_s,
     )
+
+
+def _dwell_rows(dwell_s: tuple[float, float] | None, rows: int, dt_s: float) -> tuple[int, int]:
+    if dwell_s is None:
+        return 1, max(2, round(_LONGEST_DWELL * rows))
+    if not 0.0 < dwell_s[0] < dwell_s[1]:
+        raise InputError(
+            f"dwell times {dwell_s[0]:g} to {dwell_s[1]:g} s",
+            where="dither",
+            mend="give the shortest, then the longest",
+        )
+    shortest = max(1, round(dwell_s[0] / dt_s))
+    return shortest, max(shortest + 1, round(dwell_s[1] / dt_s))
 
 
 def _settle(loop: ControlLoop, law: PILaw, state: LawState, centre: float, longest: int) -> LawState:

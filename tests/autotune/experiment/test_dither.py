@@ -19,13 +19,15 @@ from drivers import open_rig
 CONFIGS = Path(__file__).resolve().parents[3] / "configs"
 
 
-@given(rows=st.integers(1, 500), longest=st.integers(2, 50), seed=st.integers(0, 99))
+@given(rows=st.integers(1, 500), shortest=st.integers(1, 20), longest=st.integers(21, 50), seed=st.integers(0, 99))
 @settings(max_examples=30)
-def test_dither_is_binary_and_never_dwells_longer_than_asked(rows: int, longest: int, seed: int) -> None:
-    signal = random_dwells(rows, longest, seed)
+def test_dither_is_binary_and_dwells_within_what_was_asked(rows: int, shortest: int, longest: int, seed: int) -> None:
+    signal = random_dwells(rows, longest, seed, shortest)
     assert set(np.unique(signal)) <= {-1.0, 1.0}
     changes = np.flatnonzero(np.diff(signal)) + 1
-    assert np.max(np.diff(np.concatenate([[0], changes, [rows]]))) <= longest
+    dwells = np.diff(np.concatenate([[0], changes, [rows]]))
+    assert np.max(dwells) <= longest
+    assert np.all(dwells[:-1] >= shortest)
 
 
 def test_ball_under_its_slow_controller_tells_its_gain_within_its_limits(tmp_path: Path) -> None:
@@ -45,6 +47,13 @@ def test_ball_under_its_slow_controller_tells_its_gain_within_its_limits(tmp_pat
         s = 1j * point.omega_rad_s
         truth = -65.5 / (2.02e-5 * s**4 + 0.007328 * s**3 + 0.3836 * s**2 + s)
         assert abs(point.response / truth - 1.0) < 0.12
+
+
+def test_dwell_times_in_the_wrong_order_are_refused(tmp_path: Path) -> None:
+    config = load_config(CONFIGS / "ball_sim.toml")
+    rig = open_rig(config.rig, u_range=(config.limits.u_min, config.limits.u_max), u_safe=config.limits.u_safe)
+    with pytest.raises(InputError, match="dwell times 2 to 1 s"):
+        run_dither(rig, config, tmp_path / "d.csv", duration_s=1.0, dwell_s=(2.0, 1.0))
 
 
 def test_amplitude_without_room_is_refused(tmp_path: Path) -> None:
