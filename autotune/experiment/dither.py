@@ -85,7 +85,7 @@ def present_controller(rig: Rig, config: Config) -> PIDController:
 
 
 def random_dwells(rows: int, longest: int, seed: int, shortest: int = 1) -> FloatArray:
-    """Return a random binary signal (rows,) of +-1 with dwell times log-uniform from shortest to longest, in samples."""
+    """Return a random binary signal (rows,) of +-1, dwell times log-uniform from shortest to longest [samples]."""
     rng = np.random.default_rng(seed)
     signal = np.empty(rows)
     at, sign = 0, 1.0

@@ -67,6 +67,7 @@ METHODS: dict[str, Method] = {
     "PBSIDopt p=30 f=10": lambda d: pbsid_opt(d.u, d.y, 5, p=30, f=10),
     "PO-MOESP, feedback ignored": lambda d: _open_loop(d),
     "default (polished)": lambda d: fixed_order(d.u, d.y, 5).model,
+    "  the polish begun at the truth": lambda d: prediction_error(PLANT, d.u, d.y).model,
 }
 
 
@@ -167,7 +168,7 @@ def table(count: int) -> None:
 def coverage(count: int) -> None:
     omega = np.geomspace(0.02, 1.2, 12)
     truth = PLANT.response(omega)[:, 0, 0]
-    response, poles, failed = [], [], 0
+    response, poles, norms, failed = [], [], [], 0
     for seed in range(count):
         d = example_set(seed)
         try:
@@ -176,6 +177,9 @@ def coverage(count: int) -> None:
         except IdentificationError:
             failed += 1
             continue
+        loop = feedback(estimate.model, CONTROLLER)
+        stable = spectral_radius(loop.A) < 1.0
+        norms.append(h2_norm(difference(loop, LOOP)) / LOOP_NORM if stable else np.inf)
         response.append(inside_region(estimate.model.response(omega)[:, 0, 0] - truth, covariance))
         found = estimate.model.poles
         at = [int(np.argmin(np.abs(found - pole))) for pole in POLES]
@@ -184,6 +188,10 @@ def coverage(count: int) -> None:
     print(f"95 % regions cover: response {100 * np.mean(response):.1f} % (per frequency {by_omega}),")
     by_pole = " ".join(f"{100 * value:.1f}" for value in np.mean(poles, axis=0))
     print(f"  poles P1 P2 P3 {by_pole} %; {failed} failures in {count} sets")
+    rng = np.random.default_rng(0)
+    scatter = np.std([np.median(rng.choice(norms, len(norms))) for _ in range(300)])
+    print(f"  median relative H2 error of the loop {np.median(norms):.4f}, sd of the median {scatter:.4f}, ", end="")
+    print(f"{int(np.isinf(norms).sum())} models that the true controller does not stabilise")
 
 
 def orders(count: int) -> None:
