@@ -19,7 +19,7 @@ from autotune.diagnosis.result import Candidate, Diagnosis, FitQuality, FoundEff
 from autotune.diagnosis.retuning import COARSE, misfit, whiteness
 from autotune.diagnosis.samples import SampleEffect, inspect, jitter_effect
 from autotune.diagnosis.search import RUNAWAY, Hypothesis
-from autotune.diagnosis.selection import Report, Search, score, search, worth
+from autotune.diagnosis.selection import Report, Search, score, search, simplicity_lead, worth
 from autotune.diagnosis.simulation import entry_of
 from autotune.errors import InputError
 from autotune.models import Effect, Model, Parameter
@@ -175,14 +175,25 @@ def _offset(result: Fit) -> _Offset | None:
 
 
 def rivals(found: Search, adequate: bool) -> tuple[Candidate, ...]:
-    """Return every hypothesis's name with its probability among those searched, best first."""
+    """Return every hypothesis's name with its probability among those searched, best first.
+
+    A richer hypothesis that beats the chosen one by less than the lead that simplicity was given pays that lead here
+    too: the probabilities weigh what the choice weighed.
+    """
     pool = [found.retuned, *found.singles, *found.pairs, *found.triples]
-    scale = TEMPERATURE * max(1.0, found.chosen.fit.chi2 / found.chosen.fit.rows)
-    best = min(score(h) for h in pool)
+    chosen = found.chosen
+    scale = TEMPERATURE * max(1.0, chosen.fit.chi2 / chosen.fit.rows)
+    lead = simplicity_lead(found.retuned.fit, min(pool, key=score))
+
+    def weighed(h: Hypothesis) -> float:
+        refused = h.parameters > chosen.parameters and 0.0 < score(chosen) - score(h) < lead
+        return score(h) + (lead if refused else 0.0)
+
+    best = min(weighed(h) for h in pool)
     weights: dict[str, float] = {}
     for h in pool:
         name = "+".join(h.names) if h.names else "none"
-        weights[name] = max(weights.get(name, 0.0), math.exp(-(score(h) - best) / (2.0 * scale)))
+        weights[name] = max(weights.get(name, 0.0), math.exp(-(weighed(h) - best) / (2.0 * scale)))
     weights["unknown"] = UNKNOWN if adequate else 1.0
     total = sum(weights.values())
     ranked = sorted(weights.items(), key=lambda item: -item[1])

@@ -262,13 +262,18 @@ def polished(ranked: Sequence[Hypothesis], count: int, data: Data, base: Fit, po
     fits = pool.map(lambda h: polish(h, data, base), ranked[:count])
     done = sorted((h for h in fits if h is not None), key=score)
     if done:
-        lead = max(SIMPLER, 0.01 * (base.cost - done[0].fit.cost))
+        lead = simplicity_lead(base, done[0])
         near = [h for h in done if score(h) - score(done[0]) < lead]
         simplest = min(near, key=lambda h: (h.parameters, score(h)))
         if simplest.parameters < done[0].parameters:
             done.remove(simplest)
             done.insert(0, simplest)
     return done
+
+
+def simplicity_lead(base: Fit, best: Hypothesis) -> float:
+    """Return by how much a richer hypothesis must beat a simpler one to be preferred, in units of the score."""
+    return max(SIMPLER, 0.01 * (base.cost - best.fit.cost))
 
 
 def _found(data: Data, nominal: Fit, retuned: Hypothesis, singles: Sequence[Hypothesis] = ()) -> Search:
