@@ -152,7 +152,7 @@ def phase_targets(first_deg: float, last_deg: float, count: int) -> tuple[float,
 def lag_beyond_integrator(point: FrequencyPoint, plant_sign: int) -> float:
     """Return by how much the positive-gain plant's phase lies below -90 deg, in (-pi/2, 3 pi/2) [rad]."""
     phase = float(np.angle(point.response * plant_sign))
-    return (-phase - math.pi / 2.0 + math.pi / 2.0) % (2.0 * math.pi) - math.pi / 2.0
+    return -phase % (2.0 * math.pi) - math.pi / 2.0
 
 
 def predicted(points: Sequence[FrequencyPoint], plant_sign: int, phase_rad: float) -> tuple[float, LocalModel]:
