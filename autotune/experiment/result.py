@@ -38,15 +38,21 @@ class Progress:
         Rig time gone, and expected to come; NaN while nobody can know.
     message : str
         What is happening, for a person.
-    points : int
-        Points measured so far.
+    points : tuple of FrequencyPoint
+        Points of the sweep measured so far.
+    relay : RelaySettings or None
+        The relay that runs.
+    warnings : tuple of str
+        What the reader should know, so far.
     """
 
     state: State
     elapsed_s: float
     remaining_s: float
     message: str
-    points: int = 0
+    points: tuple[FrequencyPoint, ...] = ()
+    relay: RelaySettings | None = None
+    warnings: tuple[str, ...] = ()
 
     @property
     def fraction(self) -> float:

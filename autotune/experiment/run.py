@@ -14,6 +14,7 @@ from autotune.errors import AutotuneError
 from autotune.experiment.approach import Known, approach, find_midpoint, preflight
 from autotune.experiment.limits import Envelope, Watch
 from autotune.experiment.loop import ControlLoop
+from autotune.experiment.relay import RelaySettings
 from autotune.experiment.result import ExperimentResult, Progress, State
 from autotune.experiment.rig import Rig
 from autotune.experiment.sweep import Swept, sweep
@@ -89,6 +90,7 @@ def experiment_on(loop: ControlLoop, config: Config, *, on_progress: OnProgress 
         raise
     sweep_end_s = loop.tick.t_s
     journal.enter(State.HAND_BACK)
+    journal.show("all points measured", 0.0, swept.known)
     loop.watch = Watch(afloat=True)
     result = _result(loop, swept, sweep_end_s)
     loop.step(loop.nearest(result.u_rest))
@@ -155,7 +157,6 @@ class _Journal:
         self._loop = loop
         self._on_progress = on_progress
         self._states: list[dict[str, Any]] = []
-        self._points = 0
         loop.metadata["states"] = self._states
 
     def enter(self, state: State) -> None:
@@ -166,12 +167,19 @@ class _Journal:
     def tell(self, message: str) -> None:
         self.show(message, math.nan)
 
-    def show(self, message: str, remaining_s: float) -> None:
+    def show(
+        self, message: str, remaining_s: float, known: Known | None = None, relay: RelaySettings | None = None
+    ) -> None:
         self._loop.comment(message)
         if self._on_progress is not None:
-            elapsed_s = self._loop.tick.t_s
             self._on_progress(
                 Progress(
-                    state=self.state, elapsed_s=elapsed_s, remaining_s=remaining_s, message=message, points=self._points
+                    state=self.state,
+                    elapsed_s=self._loop.tick.t_s,
+                    remaining_s=remaining_s,
+                    message=message,
+                    points=known.points if known is not None and known.swept else (),
+                    relay=relay,
+                    warnings=known.warnings if known is not None else (),
                 )
             )

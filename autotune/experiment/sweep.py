@@ -30,7 +30,7 @@ FEW_HARMONICS = 7
 #: asymmetry of the duty (part of the period, less one half) from which on the mid-point is corrected within a point
 LARGEST_ASYMMETRY = 0.12
 
-Show = Callable[[str, float], None]
+Show = Callable[[str, float, Known, RelaySettings], None]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,7 +49,7 @@ def sweep(loop: ControlLoop, config: Config, known: Known, oscillation: Oscillat
     loop, config, known, oscillation
         The open loop, the settings, what is known, and the relay that runs.
     show : callable
-        Told what happens and the rig time that is expected to remain [s].
+        Told what happens, the rig time that is expected to remain [s], what is known and which relay runs.
 
     Raises
     ------
@@ -66,7 +66,12 @@ def sweep(loop: ControlLoop, config: Config, known: Known, oscillation: Oscillat
         left_s = end_s - loop.tick.t_s
         periods = allot(choices, goal, wanted.gain_sd, LEAST_PERIODS, left_s)
         expected_s = sum(time_s(choice, count) for choice, count in zip(choices, periods, strict=True))
-        show(f"point {i + 1} of {len(targets)}: {math.degrees(targets[i]):.0f} deg", expected_s)
+        show(
+            f"point {i + 1} of {len(targets)}: {math.degrees(targets[i]):.0f} deg",
+            expected_s,
+            known,
+            choices[0].settings,
+        )
         reserved_s = sum(time_s(choice, LEAST_PERIODS) for choice in choices[1:])
         cycle = _measure(oscillation, choices[0], periods[0], end_s - reserved_s, known)
         segment = _segment(cycle, oscillation.settings, loop.sample_time_s)
