@@ -5,8 +5,9 @@ from __future__ import annotations
 import difflib
 import os
 import tomllib
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
@@ -23,6 +24,8 @@ from autotune.config.procedure import (
 )
 from autotune.config.rig import RigSettings
 from autotune.errors import InputError
+
+Root = TypeVar("Root", bound=BaseModel)
 
 
 class Config(Section):
@@ -54,10 +57,30 @@ def load_config(path: str | os.PathLike[str]) -> Config:
         raise InputError(f"cannot be read ({error.strerror})", where=where, mend="check the path") from None
     except tomllib.TOMLDecodeError as error:
         raise InputError(f"not TOML: {error}", where=where) from None
+    return validated(Config, content, where)
+
+
+def validated(root: type[Root], content: Mapping[str, Any], where: str) -> Root:
+    """Return the settings that a table of keys holds.
+
+    Parameters
+    ----------
+    root : type
+        The settings asked for.
+    content : mapping
+        Keys and values, as TOML gives them.
+    where : str
+        The file, for messages.
+
+    Raises
+    ------
+    InputError
+        The first key that was refused: its path, the allowed range, the nearest known key.
+    """
     try:
-        return Config.model_validate(content)
+        return root.model_validate(content)
     except ValidationError as error:
-        raise _refusal(error, where) from None
+        raise _refusal(error, root, where) from None
 
 
 def json_schema() -> dict[str, Any]:
@@ -65,23 +88,23 @@ def json_schema() -> dict[str, Any]:
     return Config.model_json_schema() | {"$schema": "https://json-schema.org/draft/2020-12/schema"}
 
 
-def _refusal(error: ValidationError, where: str) -> InputError:
+def _refusal(error: ValidationError, root: type[BaseModel], where: str) -> InputError:
     details = error.errors(include_url=False)
     first = next((d for d in details if d["type"] == "extra_forbidden"), details[0])
     path = ".".join(str(part) for part in _key_path(first))
     more = f" (and {len(details) - 1} more)" if len(details) > 1 else ""
     if first["type"] == "extra_forbidden":
         key = str(first["loc"][-1])
-        known = _known_keys(_key_path(first)[:-1])
+        known = _known_keys(root, _key_path(first)[:-1])
         near = difflib.get_close_matches(key, known, n=1, cutoff=0.5)
         mend = f"did you mean {near[0]!r}?" if near else f"known keys here: {', '.join(known)}"
         return InputError(f"unknown key {path!r}{more}", where=where, mend=mend)
     if first["type"] == "missing":
-        return InputError(f"{path!r} is missing{more}", where=where, mend=_describe(_key_path(first)))
+        return InputError(f"{path!r} is missing{more}", where=where, mend=_describe(root, _key_path(first)))
     value = first.get("input")
     shown = f" = {value!r}" if isinstance(value, str | int | float | bool) else ""
     reason = first["msg"].removeprefix("Value error, ")
-    return InputError(f"{path}{shown}: {reason}{more}", where=where, mend=_describe(_key_path(first)))
+    return InputError(f"{path}{shown}: {reason}{more}", where=where, mend=_describe(root, _key_path(first)))
 
 
 def _key_path(detail: ErrorDetails) -> tuple[str | int, ...]:
@@ -91,9 +114,9 @@ def _key_path(detail: ErrorDetails) -> tuple[str | int, ...]:
     return tuple(part for i, part in enumerate(detail["loc"]) if not (i == 1 and part in RIG_KINDS))
 
 
-def _section(path: tuple[str | int, ...]) -> list[type[BaseModel]]:
+def _section(root: type[BaseModel], path: tuple[str | int, ...]) -> list[type[BaseModel]]:
     """Return the models that a path can lead to: one, or the kinds of a union."""
-    models: list[type[BaseModel]] = [Config]
+    models: list[type[BaseModel]] = [root]
     for part in path:
         if isinstance(part, int):
             continue
@@ -112,12 +135,12 @@ def _models_in(annotation: Any) -> list[type[BaseModel]]:
     return [model for part in getattr(annotation, "__args__", ()) for model in _models_in(part)]
 
 
-def _known_keys(path: tuple[str | int, ...]) -> list[str]:
-    return sorted({key for model in _section(path) for key in model.model_fields})
+def _known_keys(root: type[BaseModel], path: tuple[str | int, ...]) -> list[str]:
+    return sorted({key for model in _section(root, path) for key in model.model_fields})
 
 
-def _describe(path: tuple[str | int, ...]) -> str:
-    for model in _section(path[:-1]):
+def _describe(root: type[BaseModel], path: tuple[str | int, ...]) -> str:
+    for model in _section(root, path[:-1]):
         field = model.model_fields.get(str(path[-1]))
         if field is not None and field.description:
             return field.description
