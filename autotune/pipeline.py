@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
@@ -26,8 +25,12 @@ from autotune.experiment.verify import Verification, run_verification
 from autotune.identification.parametric import PlantFit, fit_plant
 from autotune.identification.reduction import ReducedModel, reduce_points
 from autotune.points import FrequencyPoint, points_to_json
+from autotune.run_log import RunLog, jsonable
 
 RECORDING, VERIFICATION, RESULT, JOURNAL = "recording.csv", "verification.csv", "result.json", "journal.jsonl"
+PROGRESS = "progress.jsonl"
+#: how long an operator may ask for the old gains after new ones were handed over [s]; then the new ones stay
+DECISION_S = 60.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -159,6 +162,7 @@ def tune(
     verify: bool = True,
     deploy: bool = True,
     on_progress: OnProgress | None = None,
+    keep: Callable[[float], bool] | None = None,
 ) -> Tuning:
     """Run the whole chain on a rig: sweep, analyse, verify, hand over the gains; files go into ``out``.
 
@@ -174,6 +178,9 @@ def tune(
         Whether to try the new loop on the rig, and to write the gains into the rig's own controller once accepted.
     on_progress : callable, optional
         Told where the procedure is.
+    keep : callable, optional
+        Asked once accepted gains were handed over, with the time to wait for an answer [s]; the old ones are written
+        back where it says no.
 
     Returns
     -------
@@ -187,11 +194,29 @@ def tune(
     IdentificationError, DesignError
         The points give no model or no controller; they are in ``out``.
     """
+    with RunLog(out / PROGRESS) as log:
+        log.begin(config)
+        return _tune(rig, config, out, log, verify=verify, deploy=deploy, on_progress=log.also(on_progress), keep=keep)
+
+
+def _tune(
+    rig: Rig,
+    config: Config,
+    out: Path,
+    log: RunLog,
+    *,
+    verify: bool,
+    deploy: bool,
+    on_progress: OnProgress,
+    keep: Callable[[float], bool] | None,
+) -> Tuning:
     experiment: ExperimentResult | None = None
     analysis: Analysis | None = None
     try:
-        experiment = run_experiment(rig, config, out / RECORDING, on_progress=on_progress)
+        experiment = run_experiment(rig, config, log.recording(out / RECORDING), on_progress=on_progress)
         analysis = analyse(experiment.points, config.design)
+        plant, reduced = analysis.fit.plant, analysis.reduced.transfer_function()
+        log.analysed(analysis.points, plant, reduced, analysis.controller)
         verification = None
         if verify:
             verification = run_verification(
@@ -199,17 +224,25 @@ def tune(
                 config,
                 analysis.controller,
                 analysis.fit,
-                out / VERIFICATION,
+                log.recording(out / VERIFICATION),
                 u_rest=experiment.u_rest,
                 noise_sd=experiment.noise_sd,
                 crossover_rad_s=analysis.margins.crossover_rad_s,
                 on_progress=on_progress,
             )
+            log.verified(verification)
         accepted = verification is not None and verification.accepted
         old, deployed = None, False
         if isinstance(rig, HoldsGains):
             old = hand_over(rig, analysis.controller if accepted and deploy else None, out / JOURNAL)
             deployed = accepted and deploy
+        log.gains(old, analysis.controller, deployed=deployed)
+        if isinstance(rig, HoldsGains) and old is not None and deployed and keep is not None:
+            log.waiting(DECISION_S)
+            if not keep(DECISION_S):
+                hand_over(rig, old, out / JOURNAL)
+                deployed = False
+            log.gains(old, analysis.controller, deployed=deployed)
     except AutotuneError as error:
         write_result(out / RESULT, experiment, analysis, None, reason=str(error))
         raise
@@ -266,7 +299,7 @@ def hand_over(rig: HoldsGains, controller: PIDController | None, journal: Path) 
 
 
 def _note(journal: Path, what: str, controller: PIDController) -> None:
-    line = json.dumps({"gains": what, "K": controller.K, "Ti_s": _finite(controller.Ti_s), "Td_s": controller.Td_s})
+    line = json.dumps(jsonable({"gains": what, "K": controller.K, "Ti_s": controller.Ti_s, "Td_s": controller.Td_s}))
     with journal.open("a", encoding="utf-8") as file:
         file.write(line + "\n")
         file.flush()
@@ -295,7 +328,7 @@ def write_result(
         content |= analysis_json(analysis)
     if verification is not None:
         content["verification"] = _verification_json(verification)
-    path.write_text(json.dumps(_clean(content), indent=2, allow_nan=False) + "\n", encoding="utf-8")
+    path.write_text(json.dumps(jsonable(content), indent=2, allow_nan=False) + "\n", encoding="utf-8")
 
 
 def analysis_json(analysis: Analysis) -> dict[str, Any]:
@@ -351,19 +384,3 @@ def _verification_json(verification: Verification) -> dict[str, Any]:
         "predicted": asdict(verification.predicted) | {"misfit_allowed": verification.allowed},
         "measured": asdict(verification.measured) | {"misfit": verification.misfit},
     }
-
-
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None
-
-
-def _clean(value: Any) -> Any:
-    """Replace what JSON has no number for by null."""
-    match value:
-        case float():
-            return _finite(value)
-        case dict():
-            return {key: _clean(entry) for key, entry in value.items()}
-        case list() | tuple():
-            return [_clean(entry) for entry in value]
-    return value
