@@ -13,25 +13,32 @@ _TERMS = 10  # of the exponential series: with a norm up to 1/4 the remainder is
 
 
 @njit(cache=True)
-def transition(a: FloatArray, duration: float) -> FloatArray:
-    """Return the transition matrix of (s, x, w, v) over a duration: x^(n) = sum a_i x^(i) + w, w' = v.
+def transitions(a: FloatArray, durations: FloatArray) -> FloatArray:
+    """Return the blocks (E, S, G, H) of the transitions of (s, x, w, v): x^(n) = sum a_i x^(i) + w, w' = v, s likewise.
 
     Parameters
     ----------
     a : (n,) array
         Coefficients a_0..a_{n-1} [1/s^(n-i)].
-    duration : float
-        Length of the piece [s].
+    durations : (count,) array
+        Lengths of the pieces [s], at least 0.
 
     Returns
     -------
-    (2n+2, 2n+2) array
-        States in the order s..s^(n-1), x..x^(n-1), w, v.
+    (count, n, 2n+4) array
+        Per duration E (n columns), S (n), G (2) and H (2): x becomes E x + H (w, v), and s, the response of the same
+        system to x, becomes E s + S x + G (w, v).
+
+    Notes
+    -----
+    The powers of the matrix are shared, so that a duration costs one polynomial per entry and, where it is long
+    against the plant's fastest time constant, a few squarings.
     """
     n = a.size
     m = 2 * n + 2
-    rate = 1e-6 / duration  # bound of the poles' magnitudes (Fujiwara): time in its unit, so that no entry dominates
-    for i in range(n):
+    longest = np.max(durations)
+    rate = 1e-6 / longest if longest > 0.0 else 1.0
+    for i in range(n):  # bound of the poles' magnitudes (Fujiwara): time in its unit, so that no entry dominates
         rate = max(rate, 2.0 * abs(a[i]) ** (1.0 / (n - i)))
     scale = np.empty(m)
     for i in range(n):
@@ -49,21 +56,74 @@ def transition(a: FloatArray, duration: float) -> FloatArray:
     matrix[n - 1, n] = 1.0
     matrix[2 * n - 1, 2 * n] = 1.0
     matrix[2 * n, 2 * n + 1] = 1.0
-    squarings = max(0, math.ceil(math.log2(rate * duration * 2.0 / 0.25)))
-    matrix *= rate * duration / 2.0**squarings
-    result = np.eye(m) + matrix
-    power = matrix
-    for term in range(2, _TERMS + 1):
-        power = power @ matrix / term
-        result += power
-        if np.max(np.abs(power)) < 1e-17:
-            break
-    for _ in range(squarings):
-        result = result @ result
-    for i in range(m):
-        for j in range(m):
-            result[i, j] *= scale[i] / scale[j]
+    width = 2 * n + 4
+    series = np.empty((_TERMS + 1, n * width))
+    power = np.eye(m)
+    for term in range(_TERMS + 1):
+        series[term] = _blocks(power, n).ravel()
+        power = power @ matrix / (term + 1)
+    unscaled = _blocks(np.outer(scale, 1.0 / scale), n)
+    result = np.empty((durations.size, n, width))
+    entries = np.empty(n * width)
+    for c in range(durations.size):
+        squarings = 0
+        tau = rate * durations[c]
+        while 2.0 * tau > 0.25:
+            tau *= 0.5
+            squarings += 1
+        terms = 1
+        remainder = 2.0 * tau
+        while terms < _TERMS and remainder > 1e-17:
+            terms += 1
+            remainder *= 2.0 * tau / terms
+        for q in range(entries.size):
+            entries[q] = series[terms, q]
+        for term in range(terms - 1, -1, -1):
+            for q in range(entries.size):
+                entries[q] = entries[q] * tau + series[term, q]
+        for i in range(n):
+            for j in range(width):
+                result[c, i, j] = entries[i * width + j]
+        for _ in range(squarings):
+            _square(result[c], tau)
+            tau *= 2.0
+        for i in range(n):
+            for j in range(width):
+                result[c, i, j] *= unscaled[i, j]
     return result
+
+
+@njit(cache=True)
+def _blocks(matrix: FloatArray, n: int) -> FloatArray:
+    """Return the blocks E, S, G, H of a matrix over (s, x, w, v), side by side."""
+    blocks = np.empty((n, 2 * n + 4))
+    blocks[:, : 2 * n + 2] = matrix[:n]
+    blocks[:, 2 * n + 2 :] = matrix[n : 2 * n, 2 * n :]
+    return blocks
+
+
+@njit(cache=True)
+def _square(blocks: FloatArray, tau: float) -> None:
+    """Replace the transition over tau by that over 2 tau: E^2, E S + S E, E G + S H + G J, E H + H J."""
+    n = blocks.shape[0]
+    old = blocks.copy()
+    for i in range(n):
+        for j in range(n):
+            E = 0.0
+            S = 0.0
+            for k in range(n):
+                E += old[i, k] * old[k, j]
+                S += old[i, k] * old[k, n + j] + old[i, n + k] * old[k, j]
+            blocks[i, j] = E
+            blocks[i, n + j] = S
+        for j in range(2):  # J = [[1, tau], [0, 1]]: w grows by v tau
+            G = old[i, 2 * n + j] + j * tau * old[i, 2 * n]
+            H = old[i, 2 * n + 2 + j] + j * tau * old[i, 2 * n + 2]
+            for k in range(n):
+                G += old[i, k] * old[k, 2 * n + j] + old[i, n + k] * old[k, 2 * n + 2 + j]
+                H += old[i, k] * old[k, 2 * n + 2 + j]
+            blocks[i, 2 * n + j] = G
+            blocks[i, 2 * n + 2 + j] = H
 
 
 @njit(cache=True)

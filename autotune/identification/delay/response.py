@@ -19,9 +19,10 @@ from numba import njit
 from numpy.typing import NDArray
 
 from autotune.arrays import FloatArray
-from autotune.identification.delay.compiled import cholesky_solve, transition
+from autotune.identification.delay.compiled import cholesky_solve, transitions
 
 _OVERFLOW = 1e100
+_NEGLIGIBLE = 1e-150
 _BLOCK = 2048  # pieces that are carried at once
 
 
@@ -76,7 +77,7 @@ def _schedule(
 def _transitions(
     a: FloatArray, pieces: FloatArray, count: int, resolution: float
 ) -> tuple[FloatArray, NDArray[np.int64]]:
-    """Return the distinct transitions among the pieces, and which of them each piece has."""
+    """Return the blocks of the distinct transitions among the pieces, and which of them each piece has."""
     which = np.empty(count, dtype=np.int64)
     known = np.empty(count)
     found = 0
@@ -90,11 +91,7 @@ def _transitions(
             which[i] = found
             known[found] = pieces[i, 0]
             found += 1
-    m = 2 * a.size + 2
-    F = np.empty((found, m, m))
-    for c in range(found):
-        F[c] = transition(a, known[c]) if known[c] > 0.0 else np.eye(m)
-    return F, which
+    return transitions(a, known[:found]), which
 
 
 @njit(cache=True)
@@ -121,11 +118,11 @@ def _propagate(
         for i in range(n):
             for c in range(2 + n):
                 new[i, c] = 0.0
-            new[i, 0] = F[f, n + i, 2 * n] * w + F[f, n + i, 2 * n + 1] * v
-            new[i, 1] = F[f, n + i, 2 * n]
+            new[i, 0] = F[f, i, 2 * n + 2] * w + F[f, i, 2 * n + 3] * v
+            new[i, 1] = F[f, i, 2 * n + 2]
             for j in range(n):
                 for c in range(2 + n):
-                    new[i, c] += F[f, n + i, n + j] * chains[j, c]
+                    new[i, c] += F[f, i, j] * chains[j, c]
         for i in range(n):
             for c in range(2 + n):
                 chains[i, c] = new[i, c]
@@ -135,7 +132,8 @@ def _propagate(
             k += 1
     for i in range(n):
         for c in range(n + 2):
-            carried[i, c] = chains[i, c]
+            # arithmetic on subnormal numbers, to which free responses decay, is ten times slower
+            carried[i, c] = chains[i, c] if abs(chains[i, c]) > _NEGLIGIBLE else 0.0
     return bool(abs(chains[0, 0]) + abs(chains[0, 1 + n]) < _OVERFLOW)
 
 
@@ -166,10 +164,10 @@ def _propagate_sensitivities(
         v = b * pieces[p, 2]
         for i in range(n):
             new_s[i] = F[f, i, 2 * n] * w + F[f, i, 2 * n + 1] * v
-            new_x[i] = F[f, n + i, 2 * n] * w + F[f, n + i, 2 * n + 1] * v
+            new_x[i] = F[f, i, 2 * n + 2] * w + F[f, i, 2 * n + 3] * v
             for j in range(n):
                 new_s[i] += F[f, i, j] * s[j] + F[f, i, n + j] * x[j]
-                new_x[i] += F[f, n + i, n + j] * x[j]
+                new_x[i] += F[f, i, j] * x[j]
         for i in range(n):
             x[i] = new_x[i]
             s[i] = new_s[i]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from autotune.errors import IdentificationError, InputError
-from autotune.identification.delay.compiled import transition
+from autotune.identification.delay.compiled import transitions
 from autotune.identification.delay.data import prepare
 from autotune.identification.delay.identify import identify_delay
 from autotune.identification.delay.model import DelayModel
@@ -46,9 +46,11 @@ def test_transition_is_the_matrix_exponential():
         M[: n - 1, 1:n] = M[n : 2 * n - 1, n + 1 : 2 * n] = np.eye(n - 1)
         M[n - 1, :n] = M[2 * n - 1, n : 2 * n] = a
         M[n - 1, n] = M[2 * n - 1, 2 * n] = M[2 * n, 2 * n + 1] = 1.0
-        for duration in (1e-5, 3e-3, 0.7):
+        durations = np.array([0.0, 1e-5, 3e-3, 0.7])
+        for duration, found in zip(durations, transitions(np.array(a), durations), strict=True):
             expected = expm(M * duration)
-            assert np.allclose(transition(np.array(a), duration), expected, rtol=1e-8, atol=1e-12 * abs(expected).max())
+            blocks = np.hstack([expected[:n], expected[n : 2 * n, 2 * n :]])
+            assert np.allclose(found, blocks, rtol=1e-8, atol=1e-12 * abs(expected).max())
 
 
 def test_response_equals_an_independent_solver():
