@@ -238,7 +238,7 @@ class RecordingWriter:
     columns : sequence of str
         Header, beginning with ``t, u, y``.
     metadata : mapping
-        First content of the sidecar; :meth:`finish` replaces it.
+        First content of the sidecar; :meth:`note` and :meth:`finish` add to it.
     """
 
     def __init__(
@@ -268,10 +268,14 @@ class RecordingWriter:
         """Write a comment line, for a person who reads the file."""
         self._file.write(f"# {text}\n".replace("\r", " ").encode())
 
-    def finish(self, metadata: Mapping[str, Any]) -> None:
-        """Add to the sidecar why the recording ended and what else is known, and close."""
+    def note(self, metadata: Mapping[str, Any]) -> None:
+        """Add what is known so far to the sidecar; a process killed later leaves it there."""
         self._metadata |= metadata
         self._write_sidecar()
+
+    def finish(self, metadata: Mapping[str, Any]) -> None:
+        """Add to the sidecar why the recording ended and what else is known, and close."""
+        self.note(metadata)
         self.close()
 
     def close(self) -> None:

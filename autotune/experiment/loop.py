@@ -9,6 +9,7 @@ import threading
 from array import array
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from types import FrameType, TracebackType
 from typing import Any, Self
 
@@ -18,7 +19,7 @@ from autotune.arrays import FloatArray
 from autotune.errors import AutotuneError, ExperimentStopped, LinkError, OperatorStop
 from autotune.experiment.limits import Envelope, Watch
 from autotune.experiment.monitor import ReadingMonitor
-from autotune.experiment.rig import Reading, Rig
+from autotune.experiment.rig import Exchanges, Reading, Rig
 from autotune.recording import RecordingWriter
 
 #: longest wait without looking for a stop signal [s]
@@ -64,6 +65,26 @@ class Timing:
     missed: int
     unusable: int
 
+    def to_table(self) -> dict[str, Any]:
+        """Return the timing as a table of the recording's sidecar."""
+        return {
+            "latency_s": [value for value in self.latency_s if math.isfinite(value)],
+            "lateness_s": [value for value in self.lateness_s if math.isfinite(value)],
+            "missed_samples": self.missed,
+            "unusable_samples": self.unusable,
+        }
+
+    @classmethod
+    def from_table(cls, table: Mapping[str, Any]) -> Timing:
+        """Return the timing that :meth:`to_table` wrote; NaN where a killed process left none."""
+        unknown = (math.nan, math.nan, math.nan)
+        return cls(
+            latency_s=tuple(table.get("latency_s") or unknown),
+            lateness_s=tuple(table.get("lateness_s") or unknown),
+            missed=table.get("missed_samples", 0),
+            unusable=table.get("unusable_samples", 0),
+        )
+
 
 @dataclass(kw_only=True)
 class _Record:
@@ -89,7 +110,10 @@ class ControlLoop:
                 tick = loop.step(u, extra={"r": setpoint})
 
     A step checks the command against the envelope, brings the row to disk, commands the rig, waits for the next
-    sample's absolute deadline, reads, and checks the reading and the limits on y that :attr:`watch` names. Leaving
+    sample's absolute deadline, reads, and checks the reading and the limits on y that :attr:`watch` names. On a rig that
+    :class:`~autotune.experiment.rig.Exchanges` it waits first, and command and reading are one: the row holds that
+    reading and the command that acts from its instant on, which is one sample older than the measurement it was
+    computed from. Leaving
     the block in any way (end, limit, fault, exception, Ctrl-C, SIGTERM) commands the safe output, gives the actuator
     back, and writes the reason into the recording's sidecar together with what was put into :attr:`metadata`.
 
@@ -131,9 +155,10 @@ class ControlLoop:
         self._writer = writer
         self._extra = tuple(extra)
         self._record = _Record()
+        self._exchanges = isinstance(rig, Exchanges)
         self._missed = 0
         self._stop_signal = ""
-        self._start_s = 0.0
+        self._start_s = self._device_start_s = 0.0
         self._deadline_s = 0.0
         self._exits = contextlib.ExitStack()
         self.tick = Tick(k=-1, t_s=0.0, y=math.nan, usable=False, u=math.nan)
@@ -144,6 +169,11 @@ class ControlLoop:
         """Control period [s]."""
         return self.envelope.sample_time_s
 
+    @property
+    def recording(self) -> Path:
+        """File that the rows are written to."""
+        return self._writer.path
+
     def __enter__(self) -> Self:
         self._exits.enter_context(_signals(self._on_signal))
         try:
@@ -152,7 +182,10 @@ class ControlLoop:
             limits = self.envelope.settings
             self._reading = self.rig.read()
             held = self._reading.u_applied if math.isfinite(self._reading.u_applied) else limits.u_safe
+            self._device_start_s = self._reading.device_time_s
             self.tick = self._judged(self._reading, u=min(max(held, limits.u_min), limits.u_max))
+            if self._exchanges:
+                self._write_row(held, {})
         except BaseException as error:
             self._leave(error)
             if isinstance(error, KeyboardInterrupt):
@@ -180,6 +213,13 @@ class ControlLoop:
     def step(self, u: float, *, extra: Mapping[str, float] | None = None) -> Tick:
         """Hold ``u`` [u unit] until the next sample and return that sample."""
         self.envelope.check_command(u, self.tick.u)
+        if isinstance(self.rig, Exchanges):
+            self._wait()
+            applied = self._reading.u_applied
+            self._reading = self.rig.exchange(u)
+            self.tick = self._judged(self._reading, u=u)
+            self._write_row(u, {"u_applied": applied, **(extra or {})})
+            return self.tick
         self._write_row(u, extra or {})
         self.rig.write(u)
         self._wait()
@@ -217,17 +257,28 @@ class ControlLoop:
         """Write a line into the recording for a person who reads it."""
         self._writer.comment(text)
 
+    def note(self, **content: Any) -> None:
+        """Put content into :attr:`metadata` and on the disk at once, for whoever goes on after a killed process."""
+        self.metadata |= content
+        try:
+            self._writer.note(self.metadata)
+        except OSError as error:
+            raise self._unwritable(error) from error
+
+    def _unwritable(self, error: OSError) -> ExperimentStopped:
+        return ExperimentStopped(
+            f"the recording cannot be written ({error.strerror})",
+            where=str(self._writer.path),
+            mend="free space on the disk; no command is sent that is not on it first",
+        )
+
     def _write_row(self, u: float, extra: Mapping[str, float]) -> None:
         y = self.tick.y if self.tick.usable else math.nan
         known = {"u_applied": self._reading.u_applied, **extra}
         try:
             self._writer.append((self.tick.t_s, u, y, *(known.get(name, math.nan) for name in self._extra)))
         except OSError as error:
-            raise ExperimentStopped(
-                f"the recording cannot be written ({error.strerror})",
-                where=str(self._writer.path),
-                mend="free space on the disk; no command is sent that is not on it first",
-            ) from error
+            raise self._unwritable(error) from error
         record = self._record
         record.t.append(self.tick.t_s)
         record.u.append(u)
@@ -256,13 +307,19 @@ class ControlLoop:
 
     def _judged(self, reading: Reading, *, u: float) -> Tick:
         self._record.latency.append(reading.latency_s)
-        t_s = reading.t_s - self._start_s
+        t_s = self._time_of(reading)
         y, usable = self.monitor.judge(reading, u)
         tick = Tick(k=self.tick.k + 1, t_s=t_s, y=y, usable=usable, u=u)
         if self.monitor.recent:
             self.envelope.check_measurement(self.monitor.recent, self.watch, self.monitor.noise)
         self.envelope.check_time(t_s)
         return tick
+
+    def _time_of(self, reading: Reading) -> float:
+        """Return the time since the loop began [s], on the device's clock where that is exact."""
+        if self._exchanges:
+            return reading.device_time_s - self._device_start_s
+        return reading.t_s - self._start_s
 
     def _on_signal(self, name: str) -> None:
         self._stop_signal = name
@@ -279,23 +336,17 @@ class ControlLoop:
             with contextlib.suppress(OSError):
                 self._write_last_row()
         self.metadata["ended"] = _reason(error) | {"output": output}
-        timing = self.timing
-        self.metadata["timing"] = {
-            "latency_s": [value for value in timing.latency_s if math.isfinite(value)],
-            "lateness_s": [value for value in timing.lateness_s if math.isfinite(value)],
-            "missed_samples": timing.missed,
-            "unusable_samples": timing.unusable,
-        }
+        self.metadata["timing"] = self.timing.to_table()
         with contextlib.suppress(OSError):  # a full disk must not hide why the loop ended
             self._writer.finish(self.metadata)
         self._exits.close()
 
     def _write_last_row(self) -> None:
         """Write the last sample, which only the safe command followed; NaN where the link broke first."""
-        t_s, y = self._reading.t_s - self._start_s, self._reading.y
+        t_s, y = self._time_of(self._reading), self._reading.y
         written_s = self._record.t[-1] if self._record.t else -math.inf
         if t_s <= written_s:
-            t_s, y = max(self.rig.clock.now() - self._start_s, written_s + SHORTLY_S), math.nan
+            t_s, y = max(t_s + self.rig.clock.now() - self._reading.t_s, written_s + SHORTLY_S), math.nan
         self._writer.append((t_s, self.envelope.settings.u_safe, y, *(math.nan for _ in self._extra)))
 
 

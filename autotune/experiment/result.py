@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
 from enum import StrEnum
 from typing import Any
 
@@ -63,15 +64,51 @@ class Progress:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Segment:
-    """One settled limit cycle.
+class Cycle:
+    """One finished limit cycle: what was set, and which rows of which recording hold it.
 
     Attributes
     ----------
-    start_s, end_s : float
-        Rows of the recording that the point was made from [s].
+    part : int
+        Number of the recording that holds it, 0 for the first; more than one where a run was resumed.
+    phase_rad : float
+        Phase of the positive-gain plant that it aimed at [rad].
     settings : RelaySettings
         The relay.
+    start_s, end_s : float
+        Window of whole periods, in the recording's time [s].
+    periods : int
+        Whole periods in it.
+    """
+
+    part: int
+    phase_rad: float
+    settings: RelaySettings
+    start_s: float
+    end_s: float
+    periods: int
+
+    def to_table(self) -> dict[str, Any]:
+        """Return the cycle as a table of the recording's sidecar."""
+        own = {key: getattr(self, key) for key in ("phase_rad", "start_s", "end_s", "periods")}
+        return own | asdict(self.settings)
+
+    @classmethod
+    def from_table(cls, table: Mapping[str, Any], part: int) -> Cycle:
+        """Return the cycle that :meth:`to_table` wrote; KeyError where one of its keys is missing."""
+        return cls(
+            part=part,
+            settings=RelaySettings(**{field.name: table[field.name] for field in fields(RelaySettings)}),
+            **{key: table[key] for key in ("phase_rad", "start_s", "end_s", "periods")},
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Segment(Cycle):
+    """A finished limit cycle with the point that was made from it.
+
+    Attributes
+    ----------
     delay_s : float
         Inserted delay with the relay's smoothing, the T that was asked for [s].
     point : FrequencyPoint
@@ -80,35 +117,42 @@ class Segment:
         The odd harmonics that stand above the noise.
     describing : DescribingFunctionEstimate
         What formulas (20)-(22) say.
-    periods : int
-        Whole periods used.
+    u_mean, noise_sd : float
+        Mean command [u unit]; standard deviation of the measurement noise [y unit].
     asymmetry : float
         Part of the period with the high command, less one half.
     """
 
-    start_s: float
-    end_s: float
-    settings: RelaySettings
     delay_s: float
     point: FrequencyPoint
     harmonics: tuple[FrequencyPoint, ...]
     describing: DescribingFunctionEstimate
-    periods: int
+    u_mean: float
+    noise_sd: float
     asymmetry: float
 
-    def metadata(self) -> dict[str, Any]:
-        """Return the segment as a table of the recording's sidecar."""
-        relay = self.settings
-        return {
-            "start_s": self.start_s,
-            "end_s": self.end_s,
-            "delay_s": self.delay_s,
-            "amplitude": relay.amplitude,
-            "hysteresis": relay.hysteresis,
-            "midpoint": relay.midpoint,
-            "smoothing": relay.smoothing,
-            "plant_sign": relay.plant_sign,
-        }
+
+@dataclass(frozen=True, kw_only=True)
+class Part:
+    """One sitting at the rig; a run that was never interrupted has one.
+
+    Attributes
+    ----------
+    recording : str
+        Name of its file.
+    points : int
+        Points finished in it.
+    rig_time_s, sweep_time_s : float
+        Its time on the rig, and from the plant's first answer to its last point [s].
+    ended : str
+        Why it ended.
+    """
+
+    recording: str
+    points: int
+    rig_time_s: float
+    sweep_time_s: float
+    ended: str
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -130,11 +174,13 @@ class ExperimentResult:
     timing : Timing
         Latency and lateness of the loop.
     rig_time_s : float
-        Time on the rig [s].
+        Time on the rig, all sittings together [s].
     first_move_s : float
-        When the plant first answered (the ball first floated) [s].
+        When the plant first answered (the ball first floated), in the last recording [s].
     sweep_time_s : float
-        From then to the end of the last point [s].
+        From the plant's first answer to the last point, all sittings together [s].
+    parts : tuple of Part
+        The sittings.
     reason : str
         Why it ended.
     warnings : tuple of str
@@ -151,5 +197,6 @@ class ExperimentResult:
     rig_time_s: float
     first_move_s: float
     sweep_time_s: float
+    parts: tuple[Part, ...]
     reason: str
     warnings: tuple[str, ...]

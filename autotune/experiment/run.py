@@ -10,16 +10,22 @@ from typing import Any
 import numpy as np
 
 from autotune.config import Config
-from autotune.errors import AutotuneError
+from autotune.errors import AutotuneError, ExperimentStopped
 from autotune.experiment.approach import Known, approach, find_midpoint, preflight
+from autotune.experiment.cycles import Earlier, refined
 from autotune.experiment.limits import Envelope, Watch
-from autotune.experiment.loop import ControlLoop
+from autotune.experiment.loop import ControlLoop, Timing
 from autotune.experiment.relay import RelaySettings
-from autotune.experiment.result import ExperimentResult, Progress, State
+from autotune.experiment.result import ExperimentResult, Part, Progress, Segment, State
 from autotune.experiment.rig import Rig
-from autotune.experiment.sweep import Swept, sweep
+from autotune.experiment.sweep import doubts, missing_phases, sweep
 from autotune.experiment.warm import warm_up
 from autotune.recording import RecordingWriter
+
+#: rows whose mean is compared with that of as many rows before, to see whether y stands still
+REST_ROWS = 50
+#: part of limits.time_s to wait for that
+REST_SHARE = 0.3
 
 OnProgress = Callable[[Progress], None]
 
@@ -41,7 +47,12 @@ def recording_metadata(config: Config) -> dict[str, Any]:
 
 
 def run_experiment(
-    rig: Rig, config: Config, recording: str | Path, *, on_progress: OnProgress | None = None
+    rig: Rig,
+    config: Config,
+    recording: str | Path,
+    *,
+    earlier: Earlier | None = None,
+    on_progress: OnProgress | None = None,
 ) -> ExperimentResult:
     """Run the whole experiment on a rig and leave it safe.
 
@@ -53,6 +64,9 @@ def run_experiment(
         Limits, operating point, sweep.
     recording : path
         CSV to write; its sidecar gets settings, times and the reason it ended.
+    earlier : Earlier, optional
+        What an interrupted run of the same configuration left: only the phases that are missing are measured, and the
+        rig is not touched where none is.
     on_progress : callable, optional
         Called a few times per second of rig time at most.
 
@@ -61,13 +75,20 @@ def run_experiment(
     ExperimentStopped, LinkError, OperatorStop
         What ended it; the rig is safe and the recording readable.
     """
+    earlier = earlier or Earlier()
+    if not missing_phases(config, earlier):
+        final = refined(earlier.segments, earlier.rows, config.signals.sample_time_s)
+        timing = earlier.recordings[-1].metadata.get("timing", {})
+        return _result(final, config, earlier.parts, Timing.from_table(timing), first_move_s=math.nan)
     writer = RecordingWriter(recording, ("t", "u", "y"), recording_metadata(config))
     warm_up()
     with ControlLoop(rig=rig, envelope=envelope_of(config), writer=writer) as loop:
-        return experiment_on(loop, config, on_progress=on_progress)
+        return experiment_on(loop, config, earlier=earlier, on_progress=on_progress)
 
 
-def experiment_on(loop: ControlLoop, config: Config, *, on_progress: OnProgress | None = None) -> ExperimentResult:
+def experiment_on(
+    loop: ControlLoop, config: Config, *, earlier: Earlier | None = None, on_progress: OnProgress | None = None
+) -> ExperimentResult:
     """Go through the states on an open loop; the plant is left at rest, under the command that holds it.
 
     Raises
@@ -75,26 +96,66 @@ def experiment_on(loop: ControlLoop, config: Config, *, on_progress: OnProgress 
     ExperimentStopped, LinkError, OperatorStop
         As :func:`run_experiment`; the loop's exit makes the rig safe.
     """
+    earlier = earlier or Earlier()
     journal = _Journal(loop, on_progress)
     try:
         journal.enter(State.PREFLIGHT)
+        if earlier.recordings and config.operating_point.approach == "ramp":
+            wait_for_rest(loop, config)
         known = preflight(loop, config, journal.tell)
         journal.enter(State.APPROACH)
-        known = approach(loop, config, known, journal.tell)
+        known = approach(loop, config, known, journal.tell, u_rest=earlier.u_rest)
         journal.enter(State.MIDPOINT)
         known, oscillation = find_midpoint(loop, config, known, journal.tell)
         journal.enter(State.SWEEP)
-        swept = sweep(loop, config, known, oscillation, journal.show)
+        segments, known = sweep(loop, config, known, oscillation, journal.show, earlier)
     except AutotuneError as error:
         error.where = error.where or journal.state.value
         raise
-    sweep_end_s = loop.tick.t_s
+    part = Part(
+        recording=loop.recording.name,
+        points=len(segments) - len(earlier.segments),
+        rig_time_s=loop.tick.t_s,
+        sweep_time_s=loop.tick.t_s - known.first_move_s,
+        ended="completed",
+    )
     journal.enter(State.HAND_BACK)
-    journal.show("all points measured", 0.0, swept.known)
+    journal.show("all points measured", 0.0, known)
     loop.watch = Watch(afloat=True)
-    result = _result(loop, swept, sweep_end_s)
+    result = _result(segments, config, (*earlier.parts, part), loop.timing, first_move_s=known.first_move_s)
     loop.step(loop.nearest(result.u_rest))
     return result
+
+
+def wait_for_rest(loop: ControlLoop, config: Config) -> None:
+    """Hold the safe command until y stands still: a plant may still be on its way back from what was done before.
+
+    Parameters
+    ----------
+    loop : ControlLoop
+        Open.
+    config : Config
+        Its ``limits.swing`` says what standing still is, ``limits.time_s`` how long to wait for it at most.
+
+    Raises
+    ------
+    ExperimentStopped
+        y still moves.
+    """
+    start_s, patience_s = loop.tick.t_s, REST_SHARE * config.limits.time_s
+    while loop.tick.t_s - start_s <= patience_s:
+        loop.step(loop.nearest(config.limits.u_safe))
+        y = loop.history(max(0, loop.tick.k - 2 * REST_ROWS))[2]
+        if y.size < 2 * REST_ROWS:
+            continue
+        change = abs(float(np.nanmean(y[REST_ROWS:]) - np.nanmean(y[:REST_ROWS])))
+        noise_sd = float(np.nanstd(np.diff(y))) / math.sqrt(2.0)  # a slow movement is not in the differences
+        if change < max(3.0 * noise_sd * math.sqrt(2.0 / REST_ROWS), 1e-3 * config.limits.swing):
+            return
+    raise ExperimentStopped(
+        f"drifting: y still moves {patience_s:.3g} s after the safe command was set",
+        mend="wait until the plant is at rest and try again",
+    )
 
 
 def float_on(loop: ControlLoop, config: Config, *, u_rest: float | None = None) -> Known:
@@ -123,30 +184,26 @@ def float_on(loop: ControlLoop, config: Config, *, u_rest: float | None = None) 
     return known
 
 
-def _result(loop: ControlLoop, swept: Swept, sweep_end_s: float) -> ExperimentResult:
-    u_means = np.array([_mean_command(loop, segment.start_s, segment.end_s) for segment in swept.segments])
+def _result(
+    segments: tuple[Segment, ...], config: Config, parts: tuple[Part, ...], timing: Timing, *, first_move_s: float
+) -> ExperimentResult:
+    u_means = np.array([segment.u_mean for segment in segments])
     spread = float(np.std(u_means, ddof=1)) if u_means.size > 1 else math.nan
-    points = tuple(sorted((segment.point for segment in swept.segments), key=lambda point: point.omega_rad_s))
-    known = swept.known
     return ExperimentResult(
-        segments=swept.segments,
-        points=points,
-        plant_sign=known.plant_sign,
+        segments=segments,
+        points=tuple(sorted((segment.point for segment in segments), key=lambda point: point.omega_rad_s)),
+        plant_sign=segments[-1].settings.plant_sign,
         u_rest=float(np.mean(u_means)),
         u_rest_sd=spread / math.sqrt(u_means.size),
-        noise_sd=known.noise_sd,
-        timing=loop.timing,
-        rig_time_s=loop.tick.t_s,
-        first_move_s=known.first_move_s,
-        sweep_time_s=sweep_end_s - known.first_move_s,
+        noise_sd=segments[-1].noise_sd,
+        timing=timing,
+        rig_time_s=sum(part.rig_time_s for part in parts),
+        first_move_s=first_move_s,
+        sweep_time_s=sum(part.sweep_time_s for part in parts),
+        parts=parts,
         reason="completed",
-        warnings=known.warnings,
+        warnings=doubts(segments, config),
     )
-
-
-def _mean_command(loop: ControlLoop, start_s: float, end_s: float) -> float:
-    t, u, _ = loop.history()
-    return float(np.mean(u[(t >= start_s) & (t < end_s)]))
 
 
 class _Journal:
@@ -157,11 +214,11 @@ class _Journal:
         self._loop = loop
         self._on_progress = on_progress
         self._states: list[dict[str, Any]] = []
-        loop.metadata["states"] = self._states
 
     def enter(self, state: State) -> None:
         self.state = state
         self._states.append({"name": state.value, "start_s": self._loop.tick.t_s})
+        self._loop.note(states=self._states)
         self._loop.comment(f"state {state.value}")
 
     def tell(self, message: str) -> None:

@@ -16,13 +16,12 @@ from autotune.config import Config
 from autotune.config.procedure import LimitSettings, VerificationSettings
 from autotune.controller import PIDController
 from autotune.design.law import PILaw
-from autotune.errors import ExperimentStopped
 from autotune.experiment.limits import Watch
 from autotune.experiment.loop import ControlLoop
 from autotune.experiment.prediction import Prediction, predict
 from autotune.experiment.result import Progress, State
 from autotune.experiment.rig import Rig
-from autotune.experiment.run import OnProgress, envelope_of, float_on, recording_metadata
+from autotune.experiment.run import OnProgress, envelope_of, float_on, recording_metadata, wait_for_rest
 from autotune.identification.parametric import PlantFit
 from autotune.recording import RecordingWriter
 
@@ -211,39 +210,6 @@ def run_test(
     return y[test.settle :], u[test.settle :]
 
 
-def wait_for_rest(loop: ControlLoop, noise_sd: float, patience_s: float) -> None:
-    """Hold the safe command until y stands still: the plant may still be on its way back from the experiment.
-
-    Parameters
-    ----------
-    loop : ControlLoop
-        Open.
-    noise_sd : float
-        Standard deviation of the measurement noise [y unit].
-    patience_s : float
-        Longest wait [s].
-
-    Raises
-    ------
-    ExperimentStopped
-        y still moves after ``patience_s``.
-    """
-    start_s, span = loop.tick.t_s, 50
-    while loop.tick.t_s - start_s <= patience_s:
-        loop.step(loop.nearest(loop.envelope.settings.u_safe))
-        y = loop.history(max(0, loop.tick.k - 2 * span))[2]
-        if y.size < 2 * span:
-            continue
-        change = abs(float(np.nanmean(y[span:]) - np.nanmean(y[:span])))
-        if change < max(3.0 * noise_sd * math.sqrt(2.0 / span), 1e-3 * loop.envelope.settings.swing):
-            return
-    raise ExperimentStopped(
-        f"drifting: y still moves {patience_s:.3g} s after the safe command was set",
-        where="verify",
-        mend="wait until the plant is at rest and verify again",
-    )
-
-
 def run_verification(
     rig: Rig,
     config: Config,
@@ -289,7 +255,7 @@ def run_verification(
     with ControlLoop(rig=rig, envelope=envelope_of(config), writer=writer, extra=("r",)) as loop:
         loop.metadata["controller"] = {"kind": controller.kind, "K": controller.K, "Ti_s": controller.Ti_s}
         if config.operating_point.approach == "ramp":
-            wait_for_rest(loop, noise_sd, patience_s=0.3 * config.limits.time_s)
+            wait_for_rest(loop, config)
         known = float_on(loop, config, u_rest=u_rest)
         y, u = run_test(loop, law, test, config.operating_point.y, known.midpoint, on_progress)
     return judge(test, y, u, law, fit, noise_sd)

@@ -1,0 +1,178 @@
+"""Points from finished limit cycles and the rows they were recorded in: the same on the rig and from the disk."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeAlias
+
+import numpy as np
+
+from autotune.arrays import FloatArray
+from autotune.errors import InputError
+from autotune.experiment.result import Cycle, Part, Segment
+from autotune.identification.frequency.describing import describing_function
+from autotune.identification.frequency.limit_cycle import WholePeriods
+from autotune.identification.frequency.limit_cycle_points import limit_cycle_points
+from autotune.points import FrequencyPoint
+from autotune.recording import Recording, read_recording
+
+#: harmonics while the rig waits; the estimate that is kept is made with all of them at the end
+FEW_HARMONICS = 7
+ALL_HARMONICS = 9
+
+Rows: TypeAlias = tuple[FloatArray, FloatArray, FloatArray]
+
+
+def measured(
+    cycle: Cycle, rows: Rows, sample_time_s: float, known: Sequence[FrequencyPoint], highest: int = FEW_HARMONICS
+) -> Segment:
+    """Return the cycle with its point.
+
+    Parameters
+    ----------
+    cycle : Cycle
+        Setting and window.
+    rows : ((N,) array, (N,) array, (N,) array)
+        t [s], u, y of the whole recording.
+    sample_time_s : float
+        Control period [s].
+    known : sequence of FrequencyPoint
+        Points of other cycles: they make the rough model of the plant better, and enter the estimate no further.
+    highest : int
+        Highest harmonic that is fitted.
+
+    Raises
+    ------
+    IdentificationError
+        No response above the noise, or too few samples per period.
+    """
+    t, u, y = rows
+    kept = (t >= cycle.start_s - 1e-9) & (t <= cycle.end_s + 2.0 * sample_time_s)
+    window = WholePeriods(start_s=cycle.start_s, end_s=cycle.end_s, periods=cycle.periods)
+    found = limit_cycle_points(t[kept], u[kept], y[kept], window=window, known=known, highest_harmonic=highest)
+    relay = cycle.settings
+    delay_s = (relay.delay_samples + 0.5 * (relay.smoothing - 1)) * sample_time_s
+    return Segment(
+        part=cycle.part,
+        phase_rad=cycle.phase_rad,
+        settings=relay,
+        start_s=found.start_s,
+        end_s=found.end_s,
+        periods=found.periods,
+        delay_s=delay_s,
+        point=found.points[0],
+        harmonics=found.points[1:],
+        describing=describing_function(found, delay_s, plant_sign=relay.plant_sign),
+        u_mean=found.u_mean,
+        noise_sd=found.noise_sd,
+        asymmetry=found.asymmetry,
+    )
+
+
+def refined(segments: Sequence[Segment], rows: Callable[[int], Rows], sample_time_s: float) -> tuple[Segment, ...]:
+    """Return every cycle estimated once more, now that the others make a better rough model of the plant.
+
+    Parameters
+    ----------
+    segments : sequence of Segment
+        As measured one after the other.
+    rows : callable
+        Returns t, u, y of a part's recording by its number.
+    sample_time_s : float
+        Control period [s].
+    """
+    return tuple(
+        measured(
+            one, rows(one.part), sample_time_s, [other.point for other in segments if other is not one], ALL_HARMONICS
+        )
+        for one in segments
+    )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Earlier:
+    """What the earlier sittings of an interrupted run left on the disk.
+
+    Attributes
+    ----------
+    recordings : tuple of Recording
+        In the order they were made; a segment's ``part`` counts them.
+    segments : tuple of Segment
+        Their finished limit cycles, points computed from the recorded rows.
+    parts : tuple of Part
+        What became of each sitting.
+    """
+
+    recordings: tuple[Recording, ...] = ()
+    segments: tuple[Segment, ...] = ()
+    parts: tuple[Part, ...] = ()
+
+    @property
+    def swept_s(self) -> float:
+        """Rig time that the finished cycles took [s]."""
+        return sum(one.end_s - one.start_s for one in self.segments)
+
+    @property
+    def u_rest(self) -> float | None:
+        """Command that holds the operating point, as far as the finished cycles know it [u unit]."""
+        return float(np.mean([one.u_mean for one in self.segments])) if self.segments else None
+
+    def rows(self, part: int) -> Rows:
+        """Return t, u, y of a part's recording."""
+        recording = self.recordings[part]
+        return recording.t, recording.u, recording.y
+
+
+def read_earlier(paths: Sequence[Path], sample_time_s: float) -> Earlier:
+    """Read interrupted recordings with their sidecars, and compute their points again.
+
+    Parameters
+    ----------
+    paths : sequence of Path
+        Recordings of one run, the oldest first; one that ended before its second row is passed over.
+    sample_time_s : float
+        Control period [s].
+
+    Raises
+    ------
+    InputError
+        A sidecar's relay table that is no finished limit cycle.
+    """
+    recordings: list[Recording] = []
+    segments: list[Segment] = []
+    parts: list[Part] = []
+    for path in paths:
+        try:
+            recording = read_recording(path)
+        except InputError as error:
+            if "two rows" in error.mend:  # killed before its second row
+                continue
+            raise
+        cycles = _finished(recording, len(recordings))
+        for cycle in cycles:
+            known = [one.point for one in segments]
+            segments.append(measured(cycle, (recording.t, recording.u, recording.y), sample_time_s, known))
+        first_move_s = float(recording.metadata.get("first_move_s", math.nan))
+        parts.append(
+            Part(
+                recording=path.name,
+                points=len(cycles),
+                rig_time_s=float(recording.t[-1]),
+                sweep_time_s=cycles[-1].end_s - first_move_s if cycles else 0.0,
+                ended=str(recording.metadata.get("ended", {}).get("reason", "not known")),
+            )
+        )
+        recordings.append(recording)
+    return Earlier(recordings=tuple(recordings), segments=tuple(segments), parts=tuple(parts))
+
+
+def _finished(recording: Recording, part: int) -> list[Cycle]:
+    try:
+        return [Cycle.from_table(table, part) for table in recording.metadata.get("relay", [])]
+    except (KeyError, TypeError) as error:
+        raise InputError(
+            f"the sidecar's relay table lacks {error}", where=recording.name, mend="begin a new run instead"
+        ) from None
