@@ -110,6 +110,17 @@ def read_points(path: str | os.PathLike[str]) -> tuple[FrequencyPoint, ...]:
             where=where,
             mend="write it with autotune identify frequency",
         ) from None
+    return points_from_json(entries, where)
+
+
+def points_from_json(entries: Sequence[Any], where: str) -> tuple[FrequencyPoint, ...]:
+    """Return the points of the entries that :func:`points_to_json` wrote; ``where`` is for messages.
+
+    Raises
+    ------
+    InputError
+        An entry without frequency, gain, phase or covariance; names the entry.
+    """
     return tuple(_point(entry, f"{where} points[{i}]") for i, entry in enumerate(entries))
 
 

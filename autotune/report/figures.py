@@ -53,7 +53,7 @@ def recording_figure(recording: Recording, u_unit: str, y_unit: str, *, marks: S
     held_t, held_u = thinned(recording.t, recording.u)
     add_line(figure, held_t, held_u, "u", ORANGE, width=1.0, row=2, col=1, line_shape="hv")
     figure.update_yaxes(title=_axis("y", y_unit), row=1, col=1)
-    figure.update_yaxes(title=_axis("u", u_unit), range=_usual_range(recording.u), row=2, col=1)
+    figure.update_yaxes(title=_axis("u", u_unit), range=usual_range(recording.u), row=2, col=1)
     figure.update_xaxes(title="time [s]", row=2, col=1)
     for time_s, name in marks:
         figure.add_vline(x=time_s, line={"color": GREY, "width": 1, "dash": "dot"})
@@ -93,13 +93,13 @@ def bode_figure(
     """
     figure = make_subplots(rows=2, cols=1, shared_xaxes=True, vertical_spacing=0.05)
     for curve in curves:
-        gain, phase_deg = _gain_phase(sign * curve.system.response(omega))
+        gain, phase_deg = gain_phase(sign * curve.system.response(omega))
         add_line(figure, omega, gain, curve.name, curve.colour, dash=curve.dash, row=1, col=1)
         add_line(figure, omega, phase_deg, curve.name, curve.colour, dash=curve.dash, row=2, col=1, showlegend=False)
     for name, points, colour in estimates:
         at = np.array([point.omega_rad_s for point in points])
-        gain, phase_deg = _gain_phase(np.array([sign * point.response for point in points]))
-        bars = np.array([_gain_phase_bars(point) for point in points]).reshape(-1, 2)
+        gain, phase_deg = gain_phase(np.array([sign * point.response for point in points]))
+        bars = np.array([gain_phase_bars(point) for point in points]).reshape(-1, 2)
         for row, values, bar in ((1, gain, bars[:, 0]), (2, phase_deg, np.degrees(bars[:, 1]))):
             figure.add_trace(
                 go.Scatter(
@@ -154,7 +154,7 @@ def nyquist_figure(
         add_line(figure, response.real[near], response.imag[near], curve.name, curve.colour, dash=curve.dash)
     for i, point in enumerate(points):
         C = complex(controller.response(np.array([point.omega_rad_s]))[0])
-        edge = _region(point, C)
+        edge = region(point, C)
         add_line(figure, edge.real, edge.imag, "95 % regions of the points", BLUE, width=1.0, showlegend=i == 0)
         figure.add_trace(
             go.Scatter(
@@ -181,7 +181,7 @@ def nichols_figure(loops: Sequence[Curve], omega: FloatArray, modulus_margin: fl
     phase_deg = np.degrees(np.angle(circle)) % 360 - 360
     add_line(figure, phase_deg, 20 * np.log10(np.abs(circle)), f"modulus margin {modulus_margin:g}", RED, dash="dot")
     for curve in loops:
-        gain, phase = _gain_phase(curve.system.response(omega))
+        gain, phase = gain_phase(curve.system.response(omega))
         add_line(figure, phase, 20 * np.log10(gain), curve.name, curve.colour, dash=curve.dash)
     margin_deg = float(np.degrees(phase_margin_rad))
     figure.add_trace(
@@ -211,8 +211,8 @@ def sensitivity_figure(loops: Sequence[Curve], omega: FloatArray, modulus_margin
     return figure
 
 
-def _usual_range(values: FloatArray) -> list[float]:
-    """Return a range that shows the middle 90 % of the values well: an approach from rest would hide a small relay."""
+def usual_range(values: FloatArray) -> list[float]:
+    """Return a range that shows the middle 90 % of the values, (N,), well: an approach from rest hides a small relay."""
     low, high = np.quantile(values, [0.05, 0.95])
     room = 0.6 * (high - low) or 1.0
     return [float(low - room), float(high + room)]
@@ -222,15 +222,15 @@ def _axis(name: str, unit: str) -> str:
     return f"{name} [{unit}]" if unit else name
 
 
-def _gain_phase(response: ComplexArray) -> tuple[FloatArray, FloatArray]:
-    """Return gain and continuous phase in degrees, the first value between -360 and 0."""
+def gain_phase(response: ComplexArray) -> tuple[FloatArray, FloatArray]:
+    """Return gain and continuous phase [deg] of a response, (N,) each; the first phase lies between -360 and 0."""
     phase_deg = np.degrees(np.unwrap(np.angle(response)))
     if phase_deg.size:
         phase_deg = phase_deg - 360.0 * np.floor((phase_deg[0] - 1e-9) / 360.0) - 360.0
     return np.abs(response), phase_deg
 
 
-def _gain_phase_bars(point: FrequencyPoint) -> tuple[float, float]:
+def gain_phase_bars(point: FrequencyPoint) -> tuple[float, float]:
     """Return the half-lengths of the 95 % bars of gain and phase [rad], from the covariance along and across."""
     along = np.array([point.response.real, point.response.imag]) / point.gain
     across = np.array([-along[1], along[0]])
@@ -241,7 +241,7 @@ def _gain_phase_bars(point: FrequencyPoint) -> tuple[float, float]:
     )
 
 
-def _region(point: FrequencyPoint, factor: complex) -> ComplexArray:
+def region(point: FrequencyPoint, factor: complex) -> ComplexArray:
     """Return the edge of the point's 95 % region times a complex factor."""
     radii, directions = point.region_radii(0.95)
     angle = np.linspace(0, 2 * np.pi, 49)
