@@ -50,7 +50,8 @@ def measured(
         No response above the noise, or too few samples per period.
     """
     t, u, y = rows
-    kept = (t >= cycle.start_s - 1e-9) & (t <= cycle.end_s + 2.0 * sample_time_s)
+    # a row later, the safe command may follow already
+    kept = (t >= cycle.start_s - 1e-9) & (t <= cycle.end_s + 0.5 * sample_time_s)
     window = WholePeriods(start_s=cycle.start_s, end_s=cycle.end_s, periods=cycle.periods)
     found = limit_cycle_points(t[kept], u[kept], y[kept], window=window, known=known, highest_harmonic=highest)
     relay = cycle.settings
