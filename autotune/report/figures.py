@@ -212,7 +212,7 @@ def sensitivity_figure(loops: Sequence[Curve], omega: FloatArray, modulus_margin
 
 
 def usual_range(values: FloatArray) -> list[float]:
-    """Return a range that shows the middle 90 % of the values, (N,), well: an approach from rest hides a small relay."""
+    """Return a range that shows the middle 90 % of the values, (N,): an approach from rest would hide a small relay."""
     low, high = np.quantile(values, [0.05, 0.95])
     room = 0.6 * (high - low) or 1.0
     return [float(low - room), float(high + room)]
