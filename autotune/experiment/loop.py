@@ -110,10 +110,9 @@ class ControlLoop:
                 tick = loop.step(u, extra={"r": setpoint})
 
     A step checks the command against the envelope, brings the row to disk, commands the rig, waits for the next
-    sample's absolute deadline, reads, and checks the reading and the limits on y that :attr:`watch` names. On a rig that
-    :class:`~autotune.experiment.rig.Exchanges` it waits first, and command and reading are one: the row holds that
-    reading and the command that acts from its instant on, which is one sample older than the measurement it was
-    computed from. Leaving
+    sample's absolute deadline, reads, and checks the reading and the limits on y that :attr:`watch` names. On a rig
+    that :class:`~autotune.experiment.rig.Exchanges` it waits first, and command and reading are one: a row holds that
+    reading and the command that acts from its instant on, which was computed from the sample before. Leaving
     the block in any way (end, limit, fault, exception, Ctrl-C, SIGTERM) commands the safe output, gives the actuator
     back, and writes the reason into the recording's sidecar together with what was put into :attr:`metadata`.
 
@@ -155,7 +154,7 @@ class ControlLoop:
         self._writer = writer
         self._extra = tuple(extra)
         self._record = _Record()
-        self._exchanges = isinstance(rig, Exchanges)
+        self._exchange = rig.exchange if isinstance(rig, Exchanges) else None
         self._missed = 0
         self._stop_signal = ""
         self._start_s = self._device_start_s = 0.0
@@ -184,7 +183,7 @@ class ControlLoop:
             held = self._reading.u_applied if math.isfinite(self._reading.u_applied) else limits.u_safe
             self._device_start_s = self._reading.device_time_s
             self.tick = self._judged(self._reading, u=min(max(held, limits.u_min), limits.u_max))
-            if self._exchanges:
+            if self._exchange is not None:
                 self._write_row(held, {})
         except BaseException as error:
             self._leave(error)
@@ -213,10 +212,10 @@ class ControlLoop:
     def step(self, u: float, *, extra: Mapping[str, float] | None = None) -> Tick:
         """Hold ``u`` [u unit] until the next sample and return that sample."""
         self.envelope.check_command(u, self.tick.u)
-        if isinstance(self.rig, Exchanges):
+        if self._exchange is not None:
             self._wait()
             applied = self._reading.u_applied
-            self._reading = self.rig.exchange(u)
+            self._reading = self._exchange(u)
             self.tick = self._judged(self._reading, u=u)
             self._write_row(u, {"u_applied": applied, **(extra or {})})
             return self.tick
@@ -317,7 +316,7 @@ class ControlLoop:
 
     def _time_of(self, reading: Reading) -> float:
         """Return the time since the loop began [s], on the device's clock where that is exact."""
-        if self._exchanges:
+        if self._exchange is not None:
             return reading.device_time_s - self._device_start_s
         return reading.t_s - self._start_s
 

@@ -83,6 +83,19 @@ class Rig(Protocol):
 
 
 @runtime_checkable
+class Exchanges(Rig, Protocol):
+    """A rig that takes a command and answers with the sample of the very instant from which the command acts.
+
+    The device stamps of its readings are exact, and a recording counts its time on them: neither the line's latency nor
+    the host's lateness is in it.
+    """
+
+    def exchange(self, u: float) -> Reading:
+        """Command the actuator, in engineering units, and return the sample at which ``u`` begins to act."""
+        ...
+
+
+@runtime_checkable
 class HoldsGains(Rig, Protocol):
     """A rig whose own controller's gains can be read and written."""
 
