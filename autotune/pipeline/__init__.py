@@ -1,0 +1,22 @@
+"""The stages in order: points to a checked controller, a rig to a verified one, gains into the rig's own controller."""
+
+from autotune.pipeline.analysis import Analysis, analyse
+from autotune.pipeline.deployment import hand_over
+from autotune.pipeline.result import analysis_json, write_result
+from autotune.pipeline.run import DECISION_S, JOURNAL, PROGRESS, RECORDING, RESULT, VERIFICATION, Tuning, tune
+
+__all__ = [
+    "DECISION_S",
+    "JOURNAL",
+    "PROGRESS",
+    "RECORDING",
+    "RESULT",
+    "VERIFICATION",
+    "Analysis",
+    "Tuning",
+    "analyse",
+    "analysis_json",
+    "hand_over",
+    "tune",
+    "write_result",
+]

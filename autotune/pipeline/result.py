@@ -1,0 +1,95 @@
+"""``result.json`` of a run: every part that was reached, the others null."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from autotune.design.nugap import Validation
+from autotune.experiment.result import ExperimentResult
+from autotune.experiment.verify import Verification
+from autotune.pipeline.analysis import Analysis
+from autotune.points import points_to_json
+from autotune.run_log import jsonable
+
+
+def write_result(
+    path: Path,
+    experiment: ExperimentResult | None,
+    analysis: Analysis | None,
+    verification: Verification | None,
+    *,
+    reason: str,
+) -> None:
+    """Write ``result.json``: every part that was reached, the others null."""
+    content: dict[str, Any] = {
+        "points": points_to_json(experiment.points) if experiment else [],
+        "reduced_model": None,
+        "controller": None,
+        "margins": None,
+        "validation": None,
+        "verification": None,
+        "experiment": _experiment_json(experiment, reason),
+    }
+    if analysis is not None:
+        content |= analysis_json(analysis)
+    if verification is not None:
+        content["verification"] = _verification_json(verification)
+    path.write_text(json.dumps(jsonable(content), indent=2, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def analysis_json(analysis: Analysis) -> dict[str, Any]:
+    """Return the parts of ``result.json`` that follow from the points."""
+    reduced, scaled = analysis.reduced, analysis.scaled
+    return {
+        "points": points_to_json(analysis.points),
+        "reduced_model": {
+            "kind": "integrating" if reduced.integrating else "self-regulating",
+            "G_r": reduced.G_r,
+            "omega_0r_rad_s": reduced.omega_0r_rad_s,
+            "omega_d_rad_s": reduced.omega_d_rad_s,
+            "relative_sd": list(reduced.sd),
+            "conditions": reduced.conditions,
+            "evidence": reduced.evidence,
+        },
+        "controller": analysis.design.to_json(),
+        "margins": analysis.margins.to_json(),
+        "validation": _validation_json(scaled) | {"unscaled": _validation_json(analysis.unscaled)},
+    }
+
+
+def _validation_json(validation: Validation) -> dict[str, Any]:
+    return {
+        "nu_gap": validation.nu_gap,
+        "b_reduced": validation.b_reduced,
+        "b_rig": validation.b_rig,
+        "scaling": validation.scaling,
+        "holds": validation.holds,
+    }
+
+
+def _experiment_json(experiment: ExperimentResult | None, reason: str) -> dict[str, Any]:
+    if experiment is None:
+        return {"rig_time_s": None, "reason": reason, "warnings": []}
+    return {
+        "rig_time_s": experiment.rig_time_s,
+        "sweep_time_s": experiment.sweep_time_s,
+        "reason": reason,
+        "warnings": list(experiment.warnings),
+        "u_rest": experiment.u_rest,
+        "u_rest_sd": experiment.u_rest_sd,
+        "noise_sd": experiment.noise_sd,
+        "plant_sign": experiment.plant_sign,
+        "timing": asdict(experiment.timing),
+    }
+
+
+def _verification_json(verification: Verification) -> dict[str, Any]:
+    return {
+        "accepted": verification.accepted,
+        "reason": verification.reason,
+        "predicted": asdict(verification.predicted) | {"misfit_allowed": verification.allowed},
+        "measured": asdict(verification.measured) | {"misfit": verification.misfit},
+    }

@@ -1,0 +1,147 @@
+"""From a rig to a verified controller in it: the stages called in order, files into one folder."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from autotune.config import Config
+from autotune.controller import PIDController
+from autotune.errors import AutotuneError
+from autotune.experiment.result import ExperimentResult
+from autotune.experiment.rig import HoldsGains, Rig
+from autotune.experiment.run import OnProgress, run_experiment
+from autotune.experiment.verify import Verification, run_verification
+from autotune.pipeline.analysis import Analysis, analyse
+from autotune.pipeline.deployment import hand_over
+from autotune.pipeline.result import write_result
+from autotune.run_log import RunLog
+
+RECORDING, VERIFICATION, RESULT, JOURNAL = "recording.csv", "verification.csv", "result.json", "journal.jsonl"
+PROGRESS = "progress.jsonl"
+#: how long an operator may ask for the old gains after new ones were handed over [s]; then the new ones stay
+DECISION_S = 60.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tuning:
+    """What a whole run ends with; what was not reached is None.
+
+    Attributes
+    ----------
+    experiment : ExperimentResult
+        The sweep.
+    analysis : Analysis
+        Model and controller.
+    verification : Verification or None
+        The new loop on the rig; None where it was not asked for.
+    old_controller : PIDController or None
+        Gains the rig held before.
+    deployed : bool
+        Whether the rig now holds the new gains.
+    """
+
+    experiment: ExperimentResult
+    analysis: Analysis
+    verification: Verification | None
+    old_controller: PIDController | None
+    deployed: bool
+
+
+def tune(
+    rig: Rig,
+    config: Config,
+    out: Path,
+    *,
+    verify: bool = True,
+    deploy: bool = True,
+    on_progress: OnProgress | None = None,
+    keep: Callable[[float], bool] | None = None,
+) -> Tuning:
+    """Run the whole chain on a rig: sweep, analyse, verify, hand over the gains; files go into ``out``.
+
+    Parameters
+    ----------
+    rig : Rig
+        Closed.
+    config : Config
+        Everything else.
+    out : Path
+        Existing folder.
+    verify, deploy : bool
+        Whether to try the new loop on the rig, and to write the gains into the rig's own controller once accepted.
+    on_progress : callable, optional
+        Told where the procedure is.
+    keep : callable, optional
+        Asked once accepted gains were handed over, with the time to wait for an answer [s]; the old ones are written
+        back where it says no.
+
+    Returns
+    -------
+    Tuning
+        With the verdict of the verification; the old gains stay unless the new ones were accepted.
+
+    Raises
+    ------
+    ExperimentStopped, LinkError, OperatorStop
+        The rig was left safe; what was recorded and the result so far are in ``out``.
+    IdentificationError, DesignError
+        The points give no model or no controller; they are in ``out``.
+    """
+    with RunLog(out / PROGRESS) as log:
+        log.begin(config)
+        return _tune(rig, config, out, log, verify=verify, deploy=deploy, on_progress=log.also(on_progress), keep=keep)
+
+
+def _tune(
+    rig: Rig,
+    config: Config,
+    out: Path,
+    log: RunLog,
+    *,
+    verify: bool,
+    deploy: bool,
+    on_progress: OnProgress,
+    keep: Callable[[float], bool] | None,
+) -> Tuning:
+    experiment: ExperimentResult | None = None
+    analysis: Analysis | None = None
+    try:
+        experiment = run_experiment(rig, config, log.recording(out / RECORDING), on_progress=on_progress)
+        analysis = analyse(experiment.points, config.design)
+        plant, reduced = analysis.fit.plant, analysis.reduced.transfer_function()
+        log.analysed(analysis.points, plant, reduced, analysis.controller)
+        verification = None
+        if verify:
+            verification = run_verification(
+                rig,
+                config,
+                analysis.controller,
+                analysis.fit,
+                log.recording(out / VERIFICATION),
+                u_rest=experiment.u_rest,
+                noise_sd=experiment.noise_sd,
+                crossover_rad_s=analysis.margins.crossover_rad_s,
+                on_progress=on_progress,
+            )
+            log.verified(verification)
+        accepted = verification is not None and verification.accepted
+        old, deployed = None, False
+        if isinstance(rig, HoldsGains):
+            old = hand_over(rig, analysis.controller if accepted and deploy else None, out / JOURNAL)
+            deployed = accepted and deploy
+        log.gains(old, analysis.controller, deployed=deployed)
+        if isinstance(rig, HoldsGains) and old is not None and deployed and keep is not None:
+            log.waiting(DECISION_S)
+            if not keep(DECISION_S):
+                hand_over(rig, old, out / JOURNAL)
+                deployed = False
+            log.gains(old, analysis.controller, deployed=deployed)
+    except AutotuneError as error:
+        write_result(out / RESULT, experiment, analysis, None, reason=str(error))
+        raise
+    write_result(out / RESULT, experiment, analysis, verification, reason="completed")
+    return Tuning(
+        experiment=experiment, analysis=analysis, verification=verification, old_controller=old, deployed=deployed
+    )
