@@ -55,7 +55,8 @@ def signal_ranges(base: Fit, data: Data) -> Range:
     tiny = 1e-12
 
     def largest(values: FloatArray) -> float:
-        return max(float(np.nanmax(np.abs(values))), tiny)
+        # the spikes that a differentiating controller puts into u say nothing of the sizes at work
+        return max(float(np.nanquantile(np.abs(values), 0.98)), tiny)
 
     return Range(
         w=largest(w),
@@ -123,20 +124,28 @@ def carried_states(base: Fit, effect: Effect, model: Model, data: Data) -> tuple
 def promise(base: Fit, effect: Effect, data: Data) -> Promise:
     """Return what the first order promises when an effect is added to a fit.
 
-    The direction d = e(with effect) - e(without) is freed of what the numbers already free could explain; the decrease
-    of |e + a d|^2 over 0 <= a <= 4 is promised, over -20 <= a <= 20 for an effect of either sign.
+    An effect that moves the reading by more than a share of the misfit is shrunk first: what far too large an effect
+    does tells nothing of its direction near zero. The direction d = e(with effect) - e(without) is freed of what the
+    numbers already free could explain; the decrease of |e + a d|^2 over 0 <= a <= 4 is promised, over -20 <= a <= 20
+    for an effect of either sign.
     """
-    p, theta, states = extended(base, effect, data)
-    try:
-        e = residual_at(p, data, theta, states)
-    except (AutotuneError, OverflowError):
+    for _ in range(SHRINKINGS):
+        p, theta, states = extended(base, effect, data)
+        try:
+            e = residual_at(p, data, theta, states)
+        except (AutotuneError, OverflowError):
+            return Promise(effect=effect, decrease=0.0, scaled=effect)
+        # a simulation that runs away is finite for a while
+        size = float(np.max(np.abs(e), initial=0.0))
+        moved = base.unexplained(e - base.e) if size < 1e15 else np.full(1, 1e15)
+        share = float(moved @ moved) / base.chi2
+        if share <= LINEAR_SHARE or not _amplitudes(effect):
+            break
+        effect = _scaled(effect, float(np.sqrt(0.3 * LINEAR_SHARE / share)), least=1e-9)
+    if not size < 1e15 or share == 0.0:
         return Promise(effect=effect, decrease=0.0, scaled=effect)
-    if not np.max(np.abs(e), initial=0.0) < 1e15:
-        return Promise(effect=effect, decrease=0.0, scaled=effect)
-    d = base.unexplained(e - base.e)
+    d = moved
     slope, curvature = -float(d @ base.e), float(d @ d)
-    if curvature <= 0.0:
-        return Promise(effect=effect, decrease=0.0, scaled=effect)
     signed = any(f.kind == "effect" and not f.positive for f in p.free[base.theta.size :])
     a = float(np.clip(slope / curvature, -20.0 if signed else 0.0, 20.0 if signed else 4.0))
     return Promise(
@@ -144,20 +153,32 @@ def promise(base: Fit, effect: Effect, data: Data) -> Promise:
     )
 
 
+#: Decrease that an effect's direction may have, as a share of chi2, before it is taken for too large to be linear.
+LINEAR_SHARE = 0.3
+#: Most simulations of one effect while it is shrunk.
+SHRINKINGS = 4
+
 #: Parameters that an effect is about proportional to: the first order tells their size.
 AMPLITUDES = frozenset(
     ("level", "breakaway", "half_width", "width", "band", "time_constant", "delay", "second_order", "third_order",
-     "coefficient", "slope", "amplitude", "in_phase", "quadrature", "error")
+     "coefficient", "slope", "amplitude", "in_phase", "quadrature", "error", "rate")
 )  # fmt: skip
+#: Parameters of those names that are something else.
+NO_AMPLITUDES = frozenset((("plant.hysteresis", "width"), ("actuator.rate_limit", "rate")))
 
 
-def _scaled(effect: Effect, a: float, most: float) -> Effect:
+def _amplitudes(effect: Effect) -> list[str]:
+    return [key for key in effect.parameters if key in AMPLITUDES and (effect.name, key) not in NO_AMPLITUDES]
+
+
+def _scaled(effect: Effect, a: float, most: float = np.inf, least: float = 0.05) -> Effect:
     """Return the effect with its amplitudes multiplied, where that is a step one can trust."""
-    if effect.name in ("plant.hysteresis", "plant.hard_stop") or a == 0.0:
+    if a == 0.0:
         return effect
-    factor = float(np.sign(a) * np.clip(abs(a), 0.05, most))
+    factor = float(np.sign(a) * np.clip(abs(a), least, most))
+    amplitudes = _amplitudes(effect)
     parameters = {
-        key: replace(q, value=q.value * factor) if key in AMPLITUDES else q for key, q in effect.parameters.items()
+        key: replace(q, value=q.value * factor) if key in amplitudes else q for key, q in effect.parameters.items()
     }
     return replace(effect, parameters=MappingProxyType(parameters))
 
@@ -206,6 +227,17 @@ def fit_extended(base: Fit, effect: Effect, data: Data, iterations: int = 30) ->
     return Hypothesis(names=tuple(e.name for e in p.model.effects), fit=result)
 
 
+def _distinct(group: Sequence[Promise]) -> list[Effect]:
+    """Return the starting points of one entry that differ once they have the size that is promised."""
+    kept: list[Effect] = []
+    for p in group:
+        values = np.array([q.value for q in p.scaled.parameters.values()])
+        known = ([q.value for q in e.parameters.values()] for e in kept)
+        if p.decrease > 0.0 and not any(np.allclose(values, other, rtol=0.2, atol=0.0) for other in known):
+            kept.append(p.scaled)
+    return kept
+
+
 def _fit_or_nothing(base: Fit, effect: Effect, data: Data) -> Hypothesis | None:
     """Return the fit, nothing where the simulation runs away: that start is no hypothesis."""
     try:
@@ -224,10 +256,7 @@ def extend(
     promises = best_promises(base.fit, data, CATALOGUE.values() if entries is None else entries, pool, extra)
     ranked = sorted(promises.values(), key=lambda group: -group[0].decrease)
     starts = [
-        effect
-        for group in ranked[:most]
-        if group[0].decrease > least
-        for effect in (group[0].scaled, group[0].effect, *(p.effect for p in group[1:]))[:starts_each]
+        effect for group in ranked[:most] if group[0].decrease > least for effect in _distinct(group)[:starts_each]
     ]
     fits: dict[str, Hypothesis] = {}
     for h in pool.map(lambda effect: _fit_or_nothing(base.fit, effect, data), starts):
