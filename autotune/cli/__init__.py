@@ -33,6 +33,7 @@ from autotune.cli import (  # noqa: E402, F401, I001
     closed_loop,
     design,
     diagnose,
+    batch,
     prove,
     rig,
     files,

@@ -1,0 +1,131 @@
+"""Independent tasks on Dask: a cluster in this process's own children, or one that is there already."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from typing import TypeVar
+
+from dask.system import CPU_COUNT
+from distributed import Client, KilledWorker, LocalCluster, as_completed
+
+import autotune
+from autotune.errors import InputError
+
+Given = TypeVar("Given")
+Answer = TypeVar("Answer")
+
+#: A task that ends with an error of its surroundings (a network drive) is tried this many times more.
+_RETRIES = 2
+#: An existing scheduler must answer, and have a worker, within this time [s].
+_PATIENCE_S = 15.0
+
+
+@contextmanager
+def cluster(workers: int | None = None, scheduler: str | None = None) -> Iterator[Client]:
+    """Connect to a Dask cluster, and leave nothing of it behind.
+
+    Parameters
+    ----------
+    workers : int, optional
+        Processes of the embedded cluster, one thread each; as many as the machine has processors when absent.
+    scheduler : str, optional
+        Address of an existing scheduler, ``tcp://host:8786``; the embedded cluster when absent.
+
+    Yields
+    ------
+    Client
+        For :func:`run_all`.
+
+    Raises
+    ------
+    InputError
+        No scheduler at the address, none of its workers there, or workers without this version of the tool.
+
+    Notes
+    -----
+    The embedded cluster listens on 127.0.0.1 only, has no dashboard, and replaces a worker that dies.
+    """
+    if scheduler is None:
+        with (
+            LocalCluster(
+                n_workers=workers or CPU_COUNT,
+                threads_per_worker=1,
+                host="127.0.0.1",
+                dashboard_address=None,
+                silence_logs=logging.CRITICAL,
+            ) as local,
+            Client(local) as client,
+        ):
+            yield client
+        return
+    try:
+        client = Client(scheduler, timeout=_PATIENCE_S)
+    except (OSError, ValueError) as error:
+        raise InputError(f"no scheduler answers ({error})", where=scheduler, mend="start dask scheduler") from None
+    with client:
+        _check(client, scheduler)
+        yield client
+
+
+def _check(client: Client, scheduler: str) -> None:
+    try:
+        client.wait_for_workers(1, timeout=_PATIENCE_S)
+    except TimeoutError:
+        raise InputError("no worker is connected", where=scheduler, mend=f"start dask worker {scheduler}") from None
+    try:
+        versions = set(client.run(_version).values())
+    except ImportError as error:
+        raise InputError(
+            f"a worker cannot import the tool ({error})", where=scheduler, mend="install relay-autotune where they run"
+        ) from None
+    if versions != {_version()}:
+        raise InputError(
+            f"the workers have version {', '.join(sorted(versions))}, this is {_version()}",
+            where=scheduler,
+            mend="install the same version where they run",
+        )
+
+
+def _version() -> str:
+    return autotune.__version__
+
+
+def run_all(
+    client: Client, function: Callable[[Given], Answer], tasks: Mapping[str, Given]
+) -> Iterator[tuple[str, Answer | Exception]]:
+    """Run a function on every task, as many at a time as there are workers.
+
+    Parameters
+    ----------
+    client : Client
+        Of :func:`cluster`.
+    function : callable
+        Pure, from one task to one answer; both are sent between processes.
+    tasks : mapping of str to object
+        By name.
+
+    Yields
+    ------
+    name : str
+        Of each task as it finishes.
+    answer : object
+        What the function returned, or the exception that the task still ended with after its retries.
+
+    Notes
+    -----
+    A task whose worker was killed is given to another; one that has killed four workers is given up
+    (``distributed.scheduler.allowed-failures``). Answers are let go of as they are yielded, so memory stays flat.
+    """
+    futures = client.map(function, list(tasks.values()), pure=False, retries=_RETRIES)
+    names = {future.key: name for future, name in zip(futures, tasks, strict=True)}
+    finished = as_completed(futures)
+    del futures
+    for future in finished:
+        error = future.exception() if future.status == "error" else None
+        if isinstance(error, KilledWorker):
+            error = RuntimeError("every worker that took it was killed, perhaps for want of memory")
+        answer = future.result() if error is None else error
+        future.release()
+        yield names.pop(future.key), answer

@@ -1,0 +1,355 @@
+"""One loop of a campaign: from its record to a row of the table of results."""
+
+from __future__ import annotations
+
+import math
+import traceback
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal, TypeAlias
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from autotune.batch.pieces import Record, read_record
+from autotune.batch.settings import CampaignSettings, LoopSettings
+from autotune.controller import Controller, PIDController, read_controller
+from autotune.design.margins import Margins, margins
+from autotune.diagnosis.diagnose import diagnose
+from autotune.diagnosis.result import Diagnosis
+from autotune.errors import AutotuneError, IdentificationError
+from autotune.identification.closed_loop.identify import identify_closed_loop
+from autotune.identification.frequency.recorded import FrequencyEstimate, combine, frequency_points
+from autotune.models import read_model
+from autotune.pipeline import Analysis, analyse, analysis_json
+from autotune.points import FrequencyPoint, points_to_json
+from autotune.recording import Recording
+from autotune.run_log import jsonable
+
+Attention: TypeAlias = Literal["act", "failed", "look", "fine"]
+
+#: What comes first in the table.
+ATTENTION: tuple[Attention, ...] = ("act", "failed", "look", "fine")
+#: A controller whose disturbance rejection (11) could be this many times better is worth a look.
+_SLUGGISH = 1.5
+#: Margins that are missed by less than this share are kept, within what a recording tells.
+_TOLERANCE = 0.1
+#: Below this phase [deg] a PI has no use for a point, and another turn could not be told from a rise.
+_LOWEST_PHASE_DEG = -270.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Row:
+    """A loop's row in the table of results; what was not reached or not asked is None.
+
+    Attributes
+    ----------
+    loop : str
+        Name.
+    attention : {"act", "failed", "look", "fine"}
+        What the reader should do.
+    severity : float
+        Within ``act``: 1 for an unstable loop, else the share by which a margin is missed, or the part of the
+        simulation error that is not noise.
+    reason : str
+        Why, in a sentence.
+    file, u_unit, y_unit : str
+        Where the record lies, and its units.
+    rows, bad_rows, pieces : int
+        Rows of the record, those without a good u and y, uninterrupted stretches used.
+    duration_s, sample_time_s : float
+        Of the stretches together, and their usual step [s].
+    points : int
+        Frequency points.
+    omega_low_rad_s, omega_high_rad_s : float
+        Their range [rad/s].
+    G_r, omega_0r_rad_s, omega_d_rad_s : float
+        Reduced model (8), or (24) without omega_0r.
+    K, Ti_s, Td_s, Tf_s, h2, modulus, phase_deg, delay_margin_s : float
+        The designed controller, and its norm (11) and margins on the fitted plant.
+    K_now, Ti_now_s, h2_now, modulus_now, phase_now_deg : float
+        The controller the loop runs with, likewise.
+    stable_now : bool
+        Whether that loop is stable on the fitted plant.
+    verdict, effects : str
+        Of the diagnosis; the effects with their probabilities.
+    nominal, retuned, extended, noise_floor : float
+        Simulation error on held-out rows over the spread of y.
+    notes : str
+        What was mended, left out or doubtful.
+    """
+
+    loop: str
+    attention: Attention
+    severity: float = 0.0
+    reason: str = ""
+    file: str = ""
+    u_unit: str = ""
+    y_unit: str = ""
+    rows: int | None = None
+    bad_rows: int | None = None
+    pieces: int | None = None
+    duration_s: float | None = None
+    sample_time_s: float | None = None
+    points: int | None = None
+    omega_low_rad_s: float | None = None
+    omega_high_rad_s: float | None = None
+    G_r: float | None = None
+    omega_0r_rad_s: float | None = None
+    omega_d_rad_s: float | None = None
+    K: float | None = None
+    Ti_s: float | None = None
+    Td_s: float | None = None
+    Tf_s: float | None = None
+    h2: float | None = None
+    modulus: float | None = None
+    phase_deg: float | None = None
+    delay_margin_s: float | None = None
+    K_now: float | None = None
+    Ti_now_s: float | None = None
+    h2_now: float | None = None
+    modulus_now: float | None = None
+    phase_now_deg: float | None = None
+    stable_now: bool | None = None
+    verdict: str | None = None
+    effects: str | None = None
+    nominal: float | None = None
+    retuned: float | None = None
+    extended: float | None = None
+    noise_floor: float | None = None
+    notes: str = ""
+
+    @property
+    def order(self) -> tuple[int, float, str]:
+        """Key that sorts rows by what needs attention first."""
+        return ATTENTION.index(self.attention), -self.severity, self.loop
+
+
+@dataclass(frozen=True, kw_only=True)
+class Work:
+    """What a worker is given: one loop of a campaign.
+
+    Attributes
+    ----------
+    loop, settings : LoopSettings, CampaignSettings
+        What to do.
+    prepared : tuple of Path
+        Parquet files that stand for the loop's export.
+    """
+
+    loop: LoopSettings
+    settings: CampaignSettings
+    prepared: tuple[Path, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Finding:
+    """What a worker gives back.
+
+    Attributes
+    ----------
+    row : Row
+        For the table.
+    points : list
+        In the form of ``points.json``.
+    result : dict
+        Of the design or the diagnosis, in the form of their files; empty where there is none.
+    """
+
+    row: Row
+    points: list[dict[str, Any]] = field(default_factory=list)
+    result: dict[str, Any] = field(default_factory=dict)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the content of the loop's file."""
+        content: dict[str, Any] = jsonable({"row": asdict(self.row), "points": self.points, "result": self.result})
+        return content
+
+
+def analyse_loop(work: Work) -> Finding:
+    """Analyse one loop; a failure is a row with its reason.
+
+    Parameters
+    ----------
+    work : Work
+        The loop.
+
+    Returns
+    -------
+    Finding
+        The same on every machine and beside any number of other workers: linear algebra runs on one thread.
+
+    Raises
+    ------
+    OSError
+        A disk or a network drive failed, which may pass.
+    """
+    loop = work.loop
+    row = Row(loop=loop.name, attention="fine", file=loop.file, u_unit=loop.u_unit, y_unit=loop.y_unit)
+    try:
+        with threadpool_limits(1):
+            return _finding(work, row)
+    except AutotuneError as error:
+        return Finding(row=replace(row, attention="failed", reason=str(error)))
+    except OSError:
+        raise
+    except Exception as error:  # one loop's defect must not end the campaign of all others
+        at = traceback.extract_tb(error.__traceback__)[-1]
+        reason = f"defect in the tool: {type(error).__name__}: {error} ({Path(at.filename).name} line {at.lineno})"
+        return Finding(row=replace(row, attention="failed", reason=reason))
+
+
+def _finding(work: Work, row: Row) -> Finding:
+    loop, settings = work.loop, work.settings
+    present = _present(loop)
+    record = read_record(loop, settings, work.prepared)
+    row = replace(
+        row,
+        rows=record.rows,
+        bad_rows=record.bad,
+        pieces=len(record.pieces),
+        duration_s=sum(piece.duration_s for piece in record.pieces),
+        sample_time_s=float(np.median(np.concatenate([np.diff(piece.t) for piece in record.pieces]))),
+        notes="; ".join(record.notes),
+    )
+    if settings.task == "diagnose":
+        found = diagnose(read_model(loop.model), record.pieces, present)
+        return Finding(row=_diagnosed(row, found), result=found.as_json())
+    points, notes = _points(record, settings, present)
+    row = _with_notes(row, notes)
+    omega = [point.omega_rad_s for point in points]
+    row = replace(row, points=len(points), omega_low_rad_s=min(omega), omega_high_rad_s=max(omega))
+    if settings.task == "identify":
+        return Finding(row=row, points=points_to_json(points))
+    analysis = analyse(_of_use(points), settings.design, compare=False)
+    return Finding(
+        row=_designed(row, analysis, present, settings), points=points_to_json(points), result=analysis_json(analysis)
+    )
+
+
+def _present(loop: LoopSettings) -> Controller | None:
+    if loop.controller:
+        return read_controller(loop.controller)
+    return PIDController(K=loop.K, Ti_s=loop.Ti_s) if loop.K is not None and loop.Ti_s is not None else None
+
+
+def _with_notes(row: Row, notes: Sequence[str]) -> Row:
+    return replace(row, notes="; ".join([*([row.notes] if row.notes else []), *notes]))
+
+
+def _points(
+    record: Record, settings: CampaignSettings, present: Controller | None
+) -> tuple[tuple[FrequencyPoint, ...], tuple[str, ...]]:
+    """Return the points of all pieces together; a piece that tells nothing is a note while another one tells."""
+    if settings.method == "closed-loop":
+        longest = max(record.pieces, key=len)
+        found = identify_closed_loop(longest, controller=present)
+        if not found.design_points:
+            raise IdentificationError(
+                found.excitation.sentence, where=longest.name, mend="move the set-point, or dither"
+            )
+        return found.design_points, found.warnings
+    estimates, refusals = [], []
+    for piece in record.pieces:
+        try:
+            estimates.append(_opened(piece))
+        except IdentificationError as error:
+            refusals.append(error)
+    if not estimates:
+        raise refusals[0]
+    combined = combine(estimates)
+    if not refusals:
+        return combined.points, combined.notes
+    left_out = f"{len(refusals)} of {len(record.pieces)} pieces gave no points, the first: {refusals[0]}"
+    return combined.points, (*combined.notes, left_out)
+
+
+def _opened(piece: Recording) -> FrequencyEstimate:
+    """Estimate points, but not from a loop that nothing but its own feedback moved: they would lie at -1/C."""
+    estimate = frequency_points(piece)
+    r = piece.extra.get("r")
+    if r is not None and np.isfinite(r).all() and np.ptp(r) == 0.0 and estimate.excitation != "relay":
+        raise IdentificationError(
+            "the set-point never moves, so that the command may follow the feedback alone",
+            where=piece.name,
+            mend='choose an interval with set-point steps or method = "closed-loop"; give no r where the loop was open',
+        )
+    return estimate
+
+
+def _of_use(points: Sequence[FrequencyPoint]) -> list[FrequencyPoint]:
+    """Return the points up to the frequency where the plant's phase, unwrapped from the lowest, is below -270 deg."""
+    ordered = sorted(points, key=lambda point: point.omega_rad_s)
+    phase = np.degrees(np.unwrap([point.phase_rad for point in ordered]))
+    of_positive_gain = phase - 180.0 * math.ceil((phase[0] - 30.0) / 180.0)
+    beyond = np.flatnonzero(of_positive_gain < _LOWEST_PHASE_DEG)
+    return ordered[: int(beyond[0])] if beyond.size else ordered
+
+
+def _designed(row: Row, analysis: Analysis, present: Controller | None, settings: CampaignSettings) -> Row:
+    reduced, c, m = analysis.reduced, analysis.controller, analysis.margins
+    row = replace(
+        _with_notes(row, analysis.warnings),
+        G_r=reduced.G_r,
+        omega_0r_rad_s=reduced.omega_0r_rad_s,
+        omega_d_rad_s=reduced.omega_d_rad_s,
+        K=c.K,
+        Ti_s=c.Ti_s,
+        Td_s=c.Td_s,
+        Tf_s=c.Tf_s,
+        h2=m.h2,
+        modulus=m.modulus,
+        phase_deg=math.degrees(m.phase_rad),
+        delay_margin_s=m.delay_s,
+    )
+    if present is not None:
+        row = _compared(row, present, margins(analysis.fit.plant, present), settings)
+    if row.attention == "fine" and (analysis.warnings or not analysis.scaled.holds):
+        doubt = analysis.warnings[0] if analysis.warnings else "criterion (10) does not hold: measure more points"
+        return replace(row, attention="look", reason=doubt)
+    return row
+
+
+def _compared(row: Row, present: Controller, m: Margins, settings: CampaignSettings) -> Row:
+    """Judge the controller that the loop runs with by the margins that were asked for, and beside the new one."""
+    asked_modulus, asked_phase = settings.design.margins
+    row = replace(
+        row,
+        K_now=present.K if isinstance(present, PIDController) else None,
+        Ti_now_s=present.Ti_s if isinstance(present, PIDController) else None,
+        h2_now=m.h2,
+        modulus_now=m.modulus,
+        phase_now_deg=math.degrees(m.phase_rad),
+        stable_now=m.stable,
+    )
+    if not m.stable:
+        return replace(row, attention="act", severity=1.0, reason="unstable with its present controller")
+    missed = 1.0 - min(m.modulus / asked_modulus, m.phase_rad / asked_phase)
+    if missed > _TOLERANCE:
+        reason = (
+            f"present margins {m.modulus:.2f} and {math.degrees(m.phase_rad):.0f} deg, "
+            f"asked {asked_modulus:.2g} and {math.degrees(asked_phase):.0f} deg"
+        )
+        return replace(row, attention="act", severity=min(missed, 1.0), reason=reason)
+    if row.h2 is not None and m.h2 > _SLUGGISH * row.h2:
+        return replace(row, attention="look", reason=f"disturbances could move y {m.h2 / row.h2:.1f} times less")
+    return row
+
+
+def _diagnosed(row: Row, found: Diagnosis) -> Row:
+    attention: dict[str, Attention] = {"none": "fine", "parameters": "look", "effect": "act", "unexplained": "act"}
+    fit = found.fit
+    grave = attention[found.verdict] == "act"
+    return replace(
+        row,
+        attention=attention[found.verdict],
+        severity=float(np.clip(1.0 - fit.noise_floor / fit.nominal, 0.0, 1.0)) if grave and fit.nominal > 0 else 0.0,
+        reason="" if found.verdict == "none" else found.sentences[0],
+        verdict=found.verdict,
+        effects=", ".join(f"{effect.name} ({effect.probability:.2f})" for effect in found.effects),
+        nominal=fit.nominal,
+        retuned=fit.retuned,
+        extended=fit.extended,
+        noise_floor=fit.noise_floor,
+    )

@@ -1,0 +1,72 @@
+"""Command: identify, design or diagnose many loops at once."""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from autotune.cli import app
+
+
+@app.command()
+def batch(
+    campaign: Annotated[Path, typer.Argument(metavar="CAMPAIGN.toml", help="loops, files, and what is asked of them")],
+    out: Annotated[Path, typer.Option(metavar="DIR", help="folder of the results; an interrupted one is continued")],
+    workers: Annotated[
+        int | None, typer.Option(min=1, help="processes on this machine; default as many as processors")
+    ] = None,
+    scheduler: Annotated[
+        str | None, typer.Option(metavar="ADDRESS", help="existing Dask scheduler, tcp://host:8786, with its workers")
+    ] = None,
+) -> None:
+    """Identify, design or diagnose every loop of a plant; results as a Parquet table and one page."""
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    from autotune.batch.campaign import RESULTS, Campaign, failed, write_results
+    from autotune.batch.engine import cluster, run_all
+    from autotune.batch.loop import ATTENTION, analyse_loop
+    from autotune.batch.settings import read_campaign
+    from autotune.errors import InputError
+    from autotune.report.campaign_page import campaign_page
+    from autotune.report.page import write_page
+
+    settings, loops = read_campaign(campaign)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"cannot be made ({error.strerror})", where=str(out), mend="choose another --out") from None
+    work = Campaign(settings=settings, loops=loops, out=out.absolute())
+    rows = work.done()
+    console = Console(highlight=False, soft_wrap=True)
+    bars = Console(stderr=True)
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=bars, transient=True, disable=not bars.is_terminal) as progress:
+        reading = progress.add_task("preparing exports", total=100, visible=False)
+        tasks = work.works(
+            rows, lambda name, share: progress.update(reading, description=name, completed=100 * share, visible=True)
+        )
+        progress.update(reading, visible=False)
+        if rows:
+            console.print(f"{len(rows)} of {len(loops)} loops are done already", markup=False)
+        if tasks:
+            # the speed is that of this session: what was done before does not count
+            bar = progress.add_task(settings.task, total=len(tasks))
+            with cluster(min(workers, len(tasks)) if workers else None, scheduler) as client:
+                for name, finding in run_all(client, analyse_loop, tasks):
+                    loop = tasks[name].loop
+                    rows[name] = failed(loop, finding) if isinstance(finding, Exception) else work.keep(loop, finding)
+                    progress.advance(bar)
+    ordered = write_results(rows.values(), work.out / RESULTS)
+    page = campaign_page(settings, ordered)
+    write_page(page, work.out / "report.html")
+    counts = Counter(row.attention for row in ordered)
+    for row in [row for row in ordered if row.attention != "fine"][:10]:
+        console.print(f"{row.attention:7s} {row.loop}: {row.reason}", markup=False)
+    if sum(counts[attention] for attention in ATTENTION[:3]) > 10:
+        console.print("and more, in the report", markup=False)
+    console.print(page.verdict, markup=False)
+    console.print(f"report: {out / 'report.html'}, table: {out / RESULTS}", markup=False)

@@ -1,0 +1,170 @@
+"""A campaign as one page: every loop, what needs attention first on top."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from autotune.batch.loop import ATTENTION, Attention, Row
+from autotune.batch.settings import CampaignSettings
+from autotune.report.page import GREEN, GREY, ORANGE, RED, Figure, Page, Section, Table, Tone, lines_figure
+
+_TITLES: dict[Attention, str] = {
+    "act": "Needs action",
+    "failed": "Not analysed",
+    "look": "Deserves a look",
+    "fine": "Fine",
+}
+_WORDS: dict[Attention, str] = {
+    "act": "need action",
+    "failed": "could not be analysed",
+    "look": "deserve a look",
+    "fine": "are fine",
+}
+_COLOURS: dict[Attention, str] = {"act": RED, "failed": GREY, "look": ORANGE, "fine": GREEN}
+
+_Columns = dict[str, Callable[[Row], str]]
+
+
+def campaign_page(settings: CampaignSettings, rows: Sequence[Row]) -> Page:
+    """Return the page of a campaign.
+
+    Parameters
+    ----------
+    settings : CampaignSettings
+        What was asked.
+    rows : sequence of Row
+        In the order of the table of results.
+    """
+    counts = Counter(row.attention for row in rows)
+    tone: Tone = "bad" if counts["act"] else "warn" if counts["failed"] or counts["look"] else "good"
+    said = ", ".join(f"{counts[attention]} {_WORDS[attention]}" for attention in ATTENTION if counts[attention])
+    asked_modulus, asked_phase = settings.design.margins
+    summary = ["Sorted by what needs attention first; all figures are in results.parquet."]
+    if settings.task == "design":
+        summary.append(
+            f"Designed for a modulus margin of {asked_modulus:.2g} and a phase margin of {np.degrees(asked_phase):.0f} "
+            "deg. A loop's own page: autotune tune --points loops/NAME.json --out DIR."
+        )
+    sections = [_section(settings, attention, rows) for attention in ATTENTION if counts[attention]]
+    return Page(
+        title=settings.name,
+        verdict=f"Of {len(rows)} loops, {said}.",
+        tone=tone,
+        summary=tuple(summary),
+        sections=(*sections, *_present_margins(settings, rows), *_notes(rows)),
+    )
+
+
+def _section(settings: CampaignSettings, attention: Attention, rows: Sequence[Row]) -> Section:
+    columns: _Columns = {"loop": lambda row: row.loop}
+    if attention != "fine":
+        columns["why"] = lambda row: row.reason
+    columns |= _FAILED if attention == "failed" else _COLUMNS[settings.task]
+    chosen = [row for row in rows if row.attention == attention]
+    cells = [tuple(cell(row) for cell in columns.values()) for row in chosen]
+    shown = [i for i in range(len(columns)) if any(line[i] for line in cells)]
+    table = Table(
+        header=tuple(list(columns)[i] for i in shown), rows=tuple(tuple(line[i] for i in shown) for line in cells)
+    )
+    return Section(title=f"{_TITLES[attention]} ({len(chosen)})", tables=(table,))
+
+
+def _number(value: float | None, form: str = ".4g") -> str:
+    return "" if value is None else format(value, form)
+
+
+def _gains(K: float | None, Ti_s: float | None) -> str:
+    return "" if K is None else f"{K:.4g}, {_number(Ti_s)} s"
+
+
+def _margins(modulus: float | None, phase_deg: float | None) -> str:
+    return "" if modulus is None else f"{modulus:.2f}, {_number(phase_deg, '.0f')}°"
+
+
+def _present(row: Row) -> str:
+    return "unstable" if row.stable_now is False else _margins(row.modulus_now, row.phase_now_deg)
+
+
+def _record(row: Row) -> str:
+    if not row.rows or row.duration_s is None:
+        return ""
+    bad = f", {100 * (row.bad_rows or 0) / row.rows:.2g} % bad" if row.bad_rows else ""
+    pieces = f" in {row.pieces}" if row.pieces and row.pieces > 1 else ""
+    return f"{_time(row.duration_s)}{pieces}, {row.rows} rows{bad}"
+
+
+def _time(seconds: float) -> str:
+    for unit, size in (("d", 86400.0), ("h", 3600.0), ("min", 60.0)):
+        if seconds >= 2.0 * size:
+            return f"{seconds / size:.3g} {unit}"
+    return f"{seconds:.3g} s"
+
+
+def _range(row: Row) -> str:
+    if row.omega_low_rad_s is None or row.omega_high_rad_s is None:
+        return ""
+    return f"{row.omega_low_rad_s:.3g} to {row.omega_high_rad_s:.3g}"
+
+
+def _error(row: Row) -> str:
+    if row.nominal is None:
+        return ""
+    return f"{_number(row.nominal, '.3g')} → {_number(row.extended, '.3g')} ({_number(row.noise_floor, '.3g')})"
+
+
+_FAILED: _Columns = {"file": lambda row: row.file.rsplit("/", 1)[-1], "record": _record}
+_COLUMNS: dict[str, _Columns] = {
+    "identify": {
+        "points": lambda row: str(row.points or ""),
+        "from to [rad/s]": _range,
+        "record": _record,
+    },
+    "design": {
+        "new K, Ti": lambda row: _gains(row.K, row.Ti_s),
+        "modulus, phase margin": lambda row: _margins(row.modulus, row.phase_deg),
+        "present K, Ti": lambda row: _gains(row.K_now, row.Ti_now_s),
+        "present margins": _present,
+        "record": _record,
+    },
+    "diagnose": {
+        "verdict": lambda row: row.verdict or "",
+        "effects (probability)": lambda row: row.effects or "",
+        "error, after, (noise)": _error,
+        "record": _record,
+    },
+}
+
+
+def _present_margins(settings: CampaignSettings, rows: Sequence[Row]) -> tuple[Section, ...]:
+    """Return a figure of the margins that the loops run with, where their controllers were given."""
+    known = [row for row in rows if row.stable_now and row.modulus_now is not None]
+    if not known:
+        return ()
+    modulus, phase = settings.design.margins
+    figure = lines_figure("phase margin [deg]", "modulus margin")
+    for attention in ATTENTION:
+        of_kind = [row for row in known if row.attention == attention]
+        if of_kind:
+            figure.add_scatter(
+                x=[row.phase_now_deg for row in of_kind],
+                y=[row.modulus_now for row in of_kind],
+                text=[row.loop for row in of_kind],
+                name=_WORDS[attention],
+                mode="markers",
+                marker={"color": _COLOURS[attention], "size": 9},
+                hovertemplate="%{text}<br>%{x:.0f} deg, %{y:.2f}<extra></extra>",
+            )
+    figure.add_hline(y=modulus, line={"color": GREY, "dash": "dot"})
+    figure.add_vline(x=float(np.degrees(phase)), line={"color": GREY, "dash": "dot"})
+    unstable = sum(row.stable_now is False for row in rows)
+    beyond = f" {unstable} unstable loops have no margins and are not shown." if unstable else ""
+    caption = f"Each point is a loop with its present controller; dotted, what was asked.{beyond}"
+    return (Section(title="Present margins", figures=(Figure(figure=figure, caption=caption),)),)
+
+
+def _notes(rows: Sequence[Row]) -> tuple[Section, ...]:
+    noted = [(row.loop, row.notes) for row in rows if row.notes]
+    return (Section(title="Notes", tables=(Table(header=("loop", "notes"), rows=tuple(noted)),)),) if noted else ()
