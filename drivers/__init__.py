@@ -54,9 +54,11 @@ def open_rig(
 
             return open_replay(settings)
         case SerialSettings():
+            from drivers.device_rig import DeviceLawRig
             from drivers.serial_rig import SerialLineRig
 
-            return SerialLineRig(settings, u_range=u_range, u_safe=u_safe)
+            on_line = DeviceLawRig if settings.relay == "device" else SerialLineRig
+            return on_line(settings, u_range=u_range, u_safe=u_safe)
         case ModbusTcpSettings() | ModbusTlsSettings() | ModbusRtuSettings():
             from drivers.modbus import ModbusLink
             from drivers.register_rig import GainRegisterRig, RegisterRig

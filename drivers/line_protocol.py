@@ -3,7 +3,7 @@
 A frame is its content, stuffed by COBS so that no zero byte is left in it, and one zero byte. After noise or a lost
 byte the next zero byte starts afresh. Numbers are little-endian::
 
-    byte 0     protocol version, 1
+    byte 0     protocol version, 2
     byte 1     type
     byte 2-3   sequence: the host's request number, repeated by its answer; in streamed rows the device's own count
     byte 4-    payload, 0 to 56 bytes
@@ -13,21 +13,24 @@ byte the next zero byte starts afresh. Numbers are little-endian::
     01 HELLO                                                                 81 INFO
     02 TAKE       u16 u_safe, u_min, u_max; u16 dead-man in ms               82 SAMPLE    the host commands; u stays
     03 READ                                                                  82 SAMPLE    feeds the dead-man
-    04 EXCHANGE   u16 u                                                      82 SAMPLE    taken before u acts; feeds
+    04 EXCHANGE   u16 u                                                      82 SAMPLE    of the tick that u acts from
     05 SAFE                                                                  82 SAMPLE    u is the safe output
     06 RELAY      f32 y_centre, midpoint, amplitude, hysteresis, delay in    82 SAMPLE    then 84 ROW every n ticks
                   ticks; u8 smoothing; i8 plant sign; u16 ticks per row;
-                  u32 longest time in ticks; u16 y_low, y_high
+                  u32 longest time in ticks; u16 y_low, y_high; another setting while the relay runs
     07 REGULATE   f32 set-point; u16 ticks per row; u32 longest time in      82 SAMPLE    then 84 ROW every n ticks
                   ticks, 0 for ever and without dead-man; u16 y_low, y_high
     08 GET_GAINS                                                             83 GAINS
     09 SET_GAINS  f32 K in u counts per y count; f32 Ti in s                 83 GAINS     as the device holds them now
+    0A TRY        f32 K, Ti, set-point, load; u16 ticks per row; u32         82 SAMPLE    then 84 ROW every n ticks
+                  longest time in ticks; u16 y_low, y_high; the PI on these
+                  gains with load added to u; others while it runs
 
     device to host
     81 INFO       u16 firmware version; u16 ticks per second; u16 y and u count at full scale; u8 device starts
-    82 SAMPLE     u32 device time in us, wraps; u16 y; u16 u in effect when y was taken; u8 state; u8 device starts
+    82 SAMPLE     u32 device time in us, wraps; u16 y; u16 u that acts from y's instant on; u8 state; u8 device starts
     83 GAINS      f32 K; f32 Ti
-    84 ROW        as SAMPLE
+    84 ROW        as SAMPLE; u32 area: u in counts times ticks since the device's law began, up to this tick, wraps
     FF REFUSED    u8 type of the request; u8 reason: 1 unknown type, 2 wrong length, 3 not in command, 4 out of range
 
     state: bits 0-1 who commands: 0 nobody (safe output), 1 the host, 2 the relay, 3 the device's PI
@@ -44,7 +47,7 @@ import struct
 from dataclasses import dataclass
 from enum import IntEnum
 
-VERSION = 1
+VERSION = 2
 MAX_CONTENT = 62
 _HEAD = struct.Struct("<BBH")
 _CRC = struct.Struct("<H")
@@ -62,6 +65,7 @@ class Kind(IntEnum):
     REGULATE = 0x07
     GET_GAINS = 0x08
     SET_GAINS = 0x09
+    TRY = 0x0A
     INFO = 0x81
     SAMPLE = 0x82
     GAINS = 0x83
@@ -89,10 +93,11 @@ PAYLOAD = {
     Kind.REGULATE: struct.Struct("<fHIHH"),
     Kind.GET_GAINS: struct.Struct("<"),
     Kind.SET_GAINS: struct.Struct("<ff"),
+    Kind.TRY: struct.Struct("<ffffHIHH"),
     Kind.INFO: struct.Struct("<HHHHB"),
     Kind.SAMPLE: struct.Struct("<IHHBB"),
     Kind.GAINS: struct.Struct("<ff"),
-    Kind.ROW: struct.Struct("<IHHBB"),
+    Kind.ROW: struct.Struct("<IHHBBI"),
     Kind.REFUSED: struct.Struct("<BB"),
 }
 

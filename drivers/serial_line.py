@@ -8,13 +8,15 @@ from __future__ import annotations
 
 import contextlib
 import random
-import time
 from collections import deque
+from collections.abc import Callable
+from typing import Protocol
 
 import serial
 
 from autotune.config.rig import SerialSettings
 from autotune.errors import LinkError
+from autotune.experiment.rig import Clock
 from drivers.line_protocol import VERSION, Decoder, Frame, Kind, encode
 
 _LINE_ERRORS: tuple[type[Exception], ...] = (OSError,)
@@ -40,6 +42,37 @@ _REASONS = {
 _CABLE = "check cable, power and [rig] device"
 
 
+class Port(Protocol):
+    """What a link needs of a serial port; pyserial's, or one in virtual time."""
+
+    timeout: float | None
+
+    @property
+    def in_waiting(self) -> int:
+        """Bytes that have arrived."""
+        ...
+
+    def read(self, size: int, /) -> bytes:
+        """Return up to ``size`` bytes, fewer where they do not come within ``timeout`` [s]."""
+        ...
+
+    def write(self, data: bytes, /) -> object:
+        """Send bytes."""
+        ...
+
+    def close(self) -> None:
+        """Close the port."""
+        ...
+
+
+def open_port(settings: SerialSettings) -> Port:
+    """Open the serial device of the settings, for this process alone."""
+    port: Port = serial.Serial(
+        settings.device, settings.baud, timeout=settings.timeout_s, write_timeout=settings.timeout_s, exclusive=True
+    )
+    return port
+
+
 class DeviceRefused(LinkError):  # noqa: N818 - a verdict, as its base
     """The device answered that it does not do it."""
 
@@ -51,11 +84,19 @@ class SerialLink:
     ----------
     settings : SerialSettings
         Line, time-outs, repetitions.
+    clock : Clock
+        Of the waits.
+    port : callable
+        Opens the line.
     """
 
-    def __init__(self, settings: SerialSettings) -> None:
+    def __init__(
+        self, settings: SerialSettings, clock: Clock, port: Callable[[SerialSettings], Port] = open_port
+    ) -> None:
         self._settings = settings
-        self._port: serial.Serial | None = None
+        self._clock = clock
+        self._open_port = port
+        self._port: Port | None = None
         self._decoder = Decoder()
         self._arrived: deque[Frame] = deque()
         # a device that answers an earlier session's request must not seem to answer this one's
@@ -82,21 +123,15 @@ class SerialLink:
         settings = self._settings
         if self._port is None:
             try:
-                self._port = serial.Serial(
-                    settings.device,
-                    settings.baud,
-                    timeout=settings.timeout_s,
-                    write_timeout=settings.timeout_s,
-                    exclusive=True,
-                )
+                self._port = self._open_port(settings)
             except _OPEN_ERRORS as error:
                 raise LinkError(f"cannot be opened ({error})", where=self.where, mend=_CABLE) from None
-        until = time.monotonic() + settings.start_s  # opening restarts a board whose reset hangs on DTR
+        until = self._clock.now() + settings.start_s  # opening restarts a board whose reset hangs on DTR
         while True:
             try:
                 return self.ask(Kind.HELLO, retries=0)[0]
             except LinkError as error:
-                if time.monotonic() > until or self._port is None or isinstance(error, DeviceRefused):
+                if self._clock.now() > until or self._port is None or isinstance(error, DeviceRefused):
                     self.disconnect()
                     raise
 
@@ -117,7 +152,7 @@ class SerialLink:
         answer : Frame
             Not a refusal.
         sent_s : float
-            When the answered request was sent, on ``time.perf_counter`` [s].
+            When the answered request was sent [s].
         suspect : bool
             Whether it took more than one attempt.
 
@@ -131,7 +166,7 @@ class SerialLink:
         attempts = 1 + (self._settings.retries if retries is None else retries)
         for attempt in range(attempts):
             self._sequence = (self._sequence + 1) & 0xFFFF
-            sent_s = time.perf_counter()
+            sent_s = self._clock.now()
             # a zero byte first ends what noise has left on the device's side
             start = b"\0" if attempt else b""
             self._write(start + encode(Frame(kind=kind, sequence=self._sequence, values=values)))
@@ -147,9 +182,9 @@ class SerialLink:
 
     def arrived(self, timeout_s: float) -> Frame | None:
         """Return the next frame that the device sent by itself, None where none comes within ``timeout_s`` [s]."""
-        until = time.monotonic() + timeout_s
+        until = self._clock.now() + timeout_s
         while not self._arrived:
-            if time.monotonic() >= until:
+            if self._clock.now() >= until:
                 return None
             self._arrived.extend(self._receive(until))
         return self._arrived.popleft()
@@ -159,9 +194,9 @@ class SerialLink:
         self._arrived.clear()
 
     def _answer(self, kind: Kind) -> Frame | None:
-        until = time.monotonic() + self._settings.timeout_s
+        until = self._clock.now() + self._settings.timeout_s
         answer: Frame | None = None
-        while answer is None and time.monotonic() < until:
+        while answer is None and self._clock.now() < until:
             for frame in self._receive(until):
                 if frame.version != VERSION:
                     raise DeviceRefused(
@@ -180,7 +215,7 @@ class SerialLink:
         """Return the frames that are complete with the next bytes."""
         port = self._opened
         try:
-            port.timeout = max(0.0, until - time.monotonic())
+            port.timeout = max(0.0, until - self._clock.now())
             return self._decoder.feed(port.read(port.in_waiting or 1))
         except _LINE_ERRORS as error:
             self.disconnect()
@@ -195,7 +230,7 @@ class SerialLink:
             raise LinkError(f"the line takes nothing ({error})", where=self.where, mend=_CABLE) from None
 
     @property
-    def _opened(self) -> serial.Serial:
+    def _opened(self) -> Port:
         if self._port is None:
             raise LinkError("the line is not open", where=self.where, mend="open the rig first")
         return self._port

@@ -1,50 +1,27 @@
-"""A rig behind a microcontroller: samples, commands, dead-man, the device's own relay and PI.
+"""A rig behind a microcontroller: samples, commands, dead-man, the gains of the device's own PI.
 
-A device that restarted, or that no longer lets the host command, says so in its next sample: that is an error and no
-sample.
+A device that restarted, whose clock jumped, or that no longer lets the host command, says so in its next sample: that
+is an error and no sample.
 """
 
 from __future__ import annotations
 
-import time
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 from autotune.config.rig import SerialSettings
 from autotune.controller import PIDController
 from autotune.errors import InputError, LinkError
-from autotune.experiment.relay import RelaySettings
 from autotune.experiment.rig import Clock, Reading
 from drivers.clock import MonotonicClock
 from drivers.line_protocol import PAYLOAD, Command, Frame, Kind
-from drivers.serial_line import DeviceRefused, SerialLink
+from drivers.serial_line import DeviceRefused, Port, SerialLink, open_port
 
-_COMMAND, _DEADMAN, _LIMIT, _TIME, _OVERRUN = 0x03, 0x04, 0x08, 0x10, 0x20
+COMMAND, _DEADMAN, _LIMIT, _TIME, _OVERRUN = 0x03, 0x04, 0x08, 0x10, 0x20
 _GAINS = PAYLOAD[Kind.SET_GAINS]
 _WRAP_S = 2**32 * 1e-6
-_LONGEST_TICKS = 2**32 - 1
-
-
-@dataclass(frozen=True, kw_only=True)
-class DeviceRow:
-    """One row that the device streams.
-
-    Attributes
-    ----------
-    count : int
-        The device's own count of rows, modulo 65536; a gap is a row that was lost on the line.
-    device_time_s : float
-        Device time of the measurement [s].
-    y : float
-        Measurement [y unit].
-    u : float
-        Output in effect when ``y`` was taken [u unit].
-    """
-
-    count: int
-    device_time_s: float
-    y: float
-    u: float
+#: how far the device's clock may be from the host's: a ceramic resonator and its temperature, and a tick or two [s]
+_CLOCK_ERROR, _CLOCK_SLACK_S = 0.02, 0.003
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,17 +64,29 @@ class SerialLineRig:
         Lowest and highest command; the device lets none beyond through [u unit].
     u_safe : float
         Command that ``make_safe`` and the device's dead-man leave [u unit].
+    clock : Clock, optional
+        Of the host; the monotonic one where absent.
+    port : callable
+        Opens the line.
 
     Notes
     -----
-    Commands are rounded to the output's counts. A sample's time stamp is the middle between request and answer; its
-    measurement is that of the device's last tick, at most one tick older.
+    Commands are rounded to the output's counts. A reading's time stamp is the middle between request and answer, its
+    device time that of the device's tick, exactly.
     """
 
-    def __init__(self, settings: SerialSettings, *, u_range: tuple[float, float], u_safe: float) -> None:
+    def __init__(
+        self,
+        settings: SerialSettings,
+        *,
+        u_range: tuple[float, float],
+        u_safe: float,
+        clock: Clock | None = None,
+        port: Callable[[SerialSettings], Port] = open_port,
+    ) -> None:
         self._settings = settings
-        self._link = SerialLink(settings)
-        self._clock = MonotonicClock()
+        self._clock = clock if clock is not None else MonotonicClock()
+        self._link = SerialLink(settings, self._clock, port)
         self._u_range = u_range
         self._u_safe = u_safe
         # the counts at full scale are the device's to say; until then, whether the range fits
@@ -111,12 +100,13 @@ class SerialLineRig:
         self._tick_s = 1e-3
         self._starts = -1
         self._device_time_s = 0.0
+        self._received_s, self._latency_s = 0.0, 0.0  # of the sample whose device time that is, on the host's clock
         self._is_open = False
         self._is_commanding = False
 
     @property
     def clock(self) -> Clock:
-        """The monotonic clock."""
+        """The host's clock."""
         return self._clock
 
     @property
@@ -128,11 +118,7 @@ class SerialLineRig:
         """Connect and take command; the output stays until the first command."""
         self._connect()
         self._is_open = True
-        counts = [self._u.count(u, "u") for u in (self._u_safe, *self._u_range)]
-        frame, *_ = self._link.ask(Kind.TAKE, counts[0], *sorted(counts[1:]), round(1e3 * self._settings.deadman_s))
-        self._starts = int(frame.values[4])
-        self._device_time_s = 1e-6 * frame.values[0]
-        self._is_commanding = True
+        self._take()
 
     def read(self) -> Reading:
         """Take one sample and feed the dead-man.
@@ -150,7 +136,7 @@ class SerialLineRig:
         self.exchange(u)
 
     def exchange(self, u: float) -> Reading:
-        """Command the actuator [u unit] and return the sample of just before, in one request.
+        """Command the actuator [u unit] and return the sample at which that begins to act, in one request.
 
         Raises
         ------
@@ -200,10 +186,7 @@ class SerialLineRig:
         LinkError
             What is read back differs, or the link broke; says what the device holds, as far as it is known.
         """
-        if controller.kind != "pi" or controller.setpoint_weight != 1.0:
-            raise InputError(
-                "the device holds a PI without set-point weight", where=self._link.where, mend="design with --kind pi"
-            )
+        self._require_pi(controller)
         self._connect()
         old = self._link.ask(Kind.GET_GAINS)[0].values
         try:
@@ -228,71 +211,16 @@ class SerialLineRig:
         self._link.ask(Kind.REGULATE, (setpoint - self._y.low) / self._y.unit, 0, 0, y_low, y_high)
         self._is_commanding = False
 
-    def run_relay(
-        self, settings: RelaySettings, *, time_s: float, y_range: tuple[float, float], ticks_per_row: int = 10
-    ) -> Iterator[DeviceRow]:
-        """Have the device run the relay by itself, and yield its rows until the time is over; then it is safe.
-
-        Parameters
-        ----------
-        settings : RelaySettings
-            Delay in ticks of the device, see :attr:`tick_s`.
-        time_s : float
-            Time after which the device ends it [s].
-        y_range : (float, float)
-            Limits on y; the device goes safe where y passes them [y unit].
-        ticks_per_row : int
-            Ticks from row to row.
-
-        Raises
-        ------
-        LinkError
-            A limit was passed, the device restarted, or no row came.
-        """
-        self._require(self._is_commanding, "the host is not in command", "open the rig again")
-        y, u = self._y, self._u
-        inverted = y.unit * u.unit < 0
-        self._link.forget()
-        frame, *_ = self._link.ask(
-            Kind.RELAY,
-            (settings.y_centre - y.low) / y.unit,
-            (settings.midpoint - u.low) / u.unit,
-            settings.amplitude / abs(u.unit),
-            settings.hysteresis / abs(y.unit),
-            settings.delay_samples,
-            settings.smoothing,
-            -settings.plant_sign if inverted else settings.plant_sign,
-            ticks_per_row,
-            min(round(time_s / self._tick_s), _LONGEST_TICKS),
-            *sorted(y.count(limit, "y") for limit in y_range),
-        )
-        self._is_commanding = False
-        self._unwrapped(frame.values[0])
-        yield from self._rows(max(self._settings.timeout_s, 4 * ticks_per_row * self._tick_s))
-
-    def _rows(self, patience_s: float) -> Iterator[DeviceRow]:
-        feed_s = 0.25 * self._settings.deadman_s
-        fed_s = last_s = time.monotonic()
-        while True:
-            now_s = time.monotonic()
-            if now_s - fed_s >= feed_s:
-                self._link.send(Kind.READ)
-                fed_s = now_s
-            frame = self._link.arrived(min(feed_s, patience_s))
-            if frame is None or frame.kind not in (Kind.ROW, Kind.SAMPLE):
-                self._require(time.monotonic() - last_s < patience_s, "no row came", "check cable and power")
-                continue
-            state = self._state(frame)
-            if state & _COMMAND != Command.RELAY:
-                if state & _TIME:
-                    return
-                raise self._ended(state)
-            if frame.kind == Kind.ROW:
-                last_s = time.monotonic()
-                stamp, y, u, *_ = frame.values
-                yield DeviceRow(
-                    count=frame.sequence, device_time_s=self._unwrapped(stamp), y=self._y.value(y), u=self._u.value(u)
-                )
+    def _take(self) -> None:
+        """Take command; the output stays until the first command."""
+        counts = [self._u.count(u, "u") for u in (self._u_safe, *self._u_range)]
+        deadman_ms = round(1e3 * self._settings.deadman_s)
+        frame, sent_s, _ = self._link.ask(Kind.TAKE, counts[0], *sorted(counts[1:]), deadman_ms)
+        self._starts = int(frame.values[4])
+        self._device_time_s = 1e-6 * frame.values[0]
+        self._received_s = self._clock.now()
+        self._latency_s = self._received_s - sent_s
+        self._is_commanding = True
 
     def _connect(self) -> None:
         """Open the line where it is not; learn the device's counts."""
@@ -316,17 +244,21 @@ class SerialLineRig:
             raise
         end_s = self._clock.now()
         state = self._state(frame)
-        if self._is_commanding and state & _COMMAND != Command.HOST:
+        if self._is_commanding and state & COMMAND != Command.HOST:
             self._is_commanding = False
             raise self._ended(state)
-        stamp, y, u, *_ = frame.values
+        device_time_s = self._steady(frame.values[0], end_s, end_s - sent_s)
+        reading = self._reading(frame, device_time_s, end_s, end_s - sent_s)
+        return replace(reading, latency_s=end_s - start_s, suspect=suspect)
+
+    def _reading(self, frame: Frame, device_time_s: float, received_s: float, latency_s: float) -> Reading:
+        _, y, u, *_ = frame.values
         return Reading(
-            t_s=end_s - 0.5 * (time.perf_counter() - sent_s),
+            t_s=received_s - 0.5 * latency_s,
             y=self._y.value(y),
             u_applied=self._u.value(u),
-            device_time_s=self._unwrapped(stamp),
-            latency_s=end_s - start_s,
-            suspect=suspect,
+            device_time_s=device_time_s,
+            latency_s=latency_s,
         )
 
     def _state(self, frame: Frame) -> int:
@@ -343,9 +275,25 @@ class SerialLineRig:
             mend = "its dead-man ran out: unload the computer or raise rig.deadman_s"
         elif state & _LIMIT:
             why, mend = "y passed its limit on the device", "look for a load on the rig, or widen limits.y_min..y_max"
+        elif state & _TIME:
+            why, mend = "the device's law ended by itself: its time is over", "raise limits.time_s"
         elif state & _OVERRUN:
             why, mend = "the relay decided too often for its delay", "raise smoothing or hysteresis"
         return LinkError(why, where=self._link.where, mend=mend)
+
+    def _steady(self, stamp_us: float, received_s: float, latency_s: float) -> float:
+        """Return the device time [s] of a sample, once it is known to have gone on with the host's."""
+        before_s = self._device_time_s
+        passed_s, host_s = self._unwrapped(stamp_us) - before_s, received_s - self._received_s
+        slack_s = self._latency_s + latency_s + _CLOCK_ERROR * host_s + _CLOCK_SLACK_S
+        if abs(passed_s - host_s) > slack_s:
+            raise LinkError(
+                f"the device's clock went {passed_s:.4g} s while {host_s:.4g} s passed",
+                where=self._link.where,
+                mend="check the device's power and oscillator; its time stamps are not to be relied on",
+            )
+        self._received_s, self._latency_s = received_s, latency_s
+        return self._device_time_s
 
     def _unwrapped(self, stamp_us: float) -> float:
         """Return the device time [s] whose low 32 bits of microseconds are given."""
@@ -356,6 +304,12 @@ class SerialLineRig:
     def _controller(self, frame: Frame) -> PIDController:
         K, Ti_s = frame.values
         return PIDController(K=K * self._u.unit / self._y.unit, Ti_s=Ti_s)
+
+    def _require_pi(self, controller: PIDController) -> None:
+        if controller.kind != "pi" or controller.setpoint_weight != 1.0:
+            raise InputError(
+                "the device holds a PI without set-point weight", where=self._link.where, mend="design with --kind pi"
+            )
 
     def _set_gains(self, K: float, Ti_s: float) -> None:
         held = self._link.ask(Kind.SET_GAINS, K, Ti_s)[0].values

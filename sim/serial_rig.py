@@ -18,7 +18,7 @@ from sim.plant import Plant
 from sim.register_device import RegisterDevice
 from sim.registers import RegisterSpec, to_words
 
-_VERSION = 1
+_VERSION = 2
 _LIVE_S = 0.002
 _SIGNALS = ("u", "heartbeat", "safe", "enable", "automatic", "setpoint", "K", "Ti")
 _WORDS = {name: RegisterSpec(table="holding", address=2 * i, type="float32") for i, name in enumerate(_SIGNALS)}
@@ -64,6 +64,7 @@ class SerialRig:
         self._beat = 0.0
         self._now_s = 0.0  # of the request that is being answered
         self._start_s = time.perf_counter()
+        self._clock_error_s = 0.0
         self._restart = threading.Event()
         self._stop = threading.Event()
         self._line = os.open(port, os.O_RDWR | os.O_NOCTTY)
@@ -85,9 +86,13 @@ class SerialRig:
         """Restart the device, as its reset button does."""
         self._restart.set()
 
+    def jump(self, seconds: float) -> None:
+        """Let the clock that stamps the samples jump [s]; the plant lives on."""
+        self._clock_error_s += seconds
+
     @property
     def now_s(self) -> float:
-        """Device time [s]."""
+        """Time the device has lived [s]."""
         return time.perf_counter() - self._start_s
 
     def _serve(self) -> None:
@@ -122,16 +127,16 @@ class SerialRig:
         if reason:
             return bytes((_VERSION, 0xFF)) + content[2:4] + bytes((kind, reason))
         if kind == 0x01:
-            answer, body = 0x81, struct.pack("<HHHHB", 1, 1000, self._y[2], self._u[2], self.starts)
+            answer, body = 0x81, struct.pack("<HHHHB", 2, 1000, self._y[2], self._u[2], self.starts)
         elif kind in (0x08, 0x09):
             per = self._unit(self._y) / self._unit(self._u)
             value = self.device.value
             answer, body = 0x83, struct.pack("<ff", value["K"] * per, value["Ti"])
         else:
-            answer, body = 0x82, self._sample
             if kind == 0x04:
                 self._put("u", self._value(payload, self._u))
                 self._feed()
+            answer, body = 0x82, self._sample
         return bytes((_VERSION, answer)) + content[2:4] + body
 
     def _obeyed(self, kind: int, payload: bytes) -> int:
@@ -173,7 +178,7 @@ class SerialRig:
         words = self.device.read("input", 0, 2, self._now_s)
         y = float(struct.unpack(">f", struct.pack(">HH", *words))[0])
         state = 1 if self._by_host else 3 if self.device.value["automatic"] == 1.0 else 0
-        time_us = int(1e6 * self._now_s) & 0xFFFFFFFF
+        time_us = int(1e6 * (self._now_s + self._clock_error_s)) & 0xFFFFFFFF
         counts = (self._count(y, self._y), self._count(self.device.output, self._u))
         return struct.pack("<IHHBB", time_us, *counts, state, self.starts & 0xFF)
 

@@ -121,6 +121,10 @@ class SerialSettings(Section):
     ] = 0.5
     y_span: Annotated[tuple[float, float], Field(description="y at count 0 and at full scale [y unit]")]
     u_span: Annotated[tuple[float, float], Field(description="u at count 0 and at full scale [u unit]")]
+    relay: Annotated[
+        Literal["host", "device"],
+        Field(description="who computes the relay and the verified PI: the host, or the device by itself at its tick"),
+    ] = "host"
     twin: TwinSettings | None = None
 
 

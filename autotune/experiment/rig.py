@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 from autotune.controller import PIDController
+from autotune.experiment.relay import RelaySettings
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,6 +93,64 @@ class Exchanges(Rig, Protocol):
 
     def exchange(self, u: float) -> Reading:
         """Command the actuator, in engineering units, and return the sample at which ``u`` begins to act."""
+        ...
+
+
+@dataclass(frozen=True, kw_only=True)
+class Row:
+    """What a device that runs a law by itself says of one sample.
+
+    Attributes
+    ----------
+    reading : Reading
+        The sample; ``u_applied`` acts from its instant on.
+    u_mean : float
+        Mean output since the row before [u unit]: its area is exact, however often the law moved the output.
+    """
+
+    reading: Reading
+    u_mean: float
+
+
+@runtime_checkable
+class RunsLaws(Exchanges, Protocol):
+    """A rig whose device runs relay and PI by itself, in ticks shorter than the host's samples, and streams rows.
+
+    The host's next exchange ends what runs, without a bump. The device ends it at the safe output where y leaves its
+    range, the time is over, or the host falls silent.
+    """
+
+    @property
+    def tick_s(self) -> float:
+        """Period of the device's own loop [s]; known once the rig has been opened."""
+        ...
+
+    @property
+    def smoothing_max(self) -> int:
+        """Readings in the longest average that the device's relay can look at."""
+        ...
+
+    def start_relay(
+        self, settings: RelaySettings, *, row_s: float, time_s: float, y_range: tuple[float, float]
+    ) -> Reading:
+        """Run the relay, its delay in ticks, or change the setting of one that runs; return the last sample before."""
+        ...
+
+    def start_trial(
+        self,
+        controller: PIDController,
+        *,
+        setpoint: float,
+        load: float,
+        row_s: float,
+        time_s: float,
+        y_range: tuple[float, float],
+    ) -> Reading:
+        """Run the PI on gains that are not kept, or change what is asked of it; return the last sample before."""
+        ...
+
+    def row(self) -> Row:
+        """Wait for the next row."""
         ...
 
 

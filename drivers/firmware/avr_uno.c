@@ -2,7 +2,8 @@
  *
  * Timer 1 counts 0 .. 15999 (mode 14): one PWM period is one tick of 1 ms. Its overflow starts the conversion, a few
  * microseconds late where another interrupt is served; the conversion's end starts the law. A new duty acts with the
- * next period, exactly one tick after the measurement it came from: the output does not jitter at all. */
+ * next period, exactly one tick after the measurement it came from and at the instant of the next one: the output does
+ * not jitter at all, and what a sample calls u acts from the sample's own instant on. */
 #include <avr/interrupt.h>
 #include <avr/io.h>
 #include <avr/sleep.h>
@@ -24,7 +25,7 @@ enum { TICKS_PER_S = 1000, TICK_US = 1000, Y_FULL = 1023, U_FULL = 16000, RING =
 static volatile uint8_t ring[RING], ring_in;
 static uint8_t ring_out;
 static volatile uint8_t tick_due;
-static volatile uint16_t measured;
+static volatile uint16_t measured, commanded, acting;
 static volatile uint32_t ticks;
 static device the_device;
 static uint8_t wire[2][FRAME_WIRE_MAX];
@@ -56,6 +57,7 @@ ISR(USART_UDRE_vect)
 ISR(TIMER1_OVF_vect)
 {
     ADCSRA |= _BV(ADSC);
+    acting = commanded; /* the duty was taken over when the period began */
 }
 
 ISR(ADC_vect)
@@ -67,11 +69,15 @@ ISR(ADC_vect)
 
 static void output(uint16_t u)
 {
-    if (u == 0) { /* duty 0 is the pin's own low: the shortest pulse of this mode is one count */
-        TCCR1A &= (uint8_t)~_BV(COM1A1);
-    } else {
-        ATOMIC_BLOCK(ATOMIC_RESTORESTATE) { OCR1A = u - 1; }
-        TCCR1A |= _BV(COM1A1);
+    ATOMIC_BLOCK(ATOMIC_RESTORESTATE)
+    {
+        commanded = u;
+        if (u == 0) { /* duty 0 is the pin's own low: the shortest pulse of this mode is one count */
+            TCCR1A &= (uint8_t)~_BV(COM1A1);
+        } else {
+            OCR1A = u - 1;
+            TCCR1A |= _BV(COM1A1);
+        }
     }
 }
 
@@ -129,14 +135,15 @@ static void start(void)
 static void tick(void)
 {
     uint32_t now;
-    uint16_t y;
+    uint16_t y, u;
     ATOMIC_BLOCK(ATOMIC_RESTORESTATE)
     {
         now = ticks;
         y = measured;
+        u = acting;
         tick_due = 0;
     }
-    output(device_tick(&the_device, now * TICK_US, y));
+    output(device_tick(&the_device, now * TICK_US, y, u));
     wdt_reset();
 }
 
@@ -155,14 +162,15 @@ int main(void)
             if (length != 0) {
                 const uint8_t answer = device_request(&the_device, receiver.piece, length, content);
                 output(device_output(&the_device));
-                send(content, answer);
+                if (answer != 0)
+                    send(content, answer);
             }
             continue;
         }
         if (wire_length[0] == 0 || wire_length[1] == 0) {
-            const uint8_t row = device_row(&the_device, content);
-            if (row != 0)
-                send(content, row);
+            const uint8_t report = device_report(&the_device, content);
+            if (report != 0)
+                send(content, report);
         }
         cli();
         if (!tick_due && ring_out == ring_in) {

@@ -5,14 +5,14 @@
 #include "frame.h"
 
 enum {
-    HELLO = 1, TAKE, READ, EXCHANGE, SAFE, RELAY, REGULATE, GET_GAINS, SET_GAINS,
+    HELLO = 1, TAKE, READ, EXCHANGE, SAFE, RELAY, REGULATE, GET_GAINS, SET_GAINS, TRY,
     INFO = 0x81, SAMPLE, GAINS, ROW, REFUSED = 0xFF
 };
 enum { DONE, UNKNOWN, LENGTH, NOT_IN_COMMAND, RANGE };
-enum { FIRMWARE = 1, COMMAND = 0x03 };
+enum { FIRMWARE = 2 };
 
 /* payload of each request, from HELLO on */
-static const uint8_t SIZE[] = {0, 8, 0, 2, 0, 32, 14, 0, 8};
+static const uint8_t SIZE[] = {0, 8, 0, 2, 0, 32, 14, 0, 8, 26};
 
 static uint16_t get16(const uint8_t *p)
 {
@@ -106,7 +106,7 @@ static void run_law(device *d, uint16_t y)
     } else if (d->is_timed && d->ticks_left-- == 0) {
         go_safe(d, DEVICE_TIME);
     } else if (d->command == DEVICE_REGULATOR) {
-        d->u = nearest(d, pi_step(&d->pi_memory, &d->pi, d->setpoint, y));
+        d->u = nearest(d, pi_step(&d->pi_memory, &d->pi, d->setpoint, y) + d->load);
     } else if (relay_step(&d->relay_memory, &d->relay, y, &u)) {
         d->u = nearest(d, u);
     } else {
@@ -114,12 +114,13 @@ static void run_law(device *d, uint16_t y)
     }
 }
 
-uint16_t device_tick(device *d, uint32_t time_us, uint16_t y)
+uint16_t device_tick(device *d, uint32_t time_us, uint16_t y, uint16_t acting)
 {
     const uint8_t ran = d->command;
+    d->area += d->last.u; /* acted from the tick before until this one */
     d->last.time_us = time_us;
     d->last.y = y;
-    d->last.u = d->u;
+    d->last.u = acting;
     if (d->command != DEVICE_NOBODY && d->is_timed && deadman_tick(&d->alive))
         go_safe(d, DEVICE_DEADMAN);
     if (d->command >= DEVICE_RELAY)
@@ -129,6 +130,7 @@ uint16_t device_tick(device *d, uint32_t time_us, uint16_t y)
         const uint8_t has_ended = d->command == DEVICE_NOBODY;
         if (--d->ticks_to_row == 0 || has_ended) {
             d->row = d->last;
+            d->row_area = d->area;
             d->row_due = 1;
             d->row_count++;
             d->ticks_to_row = d->ticks_per_row;
@@ -139,11 +141,14 @@ uint16_t device_tick(device *d, uint32_t time_us, uint16_t y)
 
 static void take(device *d, uint8_t command)
 {
+    if (d->command != command) {
+        d->row_due = 0;
+        d->row_count = 0;
+        d->area = 0;
+    }
     d->command = command;
     d->flags = 0;
     d->is_timed = 1;
-    d->row_due = 0;
-    d->row_count = 0;
     deadman_feed(&d->alive);
 }
 
@@ -174,15 +179,28 @@ static uint8_t start_relay(device *d, const uint8_t *p)
     const relay_settings s = {
         get_real(p), get_real(p + 4), get_real(p + 8), get_real(p + 12), get_real(p + 16), p[20], (int8_t)p[21],
     };
-    if (d->command != DEVICE_HOST)
+    if (d->command != DEVICE_HOST && d->command != DEVICE_RELAY)
         return NOT_IN_COMMAND;
     if (!relay_accepts(&s) || s.midpoint - s.amplitude < d->u_min || s.midpoint + s.amplitude > d->u_max)
         return RANGE;
     d->relay = s;
-    relay_start(&d->relay_memory);
+    if (d->command == DEVICE_HOST) /* else another setting; decisions on their way keep their arrival */
+        relay_start(&d->relay_memory);
     take(d, DEVICE_RELAY);
     set_run(d, p + 22);
     return DONE;
+}
+
+static uint8_t are_gains(real K, real Ti)
+{
+    return K > (real)-1e30 && K < (real)1e30 && Ti > 0;
+}
+
+static void regulate(device *d, real K, real Ti, real setpoint, real load)
+{
+    d->setpoint = setpoint;
+    d->load = load;
+    d->pi = pi_of(K, Ti, (real)1 / d->setup.ticks_per_s, d->u_min - load, d->u_max - load, (real)1e30);
 }
 
 static uint8_t start_regulator(device *d, const uint8_t *p)
@@ -190,8 +208,7 @@ static uint8_t start_regulator(device *d, const uint8_t *p)
     const real setpoint = get_real(p);
     if (!(setpoint >= 0 && setpoint <= d->setup.y_full))
         return RANGE;
-    d->setpoint = setpoint;
-    d->pi = pi_of(d->K, d->Ti, (real)1 / d->setup.ticks_per_s, d->u_min, d->u_max, (real)1e30);
+    regulate(d, d->K, d->Ti, setpoint, 0);
     pi_start(&d->pi_memory, &d->pi, d->u, setpoint, d->last.y);
     take(d, DEVICE_REGULATOR);
     set_run(d, p + 4);
@@ -199,17 +216,34 @@ static uint8_t start_regulator(device *d, const uint8_t *p)
     return DONE;
 }
 
+/* As start_regulator on gains that are not kept; once it runs, only what is asked of the law changes. */
+static uint8_t start_trial(device *d, const uint8_t *p)
+{
+    const real K = get_real(p), Ti = get_real(p + 4), setpoint = get_real(p + 8), load = get_real(p + 12);
+    if (d->command != DEVICE_HOST && d->command != DEVICE_REGULATOR)
+        return NOT_IN_COMMAND;
+    if (!are_gains(K, Ti) || !(setpoint >= 0 && setpoint <= d->setup.y_full) || !(load > -(real)d->setup.u_full) ||
+        !(load < d->setup.u_full))
+        return RANGE;
+    regulate(d, K, Ti, setpoint, load);
+    if (d->command == DEVICE_HOST)
+        pi_start(&d->pi_memory, &d->pi, d->u - load, setpoint, d->last.y);
+    take(d, DEVICE_REGULATOR);
+    set_run(d, p + 16);
+    return DONE;
+}
+
 static uint8_t set_gains(device *d, const uint8_t *p)
 {
     const real K = get_real(p), Ti = get_real(p + 4);
-    if (!(K > (real)-1e30 && K < (real)1e30 && Ti > 0))
+    if (!are_gains(K, Ti))
         return RANGE;
     d->K = K;
     d->Ti = Ti;
     return DONE;
 }
 
-/* Do what has to be done before the answer; EXCHANGE acts after its sample. */
+/* Do what has to be done before the answer. */
 static uint8_t obey(device *d, uint8_t type, const uint8_t *payload)
 {
     switch (type) {
@@ -221,7 +255,11 @@ static uint8_t obey(device *d, uint8_t type, const uint8_t *payload)
     case EXCHANGE:
         if (d->command != DEVICE_HOST)
             return NOT_IN_COMMAND;
-        return get16(payload) < d->u_min || get16(payload) > d->u_max ? RANGE : DONE;
+        if (get16(payload) < d->u_min || get16(payload) > d->u_max)
+            return RANGE;
+        d->u = get16(payload);
+        deadman_feed(&d->alive);
+        return DONE;
     case SAFE:
         go_safe(d, 0);
         return DONE;
@@ -231,6 +269,8 @@ static uint8_t obey(device *d, uint8_t type, const uint8_t *payload)
         return start_regulator(d, payload);
     case SET_GAINS:
         return set_gains(d, payload);
+    case TRY:
+        return start_trial(d, payload);
     default:
         return DONE;
     }
@@ -243,7 +283,7 @@ uint8_t device_request(device *d, const uint8_t *request, uint8_t length, uint8_
     const uint16_t sequence = get16(request + 2);
     uint8_t reason = DONE;
     uint8_t *p;
-    if (type < HELLO || type > SET_GAINS)
+    if (type < HELLO || type > TRY)
         reason = UNKNOWN;
     else if (length - FRAME_HEAD != SIZE[type - HELLO])
         reason = LENGTH;
@@ -257,15 +297,15 @@ uint8_t device_request(device *d, const uint8_t *request, uint8_t length, uint8_
         p = put16(put16(put_head(answer, INFO, sequence), FIRMWARE), d->setup.ticks_per_s);
         p = put16(put16(p, d->setup.y_full), d->setup.u_full);
         *p++ = d->setup.starts;
-    } else if (type >= GET_GAINS) {
+    } else if (type == GET_GAINS || type == SET_GAINS) {
         p = put_real(put_real(put_head(answer, GAINS, sequence), d->K), d->Ti);
+    } else if (type == EXCHANGE) {
+        d->is_owed = 1;
+        d->owed_to = sequence;
+        p = answer;
     } else {
         d->last.state = state_of(d);
         p = put_sample(d, put_head(answer, SAMPLE, sequence), &d->last);
-        if (type == EXCHANGE) {
-            d->u = get16(payload);
-            deadman_feed(&d->alive);
-        }
     }
     return (uint8_t)(p - answer);
 }
@@ -275,10 +315,14 @@ uint16_t device_output(const device *d)
     return d->u;
 }
 
-uint8_t device_row(device *d, uint8_t *content)
+uint8_t device_report(device *d, uint8_t *content)
 {
+    if (d->is_owed && (d->last.u == d->u || d->command != DEVICE_HOST)) {
+        d->is_owed = 0;
+        return (uint8_t)(put_sample(d, put_head(content, SAMPLE, d->owed_to), &d->last) - content);
+    }
     if (!d->row_due)
         return 0;
     d->row_due = 0;
-    return (uint8_t)(put_sample(d, put_head(content, ROW, d->row_count), &d->row) - content);
+    return (uint8_t)(put32(put_sample(d, put_head(content, ROW, d->row_count), &d->row), d->row_area) - content);
 }

@@ -1,7 +1,7 @@
 /* What the device does with ticks and requests; no register of any processor in here.
  *
- * Once per tick: device_tick. In between: device_request for each frame that came, device_row for what is streamed.
- * All from one thread of control. Measurement and output are counts of the converters. */
+ * Once per tick: device_tick. In between: device_request for each frame that came, device_report for what the device
+ * says by itself. All from one thread of control. Measurement and output are counts of the converters. */
 #ifndef DEVICE_H
 #define DEVICE_H
 
@@ -41,26 +41,31 @@ typedef struct {
     uint32_t ticks_left;
     uint16_t ticks_per_row, ticks_to_row, row_count; /* a row that found no room on the line is counted too */
     uint8_t row_due;
+    uint32_t area, row_area; /* of u since the device's law began, in counts times ticks */
+    uint8_t is_owed;         /* whether an EXCHANGE waits for the tick from which its u acts */
+    uint16_t owed_to;
     device_sample last, row;
     relay_settings relay;
     relay_state relay_memory;
-    real K, Ti, setpoint;
+    real K, Ti, setpoint, load;
     pi_settings pi;
     pi_state pi_memory;
 } device;
 
 void device_start(device *d, const device_setup *setup);
 
-/* Take a tick's measurement; return the output to hold from now on. */
-uint16_t device_tick(device *d, uint32_t time_us, uint16_t y);
+/* Take a tick's measurement and the output that acts from its instant on; return the output to act from the next
+ * tick on. */
+uint16_t device_tick(device *d, uint32_t time_us, uint16_t y, uint16_t acting);
 
-/* Obey a request of `length` bytes (without CRC) and write the answer's content; return its length, 0 for none. The
- * output may have changed: device_output. */
+/* Obey a request of `length` bytes (without CRC) and write the answer's content; return its length, 0 where it comes
+ * later, by device_report. The output may have changed: device_output. */
 uint8_t device_request(device *d, const uint8_t *request, uint8_t length, uint8_t *answer);
 
 uint16_t device_output(const device *d);
 
-/* Write the streamed row's content where one is due; return its length, 0 where none is. */
-uint8_t device_row(device *d, uint8_t *content);
+/* Write the content of an EXCHANGE's answer, then of a streamed row, where one is due; return its length, 0 where none
+ * is. */
+uint8_t device_report(device *d, uint8_t *content);
 
 #endif

@@ -4,7 +4,7 @@
 
 #include <stdint.h>
 
-enum { FRAME_VERSION = 1, FRAME_HEAD = 4, FRAME_CRC = 2, FRAME_CONTENT_MAX = 62, FRAME_WIRE_MAX = 64 };
+enum { FRAME_VERSION = 2, FRAME_HEAD = 4, FRAME_CRC = 2, FRAME_CONTENT_MAX = 62, FRAME_WIRE_MAX = 64 };
 
 typedef struct {
     uint8_t piece[FRAME_CONTENT_MAX + 1]; /* stuffed bytes since the last zero; the content once it is complete */

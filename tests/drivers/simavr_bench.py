@@ -15,10 +15,16 @@ from types import TracebackType
 
 import numpy as np
 
+from autotune.config import Config
+from autotune.config.rig import SerialSettings
+from drivers import twin_of
+from drivers.device_rig import DeviceLawRig
 from drivers.line_protocol import Decoder, Frame, Kind, encode
+from drivers.serial_rig import SerialLineRig
+from sim.ball import Ball
+from sim.plant import make_plant
 
 F_CPU = 16_000_000
-TICK = 16_000  # cycles
 U_FULL = 16_000
 _CALLBACK = ctypes.CFUNCTYPE(ctypes.c_uint32, ctypes.c_uint32)
 
@@ -33,7 +39,8 @@ class Uno:
     folder : Path
         Where the harness is compiled.
     plant : callable
-        Takes the count of the output held over the last millisecond and returns the sensor's voltage in mV, 0..5000.
+        Takes the count of the output over the PWM period that ends, a millisecond, and returns the sensor's voltage in
+        mV, 0..5000.
     """
 
     def __init__(self, elf: Path, folder: Path, plant: Callable[[int], int], *, baud: int = 115200) -> None:
@@ -47,9 +54,10 @@ class Uno:
         self._library.harness_new.restype = ctypes.c_void_p
         self._library.harness_cycle.restype = ctypes.c_uint64
         self._callback = _CALLBACK(plant)  # kept: the library holds no reference
-        self._it = ctypes.c_void_p(self._library.harness_new(str(elf).encode(), TICK, baud, self._callback))
+        self._it = ctypes.c_void_p(self._library.harness_new(str(elf).encode(), baud, self._callback))
         assert self._it
         self._tail = ctypes.c_uint32(0)
+        self._buffer = np.empty(1 << 20, np.uint8)
         self._decoder = Decoder()
         self._sequence = 0
         self.advance(0.01)  # before it has started it hears nothing
@@ -71,11 +79,10 @@ class Uno:
 
     def received(self) -> bytes:
         """Return the bytes that the device sent since the last call."""
-        buffer = np.empty(1 << 20, np.uint8)
         count = self._library.harness_received(
-            self._it, ctypes.byref(self._tail), buffer.ctypes.data_as(ctypes.c_void_p), len(buffer)
+            self._it, ctypes.byref(self._tail), self._buffer.ctypes.data_as(ctypes.c_void_p), len(self._buffer)
         )
-        return buffer[:count].tobytes()
+        return self._buffer[:count].tobytes()
 
     def send(self, data: bytes) -> None:
         """Put bytes on the line."""
@@ -99,6 +106,95 @@ class Uno:
     def reset(self) -> None:
         """Press the reset button."""
         self._library.harness_reset(self._it)
+
+
+class UnoPort:
+    """The Uno's line as a serial port and its time as a clock, both virtual: waiting lets the Uno live.
+
+    Parameters
+    ----------
+    uno : Uno
+        What is at the other end.
+    """
+
+    STEP_S = 1e-4
+
+    def __init__(self, uno: Uno) -> None:
+        self.timeout: float | None = 0.1
+        self._uno = uno
+        self._buffer = bytearray()
+
+    def now(self) -> float:
+        """Return the virtual time [s]."""
+        return self._uno.time_s
+
+    def sleep_until(self, t_s: float) -> None:
+        """Let the Uno live until then [s]."""
+        if t_s > self._uno.time_s:
+            self._uno.advance(t_s - self._uno.time_s)
+
+    @property
+    def in_waiting(self) -> int:
+        """Bytes that have arrived."""
+        self._buffer += self._uno.received()
+        return len(self._buffer)
+
+    def read(self, size: int) -> bytes:
+        """Return up to ``size`` bytes, as soon as there is one."""
+        until_s = self._uno.time_s + (self.timeout or 0.0)
+        while not self.in_waiting and self._uno.time_s < until_s:
+            self._uno.advance(self.STEP_S)
+        data = bytes(self._buffer[:size])
+        del self._buffer[:size]
+        return data
+
+    def write(self, data: bytes) -> None:
+        """Send bytes."""
+        self._uno.send(data)
+
+    def close(self) -> None:
+        """Leave the Uno as it is."""
+
+
+class BallBehind:
+    """A ball behind the converters, and what went through them.
+
+    Parameters
+    ----------
+    ball : Ball
+        Its 0 to 10 V come to the converter through a divider by two.
+    """
+
+    def __init__(self, ball: Ball) -> None:
+        self.ball = ball
+        self.counts: list[int] = []
+        self.u: list[int] = []
+
+    def __call__(self, count: int) -> int:
+        self.ball.advance(10.0 * count / U_FULL, 1e-3)
+        millivolts = round(min(max(self.ball.measure(), 0.0), 10.0) * 500)
+        self.u.append(count)
+        self.counts.append(millivolts * 1023 // 5000)
+        return millivolts
+
+
+def twin_ball(config: Config, start: str | None = None) -> BallBehind:
+    """Return the configuration's ball; its noise is that of the twin."""
+    twin = twin_of(config.rig)
+    made = make_plant("ball", seed=twin.seed, noise=twin.noise, start=start)
+    assert isinstance(made, Ball)
+    return BallBehind(made)
+
+
+def virtual_rig(uno: Uno, config: Config, **changes: object) -> SerialLineRig:
+    """Return the driver on an executed Uno in virtual time; ``changes`` are of the table ``[rig]``."""
+    assert isinstance(config.rig, SerialSettings)
+    settings = config.rig.model_copy(update=changes)
+    port, limits = UnoPort(uno), config.limits
+    kind = DeviceLawRig if settings.relay == "device" else SerialLineRig
+    return kind(
+        settings, u_range=(limits.u_min, limits.u_max), u_safe=limits.u_safe, clock=port, port=lambda _settings: port
+    )
 
 
 class UnoOnLine:
@@ -134,9 +230,6 @@ class UnoOnLine:
                 self._reset.clear()
                 self.uno.reset()
             behind_s = time.perf_counter() - start_s - self.uno.time_s
-            if behind_s > 0.1:  # a busy computer: what was missed is not made up for
-                start_s += behind_s - 0.01
-                behind_s = 0.01
             if behind_s > 0:
                 self.uno.advance(behind_s)
             sent = self.uno.received()

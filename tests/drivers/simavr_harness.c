@@ -12,16 +12,16 @@
 #include <simavr/sim_io.h>
 #include <simavr/sim_irq.h>
 
-enum { ADC_FULL_MV = 5000, LINE = 1 << 20, BITS_PER_BYTE = 10 };
+enum { ADC_FULL_MV = 5000, LINE = 1 << 20, BITS_PER_BYTE = 10, TIMER1_OVF = 13 };
 
-/* Advance the plant by a microtick under the duty count; return the sensor's voltage in mV. */
+/* Advance the plant by one PWM period under the duty count; return the sensor's voltage in mV. */
 typedef uint32_t (*plant_callback)(uint32_t count);
 
 typedef struct {
     avr_t *avr;
     avr_irq_t *adc, *uart_in;
     plant_callback plant;
-    uint32_t period, byte_cycles;
+    uint32_t byte_cycles, held;
     uint8_t to_device[LINE], from_device[LINE];
     uint32_t in_head, in_tail, out_head;
     int is_off;
@@ -39,11 +39,15 @@ static uint32_t duty(const avr_t *avr)
     return avr->data[0x80] & 0x80 ? (uint32_t)(avr->data[0x88] | avr->data[0x89] << 8) + 1 : 0;
 }
 
-static avr_cycle_count_t live(avr_t *avr, avr_cycle_count_t when, void *param)
+/* At BOTTOM, where the processor takes a new duty over: simavr itself would let it act at once. */
+static void on_bottom(avr_irq_t *irq, uint32_t value, void *param)
 {
     harness *h = param;
-    avr_raise_irq(h->adc, h->plant(duty(avr)));
-    return when + h->period;
+    (void)irq;
+    if (value != 0) {
+        avr_raise_irq(h->adc, h->plant(h->held));
+        h->held = duty(h->avr);
+    }
 }
 
 static avr_cycle_count_t deliver(avr_t *avr, avr_cycle_count_t when, void *param)
@@ -76,7 +80,7 @@ static void on_xoff(avr_irq_t *irq, uint32_t value, void *param)
     ((harness *)param)->is_off = 1;
 }
 
-harness *harness_new(const char *elf, uint32_t period, uint32_t baud, plant_callback plant)
+harness *harness_new(const char *elf, uint32_t baud, plant_callback plant)
 {
     elf_firmware_t firmware;
     harness *h = calloc(1, sizeof *h);
@@ -92,7 +96,6 @@ harness *harness_new(const char *elf, uint32_t period, uint32_t baud, plant_call
     h->avr->sleep = no_sleep;
     h->avr->log = LOG_ERROR;
     h->plant = plant;
-    h->period = period;
     h->byte_cycles = h->avr->frequency / baud * BITS_PER_BYTE;
     avr_ioctl(h->avr, AVR_IOCTL_UART_GET_FLAGS('0'), &flags);
     flags &= ~(uint32_t)(AVR_UART_FLAG_STDIO | AVR_UART_FLAG_POLL_SLEEP);
@@ -102,7 +105,7 @@ harness *harness_new(const char *elf, uint32_t period, uint32_t baud, plant_call
     avr_irq_register_notify(avr_io_getirq(h->avr, AVR_IOCTL_UART_GETIRQ('0'), UART_IRQ_OUTPUT), on_byte, h);
     avr_irq_register_notify(avr_io_getirq(h->avr, AVR_IOCTL_UART_GETIRQ('0'), UART_IRQ_OUT_XON), on_xon, h);
     avr_irq_register_notify(avr_io_getirq(h->avr, AVR_IOCTL_UART_GETIRQ('0'), UART_IRQ_OUT_XOFF), on_xoff, h);
-    avr_cycle_timer_register(h->avr, h->period, live, h);
+    avr_irq_register_notify(avr_get_interrupt_irq(h->avr, TIMER1_OVF) + AVR_INT_IRQ_PENDING, on_bottom, h);
     avr_cycle_timer_register(h->avr, h->byte_cycles, deliver, h);
     return h;
 }
@@ -146,6 +149,6 @@ uint32_t harness_received(const harness *h, uint32_t *tail, uint8_t *data, uint3
 void harness_reset(harness *h)
 {
     avr_reset(h->avr);
-    avr_cycle_timer_register(h->avr, h->period, live, h);
+    h->held = 0;
     avr_cycle_timer_register(h->avr, h->byte_cycles, deliver, h);
 }

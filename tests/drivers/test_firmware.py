@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from pathlib import Path
 
 import numpy as np
@@ -9,32 +10,20 @@ import pytest
 
 from autotune.errors import LinkError
 from autotune.experiment.relay import RelaySettings
+from drivers.device_rig import DeviceLawRig
 from drivers.line_protocol import Kind
-from drivers.serial_rig import SerialLineRig
 from sim.ball import Ball, BallSettings
 from tests.drivers.bench import U_RANGE, firmware_bench
 from tests.drivers.firmware_build import build_uno
 from tests.drivers.laws import relay_outputs
-from tests.drivers.simavr_bench import U_FULL, Uno
+from tests.drivers.simavr_bench import U_FULL, BallBehind, Uno
 
 pytestmark = pytest.mark.system("gcc", "gcc-avr", "avr-libc", "libsimavr-dev", "libelf-dev")
 HOVER = 8000
 
 
-class BallBehind:
-    """The ball behind the converters, and what went through them."""
-
-    def __init__(self, noise: float = 0.1) -> None:
-        self.ball = Ball(BallSettings(hover=5.0, noise=noise, bits=None, start=5.0), seed=3)
-        self.counts: list[int] = []
-        self.u: list[int] = []
-
-    def __call__(self, count: int) -> int:
-        self.ball.advance(10.0 * count / U_FULL, 1e-3)
-        millivolts = round(min(max(self.ball.measure(), 0.0), 10.0) * 500)
-        self.u.append(count)
-        self.counts.append(millivolts * 1023 // 5000)
-        return millivolts
+def noisy_ball(noise: float = 0.1) -> BallBehind:
+    return BallBehind(Ball(BallSettings(hover=5.0, noise=noise, bits=None, start=5.0), seed=3))
 
 
 def test_the_hex_is_the_same_bytes_every_time(tmp_path: Path) -> None:
@@ -51,7 +40,7 @@ def test_counts_come_in_and_go_out_exactly(uno_elf: Path) -> None:
         return 1234
 
     uno = Uno(uno_elf, uno_elf.parent, plant)
-    assert uno.ask(Kind.HELLO).values == (1, 1000, 1023, U_FULL, 1)
+    assert uno.ask(Kind.HELLO).values == (2, 1000, 1023, U_FULL, 1)
     uno.ask(Kind.TAKE, 0, 0, U_FULL, 500)
     for u in (0, 1, 2, 7999, U_FULL - 1, U_FULL):
         uno.ask(Kind.EXCHANGE, u)
@@ -69,7 +58,7 @@ def test_ticks_are_a_millisecond_by_the_processors_clock(uno_elf: Path) -> None:
 
 
 def test_a_silent_host_leaves_the_safe_output_within_the_dead_man_time(uno_elf: Path) -> None:
-    ball = BallBehind()
+    ball = noisy_ball()
     uno = Uno(uno_elf, uno_elf.parent, ball)
     uno.ask(Kind.TAKE, 123, 0, U_FULL, 300)
     uno.ask(Kind.EXCHANGE, HOVER)
@@ -95,7 +84,7 @@ def test_a_reset_is_safe_and_is_told(uno_elf: Path) -> None:
 
 @pytest.mark.parametrize(("smoothing", "delay"), [(1, 0.0), (4, 25.0), (16, 60.5)])
 def test_every_switching_instant_on_the_device_is_the_ideal_laws(uno_elf: Path, smoothing: int, delay: float) -> None:
-    ball = BallBehind()
+    ball = noisy_ball()
     uno = Uno(uno_elf, uno_elf.parent, ball)
     uno.ask(Kind.TAKE, 0, 0, U_FULL, 60_000)
     uno.ask(Kind.EXCHANGE, HOVER)
@@ -115,9 +104,9 @@ def test_every_switching_instant_on_the_device_is_the_ideal_laws(uno_elf: Path, 
     assert [frame.kind for frame in frames] == [Kind.ROW] * len(frames)
     assert np.all(np.diff([frame.sequence for frame in frames]) == 1)
     assert len(frames) == pytest.approx(4000, abs=2)
-    # the processor's tick n sees what the plant gave in its millisecond n, and its output is seen in the next
-    wanted = np.round(relay_outputs(settings, np.array(ball.counts[first:-1], float)))
-    held = np.array(ball.u[first + 1 :])
+    # the tick after sees the plant's count `first`; its output acts over the period after that
+    wanted = np.round(relay_outputs(settings, np.array(ball.counts[first:-2], float)))
+    held = np.array(ball.u[first + 2 :])
     assert np.ptp(wanted) == 2000.0
     instants, ideal = np.flatnonzero(np.diff(held)), np.flatnonzero(np.diff(wanted))
     assert len(ideal) >= 20
@@ -126,7 +115,7 @@ def test_every_switching_instant_on_the_device_is_the_ideal_laws(uno_elf: Path, 
 
 
 def test_the_devices_pi_holds_the_ball(uno_elf: Path) -> None:
-    ball = BallBehind(noise=0.02)
+    ball = noisy_ball(noise=0.02)
     uno = Uno(uno_elf, uno_elf.parent, ball)
     uno.ask(Kind.TAKE, 0, 0, U_FULL, 500)
     uno.ask(Kind.EXCHANGE, HOVER)
@@ -141,20 +130,25 @@ def test_the_devices_pi_holds_the_ball(uno_elf: Path) -> None:
 
 
 def test_the_relay_on_the_device_is_run_through_the_driver(uno_elf: Path) -> None:
-    with firmware_bench(uno_elf, deadman_s=5.0) as bench:
+    with firmware_bench(uno_elf, relay="device") as bench:
         rig = bench.rig
-        assert isinstance(rig, SerialLineRig)
+        assert isinstance(rig, DeviceLawRig)
         rig.open()
         assert rig.tick_s == 1e-3
-        y = rig.read().y
+        y = rig.exchange(0.0).y
         settings = RelaySettings(y_centre=y, midpoint=0.0, amplitude=0.5, hysteresis=0.02, delay_samples=40.0)
-        rows = list(rig.run_relay(settings, time_s=1.0, y_range=U_RANGE, ticks_per_row=5))
-        assert [row.count for row in rows] == list(range(1, len(rows) + 1))
-        assert np.diff([row.device_time_s for row in rows]) == pytest.approx(0.005)
-        assert len(rows) == 200
-        assert {row.u for row in rows[1:]} <= {-0.5, 0.5}
-        with pytest.raises(LinkError, match="not in command"):
-            rig.write(0.0)
+        began = rig.start_relay(settings, row_s=0.005, time_s=1.0, y_range=U_RANGE)
+        rows = [rig.row() for _ in range(100)]
+        stamps = [began.device_time_s, *(row.reading.device_time_s for row in rows)]
+        assert np.diff(stamps) == pytest.approx(0.005)
+        assert {row.reading.u_applied for row in rows[1:]} <= {-0.5, 0.5}
+        assert all(-0.5 <= row.u_mean <= 0.5 for row in rows)
+        sample = rig.exchange(0.25)  # the host takes it back
+        assert sample.u_applied == pytest.approx(0.25)
+        assert bench.output() == pytest.approx(0.25)
+        rig.start_relay(settings, row_s=0.005, time_s=0.2, y_range=U_RANGE)
+        with pytest.raises(LinkError, match="its time is over"):
+            deque(iter(rig.row, None), maxlen=0)
         assert bench.output() == pytest.approx(-0.5)  # safe
 
 

@@ -100,6 +100,7 @@ class Device:
         self._library = firmware.library
         self._it = ctypes.c_void_p(self._library.device_new())
         self._ticks = 0
+        self._y = 500
         self._sequence = 0
 
     def ask(self, kind: Kind, *values: float) -> Frame:
@@ -112,20 +113,27 @@ class Device:
             length = self._library.frame_receive(receiver, byte)
         assert length == 4 + PAYLOAD[kind].size
         size = self._library.device_request(self._it, receiver, length, answer)
-        size = self._library.frame_close(answer, size, wire)
-        (frame,) = Decoder().feed(wire.raw[:size])
+        if size == 0:  # an EXCHANGE is answered with the tick from which its output acts
+            self.tick(self._y)
+            frame = self.report()
+            assert frame is not None
+        else:
+            size = self._library.frame_close(answer, size, wire)
+            (frame,) = Decoder().feed(wire.raw[:size])
         assert frame.sequence == self._sequence
         return frame
 
     def tick(self, y: int) -> int:
         """Let a tick pass; return the output."""
         self._ticks += 1
-        return int(self._library.device_tick(self._it, 1000 * self._ticks, y))
+        self._y = y
+        acting = self._library.device_output(self._it)
+        return int(self._library.device_tick(self._it, 1000 * self._ticks, y, acting))
 
-    def row(self) -> Frame | None:
-        """Return the row that is due."""
+    def report(self) -> Frame | None:
+        """Return the answer or the row that is due."""
         content, wire = ctypes.create_string_buffer(62), ctypes.create_string_buffer(64)
-        size = self._library.device_row(self._it, content)
+        size = self._library.device_report(self._it, content)
         if size == 0:
             return None
         size = self._library.frame_close(content, size, wire)
@@ -147,7 +155,7 @@ def test_nobody_commands_until_a_host_takes_it(device: Device) -> None:
     assert device.ask(Kind.TAKE, 40, 1000, 15000, 300).kind == Kind.SAMPLE
     assert device.tick(501) == 0  # the output stays until the first command
     sample = device.ask(Kind.EXCHANGE, 1000)
-    assert sample.values == (2000, 501, 0, 1, 1)  # taken before the command acts
+    assert sample.values == (3000, 501, 1000, 1, 1)  # the tick from which the command acts
     assert device.tick(502) == 1000
     assert device.ask(Kind.READ).values[2] == 1000
 
@@ -166,8 +174,8 @@ def test_silence_ends_at_the_safe_output_and_stays_there(device: Device) -> None
     device.ask(Kind.TAKE, 40, 1000, 15000, 300)
     device.ask(Kind.EXCHANGE, 2000)
     outputs = [device.tick(500) for _ in range(400)]
-    assert outputs[:300] == [2000] * 300
-    assert outputs[300:] == [40] * 100
+    assert outputs[:299] == [2000] * 299  # one more has passed with the answer
+    assert outputs[299:] == [40] * 101
     device.ask(Kind.READ)
     assert device.tick(500) == 40
     assert int(device.ask(Kind.READ).values[3]) == 4  # nobody commands, the dead-man ran out
@@ -184,13 +192,15 @@ def test_the_relay_on_the_device_is_the_law_and_ends_by_itself(device: Device) -
     rows, outputs = [], []
     for value in y:
         outputs.append(device.tick(int(value)))
-        row = device.row()
+        row = device.report()
         rows += [row] if row else []
     np.testing.assert_array_equal(outputs[:1000], wanted)
     assert outputs[1000:] == [40] * 100
     assert [row.sequence for row in rows] == list(range(1, 102))
-    # the output in effect when y was taken is the one that was set a tick before
-    assert [row.values[2] for row in rows[:100]] == [outputs[k - 1] for k in range(9, 1000, 10)]
+    # what acts from y's instant on is the output that was set a tick before
+    acting = [0, *outputs]
+    assert [row.values[2] for row in rows[:100]] == acting[9:1000:10]
+    assert [row.values[5] for row in rows[:100]] == [sum(acting[: k + 1]) for k in range(9 - 1, 999, 10)]
     assert [row.values[1] for row in rows[:100]] == list(y[9:1000:10])
     assert int(rows[-1].values[3]) == 0x10  # the time is over
 
@@ -200,7 +210,7 @@ def test_a_limit_passed_on_the_device_is_the_safe_output_in_the_same_tick(device
     device.ask(Kind.RELAY, *RELAY)
     assert device.tick(600) in (7500, 8500)
     assert device.tick(901) == 40
-    row = device.row()
+    row = device.report()
     assert row is not None
     assert int(row.values[3]) == 0x08
 

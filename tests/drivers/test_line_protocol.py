@@ -51,10 +51,10 @@ def test_stuffing_agrees_with_the_published_table(content: str, stuffed: str) ->
 
 def test_the_check_is_crc_16_ccitt_false() -> None:
     assert binascii.crc_hqx(b"123456789", 0xFFFF) == 0x29B1  # the catalogue's check value
-    # version 1, READ, sequence 1; its CRC low byte first
+    # version 2, READ, sequence 1; its CRC low byte first
     assert (
         encode(Frame(kind=Kind.READ, sequence=1)).hex()
-        == "04010301" + "03" + struct.pack("<H", binascii.crc_hqx(bytes.fromhex("01030100"), 0xFFFF)).hex() + "00"
+        == "04020301" + "03" + struct.pack("<H", binascii.crc_hqx(bytes.fromhex("02030100"), 0xFFFF)).hex() + "00"
     )
 
 
