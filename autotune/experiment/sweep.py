@@ -195,8 +195,9 @@ def _measure(oscillation: Oscillation, choice: Choice, wanted: int, until_s: flo
         at_extremum = turning <= since_switch <= turning + 0.15 * period
         if tick.k < start + periods * period + 1 or not at_extremum:
             continue
-        start_s = float(loop.history(start)[0][0])
-        return WholePeriods(start_s=start_s, end_s=start_s + periods * period * step_s, periods=periods)
+        t = loop.history(start)[0]
+        row_s = (t[-1] - t[0]) / (t.size - 1)  # on the clock of the stamps, which may be the device's
+        return WholePeriods(start_s=float(t[0]), end_s=float(t[0] + periods * period * row_s), periods=periods)
 
 
 def _rebalanced(oscillation: Oscillation, edges: list[int]) -> bool:
