@@ -15,6 +15,7 @@ from scipy.stats import chi2
 from autotune.arrays import ComplexArray, FloatArray
 from autotune.errors import IdentificationError
 from autotune.identification.closed_loop.prediction_error import PredictionErrorEstimate
+from autotune.identification.closed_loop.predictor_directions import Predictor
 from autotune.identification.closed_loop.predictor_sweep import innovations
 from autotune.points import FrequencyPoint
 
@@ -187,11 +188,10 @@ class Whiteness:
 def residuals(estimate: PredictionErrorEstimate, u: FloatArray, y: FloatArray) -> FloatArray:
     """Return the one-step prediction errors of the polished model on the data it came from, shape (rows, n_y)."""
     model = estimate.model
-    F = np.hstack([model.A, model.B, model.K, estimate.offset_x[:, None]])
-    H = np.hstack([model.C, model.D, estimate.offset_y[:, None]])
+    predictor = Predictor.of(model, estimate.offset_x, estimate.offset_y, estimate.initial_state)
     delay = model.input_delay
     past = np.ascontiguousarray(u[: len(u) - delay])
-    errors: FloatArray = innovations(F, H, estimate.initial_state, past, np.ascontiguousarray(y[delay:]))
+    errors: FloatArray = innovations(predictor.F, predictor.H, predictor.x0, past, np.ascontiguousarray(y[delay:]))
     return errors
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.linalg import qr
 
 from autotune.arrays import FloatArray
 from autotune.errors import IdentificationError
@@ -24,7 +25,7 @@ _RANK = 1e-11
 
 def triangle(rows: FloatArray) -> FloatArray:
     """Return the upper triangular factor of the QR decomposition."""
-    return np.asarray(np.linalg.qr(rows, mode="r"), dtype=np.float64)
+    return np.asarray(qr(rows, mode="raw", check_finite=False)[1], dtype=np.float64)
 
 
 def least_squares(regressors: FloatArray, targets: FloatArray) -> FloatArray:
@@ -47,8 +48,14 @@ def lagged_rows(signals: Sequence[tuple[FloatArray, Sequence[int]]], start: int,
     (stop - start, columns) array
         For each signal, for each offset, its channels.
     """
-    columns = [signal[start + k : stop + k] for signal, offsets in signals for k in offsets]
-    return np.hstack(columns)
+    width = sum(signal.shape[1] * len(offsets) for signal, offsets in signals)
+    rows = np.empty((stop - start, width), order="F")
+    at = 0
+    for signal, offsets in signals:
+        for k in offsets:
+            rows[:, at : at + signal.shape[1]] = signal[start + k : stop + k]
+            at += signal.shape[1]
+    return rows
 
 
 def lagged_range(signals: Sequence[tuple[FloatArray, Sequence[int]]]) -> tuple[int, int]:
@@ -89,5 +96,5 @@ def lagged_factor(signals: Sequence[tuple[FloatArray, Sequence[int]]]) -> tuple[
     step = max(BLOCK_ROWS, 4 * width)
     for at in range(start, end, step):
         block = lagged_rows(signals, at, min(at + step, end))
-        R = triangle(np.vstack([R, block]))
+        R = triangle(np.vstack([R, block]) if len(R) else block)
     return R, end - start

@@ -7,22 +7,29 @@ free: with a controller of high gain at low frequency, residuals wrongly set to 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from autotune.arrays import FloatArray
 from autotune.errors import IdentificationError
-from autotune.identification.closed_loop.predictor_directions import Predictor, behaviour_directions
-from autotune.identification.closed_loop.predictor_sweep import innovations, normal_equations, scatter
+from autotune.identification.closed_loop.predictor_directions import (
+    Predictor,
+    behaviour_directions,
+)
+from autotune.identification.closed_loop.predictor_sweep import normal_equations, scatter
 from autotune.identification.closed_loop.state_space import InnovationModel, balancing, spectral_radius
 
 #: A step that promises less than this in -2 log likelihood moves no parameter by 3 % of its standard deviation.
 _TOLERANCE = 1e-3
-#: Rows that initial state and constant of the start are fitted on.
+#: Rows that the initial state of the start is fitted on.
 _LINEAR_ROWS = 2000
 #: A search that cannot move any more has converged if it could have gained less than this.
 _IMMATERIAL = 0.1
+#: Means above this share of the motion are an operating point, about which everything is computed: far from it, the
+#: constant and the dynamics hang together.
+_OPERATING_POINT = 0.2
 #: Zeros of the noise model nearer to the unit circle than this have no finite memory worth the name.
 _RADIUS_LIMIT = 0.9999
 #: Smaller innovations, relative to the output, are rounding.
@@ -111,7 +118,8 @@ def prediction_error(
     feedthrough : bool
         Estimate D; otherwise D is zero (y is measured before its row's u acts).
     offset : bool
-        Estimate a constant, so that means and an integrator's bias need not be known.
+        Estimate a constant where the data ask for one (a gain in -2 log likelihood above log N), so that means and an
+        integrator's bias need not be known; a constant that is not there costs precision at low frequency.
     max_iterations : int
         Accepted steps after which the search ends unconverged.
 
@@ -132,36 +140,35 @@ def prediction_error(
     u_past, y_now = np.ascontiguousarray(u[: len(u) - delay]), np.ascontiguousarray(y[delay:])
     if start.predictor_radius >= 1.0:
         raise IdentificationError("the start's predictor is not stable", where="prediction error")
-    predictor = _initial_predictor(start, u_past, y_now, feedthrough=feedthrough, offset=offset)
+    u_level, y_level = (_level(signal) if offset else np.zeros(signal.shape[1]) for signal in (u_past, y_now))
+    u_past, y_now = u_past - u_level, y_now - y_level
+    predictor = _initial_predictor(start, feedthrough=feedthrough, n_y=y.shape[1])
+    predictor = _with_initial_state(predictor, u_past, y_now)
     search = _search(predictor, u_past, y_now, feedthrough=feedthrough, offset=offset, max_iterations=max_iterations)
-    return _estimate(start, search, y_now)
+    return _estimate(start, search, y_now, u_level, y_level)
 
 
-def _initial_predictor(
-    start: InnovationModel, u: FloatArray, y: FloatArray, *, feedthrough: bool, offset: bool
-) -> Predictor:
-    n, n_y = start.order, y.shape[1]
-    D = start.D if feedthrough else np.zeros_like(start.D)
-    F = np.hstack([start.A, start.B, start.K, np.zeros((n, 1))])
-    predictor = Predictor(F=F, H=np.hstack([start.C, D, np.zeros((n_y, 1))]), x0=np.zeros(n))
-    return _with_linear_part(predictor, u, y, offset=offset)
+def _level(signal: FloatArray) -> FloatArray:
+    """Return the operating point (channels,) that a signal moves about, zero where it moves about zero."""
+    mean = signal.mean(axis=0)
+    return np.where(np.abs(mean) > _OPERATING_POINT * signal.std(axis=0), mean, 0.0)
 
 
-def _with_linear_part(predictor: Predictor, u: FloatArray, y: FloatArray, *, offset: bool) -> Predictor:
-    """Return the predictor with initial state and output constant fitted: the errors are linear in these."""
-    n, n_u, n_y = predictor.sizes
-    rows = min(len(y), _LINEAR_ROWS)
-    F, H = predictor.F.copy(), predictor.H.copy()
-    F[:, -1] = H[:, -1] = 0.0
-    none, no_u, no_y = np.zeros(n), np.zeros((rows, n_u)), np.zeros((rows, n_y))
-    columns = [innovations(F, H, unit, no_u, no_y).ravel() for unit in np.eye(n)]
-    for unit in np.eye(n_y) if offset else ():  # a constant y_0 acts as its negative, measured, does
-        columns.append(innovations(F, H, none, no_u, no_y + unit).ravel())
-    base = innovations(F, H, none, u[:rows], y[:rows]).ravel()
-    solution = np.linalg.lstsq(np.stack(columns, axis=1), -base, rcond=1e-10)[0]
-    if offset:
-        H[:, -1] = -solution[n:]
-    return Predictor(F=F, H=H, x0=solution[:n])
+def _initial_predictor(start: InnovationModel, *, feedthrough: bool, n_y: int) -> Predictor:
+    n = start.order
+    model = start if feedthrough else replace(start, D=np.zeros_like(start.D))
+    return Predictor.of(model, np.zeros(n), np.zeros(n_y), np.zeros(n))
+
+
+def _with_initial_state(predictor: Predictor, u: FloatArray, y: FloatArray) -> Predictor:
+    """Return the predictor with its initial state fitted: the errors are linear in it."""
+    n = len(predictor.x0)
+    u, y = u[:_LINEAR_ROWS], y[:_LINEAR_ROWS]
+    entries = predictor.packed().size
+    directions = np.eye(entries, n, n - entries)
+    errors = scatter(predictor.F, predictor.H, predictor.x0, u, y)
+    total = _normal_equations(predictor, directions, u, y, errors)
+    return predictor.moved(_step(total[:-1, :-1], total[:-1, -1], 0.0)[0], directions)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -173,50 +180,48 @@ class _Search:
     iterations: int
     converged: bool
 
+    def noise_free(self, y: FloatArray) -> bool:
+        """Return whether the innovations are rounding."""
+        return bool(np.all(np.diag(self.scatter) <= len(y) * (_ROUNDING * np.std(y, axis=0)) ** 2))
+
 
 def _search(
     predictor: Predictor, u: FloatArray, y: FloatArray, *, feedthrough: bool, offset: bool, max_iterations: int
 ) -> _Search:
-    damping, iterations, converged = 0.0, 0, False
+    """Search from a predictor, without a constant until that has converged and the score test asks for one."""
+    damping, iterations, converged, constant = 0.0, 0, False, False
     errors = scatter(predictor.F, predictor.H, predictor.x0, u, y)
     floor = len(y) * (_NOISE_FREE * np.std(y, axis=0)) ** 2
+    n_y = y.shape[1]
     while True:
-        if iterations in (0, 2) or iterations % 5 == 4:
+        if iterations % 5 == 0:
             predictor = _balanced(predictor)
         directions = behaviour_directions(predictor, feedthrough=feedthrough, offset=offset)
-        if len(y) * y.shape[1] <= directions.shape[1]:
+        if len(y) * n_y <= directions.shape[1]:
             raise IdentificationError(
                 f"the record is too short: {len(y)} rows for {directions.shape[1]} parameters",
                 mend="record longer, or ask for a lower order",
             )
         total = _normal_equations(predictor, directions, u, y, errors)
-        information, gradient = total[:-1, :-1], total[:-1, -1]
+        used = directions.shape[1] - (n_y if offset and not constant else 0)
+        information, gradient = total[:used, :used], total[:used, -1]
         converged = bool(np.all(np.diag(errors) <= floor))
         if converged or iterations == max_iterations:
             break
-        accepted = False
-        while not accepted:
-            step, promise, damping = _step(information, gradient, damping)
-            trial = predictor.moved(step, directions)
-            if _radius(trial) > _RADIUS_LIMIT:
-                step = _onto_boundary(predictor, directions, information, step)
-                promise = -float(step @ (2.0 * gradient + information @ step))
-                trial = predictor.moved(step, directions)
-            if promise < _TOLERANCE:
-                converged = True
-                break
-            trial_errors = _stable_scatter(trial, u, y)
-            accepted = _log_det(trial_errors) < _log_det(errors)
-            damping = damping / 10.0 if accepted else 10.0 * damping
-            if damping > 1e3:  # no step helps: the promise is below what rounding or the boundary lets through
-                converged = promise < _IMMATERIAL
-                break
-        if not accepted:
+        ahead = _improved(predictor, directions[:, :used], information, gradient, errors, u, y, damping)
+        damping, converged = ahead.damping, ahead.converged
+        if ahead.predictor is not None:
+            predictor, errors, iterations = ahead.predictor, ahead.errors, iterations + 1
+            continue
+        if constant or not offset:
             break
-        predictor, errors, iterations = trial, trial_errors, iterations + 1
+        gain = _step(total[:-1, :-1], total[:-1, -1], 0.0)[1] - ahead.promise
+        if gain < n_y * math.log(len(y)):  # what the Bayesian criterion asks of n_y parameters
+            break
+        constant, damping = True, 0.0
     return _Search(
         predictor=predictor,
-        directions=directions,
+        directions=directions[:, :used],
         information=information,
         scatter=errors,
         iterations=iterations,
@@ -224,36 +229,70 @@ def _search(
     )
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Ahead:
+    """Where one step leads: a better predictor, or None with the decrease of -2 log likelihood that was promised."""
+
+    predictor: Predictor | None
+    errors: FloatArray
+    promise: float
+    damping: float
+    converged: bool
+
+
+def _improved(
+    predictor: Predictor,
+    directions: FloatArray,
+    information: FloatArray,
+    gradient: FloatArray,
+    errors: FloatArray,
+    u: FloatArray,
+    y: FloatArray,
+    damping: float,
+) -> _Ahead:
+    """Return the outcome of one Levenberg-Marquardt step, the damping raised until the step helps."""
+    while True:
+        step, promise, damping = _step(information, gradient, damping)
+        trial = predictor.moved(step, directions)
+        radius = _radius(trial)
+        if radius > _RADIUS_LIMIT:
+            step = _onto_boundary(predictor, directions, information, step)
+            promise = -float(step @ (2.0 * gradient + information @ step))
+            trial = predictor.moved(step, directions)
+            radius = _radius(trial)
+        if promise < _TOLERANCE:
+            return _Ahead(predictor=None, errors=errors, promise=promise, damping=damping, converged=True)
+        if radius <= _RADIUS_LIMIT:
+            trial_errors = scatter(trial.F, trial.H, trial.x0, u, y)
+            if _log_det(trial_errors) < _log_det(errors):
+                return _Ahead(
+                    predictor=trial, errors=trial_errors, promise=promise, damping=damping / 10.0, converged=False
+                )
+        damping *= 10.0
+        if damping > 1e3:  # no step helps: the promise is below what rounding or the boundary lets through
+            converged = promise < _IMMATERIAL
+            return _Ahead(predictor=None, errors=errors, promise=promise, damping=damping, converged=converged)
+
+
 def _balanced(predictor: Predictor) -> Predictor:
     """Return the predictor in balanced coordinates, in which no direction is badly scaled."""
-    n, n_u, n_y = predictor.sizes
-    F, H = predictor.F, predictor.H
-    A, B, K, C, D = F[:, :n], F[:, n : n + n_u], F[:, n + n_u : n + n_u + n_y], H[:, :n], H[:, n : n + n_u]
-    T = balancing(InnovationModel(A=A, B=B, C=C, D=D, K=K, innovation_covariance=np.eye(n_y)))
+    n = len(predictor.x0)
+    A, B, K, C, _ = predictor.matrices
+    T = balancing(A, np.hstack([B, K]), C)
     inverse = np.linalg.inv(T)
-    moved = T @ F
-    moved[:, :n] = moved[:, :n] @ inverse
-    return Predictor(F=moved, H=np.hstack([C @ inverse, H[:, n:]]), x0=T @ predictor.x0)
+    F, H = T @ predictor.F, predictor.H.copy()
+    F[:, :n] = F[:, :n] @ inverse
+    H[:, :n] = C @ inverse
+    return Predictor(F=F, H=H, x0=T @ predictor.x0)
 
 
 def _normal_equations(
     predictor: Predictor, directions: FloatArray, u: FloatArray, y: FloatArray, errors: FloatArray
 ) -> FloatArray:
-    P = directions.shape[1]
-    at = np.cumsum([predictor.F.size, predictor.H.size])
-    dF, dH, dx0 = np.split(directions, at)
     covariance = errors / len(y) + np.finfo(np.float64).tiny * np.eye(len(errors))
     whitening = np.linalg.inv(np.linalg.cholesky(covariance))
     total: FloatArray = normal_equations(
-        predictor.F,
-        predictor.H,
-        predictor.x0,
-        u,
-        y,
-        np.ascontiguousarray(dF).reshape(*predictor.F.shape, P),
-        np.ascontiguousarray(dH).reshape(*predictor.H.shape, P),
-        np.ascontiguousarray(dx0),
-        whitening,
+        predictor.F, predictor.H, predictor.x0, u, y, np.ascontiguousarray(directions), whitening
     )
     return total
 
@@ -276,23 +315,17 @@ def _step(information: FloatArray, gradient: FloatArray, damping: float) -> tupl
 
 
 def _radius(predictor: Predictor) -> float:
-    n, n_u, n_y = predictor.sizes
     if not np.all(np.isfinite(predictor.F)):
         return float("inf")
-    return spectral_radius(predictor.F[:, :n] - predictor.F[:, n + n_u : n + n_u + n_y] @ predictor.H[:, :n])
+    return spectral_radius(predictor.F[:, : len(predictor.x0)])
 
 
 def _radius_gradient(predictor: Predictor, directions: FloatArray) -> FloatArray:
     """Return the derivative of the predictor's spectral radius along the directions."""
-    n, n_u, n_y = predictor.sizes
-    K, C = predictor.F[:, n + n_u : n + n_u + n_y], predictor.H[:, :n]
-    values, vectors = np.linalg.eig(predictor.F[:, :n] - K @ C)
+    n = len(predictor.x0)
+    values, vectors = np.linalg.eig(predictor.F[:, :n])
     at = int(np.argmax(np.abs(values)))
-    dF, dH, _ = np.split(directions, np.cumsum([predictor.F.size, predictor.H.size]))
-    dF, dH = dF.reshape(*predictor.F.shape, -1), dH.reshape(*predictor.H.shape, -1)
-    change = (
-        dF[:, :n] - np.einsum("iop,ok->ikp", dF[:, n + n_u : n + n_u + n_y], C) - np.einsum("io,okp->ikp", K, dH[:, :n])
-    )
+    change = directions[: predictor.F.size].reshape(*predictor.F.shape, -1)[:, :n]
     left = np.linalg.inv(vectors)[at]
     moved = np.einsum("i,ikp,k->p", left, change, vectors[:, at])
     return np.asarray(np.real(np.conj(values[at]) / abs(values[at]) * moved), dtype=np.float64)
@@ -316,51 +349,48 @@ def _onto_boundary(
     return step
 
 
-def _stable_scatter(trial: Predictor, u: FloatArray, y: FloatArray) -> FloatArray:
-    n_y = trial.sizes[2]
-    if _radius(trial) > _RADIUS_LIMIT:
-        return np.full((n_y, n_y), np.inf)
-    result: FloatArray = scatter(trial.F, trial.H, trial.x0, u, y)
-    return result
-
-
 def _log_det(errors: FloatArray) -> float:
     if not np.all(np.isfinite(errors)):
         return float("inf")
     return float(np.linalg.slogdet(errors)[1])
 
 
-def _estimate(start: InnovationModel, search: _Search, y: FloatArray) -> PredictionErrorEstimate:
+def _estimate(
+    start: InnovationModel, search: _Search, y: FloatArray, u_level: FloatArray, y_level: FloatArray
+) -> PredictionErrorEstimate:
     predictor, rows = search.predictor, len(y)
     n, n_u, n_y = predictor.sizes
     P = search.directions.shape[1]
-    dF, dH, _ = np.split(search.directions, np.cumsum([predictor.F.size, predictor.H.size]))
-    dF, dH = dF.reshape(*predictor.F.shape, P), dH.reshape(*predictor.H.shape, P)
+    d_f, d_h, _ = np.split(search.directions, np.cumsum([predictor.F.size, predictor.H.size]))
+    d_f, d_h = d_f.reshape(*predictor.F.shape, P), d_h.reshape(*predictor.H.shape, P)
+    A, B, K, C, D = predictor.matrices
+    d_k = d_f[:, n + n_u : n + n_u + n_y]
+    feedback = np.einsum("iop,or->irp", d_k, predictor.H) + np.einsum("io,orp->irp", K, d_h)  # of K H
     freedom = rows - P / n_y
-    noise_free = bool(np.all(np.diag(search.scatter) <= rows * (_ROUNDING * np.std(y, axis=0)) ** 2))
+    noise_free = search.noise_free(y)
     scale = np.sqrt(np.maximum(np.diag(search.information), np.finfo(np.float64).tiny))
     values, vectors = np.linalg.eigh(search.information / np.outer(scale, scale))
     kept = values > 1e-14 * values[-1]
     inverse = (vectors[:, kept] / values[kept]) @ vectors[:, kept].T / np.outer(scale, scale)
     model = replace(
         start,
-        A=predictor.F[:, :n],
-        B=predictor.F[:, n : n + n_u],
-        K=predictor.F[:, n + n_u : n + n_u + n_y],
-        C=predictor.H[:, :n],
-        D=predictor.H[:, n : n + n_u],
+        A=A + K @ C,
+        B=B + K @ D,
+        C=C,
+        D=D,
+        K=K,
         innovation_covariance=search.scatter / freedom,
     )
     return PredictionErrorEstimate(
         model=model,
-        d_a=dF[:, :n],
-        d_b=dF[:, n : n + n_u],
-        d_k=dF[:, n + n_u : n + n_u + n_y],
-        d_c=dH[:, :n],
-        d_d=dH[:, n : n + n_u],
+        d_a=d_f[:, :n] + feedback[:, :n],
+        d_b=d_f[:, n : n + n_u] + feedback[:, n : n + n_u],
+        d_c=d_h[:, :n],
+        d_d=d_h[:, n : n + n_u],
+        d_k=d_k,
         covariance=inverse * rows / freedom,
-        offset_x=predictor.F[:, -1],
-        offset_y=predictor.H[:, -1],
+        offset_x=predictor.F[:, -1] + K @ predictor.H[:, -1] - model.B @ u_level,
+        offset_y=predictor.H[:, -1] + y_level - D @ u_level,
         initial_state=predictor.x0,
         rows=rows,
         parameters=P,

@@ -1,8 +1,8 @@
 """Coordinates for prediction-error steps: every direction that changes the predictor, none that only renames states.
 
-A state-space model of order n has n^2 + n directions (similarity and, with a constant in the state equation, a shift of
-the state) along which its input-output behaviour does not change. The parameters move in the orthogonal complement of
-these, computed afresh at each point (data-driven local coordinates, McKelvey, Helmersson and Ribarits 2004).
+A state-space model of order n has n^2 directions (similarity) along which its input-output behaviour does not change.
+The parameters move in a complement of these, computed at the point (local coordinates, after McKelvey, Helmersson and
+Ribarits 2004).
 """
 
 from __future__ import annotations
@@ -13,16 +13,19 @@ import numpy as np
 from scipy.linalg import qr
 
 from autotune.arrays import FloatArray, IntArray
+from autotune.identification.closed_loop.state_space import InnovationModel
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Predictor:
-    """Innovation form with constants: x(t+1) = F (x, u, e, 1), y = H (x, u, 1) + e, x(0) = x0.
+    """One-step predictor with constants: x(t+1) = F (x, u, y, 1), y = H (x, u, 1) + e, x(0) = x0.
+
+    Stable wherever the noise model is, the plant unstable or not.
 
     Attributes
     ----------
     F : (n, n + n_u + n_y + 1) array
-        [A B K d].
+        [A - K C, B - K D, K, d - K y_0].
     H : (n_y, n + n_u + 1) array
         [C D y_0].
     x0 : (n,) array
@@ -32,6 +35,24 @@ class Predictor:
     F: FloatArray
     H: FloatArray
     x0: FloatArray
+
+    @classmethod
+    def of(cls, model: InnovationModel, offset_x: FloatArray, offset_y: FloatArray, x0: FloatArray) -> Predictor:
+        """Return the predictor of a model with constants d (n,) and y_0 (n_y,) in its two equations."""
+        entries = np.hstack([model.A, model.B, model.K, offset_x[:, None]])
+        n, n_y = model.order, len(model.C)
+        H = np.hstack([model.C, model.D, offset_y[:, None]])
+        F = entries.copy()
+        F[:, : entries.shape[1] - n_y - 1] -= model.K @ H[:, :-1]
+        F[:, -1] -= model.K @ offset_y
+        return cls(F=F, H=H, x0=np.asarray(x0, dtype=np.float64).reshape(n))
+
+    @property
+    def matrices(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Return A - K C, B - K D, K, C, D."""
+        n, n_u, n_y = self.sizes
+        F, H = self.F, self.H
+        return F[:, :n], F[:, n : n + n_u], F[:, n + n_u : n + n_u + n_y], H[:, :n], H[:, n : n + n_u]
 
     @property
     def sizes(self) -> tuple[int, int, int]:
@@ -51,46 +72,74 @@ class Predictor:
         return np.concatenate([self.F.ravel(), self.H.ravel(), self.x0])
 
 
-def free_entries(predictor: Predictor, *, feedthrough: bool, offset: bool) -> IntArray:
-    """Return which entries of :meth:`Predictor.packed` are estimated, as indices."""
+def free_entries(predictor: Predictor, *, feedthrough: bool) -> IntArray:
+    """Return which entries of :meth:`Predictor.packed`, constants left out, are estimated, as indices."""
     n, n_u, _ = predictor.sizes
     F, H = np.ones(predictor.F.shape, dtype=bool), np.ones(predictor.H.shape, dtype=bool)
-    F[:, -1] = H[:, -1] = offset
+    F[:, -1] = H[:, -1] = False
     H[:, n : n + n_u] = feedthrough
     return np.asarray(np.flatnonzero(np.concatenate([F.ravel(), H.ravel(), np.ones(n, dtype=bool)])), dtype=np.int64)
 
 
-def renaming_directions(predictor: Predictor, *, offset: bool) -> FloatArray:
-    """Return the directions that leave the input-output behaviour alone, shape (entries, n^2 + n or n^2)."""
+def renaming_directions(predictor: Predictor) -> FloatArray:
+    """Return the directions that leave the input-output behaviour alone, shape (entries, n^2); no constants."""
     n, F, H, x0 = len(predictor.x0), predictor.F, predictor.H, predictor.x0
-    count = n * n + (n if offset else 0)
-    dF, dH, dx0 = np.zeros((*F.shape, count)), np.zeros((*H.shape, count)), np.zeros((n, count))
+    dF, dH, dx0 = np.zeros((*F.shape, n * n)), np.zeros((*H.shape, n * n)), np.zeros((n, n * n))
     k = np.arange(n)
-    for i in range(n):  # E = e_i e_k' for every k: E [A B K d] - [A E], - C E, E x0
+    for i in range(n):  # E = e_i e_k' for every k: E F - [(A - K C) E, 0], - C E, E x0
         column = i * n + k
         dF[i][:, column] += F.T
         dF[:, k, column] -= F[:, i, None]
         dH[:, k, column] -= H[:, i, None]
         dx0[i, column] += x0
-    if offset:  # x -> x + e_i
-        dF[:, -1, n * n :] = np.eye(n) - F[:, :n]
-        dH[:, -1, n * n :] = -H[:, :n]
-        dx0[:, n * n :] = np.eye(n)
-    return np.concatenate([dF.reshape(-1, count), dH.reshape(-1, count), dx0])
+    return np.concatenate([dF.reshape(-1, n * n), dH.reshape(-1, n * n), dx0])
 
 
 def behaviour_directions(predictor: Predictor, *, feedthrough: bool, offset: bool) -> FloatArray:
-    """Return an orthonormal basis of the directions that change the behaviour, shape (entries, P).
+    """Return a basis of the directions that change the behaviour, shape (entries, P).
 
     Returns
     -------
     (entries, P) array
-        P = n (n_u + 2 n_y) + n_y (offset) + n_y n_u (feedthrough) + ... : the number of free parameters with the
-        initial state counted.
+        P = n (n_u + 2 n_y) + n + n_y n_u (feedthrough) + n_y (offset): the number of free parameters with the initial
+        state counted. The constants' columns are the last: a constant of the state equation is one of the output
+        equation in other coordinates, the predictor being stable.
+
+    Notes
+    -----
+    With one output, output injection g C reaches every change of A - K C that matters, so that C can stay and the
+    columns are unit vectors but for g; they hold until the coordinates change. With several outputs whose
+    observability indices differ it does not, and an orthonormal complement of the renaming directions is computed.
     """
-    free = free_entries(predictor, feedthrough=feedthrough, offset=offset)
-    renaming = renaming_directions(predictor, offset=offset)[free]
-    basis = qr(renaming, check_finite=False)[0][:, renaming.shape[1] :]
-    directions = np.zeros((predictor.packed().size, basis.shape[1]))
-    directions[free] = basis
+    n, _, n_y = predictor.sizes
+    entries = predictor.packed().size
+    if n_y == 1:
+        behaviour = _injection_directions(predictor, entries, feedthrough=feedthrough)
+    else:
+        free = free_entries(predictor, feedthrough=feedthrough)
+        renaming = renaming_directions(predictor)[free]
+        behaviour = np.zeros((entries, len(free) - n * n))
+        behaviour[free] = qr(renaming, check_finite=False)[0][:, n * n :]
+    return np.hstack([behaviour, constant_directions(predictor)]) if offset else behaviour
+
+
+def constant_directions(predictor: Predictor) -> FloatArray:
+    """Return the directions of the constants y_0, shape (entries, n_y)."""
+    n_y, width = predictor.H.shape
+    directions = np.zeros((predictor.packed().size, n_y))
+    directions[predictor.F.size + width * np.arange(1, n_y + 1) - 1, np.arange(n_y)] = 1.0
+    return directions
+
+
+def _injection_directions(predictor: Predictor, entries: int, *, feedthrough: bool) -> FloatArray:
+    n, n_u, _ = predictor.sizes
+    m, C = predictor.F.shape[1], predictor.H[0, :n]
+    states = np.arange(n)
+    unit = [states * m + n + q for q in range(n_u + 1)]  # B and K
+    unit += [predictor.F.size + n + np.arange(n_u)] if feedthrough else []
+    rows = np.concatenate([*unit, np.arange(entries - n, entries)])
+    directions = np.zeros((entries, n + len(rows)))
+    for i in range(n):
+        directions[i * m : i * m + n, i] = C
+    directions[rows, n + np.arange(len(rows))] = 1.0
     return directions

@@ -7,12 +7,13 @@ from numba import njit
 
 from autotune.arrays import FloatArray
 
-_BLOCK = 512
+#: Rows of derivatives that are projected at once, a block that stays in cache.
+_BLOCK = 256
 
 
 @njit(cache=True)
 def innovations(F: FloatArray, H: FloatArray, x0: FloatArray, u: FloatArray, y: FloatArray) -> FloatArray:
-    """Return e(t) = y - H (x, u, 1) along x(t+1) = F (x, u, e, 1), shape (N, n_y)."""
+    """Return e(t) = y - H (x, u, 1) along x(t+1) = F (x, u, y, 1), shape (N, n_y)."""
     n, n_u, n_y = F.shape[0], u.shape[1], y.shape[1]
     x, following = x0.copy(), np.empty(n)
     e = np.empty((y.shape[0], n_y))
@@ -31,7 +32,7 @@ def innovations(F: FloatArray, H: FloatArray, x0: FloatArray, u: FloatArray, y: 
             for q in range(n_u):
                 value += F[i, n + q] * u[t, q]
             for o in range(n_y):
-                value += F[i, n + n_u + o] * e[t, o]
+                value += F[i, n + n_u + o] * y[t, o]
             following[i] = value
         x[:] = following
     return e
@@ -39,12 +40,10 @@ def innovations(F: FloatArray, H: FloatArray, x0: FloatArray, u: FloatArray, y: 
 
 @njit(cache=True)
 def scatter(F: FloatArray, H: FloatArray, x0: FloatArray, u: FloatArray, y: FloatArray) -> FloatArray:
-    """Return the sum of e e^T, shape (n_y, n_y), without storing the innovations."""
-    n_y = y.shape[1]
+    """Return the sum of e e^T, shape (n_y, n_y), a block of rows at a time."""
+    n, n_u, n_y = F.shape[0], u.shape[1], y.shape[1]
     total = np.zeros((n_y, n_y))
-    x = x0.copy()
-    n, n_u = F.shape[0], u.shape[1]
-    following, e = np.empty(n), np.empty(n_y)
+    x, following, e = x0.copy(), np.empty(n), np.empty(n_y)
     for t in range(y.shape[0]):
         for o in range(n_y):
             value = y[t, o] - H[o, n + n_u]
@@ -60,7 +59,7 @@ def scatter(F: FloatArray, H: FloatArray, x0: FloatArray, u: FloatArray, y: Floa
             for q in range(n_u):
                 value += F[i, n + q] * u[t, q]
             for o in range(n_y):
-                value += F[i, n + n_u + o] * e[o]
+                value += F[i, n + n_u + o] * y[t, o]
             following[i] = value
         x[:] = following
         for o in range(n_y):
@@ -76,9 +75,7 @@ def normal_equations(
     x0: FloatArray,
     u: FloatArray,
     y: FloatArray,
-    dF: FloatArray,
-    dH: FloatArray,
-    dx0: FloatArray,
+    directions: FloatArray,
     whitening: FloatArray,
 ) -> FloatArray:
     """Return J^T J of the whitened [derivatives of e, e], accumulated over the rows.
@@ -89,8 +86,8 @@ def normal_equations(
         The predictor, as in :class:`autotune.identification.closed_loop.predictor_directions.Predictor`.
     u, y : (N, n_u), (N, n_y) arrays
         Data.
-    dF, dH, dx0 : (n, ..., P), (n_y, ..., P), (n, P) arrays
-        Directions.
+    directions : (entries, P) array
+        Of F row by row, H row by row and x0.
     whitening : (n_y, n_y) array
         W with W cov(e) W^T = I.
 
@@ -98,13 +95,33 @@ def normal_equations(
     -------
     (P + 1, P + 1) array
         Information matrix, gradient in the last column, sum of squares in the last entry.
+
+    Notes
+    -----
+    A change of F[i, q] acts on output o through w_i(t) with w(t+1) = A^T w(t) + C_o^T phi_q(t) (adjoint of the
+    predictor), so one bank of n states per output and regressor phi_q serves the n entries of a column of F; with
+    phi = 0 and w(0) = C_o^T the same recursion gives the derivatives by x0.
     """
-    n, n_u, n_y, P = F.shape[0], u.shape[1], y.shape[1], dx0.shape[1]
-    x, following = x0.copy(), np.empty(n)
-    S, S_next = dx0.copy(), np.empty((n, P))
-    phi, dE, e = np.empty(n + n_u + n_y + 1), np.empty((n_y, P)), np.empty(n_y)
-    phi[n + n_u + n_y] = 1.0
-    rows = np.zeros((_BLOCK * n_y, P + 1))
+    n, n_u, n_y, P = F.shape[0], u.shape[1], y.shape[1], directions.shape[1]
+    m, h = n + n_u + n_y + 1, n + n_u + 1
+    width = n * (m + 1) + n_y * h + 1
+    projection = np.zeros((width, P + 1))
+    for i in range(n):
+        for q in range(m):
+            projection[i * (m + 1) + q, :P] = -directions[i * m + q]
+        projection[i * (m + 1) + m, :P] = -directions[n * m + n_y * h + i]
+    for r in range(n_y * h):
+        projection[n * (m + 1) + r, :P] = -directions[n * m + r]
+    projection[width - 1, P] = 1.0
+    C = np.ascontiguousarray(whitening @ np.ascontiguousarray(H[:, :n]))
+    x, following, e = x0.copy(), np.empty(n), np.empty(n_y)
+    phi = np.zeros(m + 1)
+    phi[m - 1] = 1.0
+    bank = np.zeros((n_y, n, m + 1))
+    for o in range(n_y):
+        bank[o, :, m] = C[o]
+    moved = np.empty((n, m + 1))
+    rows = np.zeros((_BLOCK * n_y, width))
     total = np.zeros((P + 1, P + 1))
     filled = 0
     for t in range(y.shape[0]):
@@ -113,45 +130,43 @@ def normal_equations(
         for q in range(n_u):
             phi[n + q] = u[t, q]
         for o in range(n_y):
+            phi[n + n_u + o] = y[t, o]
             value = y[t, o] - H[o, n + n_u]
-            for j in range(P):
-                dE[o, j] = -dH[o, n + n_u, j]
             for i in range(n + n_u):
                 value -= H[o, i] * phi[i]
-                for j in range(P):
-                    dE[o, j] -= phi[i] * dH[o, i, j]
-            for i in range(n):
-                for j in range(P):
-                    dE[o, j] -= H[o, i] * S[i, j]
             e[o] = value
-            phi[n + n_u + o] = value
-        for i in range(n):
-            value = 0.0
-            for j in range(P):
-                S_next[i, j] = 0.0
-            for q in range(n + n_u + n_y + 1):
-                value += F[i, q] * phi[q]
-                for j in range(P):
-                    S_next[i, j] += phi[q] * dF[i, q, j]
-            for k in range(n):
-                for j in range(P):
-                    S_next[i, j] += F[i, k] * S[k, j]
-            for o in range(n_y):
-                for j in range(P):
-                    S_next[i, j] += F[i, n + n_u + o] * dE[o, j]
-            following[i] = value
-        x[:] = following
-        S[:, :] = S_next
         for o in range(n_y):
-            rows[filled, :] = 0.0
+            value = 0.0
+            at = n * (m + 1)
             for k in range(n_y):
                 w = whitening[o, k]
-                for j in range(P):
-                    rows[filled, j] += w * dE[k, j]
-                rows[filled, P] += w * e[k]
+                value += w * e[k]
+                for i in range(n + n_u):
+                    rows[filled, at + i] = w * phi[i]
+                rows[filled, at + n + n_u] = w
+                at += h
+            rows[filled, width - 1] = value
+            for i in range(n):
+                at = i * (m + 1)
+                for q in range(m + 1):
+                    rows[filled, at + q] = bank[o, i, q]
+                    moved[i, q] = C[o, i] * phi[q]
+                for k in range(n):
+                    a = F[k, i]
+                    for q in range(m + 1):
+                        moved[i, q] += a * bank[o, k, q]
+            bank[o] = moved
             filled += 1
+        for i in range(n):
+            value = 0.0
+            for q in range(m):
+                value += F[i, q] * phi[q]
+            following[i] = value
+        x[:] = following
         if filled == rows.shape[0]:
-            total += np.dot(rows.T, rows)
+            part = np.dot(rows, projection)
+            total += np.dot(part.T, part)
             filled = 0
-    total += np.dot(rows[:filled].T, rows[:filled])
+    part = np.dot(rows[:filled], projection)
+    total += np.dot(part.T, part)
     return total

@@ -64,7 +64,7 @@ def refit_inputs(model: InnovationModel, u: FloatArray, y: FloatArray, *, feedth
 
 
 def _state_map(model: InnovationModel, B: FloatArray) -> FloatArray:
-    return np.hstack([model.A, B, model.K, np.zeros((model.order, 1))])
+    return np.hstack([model.A - model.K @ model.C, B, model.K, np.zeros((model.order, 1))])
 
 
 def _output_map(model: InnovationModel, n_u: int) -> FloatArray:

@@ -242,21 +242,21 @@ def difference(first: InnovationModel, second: InnovationModel) -> InnovationMod
     )
 
 
-def balancing(model: InnovationModel) -> FloatArray:
-    """Return the state transformation T that balances the one-step predictor (A - K C, [B - K D, K], C).
+def balancing(A: FloatArray, B: FloatArray, C: FloatArray) -> FloatArray:
+    """Return the state transformation T that balances x(t+1) = A x + B v, y = C x.
 
-    The predictor is stable even where the plant is not, so the coordinates T x exist for unstable and integrating
-    plants. Where a state is hardly reached or hardly seen, it is scaled as if it were a little more.
+    For a one-step predictor (A - K C, [B - K D, K], C): it is stable even where the plant is not, so the coordinates
+    T x exist for unstable and integrating plants. Where a state is hardly reached or hardly seen, it is scaled as if it
+    were a little more.
 
     Raises
     ------
     IdentificationError
-        The predictor is not stable.
+        A is not stable.
     """
-    if model.predictor_radius >= 1.0:
+    if spectral_radius(A) >= 1.0:
         raise IdentificationError("the predictor is not stable", where="balancing")
-    A, B = model.A - model.K @ model.C, np.hstack([model.B - model.K @ model.D, model.K])
-    reach, observe = _gramian_factor(A, B), _gramian_factor(A.T, model.C.T)
+    reach, observe = _gramian_factor(A, B), _gramian_factor(A.T, C.T)
     U, s, _ = np.linalg.svd(observe.T @ reach)
     return np.asarray((U / np.sqrt(s)).T @ observe.T, dtype=np.float64)
 

@@ -51,10 +51,7 @@ def test_derivatives_agree_with_differences(n: int, n_u: int, n_y: int, offset: 
     directions = behaviour_directions(p, feedthrough=True, offset=offset)
     P = directions.shape[1]
     assert n * (n_u + 2 * n_y) + n_y * n_u + n + (n_y if offset else 0) == P
-    d_f, d_h, d_x = np.split(directions, np.cumsum([p.F.size, p.H.size]))
-    total = normal_equations(
-        p.F, p.H, p.x0, u, y, d_f.reshape(*p.F.shape, P), d_h.reshape(*p.H.shape, P), d_x.copy(), np.eye(n_y)
-    )
+    total = normal_equations(p.F, p.H, p.x0, u, y, directions, np.eye(n_y))
     step = 1e-6
     ahead = [_errors(p.moved(step * column, directions), u, y).ravel() for column in np.eye(P)]
     behind = [_errors(p.moved(-step * column, directions), u, y).ravel() for column in np.eye(P)]
@@ -158,9 +155,24 @@ def test_dead_time_is_named_instead_of_a_chain_of_states() -> None:
 
 def test_operating_point_and_units_do_not_matter() -> None:
     d = example_set(15)
-    plain = fixed_order(d.u, d.y, 5).model
-    moved = fixed_order(d.u + 40.0, d.y - 7.0, 5).model
-    np.testing.assert_allclose(moved.response(OMEGA), plain.response(OMEGA), rtol=2e-3)
+    here = fixed_order(d.u - 5.0, 1e-3 * (d.y + 30.0), 5).model
+    there = fixed_order(d.u + 40.0, d.y - 7.0, 5).model
+    np.testing.assert_allclose(1e3 * here.response(OMEGA), there.response(OMEGA), rtol=2e-3)
+
+
+def test_constant_is_estimated_where_the_data_ask_for_one_only() -> None:
+    d = example_set(15)
+    centred, loaded = fixed_order(d.u, d.y, 5), fixed_order(d.u + 0.2, d.y, 5)
+    assert np.all(centred.offset_x == 0.0)
+    assert np.all(centred.offset_y == 0.0)
+    assert loaded.parameters == centred.parameters + 1
+    # the constants stand for the load that was added to u
+    unseen = loaded.offset_x + 0.2 * loaded.model.B[:, 0]
+    shift, rest, *_ = np.linalg.lstsq(
+        np.vstack([loaded.model.A - np.eye(5), loaded.model.C]), np.append(unseen, loaded.offset_y), rcond=None
+    )
+    assert shift.shape == (5,)
+    assert rest[0] < 1e-3
 
 
 def test_residuals_are_white_at_the_right_order_only() -> None:
