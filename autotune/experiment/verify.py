@@ -16,6 +16,8 @@ from autotune.config import Config
 from autotune.config.procedure import LimitSettings, VerificationSettings
 from autotune.controller import PIDController
 from autotune.design.law import PILaw
+from autotune.design.margins import margins
+from autotune.errors import DesignError
 from autotune.experiment.limits import Watch
 from autotune.experiment.loop import ControlLoop
 from autotune.experiment.prediction import Prediction, predict
@@ -217,9 +219,8 @@ def run_verification(
     fit: PlantFit,
     recording: str | Path,
     *,
-    u_rest: float,
-    noise_sd: float,
-    crossover_rad_s: float,
+    u_rest: float | None = None,
+    noise_sd: float | None = None,
     on_progress: OnProgress | None = None,
 ) -> Verification:
     """Bring the rig to its operating point, close the loop with the new controller, test it and leave the rig safe.
@@ -236,20 +237,28 @@ def run_verification(
         Plant for the prediction.
     recording : path
         CSV to write.
-    u_rest, noise_sd : float
-        From the experiment: command that holds the operating point [u unit], noise of y [y unit].
-    crossover_rad_s : float
-        Of the new loop [rad/s].
+    u_rest, noise_sd : float, optional
+        From the experiment: command that holds the operating point [u unit], standard deviation of the noise of y
+        [y unit]; found on the way to the operating point where they are not known.
     on_progress : callable, optional
         Told where the procedure is.
 
     Raises
     ------
+    DesignError
+        The loop would be unstable; the rig was not touched.
     ExperimentStopped, LinkError, OperatorStop
         What ended it; the rig is safe and the recording readable.
     """
     law = law_for(controller, config.limits, config.signals.sample_time_s)
-    test = plan_test(config.verification, config.limits, law, fit, crossover_rad_s)
+    expected = margins(fit.plant, controller)
+    if not expected.stable:
+        raise DesignError(
+            "the measured plant says that this controller makes the loop unstable",
+            where="verify",
+            mend="nothing was tried on the rig; design it on this rig's points",
+        )
+    test = plan_test(config.verification, config.limits, law, fit, expected.crossover_rad_s)
     law = law_for(controller, config.limits, config.signals.sample_time_s, float(test.disturbance[-1]))
     writer = RecordingWriter(recording, ("t", "u", "y", "r"), recording_metadata(config))
     with ControlLoop(rig=rig, envelope=envelope_of(config), writer=writer, extra=("r",)) as loop:
@@ -257,8 +266,9 @@ def run_verification(
         if config.operating_point.approach == "ramp":
             wait_for_rest(loop, config)
         known = float_on(loop, config, u_rest=u_rest)
+        loop.note(test_start_s=loop.tick.t_s)
         y, u = run_test(loop, law, test, config.operating_point.y, known.midpoint, on_progress)
-    return judge(test, y, u, law, fit, noise_sd)
+    return judge(test, y, u, law, fit, known.noise_sd if noise_sd is None else noise_sd)
 
 
 def judge(

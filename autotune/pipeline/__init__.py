@@ -2,8 +2,9 @@
 
 from autotune.pipeline.analysis import Analysis, analyse
 from autotune.pipeline.deployment import hand_over
+from autotune.pipeline.folder import JOURNAL, PROGRESS, RECORDING, RESULT, VERIFICATION, recordings
 from autotune.pipeline.result import analysis_json, write_result
-from autotune.pipeline.run import DECISION_S, JOURNAL, PROGRESS, RECORDING, RESULT, VERIFICATION, Tuning, tune
+from autotune.pipeline.run import DECISION_S, Tuning, tune
 
 __all__ = [
     "DECISION_S",
@@ -17,6 +18,7 @@ __all__ = [
     "analyse",
     "analysis_json",
     "hand_over",
+    "recordings",
     "tune",
     "write_result",
 ]

@@ -2,18 +2,135 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from enum import StrEnum
 from pathlib import Path
 
 from autotune.controller import PIDController
-from autotune.errors import AutotuneError
+from autotune.errors import AutotuneError, ExperimentStopped, InputError
 from autotune.experiment.rig import HoldsGains
+from autotune.experiment.verify import Verification
 from autotune.run_log import jsonable
 
 
+class Step(StrEnum):
+    """What a line of the journal says of its gains."""
+
+    READ = "read"
+    WRITING = "writing"
+    WRITTEN = "written and read back"
+    ON_TRIAL = "written and read back, on trial"
+    KEPT = "verified, kept"
+    RESTORING = "restoring"
+    RESTORED = "restored"
+
+
+#: last steps after which the rig's gains are new ones unverified, or unknown
+OPEN_ENDS = (Step.WRITING, Step.ON_TRIAL, Step.RESTORING)
+
+
+class Journal:
+    """``journal.jsonl``: one JSON object per step, with the gains it is about, appended before the step is taken.
+
+    Parameters
+    ----------
+    path : Path
+        File to append to; made by the first note.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def note(self, step: Step, controller: PIDController) -> None:
+        """Append a step and bring it to the disk.
+
+        Raises
+        ------
+        ExperimentStopped
+            The file cannot be written.
+        """
+        line = json.dumps(jsonable({"gains": step.value, **asdict(controller)}))
+        try:
+            with self.path.open("a", encoding="utf-8") as file:
+                file.write(line + "\n")
+                file.flush()
+                os.fsync(file.fileno())
+        except OSError as error:
+            raise ExperimentStopped(
+                f"the journal cannot be written ({error.strerror})",
+                where=str(self.path),
+                mend="free space on the disk; no gains are written that are not in it first",
+            ) from error
+
+    def unfinished(self) -> PIDController | None:
+        """Return the gains to go back to where the last hand-over was interrupted, None where it was not.
+
+        Raises
+        ------
+        InputError
+            The file is not a journal.
+        """
+        if not self.path.exists():
+            return None
+        text = self.path.read_text(encoding="utf-8")
+        try:
+            # a line without its end was cut off before its step was taken
+            notes = [json.loads(line) for line in text[: text.rfind("\n") + 1].splitlines()]
+            if not notes or Step(notes[-1]["gains"]) not in OPEN_ENDS:
+                return None
+            return _gains(next(note for note in reversed(notes) if note["gains"] == Step.READ))
+        except (ValueError, KeyError, TypeError, StopIteration) as error:
+            raise InputError(
+                f"not a journal of gains ({error})",
+                where=str(self.path),
+                mend="move it away, and check the rig's gains",
+            ) from None
+
+
+def _gains(note: dict[str, float | None]) -> PIDController:
+    numbers = {key: value for key, value in note.items() if key != "gains"}
+    Ti_s = numbers.pop("Ti_s")
+    return PIDController(**{key: float(value or 0.0) for key, value in numbers.items()}, Ti_s=Ti_s or float("inf"))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Deployment:
+    """What became of a hand-over.
+
+    Attributes
+    ----------
+    old, new : PIDController
+        Gains the rig held before, and those that were handed to it, as it read them back.
+    verification : Verification or None
+        The loop with the new gains; None where it was not asked for.
+    """
+
+    old: PIDController
+    new: PIDController
+    verification: Verification | None
+
+    @property
+    def kept(self) -> bool:
+        """Whether the rig holds the new gains."""
+        return self.verification is None or self.verification.accepted
+
+
+def read_gains(rig: HoldsGains) -> PIDController:
+    """Return the gains that the rig's own controller holds; the rig is opened for this and closed again."""
+    rig.open()
+    try:
+        return rig.read_gains()
+    finally:
+        rig.make_safe()
+        rig.close()
+
+
 def hand_over(rig: HoldsGains, controller: PIDController | None, journal: Path) -> PIDController:
-    """Write gains into the rig's own controller, and the old ones back if that fails halfway.
+    """Write verified gains into the rig's own controller, and the old ones back if that fails halfway.
 
     Parameters
     ----------
@@ -34,33 +151,117 @@ def hand_over(rig: HoldsGains, controller: PIDController | None, journal: Path) 
     LinkError
         The new gains could not be written and read back; the message says whether the old ones are in place again.
     """
+    notes = Journal(journal)
+    old = read_gains(rig)
+    notes.note(Step.READ, old)
+    if controller is not None:
+        _write(rig, controller, old, notes, Step.WRITTEN)
+    return old
+
+
+def deploy(
+    rig: HoldsGains,
+    controller: PIDController,
+    journal: Path,
+    *,
+    agree: Callable[[PIDController, PIDController], None],
+    try_out: Callable[[PIDController], Verification] | None,
+) -> Deployment:
+    """Hand new gains to the rig's own controller, try them, and take them back unless they behave as predicted.
+
+    Parameters
+    ----------
+    rig : HoldsGains
+        Closed; it is opened for every step and closed again.
+    controller : PIDController
+        New gains.
+    journal : Path
+        File that says what is about to be done before it is.
+    agree : callable
+        Shown the old and the new gains before anything is written; raises where they are refused.
+    try_out : callable or None
+        Runs the verification with the gains as the rig read them back; None keeps them without.
+
+    Raises
+    ------
+    LinkError, ExperimentStopped, OperatorStop
+        Writing or verification was broken off; the message says whether the old gains are in place again.
+    """
+    notes = Journal(journal)
+    old = read_gains(rig)
+    agree(old, controller)
+    notes.note(Step.READ, old)
+    held = _write(rig, controller, old, notes, Step.ON_TRIAL if try_out else Step.WRITTEN)
+    if try_out is None:
+        return Deployment(old=old, new=held, verification=None)
+    try:
+        verification = try_out(held)
+    except BaseException as error:
+        _take_back(rig, old, notes, error, "the verification was broken off")
+        raise
+    if verification.accepted:
+        notes.note(Step.KEPT, held)
+    else:
+        restore(rig, old, journal)
+    return Deployment(old=old, new=held, verification=verification)
+
+
+def restore(rig: HoldsGains, old: PIDController, journal: Path) -> None:
+    """Write the old gains back.
+
+    Parameters
+    ----------
+    rig : HoldsGains
+        Closed; it is opened for this and closed again.
+    old : PIDController
+        Gains to go back to.
+    journal : Path
+        The journal of the hand-over; it stays open-ended where this fails.
+
+    Raises
+    ------
+    LinkError
+        They could not be written and read back.
+    """
+    notes = Journal(journal)
+    with contextlib.suppress(
+        ExperimentStopped
+    ):  # the journal is open-ended already: a full disk must not keep new gains
+        notes.note(Step.RESTORING, old)
     rig.open()
     try:
-        old = rig.read_gains()
-        _note(journal, "read", old)
-        if controller is not None:
-            _note(journal, "writing", controller)
-            try:
-                rig.write_gains(controller)
-            except AutotuneError as error:
-                _note(journal, "restoring", old)
-                rig.write_gains(old)
-                _note(journal, "restored", old)
-                raise type(error)(
-                    f"the new gains could not be written ({error.what})",
-                    where="hand-over of the gains",
-                    mend="the old gains are in place again; check the link and deploy again",
-                ) from error
-            _note(journal, "written and read back", controller)
-        return old
+        rig.write_gains(old)
     finally:
         rig.make_safe()
         rig.close()
+    notes.note(Step.RESTORED, old)
 
 
-def _note(journal: Path, what: str, controller: PIDController) -> None:
-    line = json.dumps(jsonable({"gains": what, "K": controller.K, "Ti_s": controller.Ti_s, "Td_s": controller.Td_s}))
-    with journal.open("a", encoding="utf-8") as file:
-        file.write(line + "\n")
-        file.flush()
-        os.fsync(file.fileno())
+def _write(rig: HoldsGains, new: PIDController, old: PIDController, notes: Journal, done: Step) -> PIDController:
+    """Write the new gains, or the old ones where that fails; return the new ones as the rig holds them."""
+    notes.note(Step.WRITING, new)
+    try:
+        rig.open()
+        try:
+            rig.write_gains(new)
+            held = rig.read_gains()
+        finally:
+            rig.make_safe()
+            rig.close()
+    except AutotuneError as error:
+        _take_back(rig, old, notes, error, "the new gains could not be written")
+        raise
+    notes.note(done, held)
+    return held
+
+
+def _take_back(rig: HoldsGains, old: PIDController, notes: Journal, error: BaseException, what: str) -> None:
+    """Restore the old gains after an error, and raise one of its kind that says whether they are in place."""
+    try:
+        restore(rig, old, notes.path)
+        state, mend = "the old gains are in place again", "check the link and the rig, and deploy again"
+    except AutotuneError as second:
+        state = f"the old gains could not be written back ({second.what}): the rig may hold old, new or mixed gains"
+        mend = "stop it; once the link is back, autotune deploy offers to restore them"
+    if isinstance(error, AutotuneError):
+        raise type(error)(f"{what} ({error.what}); {state}", where="hand-over of the gains", mend=mend) from error

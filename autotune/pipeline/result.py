@@ -76,6 +76,7 @@ def _experiment_json(experiment: ExperimentResult | None, reason: str) -> dict[s
     return {
         "rig_time_s": experiment.rig_time_s,
         "sweep_time_s": experiment.sweep_time_s,
+        "parts": [asdict(part) for part in experiment.parts],
         "reason": reason,
         "warnings": list(experiment.warnings),
         "u_rest": experiment.u_rest,

@@ -9,17 +9,27 @@ from pathlib import Path
 from autotune.config import Config
 from autotune.controller import PIDController
 from autotune.errors import AutotuneError
+from autotune.experiment.cycles import Earlier
 from autotune.experiment.result import ExperimentResult
 from autotune.experiment.rig import HoldsGains, Rig
 from autotune.experiment.run import OnProgress, run_experiment
+from autotune.experiment.sweep import missing_phases
 from autotune.experiment.verify import Verification, run_verification
 from autotune.pipeline.analysis import Analysis, analyse
 from autotune.pipeline.deployment import hand_over
+from autotune.pipeline.folder import (
+    JOURNAL,
+    PROGRESS,
+    RECORDING,
+    RESULT,
+    VERIFICATION,
+    next_free,
+    read_interrupted,
+    store_config,
+)
 from autotune.pipeline.result import write_result
 from autotune.run_log import RunLog
 
-RECORDING, VERIFICATION, RESULT, JOURNAL = "recording.csv", "verification.csv", "result.json", "journal.jsonl"
-PROGRESS = "progress.jsonl"
 #: how long an operator may ask for the old gains after new ones were handed over [s]; then the new ones stay
 DECISION_S = 60.0
 
@@ -56,6 +66,7 @@ def tune(
     *,
     verify: bool = True,
     deploy: bool = True,
+    resume: bool = False,
     on_progress: OnProgress | None = None,
     keep: Callable[[float], bool] | None = None,
 ) -> Tuning:
@@ -71,6 +82,8 @@ def tune(
         Existing folder.
     verify, deploy : bool
         Whether to try the new loop on the rig, and to write the gains into the rig's own controller once accepted.
+    resume : bool
+        Whether to go on with what an interrupted run left in ``out``: only the points that are missing are measured.
     on_progress : callable, optional
         Told where the procedure is.
     keep : callable, optional
@@ -84,20 +97,27 @@ def tune(
 
     Raises
     ------
+    InputError
+        There is nothing to resume, or not with this configuration; nothing was done.
     ExperimentStopped, LinkError, OperatorStop
         The rig was left safe; what was recorded and the result so far are in ``out``.
     IdentificationError, DesignError
         The points give no model or no controller; they are in ``out``.
     """
+    earlier = read_interrupted(out, config) if resume else Earlier()
+    store_config(config, out)
     with RunLog(out / PROGRESS) as log:
         log.begin(config)
-        return _tune(rig, config, out, log, verify=verify, deploy=deploy, on_progress=log.also(on_progress), keep=keep)
+        return _tune(
+            rig, config, out, earlier, log, verify=verify, deploy=deploy, on_progress=log.also(on_progress), keep=keep
+        )
 
 
 def _tune(
     rig: Rig,
     config: Config,
     out: Path,
+    earlier: Earlier,
     log: RunLog,
     *,
     verify: bool,
@@ -108,7 +128,10 @@ def _tune(
     experiment: ExperimentResult | None = None
     analysis: Analysis | None = None
     try:
-        experiment = run_experiment(rig, config, log.recording(out / RECORDING), on_progress=on_progress)
+        recording = next_free(out / RECORDING)
+        if missing_phases(config, earlier):
+            log.recording(recording)
+        experiment = run_experiment(rig, config, recording, earlier=earlier, on_progress=on_progress)
         analysis = analyse(experiment.points, config.design)
         plant, reduced = analysis.fit.plant, analysis.reduced.transfer_function()
         log.analysed(analysis.points, plant, reduced, analysis.controller)
@@ -119,10 +142,9 @@ def _tune(
                 config,
                 analysis.controller,
                 analysis.fit,
-                log.recording(out / VERIFICATION),
+                log.recording(next_free(out / VERIFICATION)),
                 u_rest=experiment.u_rest,
                 noise_sd=experiment.noise_sd,
-                crossover_rad_s=analysis.margins.crossover_rad_s,
                 on_progress=on_progress,
             )
             log.verified(verification)
