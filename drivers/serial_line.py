@@ -33,10 +33,11 @@ _OPEN_ERRORS: tuple[type[Exception], ...] = (
 )  # the latter for a speed that the port cannot run at
 
 _FLASH = "flash the firmware that belongs to this version"
+NOT_IN_COMMAND = 3
 _REASONS = {
     1: ("does not know the request", _FLASH),
     2: ("finds the request too long or too short", _FLASH),
-    3: ("does not let the host command", "open the rig again"),
+    NOT_IN_COMMAND: ("does not let the host command", "open the rig again"),
     4: ("refuses the value", "check y_span, u_span and the gains"),
 }
 _CABLE = "check cable, power and [rig] device"
@@ -74,7 +75,9 @@ def open_port(settings: SerialSettings) -> Port:
 
 
 class DeviceRefused(LinkError):  # noqa: N818 - a verdict, as its base
-    """The device answered that it does not do it."""
+    """The device answered that it does not do it; ``reason`` is its code."""
+
+    reason = 0
 
 
 class SerialLink:
@@ -208,7 +211,9 @@ class SerialLink:
                     answer = frame
         if answer is not None and answer.kind == Kind.REFUSED:
             what, mend = _REASONS.get(int(answer.values[1]), ("refuses the request", _FLASH))
-            raise DeviceRefused(f"the device {what} ({kind.name})", where=self.where, mend=mend)
+            refusal = DeviceRefused(f"the device {what} ({kind.name})", where=self.where, mend=mend)
+            refusal.reason = int(answer.values[1])
+            raise refusal
         return answer
 
     def _receive(self, until: float) -> list[Frame]:

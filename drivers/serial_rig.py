@@ -15,7 +15,7 @@ from autotune.errors import InputError, LinkError
 from autotune.experiment.rig import Clock, Reading
 from drivers.clock import MonotonicClock
 from drivers.line_protocol import PAYLOAD, Command, Frame, Kind
-from drivers.serial_line import DeviceRefused, Port, SerialLink, open_port
+from drivers.serial_line import NOT_IN_COMMAND, DeviceRefused, Port, SerialLink, open_port
 
 COMMAND, _DEADMAN, _LIMIT, _TIME, _OVERRUN = 0x03, 0x04, 0x08, 0x10, 0x20
 _GAINS = PAYLOAD[Kind.SET_GAINS]
@@ -239,9 +239,12 @@ class SerialLineRig:
         start_s = self._clock.now()
         try:
             frame, sent_s, suspect = self._link.ask(kind, *values)
-        except DeviceRefused:
+        except DeviceRefused as refusal:
             self._is_commanding = False
-            raise
+            if refusal.reason != NOT_IN_COMMAND:
+                raise
+            frame, *_ = self._link.ask(Kind.READ)  # which says why
+            raise self._ended(self._state(frame)) from None
         end_s = self._clock.now()
         state = self._state(frame)
         if self._is_commanding and state & COMMAND != Command.HOST:

@@ -97,8 +97,9 @@ class SerialRig:
 
     def _serve(self) -> None:
         received = b""
+        lines = [self._line]
         while not self._stop.is_set():
-            ready, _, _ = select.select([self._line], [], [], _LIVE_S)
+            ready, _, _ = select.select(lines, [], [], _LIVE_S)
             self.device.live(self.now_s)
             if self._restart.is_set():
                 self._restart.clear()
@@ -109,8 +110,9 @@ class SerialRig:
             if ready:
                 try:
                     received += os.read(self._line, 1024)
-                except OSError:  # the other end is gone
-                    return
+                except OSError:  # unplugged; the device lives on
+                    lines = []
+                    continue
                 *pieces, received = received.split(b"\0")
                 for piece in pieces:
                     self._now_s = self.now_s

@@ -3,7 +3,8 @@
 A line of the table counts sessions. *safe* is the longest device time from the last command that was taken to the safe
 output, against the dead-man time; *commands* are outputs outside the limits, *samples* recorded values that nobody
 measured or that were measured longer ago than an answer may take, *ends* those with the wrong exit status or cause.
-``FAULT_MOMENTS=50`` strikes at fifty moments each (about half an hour); four by default.
+``FAULT_MOMENTS=50`` strikes at fifty moments each (about an hour); four by default. ``FAULTS=serial`` runs those whose
+name has the pattern in it.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ from sim.imperfections import FaultyPlant
 from sim.plant import make_plant
 from tests.drivers.bench import DEADMAN_S
 from tests.drivers.campaign import FAULTS, Outcome, run_fault
+from tests.drivers.ctrl_c import STATES, stop_in
 from tests.drivers.signals import SIGNALS, is_right, strike_process
 
 CONFIG = Path(__file__).parents[2] / "configs" / "ball_sim.toml"
@@ -93,8 +95,11 @@ def main() -> None:
         title=f"Fault campaign: {moments} moments each, dead-man {DEADMAN_S:g} s",
     )
     wrong: list[str] = []
+    wanted = os.environ.get("FAULTS", "")
 
     def add(name: str, strike: Callable[[int], Outcome], is_end: Callable[[Outcome], bool]) -> None:
+        if not re.search(wanted, name):
+            return
         outcomes = [strike(seed) for seed in track(range(1, moments + 1), description=name, transient=True)]
         bad_ends = [outcome for outcome in outcomes if not is_end(outcome)]
         wrong.extend(f"{name}: exit status {outcome.exit_status}, {outcome.ended}" for outcome in bad_ends)
@@ -104,16 +109,22 @@ def main() -> None:
         add(fault.name, lambda seed, fault=fault: run_fault(fault, seed), _ends_as(fault.ends))  # type: ignore[misc]
     for number, _, _ in SIGNALS:
         add(
-            f"process: {number.name}",
+            f"process: {number.name if number else 'disk full'}",
             lambda seed, number=number: strike_process(number, seed),  # type: ignore[misc]
             lambda outcome, number=number: is_right(number, outcome),  # type: ignore[misc]
         )
+    for state in STATES:
+        add(f"Ctrl-C: {state}", lambda seed, s=state: stop_in(s, seed), _is_stopped)  # type: ignore[misc]
     for kind, level, ends in PLANT_FAULTS:
         add(f"plant: {kind}", lambda seed, k=kind, v=level: plant_fault(k, v, seed), _ends_as(ends))  # type: ignore[misc]
     console = Console(highlight=False, width=110)
     console.print(table)
     for line in wrong:
         console.print(f"wrong end: {line}", markup=False)
+
+
+def _is_stopped(outcome: Outcome) -> bool:
+    return "stopped by Ctrl-C" in outcome.ended and outcome.exit_status == 130
 
 
 def _ends_as(ends: Sequence[str]) -> Callable[[Outcome], bool]:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import random
 import tempfile
 import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
@@ -28,8 +29,17 @@ from drivers import open_rig
 from sim.modbus_rig import ModbusRig, RtuTransport, TcpTransport
 from sim.register_device import RegisterDevice
 from sim.serial_line import SerialLine
+from sim.serial_rig import SerialRig, device_on_line
 from sim.servo import Servo, ServoSettings
-from tests.drivers.bench import DEADMAN_S, U_SAFE, register_device, rtu_settings, tcp_settings
+from tests.drivers.bench import (
+    DEADMAN_S,
+    U_RANGE,
+    U_SAFE,
+    register_device,
+    rtu_settings,
+    serial_settings,
+    tcp_settings,
+)
 from tests.drivers.tcp_relay import TcpRelay
 
 SAMPLE_S = 0.01
@@ -41,16 +51,31 @@ Fate = Sequence[tuple[float, bytes]]
 Harm = Callable[[bytes, str], Fate]
 
 
-class LoggedServo(Servo):
-    """A servo that remembers when it measured what; no two of its measurements are equal."""
+#: of the microcontroller's converter: fine, so that a measurement is known again in the recording
+Y_SPAN, Y_FULL = (-2.0, 2.0), 65535
 
-    def __init__(self, seed: int) -> None:
+
+def by_float(y: float) -> float:
+    """Return a measurement as registers show it: a float of 32 bits."""
+    return float(np.float32(y))
+
+
+def by_count(y: float) -> float:
+    """Return a measurement as the microcontroller shows it: in counts of its converter."""
+    return float(round((y - Y_SPAN[0]) / (Y_SPAN[1] - Y_SPAN[0]) * Y_FULL))
+
+
+class LoggedServo(Servo):
+    """A servo that remembers when it measured what, as its line shows it."""
+
+    def __init__(self, seed: int, shown: Callable[[float], float] = by_float) -> None:
         super().__init__(ServoSettings(load=0.05, noise=0.002, resolution=0.0), seed=seed)
-        self.measured: dict[float, float] = {}
+        self.shown = shown
+        self.measured: dict[float, list[float]] = {}
 
     def measure(self) -> float:
         y = super().measure()
-        self.measured[float(np.float32(y))] = self.time_s
+        self.measured.setdefault(self.shown(y), []).append(self.time_s)
         return y
 
 
@@ -65,6 +90,9 @@ class Line:
     set_harm: Callable[[Harm], None] = lambda harm: None
     reset: Callable[[], None] = lambda: None
     refusing: dict[str, Any] = field(default_factory=dict)
+    unplug: Callable[[], None] = lambda: None
+    jump: Callable[[float], None] = lambda seconds: None
+    undo: ExitStack = field(default_factory=ExitStack)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,7 +143,11 @@ def tcp_line(seed: int) -> Iterator[Line]:
         refusing["left"] -= 1
         return int(refusing["code"])
 
-    with ModbusRig(device, TcpTransport(), refuse=refuse) as server, TcpRelay(server.port) as relay:
+    with (
+        ModbusRig(device, TcpTransport(), refuse=refuse) as server,
+        TcpRelay(server.port) as relay,
+        ExitStack() as undo,
+    ):
         settings = tcp_settings(relay.port, timeout_s=TIMEOUT_S)
         rig = open_rig(settings, u_range=(LIMITS.u_min, LIMITS.u_max), u_safe=U_SAFE)
 
@@ -130,6 +162,7 @@ def tcp_line(seed: int) -> Iterator[Line]:
             set_harm=harm,
             reset=relay.reset,
             refusing=refusing,
+            undo=undo,
         )
         rig.close()
 
@@ -147,6 +180,37 @@ def rtu_line(seed: int) -> Iterator[Line]:
             line.tamper = how
 
         yield Line(rig=rig, device=device, plant=plant, random=random.Random(seed), set_harm=harm)
+        rig.close()
+
+
+@contextmanager
+def serial_line(seed: int) -> Iterator[Line]:
+    """A microcontroller on a serial line."""
+    plant = LoggedServo(seed, by_count)
+    device = device_on_line(plant, u_range=U_RANGE, u_safe=0.0)
+    spans = {"y_span": Y_SPAN, "u_span": U_RANGE}
+    with (
+        SerialLine(_whole) as line,
+        SerialRig(device, line.rig_device, y_full=Y_FULL, **spans) as served,
+        ExitStack() as undo,
+    ):
+        settings = serial_settings(line.host_device, timeout_s=TIMEOUT_S, start_s=0.2, **spans)
+        rig = open_rig(settings, u_range=(LIMITS.u_min, LIMITS.u_max), u_safe=U_SAFE)
+
+        def harm(how: Harm) -> None:
+            line.tamper = how
+
+        yield Line(
+            rig=rig,
+            device=device,
+            plant=plant,
+            random=random.Random(seed),
+            set_harm=harm,
+            reset=served.restart,
+            unplug=line.close,
+            jump=served.jump,
+            undo=undo,
+        )
         rig.close()
 
 
@@ -199,11 +263,14 @@ def beyond_limits(device: RegisterDevice) -> int:
 
 def bad_samples(plant: LoggedServo, t: Any, y: Any) -> int:
     """Count samples that were not measured, or were measured longer ago than an answer may take."""
-    sent = [float(np.float32(value)) for value in y]  # the line carries floats of 32 bits, the file twelve digits
-    pairs = [(float(t_k), plant.measured.get(y_k)) for t_k, y_k in zip(t, sent, strict=True) if np.isfinite(y_k)]
-    delays = [t_k - at for t_k, at in pairs if at is not None]
-    newest = min(delays, default=0.0)  # the two clocks' difference
-    return sum(at is None for _, at in pairs) + sum(delay - newest > TIMEOUT_S for delay in delays)
+    # the line carries fewer digits than the file, and a few measurements look alike
+    delays = [
+        [float(t_k) - at for at in plant.measured.get(plant.shown(float(y_k)), [])]
+        for t_k, y_k in zip(t, y, strict=True)
+        if np.isfinite(y_k)
+    ]
+    newest = min((one[0] for one in delays if len(one) == 1), default=0.0)  # the two clocks' difference
+    return sum(not any(-1e-3 <= delay - newest <= TIMEOUT_S for delay in one) for one in delays)
 
 
 def repeatedly(harm: Callable[[random.Random], Harm]) -> Callable[[Line], None]:
@@ -270,6 +337,9 @@ _LOST = (
     "answers doubtfully",
     "took the actuator back",
     "echoes heartbeat",
+    "restarted",
+    "the line is gone",
+    "takes nothing",
 )
 _RIDDEN = ("completed", *_LOST)
 
@@ -286,6 +356,10 @@ def _late(frame: bytes, draw: random.Random) -> Fate:
     return ((draw.uniform(0.07, 0.15), frame),)
 
 
+def _half(frame: bytes, draw: random.Random) -> Fate:
+    return ((0.0, frame[: draw.randrange(1, len(frame))]),)
+
+
 def _twice(frame: bytes, draw: random.Random) -> Fate:
     return ((0.0, frame), (0.0, frame))
 
@@ -296,6 +370,25 @@ def _lost(frame: bytes, draw: random.Random) -> Fate:
 
 def _cut(line: Line) -> None:
     line.set_harm(lambda frame, direction: ())
+
+
+def _set_wall_clock(line: Line) -> None:
+    """Let the computer's wall clock jump; who measures time by it is wrong by as much."""
+    real, by_s = time.time, line.random.choice((-3600.0, 3600.0))
+    line.undo.callback(setattr, time, "time", real)
+    time.time = lambda: real() + by_s
+
+
+def _jump(line: Line) -> None:
+    line.jump(line.random.choice((-1.0, 1.0)) * line.random.uniform(0.2, 5.0))
+
+
+def _both_ways(fate: Callable[[bytes, random.Random], Fate]) -> Callable[[Line], None]:
+    def strike(line: Line) -> None:
+        draw = line.random
+        line.set_harm(lambda frame, direction: fate(frame, draw) if draw.random() < 0.05 else ((0.0, frame),))
+
+    return strike
 
 
 def _always(fate: Callable[[bytes, random.Random], Fate]) -> Callable[[Line], None]:
@@ -317,11 +410,21 @@ FAULTS = (
     Fault(name="Modbus exception 4", line=tcp_line, ends=("failed to do it",), strike=_refuse(4, 10**9)),
     Fault(name="device busy once", line=tcp_line, ends=_RIDDEN, strike=_refuse(6, 1)),
     Fault(name="device busy for good", line=tcp_line, ends=("is busy",), strike=_refuse(6, 10**9)),
-    Fault(name="device restarts", line=tcp_line, ends=_LOST[-2:], strike=_restart),
+    Fault(name="device restarts", line=tcp_line, ends=("took the actuator back", "echoes heartbeat"), strike=_restart),
+    Fault(name="wall clock jumps an hour", line=tcp_line, ends=("completed",), strike=_set_wall_clock),
     Fault(name="RTU late beyond time-out", line=rtu_line, ends=_RIDDEN, strike=_sometimes(_late)),
     Fault(name="RTU lost answers", line=rtu_line, ends=_RIDDEN, strike=_sometimes(_lost)),
     Fault(name="RTU bit flips", line=rtu_line, ends=_RIDDEN, strike=_sometimes(_flip)),
     Fault(name="RTU cable cut", line=rtu_line, ends=_LOST, strike=_cut),
+    Fault(name="serial bit flips", line=serial_line, ends=_RIDDEN, strike=_both_ways(_flip)),
+    Fault(name="serial half frames", line=serial_line, ends=_RIDDEN, strike=_both_ways(_half)),
+    Fault(name="serial late beyond time-out", line=serial_line, ends=_RIDDEN, strike=_sometimes(_late)),
+    Fault(name="serial doubled answers", line=serial_line, ends=_RIDDEN, strike=_always(_twice)),
+    Fault(name="serial lost frames", line=serial_line, ends=_RIDDEN, strike=_both_ways(_lost)),
+    Fault(name="serial device reset", line=serial_line, ends=("restarted",), strike=lambda line: line.reset()),
+    Fault(name="serial cable cut", line=serial_line, ends=_LOST, strike=_cut),
+    Fault(name="serial port unplugged", line=serial_line, ends=_LOST, strike=lambda line: line.unplug()),
+    Fault(name="device clock jumps", line=serial_line, ends=("the device's clock went",), strike=_jump),
 )
 
 

@@ -1,7 +1,8 @@
-"""A session in a process of its own, for the tests that stop or kill it: ``PORT RECORDING.csv``."""
+"""A session in a process of its own, for the tests that stop or starve it: ``PORT RECORDING.csv [BYTES]``."""
 
 from __future__ import annotations
 
+import resource
 import sys
 
 from autotune.errors import AutotuneError
@@ -14,7 +15,9 @@ from tests.drivers.campaign import LIMITS, SAMPLE_S
 
 
 def main() -> None:
-    """Run a relay until something stops it."""
+    """Run a relay until something stops it; no file may grow beyond the bytes, as on a disk that is full."""
+    if len(sys.argv) > 3:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[3]),) * 2)
     rig = open_rig(tcp_settings(int(sys.argv[1])), u_range=(LIMITS.u_min, LIMITS.u_max), u_safe=U_SAFE)
     envelope = Envelope(settings=LIMITS, sample_time_s=SAMPLE_S)
     try:

@@ -1,4 +1,4 @@
-"""Stop or kill a session's process at any sample, and look at the rig's own side."""
+"""Stop or kill a session's process at any sample, or fill its disk, and look at the rig's own side."""
 
 from __future__ import annotations
 
@@ -17,10 +17,11 @@ from tests.drivers.bench import LIMIT_S, U_SAFE, register_device
 from tests.drivers.campaign import LoggedServo, Outcome, bad_samples, beyond_limits
 
 
-def strike_process(number: signal.Signals, seed: int) -> Outcome:
+def strike_process(number: signal.Signals | None, seed: int) -> Outcome:
     """Start a session in a child process, send it a signal after a random number of commands, and wait for the end.
 
-    The recording is read back as the child left it. ``safe_after_s`` counts from the last command that was taken.
+    Without a signal the disk is full after as many rows. The recording is read back as the child left it.
+    ``safe_after_s`` counts from the last command that was taken.
     """
     strike_after = random.Random(seed).randrange(5, 60)
     plant = LoggedServo(seed)
@@ -40,10 +41,13 @@ def strike_process(number: signal.Signals, seed: int) -> Outcome:
     with tempfile.TemporaryDirectory() as folder, ModbusRig(device, TcpTransport()) as server:
         path = Path(folder) / "session.csv"
         command = [sys.executable, "-m", "tests.drivers.child_session", str(server.port), str(path)]
+        if number is None:
+            command.append(str(ROW_BYTES * strike_after))
         root = Path(__file__).parents[2]
         with subprocess.Popen(command, cwd=root, stderr=subprocess.PIPE, text=True) as child:
-            assert commanded.wait(3 * LIMIT_S)
-            child.send_signal(number)
+            if number is not None:
+                assert commanded.wait(3 * LIMIT_S)
+                child.send_signal(number)
             _, said = child.communicate(timeout=LIMIT_S)
         assert released.wait(LIMIT_S)
         recording = read_recording(path)
@@ -60,15 +64,19 @@ def strike_process(number: signal.Signals, seed: int) -> Outcome:
     )
 
 
-#: signal, exit status, the one line
-SIGNALS = (
+#: about what a row of the recording takes
+ROW_BYTES = 40
+
+#: signal (none: the disk is full), exit status, the one line
+SIGNALS: tuple[tuple[signal.Signals | None, int, str], ...] = (
+    (None, 3, "the recording cannot be written"),
     (signal.SIGKILL, -signal.SIGKILL, ""),
     (signal.SIGTERM, 130, "stopped by SIGTERM"),
     (signal.SIGINT, 130, "stopped by Ctrl-C"),
 )
 
 
-def is_right(number: signal.Signals, outcome: Outcome) -> bool:
+def is_right(number: signal.Signals | None, outcome: Outcome) -> bool:
     """Return whether exit status and line are the signal's, and rig and data came through."""
     status, line = next((status, line) for each, status, line in SIGNALS if each == number)
     return outcome.exit_status == status and line in outcome.ended and outcome.is_good

@@ -8,6 +8,7 @@ import signal
 import pytest
 
 from tests.drivers.campaign import FAULTS, Fault, run_fault
+from tests.drivers.ctrl_c import STATES, stop_in
 from tests.drivers.signals import SIGNALS, strike_process
 
 
@@ -22,12 +23,20 @@ def test_the_rig_is_safe_and_no_bad_sample_is_kept(fault: Fault) -> None:
 
 
 @pytest.mark.parametrize(("number", "status", "line"), SIGNALS, ids=lambda value: getattr(value, "name", None))
-def test_a_stopped_or_killed_process_leaves_the_rig_safe_and_the_recording_readable(
-    number: signal.Signals, status: int, line: str
+def test_a_stopped_killed_or_starved_process_leaves_the_rig_safe_and_the_recording_readable(
+    number: signal.Signals | None, status: int, line: str
 ) -> None:
     outcome = strike_process(number, seed=2)
     assert outcome.is_good, outcome
     assert outcome.exit_status == status
-    assert outcome.ended.startswith(line)
+    assert line in outcome.ended
     assert "\n" not in outcome.ended
     assert outcome.rows >= 5
+
+
+@pytest.mark.parametrize("state", STATES)
+def test_the_operator_can_stop_it_in_every_state(state: str) -> None:
+    outcome = stop_in(state, seed=4)
+    assert outcome.is_good, outcome
+    assert "stopped by Ctrl-C" in outcome.ended
+    assert outcome.exit_status == 130
