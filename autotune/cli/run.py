@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -10,6 +11,7 @@ from rich.console import Console
 
 from autotune.cli import app
 from autotune.cli.common import ProgressBar, new_folder, rig_of
+from autotune.cli.live import LISTEN, PORT, TOKEN
 
 _OUT = Annotated[Path, typer.Option(metavar="DIR", help="new folder for recordings, result.json and report.html")]
 
@@ -21,9 +23,16 @@ def run(
     dry_run: Annotated[bool, typer.Option("--dry-run", help="run the rig's simulated twin instead of the rig")] = False,
     verify: Annotated[bool, typer.Option(help="try the new loop on the rig")] = True,
     deploy: Annotated[bool, typer.Option(help="write accepted gains into the rig's own controller")] = True,
+    live: Annotated[
+        bool, typer.Option("--live", help="show the run in the browser, with Abort and the decision")
+    ] = False,
+    listen: LISTEN = "127.0.0.1",
+    port: PORT = 0,
+    token: TOKEN = None,
 ) -> None:
     """Commission a rig: relay sweep, Bode points, reduced model, controller, verification, report."""
     from autotune.config import load_config
+    from autotune.live.session import LivePage
     from autotune.pipeline import RECORDING, tune
     from autotune.recording import read_recording
     from autotune.report.page import write_page
@@ -32,15 +41,17 @@ def run(
     content = load_config(config)
     rig = rig_of(content, dry_run)
     new_folder(out, RECORDING)
-    with ProgressBar() as bar:
-        tuning = tune(rig, content, out, verify=verify, deploy=deploy, on_progress=bar.show)
-    page = run_page(content.name, content.signals, read_recording(out / RECORDING), tuning)
-    write_page(page, out / "report.html")
-    console = Console(highlight=False, soft_wrap=True)
-    for warning in (*tuning.experiment.warnings, *tuning.analysis.warnings):
-        console.print(f"warning: {warning}", markup=False)
-    console.print(page.verdict, markup=False)
-    console.print(f"report: {out / 'report.html'}", markup=False)
+    with LivePage(out, listen, port, token) if live else nullcontext() as onlooker:
+        keep = onlooker.keep if onlooker is not None else None
+        with ProgressBar() as bar:
+            tuning = tune(rig, content, out, verify=verify, deploy=deploy, on_progress=bar.show, keep=keep)
+        page = run_page(content.name, content.signals, read_recording(out / RECORDING), tuning)
+        write_page(page, out / "report.html")
+        console = Console(highlight=False, soft_wrap=True)
+        for warning in (*tuning.experiment.warnings, *tuning.analysis.warnings):
+            console.print(f"warning: {warning}", markup=False)
+        console.print(page.verdict, markup=False)
+        console.print(f"report: {out / 'report.html'}", markup=False)
 
 
 @app.command()

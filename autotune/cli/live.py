@@ -1,0 +1,52 @@
+"""Command: the live page of a run that goes on, or of one that has ended."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from autotune.cli import app
+
+LISTEN = Annotated[
+    str, typer.Option(metavar="ADDRESS", help="address of the live page; any but loopback needs a token")
+]
+PORT = Annotated[int, typer.Option(min=0, max=65535, help="port of the live page; 0 takes a free one")]
+TOKEN = Annotated[
+    str | None, typer.Option(help="what visitors need; made up where absent and the address is not loopback")
+]
+
+
+@app.command()
+def live(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="folder of a run")],
+    listen: LISTEN = "127.0.0.1",
+    port: PORT = 0,
+    token: TOKEN = None,
+    beside_run: Annotated[bool, typer.Option("--beside-run", hidden=True)] = False,
+) -> None:
+    """Show a run in the browser: while it goes, or when it has ended. Looks on only; run --live has the controls."""
+    from autotune.errors import InputError
+    from autotune.live.session import require_extra
+
+    require_extra()
+    from autotune.live.server import Run, listening, serve, token_for
+    from autotune.pipeline import PROGRESS
+
+    if not beside_run and not (folder / PROGRESS).is_file():
+        raise InputError(f"holds no {PROGRESS}", where=str(folder), mend="give the --out folder of autotune run")
+    token = token_for(listen, token)
+    bound = listening(listen, port)
+    host = f"[{listen}]" if ":" in listen else listen
+    url = f"http://{host}:{bound.getsockname()[1]}/" + (f"?token={token}" if token else "")
+    if beside_run:
+        if os.name == "posix":
+            os.nice(10)  # the control loop first
+        typer.echo(url)
+        serve(folder, bound, token, Run())
+        return
+    Console(highlight=False, soft_wrap=True).print(f"live page: {url}; Ctrl-C ends it", markup=False)
+    serve(folder, bound, token)

@@ -1,0 +1,266 @@
+"""The page's charts as options of Apache ECharts; pure functions of the story.
+
+A key with a leading colon is evaluated in the browser: text takes the colour of the page, which is light or dark there.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from autotune.arrays import FloatArray
+from autotune.live.story import Story
+from autotune.report.figures import frequencies, gain_phase, gain_phase_bars, region, usual_range
+from autotune.report.page import BLUE, GREEN, GREY, ORANGE, PURPLE, RED, thinned
+
+#: regions of the points are drawn so many times larger, in every direction, where they would be too small to see
+MAGNIFIED = 10.0
+#: part of the picture that a region's axis must reach to be drawn in its true size
+SEEN_SHARE = 0.03
+ROWS = 900
+#: part of the time shown that a state must last for its name to have room
+LABEL_SHARE = 0.05
+INK = "getComputedStyle(document.body).color"
+
+Options = dict[str, Any]
+
+#: the band is its width on its lower edge, which may be negative
+STACK = {"stack": "band", "stackStrategy": "all"}
+
+
+def strip_options(story: Story, span_s: float) -> Options:
+    """Return y with its limits and the set-point over u with its limits, for the last ``span_s`` [s]."""
+    now_s = story.now_s
+    t, u, y, r = story.rows.since(now_s - span_s)
+    u_unit, y_unit = story.units
+    limits, centre = story.limits, story.centre
+    marks = [(at, name) for at, name in story.marks if t.size and at >= t[0]]
+    spaced = [
+        (at, name if later - at > LABEL_SHARE * (now_s - t[0]) else "")
+        for (at, name), (later, _) in pairwise([*marks, (math.inf, "")])
+    ]
+    y_lines = [(limits["y_min"], "y_min"), (limits["y_max"], "y_max")] if limits else []
+    u_lines = [(limits["u_min"], "u_min"), (limits["u_max"], "u_max")] if limits else []
+    low, high = (centre - limits["swing"], centre + limits["swing"]) if limits else (0.0, 1.0)
+    shown = np.concatenate([y[np.isfinite(y)], [low, high], _near([value for value, _ in y_lines], low, high)])
+    u_range = usual_range(u) if u.size else [0.0, 1.0]
+    y_line = _line("y", t, y, BLUE, width=1.4) | {
+        "markLine": _marks(y_lines, spaced),
+        "markArea": _swing(low, high) if limits else {},
+    }
+    u_line = _line("u", t, u, ORANGE, grid=1, step=True) | {"markLine": _marks(u_lines, [(at, "") for at, _ in marks])}
+    seconds = _axis("s", grid=1) | {"min": max(0.0, now_s - span_s) if t.size else 0.0, "max": max(now_s, 1.0)}
+    return _options(
+        grids=[{"top": 34, "height": "54%"}, {"top": "67%", "bottom": 30}],
+        x_axes=[seconds | {"gridIndex": 0, "name": "", ":axisLabel": "({show: false})"}, seconds],
+        y_axes=[
+            _axis(f"y [{y_unit}]", *_padded(float(shown.min()), float(shown.max()))),
+            _axis(f"u [{u_unit}]", *u_range, grid=1) | {"splitNumber": 3},
+        ],
+        series=[y_line, _line("set-point", t, r, GREY, dash="dashed", width=1.2), u_line],
+        legend=["y", "set-point", "u"],
+    )
+
+
+def bode_options(story: Story) -> Options:
+    """Return gain and phase of the points with their 95 % bars, and of the models once there are any."""
+    sign = story.sign
+    u_unit, y_unit = story.units
+    at = np.array([point.omega_rad_s for point in story.points])
+    gain, phase_deg = gain_phase(np.array([sign * point.response for point in story.points], dtype=np.complex128))
+    bars = np.array([gain_phase_bars(point) for point in story.points]).reshape(-1, 2)
+    series = [
+        _dots("points", at, gain, BLUE), _dots("points", at, phase_deg, BLUE, grid=1),
+        _bars(at, gain, bars[:, 0], BLUE), _bars(at, phase_deg, np.degrees(bars[:, 1]), BLUE, grid=1),
+    ]  # fmt: skip
+    names = ["points"]
+    if story.points:
+        omega = frequencies(story.points, decades=0.25, count=80)
+        for name, model, colour in (("fitted plant", story.plant, GREEN), ("reduced model", story.reduced, PURPLE)):
+            if model is not None:
+                curve = gain_phase(sign * model.response(omega))
+                series += [_line(name, omega, curve[0], colour), _line(name, omega, curve[1], colour, grid=1)]
+                names.append(name)
+    frequency = _axis("rad/s", grid=1) | {"type": "log", **_decades(at)}
+    return _options(
+        grids=[{"top": 34, "height": "38%"}, {"top": "55%", "bottom": 30}],
+        x_axes=[frequency | {"gridIndex": 0, "name": "", ":axisLabel": "({show: false})"}, frequency],
+        y_axes=[
+            _axis(f"gain [{y_unit}/{u_unit}]") | {"type": "log", **_decades(gain)},
+            _axis("phase [deg]", grid=1) | {"scale": True, "splitNumber": 3},
+        ],
+        series=series,
+        legend=names,
+    )
+
+
+def regions_options(story: Story) -> tuple[Options, float]:
+    """Return the points in the complex plane with their 95 % regions, and how many times larger these are drawn."""
+    sign = story.sign
+    centres = np.array([sign * point.response for point in story.points], dtype=np.complex128)
+    extent = float(np.ptp(np.concatenate([centres.real, centres.imag, [0.0]]))) or 1.0
+    largest = max((float(point.region_radii()[0].max()) for point in story.points), default=0.0)
+    times = MAGNIFIED if largest < SEEN_SHARE * extent else 1.0
+    series = [_dots("points", centres.real, centres.imag, BLUE, labels=story_labels(story))]
+    for point, centre in zip(story.points, centres, strict=True):
+        edge = centre + times * (region(point, complex(sign)) - centre)
+        series.append(_line("95 % region", edge.real, edge.imag, ORANGE, width=1.6))
+    if story.plant is not None and story.points:
+        omega = frequencies(story.points, decades=0.15, count=80)
+        curve = sign * story.plant.response(omega)
+        series.append(_line("fitted plant", curve.real, curve.imag, GREEN))
+    axis = {"scale": True, "splitNumber": 4}
+    options = _options(
+        grids=[{"top": 34, "bottom": 30}],
+        x_axes=[_axis("real part") | axis],
+        y_axes=[_axis("imaginary part") | axis],
+        series=series,
+        legend=["points", "95 % region", *(["fitted plant"] if story.plant is not None else [])],
+    )
+    return options, times
+
+
+def story_labels(story: Story) -> list[str]:
+    """Return the frequency of every point, for its label."""
+    return [f"{point.omega_rad_s:.3g}" for point in story.points]
+
+
+def steps_options(story: Story) -> Options:
+    """Return the measured response to set-point and load step in the band of what was predicted."""
+    steps = {name: np.array(values) for name, values in story.steps.items()}
+    t = steps["t"]
+    band = _line("95 % band", t, steps["high"] - steps["low"], GREEN, width=0.0)
+    band |= STACK | {"areaStyle": {"color": GREEN, "opacity": 0.2}}
+    return _options(
+        grids=[{"top": 34, "bottom": 30}],
+        x_axes=[_axis("s") | {"min": 0.0, "max": float(t[-1])}],
+        y_axes=[_axis(f"y - operating point [{story.units[1]}]") | {"scale": True}],
+        series=[
+            _line("low", t, steps["low"], GREEN, width=0.0) | STACK,
+            band,
+            _line("measured", t, steps["measured"], BLUE, width=2.0),
+            _line("predicted", t, steps["predicted"], RED, width=1.6),
+            _line("set-point", t, steps["setpoint"], GREY, dash="dashed", width=1.2),
+        ],
+        legend=["95 % band", "measured", "predicted", "set-point"],
+    )
+
+
+def _options(
+    *, grids: list[Options], x_axes: list[Options], y_axes: list[Options], series: list[Options], legend: list[str]
+) -> Options:
+    return {
+        "animation": False,
+        "textStyle": {"fontFamily": "inherit", ":color": INK},
+        "legend": {"data": legend, "top": 0, "left": 0, "itemGap": 8, "itemWidth": 14, "textStyle": {":color": INK}},
+        "tooltip": {"trigger": "axis", "axisPointer": {"type": "line"}, "confine": True},
+        "grid": [{"left": 62, "right": 16} | grid for grid in grids],
+        "xAxis": x_axes,
+        "yAxis": y_axes,
+        "series": series,
+    }
+
+
+def _axis(name: str, low: float | None = None, high: float | None = None, *, grid: int = 0) -> Options:
+    axis: Options = {
+        "type": "value",
+        "gridIndex": grid,
+        "name": name,
+        "nameLocation": "middle",
+        "nameGap": 20 if name in ("s", "rad/s", "real part") else 46,
+        "nameTextStyle": {":color": INK},
+        "axisLabel": {":color": INK, "hideOverlap": True, ":formatter": "v => +v.toPrecision(3)"},
+        "axisLine": {"lineStyle": {"color": GREY}},
+        "splitLine": {"lineStyle": {"color": "rgba(128,128,128,0.25)"}},
+    }
+    return axis if low is None or high is None else axis | {"min": low, "max": high}
+
+
+def _line(
+    name: str, x: FloatArray, y: FloatArray, colour: str, *, grid: int = 0, dash: str = "solid",
+    width: float = 1.4, step: bool = False,
+) -> Options:  # fmt: skip
+    if x.size > ROWS:
+        x, y = thinned(x, y, ROWS)
+    line: Options = {
+        "name": name,
+        "type": "line",
+        "xAxisIndex": grid,
+        "yAxisIndex": grid,
+        "showSymbol": False,
+        "lineStyle": {"color": colour, "width": width, "type": dash},
+        "itemStyle": {"color": colour},
+        "data": _pairs(x, y),
+    }
+    return line | {"step": "end"} if step else line
+
+
+def _dots(
+    name: str, x: FloatArray, y: FloatArray, colour: str, *, grid: int = 0, labels: Sequence[str] = ()
+) -> Options:
+    pairs = _pairs(x, y)
+    data: list[Any] = (
+        [{"value": pair, "name": label} for pair, label in zip(pairs, labels, strict=True)] if labels else pairs
+    )
+    return {
+        "name": name,
+        "type": "scatter",
+        "xAxisIndex": grid,
+        "yAxisIndex": grid,
+        "symbolSize": 8,
+        "itemStyle": {"color": colour},
+        "label": {"show": bool(labels), "formatter": "{b}", "position": "right", ":color": INK},
+        "data": data,
+    }
+
+
+def _bars(x: FloatArray, y: FloatArray, half: FloatArray, colour: str, *, grid: int = 0) -> Options:
+    """Return vertical bars as one line with gaps."""
+    data: list[list[float | None]] = []
+    for at, middle, length in zip(x, y, half, strict=True):
+        data += [[float(at), float(middle - length)], [float(at), float(middle + length)], [float(at), None]]
+    return _line("95 %", np.empty(0), np.empty(0), colour, grid=grid, width=2.0) | {"data": data}
+
+
+def _marks(lines: list[tuple[float, str]], instants: list[tuple[float, str]]) -> Options:
+    def mark(where: dict[str, float], text: str, colour: str, label: Options) -> Options:
+        shown = {"formatter": text, "show": bool(text), ":color": INK, "fontSize": 11} | label
+        return where | {"lineStyle": {"color": colour, "type": "dotted"}, "label": shown}
+
+    limits = [mark({"yAxis": value}, text, RED, {"position": "insideEndTop"}) for value, text in lines]
+    begins = [mark({"xAxis": at}, text, GREY, {"position": "insideEndBottom"}) for at, text in instants]
+    return {"symbol": "none", "silent": True, "animation": False, "data": [*limits, *begins]}
+
+
+def _swing(low: float, high: float) -> Options:
+    area = [{"yAxis": low, "name": "allowed swing"}, {"yAxis": high}]
+    label = {"position": "insideBottomLeft", ":color": INK, "fontSize": 11}
+    return {"silent": True, "itemStyle": {"color": "rgba(128,128,128,0.10)"}, "label": label, "data": [area]}
+
+
+def _pairs(x: FloatArray, y: FloatArray) -> list[list[float | None]]:
+    """Return the rows as the browser takes them, six digits each; a gap where y is not a number."""
+    xs = [float(f"{value:.6g}") for value in x]
+    ys = [float(f"{value:.6g}") if np.isfinite(value) else None for value in y]
+    return [list(pair) for pair in zip(xs, ys, strict=True)]
+
+
+def _near(limits: list[float], low: float, high: float) -> list[float]:
+    """Return the limits that the axis can reach without making the swing small."""
+    return [limit for limit in limits if low - (high - low) <= limit <= high + (high - low)]
+
+
+def _padded(low: float, high: float) -> tuple[float, float]:
+    room = 0.06 * (high - low)
+    return low - room, high + room
+
+
+def _decades(values: FloatArray) -> Options:
+    """Return the ends of a logarithmic axis a little beyond the values."""
+    if not values.size:
+        return {"min": 0.1, "max": 10.0}
+    return {"min": float(f"{values.min() / 1.6:.2g}"), "max": float(f"{values.max() * 1.6:.2g}")}

@@ -1,0 +1,188 @@
+"""Serves the page from local files: on loopback, or on another address to whoever has the token."""
+
+from __future__ import annotations
+
+import os
+import secrets
+import socket
+import sys
+import threading
+import time
+from http.cookies import SimpleCookie
+from pathlib import Path
+from urllib.parse import parse_qs, urlsplit
+
+import uvicorn
+from fastapi import FastAPI
+from nicegui import app as pages
+from nicegui import ui
+from starlette.responses import PlainTextResponse
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from autotune.errors import InputError
+from autotune.live.controls import Controls
+from autotune.live.page import Screen, build
+from autotune.live.story import Story
+
+LOOPBACK = ("127.0.0.1", "::1", "localhost")
+#: time between two looks at the files [s]
+POLL_S = 0.2
+#: time without any open page after which the page of a finished run is no longer served [s]
+LINGER_S = 1.0
+#: nothing from anywhere else is loaded, no other page may frame this one; the page's library compiles templates
+POLICY = (
+    "default-src 'self'; script-src 'self' 'unsafe-inline' 'unsafe-eval'; style-src 'self' 'unsafe-inline';"
+    " img-src 'self' data:; font-src 'self' data:; frame-ancestors 'none'; form-action 'none'; base-uri 'none'"
+)
+
+
+class Guard:
+    """Lets requests through that come from the page itself, and where there is a token, from whoever has it.
+
+    On loopback the name that was asked for must be a loopback name: a foreign page that has its own name resolved to
+    this machine is refused. A request of a foreign origin is refused everywhere.
+
+    Parameters
+    ----------
+    inner : ASGI application
+        What is guarded.
+    token : str or None
+        What must be in the address once; it is kept in a cookie then. None on loopback.
+    """
+
+    def __init__(self, inner: ASGIApp, token: str | None) -> None:
+        self._inner, self._token = inner, token
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer a request, or refuse it with 403."""
+        if scope["type"] not in ("http", "websocket"):
+            await self._inner(scope, receive, send)
+            return
+        headers = {name.decode("latin-1"): value.decode("latin-1") for name, value in scope["headers"]}
+        host = headers.get("host", "")
+        origin = headers.get("origin")
+        given = parse_qs(scope["query_string"].decode("latin-1")).get("token", [""])[0]
+        cookie = SimpleCookie(headers.get("cookie", "")).get(_cookie(host))
+        foreign = origin is not None and urlsplit(origin).netloc != host
+        named = self._token is not None or urlsplit(f"//{host}").hostname in LOOPBACK
+        known = self._token is None or any(
+            secrets.compare_digest(word.encode(), self._token.encode())
+            for word in (given, cookie.value if cookie is not None else "")
+        )
+        if foreign or not named or not known:
+            await PlainTextResponse("refused: open the address that the command has printed", 403)(scope, receive, send)
+            return
+
+        async def answered(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                message["headers"] = [*message.get("headers", []), (b"content-security-policy", POLICY.encode())]
+                if self._token is not None and given:
+                    kept = f"{_cookie(host)}={self._token}; HttpOnly; SameSite=Strict; Path=/"
+                    message["headers"].append((b"set-cookie", kept.encode()))
+            await send(message)
+
+        await self._inner(scope, receive, answered)
+
+
+def _cookie(host: str) -> str:
+    """Return the name of the cookie: cookies are shared between the ports of a machine."""
+    return f"autotune_live_{urlsplit(f'//{host}').port or 80}"
+
+
+def token_for(host: str, given: str | None) -> str | None:
+    """Return the token that visitors need: the given one, a new one on another address than loopback, else none."""
+    return given or (None if host in LOOPBACK else secrets.token_urlsafe(12))
+
+
+def listening(host: str, port: int) -> socket.socket:
+    """Return a socket that listens; port 0 takes a free one.
+
+    Raises
+    ------
+    InputError
+        The address is not this machine's, or the port is taken.
+    """
+    try:
+        family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
+        bound = socket.socket(family)
+        bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        bound.bind((host, port))
+    except OSError as error:
+        raise InputError(
+            f"cannot be listened on ({error.strerror})", where=f"{host}:{port}", mend="give another --listen"
+        ) from None
+    return bound
+
+
+def serve(folder: Path, bound: socket.socket, token: str | None, run: Run | None = None) -> None:
+    """Serve the page of a run's folder until Ctrl-C, or with a ``run`` until that is over and no page is open.
+
+    Parameters
+    ----------
+    folder : Path
+        Of a run that goes on, or has ended.
+    bound : socket
+        From :func:`listening`.
+    token : str or None
+        None on loopback only.
+    run : Run, optional
+        The run that listens to the page.
+    """
+    story, screens = Story(folder), set[Screen]()
+    controls = Controls(run.act if run is not None else None)
+    story.poll()
+    shell = FastAPI()
+    ui.page("/", title="autotune live")(build(story, controls, screens))
+    ui.run_with(
+        shell, dark=None, tailwind=False, show_welcome_message=False, message_history_length=50, language="en-US"
+    )
+    settings = uvicorn.Config(
+        Guard(shell, token), log_level="warning", ws_per_message_deflate=False, timeout_graceful_shutdown=1
+    )
+    server = uvicorn.Server(settings)
+    looked_s = time.monotonic()
+
+    def look() -> None:
+        nonlocal looked_s
+        story.poll()
+        tabs = {screen.tab for screen in screens if screen.tab is not None}
+        controls.present(tabs)
+        for screen in list(screens):
+            screen.update()
+        over = run is not None and run.is_over
+        controls.run_is_gone = over and story.ended is None
+        looked_s = looked_s if over and not tabs else time.monotonic()
+        server.should_exit = server.should_exit or time.monotonic() - looked_s > LINGER_S
+
+    pages.timer(POLL_S, look)
+    server.run(sockets=[bound])
+
+
+class Run:
+    """The run that started this process: it hears actions on one pipe, and another pipe ends with it.
+
+    Its own output goes where errors go, so that nothing but actions is in the pipe.
+    """
+
+    def __init__(self) -> None:
+        self._actions = os.fdopen(os.dup(sys.stdout.fileno()), "w", buffering=1, encoding="utf-8")
+        os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
+        self._over = threading.Event()
+        threading.Thread(target=self._wait_for_end, daemon=True).start()
+
+    def act(self, action: str) -> None:
+        """Tell the run; one that is gone hears nothing."""
+        try:
+            self._actions.write(f"{action}\n")
+        except OSError:
+            self._over.set()
+
+    @property
+    def is_over(self) -> bool:
+        """Whether the run has ended."""
+        return self._over.is_set()
+
+    def _wait_for_end(self) -> None:
+        while sys.stdin.buffer.read(1):
+            pass
+        self._over.set()

@@ -1,0 +1,123 @@
+"""The run's side of the live page: starts its process, hears its actions, and never waits for it while the rig moves.
+
+The page is another process, with a lower priority, that reads the run's files; what a browser does cannot hold up the
+control loop. Only actions come back, each a line on a pipe: a thread that sleeps on it stops the loop as Ctrl-C does.
+"""
+
+from __future__ import annotations
+
+import _thread
+import importlib.util
+import queue
+import subprocess
+import sys
+import threading
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from rich.console import Console
+
+from autotune.errors import InputError
+
+#: what the page may ask; anything else on the pipe is no action
+ACTIONS = ("abort", "keep", "restore")
+
+
+def require_extra() -> None:
+    """Refuse where the page's library is not installed.
+
+    Raises
+    ------
+    InputError
+        With the command that installs it.
+    """
+    if importlib.util.find_spec("nicegui") is None:
+        raise InputError("needs nicegui", where="live page", mend="pip install 'relay-autotune[live]'")
+
+
+class LivePage:
+    """The page beside a run, as a context manager; leaving it waits until the last open page is closed, or Ctrl-C.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the run.
+    listen, port : str, int
+        Address and port; port 0 takes a free one.
+    token : str or None
+        What visitors need; made up where None and the address is not loopback.
+
+    Attributes
+    ----------
+    url : str
+        Where the page is.
+
+    Raises
+    ------
+    InputError
+        The page's library is missing, or the address cannot be listened on.
+    """
+
+    def __init__(self, folder: Path, listen: str, port: int, token: str | None) -> None:
+        require_extra()
+        self._command = [
+            sys.executable, "-m", "autotune.cli", "live", str(folder), "--beside-run",
+            "--listen", listen, "--port", str(port), *(["--token", token] if token else []),
+        ]  # fmt: skip
+        self._console = Console(highlight=False, soft_wrap=True)
+        self._answers: queue.SimpleQueue[str] = queue.SimpleQueue()
+        self.url = ""
+
+    def __enter__(self) -> Self:
+        self._page = subprocess.Popen(
+            self._command,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            start_new_session=True,  # a Ctrl-C in the shell is for the run, which tells the page how it ended
+        )
+        assert self._page.stdout is not None
+        self.url = self._page.stdout.readline().strip()
+        if not self.url:
+            self._page.wait()
+            raise InputError("did not start, its reason is above", where="live page", mend="give another --listen")
+        threading.Thread(target=self._hear, daemon=True).start()
+        self._console.print(f"live page: {self.url}", markup=False)
+        return self
+
+    def keep(self, patience_s: float) -> bool:
+        """Wait for the operator's decision on the new gains; without one, or without a page, they stay.
+
+        Parameters
+        ----------
+        patience_s : float
+            Longest wait [s].
+        """
+        try:
+            return self._answers.get(timeout=patience_s) != "restore"
+        except (queue.Empty, KeyboardInterrupt):
+            return True
+
+    def _hear(self) -> None:
+        assert self._page.stdout is not None
+        for line in self._page.stdout:
+            action = line.strip()
+            if action == "abort":
+                _thread.interrupt_main()
+            elif action in ACTIONS:
+                self._answers.put(action)
+        self._answers.put("keep")  # the page is gone: nobody will answer
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        assert self._page.stdin is not None
+        self._page.stdin.close()
+        try:
+            if self._page.poll() is None:
+                self._console.print(f"live page: {self.url} stays while it is open; Ctrl-C here ends it", markup=False)
+            self._page.wait()
+        except KeyboardInterrupt:
+            self._page.terminate()
+            self._page.wait()

@@ -1,0 +1,273 @@
+"""What an onlooker knows of a run: read from its folder as the files grow, and as well when they have ended."""
+
+from __future__ import annotations
+
+import json
+import math
+from array import array
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from autotune.arrays import FloatArray
+from autotune.controller import PIDController
+from autotune.errors import InputError
+from autotune.experiment.result import State
+from autotune.models import TransferFunction
+from autotune.pipeline import PROGRESS
+from autotune.points import FrequencyPoint, points_from_json
+
+#: part of limits.swing from which on y counts as near the limit
+NEAR_SHARE = 0.9
+#: time that nearness is judged over [s]
+RECENT_S = 3.0
+
+
+class Tail:
+    """The whole lines of a file that grows; a line that is not finished waits for its end."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._offset = 0
+
+    def lines(self) -> list[str]:
+        """Return the lines that have been finished since the last call; none while there is no file."""
+        try:
+            with self._path.open("rb") as file:
+                file.seek(self._offset)
+                text = file.read()
+        except FileNotFoundError:
+            return []
+        whole = text[: text.rfind(b"\n") + 1]
+        self._offset += len(whole)
+        return whole.decode("utf-8", errors="replace").splitlines()
+
+
+@dataclass(kw_only=True)
+class Rows:
+    """Rows of all recordings of a run, one after the other on one axis of time."""
+
+    t: array[float] = field(default_factory=lambda: array("d"))
+    u: array[float] = field(default_factory=lambda: array("d"))
+    y: array[float] = field(default_factory=lambda: array("d"))
+    r: array[float] = field(default_factory=lambda: array("d"))
+
+    def since(self, t_s: float) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Return t, u, y, r of the rows from ``t_s`` [s] on, (N,) each."""
+        t = np.array(self.t)
+        first = int(np.searchsorted(t, t_s))
+        return t[first:], np.array(self.u[first:]), np.array(self.y[first:]), np.array(self.r[first:])
+
+
+@dataclass(frozen=True, kw_only=True)
+class Gains:
+    """Old and new gains, and whether the rig holds the new ones."""
+
+    old: PIDController | None
+    new: PIDController
+    deployed: bool
+
+
+class Story:
+    """A run as far as its folder tells.
+
+    Attributes
+    ----------
+    rows : Rows
+        Samples so far.
+    marks : list of (float, str)
+        Times at which a state or a recording began [s].
+    news : int
+        Counts what changed beside the rows.
+    state, message : str
+        Where the procedure is, and what happens.
+    sign : int
+        Sign of the plant's gain as far as known.
+    points, plant, reduced, controller, steps, accepted, verdict, gains
+        What was found so far; None, empty or False before.
+    waiting_s : float
+        How long the operator may decide otherwise [s], 0 while there is nothing to decide.
+    ended : (str, int) or None
+        Reason and exit status.
+
+    Raises
+    ------
+    InputError
+        The folder holds no run that tells of itself.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._events = Tail(folder / PROGRESS)
+        self._recording: Tail | None = None
+        self._columns: list[str] = []
+        self._start_s = 0.0
+        self._remaining_s, self._told_s = math.nan, 0.0
+        self._relay: dict[str, Any] | None = None
+        self.rows = Rows()
+        self.config: dict[str, Any] = {}
+        self.marks: list[tuple[float, str]] = []
+        self.news = 0
+        self.state, self.message = "connect", "waiting for the run to begin"
+        self._told: list[str] = []
+        self.sign = 1
+        self.points: tuple[FrequencyPoint, ...] = ()
+        self.plant: TransferFunction | None = None
+        self.reduced: TransferFunction | None = None
+        self.controller: PIDController | None = None
+        self.steps: dict[str, list[float]] = {}
+        self.accepted, self.verdict = False, ""
+        self.gains: Gains | None = None
+        self.waiting_s = 0.0
+        self.ended: tuple[str, int] | None = None
+
+    def poll(self) -> bool:
+        """Read what is new, and say whether there was anything."""
+        events = self._events.lines()
+        for line in events:
+            try:
+                event = json.loads(line)
+            except ValueError:
+                raise InputError(
+                    "holds a line that is not JSON", where=str(self._folder / PROGRESS), mend="give another folder"
+                ) from None
+            self._take(event)
+        self.news += len(events)
+        return self._read_rows() or bool(events)
+
+    def _take(self, event: dict[str, Any]) -> None:
+        match event.pop("event"):
+            case "run":
+                self.config, self.ended = event["config"], None
+            case "recording":
+                self._read_rows()  # the one before is complete
+                self._start_s = self.now_s
+                self._recording, self._columns = Tail(self._folder / event["file"]), []
+                if self.controller is not None:
+                    self._enter(State.VERIFY.value, self._start_s)
+                    self.message = "bringing the rig to its operating point under the new gains"
+                    self._remaining_s = math.nan
+            case "progress":
+                self._progress(event)
+            case "analysis":
+                self.points = points_from_json(event["points"], PROGRESS)
+                self.plant, self.reduced = _transfer_function(event["plant"]), _transfer_function(event["reduced"])
+                self.controller = _controller(event["controller"])
+                self.sign = 1 if self.controller.K > 0 else -1
+                self.message = "controller designed"
+            case "verification":
+                self.steps, self.accepted, self.verdict = event["steps"], event["accepted"], event["reason"]
+            case "gains":
+                old = _controller(event["old"]) if event["old"] else None
+                self.gains = Gains(old=old, new=_controller(event["new"]), deployed=event["deployed"])
+                self.waiting_s = 0.0
+            case "waiting":
+                self.waiting_s = event["patience_s"]
+            case "ended":
+                self.ended, self.waiting_s = (event["reason"], event["exit_status"]), 0.0
+
+    def _progress(self, event: dict[str, Any]) -> None:
+        at_s = self._start_s + event["elapsed_s"]
+        self._enter(event["state"], at_s)
+        self.message = event["message"]
+        self._remaining_s = math.nan if event["remaining_s"] is None else event["remaining_s"]
+        self._told_s = at_s
+        self._relay = event["relay"]
+        self.sign = int(self._relay["plant_sign"]) if self._relay is not None else self.sign
+        self._told = event["warnings"] or self._told
+        if event["points"]:
+            self.points = points_from_json(event["points"], PROGRESS)
+
+    def _enter(self, state: str, at_s: float) -> None:
+        if state != self.state:
+            self.marks.append((at_s, state))
+        self.state = state
+
+    def _read_rows(self) -> bool:
+        lines = self._recording.lines() if self._recording is not None else []
+        for line in lines:
+            if line.startswith("#") or not line:
+                continue
+            if not self._columns:
+                self._columns = line.split(",")
+                continue
+            row = dict(zip(self._columns, map(float, line.split(",")), strict=False))
+            self.rows.t.append(self._start_s + row["t"])
+            self.rows.u.append(row["u"])
+            self.rows.y.append(row["y"])
+            self.rows.r.append(row.get("r", self.centre))
+        return bool(lines)
+
+    @property
+    def now_s(self) -> float:
+        """Rig time of the last row [s]."""
+        return self.rows.t[-1] if self.rows.t else 0.0
+
+    @property
+    def centre(self) -> float:
+        """Operating point [y unit]; NaN while unknown."""
+        return float(self.config["operating_point"]["y"]) if self.config else math.nan
+
+    @property
+    def limits(self) -> dict[str, float]:
+        """The configuration's limits; empty while unknown."""
+        return dict(self.config.get("limits", {}))
+
+    @property
+    def units(self) -> tuple[str, str]:
+        """Units of u and y."""
+        signals = self.config.get("signals", {})
+        return signals.get("u_unit", ""), signals.get("y_unit", "")
+
+    @property
+    def remaining_s(self) -> float:
+        """Rig time that the present state is still expected to take [s]; NaN while nobody can know."""
+        return max(0.0, self._remaining_s - (self.now_s - self._told_s))
+
+    def relay_text(self) -> str:
+        """Return what the relay does now, in words; nothing while none runs."""
+        if self._relay is None or self.state != State.SWEEP.value or not self.rows.u:
+            return ""
+        u_unit, y_unit = self.units
+        relay = self._relay
+        delay_s = (relay["delay_samples"] + 0.5 * (relay["smoothing"] - 1)) * self.config["signals"]["sample_time_s"]
+        side = "high" if self.rows.u[-1] > relay["midpoint"] else "low"
+        return (
+            f"Relay {side}: {relay['midpoint']:.4g} ± {relay['amplitude']:.3g} {u_unit}, inserted delay"
+            f" {delay_s:.3g} s, hysteresis {relay['hysteresis']:.2g} {y_unit}"
+        )
+
+    def limits_text(self) -> str:
+        """Return the limits in words; nothing while they are unknown."""
+        if not self.limits:
+            return ""
+        limits, (u_unit, y_unit) = self.limits, self.units
+        return (
+            f"Limits: u {limits['u_min']:g} to {limits['u_max']:g} {u_unit}, safe {limits['u_safe']:g} {u_unit};"
+            f" y {limits['y_min']:g} to {limits['y_max']:g} {y_unit},"
+            f" within {limits['swing']:g} {y_unit} of {self.centre:g} {y_unit}; {limits['time_s']:g} s in all"
+        )
+
+    def warnings(self) -> list[str]:
+        """Return what an onlooker should know, in words."""
+        found = list(self._told)
+        swing = self.limits.get("swing", math.inf)
+        floats = self.state in (State.SWEEP.value, State.VERIFY.value)
+        if floats and self.ended is None:
+            y = self.rows.since(self.now_s - RECENT_S)[2]
+            departure = float(np.nanmax(np.abs(y - self.centre), initial=0.0))
+            if departure > NEAR_SHARE * swing:
+                share = 100 * departure / swing
+                found.append(f"y comes near its limit: {share:.0f} % of the allowed swing of {swing:g} {self.units[1]}")
+        return found
+
+
+def _transfer_function(content: dict[str, Any]) -> TransferFunction:
+    return TransferFunction(num=tuple(content["num"]), den=tuple(content["den"]), delay_s=content["delay_s"])
+
+
+def _controller(content: dict[str, Any]) -> PIDController:
+    Ti_s = content["Ti_s"]
+    return PIDController(**content | {"Ti_s": math.inf if Ti_s is None else Ti_s})
