@@ -154,9 +154,16 @@ def dither(
     """Add a dither to the rig's present controller and record r, u and y, within the limits of the config."""
     from autotune.cli.common import ProgressBar, rig_of
     from autotune.config import load_config
+    from autotune.errors import InputError
     from autotune.experiment.dither import run_dither
 
     content = load_config(config)
+    if out.with_suffix(".toml").resolve() == config.resolve():
+        raise InputError(
+            f"the recording's sidecar {out.with_suffix('.toml')} would overwrite the configuration",
+            where="--out",
+            mend="give the recording another name",
+        )
     rig = rig_of(content)
     with ProgressBar() as bar:
         done = run_dither(

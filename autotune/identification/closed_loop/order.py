@@ -27,6 +27,8 @@ _CLEAR_GAIN = 6.0
 _CANDIDATE_STEPS = 25
 #: Rows that the choice looks at; longer records are polished whole once it is made.
 CHOICE_ROWS = 20_000
+#: Rows that a start is computed from; the polish, which decides, takes them all.
+_START_ROWS = 100_000
 #: Residuals below this share of the signals are rounding: a higher order earns nothing by making them smaller still.
 _NOISE_FREE = 1e-7
 
@@ -174,7 +176,7 @@ def choose_order(
             try_order(order, delay, factor)
     best = _parsimonious(fits)
     evidence = _evidence(fits)
-    factor = _factor(*shifted(u, y, best[1]), p=data.p)
+    factor = _factor(*shifted(u[:_START_ROWS], y[:_START_ROWS], best[1]), p=data.p)
     estimate = fits[best]
     if cut < len(u) or not estimate.converged:
         estimate = start_and_polish(factor, u, y, best[0], delay=best[1], feedthrough=feedthrough, offset=offset)
@@ -205,7 +207,7 @@ def fixed_order(
     feedthrough, offset : bool
         As in :func:`autotune.identification.closed_loop.prediction_error.prediction_error`.
     """
-    factor = _factor(*shifted(u, y, delay), p=p, least=order + 2)
+    factor = _factor(*shifted(u[:_START_ROWS], y[:_START_ROWS], delay), p=p, least=order + 2)
     return start_and_polish(factor, u, y, order, delay=delay, feedthrough=feedthrough, offset=offset)
 
 

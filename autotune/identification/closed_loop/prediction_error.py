@@ -27,6 +27,8 @@ _TOLERANCE = 1e-3
 _LINEAR_ROWS = 2000
 #: A search that cannot move any more has converged if it could have gained less than this.
 _IMMATERIAL = 0.1
+#: A search that could gain less than this is near enough to its end to tell whether a constant is missing.
+_NEAR = 1.0
 #: Means above this share of the motion are an operating point, about which everything is computed: far from it, the
 #: constant and the dynamics hang together.
 _OPERATING_POINT = 0.2
@@ -188,7 +190,7 @@ class _Search:
 def _search(
     predictor: Predictor, u: FloatArray, y: FloatArray, *, feedthrough: bool, offset: bool, max_iterations: int
 ) -> _Search:
-    """Search from a predictor, without a constant until that has converged and the score test asks for one."""
+    """Search from a predictor, without a constant until, near the end, the score test asks for one."""
     damping, iterations, converged, constant = 0.0, 0, False, False
     errors = scatter(predictor.F, predictor.H, predictor.x0, u, y)
     floor = len(y) * (_NOISE_FREE * np.std(y, axis=0)) ** 2
@@ -209,16 +211,16 @@ def _search(
         if converged or iterations == max_iterations:
             break
         ahead = _improved(predictor, directions[:, :used], information, gradient, errors, u, y, damping)
+        if offset and not constant and ahead.promise < _NEAR:
+            gain = _step(total[:-1, :-1], total[:-1, -1], 0.0)[1] - ahead.promise
+            constant = gain > n_y * math.log(len(y))  # what the Bayesian criterion asks of n_y parameters
+            if constant:
+                damping = 0.0
+                continue
         damping, converged = ahead.damping, ahead.converged
-        if ahead.predictor is not None:
-            predictor, errors, iterations = ahead.predictor, ahead.errors, iterations + 1
-            continue
-        if constant or not offset:
+        if ahead.predictor is None:
             break
-        gain = _step(total[:-1, :-1], total[:-1, -1], 0.0)[1] - ahead.promise
-        if gain < n_y * math.log(len(y)):  # what the Bayesian criterion asks of n_y parameters
-            break
-        constant, damping = True, 0.0
+        predictor, errors, iterations = ahead.predictor, ahead.errors, iterations + 1
     return _Search(
         predictor=predictor,
         directions=directions[:, :used],

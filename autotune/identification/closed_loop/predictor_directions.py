@@ -102,8 +102,7 @@ def behaviour_directions(predictor: Predictor, *, feedthrough: bool, offset: boo
     -------
     (entries, P) array
         P = n (n_u + 2 n_y) + n + n_y n_u (feedthrough) + n_y (offset): the number of free parameters with the initial
-        state counted. The constants' columns are the last: a constant of the state equation is one of the output
-        equation in other coordinates, the predictor being stable.
+        state counted. The constants' columns are the last.
 
     Notes
     -----
@@ -124,10 +123,19 @@ def behaviour_directions(predictor: Predictor, *, feedthrough: bool, offset: boo
 
 
 def constant_directions(predictor: Predictor) -> FloatArray:
-    """Return the directions of the constants y_0, shape (entries, n_y)."""
-    n_y, width = predictor.H.shape
+    """Return the directions of the constants, shape (entries, n_y).
+
+    Where there are states enough they are loads on the states, along which the prediction shifts most: the drift that a
+    load means does not change as a mode of plant or predictor comes near one, whereas y_0 for the same drift runs away.
+    """
+    n, n_u, n_y = predictor.sizes
+    at = predictor.F.size + (n + n_u + 1) * np.arange(1, n_y + 1) - 1  # y_0
+    loads = np.eye(n_y)
+    if n >= n_y:
+        at = (n + n_u + n_y + 1) * np.arange(1, n + 1) - 1  # d
+        loads = np.linalg.qr(np.linalg.solve(np.eye(n) - predictor.F[:, :n].T, predictor.H[:, :n].T))[0]
     directions = np.zeros((predictor.packed().size, n_y))
-    directions[predictor.F.size + width * np.arange(1, n_y + 1) - 1, np.arange(n_y)] = 1.0
+    directions[at] = loads
     return directions
 
 
