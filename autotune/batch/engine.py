@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import logging
+import signal
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import TypeVar
 
 from dask.system import CPU_COUNT
-from distributed import Client, KilledWorker, LocalCluster, as_completed
+from distributed import Client, KilledWorker, LocalCluster, Worker, as_completed
 
 import autotune
 from autotune.errors import InputError
@@ -54,7 +55,9 @@ def cluster(workers: int | None = None, scheduler: str | None = None) -> Iterato
                 threads_per_worker=1,
                 host="127.0.0.1",
                 dashboard_address=None,
+                scheduler_kwargs={"dashboard_address": "127.0.0.1:0"},  # it serves its health there, on any free port
                 silence_logs=logging.CRITICAL,
+                preload=[__name__],
             ) as local,
             Client(local) as client,
         ):
@@ -67,6 +70,11 @@ def cluster(workers: int | None = None, scheduler: str | None = None) -> Iterato
     with client:
         _check(client, scheduler)
         yield client
+
+
+def dask_setup(_worker: Worker) -> None:
+    """Leave Ctrl-C, which a terminal sends to every process of the command, to the one that closes the cluster."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def _check(client: Client, scheduler: str) -> None:

@@ -50,8 +50,8 @@ class Row:
     attention : {"act", "failed", "look", "fine"}
         What the reader should do.
     severity : float
-        Within ``act``: 1 for an unstable loop, else the share by which a margin is missed, or the part of the
-        simulation error that is not noise.
+        0 to 1. Within ``act``: 1 for an unstable loop, else the share by which a margin is missed, or the part of the
+        simulation error that is not noise; within ``look``: the part of (11) that another controller would spare.
     reason : str
         Why, in a sentence.
     file, u_unit, y_unit : str
@@ -328,12 +328,14 @@ def _compared(row: Row, present: Controller, m: Margins, settings: CampaignSetti
     missed = 1.0 - min(m.modulus / asked_modulus, m.phase_rad / asked_phase)
     if missed > _TOLERANCE:
         reason = (
-            f"present margins {m.modulus:.2f} and {math.degrees(m.phase_rad):.0f} deg, "
-            f"asked {asked_modulus:.2g} and {math.degrees(asked_phase):.0f} deg"
+            f"margins {m.modulus:.2f} and {math.degrees(m.phase_rad):.0f} deg instead of {asked_modulus:.2g} and "
+            f"{math.degrees(asked_phase):.0f} deg"
         )
         return replace(row, attention="act", severity=min(missed, 1.0), reason=reason)
     if row.h2 is not None and m.h2 > _SLUGGISH * row.h2:
-        return replace(row, attention="look", reason=f"disturbances could move y {m.h2 / row.h2:.1f} times less")
+        better = m.h2 / row.h2
+        reason = f"disturbances could move y {better:.1f} times less"
+        return replace(row, attention="look", severity=1.0 - 1.0 / better, reason=reason)
     return row
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from autotune.arrays import BoolArray, FloatArray
+from autotune.arrays import BoolArray, FloatArray, IntArray
 from autotune.batch.export import read_export
 from autotune.batch.settings import CampaignSettings, ExportSettings, LoopSettings
 from autotune.errors import InputError
@@ -92,20 +92,18 @@ def read_record(loop: LoopSettings, settings: CampaignSettings, prepared: Sequen
     rows = columns["t"].size
     columns = _stamped(columns, notes)
     good = np.isfinite(columns["u"]) & np.isfinite(columns["y"])
-    pieces = [
-        _piece(columns, span, metadata, loop) for span in _spans(columns["t"], good, settings.longest_gap_s, notes)
-    ]
-    long_enough = tuple(piece for piece in pieces if len(piece) >= _FEWEST_ROWS)
-    if len(long_enough) < len(pieces):
-        notes.append(f"{len(pieces) - len(long_enough)} pieces of fewer than {_FEWEST_ROWS} rows are left out")
-    if not long_enough:
-        longest = max((len(piece) for piece in pieces), default=0)
+    stretches = _stretches(columns["t"], good, settings.longest_gap_s, notes)
+    pieces = tuple(_piece(columns, at, metadata, loop) for at in stretches if at.size >= _FEWEST_ROWS)
+    if len(pieces) < len(stretches):
+        notes.append(f"{len(stretches) - len(pieces)} pieces of fewer than {_FEWEST_ROWS} good rows are left out")
+    if not pieces:
+        longest = max(at.size for at in stretches)
         raise InputError(
             f"no stretch of {_FEWEST_ROWS} good rows: the longest of {rows} rows has {longest}",
             where=loop.name,
             mend="check tags and quality, or raise longest_gap_s",
         )
-    return Record(pieces=long_enough, rows=rows, bad=int((~good).sum()), notes=tuple(notes))
+    return Record(pieces=pieces, rows=rows, bad=int((~good).sum()), notes=tuple(notes))
 
 
 def _stamped(columns: dict[str, FloatArray], notes: list[str]) -> dict[str, FloatArray]:
@@ -119,11 +117,11 @@ def _stamped(columns: dict[str, FloatArray], notes: list[str]) -> dict[str, Floa
     return {name: values[~repeats] for name, values in columns.items()}
 
 
-def _spans(t: FloatArray, good: BoolArray, longest_gap_s: float | None, notes: list[str]) -> list[slice]:
-    """Return the rows of each stretch: from a good row to a good row, no longer gap and no stamp that goes back."""
-    at = np.flatnonzero(good)
+def _stretches(t: FloatArray, good: BoolArray, longest_gap_s: float | None, notes: list[str]) -> list[IntArray]:
+    """Return the good rows of each stretch, in which no gap between them is longer and no stamp goes back."""
+    at: IntArray = np.flatnonzero(good)
     if at.size < 2:
-        return []
+        return [at]
     back = np.concatenate([[0], np.cumsum(np.diff(t) < 0.0)])
     steps = np.diff(t[at])
     longest = longest_gap_s or _LONGEST_GAP_STEPS * float(np.median(np.abs(steps)))
@@ -131,11 +129,12 @@ def _spans(t: FloatArray, good: BoolArray, longest_gap_s: float | None, notes: l
     for cut, what in ((goes_back, "stamps go back"), (gap & ~goes_back, f"a gap is longer than {longest:g} s")):
         if cut.any():
             notes.append(f"cut {int(cut.sum())} times where {what}")
-    groups = np.split(at, np.flatnonzero(goes_back | gap) + 1)
-    return [slice(int(rows[0]), int(rows[-1]) + 1) for rows in groups]
+    return np.split(at, np.flatnonzero(goes_back | gap) + 1)
 
 
-def _piece(columns: dict[str, FloatArray], span: slice, metadata: Mapping[str, Any], loop: LoopSettings) -> Recording:
+def _piece(columns: dict[str, FloatArray], at: IntArray, metadata: Mapping[str, Any], loop: LoopSettings) -> Recording:
+    """Return the rows from the first to the last good one, units applied already."""
+    span = slice(int(at[0]), int(at[-1]) + 1)
     t0 = columns["t"][0]
     part = {name: values[span] for name, values in columns.items()}
     part = {name: values[np.isfinite(part["u"])] for name, values in part.items()}

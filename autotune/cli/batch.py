@@ -30,7 +30,7 @@ def batch(
     from autotune.batch.engine import cluster, run_all
     from autotune.batch.loop import ATTENTION, analyse_loop
     from autotune.batch.settings import read_campaign
-    from autotune.errors import InputError
+    from autotune.errors import InputError, OperatorStop
     from autotune.report.campaign_page import campaign_page
     from autotune.report.page import write_page
 
@@ -55,11 +55,18 @@ def batch(
         if tasks:
             # the speed is that of this session: what was done before does not count
             bar = progress.add_task(settings.task, total=len(tasks))
-            with cluster(min(workers, len(tasks)) if workers else None, scheduler) as client:
-                for name, finding in run_all(client, analyse_loop, tasks):
-                    loop = tasks[name].loop
-                    rows[name] = failed(loop, finding) if isinstance(finding, Exception) else work.keep(loop, finding)
-                    progress.advance(bar)
+            try:
+                with cluster(min(workers, len(tasks)) if workers else None, scheduler) as client:
+                    for name, found in run_all(client, analyse_loop, tasks):
+                        loop = tasks[name].loop
+                        rows[name] = failed(loop, found) if isinstance(found, Exception) else work.keep(loop, found)
+                        progress.advance(bar)
+            except KeyboardInterrupt:
+                raise OperatorStop(
+                    f"stopped by the operator with {len(rows)} of {len(loops)} loops done",
+                    where=str(out),
+                    mend="the same command continues",
+                ) from None
     ordered = write_results(rows.values(), work.out / RESULTS)
     page = campaign_page(settings, ordered)
     write_page(page, work.out / "report.html")

@@ -77,11 +77,11 @@ def _number(value: float | None, form: str = ".4g") -> str:
 
 
 def _gains(K: float | None, Ti_s: float | None) -> str:
-    return "" if K is None else f"{K:.4g}, {_number(Ti_s)} s"
+    return "" if K is None else f"{K:.4g}, {_number(Ti_s)}\N{NO-BREAK SPACE}s"
 
 
 def _margins(modulus: float | None, phase_deg: float | None) -> str:
-    return "" if modulus is None else f"{modulus:.2f}, {_number(phase_deg, '.0f')}°"
+    return "" if modulus is None else f"{modulus:.2f},\N{NO-BREAK SPACE}{_number(phase_deg, '.0f')}°"
 
 
 def _present(row: Row) -> str:
@@ -93,14 +93,14 @@ def _record(row: Row) -> str:
         return ""
     bad = f", {100 * (row.bad_rows or 0) / row.rows:.2g} % bad" if row.bad_rows else ""
     pieces = f" in {row.pieces}" if row.pieces and row.pieces > 1 else ""
-    return f"{_time(row.duration_s)}{pieces}, {row.rows} rows{bad}"
+    return f"{_time(row.duration_s)}{pieces}, {row.rows}\N{NO-BREAK SPACE}rows{bad}"
 
 
 def _time(seconds: float) -> str:
     for unit, size in (("d", 86400.0), ("h", 3600.0), ("min", 60.0)):
         if seconds >= 2.0 * size:
-            return f"{seconds / size:.3g} {unit}"
-    return f"{seconds:.3g} s"
+            return f"{seconds / size:.3g}\N{NO-BREAK SPACE}{unit}"
+    return f"{seconds:.3g}\N{NO-BREAK SPACE}s"
 
 
 def _range(row: Row) -> str:
