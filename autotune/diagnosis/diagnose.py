@@ -11,8 +11,9 @@ import numpy as np
 
 from autotune.arrays import FloatArray
 from autotune.controller import Controller
+from autotune.diagnosis.data import Data
 from autotune.diagnosis.discriminate import next_experiment
-from autotune.diagnosis.fitting import Data, Fit, fit
+from autotune.diagnosis.fitting import Fit, fit
 from autotune.diagnosis.law import law_effect
 from autotune.diagnosis.noise import noise_from_differences
 from autotune.diagnosis.result import Candidate, Diagnosis, FitQuality, FoundEffect, OperatingRange, Verdict

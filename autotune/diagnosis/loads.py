@@ -7,7 +7,8 @@ from concurrent.futures import Executor
 import numpy as np
 
 from autotune.arrays import FloatArray
-from autotune.diagnosis.fitting import Data, Fit
+from autotune.diagnosis.data import Data
+from autotune.diagnosis.fitting import Fit
 from autotune.diagnosis.parameters import effect_with
 from autotune.diagnosis.search import Promise, promise
 from autotune.models import Effect

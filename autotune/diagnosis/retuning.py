@@ -8,7 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from autotune.arrays import BoolArray
-from autotune.diagnosis.fitting import Data, Fit, fit
+from autotune.diagnosis.data import Data
+from autotune.diagnosis.fitting import Fit, fit
 from autotune.diagnosis.noise import Noise, autoregressive, noise_from_differences
 from autotune.diagnosis.parameters import parametrise
 from autotune.diagnosis.windows import LAGS_PER_WINDOW, slowest_lag_s, window_rows

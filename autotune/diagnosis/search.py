@@ -11,7 +11,8 @@ import numpy as np
 
 from autotune.arrays import FloatArray
 from autotune.diagnosis.catalogue import CATALOGUE, Entry, Range
-from autotune.diagnosis.fitting import Data, Fit, fit, residual_at
+from autotune.diagnosis.data import Data
+from autotune.diagnosis.fitting import Fit, fit, residual_at
 from autotune.diagnosis.kernel import I_LEVELS
 from autotune.diagnosis.parameters import Parametrisation, effect_with, parametrise
 from autotune.diagnosis.simulation import Simulator
@@ -155,6 +156,12 @@ def promise(base: Fit, effect: Effect, data: Data) -> Promise:
 
 #: Decrease that an effect's direction may have, as a share of chi2, before it is taken for too large to be linear.
 LINEAR_SHARE = 0.3
+#: Steps of a fit after which it is decided whether it goes on.
+FIRST_STEPS = 3
+#: Effects whose fits are finished, and fits of one effect.
+FINISHED, MOST_EACH = 4, 2
+#: Share of the best fit's decrease from which on any other is finished too.
+NEAR = 0.8
 #: Most simulations of one effect while it is shrunk.
 SHRINKINGS = 4
 
@@ -220,11 +227,23 @@ def best_promises(
     return {name: sorted(group, key=lambda g: -g.decrease) for name, group in found.items()}
 
 
-def fit_extended(base: Fit, effect: Effect, data: Data, iterations: int = 30) -> Hypothesis:
-    """Fit a base with one more effect."""
-    p, theta, states = extended(base, effect, data)
-    result = fit(p, data, theta, states, iterations=iterations, inherit=base)
+def _begun(base: Fit, effect: Effect, data: Data) -> Hypothesis | None:
+    """Fit a base with one more effect for a few steps; nothing where the simulation runs away."""
+    try:
+        p, theta, states = extended(base, effect, data)
+        result = fit(p, data, theta, states, iterations=FIRST_STEPS, rounds=1, inherit=base)
+    except RUNAWAY:
+        return None
     return Hypothesis(names=tuple(e.name for e in p.model.effects), fit=result)
+
+
+def _finished(h: Hypothesis, data: Data) -> Hypothesis:
+    """Go on with a fit that has begun; where it began to run away, what it had reached stands."""
+    try:
+        f = h.fit
+        return replace(h, fit=fit(f.parametrisation, data, f.theta, f.x0, iterations=30, inherit=f))
+    except RUNAWAY:
+        return h
 
 
 def _distinct(group: Sequence[Promise]) -> list[Effect]:
@@ -238,18 +257,10 @@ def _distinct(group: Sequence[Promise]) -> list[Effect]:
     return kept
 
 
-def _fit_or_nothing(base: Fit, effect: Effect, data: Data) -> Hypothesis | None:
-    """Return the fit, nothing where the simulation runs away: that start is no hypothesis."""
-    try:
-        return fit_extended(base, effect, data)
-    except RUNAWAY:
-        return None
-
-
 def extend(
     base: Hypothesis, data: Data, pool: Executor, entries: Iterable[Entry] | None = None, most: int = 10,
     extra: Sequence[Effect] = (),
-    starts_each: int = 3,
+    starts_each: int = 4,
     least: float = 3.0,
 ) -> list[Hypothesis]:  # fmt: skip
     """Fit the most promising effects on top of a base, best first."""
@@ -258,11 +269,21 @@ def extend(
     starts = [
         effect for group in ranked[:most] if group[0].decrease > least for effect in _distinct(group)[:starts_each]
     ]
+    begun = [h for h in pool.map(lambda effect: _begun(base.fit, effect, data), starts) if h is not None]
+    begun.sort(key=lambda h: h.fit.cost)
+    finished = [h for k, h in enumerate(begun) if _goes_on(h, begun[:k], base)]
     fits: dict[str, Hypothesis] = {}
-    for h in pool.map(lambda effect: _fit_or_nothing(base.fit, effect, data), starts):
-        if h is None:
-            continue
+    for h in pool.map(lambda h: _finished(h, data), finished):
         known = fits.get(h.names[-1])
         if known is None or h.fit.cost < known.fit.cost:
             fits[h.names[-1]] = h
     return sorted(fits.values(), key=lambda h: h.fit.cost)
+
+
+def _goes_on(h: Hypothesis, better: Sequence[Hypothesis], base: Hypothesis) -> bool:
+    """Whether a fit that has begun is worth finishing: among the best few, or near them, and not one name too often."""
+    if sum(other.names == h.names for other in better) >= MOST_EACH:
+        return False
+    lead = base.fit.cost - better[0].fit.cost if better else 0.0
+    names = {other.names for other in better} | {h.names}
+    return len(names) <= FINISHED or base.fit.cost - h.fit.cost > NEAR * lead

@@ -11,7 +11,8 @@ from threadpoolctl import threadpool_limits
 
 from autotune.arrays import BoolArray, FloatArray
 from autotune.diagnosis.catalogue import CATALOGUE, Entry
-from autotune.diagnosis.fitting import Data, Fit, fit, start_states
+from autotune.diagnosis.data import Data
+from autotune.diagnosis.fitting import Fit, fit, start_states
 from autotune.diagnosis.loads import periodic_load_starts, step_load_starts
 from autotune.diagnosis.noise import Noise, noise_from_differences
 from autotune.diagnosis.retuning import COARSE, floored, misfit, prepare
@@ -25,6 +26,13 @@ from autotune.recording import Recording
 LEAST_DECREASE = 30.0
 #: Shift of an effect's size, as a logarithm, that gets a fit out of a crease.
 NUDGE = 0.06
+#: Effects whose thresholds make the criterion rough.
+ROUGH = frozenset(
+    ("actuator.dead_zone", "actuator.backlash", "actuator.stiction", "actuator.quantisation", "plant.coulomb_friction",
+     "plant.stribeck_friction")
+)  # fmt: skip
+#: A screened hypothesis this share of the best one's decrease behind, and this much, is not fitted to all rows.
+FAR_BEHIND = (0.3, 60.0)
 #: Score that a hypothesis with more free numbers must be ahead of one with fewer, at least; a hundredth of what it
 #: explains where that is more.
 SIMPLER = 15.0
@@ -75,7 +83,8 @@ def _polish(h: Hypothesis, data: Data, base: Fit, rounds: int) -> Hypothesis:
     settled = fit(p, data, h.fit.theta, states_for(h.fit, data, base), free=none)
     best = fit(p, data, h.fit.theta, settled.x0, iterations=30, rounds=rounds)
     positive = np.array([f.kind == "effect" and f.positive for f in p.free])
-    for shift in (-NUDGE, NUDGE) if positive.any() else ():
+    rough = ROUGH & set(h.names)
+    for shift in (-NUDGE, NUDGE) if rough and positive.any() else ():
         # thresholds make the criterion rough: a nudge gets a fit out of a crease
         again = fit(p, data, best.theta + shift * positive, best.x0, iterations=15, rounds=2)
         best = again if again.cost < best.cost else best
@@ -259,7 +268,8 @@ def merged(first: Sequence[Hypothesis], second: Sequence[Hypothesis]) -> list[Hy
 
 def polished(ranked: Sequence[Hypothesis], count: int, data: Data, base: Fit, pool: Executor) -> list[Hypothesis]:
     """Return the best hypotheses fitted to all data, best first."""
-    fits = pool.map(lambda h: polish(h, data, base), ranked[:count])
+    few = [h for h in ranked[:count] if not _far_behind(h, ranked[0], base)]
+    fits = pool.map(lambda h: polish(h, data, base), few)
     done = sorted((h for h in fits if h is not None), key=score)
     if done:
         lead = simplicity_lead(base, done[0])
@@ -269,6 +279,13 @@ def polished(ranked: Sequence[Hypothesis], count: int, data: Data, base: Fit, po
             done.remove(simplest)
             done.insert(0, simplest)
     return done
+
+
+def _far_behind(h: Hypothesis, best: Hypothesis, base: Fit) -> bool:
+    """Whether a hypothesis is so far behind on the rows screened that all rows will not turn it."""
+    share = h.fit.rows / base.rows
+    behind, gained = score(h) - score(best), share * base.cost - best.fit.cost
+    return behind > max(FAR_BEHIND[0] * gained, FAR_BEHIND[1])
 
 
 def simplicity_lead(base: Fit, best: Hypothesis) -> float:
@@ -289,7 +306,7 @@ def grown(
     pool: Executor,
     entries: Sequence[Entry],
     most: int,
-    starts_each: int = 3,
+    starts_each: int = 4,
     least: float = 3.0,
 ) -> list[Hypothesis]:
     """Return fits of a base with one more effect, loads of the environment at times and frequencies of their own."""

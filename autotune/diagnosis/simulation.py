@@ -68,6 +68,7 @@ class Simulator:
         number: int = 0,
         ends: FloatArray | None = None,
         stops: IntArray | None = None,
+        sample_time_s: float | None = None,
     ) -> FloatArray:
         """Simulate a recording's rows.
 
@@ -85,13 +86,15 @@ class Simulator:
             Receives the state that every window ends with.
         stops : (W,) int array, optional
             Rows before which the windows end; the next window's start by default.
+        sample_time_s : float, optional
+            The recording's, where it is known already.
 
         Returns
         -------
         (N, 4) array
             Reading, speed, position (or level) and plant input at each row; NaN outside the windows.
         """
-        dt = recording.sample_time_s
+        dt = recording.sample_time_s if sample_time_s is None else sample_time_s
         step = self.step_s(dt)
         rising = kernel.transition_table(self.chain.A, self.chain.B, step)
         falling = rising

@@ -1,0 +1,251 @@
+"""The descent of a fit: damped Gauss-Newton on whitened simulation errors, start states eliminated."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from autotune.arrays import BoolArray, FloatArray
+from autotune.diagnosis.data import Data
+from autotune.diagnosis.parameters import Parametrisation
+from autotune.diagnosis.simulation import Simulator, assemble
+from autotune.errors import AutotuneError, IdentificationError
+
+
+@dataclass(frozen=True, eq=False)
+class Spot:
+    """A point of the search with everything that was simulated there."""
+
+    theta: FloatArray
+    x0: list[FloatArray]
+    sim: Simulator
+    signals: list[FloatArray]
+    ends: list[FloatArray]
+    e: FloatArray
+
+
+Derivatives: TypeAlias = tuple[FloatArray, FloatArray]
+
+
+def simulate(sim: Simulator, x0: list[FloatArray], data: Data) -> tuple[list[FloatArray], list[FloatArray]]:
+    """Return the signals of every recording, and the states that its windows end with."""
+    signals, ends = [], [np.empty_like(x) for x in x0]
+    for i, (recording, x, starts) in enumerate(zip(data.recordings, x0, data.starts, strict=True)):
+        number = data.numbers[i] if data.numbers else i
+        signals.append(sim.run(recording, x, starts, number, ends[i], data.stops[i], data.sample_times[i]))
+    return signals, ends
+
+
+def whiten(signals: list[FloatArray], data: Data) -> tuple[list[FloatArray], FloatArray]:
+    """Return the residuals per recording, and whitened, all one after the other."""
+    residuals = []
+    for recording, out, good in zip(data.recordings, signals, data.good, strict=True):
+        r = np.where(good, recording.y - out[:, 0], 0.0)
+        residuals.append(r)
+    return residuals, np.concatenate(data.whitened(residuals))
+
+
+AnyArray: TypeAlias = NDArray[Any]
+
+
+class Problem:
+    """Residuals and their derivatives for one parametrisation on one set of data (a scratch pad, not an engine)."""
+
+    def __init__(self, parametrisation: Parametrisation, data: Data) -> None:
+        self.parametrisation = parametrisation
+        self.data = data
+        #: Largest step of every number in one iteration: a factor e for chain and effect sizes
+        self.reach = np.array([0.5 if f.kind in ("gain", "den", "num") else 1.0 for f in parametrisation.free])
+        self.reach[[f.kind == "effect" and not f.positive for f in parametrisation.free]] = 5.0
+        lengths = [len(r) for r in data.recordings]
+        edges = np.cumsum([0, *lengths])
+        #: First row of every window and the row after its last, in the concatenated residual
+        self.first = np.concatenate([e + a for e, a in zip(edges, data.starts, strict=False)])
+        self.last = np.concatenate([e + b for e, b in zip(edges, data.stops, strict=False)])
+        #: Rows inside windows, one window after the other
+        self.inside = np.concatenate([np.arange(a, b) for a, b in zip(self.first, self.last, strict=True)])
+        #: How many windows every recording has
+        self.counts = [len(a) for a in data.starts]
+
+    def spot(self, theta: FloatArray, x0: list[FloatArray]) -> Spot:
+        """Simulate at a point."""
+        sim = assemble(self.parametrisation.with_values(theta))
+        signals, ends = simulate(sim, x0, self.data)
+        return Spot(theta, x0, sim, signals, ends, whiten(signals, self.data)[1])
+
+    def per_recording(self, values: AnyArray) -> list[AnyArray]:
+        """Split what is known per window into recordings."""
+        return np.split(values, np.cumsum(self.counts)[:-1])
+
+    def chi2(self, e: FloatArray) -> FloatArray:
+        """Return every window's sum of squares."""
+        sums = np.concatenate([[0.0], np.cumsum(e**2)])
+        return np.asarray(sums[self.last] - sums[self.first])
+
+    def prior(self, e: FloatArray, may: BoolArray) -> FloatArray:
+        """Return what a unit of theta weighs against the data.
+
+        Where the structure is wrong its misfit counts as noise, else the fit would bend the chain out of all reason.
+        """
+        weight = max(1.0, float(np.sqrt(e @ e / max(self.data.rows, 1))))
+        return np.where(may, weight / self.parametrisation.spreads, 0.0)
+
+    def cost(self, e: FloatArray, theta: FloatArray, prior: FloatArray) -> float:
+        """Return chi2 and the prior's penalty."""
+        return float(e @ e + np.sum((prior * (theta - self.parametrisation.centre)) ** 2))
+
+    def jacobian(self, spot: Spot, may: BoolArray) -> Derivatives:
+        """Return de/dtheta (N, p) and de/dx0 (N, n), all windows' states moved at once."""
+        J = np.zeros((spot.e.size, spot.theta.size))
+        for i in np.flatnonzero(may):
+            J[:, i] = self._column(int(i), spot.theta, spot.x0, spot.e)
+        Jx = np.empty((spot.e.size, spot.sim.chain.order))
+        for j in range(spot.sim.chain.order):
+            h = 1e-3 * self.scales[j]
+            shifted = [x.copy() for x in spot.x0]
+            for x in shifted:
+                x[:, j] += h
+            moved = whiten(simulate(spot.sim, shifted, self.data)[0], self.data)[1]
+            column = (moved - spot.e) * (self.scales[j] / h)
+            Jx[:, j] = column if bounded(column) else 0.0
+        return J, Jx
+
+    def inherited(self, theta: FloatArray, x0: list[FloatArray], e: FloatArray, smaller: Derivatives) -> Derivatives:
+        """Return derivatives that take a smaller model's for the numbers they share, new ones for the rest."""
+        J_old, Jx = smaller
+        J = np.empty((e.size, theta.size))
+        J[:, : J_old.shape[1]] = J_old
+        for i in range(J_old.shape[1], theta.size):
+            J[:, i] = self._column(i, theta, x0, e)
+        return J, Jx
+
+    def _column(self, i: int, theta: FloatArray, x0: list[FloatArray], e: FloatArray) -> FloatArray:
+        h = 1e-3 if self.parametrisation.free[i].kind != "effect" else 1e-2
+        moved = theta.copy()
+        moved[i] += h
+        column = (self.spot(moved, x0).e - e) / h
+        return column if bounded(column) else np.zeros_like(column)
+
+    scales: FloatArray
+    reach: FloatArray
+
+
+def eliminate(
+    problem: Problem, derivatives: Derivatives, e: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Project residual and Jacobian on what the start states cannot explain.
+
+    Returns
+    -------
+    e_left, J_left
+        (N,) and (N, p) array: what is left of residual and Jacobian.
+    gain_e, gain_J
+        (W, n) and (W, n, p) array: start states that explain the rest, in units of their scales.
+    """
+    J, Jx = derivatives
+    n = Jx.shape[1]
+    X, lengths = Jx[problem.inside], problem.last - problem.first
+    both = np.column_stack([X, e[problem.inside], J[problem.inside]])
+    offsets = np.concatenate([[0], np.cumsum(lengths)[:-1]])
+    products = np.add.reduceat(X[:, :, None] * both[:, None, :], offsets, axis=0)
+    G = products[:, :, :n]
+    # a little of the prior that start states are of the signals' size keeps unfelt ones in place
+    G = G + (1e-2 + 1e-10 * np.trace(G, axis1=1, axis2=2))[:, None, None] * np.eye(n)
+    try:
+        gains = np.linalg.solve(G, products[:, :, n:])
+    except np.linalg.LinAlgError as failure:
+        raise IdentificationError("the start states cannot be told from the data", where="fit") from failure
+    left = both[:, n:]
+    spread = np.repeat(gains, lengths, axis=0)
+    left = left - np.einsum("kn,knp->kp", X, spread)
+    e_left, J_left = e.copy(), J.copy()
+    e_left[problem.inside], J_left[problem.inside] = left[:, 0], left[:, 1:]
+    return e_left, J_left, gains[:, :, 0], gains[:, :, 1:]
+
+
+def descend(
+    problem: Problem, spot: Spot, derivatives: Derivatives | None, may: BoolArray, iterations: int, tolerance: float
+) -> tuple[Spot, Derivatives | None]:
+    """Damped Gauss-Newton steps; derivatives are kept as long as they predict the decrease (chord method)."""
+    damping, fresh = 1e-4, False
+    for _ in range(iterations):
+        prior = problem.prior(spot.e, may)
+        cost = problem.cost(spot.e, spot.theta, prior)
+        if derivatives is None:
+            derivatives, fresh = problem.jacobian(spot, may), True
+        e_left, J_left, gain_e, gain_J = eliminate(problem, derivatives, spot.e)
+        if not (np.all(np.isfinite(J_left)) and np.all(np.isfinite(e_left))):
+            return spot, None  # a derivative ran out of the model's range: the last good point stands
+        step, promised = _step(problem, spot, e_left, J_left, prior, damping, may)
+        moves = problem.per_recording(problem.scales * (gain_e + gain_J @ step))
+        trial = [x - move for x, move in zip(spot.x0, moves, strict=True)]
+        new = attempted(problem, spot.theta + step, trial)
+        decrease = -np.inf if new is None else cost - problem.cost(new.e, new.theta, prior)
+        if new is not None and decrease > 0.0:
+            spot = new
+            damping = max(damping / 10.0, 1e-9)
+            if decrease < tolerance + 1e-5 * cost and (fresh or decrease > 0.5 * promised):
+                break
+            if decrease < 0.6 * promised:
+                derivatives = None
+            fresh = False
+        elif fresh:
+            if promised < tolerance or damping > 1e4:
+                break
+            damping *= 30.0
+        else:
+            derivatives = None
+    return spot, derivatives
+
+
+def _step(
+    problem: Problem,
+    spot: Spot,
+    e_left: FloatArray,
+    J_left: FloatArray,
+    prior: FloatArray,
+    damping: float,
+    may: BoolArray,
+) -> tuple[FloatArray, float]:
+    """Return the step in theta and the decrease of the cost that it promises."""
+    H = J_left.T @ J_left + np.diag(prior**2)
+    g = J_left.T @ e_left + prior**2 * (spot.theta - problem.parametrisation.centre)
+    step = np.linalg.lstsq(H + damping * np.diag(np.maximum(np.diag(H), 1e-12)), -g, rcond=1e-15)[0]
+    step[~may] = 0.0
+    step /= max(1.0, float(np.max(np.abs(step) / problem.reach, initial=0.0)))
+    promised = -2.0 * float(g @ step) - float(step @ H @ step) + float(spot.e @ spot.e - e_left @ e_left)
+    return np.asarray(step), promised
+
+
+def continued(problem: Problem, spot: Spot) -> Spot:
+    """Start every window where the one before ended, where that fits better: a way out of stuck start states."""
+    if all(len(x) == 1 for x in spot.x0):
+        return spot
+    trial = [x.copy() for x in spot.x0]
+    for i, (x, ends) in enumerate(zip(trial, spot.ends, strict=True)):
+        follows = problem.data.stops[i][:-1] == problem.data.starts[i][1:]
+        x[1:][follows] = ends[:-1][follows]
+    new = attempted(problem, spot.theta, trial)
+    if new is None:
+        return spot
+    better = problem.per_recording(problem.chi2(new.e) < 0.9 * problem.chi2(spot.e) - 2.0)
+    trial = [np.where(b[:, None], x, old) for b, x, old in zip(better, trial, spot.x0, strict=True)]
+    mixed = attempted(problem, spot.theta, trial)
+    return spot if mixed is None or mixed.e @ mixed.e >= spot.e @ spot.e else mixed
+
+
+def bounded(values: FloatArray) -> bool:
+    """Whether a simulation stayed within bounds: one that runs away is finite for a while."""
+    return bool(np.max(np.abs(values), initial=0.0) < 1e15)  # NaN compares false
+
+
+def attempted(problem: Problem, theta: FloatArray, x0: list[FloatArray]) -> Spot | None:
+    """Return a trial point, None where the model there is refused or the simulation diverges."""
+    try:
+        spot = problem.spot(theta, x0)
+    except (AutotuneError, OverflowError):
+        return None
+    return spot if bounded(spot.e) else None
