@@ -28,6 +28,7 @@ app.add_typer(identify, name="identify")
 # Each room of commands registers itself on the two apps above; the order here is the order in --help.
 from autotune.cli import (  # noqa: E402, F401, I001
     run,
+    deploy,
     live,
     frequency,
     delay,

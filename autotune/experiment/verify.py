@@ -16,13 +16,14 @@ from autotune.config import Config
 from autotune.config.procedure import LimitSettings, VerificationSettings
 from autotune.controller import PIDController
 from autotune.design.law import PILaw
-from autotune.design.margins import margins
+from autotune.design.margins import Margins, margins
 from autotune.errors import DesignError
+from autotune.experiment.device import try_on_device
 from autotune.experiment.limits import Watch
 from autotune.experiment.loop import ControlLoop
 from autotune.experiment.prediction import Prediction, predict
 from autotune.experiment.result import Progress, State
-from autotune.experiment.rig import Rig
+from autotune.experiment.rig import Rig, RunsLaws
 from autotune.experiment.run import OnProgress, envelope_of, float_on, recording_metadata, wait_for_rest
 from autotune.identification.parametric import PlantFit
 from autotune.recording import RecordingWriter
@@ -169,6 +170,8 @@ def run_test(
 ) -> tuple[FloatArray, FloatArray]:
     """Close the loop with the new law, bumpless from ``u_hold``, let it settle, and run the test.
 
+    The law is stepped here, or the device's own PI runs on the new gains where the rig lets it.
+
     Parameters
     ----------
     loop : ControlLoop
@@ -196,20 +199,45 @@ def run_test(
     count = test.settle + test.t.size
     setpoint = operating_y + np.concatenate([np.zeros(test.settle), test.setpoint])
     load = np.concatenate([np.zeros(test.settle), test.disturbance])
-    y, u = np.full(count, np.nan), np.empty(count)
-    state = law.initial(u_hold, operating_y, operating_y)
     every = max(1, round(0.5 / law.sample_time_s))
-    for k in range(count):
-        tick = loop.tick
+
+    def tell(k: int) -> None:
         if on_progress is not None and k % every == 0:
             left_s = (count - k) * law.sample_time_s
-            on_progress(
-                Progress(state=State.VERIFY, elapsed_s=tick.t_s, remaining_s=left_s, message="steps with the new gains")
-            )
+            message = "steps with the new gains"
+            on_progress(Progress(state=State.VERIFY, elapsed_s=loop.tick.t_s, remaining_s=left_s, message=message))
+
+    if isinstance(loop.rig, RunsLaws):
+        loop.step(loop.nearest(u_hold))
+        y, u = try_on_device(loop, loop.rig, law.controller, setpoint, load, tell)
+        return (y - operating_y)[test.settle :], u[test.settle :]
+    y, u = np.full(count, np.nan), np.empty(count)
+    state = law.initial(u_hold, operating_y, operating_y)
+    for k in range(count):
+        tick = loop.tick
+        tell(k)
         y[k] = tick.y - operating_y if tick.usable else np.nan
         u[k], state = law.step(state, float(setpoint[k]), tick.y)
         loop.step(loop.nearest(u[k] + load[k]), extra={"r": float(setpoint[k])})
     return y[test.settle :], u[test.settle :]
+
+
+def expected_margins(fit: PlantFit, controller: PIDController) -> Margins:
+    """Return the margins of the controller on the fitted plant.
+
+    Raises
+    ------
+    DesignError
+        The loop would be unstable, or have no crossover that its test could be timed by.
+    """
+    expected = margins(fit.plant, controller)
+    if not expected.stable or not math.isfinite(expected.crossover_rad_s):
+        raise DesignError(
+            f"on the measured plant K = {controller.K:.4g}, T_I = {controller.Ti_s:.4g} s make no stable loop",
+            where="verification",
+            mend="nothing was tried on the rig; design the controller on this rig's points",
+        )
+    return expected
 
 
 def run_verification(
@@ -251,14 +279,8 @@ def run_verification(
         What ended it; the rig is safe and the recording readable.
     """
     law = law_for(controller, config.limits, config.signals.sample_time_s)
-    expected = margins(fit.plant, controller)
-    if not expected.stable:
-        raise DesignError(
-            "the measured plant says that this controller makes the loop unstable",
-            where="verify",
-            mend="nothing was tried on the rig; design it on this rig's points",
-        )
-    test = plan_test(config.verification, config.limits, law, fit, expected.crossover_rad_s)
+    crossover_rad_s = expected_margins(fit, controller).crossover_rad_s
+    test = plan_test(config.verification, config.limits, law, fit, crossover_rad_s)
     law = law_for(controller, config.limits, config.signals.sample_time_s, float(test.disturbance[-1]))
     writer = RecordingWriter(recording, ("t", "u", "y", "r"), recording_metadata(config))
     with ControlLoop(rig=rig, envelope=envelope_of(config), writer=writer, extra=("r",)) as loop:

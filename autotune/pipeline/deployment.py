@@ -120,12 +120,10 @@ class Deployment:
 
 
 def read_gains(rig: HoldsGains) -> PIDController:
-    """Return the gains that the rig's own controller holds; the rig is opened for this and closed again."""
-    rig.open()
+    """Return the gains that the rig's own controller holds; the actuator is left to whoever has it."""
     try:
         return rig.read_gains()
     finally:
-        rig.make_safe()
         rig.close()
 
 
@@ -135,7 +133,7 @@ def hand_over(rig: HoldsGains, controller: PIDController | None, journal: Path) 
     Parameters
     ----------
     rig : HoldsGains
-        Closed; it is opened for this and closed again.
+        Closed; it is connected to for this, and its actuator left to whoever has it.
     controller : PIDController or None
         New gains; None only reads the old ones.
     journal : Path
@@ -172,7 +170,7 @@ def deploy(
     Parameters
     ----------
     rig : HoldsGains
-        Closed; it is opened for every step and closed again.
+        Closed; it is connected to for every step, and only the trial takes its actuator.
     controller : PIDController
         New gains.
     journal : Path
@@ -212,7 +210,7 @@ def restore(rig: HoldsGains, old: PIDController, journal: Path) -> None:
     Parameters
     ----------
     rig : HoldsGains
-        Closed; it is opened for this and closed again.
+        Closed; it is connected to for this, and its actuator left to whoever has it.
     old : PIDController
         Gains to go back to.
     journal : Path
@@ -228,11 +226,9 @@ def restore(rig: HoldsGains, old: PIDController, journal: Path) -> None:
         ExperimentStopped
     ):  # the journal is open-ended already: a full disk must not keep new gains
         notes.note(Step.RESTORING, old)
-    rig.open()
     try:
         rig.write_gains(old)
     finally:
-        rig.make_safe()
         rig.close()
     notes.note(Step.RESTORED, old)
 
@@ -241,12 +237,10 @@ def _write(rig: HoldsGains, new: PIDController, old: PIDController, notes: Journ
     """Write the new gains, or the old ones where that fails; return the new ones as the rig holds them."""
     notes.note(Step.WRITING, new)
     try:
-        rig.open()
         try:
             rig.write_gains(new)
             held = rig.read_gains()
         finally:
-            rig.make_safe()
             rig.close()
     except AutotuneError as error:
         _take_back(rig, old, notes, error, "the new gains could not be written")

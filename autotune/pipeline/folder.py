@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from itertools import count, takewhile
 from pathlib import Path
 from typing import Any
@@ -11,8 +13,10 @@ from typing import Any
 import tomli_w
 
 from autotune.config import Config, load_config
+from autotune.controller import PIDController
 from autotune.errors import InputError
 from autotune.experiment.cycles import Earlier, read_earlier
+from autotune.points import FrequencyPoint, read_points
 
 RECORDING, VERIFICATION, RESULT, JOURNAL = "recording.csv", "verification.csv", "result.json", "journal.jsonl"
 PROGRESS, CONFIG = "progress.jsonl", "config.toml"
@@ -57,6 +61,62 @@ def stored_config(folder: Path) -> Config:
     return load_config(folder / CONFIG)
 
 
+@dataclass(frozen=True, kw_only=True)
+class Measured:
+    """What a finished run knows of its rig: points, noise of y [y unit], command at the operating point [u unit]."""
+
+    points: tuple[FrequencyPoint, ...]
+    noise_sd: float | None = None
+    u_rest: float | None = None
+
+
+def read_measured(folder: Path) -> Measured:
+    """Return what the run in the folder measured.
+
+    Raises
+    ------
+    InputError
+        No result, or one without points.
+    """
+    points = read_points(folder / RESULT)
+    experiment = _read_json(folder / RESULT).get("experiment", {})
+    if not points:
+        raise InputError("the run measured no points", where=str(folder / RESULT), mend="autotune run CONFIG --resume")
+    return Measured(points=points, noise_sd=experiment.get("noise_sd"), u_rest=experiment.get("u_rest"))
+
+
+def read_designed(path: Path) -> PIDController:
+    """Return the controller of a ``design.json``, or of a run's ``result.json``.
+
+    Raises
+    ------
+    InputError
+        No such file, or no PI or PID in it.
+    """
+    content = _read_json(path)
+    design = content.get("controller", content)
+    try:
+        gains = {key: float(design[key] or 0.0) for key in ("K", "Td_s", "Tf_s")}
+        Ti_s = math.inf if design["Ti_s"] is None else float(design["Ti_s"])
+    except (KeyError, TypeError, ValueError):
+        raise InputError(
+            "holds no K, Ti_s, Td_s, Tf_s", where=str(path), mend="give a design.json or the folder of a completed run"
+        ) from None
+    return PIDController(**gains, Ti_s=Ti_s, setpoint_weight=float(design.get("setpoint_weight", 1.0)))
+
+
+def _read_json(path: Path) -> dict[str, Any]:
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"cannot be read ({error.strerror})", where=str(path), mend="check the path") from None
+    except ValueError as error:
+        raise InputError(f"not JSON: {error}", where=str(path)) from None
+    if not isinstance(content, dict):
+        raise InputError("not a result", where=str(path), mend="give a file that autotune wrote")
+    return content
+
+
 def read_interrupted(folder: Path, config: Config) -> Earlier:
     """Return what an interrupted run left, its points computed again from its recordings.
 
@@ -79,10 +139,7 @@ def read_interrupted(folder: Path, config: Config) -> Earlier:
             where=str(folder),
             mend=f"go on with {folder / CONFIG}, or begin a new run",
         )
-    try:
-        result = json.loads((folder / RESULT).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        result = {}  # a killed run leaves none
+    result = _read_json(folder / RESULT) if (folder / RESULT).exists() else {}  # a killed run leaves none
     if result.get("experiment", {}).get("reason") == "completed":
         raise InputError("the run is complete", where=str(folder), mend="autotune verify tries its controller again")
     return read_earlier(recordings(folder), config.signals.sample_time_s)

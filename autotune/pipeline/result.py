@@ -36,7 +36,12 @@ def write_result(
     if analysis is not None:
         content |= analysis_json(analysis)
     if verification is not None:
-        content["verification"] = _verification_json(verification)
+        content["verification"] = verification_json(verification)
+    write_json(content, path)
+
+
+def write_json(content: dict[str, Any], path: Path) -> None:
+    """Write a result file; what JSON has no number for becomes null."""
     path.write_text(json.dumps(jsonable(content), indent=2, allow_nan=False) + "\n", encoding="utf-8")
 
 
@@ -87,7 +92,8 @@ def _experiment_json(experiment: ExperimentResult | None, reason: str) -> dict[s
     }
 
 
-def _verification_json(verification: Verification) -> dict[str, Any]:
+def verification_json(verification: Verification) -> dict[str, Any]:
+    """Return the decision with what was predicted and what was measured."""
     return {
         "accepted": verification.accepted,
         "reason": verification.reason,

@@ -10,9 +10,11 @@ import numpy as np
 from plotly.subplots import make_subplots
 
 from autotune.config.procedure import SignalSettings
+from autotune.controller import PIDController
 from autotune.experiment.result import ExperimentResult, Segment
 from autotune.experiment.verify import Verification, smoothed
 from autotune.pipeline import Analysis, Tuning
+from autotune.pipeline.deployment import Deployment
 from autotune.recording import Recording
 from autotune.report.analysis_sections import analysis_sections, gains_text, margins_sentence
 from autotune.report.figures import recording_figure
@@ -84,6 +86,81 @@ def analysis_page(
     )
 
 
+def deployment_page(name: str, signals: SignalSettings, done: Deployment) -> Page:
+    """Return the page of a hand-over of gains.
+
+    Parameters
+    ----------
+    name : str
+        Of the rig.
+    signals : SignalSettings
+        Units.
+    done : Deployment
+        Old and new gains, and how the loop behaved with the new ones.
+    """
+    new, verification = gains_text(done.new, signals), done.verification
+    if verification is None:
+        verdict = f"Written and read back: {new}; not verified."
+    elif verification.accepted:
+        verdict = f"Kept: {new}; {verification.reason}."
+    else:
+        verdict = f"Not kept: {new}; {verification.reason}. The old gains are in place again."
+    gains = Table(
+        header=("", "K", "T_I [s]", "T_d [s]", "T_f [s]", "now"),
+        rows=tuple(
+            (label, *(f"{value:.5g}" for value in (c.K, c.Ti_s, c.Td_s, c.Tf_s)), "in the rig" if held else "")
+            for label, c, held in (("old", done.old, not done.kept), ("new, as read back", done.new, done.kept))
+        ),
+    )
+    return Page(
+        title=f"Gains handed over: {name}",
+        verdict=verdict,
+        tone="warn" if verification is None else "good" if done.kept else "bad",
+        summary=(_next_step(verification),),
+        sections=(
+            Section(title="Gains", tables=(gains,)),
+            *((_verification_section(verification, signals),) if verification is not None else ()),
+        ),
+    )
+
+
+def verification_page(
+    name: str, signals: SignalSettings, controller: PIDController, verification: Verification
+) -> Page:
+    """Return the page of a verification on its own.
+
+    Parameters
+    ----------
+    name : str
+        Of the rig.
+    signals : SignalSettings
+        Units.
+    controller : PIDController
+        Gains that were tried.
+    verification : Verification
+        How the loop behaved.
+    """
+    said = "Accepted" if verification.accepted else "Not accepted"
+    return Page(
+        title=f"Verification: {name}",
+        verdict=f"{said}: {gains_text(controller, signals)}; {verification.reason}.",
+        tone="good" if verification.accepted else "bad",
+        summary=(_next_step(verification),),
+        sections=(_verification_section(verification, signals),),
+    )
+
+
+def _next_step(verification: Verification | None) -> str:
+    if verification is None:
+        return "Next: verify the controller on the rig."
+    if verification.accepted:
+        return "Next: watch the loop through its usual operating range; the points were measured at one of them."
+    return (
+        "Next: compare prediction and measurement below; diagnose the recording against the fitted model to find"
+        " which physics was left out."
+    )
+
+
 def _verdict(tuning: Tuning, signals: SignalSettings) -> tuple[str, bool]:
     gains = gains_text(tuning.analysis.controller, signals)
     if tuning.verification is None:
@@ -106,15 +183,7 @@ def _summary(tuning: Tuning, signals: SignalSettings) -> tuple[str, ...]:
     ]
     if old is not None:
         lines.append(f"Before: {gains_text(old, signals)}. Now: {gains_text(tuning.analysis.controller, signals)}.")
-    if tuning.verification is None:
-        lines.append("Next: verify the controller on the rig.")
-    elif tuning.verification.accepted:
-        lines.append("Next: watch the loop through its usual operating range; the points were measured at one of them.")
-    else:
-        lines.append(
-            "Next: compare prediction and measurement below; diagnose the recording against the fitted model to find"
-            " which physics was left out."
-        )
+    lines.append(_next_step(tuning.verification))
     return tuple(lines)
 
 

@@ -1,0 +1,266 @@
+"""Commands: gains into a rig's own controller with verification, and the verification of the gains that it holds."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.console import Console
+
+from autotune.cli import app
+from autotune.cli.common import ProgressBar, rig_of
+from autotune.design.forms import Form
+from autotune.errors import AutotuneError, ExperimentStopped, InputError
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from autotune.config import Config
+    from autotune.controller import PIDController
+    from autotune.experiment.rig import HoldsGains, Rig
+    from autotune.experiment.verify import Verification
+    from autotune.identification.parametric import PlantFit
+    from autotune.pipeline.folder import Measured
+
+_CONFIG = Annotated[Path, typer.Argument(metavar="CONFIG.toml", help="configuration of the rig")]
+_CONTROLLER = Annotated[Path | None, typer.Option(metavar="C.toml", help="controller file with the gains")]
+_RUN = Annotated[
+    Path | None, typer.Option(metavar="DIR", help="folder of a run: its points predict the loop, its files go there")
+]
+_POINTS = Annotated[
+    Path | None, typer.Option(metavar="P.json", help="points that predict the loop, instead of a run's")
+]
+_OUT = Annotated[
+    Path | None,
+    typer.Option(metavar="DIR", help="folder for journal, recording and page; default: the run's, or NAME-gains"),
+]
+
+
+@app.command()
+def deploy(
+    config: _CONFIG,
+    controller: _CONTROLLER = None,
+    design: Annotated[Path | None, typer.Option(metavar="design.json", help="design with the gains")] = None,
+    run: _RUN = None,
+    points: _POINTS = None,
+    out: _OUT = None,
+    form: Annotated[
+        Form, typer.Option(help="form that the gains are shown in, as the controller's maker calls them")
+    ] = "isa",
+    u_span: Annotated[float, typer.Option(help="engineering span of the output, for percent forms [u unit]")] = 1.0,
+    y_span: Annotated[float, typer.Option(help="engineering span of the measurement [y unit]")] = 1.0,
+    verify: Annotated[bool, typer.Option(help="try the new gains on the rig and take them back if they fail")] = True,
+    yes: Annotated[bool, typer.Option("--yes", help="do not ask")] = False,
+) -> None:
+    """Write gains into the rig's own controller, read them back, verify the loop; else restore the old gains."""
+    from autotune.config import load_config
+    from autotune.experiment.verify import expected_margins
+    from autotune.pipeline.deployment import deploy as hand_over
+    from autotune.pipeline.folder import JOURNAL
+    from autotune.pipeline.result import verification_json, write_json
+    from autotune.report.page import write_page
+    from autotune.report.run_page import deployment_page
+
+    content = load_config(config)
+    new = _gains(controller, design, run)
+    measured, fit = _plant(run, points) if verify else (None, None)
+    if fit is not None:
+        expected_margins(fit, new)
+    if not yes and not sys.stdin.isatty():
+        raise InputError("nobody can be asked here", where="autotune deploy", mend="look at the gains, then give --yes")
+    rig = _with_gains(rig_of(content))
+    folder = _folder(config, run, out)
+    console = Console(highlight=False, soft_wrap=True)
+    _restore_interrupted(rig, folder / JOURNAL, console, yes)
+
+    def agree(old: PIDController, to_be: PIDController) -> None:
+        console.print(_comparison(content, old, to_be, form, (u_span, y_span), fit))
+        if not yes and not typer.confirm("Write the new gains?"):
+            raise InputError("refused: nothing was written", where="autotune deploy")
+
+    def try_out(held: PIDController) -> Verification:
+        assert measured is not None
+        assert fit is not None
+        return _verify(rig, content, held, fit, measured, folder)
+
+    done = hand_over(rig, new, folder / JOURNAL, agree=agree, try_out=try_out if verify else None)
+    verification = done.verification
+    write_json(
+        {
+            "old": asdict(done.old),
+            "new": asdict(done.new),
+            "kept": done.kept,
+            "verification": verification_json(verification) if verification is not None else None,
+        },
+        folder / "deploy.json",
+    )
+    page = deployment_page(content.name, content.signals, done)
+    write_page(page, folder / "deploy.html")
+    console.print(page.verdict, markup=False)
+    console.print(f"report: {folder / 'deploy.html'}", markup=False)
+    if not done.kept:
+        raise typer.Exit(ExperimentStopped.exit_status)
+
+
+@app.command()
+def verify(
+    config: _CONFIG, run: _RUN = None, points: _POINTS = None, controller: _CONTROLLER = None, out: _OUT = None
+) -> None:
+    """Try the gains that the rig's own controller holds (or a file's) on the rig, against what its points predict."""
+    from autotune.config import load_config
+    from autotune.experiment.rig import HoldsGains
+    from autotune.pipeline.deployment import read_gains
+    from autotune.pipeline.result import verification_json, write_json
+    from autotune.report.page import write_page
+    from autotune.report.run_page import verification_page
+
+    content = load_config(config)
+    measured, fit = _plant(run, points)
+    rig = rig_of(content)
+    gains = read_gains(rig) if isinstance(rig, HoldsGains) and controller is None else _gains(controller, None, run)
+    folder = _folder(config, run, out)
+    verification = _verify(rig, content, gains, fit, measured, folder)
+    write_json({"controller": asdict(gains), "verification": verification_json(verification)}, folder / "verify.json")
+    page = verification_page(content.name, content.signals, gains, verification)
+    write_page(page, folder / "verify.html")
+    console = Console(highlight=False, soft_wrap=True)
+    console.print(page.verdict, markup=False)
+    console.print(f"report: {folder / 'verify.html'}", markup=False)
+
+
+def _gains(controller: Path | None, design: Path | None, run: Path | None) -> PIDController:
+    """Return the gains of the one source that was given."""
+    from autotune.controller import PIDController, read_controller
+    from autotune.pipeline.folder import RESULT, read_designed
+
+    if controller is not None and design is not None:
+        raise InputError("both --controller and --design", where="gains", mend="give one of them")
+    if controller is not None:
+        given = read_controller(controller)
+        if not isinstance(given, PIDController):
+            raise InputError("no PI or PID", where=str(controller), mend="a rig's own controller takes K, Ti, Td")
+        return given
+    if design is not None:
+        return read_designed(design)
+    if run is not None:
+        return read_designed(run / RESULT)
+    raise InputError("no gains", where="gains", mend="give --controller, --design or --run")
+
+
+def _plant(run: Path | None, points: Path | None) -> tuple[Measured, PlantFit]:
+    """Return what is known of the rig, and the plant that its loop is predicted with."""
+    from autotune.identification.parametric import fit_plant
+    from autotune.pipeline.folder import Measured, read_measured
+    from autotune.points import read_points
+
+    if points is not None:
+        measured = Measured(points=read_points(points))
+    elif run is not None:
+        measured = read_measured(run)
+    else:
+        raise InputError(
+            "there is nothing to predict the loop with",
+            where="verification",
+            mend="give --run DIR or --points P.json (deploy without it: --no-verify)",
+        )
+    return measured, fit_plant(measured.points)
+
+
+def _with_gains(rig: Rig) -> HoldsGains:
+    from autotune.experiment.rig import HoldsGains
+
+    if not isinstance(rig, HoldsGains):
+        raise InputError(
+            "the gains of the rig's own controller cannot be reached",
+            where="rig",
+            mend="map rig.registers.K and Ti; or enter the gains by hand and run autotune verify --controller C.toml",
+        )
+    return rig
+
+
+def _folder(config: Path, run: Path | None, out: Path | None) -> Path:
+    """Return the folder of the journal: the same for every call with the same arguments, so that it is found again."""
+    folder = out or run or config.with_name(f"{config.stem}-gains")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"cannot be made ({error.strerror})", where=str(folder), mend="choose another --out") from None
+    return folder
+
+
+def _restore_interrupted(rig: HoldsGains, journal: Path, console: Console, yes: bool) -> None:
+    """Offer to write the old gains back where an earlier hand-over did not come to its end."""
+    from autotune.pipeline.deployment import Journal, restore
+
+    old = Journal(journal).unfinished()
+    if old is None:
+        return
+    console.print(
+        f"An earlier hand-over was interrupted ({journal}): the rig may hold gains that were never verified, or mixed"
+        f" ones. Before it, it held K = {old.K:.6g}, Ti = {old.Ti_s:.6g} s.",
+        markup=False,
+    )
+    if not yes and not typer.confirm("Restore those first?", default=True):
+        raise InputError(
+            "refused: nothing was written", where=str(journal), mend="move the journal away if the gains are right now"
+        )
+    restore(rig, old, journal)
+    console.print("The old gains are in place again.")
+
+
+def _verify(
+    rig: Rig, config: Config, gains: PIDController, fit: PlantFit, measured: Measured, folder: Path
+) -> Verification:
+    from autotune.experiment.verify import run_verification
+    from autotune.pipeline.folder import VERIFICATION, next_free
+
+    with ProgressBar() as bar:
+        return run_verification(
+            rig,
+            config,
+            gains,
+            fit,
+            next_free(folder / VERIFICATION),
+            u_rest=measured.u_rest,
+            noise_sd=measured.noise_sd,
+            on_progress=bar.show,
+        )
+
+
+def _comparison(
+    config: Config,
+    old: PIDController,
+    new: PIDController,
+    form: Form,
+    spans: tuple[float, float],
+    fit: PlantFit | None,
+) -> Table:
+    """Return old and new gains side by side, in the maker's form, with what the measured plant says of both."""
+    from rich.markup import escape
+    from rich.table import Table
+
+    from autotune.design.forms import to_form
+    from autotune.design.margins import margins
+
+    def shown(controller: PIDController) -> dict[str, str]:
+        try:
+            settings = to_form(
+                controller, form, u_span=spans[0], y_span=spans[1], sample_time_s=config.signals.sample_time_s
+            )
+        except (AutotuneError, ZeroDivisionError):  # a device as delivered may hold what the form cannot say
+            return {"K": f"{controller.K:.6g}", "Ti_s": f"{controller.Ti_s:.6g}"}
+        rows = {name: f"{value:.6g}" for name, value in settings.values.items()}
+        if fit is not None:
+            m = margins(fit.plant, controller)
+            rows |= {"modulus margin": f"{m.modulus:.3f}", "crossover [rad/s]": f"{m.crossover_rad_s:.3g}"}
+            rows |= {"stable on the measured plant": "yes" if m.stable else "no"}
+        return rows
+
+    before, after = shown(old), shown(new)
+    table = Table(form, "the rig holds", "new", title=config.name)
+    for name in dict.fromkeys((*before, *after)):
+        table.add_row(escape(name), before.get(name, "-"), after.get(name, "-"))
+    return table

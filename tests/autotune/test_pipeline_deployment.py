@@ -1,0 +1,291 @@
+"""Gains handed to a real Modbus server over lines that break, by processes that are killed, and refused by people."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import pty
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import tomli_w
+from typer.testing import CliRunner
+
+from autotune.cli import app
+from autotune.config import Config, load_config
+from autotune.config.registers import RegisterMap
+from autotune.controller import PIDController
+from autotune.errors import ExperimentStopped, InputError, LinkError
+from autotune.experiment.loop import ControlLoop
+from autotune.experiment.run import envelope_of
+from autotune.experiment.verify import Verification
+from autotune.pipeline.deployment import Journal, deploy, hand_over, restore
+from autotune.recording import RecordingWriter
+from drivers.simulated import SimulatedRig
+from sim.modbus_rig import ModbusRig, TcpTransport
+from sim.plant import make_plant
+from sim.register_device import RegisterDevice
+from tests.drivers.bench import REGISTERS, U_SAFE, register_device, rig_of, tcp_settings
+from tests.drivers.tcp_relay import Direction, TcpRelay
+
+ROOT = Path(__file__).resolve().parents[2]
+#: K and Ti lie apart, so that two requests write them
+APART = RegisterMap.model_validate(
+    REGISTERS.model_dump() | {"Ti": {"address": 40, "type": "uint32", "scale": 1e-3, "word_order": "little"}}
+)
+#: what the device sets by itself when the host falls silent, before it was told U_SAFE
+DEVICE_SAFE = 0.0
+OLD, NEW = PIDController(K=1.5, Ti_s=2.0), PIDController(K=0.75, Ti_s=4.0)
+MIXED = PIDController(K=0.75, Ti_s=2.0)
+WRITE_REGISTERS, TI_ADDRESS = 16, 40
+
+
+@dataclass(kw_only=True)
+class Line:
+    """A device behind a relay that cuts the line at the write of Ti, ``times`` times."""
+
+    device: RegisterDevice
+    relay: TcpRelay
+    times: int = 0
+    seen: Any = None
+
+    def tamper(self, frame: bytes, direction: Direction) -> Sequence[tuple[float, bytes]]:
+        is_Ti = (
+            direction == "to device" and frame[7] == WRITE_REGISTERS and frame[8:10] == TI_ADDRESS.to_bytes(2, "big")
+        )
+        if is_Ti and self.times > 0:
+            self.times -= 1
+            if self.seen is not None:
+                self.seen()
+            return ()
+        return ((0.0, frame),)
+
+    def rig(self) -> Any:
+        return rig_of(tcp_settings(self.relay.port, APART, timeout_s=0.1, retries=0))
+
+    @property
+    def gains(self) -> PIDController:
+        return PIDController(K=self.device._values["K"], Ti_s=self.device._values["Ti"])
+
+
+@pytest.fixture
+def line() -> Iterator[Line]:
+    device = register_device(APART)
+    with ModbusRig(device, TcpTransport()) as server, TcpRelay(server.port) as relay:
+        one = Line(device=device, relay=relay)
+        relay.tamper = one.tamper
+        yield one
+
+
+def steps(journal: Path) -> list[str]:
+    return [json.loads(text)["gains"] for text in journal.read_text().splitlines()]
+
+
+def agreed(old: PIDController, new: PIDController) -> None:
+    assert (old, new) == (OLD, NEW)
+
+
+def refused(old: PIDController, new: PIDController) -> None:
+    raise InputError("refused: nothing was written")
+
+
+def verified(accepted: bool) -> Any:
+    """Return a trial that ends at once with the verdict; what is under test is what follows from it."""
+    curve: Any = None
+
+    def try_out(held: PIDController) -> Verification:
+        figures: Any = None
+        return Verification(
+            accepted=accepted, reason="", test=curve, y=curve, u=curve, prediction=curve,
+            misfit=0.0, allowed=0.0, measured=figures, predicted=figures, predicted_sd=figures,
+        )  # fmt: skip
+
+    return try_out
+
+
+def test_gains_are_written_read_back_tried_and_kept(line: Line, tmp_path: Path) -> None:
+    tried = []
+    journal = tmp_path / "journal.jsonl"
+
+    def try_out(held: PIDController) -> Verification:
+        tried.append((held, line.gains, steps(journal)))
+        return verified(True)(held)
+
+    done = deploy(line.rig(), NEW, journal, agree=agreed, try_out=try_out)
+    assert done.kept
+    assert (done.old, done.new, line.gains) == (OLD, NEW, NEW)
+    assert tried == [(NEW, NEW, ["read", "writing", "written and read back, on trial"])]
+    assert steps(journal)[-1] == "verified, kept"
+    assert Journal(journal).unfinished() is None
+
+
+def test_gains_that_do_not_verify_are_taken_back(line: Line, tmp_path: Path) -> None:
+    journal = tmp_path / "journal.jsonl"
+    done = deploy(line.rig(), NEW, journal, agree=agreed, try_out=verified(False))
+    assert not done.kept
+    assert line.gains == OLD
+    assert steps(journal)[-2:] == ["restoring", "restored"]
+
+
+def test_nothing_is_written_where_the_gains_are_refused(line: Line, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="nothing was written"):
+        deploy(line.rig(), NEW, tmp_path / "journal.jsonl", agree=refused, try_out=None)
+    assert line.gains == OLD
+    assert len(line.device.history) == 0  # the actuator stayed with whoever had it
+    assert not (tmp_path / "journal.jsonl").exists()
+
+
+def test_a_line_that_breaks_once_between_the_gains_leaves_the_old_ones(line: Line, tmp_path: Path) -> None:
+    line.times = 1
+    journal = tmp_path / "journal.jsonl"
+    with pytest.raises(LinkError, match="the old gains are in place again"):
+        deploy(line.rig(), NEW, journal, agree=agreed, try_out=None)
+    assert line.gains == OLD
+    assert Journal(journal).unfinished() is None
+
+
+def test_a_line_that_stays_broken_is_no_riddle(line: Line, tmp_path: Path) -> None:
+    line.times = 1000
+    journal = tmp_path / "journal.jsonl"
+    with pytest.raises(LinkError, match="may hold old, new or mixed gains"):
+        hand_over(line.rig(), NEW, journal)
+    assert steps(journal) == ["read", "writing", "restoring"]
+    line.times = 0
+    old = Journal(journal).unfinished()
+    assert old == OLD
+    restore(line.rig(), old, journal)
+    assert line.gains == OLD
+    assert Journal(journal).unfinished() is None
+
+
+def test_a_line_that_breaks_during_the_trial_takes_the_gains_back(line: Line, tmp_path: Path) -> None:
+    config = load_config(ROOT / "configs" / "servo_sim.toml")
+    rig = line.rig()
+
+    def try_out(held: PIDController) -> Verification:
+        writer = RecordingWriter(tmp_path / "trial.csv", ("t", "u", "y"))
+        with ControlLoop(rig=rig, envelope=envelope_of(config), writer=writer) as loop:
+            while True:
+                if loop.tick.k == 5:
+                    line.relay.tamper = lambda frame, direction: ()
+                    line.device.on_change = healed
+                loop.step(loop.nearest(0.1))
+
+    def healed(change: Any) -> None:  # the device's dead-man has acted; the cable is plugged in again
+        line.relay.tamper = line.tamper
+
+    with pytest.raises(LinkError, match=r"broken off .*the old gains"):
+        deploy(rig, NEW, tmp_path / "journal.jsonl", agree=agreed, try_out=try_out)
+    line.relay.tamper = line.tamper
+    old = Journal(tmp_path / "journal.jsonl").unfinished()
+    if old is not None:  # the line was still dead when the gains should have gone back
+        restore(line.rig(), old, tmp_path / "journal.jsonl")
+    assert line.gains == OLD
+    assert line.device.output in (U_SAFE, DEVICE_SAFE)
+
+
+CHILD = """
+import sys
+from pathlib import Path
+from autotune.controller import PIDController
+from autotune.pipeline.deployment import hand_over
+from tests.autotune.test_pipeline_deployment import APART, NEW
+from tests.drivers.bench import rig_of, tcp_settings
+
+hand_over(rig_of(tcp_settings(int(sys.argv[1]), APART, timeout_s=30.0)), NEW, Path(sys.argv[2]))
+"""
+
+
+@pytest.fixture
+def half_written(line: Line, tmp_path: Path) -> Path:
+    """Return the journal of a process that was killed between the writes of K and Ti."""
+    journal = tmp_path / "journal.jsonl"
+    child = subprocess.Popen([sys.executable, "-c", CHILD, str(line.relay.port), str(journal)], cwd=ROOT)
+    line.times, line.seen = 1, child.kill
+    assert child.wait(60.0) == -signal.SIGKILL
+    line.seen = None
+    assert line.gains == MIXED
+    return journal
+
+
+def config_file(line: Line, folder: Path) -> Path:
+    """Write a configuration of the device behind the relay, its limits in order."""
+    servo = load_config(ROOT / "configs" / "servo_sim.toml")
+    config = Config.model_validate(servo.model_dump() | {"rig": tcp_settings(line.relay.port, APART).model_dump()})
+    path = folder / "rig.toml"
+    path.write_text(tomli_w.dumps(config.model_dump(mode="json", exclude_none=True)))
+    (folder / "new.toml").write_text('kind = "pi"\nK = 0.75\nTi_s = 4.0\n')
+    return path
+
+
+def typed(*arguments: str | Path, answers: str) -> tuple[int, str]:
+    """Run the command for a person at a terminal who types the answers; return its exit status and what it said."""
+    keyboard, terminal = pty.openpty()
+    os.write(keyboard, answers.encode())
+    command = [sys.executable, "-m", "autotune.cli", *map(str, arguments)]
+    done = subprocess.run(command, stdin=terminal, capture_output=True, text=True, check=False)
+    os.close(keyboard)
+    os.close(terminal)
+    return done.returncode, done.stdout + done.stderr
+
+
+def test_the_next_deploy_finds_half_written_gains_and_restores_the_old_ones(
+    line: Line, half_written: Path, tmp_path: Path
+) -> None:
+    config = config_file(line, tmp_path)
+    call = ("deploy", config, "--controller", tmp_path / "new.toml", "--no-verify", "--out", tmp_path)
+    status, said = typed(*call, answers="y\nn\n")
+    assert "interrupted" in said
+    assert "The old gains are in place again." in said
+    assert (status, line.gains) == (2, OLD)  # restored, and the new ones refused
+    assert Journal(half_written).unfinished() is None
+
+
+def test_old_and_new_gains_are_shown_and_an_answer_of_no_writes_nothing(line: Line, tmp_path: Path) -> None:
+    config = config_file(line, tmp_path)
+    call = ("deploy", config, "--controller", tmp_path / "new.toml", "--no-verify", "--form", "parallel")
+    status, said = typed(*call, answers="n\n")
+    assert (status, line.gains) == (2, OLD)
+    row = next(text for text in said.splitlines() if "Ki_per_s" in text)
+    assert [float(cell) for cell in row.split("│")[2:4]] == [0.75, 0.1875]  # K / Ti, old and new
+    assert not (tmp_path / "rig-gains" / "journal.jsonl").exists()
+
+
+def test_without_a_person_and_without_yes_nothing_is_done(line: Line, tmp_path: Path) -> None:
+    config = config_file(line, tmp_path)
+    call = ["deploy", str(config), "--controller", str(tmp_path / "new.toml")]
+    for options, mend in ((["--no-verify"], "--yes"), ([], "--points")):
+        error = CliRunner().invoke(app, [*call, *options]).exception
+        assert isinstance(error, InputError)
+        assert mend in error.mend
+    assert line.gains == OLD
+
+
+def test_a_journal_that_cannot_be_written_keeps_the_old_gains(line: Line, tmp_path: Path) -> None:
+    (tmp_path / "journal.jsonl").symlink_to("/dev/full")
+    with pytest.raises(ExperimentStopped, match="the journal cannot be written"):
+        deploy(line.rig(), NEW, tmp_path / "journal.jsonl", agree=agreed, try_out=None)
+    assert line.gains == OLD
+
+
+def test_what_is_no_journal_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "journal.jsonl").write_text('{"gains": "writing"}\n')
+    with pytest.raises(InputError, match="not a journal"):
+        Journal(tmp_path / "journal.jsonl").unfinished()
+
+
+def test_a_line_of_the_journal_that_was_cut_off_was_not_acted_upon(tmp_path: Path) -> None:
+    journal = Journal(tmp_path / "journal.jsonl")
+    rig = SimulatedRig(make_plant("servo", seed=1), u_safe=0.0, controller=PIDController(K=1.0, Ti_s=math.inf))
+    hand_over(rig, None, journal.path)
+    with journal.path.open("a") as file:
+        file.write('{"gains": "writ')
+    assert journal.unfinished() is None
+    assert replace(rig.read_gains(), K=2.0).Ti_s == math.inf
