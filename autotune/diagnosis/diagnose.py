@@ -12,6 +12,7 @@ import numpy as np
 from autotune.arrays import FloatArray
 from autotune.controller import Controller
 from autotune.diagnosis.data import Data
+from autotune.diagnosis.description import describe
 from autotune.diagnosis.discriminate import next_experiment
 from autotune.diagnosis.fitting import Fit, fit
 from autotune.diagnosis.law import law_effect
@@ -123,7 +124,7 @@ def _judge(found: Search, samples: list[SampleEffect], model: Model) -> Diagnosi
         next_experiment=next_experiment(found, effects, verdict),
         extended_model=extended,
         sentences=_sentences(verdict, effects, quality, places),
-        descriptions=(),
+        description=describe(found.retuned.fit, found.data) if verdict == "unexplained" else None,
         search=found,
     )
 

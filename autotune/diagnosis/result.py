@@ -10,6 +10,7 @@ from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
+from autotune.diagnosis.description import Description
 from autotune.diagnosis.selection import Search
 from autotune.models import Model, Parameter
 
@@ -88,8 +89,9 @@ class Diagnosis:
         The model to go on with.
     sentences : tuple of str
         The finding in words.
-    descriptions : tuple of str
-        Equations that describe, beyond the catalogue, what is left of the residual; not a cause.
+    description : Description, optional
+        What is left of the residual as a function of the signals, where no effect of the catalogue explains it; not a
+        cause.
     search : Search
         All hypotheses, for the report.
     """
@@ -102,7 +104,7 @@ class Diagnosis:
     next_experiment: NextExperiment | None
     extended_model: Model
     sentences: tuple[str, ...]
-    descriptions: tuple[str, ...]
+    description: Description | None
     search: Search
 
     def as_json(self) -> dict[str, Any]:
@@ -130,8 +132,7 @@ class Diagnosis:
                 "settings": dict(following.settings),
                 "expected": following.expected,
             },
-            "description": list(self.descriptions),
-        }
+        } | ({} if self.description is None else {"description": self.description.as_json()})
 
     def write(self, path: Path) -> None:
         """Write diagnosis.json."""
