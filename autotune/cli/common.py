@@ -58,6 +58,10 @@ class ProgressBar:
         text = f"{progress.state.value}: {progress.message}"
         self._progress.update(self._task, completed=progress.fraction, description=text, left=left)
 
+    def work(self, what: str, share: float) -> None:
+        """Show what is being computed and the share done, 0 to 1."""
+        self._progress.update(self._task, completed=share, description=what, left="")
+
     def __enter__(self) -> ProgressBar:
         self._progress.start()
         return self

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from contextlib import nullcontext
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 from rich.console import Console
@@ -12,17 +12,34 @@ from rich.console import Console
 from autotune.cli import app
 from autotune.cli.common import ProgressBar, new_folder, rig_of
 from autotune.cli.live import LISTEN, PORT, TOKEN
+from autotune.errors import InputError
 
-_OUT = Annotated[Path, typer.Option(metavar="DIR", help="new folder for recordings, result.json and report.html")]
+if TYPE_CHECKING:
+    from autotune.config import Config
+    from autotune.diagnosis.result import Diagnosis
+    from autotune.pipeline import Tuning
+
+_OUT = Annotated[Path, typer.Option(metavar="DIR", help="new folder for result.json and report.html")]
 
 
 @app.command()
 def run(
-    config: Annotated[Path, typer.Argument(metavar="CONFIG.toml", help="configuration of the rig")],
-    out: _OUT,
+    config: Annotated[
+        Path | None,
+        typer.Argument(metavar="CONFIG.toml", help="configuration of the rig; the stored one with --resume"),
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="new folder for recordings, result.json and report.html")
+    ] = None,
+    resume: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="folder of an interrupted run: go on with the points it has")
+    ] = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="run the rig's simulated twin instead of the rig")] = False,
     verify: Annotated[bool, typer.Option(help="try the new loop on the rig")] = True,
     deploy: Annotated[bool, typer.Option(help="write accepted gains into the rig's own controller")] = True,
+    diagnose: Annotated[
+        bool, typer.Option("--diagnose", help="diagnose the recordings even where the loop behaves as predicted")
+    ] = False,
     live: Annotated[
         bool, typer.Option("--live", help="show the run in the browser, with Abort and the decision")
     ] = False,
@@ -31,27 +48,87 @@ def run(
     token: TOKEN = None,
 ) -> None:
     """Commission a rig: relay sweep, Bode points, reduced model, controller, verification, report."""
-    from autotune.config import load_config
     from autotune.live.session import LivePage
     from autotune.pipeline import RECORDING, tune
     from autotune.recording import read_recording
     from autotune.report.page import write_page
     from autotune.report.run_page import run_page
 
-    content = load_config(config)
-    rig = rig_of(content, dry_run)
-    new_folder(out, RECORDING)
-    with LivePage(out, listen, port, token) if live else nullcontext() as onlooker:
+    content = _configuration(config, out, resume, dry_run)
+    rig = rig_of(content)
+    if out is not None:
+        new_folder(out, RECORDING)
+    folder = out or resume or Path()
+    console = Console(highlight=False, soft_wrap=True)
+    with LivePage(folder, listen, port, token) if live else nullcontext() as onlooker:
         keep = onlooker.keep if onlooker is not None else None
         with ProgressBar() as bar:
-            tuning = tune(rig, content, out, verify=verify, deploy=deploy, on_progress=bar.show, keep=keep)
-        page = run_page(content.name, content.signals, read_recording(out / RECORDING), tuning)
-        write_page(page, out / "report.html")
-        console = Console(highlight=False, soft_wrap=True)
+            tuning = tune(
+                rig,
+                content,
+                folder,
+                verify=verify,
+                deploy=deploy,
+                resume=resume is not None,
+                on_progress=bar.show,
+                keep=keep,
+            )
+        missed = tuning.verification is not None and not tuning.verification.accepted
+        found = _diagnosed(content, tuning, folder, console) if missed or diagnose else None
+        recordings = [read_recording(folder / part.recording) for part in tuning.experiment.parts]
+        page = run_page(content.name, content.signals, recordings, tuning, found)
+        write_page(page, folder / "report.html")
         for warning in (*tuning.experiment.warnings, *tuning.analysis.warnings):
             console.print(f"warning: {warning}", markup=False)
         console.print(page.verdict, markup=False)
-        console.print(f"report: {out / 'report.html'}", markup=False)
+        for sentence in found.sentences if found is not None else ():
+            console.print(sentence, markup=False)
+        console.print(f"report: {folder / 'report.html'}", markup=False)
+
+
+def _configuration(config: Path | None, out: Path | None, resume: Path | None, dry_run: bool) -> Config:
+    """Return the configuration that was given, or the one that the interrupted run began with."""
+    from autotune.config import load_config
+    from autotune.pipeline.folder import stored_config
+    from drivers import twin_of
+
+    if (out is None) == (resume is None):
+        raise InputError("give --out for a new run, or --resume for an interrupted one", where="autotune run")
+    if config is not None:
+        content = load_config(config)
+    elif resume is not None:
+        content = stored_config(resume)
+    else:
+        raise InputError("CONFIG.toml is missing", where="autotune run", mend="autotune run CONFIG.toml --out DIR")
+    # so that nobody goes on at the rig with what its twin has measured
+    return content.model_copy(update={"rig": twin_of(content.rig)}) if dry_run else content
+
+
+def _diagnosed(config: Config, tuning: Tuning, folder: Path, console: Console) -> Diagnosis | None:
+    """Return what the fitted plant leaves out, its files written; None where the recordings do not allow it."""
+    from autotune.diagnosis.simulation import entry_of
+    from autotune.models import write_model
+    from autotune.pipeline.folder import RESULT, VERIFICATION, recordings
+    from autotune.pipeline.mismatch import diagnose_run
+    from autotune.pipeline.result import append_diagnosis
+    from autotune.report.diagnosis_page import write_diagnosis_page
+
+    files = [folder / part.recording for part in tuning.experiment.parts]
+    files += recordings(folder, VERIFICATION)[-1:] if tuning.verification is not None else ()
+    try:
+        with ProgressBar() as bar:
+            found = diagnose_run(config, tuning.experiment, tuning.analysis.fit, files, bar.work)
+    except InputError as error:
+        console.print(f"warning: not diagnosed: {error}", markup=False)
+        return None
+    place = folder / "diagnosis"
+    place.mkdir(exist_ok=True)
+    found.write(place / "diagnosis.json")
+    equations = {effect.name: entry_of(effect.name).equation for effect in found.extended_model.effects}
+    write_model(found.extended_model, place / "extended_model.toml", equations)
+    write_diagnosis_page(found, place / "report.html")
+    append_diagnosis(folder / RESULT, found)
+    return found
 
 
 @app.command()
@@ -81,7 +158,6 @@ def tune(
     import json
 
     from autotune.config.procedure import DesignSettings, SignalSettings
-    from autotune.errors import InputError
     from autotune.identification.frequency.recorded import combine, frequency_points
     from autotune.pipeline import RESULT, analyse, analysis_json
     from autotune.points import read_points

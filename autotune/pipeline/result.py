@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from autotune.design.nugap import Validation
+from autotune.diagnosis.result import Diagnosis
 from autotune.experiment.result import ExperimentResult
 from autotune.experiment.verify import Verification
 from autotune.pipeline.analysis import Analysis
@@ -37,6 +38,14 @@ def write_result(
         content |= analysis_json(analysis)
     if verification is not None:
         content["verification"] = verification_json(verification)
+    write_json(content, path)
+
+
+def append_diagnosis(path: Path, found: Diagnosis) -> None:
+    """Add to a ``result.json`` what a diagnosis of the run's recordings found."""
+    said = found.as_json()
+    content = json.loads(path.read_text(encoding="utf-8"))
+    content["diagnosis"] = {key: said[key] for key in ("verdict", "effects", "places", "next_experiment")}
     write_json(content, path)
 
 

@@ -40,10 +40,11 @@ class Figure:
 
 @dataclass(frozen=True, kw_only=True)
 class Section:
-    """A heading with paragraphs, then tables, then figures."""
+    """A heading with paragraphs, links (what they say, and where they lead), then tables, then figures."""
 
     title: str
     text: tuple[str, ...] = ()
+    links: tuple[tuple[str, str], ...] = ()
     tables: tuple[Table, ...] = ()
     figures: tuple[Figure, ...] = ()
 
@@ -156,6 +157,7 @@ def _text(text: str) -> str:
 def _section(section: Section, number: int) -> str:
     parts = [f'<section id="s{number}"><h2>{_text(section.title)}</h2>']
     parts += [f"<p>{_text(line)}</p>" for line in section.text]
+    parts += [f'<p><a href="{html.escape(target)}">{_text(label)}</a></p>' for label, target in section.links]
     parts += [_table(table) for table in section.tables]
     parts += [_figure(figure, f"f{number}_{i}") for i, figure in enumerate(section.figures)]
     return "\n".join([*parts, "</section>"])

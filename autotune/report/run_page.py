@@ -11,6 +11,7 @@ from plotly.subplots import make_subplots
 
 from autotune.config.procedure import SignalSettings
 from autotune.controller import PIDController
+from autotune.diagnosis.result import Diagnosis
 from autotune.experiment.result import ExperimentResult, Segment
 from autotune.experiment.verify import Verification, smoothed
 from autotune.pipeline import Analysis, Tuning
@@ -21,7 +22,13 @@ from autotune.report.figures import recording_figure
 from autotune.report.page import BLUE, GREEN, GREY, ORANGE, RED, Figure, Page, Section, Table, add_line, thinned
 
 
-def run_page(name: str, signals: SignalSettings, recording: Recording, tuning: Tuning) -> Page:
+def run_page(
+    name: str,
+    signals: SignalSettings,
+    recordings: Sequence[Recording],
+    tuning: Tuning,
+    diagnosis: Diagnosis | None = None,
+) -> Page:
     """Return the page of a whole run on a rig.
 
     Parameters
@@ -30,18 +37,22 @@ def run_page(name: str, signals: SignalSettings, recording: Recording, tuning: T
         Of the rig, from the configuration.
     signals : SignalSettings
         Units.
-    recording : Recording
-        The sweep's recording.
+    recordings : sequence of Recording
+        The sweep's, one for each sitting at the rig.
     tuning : Tuning
         What the run ended with.
+    diagnosis : Diagnosis, optional
+        What the fitted plant leaves out; its own page is in ``diagnosis/report.html`` beside this one.
     """
     experiment, verification = tuning.experiment, tuning.verification
     sections = [
-        _experiment_section(recording, experiment, signals),
+        _experiment_section(recordings, experiment, signals),
         *analysis_sections(tuning.analysis, signals, experiment),
     ]
     if verification is not None:
         sections.append(_verification_section(verification, signals))
+    if diagnosis is not None:
+        sections.append(_diagnosis_section(diagnosis))
     sections.append(_warnings_section((*experiment.warnings, *tuning.analysis.warnings)))
     verdict, good = _verdict(tuning, signals)
     return Page(
@@ -187,9 +198,28 @@ def _summary(tuning: Tuning, signals: SignalSettings) -> tuple[str, ...]:
     return tuple(lines)
 
 
-def _experiment_section(recording: Recording, experiment: ExperimentResult, signals: SignalSettings) -> Section:
-    marks = [(segment.start_s, f"{i + 1}") for i, segment in enumerate(experiment.segments)]
-    timing = experiment.timing
+def _experiment_section(
+    recordings: Sequence[Recording], experiment: ExperimentResult, signals: SignalSettings
+) -> Section:
+    timing, parts = experiment.timing, experiment.parts
+    figures = []
+    for number, (recording, part) in enumerate(zip(recordings, parts, strict=True)):
+        marks = [(s.start_s, f"{i + 1}") for i, s in enumerate(experiment.segments) if s.part == number]
+        which = "The whole recording." if len(parts) == 1 else f"Sitting {number + 1}, {part.recording}."
+        figures.append(
+            Figure(
+                figure=recording_figure(recording, signals.u_unit, signals.y_unit, marks=marks),
+                caption=f"{which} Numbers mark where each limit cycle's evaluation begins.",
+                height_px=460,
+            )
+        )
+    sittings = Table(
+        header=("sitting", "recording", "points", "on the rig [s]", "ended"),
+        rows=tuple(
+            (f"{i}", part.recording, f"{part.points}", f"{part.rig_time_s:.1f}", part.ended)
+            for i, part in enumerate(parts, start=1)
+        ),
+    )
     return Section(
         title="The experiment",
         text=(
@@ -197,14 +227,11 @@ def _experiment_section(recording: Recording, experiment: ExperimentResult, sign
             f" loop {_milliseconds(timing.lateness_s)} (median, 99 %, worst);"
             f" {timing.missed} sample(s) missed, {timing.unusable} unusable.",
         ),
+        tables=(sittings,) if len(parts) > 1 else (),
         figures=(
+            *figures,
             Figure(
-                figure=recording_figure(recording, signals.u_unit, signals.y_unit, marks=marks),
-                caption="The whole recording. Numbers mark where each limit cycle's evaluation begins.",
-                height_px=460,
-            ),
-            Figure(
-                figure=_cycles_figure(recording, experiment.segments, signals),
+                figure=_cycles_figure(recordings, experiment.segments, signals),
                 caption="Two periods of every limit cycle that a point was made from, y over u; the numbers are rad/s.",
                 height_px=380,
             ),
@@ -216,13 +243,13 @@ def _milliseconds(values: tuple[float, float, float]) -> str:
     return " / ".join(f"{1e3 * value:.2g}" for value in values) + " ms"
 
 
-def _cycles_figure(recording: Recording, segments: Sequence[Segment], signals: SignalSettings) -> Any:
+def _cycles_figure(recordings: Sequence[Recording], segments: Sequence[Segment], signals: SignalSettings) -> Any:
     ordered = sorted(segments, key=lambda segment: segment.point.omega_rad_s)
     titles = [f"{segment.point.omega_rad_s:.2g}" for segment in ordered]
     figure = make_subplots(rows=2, cols=len(ordered), shared_xaxes=True, subplot_titles=titles, vertical_spacing=0.08)
     for i, segment in enumerate(ordered, start=1):
         span = 2 * 2 * math.pi / segment.point.omega_rad_s
-        part = recording.between(max(segment.start_s, segment.end_s - span), segment.end_s)
+        part = recordings[segment.part].between(max(segment.start_s, segment.end_s - span), segment.end_s)
         t = part.t - part.t[0]
         add_line(figure, *thinned(t, part.y, 600), "y", BLUE, width=1.0, row=1, col=i, showlegend=False)
         add_line(
@@ -266,6 +293,32 @@ def _verification_section(verification: Verification, signals: SignalSettings) -
                 height_px=500,
             ),
         ),
+    )
+
+
+def _diagnosis_section(found: Diagnosis) -> Section:
+    following = found.next_experiment
+    text = [*found.sentences]
+    if found.places:
+        text.append(f"It sits in: {', '.join(found.places)}.")
+    if following is not None:
+        text.append(f"Next experiment, to {following.purpose}: {following.kind}. Expected: {following.expected}.")
+    effects = Table(
+        header=("effect", "probability", "parameters"),
+        rows=tuple(
+            (
+                effect.name,
+                f"{effect.probability:.2f}",
+                ", ".join(f"{name} = {p.value:.4g} {p.unit}".rstrip() for name, p in effect.parameters.items()),
+            )
+            for effect in found.effects
+        ),
+    )
+    return Section(
+        title="Why it differs",
+        text=tuple(text),
+        links=(("The whole diagnosis, with its pictures", "diagnosis/report.html"),),
+        tables=(effects,) if found.effects else (),
     )
 
 
