@@ -20,7 +20,7 @@ Answer = TypeVar("Answer")
 #: A task that ends with an error of its surroundings (a network drive) is tried this many times more.
 _RETRIES = 2
 #: An existing scheduler must answer, and have a worker, within this time [s].
-_PATIENCE_S = 15.0
+_PATIENCE_S = 30.0
 
 
 @contextmanager
@@ -123,8 +123,8 @@ def run_all(
 
     Notes
     -----
-    A task whose worker was killed is given to another; one that has killed four workers is given up
-    (``distributed.scheduler.allowed-failures``). Answers are let go of as they are yielded, so memory stays flat.
+    A task whose worker was killed is given to another; one that has killed four workers is given up (Dask's
+    ``distributed.scheduler.allowed-failures``). Answers are let go of as they are yielded, so memory stays flat.
     """
     futures = client.map(function, list(tasks.values()), pure=False, retries=_RETRIES)
     names = {future.key: name for future, name in zip(futures, tasks, strict=True)}

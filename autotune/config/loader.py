@@ -104,7 +104,8 @@ def _refusal(error: ValidationError, root: type[BaseModel], where: str) -> Input
     value = first.get("input")
     shown = f" = {value!r}" if isinstance(value, str | int | float | bool) else ""
     reason = first["msg"].removeprefix("Value error, ")
-    return InputError(f"{path}{shown}: {reason}{more}", where=where, mend=_describe(root, _key_path(first)))
+    key = f"{path}{shown}: " if path else ""  # what holds between keys of the whole file has no path
+    return InputError(f"{key}{reason}{more}", where=where, mend=_describe(root, _key_path(first)))
 
 
 def _key_path(detail: ErrorDetails) -> tuple[str | int, ...]:
@@ -140,7 +141,7 @@ def _known_keys(root: type[BaseModel], path: tuple[str | int, ...]) -> list[str]
 
 
 def _describe(root: type[BaseModel], path: tuple[str | int, ...]) -> str:
-    for model in _section(root, path[:-1]):
+    for model in _section(root, path[:-1]) if path else []:
         field = model.model_fields.get(str(path[-1]))
         if field is not None and field.description:
             return field.description

@@ -16,6 +16,7 @@ def signals(seed: int, rows: int = 2000, gain: float = GAIN) -> tuple[FloatArray
     """Return t, u and y of gain exp(-L s)/(tau s + 1) about u = 50, y = 20, with noise of 0.01."""
     rng = np.random.default_rng(seed)
     steps = np.repeat(rng.choice([-0.5, 0.5], rows), rng.integers(3, 40, rows))[:rows]
+    steps[:20] = 0.0  # at rest before: nothing of the past is still on its way through the dead time
     decay = np.exp(-SAMPLE_S / TAU_S)
     late = round(DEAD_TIME_S / SAMPLE_S)
     delayed = np.concatenate([np.zeros(late), steps])[:rows]

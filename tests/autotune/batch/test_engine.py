@@ -1,0 +1,126 @@
+"""Tasks on Dask: workers that are killed, drives that fail for a moment, schedulers that are elsewhere."""
+
+from __future__ import annotations
+
+import os
+import signal
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import numpy as np
+import psutil
+import pytest
+from distributed import LocalCluster
+
+from autotune.batch import engine
+from autotune.batch.engine import cluster, run_all
+from autotune.errors import InputError
+
+
+def test_a_killed_worker_costs_only_its_task(two_workers, tmp_path):
+    tasks = {f"task {i}": tmp_path / str(i) for i in range(20)}
+    gate = tmp_path / "gate"
+    os.mkfifo(gate)
+
+    def answer(path: Path) -> str:
+        with path.open("a") as attempts:
+            attempts.write(f"{os.getpid()}\n")
+        if path.name == "7" and len(path.read_text().splitlines()) == 1:
+            gate.read_bytes()  # blocks: nobody ever writes there
+        return path.name
+
+    running = run_all(two_workers, answer, tasks)
+    answers = dict(next(running) for _ in range(19))
+    os.kill(int((tmp_path / "7").read_text()), signal.SIGKILL)
+    answers |= dict(running)
+    attempts = {name: len(path.read_text().splitlines()) for name, path in tasks.items()}
+    assert answers == {name: path.name for name, path in tasks.items()}
+    assert attempts == dict.fromkeys(tasks, 1) | {"task 7": 2}
+
+
+def test_a_task_that_kills_every_worker_ends_as_its_own_failure(two_workers, monkeypatch):
+    monkeypatch.setattr(two_workers.cluster.scheduler, "allowed_failures", 1)
+
+    def answer(number: int) -> int:
+        if number == 1:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return number
+
+    answers = dict(run_all(two_workers, answer, {"a": 0, "b": 1, "c": 2}))
+    assert (answers["a"], answers["c"]) == (0, 2)
+    assert "every worker that took it was killed" in str(answers["b"])
+
+
+def test_a_drive_that_fails_for_a_moment_is_asked_again(two_workers, tmp_path):
+    def answer(path: Path) -> str:
+        try:
+            path.touch(exist_ok=False)
+        except FileExistsError:
+            return "read"
+        raise OSError("network drive away")
+
+    assert dict(run_all(two_workers, answer, {"a": tmp_path / "seen"})) == {"a": "read"}
+
+
+def test_a_task_that_keeps_failing_ends_with_its_error(two_workers):
+    def answer(_: int) -> None:
+        raise OSError("network drive away")
+
+    ((_, error),) = run_all(two_workers, answer, {"a": 0})
+    assert isinstance(error, OSError)
+
+
+def test_kernels_come_compiled_from_the_disk_to_every_worker(two_workers):
+    def compiled_here() -> int:
+        from autotune.identification.frequency import reference_model as module
+
+        model = module.ReferenceModel(K=1.0, p=0.1, tau=0.1, L=0.1)
+        module.simulate_reference(np.arange(9.0), np.ones(9), model)
+        return sum(module._simulate.stats.cache_misses.values())
+
+    compiled_here()  # once on this machine, by whoever comes first
+    two_workers.wait_for_workers(2)
+    assert list(two_workers.run(compiled_here).values()) == [0, 0]
+
+
+def test_the_embedded_cluster_is_out_of_reach_of_other_machines(two_workers):
+    found = two_workers.scheduler_info(n_workers=-1)
+    addresses = [found["address"], *found["workers"], *(worker["nanny"] for worker in found["workers"].values())]
+    assert {urlsplit(address).hostname for address in addresses} == {"127.0.0.1"}
+    pids = {os.getpid(), *two_workers.run(os.getpid).values()}
+    listening = {
+        c.laddr.ip
+        for pid in pids
+        for c in psutil.Process(pid).net_connections("inet")
+        if c.status == psutil.CONN_LISTEN
+    }
+    assert listening == {"127.0.0.1"}
+
+
+def test_an_existing_scheduler_and_its_two_workers(scheduler):
+    with cluster(scheduler=scheduler) as client:
+        client.wait_for_workers(2, timeout=30)
+        answers = dict(run_all(client, lambda number: (number**2, os.getpid()), {str(i): i for i in range(8)}))
+        assert {name: square for name, (square, _) in answers.items()} == {str(i): i**2 for i in range(8)}
+        assert os.getpid() not in {pid for _, pid in answers.values()}
+    with cluster(scheduler=scheduler) as again:  # closing the first connection left the scheduler alone
+        assert len(again.scheduler_info(n_workers=-1)["workers"]) == 2
+
+
+def test_nobody_at_the_address_is_said_at_once(monkeypatch):
+    monkeypatch.setattr(engine, "_PATIENCE_S", 0.2)
+    with (
+        pytest.raises(InputError, match=r"tcp://127\.0\.0\.1:9.*dask scheduler"),
+        cluster(scheduler="tcp://127.0.0.1:9"),
+    ):
+        pass
+
+
+def test_a_scheduler_without_workers_is_said(monkeypatch):
+    monkeypatch.setattr(engine, "_PATIENCE_S", 0.5)
+    with (
+        LocalCluster(n_workers=0, host="127.0.0.1", dashboard_address="127.0.0.1:0") as empty,
+        pytest.raises(InputError, match="no worker is connected"),
+        cluster(scheduler=empty.scheduler_address),
+    ):
+        pass
