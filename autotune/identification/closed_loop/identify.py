@@ -150,7 +150,7 @@ def identify_closed_loop(
     law = _checked_law(recording, controller, r, warnings)
     scale_u, scale_y = float(np.std(u)), float(np.std(y))
     u_1, y_1 = ((u - u.mean()) / scale_u)[:, None], ((y - y.mean()) / scale_y)[:, None]
-    motion = _look(u_1, y_1, r)
+    motion = _look(u_1, y_1, r, recording.name)
     evidence: tuple[Candidate, ...] = ()
     if order is None:
         choice = choose_order(u_1, y_1, max_order=max_order, progress=progress)
@@ -260,12 +260,12 @@ def _checked_law(
     return law
 
 
-def _look(u: FloatArray, y: FloatArray, r: FloatArray | None) -> float:
+def _look(u: FloatArray, y: FloatArray, r: FloatArray | None, name: str) -> float:
     rows = min(len(u), _LOOK_ROWS)
     p = min(12, default_past_window(rows, 2))
     motion = own_motion(lagged_data(u[:rows], y[:rows], p))
     moves = r is not None and float(np.ptp(r)) > 1e-9 * max(1.0, float(np.max(np.abs(r))))
-    require_excitation(motion, r_recorded=r is not None, r_moves=moves)
+    require_excitation(motion, r_recorded=r is not None, r_moves=moves, where=name)
     return motion
 
 

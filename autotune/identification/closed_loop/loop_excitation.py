@@ -72,7 +72,7 @@ def own_motion(data: LaggedData) -> float:
     return float(np.min(left / np.where(total > 0, total, np.inf)))
 
 
-def require_excitation(motion: float, *, r_recorded: bool, r_moves: bool) -> None:
+def require_excitation(motion: float, *, r_recorded: bool, r_moves: bool, where: str = "") -> None:
     """Refuse a recording in which nothing but the feedback moved the command.
 
     Raises
@@ -86,6 +86,7 @@ def require_excitation(motion: float, *, r_recorded: bool, r_moves: bool) -> Non
     raise IdentificationError(
         f"u is not persistently exciting: it follows from past u and y alone (all but {motion:.1e} of it), "
         f"and {reason}, so plant and inverse controller cannot be told apart",
+        where=where,
         mend="move the set-point or add a dither to the command while recording",
     )
 
@@ -159,7 +160,7 @@ def judge(
     else:
         sentence = (
             f"not excited enough: {sentence}; {100 * PRECISION_WANTED:g} % would need the same excitation "
-            f"{factor:.2g} times as large, or the record {factor**2:.2g} times as long"
+            f"{_times(factor)} times as large, or the record {_times(factor**2)} times as long"
         )
     return ExcitationVerdict(
         enough=enough,
@@ -171,3 +172,7 @@ def judge(
         length_factor=factor**2,
         sentence=sentence,
     )
+
+
+def _times(factor: float) -> str:
+    return f"{factor:.2g}" if factor < 100.0 else f"{factor:.0f}"
