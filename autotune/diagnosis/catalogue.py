@@ -222,9 +222,12 @@ def _actuator() -> tuple[Entry, ...]:
         ),
         Entry(
             name="actuator.quantisation",
-            equation="w = step round(u / step)",
-            parameters=(Quantity(name="step", unit="{u}", slot=k.A_QUANTUM),),
-            starts=lambda s: [(c * s.w,) for c in (0.03, 0.06, 0.12, 0.25, 0.5)],
+            equation="w = origin + step round((u - origin) / step)",
+            parameters=(
+                Quantity(name="step", unit="{u}", slot=k.A_QUANTUM),
+                Quantity(name="origin", unit="{u}", scale="real", slot=k.A_QUANTUM_ORIGIN),
+            ),
+            starts=lambda s: [],
             confusable=("actuator.stiction",),
             reference=astrom,
         ),

@@ -43,14 +43,20 @@ class Data:
     numbers: tuple[int, ...] = ()
 
     def thinned(self, rows: int) -> Data:
-        """Return the data with windows left out evenly, until about as many rows count."""
+        """Return the data with windows left out evenly, until about as many rows count.
+
+        Windows in which u or y is largest or smallest stay: a limit that is rarely reached acts only there.
+        """
         share = max(1.0, self.rows / rows)
         if share < 1.5:
             return self
         starts, stops, good = [], [], []
-        for a, b, ok in zip(self.starts, self.stops, self.good, strict=True):
+        for r, a, b, ok in zip(self.recordings, self.starts, self.stops, self.good, strict=True):
             count = min(len(a), max(LEAST_WINDOWS_KEPT, round(len(a) / share)))
-            keep = np.unique(np.linspace(0, len(a) - 1, count).round().astype(np.int64))
+            far = [extreme(np.where(ok, x, np.median(x[ok]))) for x in (r.u, r.y) for extreme in (np.argmin, np.argmax)]
+            extremes = np.clip(np.searchsorted(a, far, side="right") - 1, 0, len(a) - 1)
+            evenly = np.linspace(0, len(a) - 1, count).round().astype(np.int64)
+            keep = np.union1d(evenly, extremes)
             inside = np.zeros(ok.size, dtype=bool)
             for first, last in zip(a[keep], b[keep], strict=True):
                 inside[first:last] = True

@@ -18,7 +18,7 @@ from autotune.diagnosis.fitting import Fit, fit
 from autotune.diagnosis.law import law_effect
 from autotune.diagnosis.noise import noise_from_differences
 from autotune.diagnosis.result import Candidate, Diagnosis, FitQuality, FoundEffect, OperatingRange, Verdict
-from autotune.diagnosis.retuning import COARSE, misfit, whiteness
+from autotune.diagnosis.retuning import BLOCKS, COARSE, misfit, whiteness
 from autotune.diagnosis.samples import SampleEffect, inspect, jitter_effect
 from autotune.diagnosis.search import RUNAWAY, Hypothesis
 from autotune.diagnosis.selection import Report, Search, score, search, simplicity_lead, worth
@@ -27,21 +27,27 @@ from autotune.errors import InputError
 from autotune.models import Effect, Model, Parameter
 from autotune.recording import Recording
 
-#: Residual variance over the noise's (see :func:`autotune.diagnosis.selection.misfit`) up to which a model is adequate.
-ADEQUATE = 1.12
-#: The same for the slow part of the residual, after its own AR(2) has been taken out.
-WHITE = 1.45
+#: Residual variance over the noise's (see :func:`autotune.diagnosis.retuning.misfit`) up to which a model is adequate,
+#: beside one standard deviation of that ratio.
+ADEQUATE = 1.04
+#: The same for the slow part of the residual, after its own AR(2) has been taken out, beside two standard deviations.
+WHITE = 1.15
+#: Misfit of a model without effects from which on something must be missing, although no effect is worth it.
+MISSING = 1.1
 #: Decrease of chi2 that wrong numbers must bring before the verdict is "parameters".
 NUMBERS_DECREASE = 25.0
 #: An operating point that lies this many standard deviations from the nominal one is an offset.
 OFFSET_SIGMAS = 6.0
-#: Share of the retuned model's excess misfit that an effect must explain where nothing explains all of it.
-DOMINANT = 0.4
+#: Share of the retuned model's excess misfit that an effect must explain where nothing explains all of it, and how
+#: many times the noise's variance the retuned model's error must have: nearer to the noise adequacy is asked for.
+DOMINANT, FAR_FROM_NOISE = 0.35, 6.0
 #: Correlation of the noise from which on it is a disturbance of the plant's, not of single samples.
 SLOW_NOISE = 0.8
 #: Weight of a cause outside the catalogue, beside the best hypothesis's 1, where that explains the recordings or most
 #: of what retuning leaves; elsewhere it weighs as much as the best.
 UNKNOWN = 0.03
+#: Evidence from which on what single rows show is sure, and its share of what an effect of the chain gains.
+SURE, SAMPLE_SHARE = 60.0, 0.2
 #: Scale of the log-odds: one unit of chi2 counts this much less than for ideal noise.
 TEMPERATURE = 3.0
 
@@ -94,7 +100,14 @@ def diagnose(
     gained = score(found.retuned) - score(found.chosen)
     quick = not found.data.noise.ar or found.data.noise.ar[0] < SLOW_NOISE
     near = misfit(found.retuned.fit, found.data) < COARSE
-    strong = [s for s in strong if s.evidence > gained and (s.name != "timing.jitter" or (quick and near))]
+    # a stamp that is wrong disturbs single rows: effects of the chain would leave something slow as well
+    fast = is_white(found.retuned.fit, found.data) and quick and near
+    strong = [
+        s
+        for s in strong
+        if (s.evidence > max(SAMPLE_SHARE * gained, SURE) and fast)
+        or (s.evidence > gained and (s.name != "timing.jitter" or (quick and near)))
+    ]
     if any(s.name == "timing.jitter" for s in strong):
         found = replace(found, chosen=found.retuned)
     report("checking on held-out rows", 0.9)
@@ -131,7 +144,12 @@ def _judge(found: Search, samples: list[SampleEffect], model: Model) -> Diagnosi
 
 def is_adequate(result: Fit, data: Data) -> bool:
     """Whether a residual is noise: no more variance than its jitter shows, and no slow part."""
-    return misfit(result, data) < ADEQUATE and whiteness(result, data) < WHITE
+    return misfit(result, data) < ADEQUATE + math.sqrt(2.0 / result.rows) and is_white(result, data)
+
+
+def is_white(result: Fit, data: Data) -> bool:
+    """Whether a residual has no slow part beyond what chance brings."""
+    return whiteness(result, data) < WHITE + 2.0 * math.sqrt(2.0 / (BLOCKS * len(result.windows)))
 
 
 def _verdict(found: Search, samples: list[SampleEffect], adequate: bool, offset: bool) -> Verdict:
@@ -140,7 +158,7 @@ def _verdict(found: Search, samples: list[SampleEffect], adequate: bool, offset:
     if samples or (offset and adequate):
         return "effect"
     if not adequate:
-        return "unexplained" if misfit(found.chosen.fit, found.data) > ADEQUATE * 1.05 else _numbers(found)
+        return "unexplained" if misfit(found.chosen.fit, found.data) > MISSING else _numbers(found)
     return _numbers(found)
 
 
@@ -156,7 +174,8 @@ def dominates(quality: FitQuality) -> bool:
     away most of the variance that retuning leaves above the noise.
     """
     left = quality.retuned**2 - quality.noise_floor**2
-    return left > 0.0 and quality.retuned**2 - quality.extended**2 > DOMINANT * left
+    far = quality.retuned**2 > FAR_FROM_NOISE * quality.noise_floor**2
+    return far and quality.retuned**2 - quality.extended**2 > DOMINANT * left
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -253,9 +272,9 @@ def _found_effect(
     entry = entry_of(effect.name)
     windows = everywhere
     if effect.name == "environment.step_load":
-        number = int(effect.parameters["recording"].value)
-        r = found.data.recordings[number]
-        windows = ((number, float(r.t[0] + effect.parameters["time"].value), float(r.t[-1])),)
+        number, after = int(effect.parameters["recording"].value), effect.parameters["time"].value
+        pairs = [(i, r) for i, r in enumerate(found.data.recordings) if number in (-1, i)]
+        windows = tuple((i, float(r.t[0] + after), float(r.t[-1])) for i, r in pairs)
     return FoundEffect(
         name=effect.name,
         probability=probability_of(effect.name, found, adequate),
@@ -338,9 +357,9 @@ def held_out(found: Search) -> tuple[FitQuality, bool]:
             tested = fit(p, odd, theta, _states_of(h.fit, odd), free=none, iterations=8)
         except RUNAWAY:
             # numbers from half the windows can run away on the other half: then those of all windows count
-            tested = fit(p, odd, h.fit.theta, _states_of(h.fit, odd), free=none, iterations=8)
+            tested = h.fit
         squares = sum(float(e @ e) for e in tested.residuals)
-        return math.sqrt(squares / max(odd.rows - sum(Q.shape[1] for Q in tested.states_explain), 1)) / spread
+        return math.sqrt(squares / max(tested.rows - sum(Q.shape[1] for Q in tested.states_explain), 1)) / spread
 
     nominal, retuned = error(found.retuned, tune=False), error(found.retuned, tune=True)
     extended = error(found.chosen, tune=True) if found.chosen.names else retuned

@@ -26,15 +26,15 @@ SIGNALS = 4
 
 # Slots of the vector of effect parameters. A slot that is not switched on is not read.
 (
-    A_QUANTUM, A_BACKLASH, A_STICTION, A_SLIP, A_DEAD_ZONE, A_SECOND, A_THIRD, A_LOW, A_HIGH, A_RATE, A_DRIFT,
-    A_FALL,
+    A_QUANTUM, A_QUANTUM_ORIGIN, A_BACKLASH, A_STICTION, A_SLIP, A_DEAD_ZONE, A_SECOND, A_THIRD, A_LOW, A_HIGH, A_RATE,
+    A_DRIFT, A_FALL,
     COULOMB, BREAKAWAY, STRIBECK_SPEED, DRAG, CUBIC, POSITION_GAIN, STOP_LOW, STOP_HIGH, SQRT_1, SQRT_2,
     HYSTERESIS, HYSTERESIS_WIDTH, RADIATION, RADIATION_ZERO, LEAK, SINE, SINE_PERIOD, SINE_PHASE,
     S_LOW, S_HIGH, S_QUANTUM, S_SECOND, S_THIRD, S_ABSOLUTE, S_DRIFT,
     CLOCK,
     STEP, STEP_TIME, STEP_END, STEP_RECORDING, PERIODIC_SIN, PERIODIC_COS, PERIODIC_FREQUENCY, DRIFTING,
-) = range(46)  # fmt: skip
-SLOTS = 46
+) = range(47)  # fmt: skip
+SLOTS = 47
 
 # Positions in the vector of structure integers.
 I_ACTUATOR, I_SPEED, I_POSITION, I_LEVELS = range(4)
@@ -77,7 +77,8 @@ def _actuator(
 ) -> float:
     """Return what the first block receives for a command, effects of the actuator applied in their physical order."""
     if on[A_QUANTUM]:
-        u = E[A_QUANTUM] * math.floor(u / E[A_QUANTUM] + 0.5)
+        origin = E[A_QUANTUM_ORIGIN]
+        u = origin + E[A_QUANTUM] * math.floor((u - origin) / E[A_QUANTUM] + 0.5)
     w = u - offset
     if on[A_BACKLASH]:
         half = 0.5 * E[A_BACKLASH]

@@ -17,6 +17,8 @@ from autotune.models import Block, Effect, Model, Parameter, TransferFunction
 Kind: TypeAlias = Literal["gain", "den", "num", "delay", "u_offset", "effect"]
 #: Standard deviation of a nominal number's logarithm: people's gains and lags are right to some tens of percent.
 NOMINAL_SPREAD = 0.2
+#: Parameters that no derivative tells: a direct search sets them.
+FOUND_DIRECTLY = ("recording", "time", "end", "origin")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -194,7 +196,7 @@ def parametrise(
     model : Model
         Nominal model without effects.
     effects : sequence of Effect
-        Effects at their starting values. Parameters that count or mark (recording, time, end) stay as they are.
+        Effects at their starting values. Parameters that count or mark stay as they are.
     input_size, sample_time_s : float
         As in :func:`chain_parameters`.
     sizes : sequence of sequence of float, optional
@@ -209,7 +211,7 @@ def parametrise(
     for number, effect in enumerate(effects):
         scales = {q.name: q.scale for q in entry_of(effect.name).parameters}
         for j, (key, parameter) in enumerate(effect.parameters.items()):
-            if key in ("recording", "time", "end"):
+            if key in FOUND_DIRECTLY:
                 continue
             positive = scales.get(key, "positive") == "positive"
             size = abs(parameter.value) or 1.0

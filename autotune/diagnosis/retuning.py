@@ -19,6 +19,8 @@ from autotune.recording import Recording
 #: Residual variance over the noise's from which on the misfit itself is taken for white noise: the jitter of a clean
 #: recording says nothing of how well a model can do.
 COARSE = 25.0
+#: Blocks of a window whose means show slow power.
+BLOCKS = 24
 
 
 def prepare(model: Model, recordings: Sequence[Recording], good: Sequence[BoolArray]) -> tuple[Data, Fit]:
@@ -83,7 +85,7 @@ def whiteness(result: Fit, data: Data) -> float:
     slow = expected = 0.0
     for e, starts in zip(replace(data, noise=noise).whitened(list(result.residuals)), data.starts, strict=True):
         for part in np.split(e, starts[1:]):
-            width = max(4, part.size // 24)
+            width = max(4, part.size // BLOCKS)
             count = part.size // width
             means = part[: count * width].reshape(count, width).mean(axis=1) * np.sqrt(width)
             slow += float(means @ means)

@@ -148,7 +148,10 @@ def promise(base: Fit, effect: Effect, data: Data) -> Promise:
     d = moved
     slope, curvature = -float(d @ base.e), float(d @ d)
     signed = any(f.kind == "effect" and not f.positive for f in p.free[base.theta.size :])
-    a = float(np.clip(slope / curvature, -20.0 if signed else 0.0, 20.0 if signed else 4.0))
+    low, high = (-20.0, 20.0) if signed else (0.0, 4.0)
+    if not _amplitudes(effect):
+        low, high = 0.0, 1.0  # a limit or a step is not made larger by a factor
+    a = float(np.clip(slope / curvature, low, high))
     return Promise(
         effect=effect, decrease=2.0 * a * slope - a * a * curvature, scaled=_scaled(effect, a, 20.0 if signed else 2.0)
     )

@@ -12,8 +12,8 @@ from threadpoolctl import threadpool_limits
 from autotune.arrays import BoolArray, FloatArray
 from autotune.diagnosis.catalogue import CATALOGUE, Entry
 from autotune.diagnosis.data import Data
+from autotune.diagnosis.direct import periodic_load_starts, quantisation_starts, step_load_starts
 from autotune.diagnosis.fitting import Fit, fit, start_states
-from autotune.diagnosis.loads import periodic_load_starts, step_load_starts
 from autotune.diagnosis.noise import Noise, noise_from_differences
 from autotune.diagnosis.retuning import COARSE, floored, misfit, prepare
 from autotune.diagnosis.search import RUNAWAY, Hypothesis, extend
@@ -135,7 +135,10 @@ def search(
     with threadpool_limits(1), ThreadPoolExecutor(2) as pool:
         report("retuning", 0.0)
         data, base = prepare(model, recordings, good)
-        nominal = fit(base.parametrisation, data, x0=base.x0, free=np.zeros(base.theta.size, dtype=bool))
+        try:
+            nominal = fit(base.parametrisation, data, x0=base.x0, free=np.zeros(base.theta.size, dtype=bool))
+        except RUNAWAY:
+            nominal = base  # nominal numbers that run away have no error that could be told
         try:
             return _searched(data, base, nominal, entries, pool, report)
         except RUNAWAY:
@@ -309,13 +312,15 @@ def grown(
     starts_each: int = 4,
     least: float = 3.0,
 ) -> list[Hypothesis]:
-    """Return fits of a base with one more effect, loads of the environment at times and frequencies of their own."""
+    """Return fits of a base with one more effect, what a direct search starts included."""
     names = {entry.name for entry in entries}
     extra = []
     if "environment.step_load" in names:
         extra += step_load_starts(base.fit, data, pool)
     if "environment.periodic_load" in names:
         extra += periodic_load_starts(base.fit, data, slowest_lag_s(base.fit.parametrisation.model))
+    if "actuator.quantisation" in names:
+        extra += quantisation_starts(base.fit, data, pool)
     return extend(base, data, pool, entries, most=most, extra=extra, starts_each=starts_each, least=least)
 
 

@@ -1,4 +1,4 @@
-"""Starting points for loads of the environment: when a step came, at which frequency a force swings."""
+"""Starting points by direct search: when a step came, at which frequency a force swings, a converter's lattice."""
 
 from __future__ import annotations
 
@@ -14,11 +14,15 @@ from autotune.diagnosis.search import Promise, promise
 from autotune.models import Effect
 
 #: Candidate times of a step per recording.
-STEP_TIMES = 24
+STEP_TIMES = 16
+#: Steps of a converter that are tried: the smallest as a share of the standard deviation of u, span as a factor, count.
+STEPS_TRIED = (0.15, 20.0, 32)
 
 
 def step_load_starts(base: Fit, data: Data, pool: Executor) -> list[Effect]:
     """Return the most promising step load: its time is searched on a grid, then around the best.
+
+    It comes in one of the recordings, or in all at the same time (number -1), as a test that is repeated brings it.
 
     Parameters
     ----------
@@ -44,6 +48,8 @@ def step_load_starts(base: Fit, data: Data, pool: Executor) -> list[Effect]:
     for i, r in enumerate(data.recordings):
         step = r.duration_s / (STEP_TIMES + 1)
         grid += [(i, step * (k + 1)) for k in range(STEP_TIMES)]
+    if len(data.recordings) > 1:
+        grid += [(-1, step * (k + 1)) for k in range(STEP_TIMES)]
     best = tried(grid)
     for _ in range(3):
         at, number = best.effect.parameters["time"].value, int(best.effect.parameters["recording"].value)
@@ -97,3 +103,46 @@ def periodic_load_starts(base: Fit, data: Data, lag_s: float, count: int = 3) ->
     return [
         effect_with("environment.periodic_load", (a, b, float(frequencies[line]))) for line in lines for a, b in phases
     ]
+
+
+def quantisation_starts(base: Fit, data: Data, pool: Executor) -> list[Effect]:
+    """Return the most promising lattice of the actuator's converter: step and origin on a grid, then around the best.
+
+    Parameters
+    ----------
+    base : Fit
+        What the converter is added to.
+    data : Data
+        Recordings.
+    pool : Executor
+        Where simulations run.
+
+    Returns
+    -------
+    list of Effect
+        At most one ``actuator.quantisation``. Its origin is the point of the lattice nearest to the middle of u, so
+        that a small error of the step does not move the lattice away.
+    """
+    u = np.concatenate([r.u for r in data.recordings])
+    middle, spread = float(np.median(u)), float(np.std(u))
+    if spread == 0.0:
+        return []
+
+    def tried(lattices: list[tuple[float, float]]) -> Promise:
+        effects = [effect_with("actuator.quantisation", (step, middle + step * phase)) for step, phase in lattices]
+        return max(pool.map(lambda e: promise(base, e, data), effects), key=lambda p: p.decrease)
+
+    ratio = STEPS_TRIED[1] ** (1.0 / STEPS_TRIED[2])
+    steps = [STEPS_TRIED[0] * spread * ratio**i for i in range(STEPS_TRIED[2] + 1)]
+    turn = 0.25
+    best = tried([(step, turn * k) for step in steps for k in range(4)])
+    for _ in range(4):
+        if best.decrease <= 0.0:
+            return []
+        ratio, turn = ratio**0.4, 0.4 * turn
+        q = best.effect.parameters
+        step, phase = q["step"].value, (q["origin"].value - middle) / q["step"].value
+        near = [(step * ratio**i, phase + turn * k) for i in (-1, 0, 1) for k in (-1, 0, 1) if i or k]
+        closer = tried(near)
+        best = closer if closer.decrease > best.decrease else best
+    return [best.effect]
