@@ -91,7 +91,7 @@ def bode_options(story: Story) -> Options:
         x_axes=[frequency | {"gridIndex": 0, "name": "", ":axisLabel": "({show: false})"}, frequency],
         y_axes=[
             _axis(f"gain [{y_unit}/{u_unit}]") | {"type": "log", **_decades(gain)},
-            _axis("phase [deg]", grid=1) | {"scale": True, "splitNumber": 3},
+            _axis("phase [deg]", grid=1) | _degrees(phase_deg),
         ],
         series=series,
         legend=names,
@@ -257,6 +257,17 @@ def _near(limits: list[float], low: float, high: float) -> list[float]:
 def _padded(low: float, high: float) -> tuple[float, float]:
     room = 0.06 * (high - low)
     return low - room, high + room
+
+
+def _degrees(phase_deg: FloatArray) -> Options:
+    """Return the ends and the ticks of an axis of phases: multiples of 15 or 45 degrees."""
+    low, high = (float(phase_deg.min()), float(phase_deg.max())) if phase_deg.size else (-180.0, -90.0)
+    tick = 15 if high - low < 60.0 else 45
+    return {
+        "min": tick * math.floor((low - 4.0) / tick),
+        "max": tick * math.ceil((high + 4.0) / tick),
+        "interval": tick,
+    }
 
 
 def _decades(values: FloatArray) -> Options:

@@ -11,6 +11,7 @@ from nicegui import Client, ui
 from nicegui.events import KeyEventArguments
 
 from autotune.controller import PIDController
+from autotune.experiment.loop import SAFE
 from autotune.live.charts import bode_options, regions_options, steps_options, strip_options
 from autotune.live.controls import Controls
 from autotune.live.story import Story
@@ -85,6 +86,7 @@ class Screen:
         self.tab: str | None = None
         self._span_s = 60.0 if story.ended is None else math.inf
         self._shown: tuple[Any, ...] = ()
+        self._gains_news = -1
         self._drawn_s = -math.inf
         self._drawing = False
         self._seen_rows, self._seen_s = -1, time.monotonic()
@@ -153,12 +155,17 @@ class Screen:
                 self._choice_note = ui.label().classes("note")
 
     @property
+    def is_connected(self) -> bool:
+        """Whether the browser is there now."""
+        return bool(self._client.has_socket_connection)
+
+    @property
     def _holds_controls(self) -> bool:
         return self.tab is not None and self._controls.holder == self.tab
 
     def update(self) -> None:
         """Show what is new; a browser that has not drawn the last picture yet is left in peace."""
-        if not self._client.has_socket_connection:
+        if not self.is_connected:
             return
         self._show_words()
         now_s = time.monotonic()
@@ -195,8 +202,7 @@ class Screen:
         self._warnings.text = "\n".join(warnings)
         self._warnings.set_visibility(bool(warnings))
         acts, over = controls.act is not None, story.ended is not None
-        self._abort.set_visibility(acts and not over)
-        self._abort.set_enabled(self._holds_controls)
+        self._abort.set_visibility(acts and not over and self._holds_controls)
         self._take.set_visibility(acts and not over and controls.holder is None)
         self._role.text = self._role_text(acts, over)
         self._outcome.set_visibility(bool(story.verdict or story.gains))
@@ -207,7 +213,9 @@ class Screen:
         story = self._story
         if story.ended is not None:
             reason, status = story.ended
-            return f"Ended: {reason}." if status else "Ended: completed."
+            reason = f"{story.state}: Abort on the live page" if self._controls.aborted and status == 130 else reason
+            left = "the rig has its safe output" if story.output == SAFE else f"safe output {story.output or 'unknown'}"
+            return f"Ended: {reason}; {left}."
         if self._controls.run_is_gone:
             return "The run is gone without a word: it was killed. The device's own dead-man timer has to act."
         if story.waiting_s:
@@ -253,8 +261,9 @@ class Screen:
             if isinstance(button, ui.button):
                 button.set_enabled(self._holds_controls)
         self._choice_note.text = f"Without an answer within {story.waiting_s:.0f} s the new gains stay."
-        if self._shown and self._shown[1] == (story.news, self._dark.value):
+        if self._gains_news == story.news:
             return
+        self._gains_news = story.news
         self._gains.clear()
         with self._gains:
             for cells in _gain_rows(story):

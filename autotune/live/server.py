@@ -27,8 +27,8 @@ from autotune.live.story import Story
 LOOPBACK = ("127.0.0.1", "::1", "localhost")
 #: time between two looks at the files [s]
 POLL_S = 0.2
-#: time without any open page after which the page of a finished run is no longer served [s]
-LINGER_S = 1.0
+#: time without any open page after which the page of a finished run is no longer served [s]; a reload takes less
+LINGER_S = 1.5
 #: nothing from anywhere else is loaded, no other page may frame this one; the page's library compiles templates
 POLICY = (
     "default-src 'self'; script-src 'self' 'unsafe-inline' 'unsafe-eval'; style-src 'self' 'unsafe-inline';"
@@ -104,14 +104,11 @@ def listening(host: str, port: int) -> socket.socket:
     """
     try:
         family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
-        bound = socket.socket(family)
-        bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        bound.bind((host, port))
+        return socket.create_server((host, port), family=family)
     except OSError as error:
         raise InputError(
-            f"cannot be listened on ({error.strerror})", where=f"{host}:{port}", mend="give another --listen"
+            f"cannot be listened on ({error.strerror})", where=f"{host}:{port}", mend="give another --listen or --port"
         ) from None
-    return bound
 
 
 def serve(folder: Path, bound: socket.socket, token: str | None, run: Run | None = None) -> None:
@@ -151,7 +148,7 @@ def serve(folder: Path, bound: socket.socket, token: str | None, run: Run | None
             screen.update()
         over = run is not None and run.is_over
         controls.run_is_gone = over and story.ended is None
-        looked_s = looked_s if over and not tabs else time.monotonic()
+        looked_s = looked_s if over and not any(screen.is_connected for screen in screens) else time.monotonic()
         server.should_exit = server.should_exit or time.monotonic() - looked_s > LINGER_S
 
     pages.timer(POLL_S, look)

@@ -52,6 +52,8 @@ class LivePage:
     ----------
     url : str
         Where the page is.
+    process : Popen
+        The page's process.
 
     Raises
     ------
@@ -70,19 +72,22 @@ class LivePage:
         self.url = ""
 
     def __enter__(self) -> Self:
-        self._page = subprocess.Popen(
+        self.process = subprocess.Popen(
             self._command,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
             start_new_session=True,  # a Ctrl-C in the shell is for the run, which tells the page how it ended
         )
-        assert self._page.stdout is not None
-        self.url = self._page.stdout.readline().strip()
+        assert self.process.stdout is not None
+        self.url = self.process.stdout.readline().strip()
         if not self.url:
-            self._page.wait()
-            raise InputError("did not start, its reason is above", where="live page", mend="give another --listen")
-        threading.Thread(target=self._hear, daemon=True).start()
+            self.process.wait()
+            raise InputError(
+                "did not start, its reason is above", where="live page", mend="give another --listen or --port"
+            )
+        self._hearing = threading.Thread(target=self._hear, daemon=True)
+        self._hearing.start()
         self._console.print(f"live page: {self.url}", markup=False)
         return self
 
@@ -100,8 +105,8 @@ class LivePage:
             return True
 
     def _hear(self) -> None:
-        assert self._page.stdout is not None
-        for line in self._page.stdout:
+        assert self.process.stdout is not None
+        for line in self.process.stdout:
             action = line.strip()
             if action == "abort":
                 _thread.interrupt_main()
@@ -112,12 +117,15 @@ class LivePage:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        assert self._page.stdin is not None
-        self._page.stdin.close()
+        assert self.process.stdin is not None
+        assert self.process.stdout is not None
+        self.process.stdin.close()
         try:
-            if self._page.poll() is None:
+            if self.process.poll() is None:
                 self._console.print(f"live page: {self.url} stays while it is open; Ctrl-C here ends it", markup=False)
-            self._page.wait()
+            self.process.wait()
         except KeyboardInterrupt:
-            self._page.terminate()
-            self._page.wait()
+            self.process.terminate()
+            self.process.wait()
+        self._hearing.join()
+        self.process.stdout.close()

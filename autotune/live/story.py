@@ -4,23 +4,26 @@ from __future__ import annotations
 
 import json
 import math
+import tomllib
 from array import array
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from autotune.arrays import FloatArray
 from autotune.controller import PIDController
 from autotune.errors import InputError
+from autotune.experiment.monitor import RECENT
 from autotune.experiment.result import State
 from autotune.models import TransferFunction
 from autotune.pipeline import PROGRESS
 from autotune.points import FrequencyPoint, points_from_json
 
 #: part of limits.swing from which on y counts as near the limit
-NEAR_SHARE = 0.9
+NEAR_SHARE = 0.95
 #: time that nearness is judged over [s]
 RECENT_S = 3.0
 
@@ -91,6 +94,8 @@ class Story:
         How long the operator may decide otherwise [s], 0 while there is nothing to decide.
     ended : (str, int) or None
         Reason and exit status.
+    output : str
+        How the rig was left, once that is known.
 
     Raises
     ------
@@ -103,6 +108,7 @@ class Story:
         self._events = Tail(folder / PROGRESS)
         self._recording: Tail | None = None
         self._columns: list[str] = []
+        self._sidecar: Path | None = None
         self._start_s = 0.0
         self._remaining_s, self._told_s = math.nan, 0.0
         self._relay: dict[str, Any] | None = None
@@ -122,6 +128,7 @@ class Story:
         self.gains: Gains | None = None
         self.waiting_s = 0.0
         self.ended: tuple[str, int] | None = None
+        self.output = ""
 
     def poll(self) -> bool:
         """Read what is new, and say whether there was anything."""
@@ -144,7 +151,8 @@ class Story:
             case "recording":
                 self._read_rows()  # the one before is complete
                 self._start_s = self.now_s
-                self._recording, self._columns = Tail(self._folder / event["file"]), []
+                path = self._folder / event["file"]
+                self._recording, self._columns, self._sidecar = Tail(path), [], path.with_suffix(".toml")
                 if self.controller is not None:
                     self._enter(State.VERIFY.value, self._start_s)
                     self.message = "bringing the rig to its operating point under the new gains"
@@ -167,6 +175,14 @@ class Story:
                 self.waiting_s = event["patience_s"]
             case "ended":
                 self.ended, self.waiting_s = (event["reason"], event["exit_status"]), 0.0
+                self.output = self._output()
+
+    def _output(self) -> str:
+        """Return how the last recording says the rig was left."""
+        if self._sidecar is None or not self._sidecar.is_file():
+            return ""
+        ended = tomllib.loads(self._sidecar.read_text(encoding="utf-8")).get("ended", {})
+        return str(ended.get("output", ""))
 
     def _progress(self, event: dict[str, Any]) -> None:
         at_s = self._start_s + event["elapsed_s"]
@@ -254,10 +270,11 @@ class Story:
         """Return what an onlooker should know, in words."""
         found = list(self._told)
         swing = self.limits.get("swing", math.inf)
-        floats = self.state in (State.SWEEP.value, State.VERIFY.value)
-        if floats and self.ended is None:
-            y = self.rows.since(self.now_s - RECENT_S)[2]
-            departure = float(np.nanmax(np.abs(y - self.centre), initial=0.0))
+        floats = self.state == State.SWEEP.value and self.ended is None
+        y = self.rows.since(self.now_s - RECENT_S)[2] if floats else np.empty(0)
+        if y.size > RECENT:
+            medians = np.median(sliding_window_view(y, RECENT), axis=1)  # what the limits are judged on
+            departure = float(np.nanmax(np.abs(medians - self.centre), initial=0.0))
             if departure > NEAR_SHARE * swing:
                 share = 100 * departure / swing
                 found.append(f"y comes near its limit: {share:.0f} % of the allowed swing of {swing:g} {self.units[1]}")

@@ -1,0 +1,216 @@
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import pytest
+import tomli_w
+from playwright.sync_api import Browser, Page, expect, sync_playwright
+
+from autotune.cli.served import device_of
+from autotune.config import load_config
+from autotune.live.session import LivePage
+from autotune.pipeline import tune
+from autotune.recording import read_recording
+from sim.modbus_rig import ModbusRig, TcpTransport
+from tests.autotune.experiment.rigs import ball_config, ball_rig
+
+pytestmark = pytest.mark.system("chromium")
+
+CONFIGS = Path(__file__).resolve().parents[3] / "configs"
+#: no wait of a test is longer [ms]
+LIMIT_MS = 20_000
+#: the pixels of a chart, and of all charts
+PIXELS = "() => [...document.querySelectorAll('canvas')].map(one => one.toDataURL()).join()"
+CONTRAST = """selector => {
+  const channels = text => text.match(/[\\d.]+/g).map(Number);
+  const linear = c => c <= 0.04045 ? c / 12.92 : ((c + 0.055) / 1.055) ** 2.4;
+  const light = text => channels(text).slice(0, 3).map(c => linear(c / 255))
+    .reduce((sum, c, i) => sum + c * [0.2126, 0.7152, 0.0722][i], 0);
+  const element = document.querySelector(selector);
+  let behind = element;
+  while (channels(getComputedStyle(behind).backgroundColor)[3] === 0) behind = behind.parentElement;
+  const pair = [light(getComputedStyle(element).color), light(getComputedStyle(behind).backgroundColor)];
+  return (Math.max(...pair) + 0.05) / (Math.min(...pair) + 0.05);
+}"""
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    with sync_playwright() as driver:
+        options = ["--no-sandbox"] if os.geteuid() == 0 else []
+        opened = driver.chromium.launch(executable_path=shutil.which("chromium"), args=options)
+        yield opened
+        opened.close()
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a run of the simulated ball that waited for the operator's decision."""
+    out = tmp_path_factory.mktemp("whole")
+    tune(ball_rig(), ball_config(), out, keep=lambda patience_s: True)
+    return out
+
+
+class Growing:
+    """A folder that fills as that of a run does, from the files of one that has ended."""
+
+    def __init__(self, whole: Path, folder: Path) -> None:
+        self.folder = folder
+        self._whole = whole
+        self._events = (whole / "progress.jsonl").read_text().splitlines()
+
+    def until(self, word: str, rows: int) -> None:
+        """Let it grow up to the first event that contains the word, and so many rows of the first recording."""
+        last = next(i for i, line in enumerate(self._events) if word in line)
+        (self.folder / "progress.jsonl").write_text("\n".join(self._events[: last + 1]) + "\n")
+        lines = (self._whole / "recording.csv").read_text().splitlines(keepends=True)
+        (self.folder / "recording.csv").write_text("".join(lines[:rows]))
+
+
+@pytest.fixture
+def growing(whole: Path, tmp_path: Path) -> Growing:
+    folder = Growing(whole, tmp_path)
+    folder.until("point 2 of 5", 2000)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def deciding(whole: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[LivePage]:
+    """The page of a run that waits for the operator's decision."""
+    folder = Growing(whole, tmp_path_factory.mktemp("deciding"))
+    folder.until('"waiting"', 6000)
+    with LivePage(folder.folder, "127.0.0.1", 0, None) as page:
+        yield page
+
+
+def opened(browser: Browser, url: str, **options: object) -> Page:
+    page = browser.new_context(**options).new_page()  # type: ignore[arg-type]
+    page.set_default_timeout(LIMIT_MS)
+    page.goto(url)
+    expect(page.locator("canvas").first).to_be_visible(timeout=LIMIT_MS)
+    return page
+
+
+def test_the_picture_follows_the_data_and_nothing_is_asked_of_another_machine(
+    browser: Browser, growing: Growing
+) -> None:
+    with LivePage(growing.folder, "127.0.0.1", 0, None) as beside:
+        follow(browser.new_context().new_page(), beside, growing)
+
+
+def follow(page: Page, beside: LivePage, growing: Growing) -> None:
+    asked: list[str] = []
+    page.on("request", lambda request: asked.append(request.url))
+    page.on("websocket", lambda socket: asked.append(socket.url))
+    page.goto(beside.url)
+    expect(page.get_by_role("status")).to_have_text(re.compile("point 2 of 5"), timeout=LIMIT_MS)
+    seen = set()
+    for word, rows in (("point 2 of 5", 2500), ("point 4 of 5", 2500), ("all points measured", 6000)):
+        page.wait_for_function(f"seen => ({PIXELS})().length > 20000 && !seen.includes(({PIXELS})())", arg=list(seen))
+        seen.add(page.evaluate(PIXELS))
+        growing.until(word, rows)
+        expect(page.get_by_role("status")).to_have_text(re.compile(word), timeout=LIMIT_MS)
+    page.wait_for_function(f"seen => !seen.includes(({PIXELS})())", arg=list(seen))
+    assert len(asked) > 5
+    assert {urlsplit(url).netloc for url in asked if not url.startswith("data:")} == {urlsplit(beside.url).netloc}
+    page.context.close()
+
+
+def test_light_or_dark_narrow_or_wide_everything_can_be_read(browser: Browser, deciding: LivePage) -> None:
+    pictures = set()
+    for width, scheme in ((400, "light"), (400, "dark"), (1920, "light"), (1920, "dark")):
+        page = opened(browser, deciding.url, viewport={"width": width, "height": 1000}, color_scheme=scheme)
+        expect(page.locator(".outcome")).to_be_visible(timeout=LIMIT_MS)
+        page.wait_for_function(f"({PIXELS})().length > 20000")
+        pictures.add(page.evaluate(PIXELS))
+        assert page.evaluate("document.documentElement.scrollWidth - innerWidth") <= 0
+        for selector in ("h1", "[role=status]", ".left", ".note", ".gains", "body"):
+            assert page.evaluate(CONTRAST, selector) >= 4.5, f"{selector} at {width} px, {scheme}"
+        page.context.close()
+    assert len(pictures) == 4
+
+
+def test_by_keyboard_alone_the_old_gains_are_asked_back(browser: Browser, deciding: LivePage) -> None:
+    page = opened(browser, deciding.url)
+    take = page.get_by_role("button", name="Take the controls")
+    expect(take.or_(page.get_by_role("button", name="Abort")).first).to_be_visible(timeout=LIMIT_MS)
+    if take.is_visible():  # another test's page had them
+        take.press("Enter")
+    restore = page.get_by_role("button", name="Restore old gains")
+    expect(restore).to_be_enabled(timeout=LIMIT_MS)
+    page.keyboard.press("Tab")
+    expect(page.get_by_role("button", name="Abort")).to_be_focused()
+    for _ in range(12):
+        page.keyboard.press("Tab")
+        if restore.evaluate("one => one === document.activeElement"):
+            break
+    page.keyboard.press("Enter")
+    assert not deciding.keep(LIMIT_MS / 1000)
+    page.context.close()
+
+
+def test_one_page_holds_the_controls_through_a_reload_and_another_takes_them_when_it_is_closed(
+    browser: Browser, growing: Growing
+) -> None:
+    with LivePage(growing.folder, "127.0.0.1", 0, None) as beside:
+        first = opened(browser, beside.url)
+        abort = first.get_by_role("button", name="Abort")
+        expect(abort).to_be_visible(timeout=LIMIT_MS)
+        second = opened(browser, beside.url)
+        expect(second.get_by_text("Another page holds the controls")).to_be_visible(timeout=LIMIT_MS)
+        expect(second.get_by_role("button", name="Abort")).to_be_hidden()
+        first.reload()
+        expect(abort).to_be_visible(timeout=LIMIT_MS)
+        first.context.close()
+        second.get_by_role("button", name="Take the controls").click()
+        expect(second.get_by_role("button", name="Abort")).to_be_visible(timeout=LIMIT_MS)
+        beside.process.kill()
+        assert beside.keep(LIMIT_MS / 1000)  # without a page the automatic decision stands
+        second.context.close()
+
+
+def test_abort_brings_the_rig_to_its_safe_output_within_one_control_period(browser: Browser, tmp_path: Path) -> None:
+    tanks = load_config(CONFIGS / "two_tank_sim.toml").model_dump(exclude_none=True)
+    modbus = load_config(CONFIGS / "ball_modbus_tcp.toml").model_dump(exclude_none=True)["rig"]
+    twin = {"plant": "two_tank", "start": "level", "deadman_s": 30.0}
+    content = tanks | {"rig": modbus | {"twin": twin}, "name": "tanks behind Modbus"}
+    file = tmp_path / "tanks.toml"
+    file.write_text(tomli_w.dumps(content))
+    device = device_of(load_config(file))
+    with ModbusRig(device, TcpTransport()) as server:
+        content["rig"]["port"] = server.port
+        file.write_text(tomli_w.dumps(content))
+        command = ["run", str(file), "--out", str(tmp_path / "out"), "--live"]
+        with subprocess.Popen(
+            [sys.executable, "-m", "autotune.cli", *command], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        ) as run:
+            assert run.stdout is not None
+            address = run.stdout.readline().split()[-1]
+            page = opened(browser, address)
+            expect(page.get_by_role("button", name="Abort")).to_be_visible(timeout=LIMIT_MS)
+            page.wait_for_function("document.querySelector('.left').innerText.match(/^[2-9]/)")
+            assert device.output == pytest.approx(3.0, abs=0.1)
+            before = len(read_recording(tmp_path / "out" / "recording.csv"))
+            page.keyboard.press("Escape")
+            expect(page.get_by_role("status")).to_have_text(
+                "Ended: preflight: Abort on the live page; the rig has its safe output.", timeout=LIMIT_MS
+            )
+            page.context.close()
+            _, errors = run.communicate()
+    recording = read_recording(tmp_path / "out" / "recording.csv")
+    # at most the period that Abort was pressed in, one more that began while it was on its way, and the safe command
+    assert len(recording) - before <= 3
+    assert recording.u[-1] == device.output == 0.0
+    assert [change.cause for change in device.history][-1] != "dead-man"
+    assert run.returncode == 130
+    assert "stopped by" in errors
+    ended = json.loads((tmp_path / "out" / "progress.jsonl").read_text().splitlines()[-1])
+    assert ended["exit_status"] == 130
