@@ -7,20 +7,39 @@ output-error one their starred values are, reached from an instrumental-variable
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
 from autotune.errors import IdentificationError, InputError
 from autotune.identification.delay.data import DelayData, PastInput, input_period, prepare
 from autotune.identification.delay.model import DelayModel
-from autotune.identification.delay.output_error import Point, Structure, finish, minimise, polish, solve_linear
-from autotune.identification.delay.search import binned, search
+from autotune.identification.delay.output_error import (
+    Point,
+    Structure,
+    finish,
+    minimise,
+    polish,
+    residuals,
+    solve_linear,
+    whitening_filter,
+)
+from autotune.identification.delay.profile import profile
+from autotune.identification.delay.search import binned, scan, search
 from autotune.models import Hold
 from autotune.recording import Recording
 
 _MIDDLE_BINS = 6000
+_SCANNED_BINS = 2400
 #: relative standard deviation of b above which the order is refused: from order 3 on, linearised intervals fail earlier
 _UNDETERMINED = {1: 0.5, 2: 0.5, 3: 0.2, 4: 0.2}
+#: relative standard deviation of b below which the sum of squares is a paraboloid as far as the intervals reach
+_LINEAR = 0.01
+_MINIMA = 4
+_COMPARED_ORDER = 3
+#: rise of the sum of squares, in residual variances and logarithms of the rows, that an order must be worth: what the
+#: Bayes information criterion asks for a coefficient and an initial state
+_NEEDED = 2.0
 _COMPARED = 3
 _ALIKE = 6.0  # residual variances: a hundredth of the rightful minimum's chance
 MAX_ORDER = 4
@@ -107,6 +126,9 @@ def identify_delay(
     finest = min(c.rows_per_bin for c in candidates)
     middle = binned(data, max(_MIDDLE_BINS, 10 * data.ty.size // finest))
     best = _best_on_common_rows(middle, structure, [c.point for c in candidates], largest)
+    if _doubtful(middle, structure, best):
+        say("comparing delays")
+        best = scan(binned(middle, _SCANNED_BINS), structure, best, max_delay_s=largest)
     say("fitting")
     return _polish_on_all_rows(data, middle, structure, best, largest, coloured)
 
@@ -150,6 +172,16 @@ def _best_on_common_rows(data: DelayData, structure: Structure, candidates: list
     return best
 
 
+def _doubtful(data: DelayData, structure: Structure, point: Point) -> bool:
+    """Whether the point may not be the lowest minimum: something is left in the residual, or b is hardly determined."""
+    usable = data.usable_from(point.h)
+    here = solve_linear(usable, structure, point.a, point.h)
+    if whitening_filter(residuals(usable, here)).size > 0:
+        return True
+    model = finish(usable, structure, here)
+    return bool(model.standard_deviations[structure.order] > _LINEAR * abs(model.b))
+
+
 def _polish_on_all_rows(
     data: DelayData, middle: DelayData, structure: Structure, best: Point, largest: float, coloured: bool
 ) -> DelayModel:
@@ -165,11 +197,25 @@ def _polish_on_all_rows(
         sd = finish(rough, structure, best).standard_deviations[structure.order + 1]
         if best.h < limit or limit >= largest:
             break
-    limit = min(best.h + 6.0 * float(sd) + 2.0 * step, largest)
-    model = polish(data.usable_from(limit), structure, best, max_delay_s=limit, coloured=coloured)
-    _require_inside(data, model, largest)
-    _require_determined(data, model)
-    return model
+    for _ in range(_MINIMA):
+        limit = min(best.h + 8.0 * float(sd) + 2.0 * step, largest)
+        usable = data.usable_from(limit)
+        best, whitening = polish(usable, structure, best, max_delay_s=limit, coloured=coloured)
+        model = finish(usable, structure, best, whitening)
+        _require_inside(data, model, largest)
+        _require_determined(data, model)
+        if model.standard_deviations[structure.order] < _LINEAR * abs(model.b):
+            return model
+        if structure.order >= _COMPARED_ORDER:
+            _require_order(data, structure, best, model, largest)
+        found = profile(usable, structure, best, model, max_delay_s=limit)
+        if found.endless:
+            raise _undetermined(data, found.model, f"nothing bounds {found.endless}")
+        if found.lower is None:
+            _require_determined(data, found.model)
+            return found.model
+        best = found.lower
+    raise _undetermined(data, model, "several sets of parameters explain it alike")
 
 
 def _require_inside(data: DelayData, model: DelayModel, largest: float) -> None:
@@ -185,14 +231,42 @@ def _require_determined(data: DelayData, model: DelayModel) -> None:
     sd = model.standard_deviations
     n = model.order
     if sd[n] > _UNDETERMINED[n] * abs(model.b):
-        period = input_period(data)
-        excites = "" if np.isnan(period) else f"; u repeats every {period:.3g} s and excites few frequencies"
-        raise IdentificationError(
-            f"the record does not determine order {n}: b = {model.b:.3g} with a standard deviation of {sd[n]:.2g}, "
-            f"delay {model.delay_s:.3g} +- {1.96 * sd[n + 1]:.2g} s{excites}",
-            where=data.name,
-            mend="ask for a lower order, move u further, or add a step or relay cycles at two more inserted delays",
-        )
+        raise _undetermined(data, model, f"the standard deviation of b is {100 * sd[n] / abs(model.b):.0f} % of it")
+
+
+def _require_order(data: DelayData, structure: Structure, best: Point, model: DelayModel, largest: float) -> None:
+    """Refuse an order that the next lower one does without: what is left over goes into a resonance of the noise."""
+    lower = replace(structure, order=structure.order - 1)
+    whitening = np.array(model.noise_ar)
+    for candidate in search(data, lower, max_delay_s=largest):
+        limit = min(max(1.25 * candidate.point.h, model.delay_s) + 2.0 * abs(model.a[-1] / model.a[-2]), largest)
+        usable = data.usable_from(limit)
+        if usable.ty.size < 3 * structure.parameters:
+            continue
+        start = solve_linear(usable, lower, candidate.point.a, candidate.point.h, whitening)
+        fitted = minimise(usable, lower, start, max_delay_s=limit, whitening=whitening, tolerance=0.1)
+        full = solve_linear(usable, structure, best.a, best.h, whitening)
+        rise = (fitted.cost - full.cost) / model.noise_sd**2
+        if rise < _NEEDED * np.log(usable.ty.size):
+            raise IdentificationError(
+                f"the record does not determine order {structure.order}: order {lower.order} with a delay of "
+                f"{fitted.h:.3g} s explains it as well",
+                where=data.name,
+                mend=f"ask for --order {lower.order}, move u further and faster, or record relay cycles at two more "
+                "inserted delays",
+            )
+
+
+def _undetermined(data: DelayData, model: DelayModel, why: str) -> IdentificationError:
+    period = input_period(data)
+    n = model.order
+    excites = "" if np.isnan(period) else f"; u repeats every {period:.3g} s and excites few frequencies"
+    return IdentificationError(
+        f"the record does not determine order {n}: {why} (b = {model.b:.3g}, "
+        f"delay {model.delay_s:.3g} +- {1.96 * model.standard_deviations[n + 1]:.2g} s){excites}",
+        where=data.name,
+        mend="ask for a lower order, move u further, or add a step or relay cycles at two more inserted delays",
+    )
 
 
 def _too_short(data: DelayData, structure: Structure) -> IdentificationError:

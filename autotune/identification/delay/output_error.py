@@ -12,6 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import solve_toeplitz
 
 from autotune.arrays import BoolArray, FloatArray
@@ -93,6 +94,7 @@ def minimise(
     whitening: FloatArray = _WHITE,
     iterations: int = 30,
     tolerance: float = 1e-4,
+    held: int | None = None,
 ) -> Point:
     """Move (a, h) to the next minimum of the sum of squares.
 
@@ -112,6 +114,8 @@ def minimise(
         Largest number of accepted steps.
     tolerance : float
         Stops when a step gains less than this many residual variances: 1e-4 is 0.01 standard deviations.
+    held : int, optional
+        Index in (b, d, initial state, a, h) of a coefficient, or of the delay, that stays where it is.
 
     Returns
     -------
@@ -119,18 +123,18 @@ def minimise(
         Never costlier than ``start``.
     """
     n = structure.order
-    free = np.flatnonzero(structure.free)
-    moving = free >= 2 + n
+    every = np.flatnonzero(structure.free)
+    every = every[every != held]
     damping = 1e-3
     point = start
     for _ in range(iterations):
         gram, finite = _gram(data, point.a, point.h, point.theta, whitening)
         if not finite:
             return point
-        G, g = gram[np.ix_(free, free)], gram[free, -1]
         for _trial in range(8):
-            step = np.zeros(2 * n + 3)
-            step[free], _, regular = cholesky_solve(G + np.diag(damping * moving * np.diag(G)), g, 1e-13)
+            step, regular = _damped_step(gram, every, n, damping)
+            if regular and not 0.0 <= point.h + step[-1] <= max_delay_s and point.h in (0.0, max_delay_s):
+                step, regular = _damped_step(gram, every[every != 2 * n + 2], n, damping)  # along the limit of h
             if not regular:
                 damping *= 8.0
                 continue
@@ -148,6 +152,22 @@ def minimise(
         if gained < tolerance:
             break
     return point
+
+
+def _damped_step(gram: FloatArray, free: NDArray[np.intp], n: int, damping: float) -> tuple[FloatArray, bool]:
+    """Return the step of (b, d, initial state, a, h) and whether the matrix was regular."""
+    G = gram[np.ix_(free, free)]
+    step = np.zeros(2 * n + 3)
+    step[free], _, regular = cholesky_solve(G + np.diag(damping * (free >= 2 + n) * np.diag(G)), gram[free, -1], 1e-13)
+    return step, regular
+
+
+def parameters(data: DelayData, point: Point) -> FloatArray:
+    """Return (a_0.., b, delay, constant, initial state) of a point, the operating point added back."""
+    b, d = float(point.theta[0]), float(point.theta[1])
+    initial = point.theta[2:].copy()
+    initial[0] += data.y_0
+    return np.array([*point.a, b, point.h, d - b * data.u_0 - point.a[0] * data.y_0, *initial])
 
 
 def finish(data: DelayData, structure: Structure, point: Point, whitening: FloatArray = _WHITE) -> DelayModel:
@@ -169,16 +189,14 @@ def finish(data: DelayData, structure: Structure, point: Point, whitening: Float
     inner[np.ix_(free, free)] = np.linalg.inv(information / np.outer(scale, scale)) / np.outer(scale, scale)
     variance = point.cost / (point.rows - structure.parameters)
     back = _to_parameters(data, structure, point)
-    b, d = float(point.theta[0]), float(point.theta[1])
-    initial = point.theta[2:].copy()
-    initial[0] += data.y_0
+    values = parameters(data, point)
     return DelayModel(
         a=point.a,
-        b=b,
+        b=float(values[n]),
         delay_s=point.h,
-        constant=d - b * data.u_0 - point.a[0] * data.y_0,
+        constant=float(values[n + 2]),
         initial_time_s=float(data.ty[0]),
-        initial_state=tuple(float(value) for value in initial),
+        initial_state=tuple(float(value) for value in values[n + 3 :]),
         covariance=variance * back @ inner @ back.T,
         noise_sd=float(np.sqrt(variance)),
         noise_ar=tuple(float(value) for value in whitening),
@@ -261,8 +279,8 @@ def whitening_filter(residual: FloatArray, max_order: int = _MAX_AR) -> FloatArr
 
 def polish(
     data: DelayData, structure: Structure, start: Point, *, max_delay_s: float, coloured: bool = True
-) -> DelayModel:
-    """Fit from a starting point, find the noise's colour, fit again under it, and return the model.
+) -> tuple[Point, FloatArray]:
+    """Fit from a starting point, find the noise's colour, fit again under it; return minimum and whitening filter.
 
     Parameters
     ----------
@@ -307,7 +325,7 @@ def polish(
         )
         if settled:
             break
-    return finish(data, structure, point, whitening)
+    return point, whitening
 
 
 def _gram(

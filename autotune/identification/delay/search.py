@@ -27,6 +27,9 @@ _CANDIDATES = 8
 _FITTED = 3
 _ENERGY_LOST = 0.05  # of u within the bins: above, shorter sections are searched in finer bins
 _REFINEMENT = 6
+_SCANNED = 41
+_SCANNED_DELAYS = 3.0  # how far: times the delay found,
+_SCANNED_SHARE = 0.1  # and a share of the record
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -127,6 +130,55 @@ def search(data: DelayData, structure: Structure, *, max_delay_s: float) -> list
             mend="give a larger --max-delay, a longer record, or a lower order",
         )
     return found
+
+
+def scan(data: DelayData, structure: Structure, best: Point, *, max_delay_s: float) -> Point:
+    """Fit the coefficients at every delay of a grid, outwards from a point, and return the lowest minimum.
+
+    Parameters
+    ----------
+    data : DelayData
+        Record, in bins where it is long.
+    structure : Structure
+        Order and free parameters.
+    best : Point
+        Where to begin.
+    max_delay_s : float
+        Largest delay considered [s].
+
+    Returns
+    -------
+    Point
+        On the rows that every delay of the grid can explain. The sum of squares over h has kinks where a step of u
+        passes a row, and a minimum beyond each, which no step downhill leaves.
+    """
+    reach = min(max_delay_s, max(_SCANNED_DELAYS * best.h, _SCANNED_SHARE * data.duration_s))
+    usable = data.usable_from(reach)
+    if usable.ty.size < 3 * structure.parameters:
+        return best
+    begin = solve_linear(usable, structure, best.a, min(best.h, reach))
+    grid = reach * np.linspace(0.0, 1.0, _SCANNED) ** 2
+    points = [begin]
+    for side in (grid[grid < begin.h][::-1], grid[grid > begin.h]):
+        at = begin
+        for h in side:
+            start = solve_linear(usable, structure, at.a, float(h))
+            if not np.isfinite(start.cost):
+                break
+            at = minimise(
+                usable,
+                structure,
+                start,
+                max_delay_s=reach,
+                iterations=4,
+                tolerance=0.1,
+                held=2 * structure.order + 2,
+            )
+            points.append(at)
+    points.sort(key=lambda point: point.h)
+    lowest = sorted(_local_minima(points), key=lambda point: point.cost)[:_FITTED]
+    fitted = [minimise(usable, structure, start, max_delay_s=reach, tolerance=1e-2) for start in lowest]
+    return min(fitted, key=lambda point: point.cost, default=begin)
 
 
 def _section(data: DelayData, rows: int) -> DelayData:
