@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
+
 from autotune.controller import PIDController
 from autotune.errors import InputError, LinkError
 from autotune.experiment.relay import RelaySettings
@@ -160,7 +163,9 @@ class DeviceLawRig(SerialLineRig):
             )
         if not runs:
             self._link.forget()
-        limits = sorted(self._y.count(limit, "y") for limit in y_range)
+        # beyond the converter's span no limit can be passed
+        span = sorted((self._y.low, self._y.high))
+        limits = sorted(self._y.count(min(max(limit, span[0]), span[1]), "y") for limit in y_range)
         longest = min(round(time_s / self._tick_s), _LONGEST_TICKS)
         frame, sent_s, _ = self._link.ask(kind, *settings, ticks, longest, *limits)
         self._is_commanding = False
@@ -186,4 +191,5 @@ class DeviceLawRig(SerialLineRig):
         mean = (area - self._area) % _AREA_WRAP / ticks
         self._count, self._area, self._row_at_s = count, area, at_s
         self._received_s, self._latency_s = self._clock.now(), self._row_s
-        return Row(reading=self._reading(frame, at_s, self._received_s, 0.0), u_mean=self._u.value(mean))
+        reading = replace(self._reading(frame, at_s, self._received_s, 0.0), latency_s=math.nan)
+        return Row(reading=reading, u_mean=self._u.value(mean))

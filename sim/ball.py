@@ -53,7 +53,7 @@ class BallSettings:
     start: float = FLOOR
 
 
-def make_ball(*, seed: int = 0, noise: float | None = None, start: str | None = None) -> Ball:
+def make_ball(*, seed: int = 0, noise: float | None = None, start: str | None = None, converters: bool = True) -> Ball:
     """Return a ball rig whose hover voltage is drawn uniformly within 0.5 V of the nominal 5 V.
 
     Parameters
@@ -64,12 +64,16 @@ def make_ball(*, seed: int = 0, noise: float | None = None, start: str | None = 
         Half-width of the uniform noise [V]; 0.35 where absent.
     start : {"floor", "afloat"}, optional
         Where the ball starts; on the floor where absent.
+    converters : bool
+        Whether it comes with its 12-bit converters; a device in front of it has its own.
     """
     heights = {None: FLOOR, "floor": FLOOR, "afloat": Y_NOMINAL}
     if start not in heights:
         raise ValueError(f"a ball starts on the floor or afloat, not {start!r}")
     hover = U_NOMINAL + float(np.random.default_rng((seed, 1)).uniform(-0.5, 0.5))
-    settings = BallSettings(hover=hover, noise=0.35 if noise is None else noise, start=heights[start])
+    settings = BallSettings(
+        hover=hover, noise=0.35 if noise is None else noise, bits=12 if converters else None, start=heights[start]
+    )
     return Ball(settings, seed=seed)
 
 

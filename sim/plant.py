@@ -48,7 +48,9 @@ class Plant(Protocol):
         ...
 
 
-def make_plant(name: str, *, seed: int = 0, noise: float | None = None, start: str | None = None) -> Plant:
+def make_plant(
+    name: str, *, seed: int = 0, noise: float | None = None, start: str | None = None, converters: bool = True
+) -> Plant:
     """Return the named plant.
 
     Parameters
@@ -61,6 +63,8 @@ def make_plant(name: str, *, seed: int = 0, noise: float | None = None, start: s
         Half-width of the uniform measurement noise [y unit]; the plant's own where absent.
     start : str, optional
         Where the plant starts, in the plant's own words (the ball: ``floor`` or ``afloat``); usually at rest, idle.
+    converters : bool
+        Whether the ball comes with its own converters; a device in front of it has others.
 
     Raises
     ------
@@ -72,7 +76,7 @@ def make_plant(name: str, *, seed: int = 0, noise: float | None = None, start: s
         case "ball":
             from sim.ball import make_ball
 
-            return make_ball(seed=seed, noise=noise, start=start)
+            return make_ball(seed=seed, noise=noise, start=start, converters=converters)
         case "servo":
             from sim.servo import make_servo
 

@@ -130,7 +130,7 @@ def served_on_line(config: Config, settings: SerialSettings) -> Iterator[SerialR
     """
     twin, controller = _twin(settings), config.controller
     device = device_on_line(
-        make_plant(twin.plant, seed=twin.seed, noise=twin.noise, start=twin.start),
+        make_plant(twin.plant, seed=twin.seed, noise=twin.noise, start=twin.start, converters=False),
         u_range=(config.limits.u_min, config.limits.u_max),
         u_safe=config.limits.u_safe,
         gains=(controller.K, controller.Ti_s) if controller else (0.0, 1.0),

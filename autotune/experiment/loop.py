@@ -8,7 +8,7 @@ import signal
 import threading
 from array import array
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import FrameType, TracebackType
 from typing import Any, Self
@@ -19,7 +19,7 @@ from autotune.arrays import FloatArray
 from autotune.errors import AutotuneError, ExperimentStopped, LinkError, OperatorStop
 from autotune.experiment.limits import Envelope, Watch
 from autotune.experiment.monitor import ReadingMonitor
-from autotune.experiment.rig import Exchanges, Reading, Rig
+from autotune.experiment.rig import Exchanges, Reading, Rig, Row
 from autotune.recording import RecordingWriter
 
 #: longest wait without looking for a stop signal [s]
@@ -213,17 +213,42 @@ class ControlLoop:
         """Hold ``u`` [u unit] until the next sample and return that sample."""
         self.envelope.check_command(u, self.tick.u)
         if self._exchange is not None:
+            if not self._is_written:
+                self._write_row(self.tick.u, {})
             self._wait()
             applied = self._reading.u_applied
             self._reading = self._exchange(u)
             self.tick = self._judged(self._reading, u=u)
-            self._write_row(u, {"u_applied": applied, **(extra or {})})
+            # what acts, to the converter's last count
+            acting = self._reading.u_applied if math.isfinite(self._reading.u_applied) else u
+            self._write_row(acting, {"u_applied": applied, **(extra or {})})
             return self.tick
         self._write_row(u, extra or {})
         self.rig.write(u)
         self._wait()
         self._reading = self.rig.read()
         self.tick = self._judged(self._reading, u=u)
+        return self.tick
+
+    def begin(self, reading: Reading) -> None:
+        """Take the sample after which a law on the device begins; its row is written with the one that follows."""
+        if self._time_of(reading) > self.tick.t_s:
+            self._reading = reading
+            self.tick = self._judged(reading, u=reading.u_applied)
+
+    def follow(self, row: Row, *, extra: Mapping[str, float] | None = None) -> Tick:
+        """Take a row of a law that the device runs by itself, and return its sample; a row lost on the line is NaN."""
+        self._look_for_stop()
+        if not self._is_written:
+            self._write_row(row.u_mean, extra or {})
+        lost = round((self._time_of(row.reading) - self.tick.t_s) / self.sample_time_s) - 1
+        for _ in range(lost):
+            before = self.tick
+            self.tick = replace(before, k=before.k + 1, t_s=before.t_s + self.sample_time_s, usable=False)
+            self._write_row(row.u_mean, extra or {})
+        self._reading = row.reading
+        self._deadline_s = self.rig.clock.now()
+        self.tick = self._judged(row.reading, u=row.reading.u_applied)
         return self.tick
 
     def history(self, start: int = 0) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -297,15 +322,24 @@ class ControlLoop:
             self._missed += int(behind)
             self._deadline_s += step * int(behind)
         while True:
-            if self._stop_signal:
-                raise OperatorStop(f"stopped by {self._stop_signal}", mend="run it again when ready")
+            self._look_for_stop()
             clock.sleep_until(min(self._deadline_s, clock.now() + SLICE_S))
             if clock.now() >= self._deadline_s - 1e-9:
                 break
         self._record.lateness.append(max(0.0, clock.now() - self._deadline_s))
 
+    def _look_for_stop(self) -> None:
+        if self._stop_signal:
+            raise OperatorStop(f"stopped by {self._stop_signal}", mend="run it again when ready")
+
+    @property
+    def _is_written(self) -> bool:
+        """Whether the latest sample's row is on the disk."""
+        return self.tick.k < len(self._record.t)
+
     def _judged(self, reading: Reading, *, u: float) -> Tick:
-        self._record.latency.append(reading.latency_s)
+        if math.isfinite(reading.latency_s):
+            self._record.latency.append(reading.latency_s)
         t_s = self._time_of(reading)
         y, usable = self.monitor.judge(reading, u)
         tick = Tick(k=self.tick.k + 1, t_s=t_s, y=y, usable=usable, u=u)

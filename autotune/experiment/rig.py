@@ -25,7 +25,7 @@ class Reading:
     device_time_s : float
         Device time stamp [s]; NaN where it has none.
     latency_s : float
-        Time the read took on the link [s].
+        Time the read took on the link [s]; NaN where the device sent it by itself.
     suspect : bool
         Whether the link had to retry or the answer did not identify itself: not to be used in an estimate.
     """

@@ -13,11 +13,12 @@ from autotune.config import Config
 from autotune.errors import AutotuneError, ExperimentStopped
 from autotune.experiment.approach import Known, approach, find_midpoint, preflight
 from autotune.experiment.cycles import Earlier, refined
+from autotune.experiment.device import DeviceOscillation
 from autotune.experiment.limits import Envelope, Watch
 from autotune.experiment.loop import ControlLoop, Timing
 from autotune.experiment.relay import RelaySettings
 from autotune.experiment.result import ExperimentResult, Part, Progress, Segment, State
-from autotune.experiment.rig import Rig
+from autotune.experiment.rig import Rig, RunsLaws
 from autotune.experiment.sweep import doubts, missing_phases, sweep
 from autotune.experiment.warm import warm_up
 from autotune.recording import RecordingWriter
@@ -107,6 +108,8 @@ def experiment_on(
         known = approach(loop, config, known, journal.tell, u_rest=earlier.u_rest)
         journal.enter(State.MIDPOINT)
         known, oscillation = find_midpoint(loop, config, known, journal.tell)
+        if isinstance(loop.rig, RunsLaws):
+            oscillation = DeviceOscillation(loop.rig, oscillation)
         journal.enter(State.SWEEP)
         segments, known = sweep(loop, config, known, oscillation, journal.show, earlier)
     except AutotuneError as error:

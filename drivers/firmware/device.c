@@ -144,6 +144,7 @@ static void take(device *d, uint8_t command)
     if (d->command != command) {
         d->row_due = 0;
         d->row_count = 0;
+        d->ticks_per_row = 0;
         d->area = 0;
     }
     d->command = command;
@@ -168,7 +169,9 @@ static uint8_t take_by_host(device *d, const uint8_t *p)
 
 static void set_run(device *d, const uint8_t *p)
 {
-    d->ticks_per_row = d->ticks_to_row = get16(p);
+    const uint16_t ticks_per_row = get16(p);
+    if (ticks_per_row != d->ticks_per_row) /* else the rows go on as they came */
+        d->ticks_per_row = d->ticks_to_row = ticks_per_row;
     d->ticks_left = get32(p + 2);
     d->y_low = get16(p + 6);
     d->y_high = get16(p + 8);

@@ -181,7 +181,7 @@ class BallBehind:
 def twin_ball(config: Config, start: str | None = None) -> BallBehind:
     """Return the configuration's ball; its noise is that of the twin."""
     twin = twin_of(config.rig)
-    made = make_plant("ball", seed=twin.seed, noise=twin.noise, start=start)
+    made = make_plant("ball", seed=twin.seed, noise=twin.noise, start=start, converters=False)
     assert isinstance(made, Ball)
     return BallBehind(made)
 
