@@ -31,6 +31,8 @@ LEAST_SHARE = 0.05
 #: Segments of a curve, and the smoothing weights that are tried, relative to the data's own curvature.
 SEGMENTS = 8
 SMOOTHINGS = (1e-4, 1e-3, 1e-2, 1e-1, 1.0)
+#: Weight that pulls a curve to zero: it holds what the model's own numbers explain as well, such as a straight line.
+LEVEL = 1e-3
 #: Ridge on unit columns while subsets are compared.
 RIDGE = 1e-7
 #: Share of a signal's size within which its sign passes through zero.
@@ -110,7 +112,7 @@ class Description:
     def sentence(self) -> str:
         """What a reader is told."""
         if not self.terms:
-            return f"{self.equation.capitalize()} (a description, not a cause)."
+            return f"{self.equation.capitalize()}."
         return (
             f"A description, not a cause: {self.equation}; it takes away {100 * self.explained:.0f} % of the misfit "
             "above the noise on windows that it was not fitted to."
@@ -169,12 +171,11 @@ def describe(result: Fit, data: Data) -> Description:
     curves = sorted(_curves(scene), key=lambda c: -c.explained)
     terms, place, explained = _equation(scene)
     shares = {f"{c.signal}, added to {_ADDS_TO[c.place]}": round(c.explained, 3) for c in curves}
-    same = [c for c in curves if terms and c.place == place and c.signal in terms[0].text]
     return Description(
         place=place if terms else curves[0].place,
         terms=terms,
         explained=explained,
-        curve=(same or curves)[0],
+        curve=curves[0],
         shares=shares,
     )
 
@@ -384,6 +385,8 @@ def _equation(scene: _Scene) -> tuple[tuple[Term, ...], Place, float]:
         error, chosen = found[0], [groups[i][k] for k in found[1]]
     if not chosen:
         return (), "plant", 0.0
+    alone = [scene.best_subset([c.column], 1)[0] for c in chosen]
+    chosen = [chosen[i] for i in np.argsort(alone)]
     X = np.column_stack([scene.J, *(c.column for c in chosen)])
     beta, inverse = _ridge(X, scene.e, np.zeros((X.shape[1], X.shape[1])))
     left = scene.e - X @ beta
@@ -414,10 +417,10 @@ def _curves(scene: _Scene) -> Iterator[Curve]:
             rows = [spline(s) for s in values]
             X = np.column_stack([scene.shown(place, [B[:, k] for B in rows]) for k in range(SEGMENTS + 3)])
             weight = float(np.sum(X**2)) / X.shape[1]
-            tried = [(scene.cross_validated(X, s * weight * second.T @ second), s) for s in SMOOTHINGS]
-            error, smoothing = min(tried)
+            penalties = [weight * (s * second.T @ second + LEVEL * np.eye(X.shape[1])) for s in SMOOTHINGS]
+            error, best = min((scene.cross_validated(X, P), i) for i, P in enumerate(penalties))
             penalty = np.zeros((scene.J.shape[1] + X.shape[1],) * 2)
-            penalty[scene.J.shape[1] :, scene.J.shape[1] :] = smoothing * weight * second.T @ second
+            penalty[scene.J.shape[1] :, scene.J.shape[1] :] = penalties[best]
             beta, inverse = _ridge(np.column_stack([scene.J, X]), scene.e, penalty)
             x = np.linspace(low, high, 61)
             B = spline(x)

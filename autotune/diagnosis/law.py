@@ -39,11 +39,11 @@ def law_effect(recordings: Sequence[Recording], controller: Controller | None = 
     coloured noise (differences of u and of the regressors), and compared with what is stated.
     """
     for r in recordings:
-        stated = _stated(r.metadata, controller)
+        stated = stated_law(r.metadata, controller)
         if stated is None or "r" not in r.extra or not np.all(np.isfinite(r["r"])):
             continue
         K, Ti = stated
-        estimate, covariance = _estimated(r)
+        estimate, covariance = fitted_law(r)
         names = ["gain_factor"] + (["T_I_factor"] if np.isfinite(Ti) else [])
         aims = np.array([K, K / Ti])[: len(names)]
         if np.any(aims == 0.0):
@@ -65,7 +65,8 @@ def law_effect(recordings: Sequence[Recording], controller: Controller | None = 
     return None
 
 
-def _stated(metadata: Mapping[str, Any], controller: Controller | None) -> tuple[float, float] | None:
+def stated_law(metadata: Mapping[str, Any], controller: Controller | None) -> tuple[float, float] | None:
+    """Return K and T_I of the PI law that the user or the sidecar states, nothing where it is another or none."""
     if isinstance(controller, PIDController):
         return (controller.K, controller.Ti_s) if controller.Td_s == 0.0 and controller.Tf_s == 0.0 else None
     given = metadata.get("controller", {})
@@ -77,7 +78,7 @@ def _stated(metadata: Mapping[str, Any], controller: Controller | None) -> tuple
     return float(given["K"]), Ti
 
 
-def _estimated(r: Recording) -> tuple[FloatArray, FloatArray]:
+def fitted_law(r: Recording) -> tuple[FloatArray, FloatArray]:
     """Return K and K/T_I with their covariance, the dither's colour taken for an AR(8) noise."""
     e = np.nan_to_num(r["r"] - r.y)
     integral = np.concatenate([[0.0], np.cumsum(0.5 * (e[1:] + e[:-1]) * np.diff(r.t))])

@@ -6,27 +6,22 @@ import os
 
 import numpy as np
 
+from autotune.controller import Controller
+from autotune.diagnosis.description import Curve, Description
 from autotune.diagnosis.result import Diagnosis, FoundEffect
 from autotune.diagnosis.selection import score
-from autotune.report.page import (
-    BLUE,
-    GREY,
-    ORANGE,
-    Figure,
-    Page,
-    Section,
-    Table,
-    Tone,
-    add_line,
-    lines_figure,
-    thinned,
-    write_page,
-)
+from autotune.report.page import Figure, Page, Section, Table, Tone, write_page
+from autotune.report.screen_figures import curve_figure, screen_sections, trace_figures
 
 _TONES: dict[str, Tone] = {"none": "good", "parameters": "good", "effect": "warn", "unexplained": "bad"}
 
 
-def write_diagnosis_page(found: Diagnosis, path: str | os.PathLike[str]) -> None:
+def write_diagnosis_page(
+    found: Diagnosis,
+    path: str | os.PathLike[str],
+    controller: Controller | None = None,
+    before: tuple[Section, ...] = (),
+) -> None:
     """Write the page of a diagnosis.
 
     Parameters
@@ -35,15 +30,21 @@ def write_diagnosis_page(found: Diagnosis, path: str | os.PathLike[str]) -> None
         What to show.
     path : path
         File to write.
+    controller : Controller, optional
+        The stated law, where the sidecars do not state it.
+    before : tuple of Section
+        What led to the diagnosis, shown after its summary.
     """
-    sections = (_effects(found), _fits(found), _hypotheses(found), _traces(found), _residuals(found))
+    described = () if found.description is None else (_described(found.description),)
+    traces = Section(title="Simulation against recording", figures=trace_figures(found))
+    sections = (*before, _effects(found), *described, _fits(found), _hypotheses(found), traces)
     write_page(
         Page(
             title=f"Diagnosis of {found.extended_model.name}",
             verdict=found.sentences[0],
             tone=_TONES[found.verdict],
             summary=(*found.sentences[1:], *_next(found)),
-            sections=sections,
+            sections=(*sections, *screen_sections(found, controller)),
         ),
         path,
     )
@@ -71,6 +72,33 @@ def _effect_rows(effect: FoundEffect) -> list[tuple[str, ...]]:
         first = (effect.name, f"{effect.probability:.2f}", ", ".join(effect.places)) if i == 0 else ("", "", "")
         rows.append((*first, name, value, effect.equation if i == 0 else ""))
     return rows or [(effect.name, f"{effect.probability:.2f}", ", ".join(effect.places), "", "", effect.equation)]
+
+
+def _described(description: Description) -> Section:
+    """Show what no effect of the catalogue explains, as an equation and as a curve."""
+    terms = Table(
+        header=("term", "value", "unit of the whole"),
+        rows=tuple((t.text, f"{t.value:.4g} ± {1.96 * t.sd:.2g}", t.unit) for t in description.terms),
+    )
+    shares = Table(
+        header=("signal", "held-out share"),
+        rows=tuple((name, f"{100 * share:.0f} %") for name, share in description.shares.items()),
+        caption="What a free curve over each signal takes away of the misfit above the noise, on held-out windows.",
+    )
+    return Section(
+        title="A description, not a cause",
+        text=(description.sentence,),
+        tables=(terms, shares) if description.terms else (shares,),
+        figures=(_curve(description.curve),) if description.curve.explained > 0.0 else (),
+    )
+
+
+def _curve(curve: Curve) -> Figure:
+    caption = (
+        f"What is missing over {curve.signal}, as a smoothing spline of no assumed form, with its 95 % band; it "
+        f"takes away {100 * curve.explained:.0f} % of the held-out misfit above the noise. It does not tell an offset."
+    )
+    return Figure(figure=curve_figure(curve), caption=caption, height_px=320)
 
 
 def _fits(found: Diagnosis) -> Section:
@@ -112,42 +140,3 @@ def _hypotheses(found: Diagnosis) -> Section:
         header=("candidate", "probability"), rows=tuple((c.name, f"{c.probability:.3f}") for c in found.candidates)
     )
     return Section(title="Rivals", tables=(table, odds))
-
-
-def _traces(found: Diagnosis) -> Section:
-    figures = []
-    for i, r in enumerate(found.search.data.recordings):
-        figure = lines_figure("t [s]", f"y [{found.extended_model.output.unit}]")
-        add_line(figure, *thinned(r.t, r.y), "measured", GREY, width=1.0)
-        add_line(figure, *thinned(r.t, found.search.retuned.fit.signals[i][:, 0]), "retuned", ORANGE)
-        add_line(figure, *thinned(r.t, found.search.chosen.fit.signals[i][:, 0]), "extended", BLUE)
-        figures.append(Figure(figure=figure, caption=f"Recording {i}: measured, and simulated window by window."))
-    return Section(title="Simulation against recording", figures=tuple(figures))
-
-
-def _residuals(found: Diagnosis) -> Section:
-    figures = []
-    for column, name in ((1, "speed"), (2, "position"), (3, "plant input")):
-        figure = lines_figure(name, "residual / noise")
-        for fit, label, colour in (
-            (found.search.retuned.fit, "retuned", ORANGE),
-            (found.search.chosen.fit, "extended", BLUE),
-        ):
-            x = np.concatenate([s[:, column] for s in fit.signals])
-            e = np.concatenate(fit.residuals) / found.search.data.noise.total_sd
-            ok = np.isfinite(x)
-            order = np.argsort(x[ok])
-            parts = np.array_split(order, 40)
-            add_line(
-                figure,
-                np.array([x[ok][p].mean() for p in parts]),
-                np.array([e[ok][p].mean() for p in parts]),
-                label,
-                colour,
-            )
-        figures.append(
-            Figure(
-                figure=figure, caption=f"Mean residual against {name}: flat where nothing is missing.", height_px=300
-            )
-        )
-    return Section(title="Residual against the signals", figures=tuple(figures))

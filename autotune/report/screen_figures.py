@@ -1,0 +1,221 @@
+"""Pictures of the screens: each cheap look at recordings and residuals with the one sentence that it says."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import plotly.graph_objects as go
+
+from autotune.arrays import FloatArray
+from autotune.controller import Controller
+from autotune.diagnosis.description import Curve
+from autotune.diagnosis.result import Diagnosis
+from autotune.diagnosis.screens import (
+    LawScreen,
+    Means,
+    PeriodScreen,
+    direction_screen,
+    independent_share,
+    law_screen,
+    means_over,
+    period_screen,
+    signals_of,
+    spectrum_screen,
+    stamp_screen,
+    value_screen,
+    window_screen,
+)
+from autotune.report.page import BLUE, GREEN, GREY, ORANGE, Figure, Section, Table, add_line, lines_figure, thinned
+
+#: Height of one screen's picture [px]; periods of the recomputed law that are drawn.
+HEIGHT, LAW_ROWS = 300, 600
+
+
+def screen_sections(found: Diagnosis, controller: Controller | None = None) -> tuple[Section, ...]:
+    """Return the screens of a diagnosis as sections: samples, residual over time and frequency, over the signals.
+
+    Parameters
+    ----------
+    found : Diagnosis
+        With its search.
+    controller : Controller, optional
+        The stated law, where the sidecars do not state it.
+    """
+    return (_samples(found, controller), _residual(found), _signals(found))
+
+
+def _samples(found: Diagnosis, controller: Controller | None) -> Section:
+    recordings = found.search.data.recordings
+    stamps, values = stamp_screen(recordings), value_screen(recordings)
+    u_unit, y_unit = found.extended_model.input.unit, found.extended_model.output.unit
+    steps = _histogram(np.concatenate(stamps.steps), "step between time stamps / sample time", (0.9, 1.1), log=True)
+    taken = _histogram(values.values, f"y [{y_unit}]", (np.inf, -np.inf))
+    figures = [
+        Figure(figure=steps, caption=f"Time stamps. {stamps.sentence}", height_px=HEIGHT),
+        Figure(figure=taken, caption=f"Readings. {values.sentence}", height_px=HEIGHT),
+    ]
+    law = law_screen(recordings, controller)
+    text = () if law else ("No recording has a set-point r and a stated PI law: the law was not recomputed.",)
+    if law is not None:
+        figures.append(
+            Figure(figure=_law(law, u_unit), caption=f"Control law recomputed. {law.sentence}", height_px=HEIGHT)
+        )
+    return Section(title="What the samples alone show", text=text, figures=tuple(figures))
+
+
+def _histogram(values: FloatArray, title: str, least: tuple[float, float], *, log: bool = False) -> Any:
+    figure = lines_figure(title, "rows", log_y=log)
+    edges = np.linspace(min(values.min(), least[0]), max(values.max(), least[1]), 161)
+    counts = np.histogram(values, edges)[0]
+    middle = 0.5 * (edges[1:] + edges[:-1])
+    figure.add_trace(go.Bar(x=middle, y=counts, marker={"color": BLUE}, showlegend=False, width=edges[1] - edges[0]))
+    return figure
+
+
+def _law(law: LawScreen, unit: str) -> Any:
+    figure = lines_figure("t [s]", f"u [{unit}]")
+    near = slice(0, LAW_ROWS)
+    add_line(figure, law.t[near], law.recorded[near], "recorded", GREY)
+    add_line(figure, law.t[near], law.recomputed[near], "recomputed from r and y", BLUE)
+    return figure
+
+
+def _residual(found: Diagnosis) -> Section:
+    retuned, extended, data = found.search.retuned.fit, found.search.chosen.fit, found.search.data
+    y_unit = found.extended_model.output.unit
+    spectrum = spectrum_screen(retuned, extended, data)
+    figure = lines_figure("frequency [Hz]", f"power density [{y_unit}²/Hz]", log_x=True, log_y=True)
+    add_line(figure, spectrum.frequency_hz, spectrum.retuned, "retuned", ORANGE)
+    add_line(figure, spectrum.frequency_hz, spectrum.extended, "extended", BLUE)
+    add_line(figure, spectrum.frequency_hz, spectrum.noise, "noise model", GREY, dash="dot")
+    figures = [_over_time(found)]
+    figures.append(Figure(figure=figure, caption=f"Residual over frequency. {spectrum.sentence}", height_px=HEIGHT))
+    periods = period_screen(retuned, data)
+    if periods is not None:
+        figures += _periods(periods, y_unit)
+    direction = direction_screen(retuned, data)
+    if direction is not None:
+        figure = lines_figure(f"|rate of the reading| [{y_unit}/s]", "residual / noise")
+        _add_means(figure, direction.rising, "rising", BLUE)
+        _add_means(figure, direction.falling, "falling", ORANGE)
+        figures.append(Figure(figure=figure, caption=f"Up against down. {direction.sentence}", height_px=HEIGHT))
+    windows = window_screen(retuned, data)
+    if windows is not None:
+        figure = lines_figure(windows.against, f"change of {windows.name} [{windows.unit}]")
+        bars = {"type": "data", "array": 1.96 * windows.sd, "color": BLUE, "thickness": 1}
+        figure.add_trace(
+            go.Scatter(x=windows.x, y=windows.change, mode="markers", marker={"color": BLUE, "size": 6}, error_y=bars,
+                       showlegend=False)
+        )  # fmt: skip
+        figures.append(
+            Figure(figure=figure, caption=f"Numbers in every window alone. {windows.sentence}", height_px=HEIGHT)
+        )
+    missing = [] if periods else ["repeated periods and harmonics (no recording's u is periodic)"]
+    missing += [] if direction else ["up against down (the reading goes one way only)"]
+    missing += [] if windows else ["numbers in every window alone (too few windows)"]
+    text = (f"Not looked at: {', '.join(missing)}.",) if missing else ()
+    return Section(title="What retuning leaves, when and how fast", text=text, figures=tuple(figures))
+
+
+def _over_time(found: Diagnosis) -> Figure:
+    """Draw the size of the residual in every window, one recording after the other."""
+    data, figure = found.search.data, lines_figure("t, one recording after the other [s]", "rms residual / noise")
+    middles, at = [], 0.0
+    for r, a, b in zip(data.recordings, data.starts, data.stops, strict=True):
+        middles.append(at + 0.5 * (r.t[a] + r.t[b - 1]) - r.t[0])
+        at += r.duration_s
+    t = np.concatenate(middles)
+    sizes = {}
+    for fit, name, colour in (
+        (found.search.retuned.fit, "retuned", ORANGE),
+        (found.search.chosen.fit, "extended", BLUE),
+    ):
+        e = np.concatenate(fit.residuals) / data.noise.total_sd
+        sizes[name] = np.array([np.sqrt(np.mean(e[a:b] ** 2)) for a, b in fit.windows])
+        add_line(figure, t, sizes[name], name, colour)
+    add_line(figure, t[[0, -1]], np.ones(2), "noise", GREY, dash="dot")
+    worst, usual = int(np.argmax(sizes["retuned"])), float(np.median(sizes["retuned"]))
+    caption = (
+        f"Residual over time, window by window. Retuned it is usually {usual:.3g} times the noise, at most "
+        f"{sizes['retuned'][worst]:.3g} times, near {t[worst]:.4g} s."
+    )
+    return Figure(figure=figure, caption=caption, height_px=HEIGHT)
+
+
+def _periods(screen: PeriodScreen, unit: str) -> list[Figure]:
+    folded = lines_figure("time within the period [s]", f"mean residual [{unit}]")
+    _band(folded, screen.phase, screen.mean, 1.96 * screen.spread, BLUE)
+    add_line(folded, screen.phase, screen.mean, f"recording {screen.number}", BLUE)
+    orders = np.arange(1, screen.harmonics.size + 1)
+    bars = lines_figure("harmonic of the period", f"amplitude of the residual [{unit}]")
+    for first, name, colour in ((0, "odd", BLUE), (1, "even", ORANGE)):
+        bars.add_trace(
+            go.Bar(x=orders[first::2], y=screen.harmonics[first::2], name=name, marker={"color": colour}, width=0.6)
+        )
+    add_line(bars, np.array([0.5, orders[-1] + 0.5]), np.full(2, 3.0 * screen.floor), "noise, 3 sd", GREY, dash="dot")
+    return [
+        Figure(figure=folded, caption=f"Repeated periods. {screen.sentence}", height_px=HEIGHT),
+        Figure(figure=bars, caption=f"Odd and even harmonics. {screen.harmonic_sentence}", height_px=HEIGHT),
+    ]
+
+
+def _signals(found: Diagnosis) -> Section:
+    search = found.search
+    before = signals_of(search.retuned.fit, search.data)
+    after = signals_of(search.chosen.fit, search.data)
+    per_row = independent_share(search.retuned.fit)
+    curves = {name: means_over(name, *before[name], per_row) for name in before}
+    best = max(curves, key=lambda name: curves[name].explained)
+    figures, rows = [], []
+    for name, means in sorted(curves.items(), key=lambda pair: -pair[1].explained):
+        figure = lines_figure(name, "residual / noise")
+        _add_means(figure, means, "retuned", ORANGE)
+        share = "-"
+        if name in after:
+            extended = means_over(name, *after[name], per_row)
+            _add_means(figure, extended, "extended", BLUE)
+            share = f"{100 * extended.explained:.1f} %"
+        rows.append((name, f"{100 * means.explained:.1f} %", share))
+        caption = f"Mean residual over {name} with 95 % bands: flat at zero where nothing is missing."
+        figures.append(Figure(figure=figure, caption=caption, height_px=260))
+    table = Table(header=("signal", "retuned", "extended"), rows=tuple(rows),
+                  caption="Share of the residual's power that its mean over each signal explains.")  # fmt: skip
+    text = f"What retuning leaves goes most with {best} ({100 * curves[best].explained:.1f} % of its power)."
+    return Section(title="Residual against every signal", text=(text,), tables=(table,), figures=tuple(figures))
+
+
+def _add_means(figure: Any, means: Means, name: str, colour: str) -> None:
+    _band(figure, means.x, means.mean, 1.96 * means.error, colour)
+    add_line(figure, means.x, means.mean, name, colour)
+
+
+def _band(figure: Any, x: FloatArray, y: FloatArray, half: FloatArray, colour: str) -> None:
+    red, green, blue = (int(colour[i : i + 2], 16) for i in (1, 3, 5))
+    figure.add_trace(
+        go.Scatter(
+            x=np.concatenate([x, x[::-1]]), y=np.concatenate([y + half, (y - half)[::-1]]), fill="toself",
+            fillcolor=f"rgba({red},{green},{blue},0.18)", line={"width": 0}, hoverinfo="skip", showlegend=False,
+            mode="lines",
+        )
+    )  # fmt: skip
+
+
+def curve_figure(curve: Curve) -> Any:
+    """Return the picture of a description's free curve with its 95 % band."""
+    figure = lines_figure(curve.signal, f"missing [{curve.unit}]")
+    _band(figure, curve.x, curve.value, 1.96 * curve.sd, GREEN)
+    add_line(figure, curve.x, curve.value, "free curve", GREEN)
+    return figure
+
+
+def trace_figures(found: Diagnosis) -> tuple[Figure, ...]:
+    """Return every recording with the retuned and the extended simulation, window by window."""
+    figures = []
+    for i, r in enumerate(found.search.data.recordings):
+        figure = lines_figure("t [s]", f"y [{found.extended_model.output.unit}]")
+        add_line(figure, *thinned(r.t, r.y), "measured", GREY, width=1.0)
+        add_line(figure, *thinned(r.t, found.search.retuned.fit.signals[i][:, 0]), "retuned", ORANGE)
+        add_line(figure, *thinned(r.t, found.search.chosen.fit.signals[i][:, 0]), "extended", BLUE)
+        figures.append(Figure(figure=figure, caption=f"Recording {i}: measured, and simulated window by window."))
+    return tuple(figures)
