@@ -17,6 +17,7 @@ from autotune.errors import IdentificationError
 from autotune.identification.closed_loop.predictor_directions import (
     Predictor,
     behaviour_directions,
+    regressors,
 )
 from autotune.identification.closed_loop.predictor_sweep import normal_equations, scatter
 from autotune.identification.closed_loop.state_space import InnovationModel, balancing, spectral_radius
@@ -169,7 +170,8 @@ def _with_initial_state(predictor: Predictor, u: FloatArray, y: FloatArray) -> P
     entries = predictor.packed().size
     directions = np.eye(entries, n, n - entries)
     errors = scatter(predictor.F, predictor.H, predictor.x0, u, y)
-    total = _normal_equations(predictor, directions, u, y, errors)
+    nothing = np.zeros((0, predictor.F.shape[1]))
+    total = _normal_equations(predictor, directions, u, y, errors, nothing)
     return predictor.moved(_step(total[:-1, :-1], total[:-1, -1], 0.0)[0], directions)
 
 
@@ -196,15 +198,18 @@ def _search(
     floor = len(y) * (_NOISE_FREE * np.std(y, axis=0)) ** 2
     n_y = y.shape[1]
     while True:
-        if iterations % 5 == 0:
+        renewed = iterations % 5 == 0
+        if renewed:
             predictor = _balanced(predictor)
-        directions = behaviour_directions(predictor, feedthrough=feedthrough, offset=offset)
+        if renewed or n_y > 1:  # with one output they hold as long as the coordinates do
+            directions = behaviour_directions(predictor, feedthrough=feedthrough, offset=offset)
+            phi = regressors(predictor)
         if len(y) * n_y <= directions.shape[1]:
             raise IdentificationError(
                 f"the record is too short: {len(y)} rows for {directions.shape[1]} parameters",
                 mend="record longer, or ask for a lower order",
             )
-        total = _normal_equations(predictor, directions, u, y, errors)
+        total = _normal_equations(predictor, directions, u, y, errors, phi)
         used = directions.shape[1] - (n_y if offset and not constant else 0)
         information, gradient = total[:used, :used], total[:used, -1]
         converged = bool(np.all(np.diag(errors) <= floor))
@@ -289,13 +294,17 @@ def _balanced(predictor: Predictor) -> Predictor:
 
 
 def _normal_equations(
-    predictor: Predictor, directions: FloatArray, u: FloatArray, y: FloatArray, errors: FloatArray
+    predictor: Predictor, directions: FloatArray, u: FloatArray, y: FloatArray, errors: FloatArray, phi: FloatArray
 ) -> FloatArray:
+    """Return the whitened normal equations; the directions change F by multiples of the orthogonal rows of phi."""
+    n, of_f, P = len(predictor.x0), predictor.F.size, directions.shape[1]
+    change = (phi / np.maximum(np.sum(phi**2, axis=1, keepdims=True), np.finfo(np.float64).tiny)) @ directions[
+        :of_f
+    ].reshape(n, -1, P)
+    inner = np.concatenate([change.reshape(-1, P), directions[of_f:]])
     covariance = errors / len(y) + np.finfo(np.float64).tiny * np.eye(len(errors))
     whitening = np.linalg.inv(np.linalg.cholesky(covariance))
-    total: FloatArray = normal_equations(
-        predictor.F, predictor.H, predictor.x0, u, y, np.ascontiguousarray(directions), whitening
-    )
+    total: FloatArray = normal_equations(predictor.F, predictor.H, predictor.x0, u, y, phi, inner, whitening)
     return total
 
 

@@ -122,6 +122,20 @@ def behaviour_directions(predictor: Predictor, *, feedthrough: bool, offset: boo
     return np.hstack([behaviour, constant_directions(predictor)]) if offset else behaviour
 
 
+def regressors(predictor: Predictor) -> FloatArray:
+    """Return Phi (m, n + n_u + n_y + 1) such that every direction changes F by some G Phi.
+
+    With one output and injection directions these are the prediction, u, y and 1; else all of x, u, y and 1.
+    """
+    n, _, n_y = predictor.sizes
+    everything = np.eye(predictor.F.shape[1])
+    if n_y > 1:
+        return everything
+    prediction = np.zeros((1, len(everything)))
+    prediction[0, :n] = predictor.H[0, :n]
+    return np.vstack([prediction, everything[n:]])
+
+
 def constant_directions(predictor: Predictor) -> FloatArray:
     """Return the directions of the constants, shape (entries, n_y).
 

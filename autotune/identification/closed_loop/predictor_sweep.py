@@ -75,6 +75,7 @@ def normal_equations(
     x0: FloatArray,
     u: FloatArray,
     y: FloatArray,
+    regressors: FloatArray,
     directions: FloatArray,
     whitening: FloatArray,
 ) -> FloatArray:
@@ -86,8 +87,10 @@ def normal_equations(
         The predictor, as in :class:`autotune.identification.closed_loop.predictor_directions.Predictor`.
     u, y : (N, n_u), (N, n_y) arrays
         Data.
-    directions : (entries, P) array
-        Of F row by row, H row by row and x0.
+    regressors : (m, n + n_u + n_y + 1) array
+        Phi: F changes by G Phi only.
+    directions : (n m + entries of H + n, P) array
+        Of G row by row, H row by row and x0.
     whitening : (n_y, n_y) array
         W with W cov(e) W^T = I.
 
@@ -98,12 +101,12 @@ def normal_equations(
 
     Notes
     -----
-    A change of F[i, q] acts on output o through w_i(t) with w(t+1) = A^T w(t) + C_o^T phi_q(t) (adjoint of the
-    predictor), so one bank of n states per output and regressor phi_q serves the n entries of a column of F; with
-    phi = 0 and w(0) = C_o^T the same recursion gives the derivatives by x0.
+    A change of G[i, q] acts on output o through w_i(t) with w(t+1) = A^T w(t) + C_o^T phi_q(t) (adjoint of the
+    predictor), phi = Phi (x, u, y, 1), so one bank of n states per output and regressor serves the n entries of a
+    column of G; with phi = 0 and w(0) = C_o^T the same recursion gives the derivatives by x0.
     """
     n, n_u, n_y, P = F.shape[0], u.shape[1], y.shape[1], directions.shape[1]
-    m, h = n + n_u + n_y + 1, n + n_u + 1
+    m, h, inputs = regressors.shape[0], n + n_u + 1, n + n_u + n_y + 1
     width = n * (m + 1) + n_y * h + 1
     projection = np.zeros((width, P + 1))
     for i in range(n):
@@ -115,8 +118,7 @@ def normal_equations(
     projection[width - 1, P] = 1.0
     C = np.ascontiguousarray(whitening @ np.ascontiguousarray(H[:, :n]))
     x, following, e = x0.copy(), np.empty(n), np.empty(n_y)
-    phi = np.zeros(m + 1)
-    phi[m - 1] = 1.0
+    phi, z = np.zeros(m + 1), np.ones(inputs)
     bank = np.zeros((n_y, n, m + 1))
     for o in range(n_y):
         bank[o, :, m] = C[o]
@@ -126,15 +128,20 @@ def normal_equations(
     filled = 0
     for t in range(y.shape[0]):
         for i in range(n):
-            phi[i] = x[i]
+            z[i] = x[i]
         for q in range(n_u):
-            phi[n + q] = u[t, q]
+            z[n + q] = u[t, q]
         for o in range(n_y):
-            phi[n + n_u + o] = y[t, o]
+            z[n + n_u + o] = y[t, o]
             value = y[t, o] - H[o, n + n_u]
             for i in range(n + n_u):
-                value -= H[o, i] * phi[i]
+                value -= H[o, i] * z[i]
             e[o] = value
+        for q in range(m):
+            value = 0.0
+            for k in range(inputs):
+                value += regressors[q, k] * z[k]
+            phi[q] = value
         for o in range(n_y):
             value = 0.0
             at = n * (m + 1)
@@ -142,7 +149,7 @@ def normal_equations(
                 w = whitening[o, k]
                 value += w * e[k]
                 for i in range(n + n_u):
-                    rows[filled, at + i] = w * phi[i]
+                    rows[filled, at + i] = w * z[i]
                 rows[filled, at + n + n_u] = w
                 at += h
             rows[filled, width - 1] = value
@@ -159,8 +166,8 @@ def normal_equations(
             filled += 1
         for i in range(n):
             value = 0.0
-            for q in range(m):
-                value += F[i, q] * phi[q]
+            for k in range(inputs):
+                value += F[i, k] * z[k]
             following[i] = value
         x[:] = following
         if filled == rows.shape[0]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.linalg import solve_discrete_are
+from scipy.linalg import solve_discrete_are, solve_triangular
 
 from autotune.arrays import FloatArray
 from autotune.errors import IdentificationError
@@ -85,9 +85,11 @@ def autoregression(data: LaggedData, *, feedthrough: bool) -> tuple[FloatArray, 
         Feedthrough, zero where not asked for.
     """
     now_u, now_y = data.now
-    regressors = slice(0, now_u.stop if feedthrough else data.past().stop)
-    theta = least_squares(data.R[:, regressors], data.R[:, now_y])
     width = data.past().stop
+    if feedthrough:  # u(t) may follow from the past exactly, the past alone never does: it holds a trace of noise
+        theta = least_squares(data.R[:, : now_u.stop], data.R[:, now_y])
+    else:
+        theta = solve_triangular(data.R[:width, :width], data.R[:width, now_y], check_finite=False)
     phi = theta[:width].T.reshape(data.n_y, data.p, data.n_u + data.n_y).transpose(1, 0, 2)
     return phi, theta[width:].T if feedthrough else np.zeros((data.n_y, data.n_u))
 

@@ -51,7 +51,8 @@ def test_derivatives_agree_with_differences(n: int, n_u: int, n_y: int, offset: 
     directions = behaviour_directions(p, feedthrough=True, offset=offset)
     P = directions.shape[1]
     assert n * (n_u + 2 * n_y) + n_y * n_u + n + (n_y if offset else 0) == P
-    total = normal_equations(p.F, p.H, p.x0, u, y, directions, np.eye(n_y))
+    every = np.eye(p.F.shape[1])
+    total = normal_equations(p.F, p.H, p.x0, u, y, every, directions, np.eye(n_y))
     step = 1e-6
     ahead = [_errors(p.moved(step * column, directions), u, y).ravel() for column in np.eye(P)]
     behind = [_errors(p.moved(-step * column, directions), u, y).ravel() for column in np.eye(P)]
