@@ -15,7 +15,7 @@ from autotune.errors import ExperimentStopped, IdentificationError, LinkError
 from autotune.experiment.limits import Watch
 from autotune.experiment.loop import ControlLoop
 from autotune.experiment.monitor import RECENT
-from autotune.experiment.oscillation import Oscillation
+from autotune.experiment.oscillation import Oscillation, noise_half, too_noisy
 from autotune.experiment.relay import RelaySettings
 from autotune.identification.frequency.limit_cycle_points import limit_cycle_points
 from autotune.points import FrequencyPoint
@@ -340,6 +340,12 @@ def _balance(oscillation: Oscillation, config: Config, known: Known, tell: Tell)
         high = float(np.nanmax(y)) - float(np.nanmin(y)) - 2.0 * known.noise_half
         if abs(asymmetry) > 0.3:
             tries += 1
+            if tries > 12 and too_noisy(loop):
+                raise ExperimentStopped(
+                    f"drowned in noise: the relay switches on noise of +-{noise_half(loop):.3g} and not on y",
+                    where="find the mid-point",
+                    mend="filter the measurement at the device, or allow more swing",
+                )
             if tries > 12:
                 raise ExperimentStopped(
                     f"asymmetric: the command is on one side for {50 + 50 * abs(asymmetry):.0f} % of the time"

@@ -6,12 +6,38 @@ import math
 from dataclasses import replace
 from statistics import median
 
+import numpy as np
+
 from autotune.errors import ExperimentStopped
 from autotune.experiment.loop import ControlLoop, Tick
 from autotune.experiment.relay import RelaySettings, RelayState, relay_step
 
 #: waited-for half periods after which a switch that does not come is called no oscillation
 PATIENCE = 6.0
+#: times to the extremum of y after which a plant that still runs away is not held by what is commanded
+POWERLESS = 1.25
+#: switches of one setting after which it has shown that it turns y
+PROVEN = 2
+#: rows that the noise is judged on
+NOISE_ROWS = 100
+#: half-width of the noise, as a part of limits.swing, from which on a relay that fails has failed on it
+NOISY_SHARE = 0.25
+
+
+def noise_half(loop: ControlLoop) -> float:
+    """Return twice the standard deviation of the noise over the last rows [y unit].
+
+    From second differences, so that a plant that moves is not taken for noise, and from their median, nor are a few
+    wild readings; on the way to the operating point a sensor at its rail hides half of it.
+    """
+    y = loop.history(max(0, loop.tick.k - NOISE_ROWS))[2]
+    bends = np.abs(np.diff(y[np.isfinite(y)], 2))
+    return 2.0 * 1.4826 * float(np.median(bends)) / math.sqrt(6.0) if bends.size else 0.0
+
+
+def too_noisy(loop: ControlLoop) -> bool:
+    """Return whether the noise is so wide that a relay which fails has failed on it."""
+    return noise_half(loop) > NOISY_SHARE * loop.envelope.settings.swing
 
 
 class Oscillation:
@@ -56,14 +82,28 @@ class Oscillation:
         self._sign_is_sure = sign_is_sure
         self._nudge_s = nudge_s
         self._last_nudge_s = loop.tick.t_s
+        self._turning_s, self._foreseen = math.inf, False
 
     @property
     def switched(self) -> int:
         """Decisions the relay has taken in its life."""
         return self._state.switches
 
-    def change(self, settings: RelaySettings, *, patience_s: float, nudge_s: float = math.inf) -> None:
-        """Go on with another setting, from the next command on."""
+    def change(
+        self,
+        settings: RelaySettings,
+        *,
+        patience_s: float,
+        nudge_s: float = math.inf,
+        turning_s: float = math.inf,
+        foreseen: bool = False,
+    ) -> None:
+        """Go on with another setting, from the next command on.
+
+        It turns y ``turning_s`` [s] after a switch; ``foreseen`` says that by the measured points it keeps within the
+        swing.
+        """
+        self._turning_s, self._foreseen = turning_s, foreseen
         self.settings = settings
         self.edges = []
         self.start_row = self.loop.tick.k
@@ -85,7 +125,8 @@ class Oscillation:
         Raises
         ------
         ExperimentStopped
-            No oscillation, wrong sign, or a relay level outside the command's range.
+            No oscillation, wrong sign, a relay level outside the command's range, an actuator that gives less than is
+            commanded, or noise that hides where y is.
         """
         tick = self.loop.tick
         limits = self.loop.envelope.settings
@@ -104,7 +145,35 @@ class Oscillation:
             self._last_nudge_s = tick.t_s
             self.move_midpoint(self.settings.midpoint + 0.5 * self._state.level * self.settings.amplitude)
         self._check_alive(tick)
-        return self.loop.step(self.loop.nearest(u)), switched
+        try:
+            return self.loop.step(self.loop.nearest(u)), switched
+        except ExperimentStopped as error:
+            raise self.named(error) from error
+
+    def named(self, error: ExperimentStopped) -> ExperimentStopped:
+        """Return the error with its cause, where y left its limits for one that can be told."""
+        y, limits = median(self.loop.monitor.recent), self.loop.envelope.settings
+        away = y - self.settings.y_centre
+        if type(error) is not ExperimentStopped or abs(away) <= limits.swing:
+            return error
+        if too_noisy(self.loop):
+            return ExperimentStopped(
+                f"drowned in noise: y = {y:.4g} left the swing of {limits.swing:g} around {self.settings.y_centre:g},"
+                f" and noise of +-{noise_half(self.loop):.3g} hides where it is",
+                mend="filter the measurement at the device, or allow more swing",
+            )
+        # a relay that has turned y before, or was chosen from measured points to do so, is not simply too strong
+        expected = self._foreseen or len(self.edges) > PROVEN
+        pushed_back = away * self._state.level * self.settings.plant_sign < 0.0
+        runs_away = pushed_back and self.loop.tick.t_s - self._last_switch_s > POWERLESS * self._turning_s
+        if expected or runs_away:
+            level = self.settings.midpoint + self._state.level * self.settings.amplitude
+            return ExperimentStopped(
+                f"saturated, or under a load: y = {y:.4g} left the swing of {limits.swing:g} around"
+                f" {self.settings.y_centre:g} at the command {level:.4g}, where by the points it should turn",
+                mend="look for an actuator at its end, or a load; else choose another operating point",
+            )
+        return error
 
     def _check_alive(self, tick: Tick) -> None:
         y = median(self.loop.monitor.recent)

@@ -79,7 +79,8 @@ def sweep(
             choices[0].settings,
         )
         reserved_s = sum(time_s(choice, LEAST_PERIODS) for choice in choices[1:])
-        window = _measure(oscillation, choices[0], periods[0], end_s - reserved_s, settled=i > 0)
+        foreseen = known.swept and wanted.relay_amplitude is None
+        window = _measure(oscillation, choices[0], periods[0], end_s - reserved_s, settled=i > 0, foreseen=foreseen)
         cycle = Cycle(
             part=part,
             phase_rad=target,
@@ -156,7 +157,9 @@ def _choice(config: Config, known: Known, phase_rad: float) -> Choice:
     )
 
 
-def _measure(oscillation: Oscillation, choice: Choice, wanted: int, until_s: float, *, settled: bool) -> WholePeriods:
+def _measure(
+    oscillation: Oscillation, choice: Choice, wanted: int, until_s: float, *, settled: bool, foreseen: bool
+) -> WholePeriods:
     """Run one setting for whole periods, or until its time is over.
 
     Parameters
@@ -171,10 +174,17 @@ def _measure(oscillation: Oscillation, choice: Choice, wanted: int, until_s: flo
         When to end with fewer, but with no fewer than the least [s].
     settled : bool
         Whether the cycle before had the same peak: then this one is settled from its first row on.
+    foreseen : bool
+        Whether measured points say that the setting keeps within the swing.
     """
     loop = oscillation.loop
     step_s = loop.sample_time_s
-    oscillation.change(choice.settings, patience_s=PATIENCE * math.pi / choice.omega_rad_s)
+    oscillation.change(
+        choice.settings,
+        patience_s=PATIENCE * math.pi / choice.omega_rad_s,
+        turning_s=choice.turning_s,
+        foreseen=foreseen,
+    )
     start = oscillation.start_row if settled else -1
     turning = round(choice.turning_s / step_s)
     skip = 0  # edges before the cycle that is measured

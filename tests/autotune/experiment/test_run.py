@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,10 +13,12 @@ import pytest
 
 from autotune.errors import ExperimentStopped, LinkError
 from autotune.experiment.result import ExperimentResult, Progress, State
+from autotune.experiment.rig import Reading
 from autotune.experiment.run import float_on, run_experiment
 from autotune.recording import read_recording
 from drivers.simulated import SimulatedRig
-from sim.imperfections import Fault
+from sim.ball import make_ball
+from sim.imperfections import Fault, FaultyPlant
 from tests.autotune.experiment.rigs import CONFIG, ball_config, ball_rig, open_loop
 
 
@@ -114,6 +117,39 @@ FAULTS = {
     "wrong sign": [Fault(kind="inverted actuator", value=5.0)],
     "link cut": [Fault(kind="cut link", start_s=20.0)],
 }
+
+
+class Mute(SimulatedRig):
+    """A rig that does not say what it applies."""
+
+    def read(self) -> Reading:
+        return replace(super().read(), u_applied=math.nan)
+
+
+@pytest.mark.parametrize(
+    ("seed", "start_s", "level"),
+    [(1, 22.0, 4.6), (1, 40.0, 4.6), (2, 22.0, 5.1), (2, 40.0, 4.9), (3, 22.0, 4.8), (3, 40.0, 4.8)],
+)
+def test_an_actuator_that_saturates_in_mid_sweep_is_named_though_nobody_reads_it_back(
+    seed: int, start_s: float, level: float, tmp_path: Path
+) -> None:
+    fault = Fault(kind="saturated actuator", start_s=start_s, value=level)
+    rig = Mute(FaultyPlant(make_ball(seed=seed, noise=0.35), [fault]), u_safe=0.0)
+    with pytest.raises(ExperimentStopped, match="relay sweep: saturated, or under a load"):
+        run_experiment(rig, ball_config(), tmp_path / "r.csv")
+    assert rig.command == 0.0
+
+
+@pytest.mark.parametrize("seed", [1, 4])
+def test_a_relay_that_fails_on_noise_says_so(seed: int, tmp_path: Path) -> None:
+    with pytest.raises(ExperimentStopped, match="drowned in noise"):
+        run_experiment(ball_rig(seed=seed, noise=1.0), ball_config(), tmp_path / "r.csv")
+
+
+def test_an_amplitude_that_a_person_asked_for_and_that_is_too_large_is_not_called_saturation(tmp_path: Path) -> None:
+    config = ball_config(experiment={"relay_amplitude": 0.6})
+    with pytest.raises(ExperimentStopped, match=r"limits\.swing .* ask for a smaller relay_amplitude"):
+        run_experiment(ball_rig(seed=1), config, tmp_path / "r.csv")
 
 
 @pytest.mark.parametrize("verdict", FAULTS)
