@@ -163,11 +163,17 @@ def read_earlier(paths: Sequence[Path], sample_time_s: float) -> Earlier:
                 points=len(cycles),
                 rig_time_s=float(recording.t[-1]),
                 sweep_time_s=cycles[-1].end_s - first_move_s if cycles else 0.0,
-                ended=str(recording.metadata.get("ended", {}).get("reason", "not known")),
+                ended=_why(recording),
             )
         )
         recordings.append(recording)
     return Earlier(recordings=tuple(recordings), segments=tuple(segments), parts=tuple(parts))
+
+
+def _why(recording: Recording) -> str:
+    ended = recording.metadata.get("ended", {})
+    # only a loop that came to its end left an exit status
+    return str(ended["reason"]) if "exit_status" in ended else "killed: nothing was written at the end"
 
 
 def _finished(recording: Recording, part: int) -> list[Cycle]:

@@ -12,7 +12,6 @@ from autotune.identification.frequency.describing import describing_function
 from autotune.identification.frequency.harmonics import held_coefficients
 from autotune.identification.frequency.limit_cycle_points import LimitCycle, limit_cycle_points
 from autotune.identification.frequency.noise import noise_spectrum
-from autotune.identification.frequency.settling import settling
 from autotune.models import TransferFunction
 from tests.autotune.identification.relay_loop import BALL, last_periods, relay_loop
 
@@ -136,24 +135,6 @@ def test_coloured_noise_is_recognised_and_its_level_found_at_low_frequency() -> 
     assert not spectrum.is_white
     assert spectrum.variance_at(np.array([1.0]))[0] == pytest.approx(25.0, rel=0.2)
     assert noise_spectrum(white, 0.01, 0).variance_at(np.array([1.0]))[0] == pytest.approx(1.0, rel=0.1)
-
-
-def test_a_cycle_that_still_grows_is_not_settled_and_a_grown_one_is() -> None:
-    t = 0.01 * np.arange(6000)
-    u = np.where((t % 2.0) < 1.0, 1.0, -1.0)
-    y = (1.0 - 0.8 * np.exp(-t / 6.0)) * np.sin(np.pi * t) + np.random.default_rng(1).normal(0.0, 0.05, t.size)
-    early = t < 6.02
-    growing, grown = settling(t[early], u[early], y[early]), settling(t, u, y)
-    assert not growing.is_settled
-    assert growing.change > 0.1
-    assert grown.is_settled
-
-
-def test_a_change_below_the_noise_does_not_hold_the_experiment_up() -> None:
-    t = 0.01 * np.arange(800)
-    u = np.where((t % 2.0) < 1.0, 1.0, -1.0)
-    y = (1.0 + 0.02 * t) * np.sin(np.pi * t) + np.random.default_rng(1).normal(0.0, 1.0, t.size)
-    assert settling(t, u, y).is_settled
 
 
 def test_one_period_is_too_few() -> None:
