@@ -142,7 +142,7 @@ def _largest_delay(data: DelayData, max_delay_s: float | None) -> float:
         raise InputError(
             f"largest delay {max_delay_s:g} s lies outside the record of {reach:.4g} s",
             where=data.name,
-            mend="record longer, or give a smaller --max-delay",
+            mend=f"give --max-delay between 0 and {reach:.4g}, or record longer",
         )
     return max_delay_s
 
@@ -176,7 +176,7 @@ def _doubtful(data: DelayData, structure: Structure, point: Point) -> bool:
     """Whether the point may not be the lowest minimum: something is left in the residual, or b is hardly determined."""
     usable = data.usable_from(point.h)
     here = solve_linear(usable, structure, point.a, point.h)
-    if whitening_filter(residuals(usable, here)).size > 0:
+    if whitening_filter(residuals(usable, here), max_order=2).size > 0:
         return True
     model = finish(usable, structure, here)
     return bool(model.standard_deviations[structure.order] > _LINEAR * abs(model.b))
@@ -203,19 +203,19 @@ def _polish_on_all_rows(
         best, whitening = polish(usable, structure, best, max_delay_s=limit, coloured=coloured)
         model = finish(usable, structure, best, whitening)
         _require_inside(data, model, largest)
-        _require_determined(data, model)
+        _require_determined(data, model, largest)
         if model.standard_deviations[structure.order] < _LINEAR * abs(model.b):
             return model
         if structure.order >= _COMPARED_ORDER:
             _require_order(data, structure, best, model, largest)
         found = profile(usable, structure, best, model, max_delay_s=limit)
         if found.endless:
-            raise _undetermined(data, found.model, f"nothing bounds {found.endless}")
+            raise _undetermined(data, found.model, largest, f"nothing bounds {found.endless}")
         if found.lower is None:
-            _require_determined(data, found.model)
+            _require_determined(data, found.model, largest)
             return found.model
         best = found.lower
-    raise _undetermined(data, model, "several sets of parameters explain it alike")
+    raise _undetermined(data, model, largest, "several sets of parameters explain it alike")
 
 
 def _require_inside(data: DelayData, model: DelayModel, largest: float) -> None:
@@ -227,11 +227,12 @@ def _require_inside(data: DelayData, model: DelayModel, largest: float) -> None:
         )
 
 
-def _require_determined(data: DelayData, model: DelayModel) -> None:
+def _require_determined(data: DelayData, model: DelayModel, largest: float) -> None:
     sd = model.standard_deviations
     n = model.order
     if sd[n] > _UNDETERMINED[n] * abs(model.b):
-        raise _undetermined(data, model, f"the standard deviation of b is {100 * sd[n] / abs(model.b):.0f} % of it")
+        why = f"the standard deviation of b is {100 * sd[n] / abs(model.b):.0f} % of it"
+        raise _undetermined(data, model, largest, why)
 
 
 def _require_order(data: DelayData, structure: Structure, best: Point, model: DelayModel, largest: float) -> None:
@@ -257,15 +258,17 @@ def _require_order(data: DelayData, structure: Structure, best: Point, model: De
             )
 
 
-def _undetermined(data: DelayData, model: DelayModel, why: str) -> IdentificationError:
+def _undetermined(data: DelayData, model: DelayModel, largest: float, why: str) -> IdentificationError:
     period = input_period(data)
     n = model.order
     excites = "" if np.isnan(period) else f"; u repeats every {period:.3g} s and excites few frequencies"
     return IdentificationError(
         f"the record does not determine order {n}: {why} (b = {model.b:.3g}, "
-        f"delay {model.delay_s:.3g} +- {1.96 * model.standard_deviations[n + 1]:.2g} s){excites}",
+        f"delay {model.delay_s:.3g} +- {1.96 * model.standard_deviations[n + 1]:.2g} s of at most {largest:.4g} s)"
+        f"{excites}",
         where=data.name,
-        mend="ask for a lower order, move u further, or add a step or relay cycles at two more inserted delays",
+        mend="ask for a lower order, move u further, or add a step or relay cycles at two more inserted delays; where "
+        "the delay may be longer, give --max-delay and a longer record",
     )
 
 

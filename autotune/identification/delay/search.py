@@ -14,7 +14,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from autotune.arrays import BoolArray, ComplexArray, FloatArray
+from autotune.arrays import BoolArray, FloatArray
 from autotune.errors import IdentificationError
 from autotune.identification.delay.data import DelayData
 from autotune.identification.delay.modulating import SinePower
@@ -266,7 +266,7 @@ def _modulated(
         Y, U, starts, shifts, data.before is None, structure.integrator, structure.offset, kernels[0].sum()
     )
     return [
-        (float(shift * grid.dt), _stabilised(row, data.duration_s))
+        (float(shift * grid.dt), tuple(float(value) for value in _stabilised(row, data.duration_s)))
         for shift, row, good in zip(shifts, a, valid, strict=True)
         if good
     ]
@@ -321,14 +321,21 @@ def _instrumental(
     return a, valid
 
 
-def _stabilised(a: FloatArray, duration_s: float) -> tuple[float, ...]:
+@njit(cache=True)
+def _stabilised(a: FloatArray, duration_s: float) -> FloatArray:
     """Mirror poles that would grow by more than a factor e over the record into the left half plane."""
-    if a.size <= 2 and np.all(a <= 0.0):
-        return tuple(float(value) for value in a)
-    roots: ComplexArray = np.roots([1.0, *(-a[::-1])]).astype(np.complex128)
-    growing = roots.real > 1.0 / duration_s
-    roots = np.where(growing, -roots.conj(), roots)
-    return tuple(float(value) for value in -np.poly(roots).real[:0:-1])
+    n = a.size
+    if n <= 2 and np.all(a <= 0.0):
+        return a
+    polynomial = np.ones(n + 1, dtype=np.complex128)
+    polynomial[1:] = -a[::-1]
+    product = np.zeros(n + 1, dtype=np.complex128)  # descending powers of prod(s - root)
+    product[0] = 1.0
+    for root in np.roots(polynomial):
+        kept = -np.conj(root) if root.real > 1.0 / duration_s else root
+        for q in range(n, 0, -1):
+            product[q] -= kept * product[q - 1]
+    return -product.real[:0:-1]
 
 
 def _local_minima(points: list[Point]) -> list[Point]:
