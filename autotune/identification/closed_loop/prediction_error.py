@@ -14,27 +14,18 @@ import numpy as np
 
 from autotune.arrays import FloatArray
 from autotune.errors import IdentificationError
-from autotune.identification.closed_loop.predictor_directions import (
-    Predictor,
-    behaviour_directions,
-    regressors,
-)
-from autotune.identification.closed_loop.predictor_sweep import normal_equations, scatter
-from autotune.identification.closed_loop.state_space import InnovationModel, balancing, spectral_radius
+from autotune.identification.closed_loop.damped_step import damped_step, improved, log_determinant, whitened_equations
+from autotune.identification.closed_loop.predictor_directions import Predictor, behaviour_directions, regressors
+from autotune.identification.closed_loop.predictor_sweep import scatter
+from autotune.identification.closed_loop.state_space import InnovationModel, balancing
 
-#: A step that promises less than this in -2 log likelihood moves no parameter by 3 % of its standard deviation.
-_TOLERANCE = 1e-3
 #: Rows that the initial state of the start is fitted on.
 _LINEAR_ROWS = 2000
-#: A search that cannot move any more has converged if it could have gained less than this.
-_IMMATERIAL = 0.1
 #: A search that could gain less than this is near enough to its end to tell whether a constant is missing.
 _NEAR = 1.0
 #: Means above this share of the motion are an operating point, about which everything is computed: far from it, the
 #: constant and the dynamics hang together.
 _OPERATING_POINT = 0.2
-#: Zeros of the noise model nearer to the unit circle than this have no finite memory worth the name.
-_RADIUS_LIMIT = 0.9999
 #: Smaller innovations, relative to the output, are rounding.
 _NOISE_FREE = 1e-11
 #: Innovations this small say that the record has no noise in it.
@@ -171,8 +162,8 @@ def _with_initial_state(predictor: Predictor, u: FloatArray, y: FloatArray) -> P
     directions = np.eye(entries, n, n - entries)
     errors = scatter(predictor.F, predictor.H, predictor.x0, u, y)
     nothing = np.zeros((0, predictor.F.shape[1]))
-    total = _normal_equations(predictor, directions, u, y, errors, nothing)
-    return predictor.moved(_step(total[:-1, :-1], total[:-1, -1], 0.0)[0], directions)
+    total = whitened_equations(predictor, directions, u, y, errors, nothing)
+    return predictor.moved(damped_step(total[:-1, :-1], total[:-1, -1], 0.0)[0], directions)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -209,15 +200,15 @@ def _search(
                 f"the record is too short: {len(y)} rows for {directions.shape[1]} parameters",
                 mend="record longer, or ask for a lower order",
             )
-        total = _normal_equations(predictor, directions, u, y, errors, phi)
+        total = whitened_equations(predictor, directions, u, y, errors, phi)
         used = directions.shape[1] - (n_y if offset and not constant else 0)
         information, gradient = total[:used, :used], total[:used, -1]
         converged = bool(np.all(np.diag(errors) <= floor))
         if converged or iterations == max_iterations:
             break
-        ahead = _improved(predictor, directions[:, :used], information, gradient, errors, u, y, damping)
+        ahead = improved(predictor, directions[:, :used], information, gradient, errors, u, y, damping)
         if offset and not constant and ahead.promise < _NEAR:
-            gain = _step(total[:-1, :-1], total[:-1, -1], 0.0)[1] - ahead.promise
+            gain = damped_step(total[:-1, :-1], total[:-1, -1], 0.0)[1] - ahead.promise
             constant = gain > n_y * math.log(len(y))  # what the Bayesian criterion asks of n_y parameters
             if constant:
                 damping = 0.0
@@ -236,51 +227,6 @@ def _search(
     )
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Ahead:
-    """Where one step leads: a better predictor, or None with the decrease of -2 log likelihood that was promised."""
-
-    predictor: Predictor | None
-    errors: FloatArray
-    promise: float
-    damping: float
-    converged: bool
-
-
-def _improved(
-    predictor: Predictor,
-    directions: FloatArray,
-    information: FloatArray,
-    gradient: FloatArray,
-    errors: FloatArray,
-    u: FloatArray,
-    y: FloatArray,
-    damping: float,
-) -> _Ahead:
-    """Return the outcome of one Levenberg-Marquardt step, the damping raised until the step helps."""
-    while True:
-        step, promise, damping = _step(information, gradient, damping)
-        trial = predictor.moved(step, directions)
-        radius = _radius(trial)
-        if radius > _RADIUS_LIMIT:
-            step = _onto_boundary(predictor, directions, information, step)
-            promise = -float(step @ (2.0 * gradient + information @ step))
-            trial = predictor.moved(step, directions)
-            radius = _radius(trial)
-        if promise < _TOLERANCE:
-            return _Ahead(predictor=None, errors=errors, promise=promise, damping=damping, converged=True)
-        if radius <= _RADIUS_LIMIT:
-            trial_errors = scatter(trial.F, trial.H, trial.x0, u, y)
-            if _log_det(trial_errors) < _log_det(errors):
-                return _Ahead(
-                    predictor=trial, errors=trial_errors, promise=promise, damping=damping / 10.0, converged=False
-                )
-        damping *= 10.0
-        if damping > 1e3:  # no step helps: the promise is below what rounding or the boundary lets through
-            converged = promise < _IMMATERIAL
-            return _Ahead(predictor=None, errors=errors, promise=promise, damping=damping, converged=converged)
-
-
 def _balanced(predictor: Predictor) -> Predictor:
     """Return the predictor in balanced coordinates, in which no direction is badly scaled."""
     n = len(predictor.x0)
@@ -291,79 +237,6 @@ def _balanced(predictor: Predictor) -> Predictor:
     F[:, :n] = F[:, :n] @ inverse
     H[:, :n] = C @ inverse
     return Predictor(F=F, H=H, x0=T @ predictor.x0)
-
-
-def _normal_equations(
-    predictor: Predictor, directions: FloatArray, u: FloatArray, y: FloatArray, errors: FloatArray, phi: FloatArray
-) -> FloatArray:
-    """Return the whitened normal equations; the directions change F by multiples of the orthogonal rows of phi."""
-    n, of_f, P = len(predictor.x0), predictor.F.size, directions.shape[1]
-    change = (phi / np.maximum(np.sum(phi**2, axis=1, keepdims=True), np.finfo(np.float64).tiny)) @ directions[
-        :of_f
-    ].reshape(n, -1, P)
-    inner = np.concatenate([change.reshape(-1, P), directions[of_f:]])
-    covariance = errors / len(y) + np.finfo(np.float64).tiny * np.eye(len(errors))
-    whitening = np.linalg.inv(np.linalg.cholesky(covariance))
-    total: FloatArray = normal_equations(predictor.F, predictor.H, predictor.x0, u, y, phi, inner, whitening)
-    return total
-
-
-def _step(information: FloatArray, gradient: FloatArray, damping: float) -> tuple[FloatArray, float, float]:
-    """Return the damped Gauss-Newton step, the decrease of -2 log likelihood an undamped one promises, the damping.
-
-    A damping below the smallest eigenvalue (unit diagonal) does nothing: it is replaced by that eigenvalue for the
-    next attempt.
-    """
-    scale = np.sqrt(np.maximum(np.diag(information), 1e-12 * np.max(np.diag(information))))
-    values, vectors = np.linalg.eigh(information / np.outer(scale, scale))
-    turned = vectors.T @ (gradient / scale)
-    kept = values > 1e-13 * values[-1]
-    turned = np.where(kept, turned, 0.0)
-    safe = np.where(kept, values, 1.0)
-    least = float(np.min(safe))
-    step = -(vectors @ (turned / (safe + (damping if damping > 0.1 * least else 0.0)))) / scale
-    return step, float(np.sum(turned**2 / safe)), max(damping, 0.1 * least)
-
-
-def _radius(predictor: Predictor) -> float:
-    if not np.all(np.isfinite(predictor.F)):
-        return float("inf")
-    return spectral_radius(predictor.F[:, : len(predictor.x0)])
-
-
-def _radius_gradient(predictor: Predictor, directions: FloatArray) -> FloatArray:
-    """Return the derivative of the predictor's spectral radius along the directions."""
-    n = len(predictor.x0)
-    values, vectors = np.linalg.eig(predictor.F[:, :n])
-    at = int(np.argmax(np.abs(values)))
-    change = directions[: predictor.F.size].reshape(*predictor.F.shape, -1)[:, :n]
-    left = np.linalg.inv(vectors)[at]
-    moved = np.einsum("i,ikp,k->p", left, change, vectors[:, at])
-    return np.asarray(np.real(np.conj(values[at]) / abs(values[at]) * moved), dtype=np.float64)
-
-
-def _onto_boundary(
-    predictor: Predictor, directions: FloatArray, information: FloatArray, step: FloatArray
-) -> FloatArray:
-    """Return the step bent back onto the stability boundary, the nearest way in the metric of the information.
-
-    Zeros of the noise model do lie there: a trend taken out, or an integrating plant with white noise on its sensor.
-    """
-    for _ in range(3):
-        trial = predictor.moved(step, directions)
-        excess = _radius(trial) - (_RADIUS_LIMIT - 1e-7)
-        if not 0.0 < excess < 1.0:
-            break
-        outward = _radius_gradient(trial, directions)
-        across = np.linalg.lstsq(information, outward, rcond=1e-13)[0]
-        step = step - across * excess / max(float(outward @ across), np.finfo(np.float64).tiny)
-    return step
-
-
-def _log_det(errors: FloatArray) -> float:
-    if not np.all(np.isfinite(errors)):
-        return float("inf")
-    return float(np.linalg.slogdet(errors)[1])
 
 
 def _estimate(
@@ -405,7 +278,7 @@ def _estimate(
         initial_state=predictor.x0,
         rows=rows,
         parameters=P,
-        log_det=_log_det(search.scatter / rows),
+        log_det=log_determinant(search.scatter / rows),
         iterations=search.iterations,
         converged=search.converged,
         condition=1.0 if noise_free else float(values[-1] / max(values[0], 1e-300 * values[-1])),

@@ -1,0 +1,144 @@
+"""One damped Gauss-Newton (Levenberg-Marquardt) step of a predictor, kept inside the stability boundary."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from autotune.arrays import FloatArray
+from autotune.identification.closed_loop.predictor_directions import Predictor
+from autotune.identification.closed_loop.predictor_sweep import normal_equations, scatter
+from autotune.identification.closed_loop.state_space import spectral_radius
+
+#: A step that promises less than this in -2 log likelihood moves no parameter by 3 % of its standard deviation.
+_TOLERANCE = 1e-3
+#: A search that cannot move any more has converged if it could have gained less than this.
+_IMMATERIAL = 0.1
+#: Zeros of the noise model nearer to the unit circle than this have no finite memory worth the name.
+_RADIUS_LIMIT = 0.9999
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Ahead:
+    """Where one step leads: a better predictor, or None with the decrease of -2 log likelihood that was promised."""
+
+    predictor: Predictor | None
+    errors: FloatArray
+    promise: float
+    damping: float
+    converged: bool
+
+
+def improved(
+    predictor: Predictor,
+    directions: FloatArray,
+    information: FloatArray,
+    gradient: FloatArray,
+    errors: FloatArray,
+    u: FloatArray,
+    y: FloatArray,
+    damping: float,
+) -> Ahead:
+    """Return the outcome of one Levenberg-Marquardt step, the damping raised until the step helps.
+
+    A search has converged where an undamped step promises less than the tolerance, or where the boundary is in the way
+    and no step gains more.
+    """
+    bounded = False
+    while True:
+        step, promise, damping = damped_step(information, gradient, damping)
+        trial = predictor.moved(step, directions)
+        bent = _radius(trial) > _RADIUS_LIMIT
+        bounded = bounded or bent
+        if bent:
+            step = _onto_boundary(predictor, directions, information, step)
+            promise = -float(step @ (2.0 * gradient + information @ step))
+            trial = predictor.moved(step, directions)
+        if promise < _TOLERANCE and not bent:
+            return Ahead(predictor=None, errors=errors, promise=promise, damping=damping, converged=True)
+        if promise >= _TOLERANCE and _radius(trial) <= _RADIUS_LIMIT:
+            trial_errors = scatter(trial.F, trial.H, trial.x0, u, y)
+            gain = len(y) * (log_determinant(errors) - log_determinant(trial_errors))
+            if gain > _TOLERANCE:
+                return Ahead(
+                    predictor=trial, errors=trial_errors, promise=promise, damping=damping / 10.0, converged=False
+                )
+        damping *= 10.0
+        if damping > 1e3:  # no step helps: rounding, or the best model on the boundary
+            converged = bounded or promise < _IMMATERIAL
+            return Ahead(predictor=None, errors=errors, promise=promise, damping=damping, converged=converged)
+
+
+def whitened_equations(
+    predictor: Predictor, directions: FloatArray, u: FloatArray, y: FloatArray, errors: FloatArray, phi: FloatArray
+) -> FloatArray:
+    """Return the whitened normal equations; the directions change F by multiples of the orthogonal rows of phi."""
+    n, of_f, P = len(predictor.x0), predictor.F.size, directions.shape[1]
+    change = (phi / np.maximum(np.sum(phi**2, axis=1, keepdims=True), np.finfo(np.float64).tiny)) @ directions[
+        :of_f
+    ].reshape(n, -1, P)
+    inner = np.concatenate([change.reshape(-1, P), directions[of_f:]])
+    covariance = errors / len(y) + np.finfo(np.float64).tiny * np.eye(len(errors))
+    whitening = np.linalg.inv(np.linalg.cholesky(covariance))
+    total: FloatArray = normal_equations(predictor.F, predictor.H, predictor.x0, u, y, phi, inner, whitening)
+    return total
+
+
+def damped_step(information: FloatArray, gradient: FloatArray, damping: float) -> tuple[FloatArray, float, float]:
+    """Return the damped Gauss-Newton step, the decrease of -2 log likelihood an undamped one promises, the damping.
+
+    A damping below the smallest eigenvalue (unit diagonal) does nothing: it is replaced by that eigenvalue for the
+    next attempt.
+    """
+    scale = np.sqrt(np.maximum(np.diag(information), 1e-12 * np.max(np.diag(information))))
+    values, vectors = np.linalg.eigh(information / np.outer(scale, scale))
+    turned = vectors.T @ (gradient / scale)
+    kept = values > 1e-13 * values[-1]
+    turned = np.where(kept, turned, 0.0)
+    safe = np.where(kept, values, 1.0)
+    least = float(np.min(safe))
+    step = -(vectors @ (turned / (safe + (damping if damping > 0.1 * least else 0.0)))) / scale
+    return step, float(np.sum(turned**2 / safe)), max(damping, 0.1 * least)
+
+
+def _radius(predictor: Predictor) -> float:
+    if not np.all(np.isfinite(predictor.F)):
+        return float("inf")
+    return spectral_radius(predictor.F[:, : len(predictor.x0)])
+
+
+def _radius_gradient(predictor: Predictor, directions: FloatArray) -> FloatArray:
+    """Return the derivative of the predictor's spectral radius along the directions."""
+    n = len(predictor.x0)
+    values, vectors = np.linalg.eig(predictor.F[:, :n])
+    at = int(np.argmax(np.abs(values)))
+    change = directions[: predictor.F.size].reshape(*predictor.F.shape, -1)[:, :n]
+    left = np.linalg.inv(vectors)[at]
+    moved = np.einsum("i,ikp,k->p", left, change, vectors[:, at])
+    return np.asarray(np.real(np.conj(values[at]) / abs(values[at]) * moved), dtype=np.float64)
+
+
+def _onto_boundary(
+    predictor: Predictor, directions: FloatArray, information: FloatArray, step: FloatArray
+) -> FloatArray:
+    """Return the step bent back onto the stability boundary, the nearest way in the metric of the information.
+
+    Zeros of the noise model do lie there: a trend taken out, or an integrating plant with white noise on its sensor.
+    """
+    for _ in range(3):
+        trial = predictor.moved(step, directions)
+        excess = _radius(trial) - (_RADIUS_LIMIT - 1e-7)
+        if not 0.0 < excess < 1.0:
+            break
+        outward = _radius_gradient(trial, directions)
+        across = np.linalg.lstsq(information, outward, rcond=1e-13)[0]
+        step = step - across * excess / max(float(outward @ across), np.finfo(np.float64).tiny)
+    return step
+
+
+def log_determinant(errors: FloatArray) -> float:
+    """Return the log determinant of a scatter matrix, infinite where it is not finite."""
+    if not np.all(np.isfinite(errors)):
+        return float("inf")
+    return float(np.linalg.slogdet(errors)[1])
