@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from autotune.cli.closed_loop import dither
 from autotune.config import load_config
 from autotune.errors import InputError
 from autotune.experiment.dither import random_dwells, run_dither
@@ -40,6 +41,7 @@ def test_ball_under_its_slow_controller_tells_its_gain_within_its_limits(tmp_pat
     assert np.all((recording.u >= limits.u_min) & (recording.u <= limits.u_max))
     found = identify_closed_loop(recording, controller=done.controller, order=2)
     assert found.law is not None
+    assert found.estimate.converged  # at 10 ms the plant's poles, and the noise model's, crowd at one
     assert found.law.unexplained < 1e-6  # the recorded dither is what the law did not ask for
     near = [point for point in found.points if 1.0 < point.omega_rad_s < 6.0]
     assert near
@@ -62,3 +64,11 @@ def test_amplitude_without_room_is_refused(tmp_path: Path) -> None:
     rig = open_rig(config.rig, u_range=(limits.u_min, limits.u_max), u_safe=limits.u_safe)
     with pytest.raises(InputError, match="amplitude"):
         run_dither(rig, config, tmp_path / "d.csv", duration_s=1.0, amplitude=1e6)
+
+
+def test_recording_whose_sidecar_would_be_the_configuration_is_refused(tmp_path: Path) -> None:
+    config = tmp_path / "rig.toml"
+    config.write_text((CONFIGS / "servo_sim.toml").read_text())
+    with pytest.raises(InputError, match="would overwrite the configuration"):
+        dither(config, tmp_path / "rig.csv")
+    assert config.read_text() == (CONFIGS / "servo_sim.toml").read_text()
