@@ -200,7 +200,7 @@ def _follow(recording: Path, out: Path, settings: _Tracking, quiet_s: float) -> 
     quiet_since = time.monotonic()
     with out.open("w", encoding="utf-8") as table:
         while True:
-            record = read_recording(recording) if quiet_s == 0.0 else _readable(recording)
+            record = _in_operation(read_recording(recording)) if quiet_s == 0.0 else _readable(recording)
             if record is not None and len(record) > rows:
                 rows, quiet_since = len(record), time.monotonic()
                 length = settings.window_s if settings.window_s is not None else 0.2 * record.duration_s
@@ -227,13 +227,21 @@ def _follow(recording: Path, out: Path, settings: _Tracking, quiet_s: float) -> 
     typer.echo(f"wrote {out}")
 
 
+def _in_operation(record: Recording) -> Recording:
+    """Leave out the rows before the first set-point: on the way there the plant may stand on a stop."""
+    import numpy as np
+
+    closed = np.flatnonzero(np.isfinite(record.extra["r"])) if "r" in record.extra else np.array([])
+    return record.between(float(record.t[closed[0]]), np.inf) if closed.size else record
+
+
 def _readable(recording: Path) -> Recording | None:
-    """Return what a growing recording holds, None while it holds less than two rows."""
+    """Return what a growing recording holds of the loop in operation, None while that is less than two rows."""
     from autotune.errors import InputError
     from autotune.recording import read_recording
 
     try:
-        return read_recording(recording)
+        return _in_operation(read_recording(recording))
     except InputError:
         return None
 

@@ -68,6 +68,7 @@ def prepare(
     past_input: PastInput = "unknown",
     start_s: float | None = None,
     offset: bool = True,
+    skip_missing: bool = False,
 ) -> DelayData:
     """Check a recording and bring it into the form the fits use.
 
@@ -83,6 +84,8 @@ def prepare(
         Time stamp from which y is used [s]; rows before serve as the input's past.
     offset : bool
         Whether means are subtracted, for a constant that is estimated and added back.
+    skip_missing : bool
+        Whether rows whose y is NaN are left out, u being known; refused otherwise.
 
     Raises
     ------
@@ -98,6 +101,10 @@ def prepare(
         raise InputError(
             f"no row from t = {start_s:g} s on", where=recording.name, mend=f"it ends at {recording.t[-1]:g} s"
         )
+    if skip_missing:
+        used &= np.isfinite(recording.y)
+        if not used.any():
+            raise IdentificationError("no row has a y", where=recording.name, mend="check the sensor and the link")
     replace(recording, y=np.where(used, recording.y, 0.0)).require_finite(("y",))
     hold = hold if hold is not None else recording.metadata.get("hold", "zero")
     if hold not in ("zero", "linear"):

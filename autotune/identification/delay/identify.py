@@ -56,6 +56,7 @@ def identify_delay(
     integrator: bool = False,
     offset: bool = True,
     coloured: bool = True,
+    skip_missing: bool = False,
     start: DelayModel | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> DelayModel:
@@ -82,6 +83,8 @@ def identify_delay(
         Whether a constant d is estimated: an offset of y or u, or a constant load.
     coloured : bool
         Whether the noise may be autoregressive; white is assumed otherwise.
+    skip_missing : bool
+        Whether rows whose y is NaN, lost samples, are left out; refused otherwise.
     start : DelayModel, optional
         A model to begin with instead of the search, as when a window of a record follows another.
     progress : callable, optional
@@ -114,7 +117,9 @@ def identify_delay(
     if not 1 <= order <= MAX_ORDER:
         raise InputError(f"order {order}", where="order", mend=f"orders 1 to {MAX_ORDER} are supported")
     structure = Structure(order=order, integrator=integrator, offset=offset)
-    data = prepare(recording, hold=hold, past_input=past_input, start_s=start_s, offset=offset)
+    data = prepare(
+        recording, hold=hold, past_input=past_input, start_s=start_s, offset=offset, skip_missing=skip_missing
+    )
     largest = _largest_delay(data, max_delay_s)
     if data.ty.size < 3 * structure.parameters:
         raise _too_short(data, structure)

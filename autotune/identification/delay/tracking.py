@@ -89,7 +89,8 @@ def track(
     Notes
     -----
     Within a window the parameters are taken as constant: a drift over it is averaged, and its interval covers the
-    average. A window that excites too little is reported with the reason, not bridged.
+    average. A window that excites too little is reported with the reason, not bridged; rows without a y, as a link
+    loses them, are left out.
     """
     begin, end = float(recording.t[0]), float(recording.t[-1])
     if not every_s > 0.0 or not 0.0 < window_s <= end - begin:
@@ -112,6 +113,7 @@ def track(
                 hold=hold,
                 start_s=at - window_s,
                 integrator=integrator,
+                skip_missing=True,
                 start=start,
             )
 

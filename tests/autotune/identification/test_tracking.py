@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -87,6 +88,40 @@ def test_an_unexcited_window_is_reported_with_its_reason():
     assert fits[0].model is not None
     assert fits[-1].model is None
     assert "constant" in fits[-1].reason
+
+
+def test_lost_samples_cost_nothing_but_themselves():
+    """One y in ten is lost, u being known: the window is determined as well as a tenth fewer rows allow."""
+    record = loop_in_operation().between(0.0, 80.0)
+    lost = np.random.default_rng(1).random(len(record)) < 0.1
+    holed = replace(record, y=np.where(lost, np.nan, record.y))
+    whole, fitted = (next(track(r, 2, window_s=60.0, every_s=60.0, max_delay_s=5.0)).model for r in (record, holed))
+    assert whole is not None
+    assert fitted is not None
+    assert np.all(np.abs(fitted.values[:4] - whole.values[:4]) < 2.0 * whole.standard_deviations[:4])
+    assert np.allclose(fitted.standard_deviations[:4], whole.standard_deviations[:4] / np.sqrt(0.9), rtol=0.1)
+
+
+def test_the_way_to_the_operating_point_is_not_tracked(tmp_path):
+    """Before the first set-point the plant rests on a stop, whatever u does: that is not the loop."""
+    record = loop_in_operation().between(0.0, 90.0)
+    approach = record.t < 30.0
+    written = replace(
+        record,
+        u=np.where(approach, record.t / 10.0, record.u),
+        y=np.where(approach, 0.0, record.y),
+        extra={"r": np.where(approach, np.nan, 10.0)},
+    )
+    write_recording(written, tmp_path / "loop.csv")
+    watched = CliRunner().invoke(
+        app,
+        ["watch", str(tmp_path / "loop.csv"), "--window", "50", "--max-delay", "3", "--out", str(tmp_path / "w.csv")],
+    )
+    assert watched.exit_code == 0, watched.output
+    header, first = (tmp_path / "w.csv").read_text().splitlines()[:2]
+    found = dict(zip(header.split(","), map(float, first.split(",")), strict=True))
+    assert found["t"] == pytest.approx(80.0, abs=0.1)
+    assert abs(found["dead_time"] - 0.4) < 5.0 * found["dead_time_sd"]
 
 
 def test_a_window_longer_than_the_record_is_refused():
