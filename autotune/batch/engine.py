@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import TypeVar
 
+import dask
 from dask.system import CPU_COUNT
 from distributed import Client, KilledWorker, LocalCluster, Worker, as_completed
 
@@ -50,6 +51,7 @@ def cluster(workers: int | None = None, scheduler: str | None = None) -> Iterato
     """
     if scheduler is None:
         with (
+            dask.config.set({"distributed.worker.profile.enabled": False}),  # its samples would fill the memory
             LocalCluster(
                 n_workers=workers or CPU_COUNT,
                 threads_per_worker=1,

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import math
+import shutil
+from pathlib import Path
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -18,6 +20,8 @@ from autotune.cli import app
 from autotune.errors import InputError
 from autotune.points import read_points
 from tests.autotune.batch.plant_files import DEAD_TIME_S, GAIN, TAU_S, plant_file, signals, write
+
+EXAMPLES = Path(__file__).resolve().parents[3] / "configs" / "campaigns"
 
 
 def plant_folder(folder, task):
@@ -157,6 +161,39 @@ def test_tags_of_a_wide_export_give_what_the_recording_itself_gives(tmp_path):
     assert pq.read_schema(prepared).names == ["time", "A.OP", "A.PV", "B.PV"]
 
 
+def test_the_example_reads_a_historian_with_german_numbers_quality_flags_and_a_file_per_day(tmp_path):
+    for name in ("boiler_house.toml", "boiler_house.csv"):
+        shutil.copy(EXAMPLES / name, tmp_path)
+    _, loops = read_campaign(tmp_path / "boiler_house.toml")
+    tags: dict[str, list[str]] = {}
+    t, _, _ = signals(0)
+    for seed, loop in enumerate(loops):
+        _, u, y = signals(seed)
+        for tag, values in ((loop.u, u), (loop.y, y)):
+            tags[tag] = [f"{value:.6f}".replace(".", ",") for value in values]
+            tags[f"{tag}.Q"] = ["Good"] * t.size
+    tags["TIC101.PV.Q"][300:310] = ["Bad"] * 10
+    tags["TIC102.PV"][500:502] = ["I/O Timeout"] * 2
+    tags["FIC120.PV.Q"] = ["Bad"] * t.size
+    stamps = [f"14.10.2024 00:{int(s // 60):02d}:{int(s % 60):02d},{round(s % 1 * 1000):03d}" for s in t + 1e-9]
+    lines = [";".join(cells) for cells in zip(stamps, *tags.values(), strict=True)]
+    (tmp_path / "historian").mkdir()
+    for day, part in (("14", lines[:1200]), ("15", lines[1200:])):
+        text = "\n".join([";".join(["Time", *tags]), *part])
+        (tmp_path / "historian" / f"2024-10-{day}.csv").write_text(text + "\n")
+    path = tmp_path / "boiler_house.toml"
+    path.write_text(path.read_text().replace('"design" ', '"identify" '))
+    rows, _ = analysed(path, tmp_path / "out")
+    found = {row.loop: row for row in rows}
+    assert [row.loop for row in rows if row.attention == "failed"] == ["FIC-120 fuel"]
+    assert "no stretch of 60 good rows" in found["FIC-120 fuel"].reason
+    assert (found["TIC-101 steam"].rows, found["TIC-101 steam"].bad_rows) == (2000, 10)
+    assert "10 rows are flagged as bad" in found["TIC-101 steam"].notes
+    assert found["TIC-102 feed water"].bad_rows == 2
+    assert found["PIC-110 drum"].rows == 1600
+    assert len(list((tmp_path / "out" / "tables").iterdir())) == 2
+
+
 def test_a_closed_loop_whose_set_point_rests_gives_no_points(tmp_path):
     t, u, y = signals(0)
     path = write(tmp_path / "a.csv", {"t": t, "u": u, "y": y, "r": np.full(t.size, 20.0)})
@@ -195,17 +232,18 @@ def test_a_defect_in_the_tool_is_a_row_that_says_where(tmp_path, monkeypatch):
     assert "ZeroDivisionError: by nothing (test_campaign.py line" in row.reason
 
 
-def test_a_diagnosis_says_which_loop_is_not_as_its_model_says(tmp_path):
-    plant_file(tmp_path / "a.csv", 0, rows=600)
-    (tmp_path / "m.toml").write_text(
+def test_a_diagnosis_says_which_bench_is_not_as_its_model_says(tmp_path):
+    shutil.copy(EXAMPLES / "recordings.toml", tmp_path)
+    (tmp_path / "recordings").mkdir()
+    plant_file(tmp_path / "recordings" / "as believed.csv", 0, rows=600)
+    plant_file(tmp_path / "recordings" / "twice.csv", 0, rows=600, gain=2.0 * GAIN)
+    (tmp_path / "bench.toml").write_text(
         'name = "plant"\n[input]\noffset = 50.0\n[output]\noffset = 20.0\n[[block]]\nname = "lag"\nplace = "plant"\n'
-        f"num = [{0.5 * GAIN}]\nden = [{TAU_S}, 1.0]\ndelay = {DEAD_TIME_S}\n"
+        f"num = [{GAIN}]\nden = [{TAU_S}, 1.0]\ndelay = {DEAD_TIME_S}\n"
     )
-    (tmp_path / "c.toml").write_text(
-        'name = "a"\ntask = "diagnose"\n[[loop]]\nname = "a"\nfile = "a.csv"\nmodel = "m.toml"\n'
-    )
-    ((row,), _) = analysed(tmp_path / "c.toml", tmp_path / "out")
-    assert (row.attention, row.verdict) == ("look", "parameters")
-    assert row.retuned < 0.1 * row.nominal
-    diagnosis = json.loads((tmp_path / "out" / "loops" / "a.json").read_text())["result"]
+    (twice, believed), _ = analysed(tmp_path / "recordings.toml", tmp_path / "out")
+    assert (twice.loop, twice.attention, twice.verdict) == ("twice", "look", "parameters")
+    assert twice.retuned < 0.1 * twice.nominal
+    assert (believed.attention, believed.verdict) == ("fine", "none")
+    diagnosis = json.loads((tmp_path / "out" / "loops" / "twice.json").read_text())["result"]
     assert diagnosis["verdict"] == "parameters"
