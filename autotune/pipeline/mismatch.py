@@ -77,7 +77,8 @@ def around_operating_point(recording: Recording) -> Recording | None:
     recording = replace(recording, extra=MappingProxyType({}))
     cycles = recording.metadata.get("relay", [])
     if cycles:
-        return recording.between(cycles[0]["start_s"], cycles[-1]["end_s"])
+        half = 0.5 * recording.sample_time_s  # the file rounds the stamps
+        return recording.between(cycles[0]["start_s"] - half, cycles[-1]["end_s"] - half)
     if "test_start_s" in recording.metadata:
         # the last row's command is the safe one
         return recording.between(recording.metadata["test_start_s"], float(recording.t[-1]))

@@ -1,20 +1,29 @@
 from __future__ import annotations
 
+import json
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from autotune.config import load_config
+from autotune.config import Config, load_config
 from autotune.config.procedure import DesignSettings
 from autotune.controller import PIDController
-from autotune.errors import IdentificationError, LinkError
+from autotune.errors import DesignError, IdentificationError, InputError, LinkError
 from autotune.experiment.rig import Reading
+from autotune.experiment.verify import Verification, run_verification
+from autotune.identification.parametric import fit_plant
 from autotune.models import TransferFunction
-from autotune.pipeline import analyse, hand_over, tune
+from autotune.pipeline import Tuning, analyse, hand_over, tune
+from autotune.pipeline.deployment import deploy
+from autotune.pipeline.folder import differences, next_free, read_interrupted, store_config, stored_config
+from autotune.pipeline.mismatch import around_operating_point, diagnose_run, resting_command
+from autotune.pipeline.result import append_diagnosis
 from autotune.points import FrequencyPoint
+from autotune.recording import read_recording
 from drivers.simulated import SimulatedRig
 from sim.plant import make_plant
 
@@ -35,13 +44,17 @@ def points_of(plant: TransferFunction, omega: np.ndarray, relative_sd: float) ->
     ]  # fmt: skip
 
 
-class Changing(SimulatedRig):
+class Mute(SimulatedRig):
+    """A rig that does not say what it applies."""
+
+    def read(self) -> Reading:
+        return replace(super().read(), u_applied=math.nan)
+
+
+class Changing(Mute):
     """The ball rig whose actuator becomes stronger after the sweep, as when somebody opens a valve."""
 
     stronger = 1.0
-
-    def read(self) -> Reading:
-        return replace(super().read(), u_applied=math.nan)  # this rig does not say what it applies
 
     def live(self, dt_s: float) -> None:
         self.plant.advance(4.9 + self.stronger * (self.command - 4.9), dt_s)
@@ -97,3 +110,118 @@ def test_gains_that_cannot_be_written_are_taken_back(tmp_path: Path) -> None:
     assert [line.split('"')[3] for line in journal.read_text().splitlines()] == [
         "read", "writing", "restoring", "restored",
     ]  # fmt: skip
+
+
+def test_gains_on_trial_are_taken_back_where_the_plant_is_not_the_measured_one(tmp_path: Path) -> None:
+    config = load_config(CONFIGS / "ball_sim.toml")
+    rig = Changing(make_plant("ball", seed=4, noise=0.1), u_safe=0.0, controller=OLD)
+    rig.stronger = 1.4
+    fit = fit_plant(points_of(BALL, np.array([0.9, 1.5, 2.4, 3.5, 5.0]), 0.004))
+
+    def try_out(held: PIDController) -> Verification:
+        assert rig.read_gains() == held
+        return run_verification(rig, config, held, fit, tmp_path / "verification.csv")
+
+    new = PIDController(K=-0.0247, Ti_s=3.6)
+    done = deploy(rig, new, tmp_path / "journal.jsonl", agree=lambda old, to_be: None, try_out=try_out)
+    assert not done.kept
+    assert rig.read_gains() == OLD
+    assert rig.command == 0.0
+
+
+def test_gains_that_the_measured_plant_calls_unstable_never_reach_the_rig(tmp_path: Path) -> None:
+    config = load_config(CONFIGS / "ball_sim.toml")
+    rig = SimulatedRig(make_plant("ball", seed=4, noise=0.1), u_safe=0.0, controller=OLD)
+    fit = fit_plant(points_of(BALL, np.array([0.9, 1.5, 2.4, 3.5, 5.0]), 0.004))
+    with pytest.raises(DesignError, match="no stable loop"):
+        run_verification(rig, config, PIDController(K=0.02, Ti_s=3.0), fit, tmp_path / "verification.csv")
+    assert rig.clock.now() == 0.0
+    assert list(tmp_path.iterdir()) == []
+
+
+class Loaded(Mute):
+    """The ball rig with something that leans on its actuator 32 s after the sweep, in the midst of the verification."""
+
+    swept_s = math.inf
+
+    def live(self, dt_s: float) -> None:
+        late = self.clock.now() - self.swept_s > 32.0
+        self.plant.advance(self.command - (0.03 if late else 0.0), dt_s)
+
+    def close(self) -> None:
+        super().close()
+        self.swept_s = min(self.swept_s, self.clock.now())
+
+
+def sections(config: Config, **changes: dict[str, Any]) -> Config:
+    return config.model_copy(
+        update={name: getattr(config, name).model_copy(update=keys) for name, keys in changes.items()}
+    )
+
+
+@pytest.fixture(scope="module")
+def loaded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Config, Tuning, Path]:
+    folder = tmp_path_factory.mktemp("loaded")
+    config = sections(
+        load_config(CONFIGS / "ball_sim.toml"),
+        signals={"sample_time_s": 0.03}, experiment={"points": 3, "budget_s": 30.0},
+    )  # fmt: skip
+    rig = Loaded(make_plant("ball", seed=4, noise=0.1), u_safe=0.0, controller=OLD)
+    return config, tune(rig, config, folder), folder
+
+
+def test_the_fitted_plant_explains_the_sweep_around_its_operating_point(loaded: tuple[Config, Tuning, Path]) -> None:
+    config, tuning, folder = loaded
+    sweep = around_operating_point(read_recording(folder / "recording.csv"))
+    assert sweep is not None
+    assert sweep.t[0] == pytest.approx(tuning.experiment.segments[0].start_s)
+    assert np.abs(sweep.y - 5.0).max() < 3.0  # the floor, at 10 V, is not in it
+    u_rest = resting_command(sweep, tuning.analysis.fit.plant, tuning.experiment.u_rest, config.operating_point.y)
+    truth = make_plant("ball", seed=4, noise=0.1).u_rest
+    assert u_rest == pytest.approx(truth, abs=5e-4)
+
+
+def test_a_load_in_the_midst_of_the_verification_is_found_in_the_runs_own_recordings(
+    loaded: tuple[Config, Tuning, Path],
+) -> None:
+    config, tuning, folder = loaded
+    assert tuning.verification is not None
+    assert not tuning.verification.accepted
+    files = [folder / "recording.csv", folder / "verification.csv"]
+    found = diagnose_run(config, tuning.experiment, tuning.analysis.fit, files, lambda what, share: None)
+    append_diagnosis(folder / "result.json", found)
+    assert found.verdict == "effect"
+    assert found.effects[0].name == "environment.step_load"
+    recording, start_s, _ = found.effects[0].windows[0]
+    assert recording == 1
+    assert start_s == pytest.approx(32.0, abs=0.5)
+    assert found.effects[0].parameters["amplitude"].value == pytest.approx(-0.03, rel=0.1)
+    told = json.loads((folder / "result.json").read_text())["diagnosis"]
+    assert (told["verdict"], told["effects"][0]["name"]) == ("effect", "environment.step_load")
+    assert told["next_experiment"]
+
+
+def test_the_stored_configuration_is_the_one_that_was_given(tmp_path: Path) -> None:
+    for path in sorted(CONFIGS.glob("ball_*.toml")):
+        config = load_config(path)
+        store_config(config, tmp_path)
+        assert stored_config(tmp_path) == config
+
+
+def test_a_run_is_not_gone_on_with_under_other_limits_and_the_refusal_names_them(tmp_path: Path) -> None:
+    config = load_config(CONFIGS / "ball_sim.toml")
+    store_config(config, tmp_path)
+    other = sections(config, limits={"swing": 2.5}, experiment={"points": 7}, design={"noise_gain": 0.2})
+    assert differences(config, other) == ("limits.swing = 2.5, was 3.0", "experiment.points = 7, was 5")
+    with pytest.raises(InputError, match=r"limits\.swing = 2\.5, was 3\.0; experiment\.points = 7, was 5"):
+        read_interrupted(tmp_path, other)
+    assert read_interrupted(tmp_path, sections(config, design={"noise_gain": 0.2})).segments == ()
+
+
+def test_no_recording_is_ever_overwritten(tmp_path: Path) -> None:
+    names = []
+    for _ in range(3):
+        path = next_free(tmp_path / "recording.csv")
+        path.touch()
+        names.append(path.name)
+    assert names == ["recording.csv", "recording-2.csv", "recording-3.csv"]
