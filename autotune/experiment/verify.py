@@ -208,7 +208,8 @@ def run_test(
             on_progress(Progress(state=State.VERIFY, elapsed_s=loop.tick.t_s, remaining_s=left_s, message=message))
 
     if isinstance(loop.rig, RunsLaws):
-        loop.step(loop.nearest(u_hold))
+        while loop.tick.u != (u_next := loop.nearest(u_hold)):
+            loop.step(u_next)
         y, u = try_on_device(loop, loop.rig, law.controller, setpoint, load, tell)
         return (y - operating_y)[test.settle :], u[test.settle :]
     y, u = np.full(count, np.nan), np.empty(count)

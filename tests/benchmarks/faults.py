@@ -2,7 +2,8 @@
 
 A line of the table counts sessions. *safe* is the longest device time from the last command that was taken to the safe
 output, against the dead-man time; *commands* are outputs outside the limits, *samples* recorded values that nobody
-measured or that were measured longer ago than an answer may take, *ends* those with the wrong exit status or cause.
+measured or that were measured longer ago than an answer may take, *ends* those with the wrong exit status or cause. A
+session that a busy computer ends before the fault is begun again.
 ``FAULT_MOMENTS=50`` strikes at fifty moments each (about an hour); four by default. ``FAULTS=serial`` runs those whose
 name has the pattern in it.
 """

@@ -192,7 +192,7 @@ def firmware_bench(elf: Path, **changes: Any) -> Iterator[Bench]:
     uno = Uno(elf, elf.parent, live)
     with SerialLine() as line, UnoOnLine(uno, line.rig_device) as served:
         # the Uno lives in this process: where the computer is busy its host is late, and that is not what is tested
-        rig = rig_of(serial_settings(line.host_device, **({"deadman_s": 5.0} | changes)))
+        rig = rig_of(serial_settings(line.host_device, **({"deadman_s": 5.0, "timeout_s": 1.0} | changes)))
         yield Bench(rig=rig, output=lambda: low + span * uno.duty / U_FULL, cut=line.cut, restart=served.restart)
         rig.close()
 

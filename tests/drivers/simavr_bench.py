@@ -117,7 +117,7 @@ class UnoPort:
         What is at the other end.
     """
 
-    STEP_S = 1e-4
+    STEP_S = 2.5e-4
 
     def __init__(self, uno: Uno) -> None:
         self.timeout: float | None = 0.1

@@ -28,8 +28,9 @@ from tests.drivers.bench import (
 FIRMWARE = pytest.param(
     "firmware", marks=pytest.mark.system("gcc", "gcc-avr", "avr-libc", "libsimavr-dev", "libelf-dev")
 )
-ALL = ("simulated", "replay", "tcp", "rtu", "tls", "serial", FIRMWARE)
-MOVING = ("simulated", "tcp", "rtu", "tls", "serial", FIRMWARE)
+ON_DEVICE = pytest.param("firmware, laws on the device", marks=FIRMWARE.marks)
+ALL = ("simulated", "replay", "tcp", "rtu", "tls", "serial", FIRMWARE, ON_DEVICE)
+MOVING = ("simulated", "tcp", "rtu", "tls", "serial", FIRMWARE, ON_DEVICE)
 REAL = ("tcp", "rtu", "tls", "serial")
 
 
@@ -48,6 +49,8 @@ def bench(request: pytest.FixtureRequest) -> Iterator[Bench]:
             context = serial_bench()
         case "firmware":
             context = firmware_bench(request.getfixturevalue("uno_elf"))
+        case "firmware, laws on the device":
+            context = firmware_bench(request.getfixturevalue("uno_elf"), relay="device")
         case _:
             certificates: Path = request.getfixturevalue("certificates")
             context = tls_bench(certificates)
