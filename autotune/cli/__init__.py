@@ -35,6 +35,7 @@ from autotune.cli import (  # noqa: E402, F401, I001
     closed_loop,
     design,
     diagnose,
+    investigate,
     batch,
     prove,
     rig,

@@ -1,0 +1,85 @@
+"""``autotune investigate``: experiments on a rig until what its simulation leaves out is told apart."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from autotune.cli import app
+
+if TYPE_CHECKING:
+    from autotune.controller import Controller
+    from autotune.diagnosis.investigate import Investigation
+
+ROUNDS = "rounds.json"
+
+
+@app.command()
+def investigate(
+    config: Annotated[Path, typer.Argument(metavar="CONFIG.toml", help="configuration of the rig")],
+    model: Annotated[Path, typer.Option(help="nominal model", metavar="M.toml")],
+    out: Annotated[
+        Path, typer.Option(help="new folder for recordings, rounds.json and the diagnosis's files", metavar="DIR")
+    ],
+    recordings: Annotated[
+        list[Path] | None, typer.Argument(metavar="[REC.csv ...]", help="what has been recorded already")
+    ] = None,
+    rounds: Annotated[int, typer.Option(min=1, max=20, help="most experiments")] = 3,
+    duration: Annotated[
+        float | None, typer.Option(min=1.0, help="time under excitation per round [s]; default experiment.budget_s")
+    ] = None,
+    rig_time: Annotated[
+        float | None, typer.Option(min=1.0, help="time under excitation in all [s]; default all rounds")
+    ] = None,
+    without: Annotated[
+        list[str] | None, typer.Option(help="leave an effect out of the catalogue; may be given several times")
+    ] = None,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="run the rig's simulated twin instead of the rig")] = False,
+) -> None:
+    """Run the experiments that tell apart what a model may leave out, until one hypothesis is left."""
+    from autotune.cli.common import ProgressBar, new_folder, rig_of
+    from autotune.config import load_config
+    from autotune.controller import PIDController
+    from autotune.diagnosis.investigate import investigate as find_out
+    from autotune.models import read_model
+    from autotune.recording import read_recording
+
+    content = load_config(config)
+    nominal = read_model(model)
+    given = [read_recording(path) for path in recordings or []]
+    rig = rig_of(content, dry_run)
+    new_folder(out, ROUNDS)
+    stated = content.controller
+    law = PIDController(K=stated.K, Ti_s=stated.Ti_s) if stated else None
+    with ProgressBar() as bar:
+        known = find_out(
+            rig, content, nominal, given, out, rounds=rounds, duration_s=duration, rig_time_s=rig_time,
+            without=without or (), report=bar.work, on_progress=bar.show, keep=lambda known: _keep(known, out, law),
+        )  # fmt: skip
+    for one in known.rounds:
+        kind, on = one.plan.excitation.kind, one.plan.excitation.on
+        best = ", ".join(f"{name} {p:.2f}" for name, p in one.candidates[:2])
+        typer.echo(f"round {one.number}, {kind} on the {on}: {one.verdict}; {best}")
+    for sentence in known.diagnosis.sentences if known.diagnosis else ():
+        typer.echo(sentence)
+    typer.echo(f"ended: {known.ended}")
+    typer.echo(f"rounds.json, diagnosis.json, extended_model.toml and report.html are in {out}")
+
+
+def _keep(known: Investigation, out: Path, law: Controller | None) -> None:
+    """Write what is known so far; a later stop leaves it there."""
+    from autotune.diagnosis.simulation import entry_of
+    from autotune.models import write_model
+    from autotune.report.investigation_page import write_investigation_page
+
+    (out / ROUNDS).write_text(json.dumps(known.as_json(), indent=2) + "\n", encoding="utf-8")
+    found = known.diagnosis
+    if found is None:
+        return
+    found.write(out / "diagnosis.json")
+    equations = {effect.name: entry_of(effect.name).equation for effect in found.extended_model.effects}
+    write_model(found.extended_model, out / "extended_model.toml", equations)
+    write_investigation_page(known, found, out / "report.html", law)

@@ -1,0 +1,50 @@
+"""The page of an investigation: how the hypotheses fell, round by round, before the diagnosis that is left."""
+
+from __future__ import annotations
+
+import os
+
+from autotune.controller import Controller
+from autotune.diagnosis.investigate import Investigation
+from autotune.diagnosis.result import Diagnosis
+from autotune.report.diagnosis_page import write_diagnosis_page
+from autotune.report.page import Section, Table
+
+
+def write_investigation_page(
+    known: Investigation, found: Diagnosis, path: str | os.PathLike[str], controller: Controller | None = None
+) -> None:
+    """Write the page of an investigation.
+
+    Parameters
+    ----------
+    known : Investigation
+        Rounds, and why it ended.
+    found : Diagnosis
+        Over all its recordings.
+    path : path
+        File to write.
+    controller : Controller, optional
+        The stated law.
+    """
+    write_diagnosis_page(found, path, controller, (_rounds(known),))
+
+
+def _rounds(known: Investigation) -> Section:
+    rows = [("0", "given recordings", "-", "-", _named(known.before))] if known.before else []
+    for one in known.rounds:
+        excitation = one.plan.excitation
+        asked = " against ".join(one.plan.between) or "what there is at all"
+        done = f"{excitation.kind} on the {excitation.on}, {excitation.amplitude:.3g}, {excitation.duration_s:.4g} s"
+        expected = f"{one.plan.discrimination:.0f}" if one.plan.between else "-"
+        rows.append((str(one.number), done, asked, expected, _named(one.candidates)))
+    table = Table(
+        header=("round", "experiment", "to tell", "expected misfit", "believed after it"), rows=tuple(rows),
+        caption="Expected misfit: of one hypothesis where another is true, in noise variances, mean over the pairs.",
+    )  # fmt: skip
+    text = f"Ended: {known.ended}." if known.ended else "It goes on."
+    return Section(title="How it was learnt", text=(text,), tables=(table,) if rows else ())
+
+
+def _named(candidates: tuple[tuple[str, float], ...], most: int = 3) -> str:
+    return ", ".join(f"{name} {p:.2f}" for name, p in candidates[:most])
