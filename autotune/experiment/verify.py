@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,7 @@ from autotune.experiment.limits import Watch
 from autotune.experiment.loop import ControlLoop
 from autotune.experiment.prediction import Prediction, predict
 from autotune.experiment.result import Progress, State
-from autotune.experiment.rig import Rig, RunsLaws
+from autotune.experiment.rig import Exchanges, Rig, RunsLaws
 from autotune.experiment.run import OnProgress, envelope_of, float_on, recording_metadata, wait_for_rest
 from autotune.identification.parametric import PlantFit
 from autotune.recording import RecordingWriter
@@ -281,6 +281,8 @@ def run_verification(
     """
     law = law_for(controller, config.limits, config.signals.sample_time_s)
     crossover_rad_s = expected_margins(fit, controller).crossover_rad_s
+    if isinstance(rig, Exchanges) and not isinstance(rig, RunsLaws):
+        fit = _delayed(fit, config.signals.sample_time_s)  # its commands act one sample after what they come from
     test = plan_test(config.verification, config.limits, law, fit, crossover_rad_s)
     law = law_for(controller, config.limits, config.signals.sample_time_s, float(test.disturbance[-1]))
     writer = RecordingWriter(recording, ("t", "u", "y", "r"), recording_metadata(config))
@@ -292,6 +294,13 @@ def run_verification(
         loop.note(test_start_s=loop.tick.t_s)
         y, u = run_test(loop, law, test, config.operating_point.y, known.midpoint, on_progress)
     return judge(test, y, u, law, fit, known.noise_sd if noise_sd is None else noise_sd)
+
+
+def _delayed(fit: PlantFit, delay_s: float) -> PlantFit:
+    parameters = fit.parameters.copy()
+    parameters[-1] += delay_s
+    plant = replace(fit.plant, delay_s=fit.plant.delay_s + delay_s)
+    return replace(fit, plant=plant, parameters=parameters)
 
 
 def judge(
