@@ -317,7 +317,10 @@ def _plant() -> tuple[Entry, ...]:
             equation="times omega^2 / (s^2 + 2 damping omega s + omega^2)",
             parameters=(Quantity(name="frequency", unit="Hz"), Quantity(name="damping", unit="")),
             starts=lambda s: [
-                (c / (6.28 * s.lag_s), 0.1) for c in (1.5, 4.0, 10.0, 25.0) if c * s.dt_s < 1.5 * s.lag_s
+                # a narrow peak is found from near it alone
+                (c / (6.28 * s.lag_s), 0.08)
+                for c in (1.3 * 1.3**i for i in range(12))
+                if c * s.dt_s < 1.5 * s.lag_s
             ],
             confusable=("sensor.lag", "timing.dead_time"),
             places=("plant", "sensor"),

@@ -50,6 +50,8 @@ class Data:
         share = max(1.0, self.rows / rows)
         if share < 1.5:
             return self
+        if all(len(a) <= LEAST_WINDOWS_KEPT for a in self.starts):
+            return self
         starts, stops, good = [], [], []
         for r, a, b, ok in zip(self.recordings, self.starts, self.stops, self.good, strict=True):
             count = min(len(a), max(LEAST_WINDOWS_KEPT, round(len(a) / share)))

@@ -134,9 +134,12 @@ class Problem:
 
 
 def eliminate(
-    problem: Problem, derivatives: Derivatives, e: FloatArray
+    problem: Problem, derivatives: Derivatives, e: FloatArray, damping: float = 0.0
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Project residual and Jacobian on what the start states cannot explain.
+
+    Damped, the start states explain less, and move less: a window that begins where dry friction holds the plant
+    tells nothing true of how far its state may go.
 
     Returns
     -------
@@ -153,7 +156,7 @@ def eliminate(
     products = np.add.reduceat(X[:, :, None] * both[:, None, :], offsets, axis=0)
     G = products[:, :, :n]
     # a little of the prior that start states are of the signals' size keeps unfelt ones in place
-    G = G + (1e-2 + 1e-10 * np.trace(G, axis1=1, axis2=2))[:, None, None] * np.eye(n)
+    G = G + damping * G * np.eye(n) + (1e-2 + 1e-10 * np.trace(G, axis1=1, axis2=2))[:, None, None] * np.eye(n)
     try:
         gains = np.linalg.solve(G, products[:, :, n:])
     except np.linalg.LinAlgError as failure:
@@ -176,10 +179,12 @@ def descend(
         cost = problem.cost(spot.e, spot.theta, prior)
         if derivatives is None:
             derivatives, fresh = problem.jacobian(spot, may), True
-        e_left, J_left, gain_e, gain_J = eliminate(problem, derivatives, spot.e)
+        e_left, J_left, gain_e, gain_J = eliminate(problem, derivatives, spot.e, damping)
         if not (np.all(np.isfinite(J_left)) and np.all(np.isfinite(e_left))):
             return spot, None  # a derivative ran out of the model's range: the last good point stands
-        step, promised = _step(problem, spot, e_left, J_left, prior, damping, may)
+        step = _step(problem, spot, derivatives[0], e_left, J_left, prior, damping, may)
+        left = e_left + J_left @ step
+        promised = cost - problem.cost(left, spot.theta + step, prior)
         moves = problem.per_recording(problem.scales * (gain_e + gain_J @ step))
         trial = [x - move for x, move in zip(spot.x0, moves, strict=True)]
         new = attempted(problem, spot.theta + step, trial)
@@ -204,20 +209,20 @@ def descend(
 def _step(
     problem: Problem,
     spot: Spot,
+    J: FloatArray,
     e_left: FloatArray,
     J_left: FloatArray,
     prior: FloatArray,
     damping: float,
     may: BoolArray,
-) -> tuple[FloatArray, float]:
-    """Return the step in theta and the decrease of the cost that it promises."""
-    H = J_left.T @ J_left + np.diag(prior**2)
-    g = J_left.T @ e_left + prior**2 * (spot.theta - problem.parametrisation.centre)
+) -> FloatArray:
+    """Return the step in theta."""
+    H = J.T @ J_left + np.diag(prior**2)
+    g = J.T @ e_left + prior**2 * (spot.theta - problem.parametrisation.centre)
     step = np.linalg.lstsq(H + damping * np.diag(np.maximum(np.diag(H), 1e-12)), -g, rcond=1e-15)[0]
     step[~may] = 0.0
     step /= max(1.0, float(np.max(np.abs(step) / problem.reach, initial=0.0)))
-    promised = -2.0 * float(g @ step) - float(step @ H @ step) + float(spot.e @ spot.e - e_left @ e_left)
-    return np.asarray(step), promised
+    return np.asarray(step)
 
 
 def continued(problem: Problem, spot: Spot) -> Spot:

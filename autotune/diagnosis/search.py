@@ -122,39 +122,53 @@ def carried_states(base: Fit, effect: Effect, model: Model, data: Data) -> tuple
     return base.x0
 
 
-def promise(base: Fit, effect: Effect, data: Data) -> Promise:
-    """Return what the first order promises when an effect is added to a fit.
+def promises(base: Fit, effect: Effect, data: Data) -> list[Promise]:
+    """Return what the first order promises when an effect is added to a fit: near zero, and at the size given.
 
-    An effect that moves the reading by more than a share of the misfit is shrunk first: what far too large an effect
-    does tells nothing of its direction near zero. The direction d = e(with effect) - e(without) is freed of what the
-    numbers already free could explain; the decrease of |e + a d|^2 over 0 <= a <= 4 is promised, over -20 <= a <= 20
-    for an effect of either sign.
+    An effect that moves the reading by more than a share of the misfit is shrunk: what far too large an effect does
+    tells nothing of its direction near zero. Dry friction that is as large as that is found from its own size alone.
     """
+    tried = []
     for _ in range(SHRINKINGS):
-        p, theta, states = extended(base, effect, data)
-        try:
-            e = residual_at(p, data, theta, states)
-        except (AutotuneError, OverflowError):
-            return Promise(effect=effect, decrease=0.0, scaled=effect)
-        # a simulation that runs away is finite for a while
-        size = float(np.max(np.abs(e), initial=0.0))
-        moved = base.unexplained(e - base.e) if size < 1e15 else np.full(1, 1e15)
-        share = float(moved @ moved) / base.chi2
+        found, share = _promise(base, effect, data)
+        tried.append(found)
         if share <= LINEAR_SHARE or not _amplitudes(effect):
             break
         effect = _scaled(effect, float(np.sqrt(0.3 * LINEAR_SHARE / share)), least=1e-9)
-    if not size < 1e15 or share == 0.0:
-        return Promise(effect=effect, decrease=0.0, scaled=effect)
-    d = moved
+    return [tried[-1], *tried[:1]] if len(tried) > 1 else tried
+
+
+def promise(base: Fit, effect: Effect, data: Data) -> Promise:
+    """Return what the first order promises when an effect is added to a fit, near zero where it is too large."""
+    return promises(base, effect, data)[0]
+
+
+def _promise(base: Fit, effect: Effect, data: Data) -> tuple[Promise, float]:
+    """Return what is promised, and how far the effect moves the reading as a share of chi2.
+
+    The direction d = e(with effect) - e(without) is freed of what the numbers already free could explain; the decrease
+    of |e + a d|^2 over 0 <= a <= 4 is promised, over -20 <= a <= 20 for an effect of either sign.
+    """
+    nothing = Promise(effect=effect, decrease=0.0, scaled=effect)
+    p, theta, states = extended(base, effect, data)
+    try:
+        e = residual_at(p, data, theta, states)
+    except (AutotuneError, OverflowError):
+        return nothing, RAN_AWAY
+    # a simulation that runs away is finite for a while
+    if not np.max(np.abs(e), initial=0.0) < 1e15:
+        return nothing, RAN_AWAY
+    d = base.unexplained(e - base.e)
     slope, curvature = -float(d @ base.e), float(d @ d)
+    if curvature == 0.0:
+        return nothing, 0.0
     signed = any(f.kind == "effect" and not f.positive for f in p.free[base.theta.size :])
     low, high = (-20.0, 20.0) if signed else (0.0, 4.0)
     if not _amplitudes(effect):
         low, high = 0.0, 1.0  # a limit or a step is not made larger by a factor
     a = float(np.clip(slope / curvature, low, high))
-    return Promise(
-        effect=effect, decrease=2.0 * a * slope - a * a * curvature, scaled=_scaled(effect, a, 20.0 if signed else 2.0)
-    )
+    scaled = _scaled(effect, a, 20.0 if signed else 2.0)
+    return Promise(effect=effect, decrease=2.0 * a * slope - a * a * curvature, scaled=scaled), curvature / base.chi2
 
 
 #: Decrease that an effect's direction may have, as a share of chi2, before it is taken for too large to be linear.
@@ -165,8 +179,8 @@ FIRST_STEPS = 3
 FINISHED, MOST_EACH = 4, 2
 #: Share of the best fit's decrease from which on any other is finished too.
 NEAR = 0.8
-#: Most simulations of one effect while it is shrunk.
-SHRINKINGS = 4
+#: Most simulations of one effect while it is shrunk, and the share of chi2 that a simulation counts that ran away.
+SHRINKINGS, RAN_AWAY = 4, 1e6
 
 #: Parameters that an effect is about proportional to: the first order tells their size.
 AMPLITUDES = frozenset(
@@ -225,8 +239,8 @@ def best_promises(
     ]
     effects += [e for e in extra if e.name not in present]
     found: dict[str, list[Promise]] = {}
-    for result in pool.map(lambda effect: promise(base, effect, data), effects):
-        found.setdefault(result.effect.name, []).append(result)
+    for group in pool.map(lambda effect: promises(base, effect, data), effects):
+        found.setdefault(group[0].effect.name, []).extend(group)
     return {name: sorted(group, key=lambda g: -g.decrease) for name, group in found.items()}
 
 
@@ -235,6 +249,8 @@ def _begun(base: Fit, effect: Effect, data: Data) -> Hypothesis | None:
     try:
         p, theta, states = extended(base, effect, data)
         result = fit(p, data, theta, states, iterations=FIRST_STEPS, rounds=1, inherit=base)
+        if result.cost > base.cost:  # start states that dry friction holds need more steps to come free
+            result = fit(p, data, result.theta, result.x0, iterations=4 * FIRST_STEPS, rounds=1)
     except RUNAWAY:
         return None
     return Hypothesis(names=tuple(e.name for e in p.model.effects), fit=result)

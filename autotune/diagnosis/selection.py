@@ -91,6 +91,12 @@ def _polish(h: Hypothesis, data: Data, base: Fit, rounds: int) -> Hypothesis:
     return replace(h, fit=best)
 
 
+def own(result: Fit, data: Data) -> list[FloatArray]:
+    """Return a fit's start states of the windows that thinned data have."""
+    pairs = zip(result.x0, result.starts, data.starts, strict=True)
+    return [x0[np.searchsorted(known, starts)] for x0, known, starts in pairs]
+
+
 def states_for(result: Fit, data: Data, base: Fit) -> tuple[FloatArray, ...]:
     """Return start states for all windows: a fit's own where it has the window, else the base's or rest."""
     states = start_states(result.sim, data)
@@ -151,7 +157,9 @@ def _searched(data: Data, base: Fit, nominal: Fit, entries: Sequence[Entry], poo
     chosen = retuned = Hypothesis(names=(), fit=base)
     report("single effects", 0.1)
     few = data.thinned(SCREENING_ROWS)
-    screen = retuned if few is data else Hypothesis(names=(), fit=fit(base.parametrisation, few, base.theta))
+    screen = (
+        retuned if few is data else Hypothesis(names=(), fit=fit(base.parametrisation, few, base.theta, own(base, few)))
+    )
     candidates = grown(screen, few, pool, entries, most=7)
     if bent(base):
         candidates = merged(candidates, grown(_unbent(base, few), few, pool, entries, most=7))

@@ -122,3 +122,13 @@ def test_an_unknown_effect_and_a_missing_parameter_are_refused_by_name() -> None
         assemble(servo(effects=(effect("plant.gremlin", level=1.0),)))
     with pytest.raises(InputError, match="time_constant"):
         assemble(servo(effects=(effect("sensor.lag"),)))
+
+
+@settings(max_examples=20)
+@given(step=st.floats(0.05, 0.5), origin=st.floats(-1.0, 1.0), seed=st.integers(0, 1000))
+def test_a_converters_lattice_passes_through_its_origin(step: float, origin: float, seed: int) -> None:
+    u = np.random.default_rng(seed).normal(size=60)
+    rounded = origin + step * np.floor((u - origin) / step + 0.5)
+    stepped = assemble(servo(effects=(effect("actuator.quantisation", step=step, origin=origin),)))
+    got = stepped.run(recording(u, 0.01), np.zeros(3))
+    np.testing.assert_allclose(got, assemble(servo()).run(recording(rounded, 0.01), np.zeros(3)), atol=1e-10)

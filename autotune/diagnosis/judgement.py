@@ -1,0 +1,164 @@
+"""Judgement: whether a fit is adequate, how probable a hypothesis is beside its rivals, errors on held-out windows.
+
+The constants were fitted on concealed cases (``python -m tests.benchmarks calibrate``), none of them of the proof.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from autotune.diagnosis.data import Data
+from autotune.diagnosis.fitting import Fit, fit
+from autotune.diagnosis.noise import noise_from_differences
+from autotune.diagnosis.result import Candidate, FitQuality
+from autotune.diagnosis.retuning import BLOCKS, misfit, whiteness
+from autotune.diagnosis.search import RUNAWAY, Hypothesis
+from autotune.diagnosis.selection import Search, own, score, simplicity_lead
+
+#: Residual variance over the noise's (see :func:`autotune.diagnosis.retuning.misfit`) up to which a model is adequate,
+#: beside one standard deviation of that ratio.
+ADEQUATE = 1.04
+#: The same for the slow part of the residual, after its own AR(2) has been taken out, beside two standard deviations.
+WHITE = 1.15
+#: Misfit of a model without effects from which on something must be missing, although no effect is worth it.
+MISSING = 1.1
+#: Share of the retuned model's excess misfit that an effect must explain where nothing explains all of it, and how
+#: many times the noise's variance the retuned model's error must have: nearer to the noise adequacy is asked for.
+DOMINANT, FAR_FROM_NOISE = 0.35, 6.0
+#: Weight of a cause outside the catalogue, beside the best hypothesis's 1: where that explains the recordings, and
+#: where it explains most of what retuning leaves far above the noise.
+UNKNOWN, HALF_EXPLAINED = 0.02, 0.25
+#: Scale of the log-odds: one unit of chi2 counts this much less than for ideal noise.
+TEMPERATURE = 3.0
+
+
+def is_adequate(result: Fit, data: Data) -> bool:
+    """Whether a residual is noise: no more variance than its jitter shows, and no slow part."""
+    return misfit(result, data) < _allowed(result) and is_white(result, data)
+
+
+def _allowed(result: Fit) -> float:
+    return ADEQUATE + math.sqrt(2.0 / result.rows)
+
+
+def is_white(result: Fit, data: Data) -> bool:
+    """Whether a residual has no slow part beyond what chance brings."""
+    return whiteness(result, data) < WHITE + 2.0 * math.sqrt(2.0 / (BLOCKS * len(result.windows)))
+
+
+def dominates(quality: FitQuality) -> bool:
+    """Whether the chosen effects explain most of a misfit that nothing explains whole.
+
+    On real rigs something always remains; an effect is named all the same when on rows that were not fitted it takes
+    away most of the variance that retuning leaves above the noise.
+    """
+    left = quality.retuned**2 - quality.noise_floor**2
+    far = quality.retuned**2 > FAR_FROM_NOISE * quality.noise_floor**2
+    return far and quality.retuned**2 - quality.extended**2 > DOMINANT * left
+
+
+def rivals(found: Search, doubt: float) -> tuple[Candidate, ...]:
+    """Return every hypothesis's name with its probability among those searched, best first.
+
+    Parameters
+    ----------
+    found : Search
+        Hypotheses with their fits.
+    doubt : float
+        Weight of a cause outside the catalogue beside the best hypothesis's 1, see :func:`doubt_of`.
+
+    Notes
+    -----
+    A richer hypothesis that beats the chosen one by less than the lead that simplicity was given pays that lead here
+    too: the probabilities weigh what the choice weighed.
+    """
+    pool = [found.retuned, *found.singles, *found.pairs, *found.triples]
+    chosen = found.chosen
+    lead = simplicity_lead(found.retuned.fit, min(pool, key=score))
+    scores: dict[str, float] = {}
+    for h in pool:
+        refused = h.parameters > chosen.parameters and 0.0 < score(chosen) - score(h) < lead
+        name = "+".join(h.names) if h.names else "none"
+        scores[name] = min(scores.get(name, math.inf), score(h) + (lead if refused else 0.0))
+    return weighed(scores, TEMPERATURE * max(1.0, chosen.fit.chi2 / chosen.fit.rows), doubt)
+
+
+def weighed(scores: Mapping[str, float], scale: float, doubt: float) -> tuple[Candidate, ...]:
+    """Return probabilities of hypotheses from their scores, best first, a cause that is none of them included.
+
+    Parameters
+    ----------
+    scores : mapping
+        Score by name, see :func:`autotune.diagnosis.selection.score`; twice a log-likelihood where noise is ideal.
+    scale : float
+        Units of score that count as one.
+    doubt : float
+        Weight of what is none of them, beside 1 of the best.
+    """
+    best = min(scores.values())
+    weights = {name: math.exp(-(value - best) / (2.0 * scale)) for name, value in scores.items()} | {"unknown": doubt}
+    total = sum(weights.values())
+    ranked = sorted(weights.items(), key=lambda item: -item[1])
+    return tuple(Candidate(name=name, probability=w / total) for name, w in ranked if w / total > 1e-4)[:12]
+
+
+def doubt_of(result: Fit, data: Data, dominant: bool) -> float:
+    """Return the weight of a cause outside the catalogue, beside 1 of the best hypothesis.
+
+    Small where the residual is noise, and the larger the nearer its misfit comes to the bound of adequacy; beyond it
+    the two weigh the same, but for an effect that explains most of what retuning leaves far above the noise.
+    """
+    if is_adequate(result, data):
+        excess = max(misfit(result, data) - 1.0, 0.0) / (_allowed(result) - 1.0)
+        return UNKNOWN + (1.0 - UNKNOWN) * excess**4
+    return HALF_EXPLAINED if dominant else 1.0
+
+
+def held_out(found: Search) -> tuple[FitQuality, bool]:
+    """Return errors on every second window, with numbers fitted to the others, and whether the extended model wins."""
+    data = found.data
+    odd, even = _half(data, 1), _half(data, 0)
+    y = np.concatenate([r.y[g] for r, g in zip(odd.recordings, odd.good, strict=True)])
+    spread = float(np.std(y)) or 1.0
+
+    def error(h: Hypothesis, tune: bool) -> float:
+        p, none = h.fit.parametrisation, np.zeros(h.fit.theta.size, dtype=bool)
+        theta = h.fit.theta if tune else p.centre
+        try:
+            if tune:
+                theta = fit(p, even, theta, own(h.fit, even), iterations=6, rounds=1).theta
+            tested = fit(p, odd, theta, own(h.fit, odd), free=none, iterations=8)
+        except RUNAWAY:
+            # numbers from half the windows can run away on the other half: then those of all windows count
+            tested = h.fit
+        squares = sum(float(e @ e) for e in tested.residuals)
+        return math.sqrt(squares / max(tested.rows - sum(Q.shape[1] for Q in tested.states_explain), 1)) / spread
+
+    nominal, retuned = error(found.retuned, tune=False), error(found.retuned, tune=True)
+    extended = error(found.chosen, tune=True) if found.chosen.names else retuned
+    noise = noise_from_differences(found.chosen.fit.residuals, data.good).total_sd / spread
+    quality = FitQuality(nominal=nominal, retuned=retuned, extended=extended, noise_floor=noise)
+    return quality, extended <= retuned
+
+
+def _half(data: Data, which: int) -> Data:
+    """Return every second window of the data, or block of windows where there are few."""
+    starts, stops, good = [], [], []
+    number = which
+    for a, b, ok in zip(data.starts, data.stops, data.good, strict=True):
+        # few windows may go by direction one and one: then blocks of them are taken
+        block = 1 if len(a) >= 8 else max(1, len(a) // 2)
+        keep = (np.arange(len(a)) // block) % 2 == number % 2
+        if not keep.any():
+            keep[:] = True
+        inside = np.zeros(ok.size, dtype=bool)
+        for first, last in zip(a[keep], b[keep], strict=True):
+            inside[first:last] = True
+        starts.append(a[keep])
+        stops.append(b[keep])
+        good.append(ok & inside)
+    return replace(data, starts=tuple(starts), stops=tuple(stops), good=tuple(good))
