@@ -44,7 +44,9 @@ def batch(
     console = Console(highlight=False, soft_wrap=True)
     bars = Console(stderr=True)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=bars, transient=True, disable=not bars.is_terminal) as progress:
+    with Progress(
+        *columns, console=bars, transient=True, disable=not bars.is_terminal, speed_estimate_period=600.0
+    ) as progress:
         reading = progress.add_task("preparing exports", total=100, visible=False)
         tasks = work.works(
             rows, lambda name, share: progress.update(reading, description=name, completed=100 * share, visible=True)
@@ -53,14 +55,14 @@ def batch(
         if rows:
             console.print(f"{len(rows)} of {len(loops)} loops are done already", markup=False)
         if tasks:
-            # the speed is that of this session: what was done before does not count
-            bar = progress.add_task(settings.task, total=len(tasks))
+            # its speed is that of this session: what was done before does not count
+            bar = progress.add_task("starting workers", total=len(tasks))
             try:
                 with cluster(min(workers, len(tasks)) if workers else None, scheduler) as client:
                     for name, found in run_all(client, analyse_loop, tasks):
                         loop = tasks[name].loop
                         rows[name] = failed(loop, found) if isinstance(found, Exception) else work.keep(loop, found)
-                        progress.advance(bar)
+                        progress.update(bar, advance=1, description=settings.task)
             except KeyboardInterrupt:
                 raise OperatorStop(
                     f"stopped by the operator with {len(rows)} of {len(loops)} loops done",
