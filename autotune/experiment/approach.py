@@ -12,6 +12,7 @@ import numpy as np
 from autotune.arrays import FloatArray
 from autotune.config import Config
 from autotune.errors import ExperimentStopped, IdentificationError, LinkError
+from autotune.experiment.feasibility import supported_rad_s
 from autotune.experiment.limits import Watch
 from autotune.experiment.loop import ControlLoop
 from autotune.experiment.monitor import RECENT
@@ -64,6 +65,8 @@ class Known:
         What is known of the plant.
     swept : bool
         Whether the points are the sweep's, and not a short look.
+    link_rad_s : float
+        Frequency up to which the link supports points [rad/s].
     warnings : tuple of str
         What the reader should know.
     """
@@ -78,6 +81,7 @@ class Known:
     speed: float = 0.0
     points: tuple[FrequencyPoint, ...] = ()
     swept: bool = False
+    link_rad_s: float = math.inf
     warnings: tuple[str, ...] = ()
 
 
@@ -100,13 +104,20 @@ def preflight(loop: ControlLoop, config: Config, tell: Tell) -> Known:
             _check_at_rest(loop, first_row, first)
     y = loop.history(first_row)[2][1:]
     y = y[np.isfinite(y)]
-    _, late, _ = loop.timing.latency_s
+    timing = loop.timing
+    typical, late, _ = timing.latency_s
     if late > 0.8 * loop.sample_time_s:
         raise LinkError(
             f"link too slow: a reading takes {1e3 * late:.3g} ms, the sample time is {1e3 * loop.sample_time_s:.3g} ms",
             where="preflight",
             mend="raise signals.sample_time_s, or use a faster link",
         )
+    link_rad_s = supported_rad_s(timing, loop.sample_time_s, config.experiment.gain_sd, exact=loop.is_exact)
+    tell(
+        f"a reading takes {1e3 * typical:.2g} ms, up to {1e3 * late:.2g} ms in 99 %:"
+        f" this link supports points up to {link_rad_s:.3g} rad/s"
+    )
+    loop.note(link_rad_s=link_rad_s)
     steps = np.diff(y)
     # from differences: a plant that drifts is not taken for noise; from their median: nor are a few wild readings
     typical = 1.4826 * float(np.median(np.abs(steps)))
@@ -130,6 +141,7 @@ def preflight(loop: ControlLoop, config: Config, tell: Tell) -> Known:
         noise_half=noise_half,
         y_rest=float(np.mean(y)),
         plant_sign=config.operating_point.plant_sign,
+        link_rad_s=link_rad_s,
     )
 
 

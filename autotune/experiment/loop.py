@@ -169,6 +169,11 @@ class ControlLoop:
         return self.envelope.sample_time_s
 
     @property
+    def is_exact(self) -> bool:
+        """Whether rows carry the device's own stamps, in which the link has no part."""
+        return self._exchange is not None
+
+    @property
     def recording(self) -> Path:
         """File that the rows are written to."""
         return self._writer.path

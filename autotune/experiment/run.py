@@ -79,8 +79,9 @@ def run_experiment(
     earlier = earlier or Earlier()
     if not missing_phases(config, earlier):
         final = refined(earlier.segments, earlier.rows, config.signals.sample_time_s)
-        timing = earlier.recordings[-1].metadata.get("timing", {})
-        return _result(final, config, earlier.parts, Timing.from_table(timing), first_move_s=math.nan)
+        last = earlier.recordings[-1].metadata
+        known = Known(first_move_s=math.nan, link_rad_s=last.get("link_rad_s", math.inf))
+        return _result(final, config, earlier.parts, Timing.from_table(last.get("timing", {})), known)
     writer = RecordingWriter(recording, ("t", "u", "y"), recording_metadata(config))
     warm_up()
     with ControlLoop(rig=rig, envelope=envelope_of(config), writer=writer) as loop:
@@ -125,7 +126,7 @@ def experiment_on(
     journal.enter(State.HAND_BACK)
     journal.show("all points measured", 0.0, known)
     loop.watch = Watch(afloat=True)
-    result = _result(segments, config, (*earlier.parts, part), loop.timing, first_move_s=known.first_move_s)
+    result = _result(segments, config, (*earlier.parts, part), loop.timing, known)
     loop.step(loop.nearest(result.u_rest))
     return result
 
@@ -188,7 +189,7 @@ def float_on(loop: ControlLoop, config: Config, *, u_rest: float | None = None) 
 
 
 def _result(
-    segments: tuple[Segment, ...], config: Config, parts: tuple[Part, ...], timing: Timing, *, first_move_s: float
+    segments: tuple[Segment, ...], config: Config, parts: tuple[Part, ...], timing: Timing, known: Known
 ) -> ExperimentResult:
     u_means = np.array([segment.u_mean for segment in segments])
     spread = float(np.std(u_means, ddof=1)) if u_means.size > 1 else math.nan
@@ -201,11 +202,11 @@ def _result(
         noise_sd=segments[-1].noise_sd,
         timing=timing,
         rig_time_s=sum(part.rig_time_s for part in parts),
-        first_move_s=first_move_s,
+        first_move_s=known.first_move_s,
         sweep_time_s=sum(part.sweep_time_s for part in parts),
         parts=parts,
         reason="completed",
-        warnings=doubts(segments, config),
+        warnings=doubts(segments, config, known.link_rad_s),
     )
 
 

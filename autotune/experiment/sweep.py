@@ -63,7 +63,10 @@ def sweep(
     segments = list(earlier.segments)
     if segments:
         known = replace(
-            known, points=tuple(one.point for one in segments), swept=True, warnings=doubts(segments, config)
+            known,
+            points=tuple(one.point for one in segments),
+            swept=True,
+            warnings=doubts(segments, config, known.link_rad_s),
         )
     loop.note(first_move_s=known.first_move_s)
     for i, target in enumerate(targets):
@@ -101,7 +104,7 @@ def sweep(
             noise_sd=segment.noise_sd,
             points=(*(known.points if known.swept else ()), segment.point),
             swept=True,
-            warnings=doubts(segments, config),
+            warnings=doubts(segments, config, known.link_rad_s),
         )
 
     def rows(number: int) -> Rows:
@@ -119,11 +122,17 @@ def missing_phases(config: Config, earlier: Earlier) -> tuple[float, ...]:
     return tuple(phase for phase in targets if not any(math.isclose(phase, other) for other in done))
 
 
-def doubts(segments: Sequence[Segment], config: Config) -> tuple[str, ...]:
-    """Return what the reader should know of points that did not become as good as was wanted."""
+def doubts(segments: Sequence[Segment], config: Config, link_rad_s: float) -> tuple[str, ...]:
+    """Return what the reader should know of points not as good as was wanted, or beyond what the link supports."""
     wanted = config.experiment.gain_sd
     sds = [math.sqrt(float(np.trace(one.point.covariance)) / 2.0) / one.point.gain for one in segments]
-    return tuple(
+    beyond = tuple(
+        f"point at {omega:.3g} rad/s is beyond the {link_rad_s:.3g} rad/s that this link supports: its phase may be off"
+        f" by {math.degrees(wanted * omega / link_rad_s):.2g} deg, use a link with less latency"
+        for omega in (one.point.omega_rad_s for one in segments)
+        if omega > link_rad_s
+    )
+    return beyond + tuple(
         f"point at {one.point.omega_rad_s:.3g} rad/s is known to {100 * sd:.2g} % only,"
         f" {100 * wanted:.2g} % was wanted: raise experiment.budget_s"
         for one, sd in zip(segments, sds, strict=True)
