@@ -43,6 +43,36 @@ from autotune.cli import (  # noqa: E402, F401, I001
 )
 
 
+#: what --help groups together, in the order of the work
+TOUR = {
+    "At a rig": ("run", "deploy", "verify", "live", "dither", "investigate", "probe", "ports", "rig"),
+    "From recordings to a controller": ("tune", "identify", "reduce", "design", "margins", "controller"),
+    "In operation, and where model and rig differ": ("watch", "simulate", "diagnose", "batch", "prove"),
+}
+
+
+def _arrange() -> None:
+    """Put every command into its group; one that is in none stays at the head of the help."""
+    order = [name for names in TOUR.values() for name in names]
+
+    def place(name: str) -> int:
+        return order.index(name) if name in order else -1
+
+    def panel(name: str) -> str | None:
+        return next((title for title, names in TOUR.items() if name in names), None)
+
+    commands, groups = app.registered_commands, app.registered_groups
+    named = {id(one): one.name or getattr(one.callback, "__name__", "") for one in commands}
+    commands.sort(key=lambda one: place(named[id(one)]))
+    for one in commands:
+        one.rich_help_panel = panel(named[id(one)])
+    for group in groups:
+        group.rich_help_panel = panel(str(group.name))
+
+
+_arrange()
+
+
 def main() -> None:
     """Run the command line; an error of the tool is one line on stderr and its exit status."""
     try:
