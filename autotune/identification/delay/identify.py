@@ -105,8 +105,10 @@ def identify_delay(
 
     Notes
     -----
-    The covariance is the inverse information at the estimate: asymptotic, and right only if the structure is. In
-    closed loop the estimate is consistent where the noise model is right and the loop has a delay.
+    The covariance is the inverse information at the estimate; where b is known to no better than 1 %, its standard
+    deviations are widened to the likelihood intervals. Both are right only if the structure is. From order 3 on an
+    order that the next lower one does without, by the Bayes information criterion, is refused. In closed loop the
+    estimate is consistent where the noise model is right and the loop has a delay.
 
     References
     ----------
@@ -208,11 +210,11 @@ def _polish_on_all_rows(
         best, whitening = polish(usable, structure, best, max_delay_s=limit, coloured=coloured)
         model = finish(usable, structure, best, whitening)
         _require_inside(data, model, largest)
-        _require_determined(data, model, largest)
         if model.standard_deviations[structure.order] < _LINEAR * abs(model.b):
             return model
         if structure.order >= _COMPARED_ORDER:
             _require_order(data, structure, best, model, largest)
+        _require_determined(data, model, largest)
         found = profile(usable, structure, best, model, max_delay_s=limit)
         if found.endless:
             raise _undetermined(data, found.model, largest, f"nothing bounds {found.endless}")
