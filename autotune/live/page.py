@@ -163,6 +163,12 @@ class Screen:
     def _holds_controls(self) -> bool:
         return self.tab is not None and self._controls.holder == self.tab
 
+    @property
+    def _may_abort(self) -> bool:
+        """Whether there is something to stop: not before the decision, when the rig is at rest."""
+        story = self._story
+        return self._holds_controls and self._controls.act is not None and story.ended is None and not story.waiting_s
+
     def update(self) -> None:
         """Show what is new; a browser that has not drawn the last picture yet is left in peace."""
         if not self.is_connected:
@@ -202,7 +208,7 @@ class Screen:
         self._warnings.text = "\n".join(warnings)
         self._warnings.set_visibility(bool(warnings))
         acts, over = controls.act is not None, story.ended is not None
-        self._abort.set_visibility(acts and not over and self._holds_controls)
+        self._abort.set_visibility(self._may_abort)
         self._take.set_visibility(acts and not over and controls.holder is None)
         self._role.text = self._role_text(acts, over)
         self._outcome.set_visibility(bool(story.verdict or story.gains))
@@ -224,7 +230,7 @@ class Screen:
 
     def _left_text(self) -> str:
         story = self._story
-        if story.ended is not None:
+        if story.ended is not None or story.waiting_s:
             return f"{story.now_s:.0f} s on the rig"
         left = (
             f"{story.remaining_s:.0f} s left in this state"
@@ -292,7 +298,7 @@ class Screen:
             self._on_abort()
 
     def _on_abort(self) -> None:
-        if self._holds_controls and self._story.ended is None:
+        if self._may_abort:
             self._controls.ask("abort")
 
     def _on_choice(self, choice: str) -> None:
@@ -325,7 +331,7 @@ def _gain_rows(story: Story) -> list[tuple[str, str, str]]:
     u_unit, y_unit = story.units
 
     def cell(controller: PIDController | None, name: str) -> str:
-        return "-" if controller is None else f"{getattr(controller, name):.4g}"
+        return "-" if controller is None else f"{getattr(controller, name):.4g}".replace("inf", "∞")
 
     rows = [("", "old gains", "new gains")]
     names = {"K": f"K [{u_unit}/{y_unit}]", "Ti_s": "T_I [s]", "Td_s": "T_d [s]", "Tf_s": "T_f [s]"}
