@@ -192,7 +192,6 @@ def _follow(recording: Path, out: Path, settings: _Tracking, quiet_s: float) -> 
     import time
 
     from autotune.identification.delay.tracking import track
-    from autotune.recording import read_recording
 
     while quiet_s > 0.0 and not recording.exists():
         time.sleep(0.1)
@@ -200,7 +199,7 @@ def _follow(recording: Path, out: Path, settings: _Tracking, quiet_s: float) -> 
     quiet_since = time.monotonic()
     with out.open("w", encoding="utf-8") as table:
         while True:
-            record = _in_operation(read_recording(recording)) if quiet_s == 0.0 else _readable(recording)
+            record = _of_operation(recording) if quiet_s == 0.0 else _readable(recording)
             if record is not None and len(record) > rows:
                 rows, quiet_since = len(record), time.monotonic()
                 length = settings.window_s if settings.window_s is not None else 0.2 * record.duration_s
@@ -227,12 +226,27 @@ def _follow(recording: Path, out: Path, settings: _Tracking, quiet_s: float) -> 
     typer.echo(f"wrote {out}")
 
 
-def _in_operation(record: Recording) -> Recording:
-    """Leave out the rows before the first set-point: on the way there the plant may stand on a stop."""
+def _in_operation(record: Recording) -> Recording | None:
+    """Leave out the rows before the first set-point, as the plant may be at a stop; None where there is none."""
     import numpy as np
 
-    closed = np.flatnonzero(np.isfinite(record.extra["r"])) if "r" in record.extra else np.array([])
-    return record.between(float(record.t[closed[0]]), np.inf) if closed.size else record
+    if "r" not in record.extra:
+        return record
+    closed = record.t[np.isfinite(record.extra["r"])]
+    return record.between(float(closed[0]), np.inf) if closed.size > 1 else None
+
+
+def _of_operation(recording: Path) -> Recording:
+    """Return a finished recording of the loop in operation."""
+    from autotune.errors import InputError
+    from autotune.recording import read_recording
+
+    record = _in_operation(read_recording(recording))
+    if record is None:
+        raise InputError(
+            "column 'r' has no set-point in any row", where=str(recording), mend="record the loop in operation"
+        )
+    return record
 
 
 def _readable(recording: Path) -> Recording | None:
