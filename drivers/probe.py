@@ -1,4 +1,4 @@
-"""First contact with a register map: every register read once, nothing written, and what looks wrong."""
+"""First contact: every register, or all that a microcontroller says, read once, nothing written; what looks wrong."""
 
 from __future__ import annotations
 
@@ -8,10 +8,13 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 from autotune.config.registers import RegisterSettings, RegisterType
-from autotune.config.rig import AnyModbusSettings
+from autotune.config.rig import AnyModbusSettings, SerialSettings
 from autotune.errors import LinkError
+from drivers.clock import MonotonicClock
+from drivers.line_protocol import Command, Kind
 from drivers.modbus import ModbusLink
 from drivers.registers import Codec, blocks, codecs
+from drivers.serial_line import SerialLink
 
 Order = Literal["big", "little"]
 
@@ -66,6 +69,93 @@ def probe(settings: AnyModbusSettings, *, expected: Mapping[str, tuple[float, fl
         )
     finally:
         link.disconnect()
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProbedSignal:
+    """One signal as a microcontroller shows it.
+
+    Attributes
+    ----------
+    name : str
+        Signal.
+    raw : str
+        As it came over the line.
+    value : float
+        Engineering value.
+    warnings : tuple of str
+        What looks wrong with it.
+    """
+
+    name: str
+    raw: str
+    value: float
+    warnings: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProbedDevice:
+    """A microcontroller as it shows itself: who it is, and its signals."""
+
+    description: str
+    signals: tuple[ProbedSignal, ...]
+
+
+def probe_line(settings: SerialSettings, *, expected: Mapping[str, tuple[float, float]]) -> ProbedDevice:
+    """Ask a microcontroller who it is, for a sample and for its gains; nothing is written and no command taken.
+
+    Parameters
+    ----------
+    settings : SerialSettings
+        The table ``[rig]``.
+    expected : mapping of str to (float, float)
+        Range within which a signal's engineering value is plausible.
+
+    Raises
+    ------
+    LinkError
+        Nobody answers, or it speaks another version.
+    """
+    link = SerialLink(settings, MonotonicClock())
+    try:
+        version, ticks, y_full, u_full, starts = link.connect().values
+        time_us, y, u, state, _ = link.ask(Kind.READ)[0].values
+        K, Ti_s = link.ask(Kind.GET_GAINS)[0].values
+    finally:
+        link.disconnect()
+    who = Command(int(state) & 3).name.lower()
+    per_count = (_scaled(1.0, settings.u_span, u_full) - settings.u_span[0]) / (
+        _scaled(1.0, settings.y_span, y_full) - settings.y_span[0]
+    )
+    return ProbedDevice(
+        description=(
+            f"microcontroller, firmware {version:g}, {ticks:g} ticks per second, started {starts:g} time(s),"
+            f" commanded by {who}"
+        ),
+        signals=(
+            _counted("y", y, y_full, settings.y_span, expected.get("y")),
+            _counted("u_applied", u, u_full, settings.u_span, None),
+            ProbedSignal(name="device_time", raw=f"{time_us:g} us", value=1e-6 * time_us),
+            ProbedSignal(name="K", raw=f"{K:g} counts/count", value=K * per_count),
+            ProbedSignal(name="Ti", raw=f"{Ti_s:g} s", value=Ti_s),
+        ),
+    )
+
+
+def _scaled(count: float, span: tuple[float, float], full: float) -> float:
+    return span[0] + count * (span[1] - span[0]) / full
+
+
+def _counted(
+    name: str, count: float, full: float, span: tuple[float, float], expected: tuple[float, float] | None
+) -> ProbedSignal:
+    value = _scaled(count, span, full)
+    warnings = []
+    if expected is not None and not expected[0] <= value <= expected[1]:
+        warnings.append(f"{value:.6g}, expected {expected[0]:g}..{expected[1]:g}; check rig.{name}_span and the wiring")
+    if expected is not None and count in (0.0, full):
+        warnings.append("at the end of the converter's range; check that the sensor is connected")
+    return ProbedSignal(name=name, raw=f"{count:g} of {full:g}", value=value, warnings=tuple(warnings))
 
 
 def _probe_one(link: ModbusLink, codec: Codec, expected: tuple[float, float] | None) -> ProbedRegister:

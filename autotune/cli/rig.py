@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 import threading
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -16,7 +17,7 @@ from autotune.cli import app
 if TYPE_CHECKING:
     from autotune.config import Config
     from autotune.config.registers import RegisterSettings
-    from autotune.config.rig import AnyModbusSettings
+    from autotune.config.rig import AnyModbusSettings, SerialSettings
 
 _CONFIG = Annotated[Path, typer.Argument(metavar="CONFIG.toml", help="configuration of the rig")]
 
@@ -52,12 +53,16 @@ def rig(config: _CONFIG) -> None:
 
 @app.command()
 def probe(config: _CONFIG) -> None:
-    """Read every mapped register once, raw and engineering value side by side; nothing is written."""
+    """Read every mapped register, or all a microcontroller says, once; nothing is written."""
     from autotune.cli.served import modbus_settings
     from autotune.config import load_config
+    from autotune.config.rig import SerialSettings
     from drivers.probe import probe as probe_registers
 
     content = load_config(config)
+    if isinstance(content.rig, SerialSettings):
+        _probe_line(content, content.rig)
+        return
     found = probe_registers(modbus_settings(content), expected=_expected(content))
     units = _units(content)
     table = Table("signal", "register", "type", "raw", "value", "unit", title=content.name)
@@ -69,18 +74,37 @@ def probe(config: _CONFIG) -> None:
         table.add_row(one.name, place, register.type, raw, value, units.get(one.name, ""))
     console = Console(highlight=False, soft_wrap=True)
     console.print(table)
-    for one in found:
-        for warning in one.warnings:
-            console.print(f"{one.name}: {warning}", markup=False)
-    doubtful = [one.name for one in found if one.warnings]
+    _print_verdict(console, f"{len(found)} registers", {one.name: one.warnings for one in found})
+
+
+def _probe_line(config: Config, settings: SerialSettings) -> None:
+    from drivers.probe import probe_line
+
+    found = probe_line(settings, expected=_expected(config))
+    units = _units(config)
+    table = Table("signal", "raw", "value", "unit", title=config.name)
+    for one in found.signals:
+        table.add_row(one.name, one.raw, f"{one.value:.6g}", units.get(one.name, ""))
+    console = Console(highlight=False, soft_wrap=True)
+    console.print(found.description, markup=False)
+    console.print(table)
+    _print_verdict(console, f"{len(found.signals)} signals", {one.name: one.warnings for one in found.signals})
+
+
+def _print_verdict(console: Console, what: str, warnings: Mapping[str, Sequence[str]]) -> None:
+    for name, said in warnings.items():
+        for warning in said:
+            console.print(f"{name}: {warning}", markup=False)
+    doubtful = [name for name, said in warnings.items() if said]
     verdict = f"{', '.join(doubtful)} look implausible" if doubtful else "all values are plausible"
-    console.print(f"{len(found)} registers read, nothing written: {verdict}")
+    console.print(f"{what} read, nothing written: {verdict}")
 
 
 @app.command()
 def ports(
     ask: Annotated[
-        bool, typer.Option("--ask", help="send a Modbus identification request to each port (default: only list)")
+        bool,
+        typer.Option("--ask", help="ask each port who is there: microcontroller, Modbus device (default: only list)"),
     ] = False,
     unit: Annotated[int, typer.Option(min=1, max=247, help="unit id to ask for")] = 1,
 ) -> None:

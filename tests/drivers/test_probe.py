@@ -12,11 +12,20 @@ from hypothesis import strategies as st
 
 from autotune.config.registers import RegisterMap, RegisterSettings
 from drivers.ports import answers_on
-from drivers.probe import implausible, probe
+from drivers.probe import implausible, probe, probe_line
 from drivers.registers import Codec
 from sim.modbus_rig import ModbusRig, RtuTransport, TcpTransport
 from sim.serial_line import SerialLine
-from tests.drivers.bench import REGISTERS, register_device, rtu_settings, tcp_settings
+from sim.serial_rig import SerialRig, device_on_line
+from tests.drivers.bench import (
+    REGISTERS,
+    U_RANGE,
+    register_device,
+    rtu_settings,
+    serial_settings,
+    servo,
+    tcp_settings,
+)
 
 
 def codec(**settings: Any) -> Codec:
@@ -105,9 +114,27 @@ def test_a_device_whose_words_are_swapped_is_found_out() -> None:
 
 def test_what_answers_on_a_serial_port_is_found_and_silence_is_too() -> None:
     with SerialLine() as line, ModbusRig(register_device(), RtuTransport(device=line.rig_device, parity="N")):
-        assert answers_on(line.host_device) == "Modbus RTU unit 1 at 9600 bit/s, parity N"
+        assert answers_on(line.host_device, start_s=0.1) == "Modbus RTU unit 1 at 9600 bit/s, parity N"
     with SerialLine() as silent:
-        assert answers_on(silent.host_device) == "nothing"
+        assert answers_on(silent.host_device, start_s=0.1) == "nothing"
+
+
+def test_a_microcontroller_is_found_and_probed_and_nothing_is_written_to_it() -> None:
+    device = device_on_line(servo(), u_range=U_RANGE, u_safe=0.0, gains=(1.5, 2.0))
+    came_with = dict(device.value)
+    with SerialLine() as line, SerialRig(device, line.rig_device, y_span=U_RANGE, u_span=U_RANGE):
+        assert answers_on(line.host_device) == "microcontroller, firmware 2, at 115200 bit/s"
+        settings = serial_settings(line.host_device)
+        found = probe_line(settings, expected={"y": (-1.0, 1.0)})
+        wrong = probe_line(settings.model_copy(update={"y_span": (90.0, 110.0)}), expected={"y": (-1.0, 1.0)})
+    assert "firmware 2, 1000 ticks per second, started 1 time(s), commanded by nobody" in found.description
+    signals = {one.name: one for one in found.signals}
+    assert not any(one.warnings for one in found.signals)
+    assert signals["y"].value == pytest.approx(device.plant.y_true, abs=0.02)
+    assert signals["u_applied"].value == pytest.approx(device.output, abs=1e-3)
+    assert (signals["K"].value, signals["Ti"].value) == pytest.approx((1.5, 2.0))
+    assert any("rig.y_span" in warning for one in wrong.signals for warning in one.warnings)
+    assert device.value == came_with
 
 
 def test_a_map_with_a_heartbeat_may_read_it_back_from_its_own_register() -> None:

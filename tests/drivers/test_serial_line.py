@@ -10,7 +10,9 @@ import sys
 from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner
 
+from autotune.cli import app
 from autotune.config import load_config
 from autotune.controller import PIDController
 from autotune.errors import InputError, LinkError
@@ -149,6 +151,10 @@ def test_autotune_rig_serves_the_configurations_microcontroller(tmp_path: Path) 
         try:
             assert process.stdout is not None
             assert process.stdout.readline().startswith("serving a microcontroller")
+            probed = CliRunner().invoke(app, ["probe", str(path)])
+            assert probed.exit_code == 0, probed.output
+            assert "nothing written" in probed.output
+            assert "commanded by nobody" in probed.output
             rig = open_rig(config.rig, u_range=(0.0, 10.0), u_safe=0.0)
             rig.open()
             assert rig.read().y == pytest.approx(10.0, abs=0.4)  # on the floor
