@@ -130,6 +130,8 @@ def read_gains(rig: HoldsGains) -> PIDController:
 def hand_over(rig: HoldsGains, controller: PIDController | None, journal: Path) -> PIDController:
     """Write verified gains into the rig's own controller, and the old ones back if that fails halfway.
 
+    Where the journal says that an earlier hand-over was interrupted, the gains from before it are restored first.
+
     Parameters
     ----------
     rig : HoldsGains
@@ -150,6 +152,9 @@ def hand_over(rig: HoldsGains, controller: PIDController | None, journal: Path) 
         The new gains could not be written and read back; the message says whether the old ones are in place again.
     """
     notes = Journal(journal)
+    before = notes.unfinished()
+    if before is not None:
+        restore(rig, before, journal)
     old = read_gains(rig)
     notes.note(Step.READ, old)
     if controller is not None:

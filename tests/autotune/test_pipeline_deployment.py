@@ -248,6 +248,14 @@ def test_the_next_deploy_finds_half_written_gains_and_restores_the_old_ones(
     assert Journal(half_written).unfinished() is None
 
 
+def test_a_run_that_is_gone_on_with_does_not_take_half_written_gains_for_the_old_ones(
+    line: Line, half_written: Path
+) -> None:
+    assert hand_over(line.rig(), NEW, half_written) == OLD
+    assert line.gains == NEW
+    assert steps(half_written)[2:] == ["restoring", "restored", "read", "writing", "written and read back"]
+
+
 def test_old_and_new_gains_are_shown_and_an_answer_of_no_writes_nothing(line: Line, tmp_path: Path) -> None:
     config = config_file(line, tmp_path)
     call = ("deploy", config, "--controller", tmp_path / "new.toml", "--no-verify", "--form", "parallel")
