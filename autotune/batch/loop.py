@@ -327,10 +327,7 @@ def _compared(row: Row, present: Controller, m: Margins, settings: CampaignSetti
         return replace(row, attention="act", severity=1.0, reason="unstable with its present controller")
     missed = 1.0 - min(m.modulus / asked_modulus, m.phase_rad / asked_phase)
     if missed > _TOLERANCE:
-        reason = (
-            f"margins {m.modulus:.2f} and {math.degrees(m.phase_rad):.0f} deg instead of {asked_modulus:.2g} and "
-            f"{math.degrees(asked_phase):.0f} deg"
-        )
+        reason = f"margin {100.0 * min(missed, 1.0):.0f} % too small"
         return replace(row, attention="act", severity=min(missed, 1.0), reason=reason)
     if row.h2 is not None and m.h2 > _SLUGGISH * row.h2:
         better = m.h2 / row.h2

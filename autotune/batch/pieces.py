@@ -143,9 +143,8 @@ def _piece(columns: dict[str, FloatArray], at: IntArray, metadata: Mapping[str, 
     t, u, y = part.pop("t") - t0, part.pop("u"), part.pop("y")
     if "r" in part:
         part["r"] = _held(part["r"])
-    return Recording(
-        t=t, u=u, y=y, extra=MappingProxyType(part), metadata=metadata, name=f"{loop.name} from t = {t[0]:g} s"
-    )
+    name = loop.name if span.start == 0 else f"{loop.name} from t = {t[0]:g} s"
+    return Recording(t=t, u=u, y=y, extra=MappingProxyType(part), metadata=metadata, name=name)
 
 
 def _held(r: FloatArray) -> FloatArray:
