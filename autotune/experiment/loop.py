@@ -6,9 +6,9 @@ import contextlib
 import math
 import signal
 import threading
-from array import array
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections import deque
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import FrameType, TracebackType
 from typing import Any, Self
@@ -20,6 +20,7 @@ from autotune.errors import AutotuneError, ExperimentStopped, LinkError, Operato
 from autotune.experiment.limits import Envelope, Watch
 from autotune.experiment.monitor import ReadingMonitor
 from autotune.experiment.rig import Exchanges, Reading, Rig, Row
+from autotune.experiment.rows import KEPT_ROWS, RecentRows
 from autotune.recording import RecordingWriter
 
 #: longest wait without looking for a stop signal [s]
@@ -86,17 +87,6 @@ class Timing:
         )
 
 
-@dataclass(kw_only=True)
-class _Record:
-    """Rows kept in memory for estimates while the file grows."""
-
-    t: array[float] = field(default_factory=lambda: array("d"))
-    u: array[float] = field(default_factory=lambda: array("d"))
-    y: array[float] = field(default_factory=lambda: array("d"))
-    latency: array[float] = field(default_factory=lambda: array("d"))
-    lateness: array[float] = field(default_factory=lambda: array("d"))
-
-
 class ControlLoop:
     """A session with a rig, as a context manager; every experiment and every verification runs in one.
 
@@ -153,7 +143,9 @@ class ControlLoop:
         self.metadata: dict[str, Any] = {}
         self._writer = writer
         self._extra = tuple(extra)
-        self._record = _Record()
+        self._rows = RecentRows(writer.path)
+        self._latency: deque[float] = deque(maxlen=KEPT_ROWS)
+        self._lateness: deque[float] = deque(maxlen=KEPT_ROWS)
         self._exchange = rig.exchange if isinstance(rig, Exchanges) else None
         self._missed = 0
         self._stop_signal = ""
@@ -258,28 +250,23 @@ class ControlLoop:
 
     def history(self, start: int = 0) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return t, u, y of the rows from number ``start`` on, (N,) each; y is NaN where a sample was unusable."""
-        record = self._record
-        return (
-            np.array(record.t[start:], dtype=np.float64),
-            np.array(record.u[start:], dtype=np.float64),
-            np.array(record.y[start:], dtype=np.float64),
-        )
+        return self._rows.since(start)
 
     @property
     def timing(self) -> Timing:
-        """Latency, lateness and losses so far."""
+        """Losses so far, latency and lateness of the latest samples."""
 
-        def spread(values: array[float]) -> tuple[float, float, float]:
+        def spread(values: Collection[float]) -> tuple[float, float, float]:
             if not values:
                 return math.nan, math.nan, math.nan
-            data = np.array(values)
+            data = np.array(list(values))
             return float(np.median(data)), float(np.quantile(data, 0.99)), float(data.max())
 
         return Timing(
-            latency_s=spread(self._record.latency),
-            lateness_s=spread(self._record.lateness),
+            latency_s=spread(self._latency),
+            lateness_s=spread(self._lateness),
             missed=self._missed,
-            unusable=int(np.isnan(np.array(self._record.y)).sum()),
+            unusable=self._rows.unusable,
         )
 
     def comment(self, text: str) -> None:
@@ -308,10 +295,7 @@ class ControlLoop:
             self._writer.append((self.tick.t_s, u, y, *(known.get(name, math.nan) for name in self._extra)))
         except OSError as error:
             raise self._unwritable(error) from error
-        record = self._record
-        record.t.append(self.tick.t_s)
-        record.u.append(u)
-        record.y.append(y)
+        self._rows.append(self.tick.t_s, u, y)
 
     def _wait(self) -> None:
         """Wait for the next absolute deadline; a missed one is counted and left out, the grid stays."""
@@ -331,7 +315,7 @@ class ControlLoop:
             clock.sleep_until(min(self._deadline_s, clock.now() + SLICE_S))
             if clock.now() >= self._deadline_s - 1e-9:
                 break
-        self._record.lateness.append(max(0.0, clock.now() - self._deadline_s))
+        self._lateness.append(max(0.0, clock.now() - self._deadline_s))
 
     def _look_for_stop(self) -> None:
         if self._stop_signal:
@@ -340,11 +324,11 @@ class ControlLoop:
     @property
     def _is_written(self) -> bool:
         """Whether the latest sample's row is on the disk."""
-        return self.tick.k < len(self._record.t)
+        return self.tick.k < len(self._rows)
 
     def _judged(self, reading: Reading, *, u: float) -> Tick:
         if math.isfinite(reading.latency_s):
-            self._record.latency.append(reading.latency_s)
+            self._latency.append(reading.latency_s)
         t_s = self._time_of(reading)
         y, usable = self.monitor.judge(reading, u)
         tick = Tick(k=self.tick.k + 1, t_s=t_s, y=y, usable=usable, u=u)
@@ -382,7 +366,7 @@ class ControlLoop:
     def _write_last_row(self) -> None:
         """Write the last sample, which only the safe command followed; NaN where the link broke first."""
         t_s, y = self._time_of(self._reading), self._reading.y
-        written_s = self._record.t[-1] if self._record.t else -math.inf
+        written_s = self._rows.last_s
         if t_s <= written_s:
             t_s, y = max(t_s + self.rig.clock.now() - self._reading.t_s, written_s + SHORTLY_S), math.nan
         self._writer.append((t_s, self.envelope.settings.u_safe, y, *(math.nan for _ in self._extra)))
