@@ -59,7 +59,7 @@ def run_page(
         title=f"Commissioning: {name}",
         verdict=verdict,
         tone="good" if good else "bad" if verification is not None else "warn",
-        summary=_summary(tuning, signals),
+        summary=_summary(tuning, signals, diagnosis),
         sections=tuple(sections),
     )
 
@@ -182,7 +182,7 @@ def _verdict(tuning: Tuning, signals: SignalSettings) -> tuple[str, bool]:
     return f"Not accepted: {gains}; {tuning.verification.reason}. The old gains were kept.", False
 
 
-def _summary(tuning: Tuning, signals: SignalSettings) -> tuple[str, ...]:
+def _summary(tuning: Tuning, signals: SignalSettings, diagnosis: Diagnosis | None) -> tuple[str, ...]:
     experiment = tuning.experiment
     old = tuning.old_controller
     lines = [
@@ -193,8 +193,16 @@ def _summary(tuning: Tuning, signals: SignalSettings) -> tuple[str, ...]:
         margins_sentence(tuning.analysis),
     ]
     if old is not None:
-        lines.append(f"Before: {gains_text(old, signals)}. Now: {gains_text(tuning.analysis.controller, signals)}.")
-    lines.append(_next_step(tuning.verification))
+        new = gains_text(tuning.analysis.controller, signals)
+        before = gains_text(old, signals)
+        lines.append(
+            f"Before: {before}. Now: {new}." if tuning.deployed else f"The rig holds: {before}. Designed: {new}."
+        )
+    lines.append(
+        _next_step(tuning.verification)
+        if diagnosis is None or diagnosis.verdict == "none"
+        else "Next: read below why the loop differs from its prediction, and mend that or the model."
+    )
     return tuple(lines)
 
 
