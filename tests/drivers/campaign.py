@@ -64,7 +64,7 @@ def by_float(y: float) -> float:
 
 def by_count(y: float) -> float:
     """Return a measurement as the microcontroller shows it: in counts of its converter."""
-    return float(round((y - Y_SPAN[0]) / (Y_SPAN[1] - Y_SPAN[0]) * Y_FULL))
+    return float(round((by_float(y) - Y_SPAN[0]) / ((Y_SPAN[1] - Y_SPAN[0]) / Y_FULL)))
 
 
 class LoggedServo(Servo):
