@@ -21,13 +21,16 @@ from autotune.arrays import BoolArray, FloatArray, IntArray
 from autotune.diagnosis import kernel
 from autotune.diagnosis.data import Data
 from autotune.diagnosis.fitting import Fit
+from autotune.diagnosis.selection import LEAST_DECREASE
 from autotune.diagnosis.simulation import Simulator
 
 Place: TypeAlias = Literal["actuator", "plant", "sensor"]
 #: Most terms that a person can still read as one equation.
 MOST_TERMS = 3
 #: Least share of the held-out misfit above the noise that one more term must take away.
-LEAST_SHARE = 0.05
+LEAST_SHARE = 0.1
+#: Least share of a function's power that the model's own numbers cannot imitate.
+NEW = 1e-3
 #: Segments of a curve, and the smoothing weights that are tried, relative to the data's own curvature.
 SEGMENTS = 8
 SMOOTHINGS = (1e-4, 1e-3, 1e-2, 1e-1, 1.0)
@@ -187,6 +190,7 @@ class _Scene:
         self.result, self.data = result, data
         self.e = self.freed(result.e)
         self.J = self.freed(result.jacobian[0])
+        self._own = np.linalg.svd(self.J / np.maximum(np.linalg.norm(self.J, axis=0), 1e-300), full_matrices=False)[0]
         self.rows = data.rows
         number = np.zeros(result.e.size, dtype=np.int64)
         for i, (a, b) in enumerate(result.windows):
@@ -232,6 +236,11 @@ class _Scene:
                 out = self._ways[place].run(driven, np.zeros((len(starts), order)), starts, stops=stops)[:, 0]
             rows.append(np.where(ok, out, 0.0))
         return self.freed(np.concatenate(self.data.whitened(rows)))
+
+    def is_new(self, column: FloatArray) -> bool:
+        """Whether a direction is more than what the model's own numbers can do."""
+        left = column - self._own @ (self._own.T @ column)
+        return bool(left @ left > NEW * (column @ column))
 
     def _signals(self) -> dict[Place, dict[str, list[FloatArray]]]:
         """Return the signals that something missing may depend on, per place and recording; silent ones left out.
@@ -372,9 +381,9 @@ def _candidates(scene: _Scene) -> Iterator[_Candidate]:
 
 def _equation(scene: _Scene) -> tuple[tuple[Term, ...], Place, float]:
     """Select up to three terms, all added at one place, as long as held-out windows ask for one more."""
-    pool = list(_candidates(scene))
+    pool = [c for c in _candidates(scene) if scene.is_new(c.column)]
     before = scene.cross_validated(np.zeros((scene.e.size, 0)))
-    least = LEAST_SHARE * max(before - scene.rows, LEAST_SHARE * scene.rows)
+    least = max(LEAST_SHARE * (before - scene.rows), LEAST_DECREASE)
     chosen: list[_Candidate] = []
     error = before
     groups = [[c for c in pool if c.place == place] for place in scene.signals]

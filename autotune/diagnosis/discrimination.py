@@ -35,7 +35,7 @@ ALIVE, MOST_ALIVE, DECIDED = 0.02, 4, 0.9
 #: Expected discrimination below which nothing more can be learnt, and above which more is worth nothing.
 LEAST_DISCRIMINATION, CERTAIN = 20.0, 400.0
 #: Shares of the allowed swing and of the command's room that a planned excitation takes.
-SWING_SHARE, ROOM_SHARE = 0.7, 0.8
+SWING_SHARE, ROOM_SHARE = 0.5, 0.8
 #: Slowest feature of an excitation, in time constants of the loop.
 HOLDS = 2.5
 
@@ -65,21 +65,38 @@ def alive(found: Diagnosis) -> dict[str, tuple[Hypothesis, float]]:
     Parameters
     ----------
     found : Diagnosis
-        With candidates and search; ``unknown`` is no hypothesis that predicts anything.
+        With candidates and search; ``unknown`` is no hypothesis that predicts anything. The chosen hypothesis is
+        always among those returned, however little is left for it.
     """
     search = found.search
     pool = {frozenset(h.names): h for h in (search.retuned, *search.singles, *search.pairs, *search.triples)}
+    believed = {candidate.name: candidate.probability for candidate in found.candidates}
+    chosen = "+".join(search.chosen.names) or "none"
     classes: dict[frozenset[str], tuple[str, Hypothesis, float]] = {}
-    for candidate in found.candidates:
-        names = frozenset() if candidate.name == "none" else frozenset(candidate.name.split("+"))
+    for name, probability in ({chosen: 0.0} | believed).items():
+        names = frozenset() if name == "none" else frozenset(name.split("+"))
         if names not in pool:
             continue
-        key = frozenset(min((name, *entry_of(name).same)) for name in names)
-        label, h, p = classes.get(key, (candidate.name, pool[names], 0.0))
-        classes[key] = (label, h, p + candidate.probability)
+        label, h, p = classes.get(_class(names), (name, pool[names], 0.0))
+        classes[_class(names)] = (label, h, p + probability)
     total = sum(p for _, _, p in classes.values()) or 1.0
+    kept = classes[_class(frozenset(search.chosen.names))][0]
     ranked = sorted(((label, h, p / total) for label, h, p in classes.values()), key=lambda c: -c[2])
-    return {label: (h, p) for label, h, p in ranked[:MOST_ALIVE] if p >= ALIVE}
+    few = [one for one in ranked if one[2] >= ALIVE][:MOST_ALIVE]
+    few += [one for one in ranked if one[0] == kept and one not in few]
+    return {label: (h, max(p, ALIVE)) for label, h, p in few}
+
+
+def decided(found: Diagnosis) -> str:
+    """Return the hypothesis that is left, with all that u and y cannot tell from it; empty where several are."""
+    hypotheses = alive(found)
+    best, (h, p) = next(iter(hypotheses.items()))
+    same = _class(frozenset(h.names)) == _class(frozenset(found.search.chosen.names))
+    return best if same and (len(hypotheses) == 1 or p >= DECIDED) else ""
+
+
+def _class(names: frozenset[str]) -> frozenset[str]:
+    return frozenset(min((name, *entry_of(name).same)) for name in names)
 
 
 def plan_in(

@@ -10,7 +10,7 @@ from typing import Any
 from autotune.config import Config
 from autotune.controller import Controller, PIDController
 from autotune.diagnosis.diagnose import diagnose
-from autotune.diagnosis.discrimination import DECIDED, LEAST_DISCRIMINATION, Plan, alive, general, plan_in
+from autotune.diagnosis.discrimination import LEAST_DISCRIMINATION, Plan, alive, decided, general, plan_in
 from autotune.diagnosis.result import Diagnosis
 from autotune.diagnosis.simulation import assemble
 from autotune.errors import AutotuneError
@@ -186,9 +186,8 @@ def _next(
         return Plan(excitation=first, between=(), discrimination=0.0), ""
     if found.verdict in ("none", "parameters"):
         return None, "the simulation explains the recordings"
-    hypotheses = alive(found)
-    best = next(iter(hypotheses), "")
-    if len(hypotheses) < 2 or hypotheses[best][1] >= DECIDED:
+    hypotheses, best = alive(found), decided(found)
+    if best or len(hypotheses) < 2:
         unexplained = "no hypothesis explains the recordings: see the description of what is missing"
         return None, unexplained if found.verdict == "unexplained" else f"one hypothesis is left: {best}"
     if done >= rounds:

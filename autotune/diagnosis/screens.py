@@ -26,7 +26,7 @@ PERIODIC, LEAST_PERIODS = 0.9, 3
 #: Harmonics looked at.
 HARMONICS = 10
 #: Bins of a curve of means; standard errors beyond which a mean is more than chance.
-BINS, CLEAR = 24, 4.0
+BINS, CLEAR = 24, 3.0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -195,8 +195,13 @@ def period_of(u: FloatArray) -> int:
     below = np.flatnonzero(correlation < 0.5)
     if not below.size or below[0] >= lags:
         return 0
-    peak = int(below[0] + np.argmax(correlation[below[0] :]))
-    return peak if correlation[peak] > PERIODIC and peak < lags else 0
+    later = correlation[below[0] :]
+    if later.max() < PERIODIC:
+        return 0
+    # multiples of the period correlate as well: the first peak counts
+    first = int(np.argmax(later > later.max() - 0.02))
+    peak = int(below[0] + first + np.argmax(later[first : first + max(2, below[0])]))
+    return peak if peak < lags else 0
 
 
 def period_screen(result: Fit, data: Data) -> PeriodScreen | None:
@@ -282,15 +287,18 @@ def direction_screen(result: Fit, data: Data) -> DirectionScreen | None:
     sd, per_row = data.noise.total_sd, independent_share(result)
     good = np.concatenate(data.good) & np.isfinite(np.concatenate([s[:, 0] for s in result.signals]))
     rates = [np.gradient(np.nan_to_num(s[:, 0]), r.t) for s, r in zip(result.signals, data.recordings, strict=True)]
-    rate = np.concatenate(rates)[good]
-    e = np.concatenate(result.residuals)[good] / sd
-    up, down = rate > 0.0, rate < 0.0
-    if min(up.sum(), down.sum()) < 100:
+    rate = np.concatenate(rates)
+    e = np.concatenate(result.residuals) / sd
+    up, down = good & (rate > 0.0), good & (rate < 0.0)
+    gaps = []
+    for a, b in result.windows:
+        if min(up[a:b].sum(), down[a:b].sum()) >= 5:
+            gaps.append(e[a:b][up[a:b]].mean() - e[a:b][down[a:b]].mean())
+    if len(gaps) < 4:
         return None
     rising = means_over("rate of the reading, rising", rate[up], e[up], per_row, BINS // 2)
     falling = means_over("rate of the reading, falling", -rate[down], e[down], per_row, BINS // 2)
-    gap = float(e[up].mean() - e[down].mean())
-    error = float(np.hypot(e[up].std() / np.sqrt(per_row * up.sum()), e[down].std() / np.sqrt(per_row * down.sum())))
+    gap, error = float(np.mean(gaps)), float(np.std(gaps, ddof=1) / np.sqrt(len(gaps)))
     verdict = "more than chance" if abs(gap) > CLEAR * error else "within chance"
     says = f"Rising less falling, the mean residual differs by {gap:.2g} ± {1.96 * error:.2g} noise sd: {verdict}."
     return DirectionScreen(rising=rising, falling=falling, sentence=says)

@@ -32,7 +32,7 @@ KINDS: tuple[Kind, ...] = ("staircase", "triangle", "random steps", "sweep", "pu
 #: Levels of a staircase: up, down through the middle, and back, so that every level is met in both directions.
 LEVELS = (0.0, 0.5, 1.0, 0.5, 0.0, -0.5, -1.0, -0.5)
 #: Departure of y at which the pattern is halved, as a share of the allowed swing.
-ALARM = 0.85
+ALARM = 0.65
 #: Longest wait for rest before the pattern begins, in its slowest feature; departure that counts as rest, of the swing.
 SETTLE, AT_REST = 6.0, 0.1
 
@@ -159,14 +159,15 @@ def run_excitation(
                 left_s = (pattern.size - k) * dt_s
                 on_progress(Progress(state=State.SWEEP, elapsed_s=tick.t_s, remaining_s=left_s,
                                      message=f"{excitation.kind} on the {excitation.on}"))  # fmt: skip
-            if drive.away(tick) > ALARM * limits.swing and tick.t_s - alarmed_s > excitation.hold_s:
+            if drive.away(tick) > ALARM * limits.swing and tick.t_s - alarmed_s > 0.25 * excitation.hold_s:
                 share, alarmed_s = 0.5 * share, tick.t_s
             drive.step(share * float(wanted), on_setpoint=excitation.on == "set-point")
         loop.metadata["excitation"] |= {"start_s": start_s, "end_s": loop.tick.t_s, "share_at_end": share}
         if config.controller is not None:
             loop.metadata["controller"] = {"kind": "pi", "K": config.controller.K, "Ti_s": config.controller.Ti_s}
         end_s = loop.tick.t_s
-    return read_recording(recording).between(start_s, end_s)
+    # stamps in the file are rounded: half a sample to either side
+    return read_recording(recording).between(start_s - 0.5 * dt_s, end_s - 0.5 * dt_s)
 
 
 def _brought_there(loop: ControlLoop, config: Config) -> float:
