@@ -18,6 +18,8 @@ from autotune.errors import InputError
 Given = TypeVar("Given")
 Answer = TypeVar("Answer")
 
+#: The profiler's samples would fill the memory; no task waits at a worker, where it would share the blame for its death.
+_EMBEDDED = {"distributed.worker.profile.enabled": False, "distributed.scheduler.worker-saturation": 1.0}
 #: A task that ends with an error of its surroundings (a network drive) is tried this many times more.
 _RETRIES = 2
 #: An existing scheduler must answer, and have a worker, within this time [s].
@@ -51,7 +53,7 @@ def cluster(workers: int | None = None, scheduler: str | None = None) -> Iterato
     """
     if scheduler is None:
         with (
-            dask.config.set({"distributed.worker.profile.enabled": False}),  # its samples would fill the memory
+            dask.config.set(_EMBEDDED),
             LocalCluster(
                 n_workers=workers or CPU_COUNT,
                 threads_per_worker=1,
