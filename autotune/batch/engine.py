@@ -18,7 +18,7 @@ from autotune.errors import InputError
 Given = TypeVar("Given")
 Answer = TypeVar("Answer")
 
-#: The profiler's samples would fill the memory; no task waits at a worker, where it would share the blame for its death.
+#: The profiler's samples would fill the memory. No task waits at a worker, or it would share the blame for its death.
 _EMBEDDED = {"distributed.worker.profile.enabled": False, "distributed.scheduler.worker-saturation": 1.0}
 #: A task that ends with an error of its surroundings (a network drive) is tried this many times more.
 _RETRIES = 2
