@@ -81,7 +81,7 @@ def diagnose(
     found.write(out / "diagnosis.json")
     equations = {effect.name: entry_of(effect.name).equation for effect in found.extended_model.effects}
     write_model(found.extended_model, out / "extended_model.toml", equations)
-    write_diagnosis_page(found, out / "report.html")
+    write_diagnosis_page(found, out / "report.html", law)
     for sentence in found.sentences:
         typer.echo(sentence)
     typer.echo(f"diagnosis.json, extended_model.toml and report.html are in {out}")
