@@ -140,12 +140,12 @@ def test_gains_that_the_measured_plant_calls_unstable_never_reach_the_rig(tmp_pa
 
 
 class Loaded(Mute):
-    """The ball rig with something that leans on its actuator 32 s after the sweep, in the midst of the verification."""
+    """The ball rig with something that leans on its actuator 28 s after the sweep, in the midst of the verification."""
 
     swept_s = math.inf
 
     def live(self, dt_s: float) -> None:
-        late = self.clock.now() - self.swept_s > 32.0
+        late = self.clock.now() - self.swept_s > 28.0
         self.plant.advance(self.command - (0.03 if late else 0.0), dt_s)
 
     def close(self) -> None:
@@ -164,7 +164,7 @@ def loaded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Config, Tuning, Pa
     folder = tmp_path_factory.mktemp("loaded")
     config = sections(
         load_config(CONFIGS / "ball_sim.toml"),
-        signals={"sample_time_s": 0.03}, experiment={"points": 3, "budget_s": 30.0},
+        signals={"sample_time_s": 0.03}, experiment={"points": 3, "budget_s": 25.0}, verification={"duration_s": 8.0},
     )  # fmt: skip
     rig = Loaded(make_plant("ball", seed=4, noise=0.1), u_safe=0.0, controller=OLD)
     return config, tune(rig, config, folder), folder
@@ -194,7 +194,7 @@ def test_a_load_in_the_midst_of_the_verification_is_found_in_the_runs_own_record
     assert found.effects[0].name == "environment.step_load"
     recording, start_s, _ = found.effects[0].windows[0]
     assert recording == 1
-    assert start_s == pytest.approx(32.0, abs=0.5)
+    assert start_s == pytest.approx(28.0, abs=0.5)
     assert found.effects[0].parameters["amplitude"].value == pytest.approx(-0.03, rel=0.1)
     told = json.loads((folder / "result.json").read_text())["diagnosis"]
     assert (told["verdict"], told["effects"][0]["name"]) == ("effect", "environment.step_load")
