@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 
@@ -118,6 +119,23 @@ class ReplayRig:
             raise LinkError("the rig is not open", where=self._recording.name, mend="open it before the first sample")
 
 
+class ExchangeReplayRig(ReplayRig):
+    """A recording of a rig that took commands and samples at one instant: a row's command comes from the row before."""
+
+    def read(self) -> Reading:
+        """Return the next row's measurement, with the command that acts from its instant on."""
+        reading = super().read()
+        return replace(reading, u_applied=float(self._recording.u[self._row]), device_time_s=reading.t_s)
+
+    def exchange(self, u: float) -> Reading:
+        """Return the next row, whose recorded command ``u`` [u unit] is compared with."""
+        reading = self.read()
+        self.write(u)
+        return reading
+
+
 def open_replay(settings: ReplaySettings) -> ReplayRig:
     """Return the rig that ``[rig] kind = "replay"`` describes."""
-    return ReplayRig(read_recording(settings.recording), tolerance=settings.tolerance)
+    recording = read_recording(settings.recording)
+    kind = ExchangeReplayRig if recording.metadata.get("rig") == "serial" else ReplayRig
+    return kind(recording, tolerance=settings.tolerance)

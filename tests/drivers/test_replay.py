@@ -9,10 +9,13 @@ import pytest
 from autotune.config import load_config
 from autotune.config.rig import ReplaySettings
 from autotune.errors import InputError, LinkError
-from autotune.experiment.run import run_experiment
-from autotune.recording import Recording, RecordingWriter
+from autotune.experiment.loop import ControlLoop
+from autotune.experiment.rig import Rig
+from autotune.experiment.run import envelope_of, run_experiment
+from autotune.recording import Recording, RecordingWriter, read_recording
 from drivers import open_rig
 from drivers.replay import ReplayRig
+from tests.drivers.bench import serial_bench
 
 T = np.array([0.0, 0.011, 0.019, 0.032])
 U = np.array([1.0, -1.0, 1.0, 0.0])
@@ -74,3 +77,22 @@ def test_a_replayed_experiment_gives_the_points_that_were_measured(tmp_path: Pat
     for one, other in zip(measured, replayed, strict=True):
         assert other.omega_rad_s == pytest.approx(one.omega_rad_s, rel=1e-9)
         assert abs(other.response / one.response - 1.0) < 1e-8  # twelve digits in the file
+
+
+def test_a_recording_of_exchanged_samples_is_gone_through_by_the_law_that_made_it(tmp_path: Path) -> None:
+    def go(rig: Rig, path: Path) -> None:
+        config = load_config(Path(__file__).parents[2] / "configs" / "servo_sim.toml")
+        writer = RecordingWriter(path, ("t", "u", "y"), {"rig": "serial"})
+        with ControlLoop(rig=rig, envelope=envelope_of(config), writer=writer) as loop:
+            for _ in range(40):
+                loop.step(loop.nearest(-0.4 if loop.tick.y > 0.0 else 0.4))
+
+    with serial_bench(deadman_s=5.0) as bench:
+        go(bench.rig, tmp_path / "first.csv")
+    first = read_recording(tmp_path / "first.csv")
+    tolerance = 20.0 / 16000  # a count of the output
+    settings = ReplaySettings(kind="replay", recording=first.name, tolerance=tolerance)
+    go(open_rig(settings, u_range=(-1.0, 1.0), u_safe=0.0), tmp_path / "again.csv")
+    again = read_recording(tmp_path / "again.csv")
+    for column in ("t", "u", "y"):
+        np.testing.assert_allclose(again[column][:-1], first[column][:-1], atol=1e-9)
