@@ -27,15 +27,18 @@ _PATIENCE_S = 30.0
 
 
 @contextmanager
-def cluster(workers: int | None = None, scheduler: str | None = None) -> Iterator[Client]:
+def cluster(workers: int | None = None, scheduler: str | None = None, *, processes: bool = True) -> Iterator[Client]:
     """Connect to a Dask cluster, and leave nothing of it behind.
 
     Parameters
     ----------
     workers : int, optional
-        Processes of the embedded cluster, one thread each; as many as the machine has processors when absent.
+        Tasks that the embedded cluster runs at a time; as many as the machine has processors when absent.
     scheduler : str, optional
         Address of an existing scheduler, ``tcp://host:8786``; the embedded cluster when absent.
+    processes : bool
+        Whether each task of the embedded cluster has a process of its own; a thread is enough for one that starts a
+        program.
 
     Yields
     ------
@@ -52,16 +55,18 @@ def cluster(workers: int | None = None, scheduler: str | None = None) -> Iterato
     The embedded cluster listens on 127.0.0.1 only, has no dashboard, and replaces a worker that dies.
     """
     if scheduler is None:
+        tasks = workers or CPU_COUNT
         with (
             dask.config.set(_EMBEDDED),
             LocalCluster(
-                n_workers=workers or CPU_COUNT,
-                threads_per_worker=1,
-                host="127.0.0.1",
+                n_workers=tasks if processes else 1,
+                threads_per_worker=1 if processes else tasks,
+                processes=processes,
+                host="tcp://127.0.0.1",
                 dashboard_address=None,
                 scheduler_kwargs={"dashboard_address": "127.0.0.1:0"},  # it serves its health there, on any free port
                 silence_logs=logging.CRITICAL,
-                preload=[__name__],
+                preload=[__name__] if processes else [],
             ) as local,
             Client(local) as client,
         ):
