@@ -132,6 +132,7 @@ def main() -> None:
     headers: tuple[Any, ...] = ("link", "worst error [%]", "delay [ms]", "from truth", "from in process", "95 %")
     table = Table(*headers, title="Points over every link")
     reference: tuple[FrequencyPoint, ...] = ()
+    missing: list[str] = []
     with tempfile.TemporaryDirectory() as folder:
         for name, points in virtual_runs(Path(folder)):
             reference = reference or points
@@ -140,5 +141,7 @@ def main() -> None:
             try:
                 table.add_row(*row(kind, real_run(kind, Path(folder)), reference))
             except AutotuneError as error:
-                table.add_row(kind, str(error))
+                missing.append(f"{kind}: {error}")
     console.print(table)
+    for line in missing:
+        console.print(line, markup=False)

@@ -224,14 +224,14 @@ class UnoOnLine:
         start_s = time.perf_counter() - self.uno.time_s
         while not self._stop.is_set():
             ready, _, _ = select.select([self._line], [], [], 0.0005)
-            if ready:
-                self.uno.send(os.read(self._line, 4096))
+            arrived = os.read(self._line, 4096) if ready else b""
             if self._reset.is_set():
                 self._reset.clear()
                 self.uno.reset()
             behind_s = time.perf_counter() - start_s - self.uno.time_s
             if behind_s > 0:
                 self.uno.advance(behind_s)
+            self.uno.send(arrived)  # now: where the computer was busy the request is not older than it is
             sent = self.uno.received()
             if sent:
                 os.write(self._line, sent)
