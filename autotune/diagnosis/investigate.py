@@ -184,9 +184,9 @@ def _next(
     if found is None:
         first = general(assemble(model), config, duration_s)
         return Plan(excitation=first, between=(), discrimination=0.0), ""
-    if found.verdict in ("none", "parameters"):
-        return None, "the simulation explains the recordings"
     hypotheses, best = alive(found), decided(found)
+    if best == "none":
+        return None, "the simulation explains the recordings"
     if best or len(hypotheses) < 2:
         unexplained = "no hypothesis explains the recordings: see the description of what is missing"
         return None, unexplained if found.verdict == "unexplained" else f"one hypothesis is left: {best}"
