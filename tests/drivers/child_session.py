@@ -11,7 +11,8 @@ from autotune.experiment.loop import ControlLoop
 from autotune.recording import RecordingWriter
 from drivers import open_rig
 from tests.drivers.bench import U_SAFE, tcp_settings
-from tests.drivers.campaign import LIMITS, SAMPLE_S
+from tests.drivers.campaign import SAMPLE_S
+from tests.drivers.lines import LIMITS
 
 
 def main() -> None:

@@ -14,7 +14,8 @@ from autotune.recording import read_recording
 from sim.modbus_rig import ModbusRig, TcpTransport
 from sim.register_device import OutputChange
 from tests.drivers.bench import LIMIT_S, U_SAFE, register_device
-from tests.drivers.campaign import ATTEMPTS, LoggedServo, NeverBegunError, Outcome, bad_samples, beyond_limits
+from tests.drivers.campaign import ATTEMPTS, NeverBegunError, Outcome, bad_samples, beyond_limits
+from tests.drivers.lines import LoggedServo
 
 
 def strike_process(number: signal.Signals | None, seed: int) -> Outcome:

@@ -1,0 +1,166 @@
+"""The lines of the fault campaign: a servo that remembers what it measured, behind each link, and means of harm."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from autotune.config.procedure import LimitSettings
+from autotune.experiment.rig import Rig
+from drivers import open_rig
+from sim.modbus_rig import ModbusRig, RtuTransport, TcpTransport
+from sim.register_device import RegisterDevice
+from sim.serial_line import SerialLine
+from sim.serial_rig import SerialRig, device_on_line
+from sim.servo import Servo, ServoSettings
+from tests.drivers.bench import (
+    U_RANGE,
+    U_SAFE,
+    register_device,
+    rtu_settings,
+    serial_settings,
+    tcp_settings,
+)
+from tests.drivers.tcp_relay import TcpRelay
+
+TIMEOUT_S = 0.06
+LIMITS = LimitSettings(u_min=-1.0, u_max=1.0, u_safe=U_SAFE, y_min=-3.0, y_max=3.0, swing=2.0, time_s=60.0)
+
+Fate = Sequence[tuple[float, bytes]]
+Harm = Callable[[bytes, str], Fate]
+
+#: of the microcontroller's converter: fine, so that a measurement is known again in the recording
+Y_SPAN, Y_FULL = (-2.0, 2.0), 65535
+
+
+def by_float(y: float) -> float:
+    """Return a measurement as registers show it: a float of 32 bits."""
+    return float(np.float32(y))
+
+
+def by_count(y: float) -> float:
+    """Return a measurement as the microcontroller shows it: in counts of its converter."""
+    return float(round((by_float(y) - Y_SPAN[0]) / ((Y_SPAN[1] - Y_SPAN[0]) / Y_FULL)))
+
+
+class LoggedServo(Servo):
+    """A servo that remembers when it measured what, as its line shows it."""
+
+    def __init__(self, seed: int, shown: Callable[[float], float] = by_float) -> None:
+        super().__init__(ServoSettings(load=0.05, noise=0.002, resolution=0.0), seed=seed)
+        self.shown = shown
+        self.measured: dict[float, list[float]] = {}
+
+    def measure(self) -> float:
+        y = super().measure()
+        self.measured.setdefault(self.shown(y), []).append(self.time_s)
+        return y
+
+
+@dataclass(kw_only=True)
+class Line:
+    """A rig on a line, the device behind it, and the means to harm both."""
+
+    rig: Rig
+    device: RegisterDevice
+    plant: LoggedServo
+    random: random.Random
+    set_harm: Callable[[Harm], None] = lambda harm: None
+    reset: Callable[[], None] = lambda: None
+    refusing: dict[str, Any] = field(default_factory=dict)
+    unplug: Callable[[], None] = lambda: None
+    jump: Callable[[float], None] = lambda seconds: None
+    undo: ExitStack = field(default_factory=ExitStack)
+
+
+def _whole(frame: bytes, direction: str) -> Fate:
+    return ((0.0, frame),)
+
+
+@contextmanager
+def tcp_line(seed: int) -> Iterator[Line]:
+    """A rig on TCP with a relay in between."""
+    plant = LoggedServo(seed)
+    device = register_device(plant=plant)
+    refusing: dict[str, Any] = {}
+
+    def refuse(table: str, address: int, writes: bool) -> int | None:
+        if refusing.get("left", 0) <= 0:
+            return None
+        refusing["left"] -= 1
+        return int(refusing["code"])
+
+    with (
+        ModbusRig(device, TcpTransport(), refuse=refuse) as server,
+        TcpRelay(server.port) as relay,
+        ExitStack() as undo,
+    ):
+        settings = tcp_settings(relay.port, timeout_s=TIMEOUT_S)
+        rig = open_rig(settings, u_range=(LIMITS.u_min, LIMITS.u_max), u_safe=U_SAFE)
+
+        def harm(how: Harm) -> None:
+            relay.tamper = how
+
+        yield Line(
+            rig=rig,
+            device=device,
+            plant=plant,
+            random=random.Random(seed),
+            set_harm=harm,
+            reset=relay.reset,
+            refusing=refusing,
+            undo=undo,
+        )
+        rig.close()
+
+
+@contextmanager
+def rtu_line(seed: int) -> Iterator[Line]:
+    """A rig on a serial line."""
+    plant = LoggedServo(seed)
+    device = register_device(plant=plant)
+    with SerialLine(_whole) as line, ModbusRig(device, RtuTransport(device=line.rig_device, parity="N")):
+        settings = rtu_settings(line.host_device, timeout_s=TIMEOUT_S, late_reply_s=0.2)
+        rig = open_rig(settings, u_range=(LIMITS.u_min, LIMITS.u_max), u_safe=U_SAFE)
+
+        def harm(how: Harm) -> None:
+            line.tamper = how
+
+        yield Line(rig=rig, device=device, plant=plant, random=random.Random(seed), set_harm=harm)
+        rig.close()
+
+
+@contextmanager
+def serial_line(seed: int) -> Iterator[Line]:
+    """A microcontroller on a serial line."""
+    plant = LoggedServo(seed, by_count)
+    device = device_on_line(plant, u_range=U_RANGE, u_safe=0.0)
+    spans = {"y_span": Y_SPAN, "u_span": U_RANGE}
+    with (
+        SerialLine(_whole) as line,
+        SerialRig(device, line.rig_device, y_full=Y_FULL, **spans) as served,
+        ExitStack() as undo,
+    ):
+        settings = serial_settings(line.host_device, timeout_s=TIMEOUT_S, start_s=0.2, **spans)
+        rig = open_rig(settings, u_range=(LIMITS.u_min, LIMITS.u_max), u_safe=U_SAFE)
+
+        def harm(how: Harm) -> None:
+            line.tamper = how
+
+        yield Line(
+            rig=rig,
+            device=device,
+            plant=plant,
+            random=random.Random(seed),
+            set_harm=harm,
+            reset=served.restart,
+            unplug=line.close,
+            jump=served.jump,
+            undo=undo,
+        )
+        rig.close()
