@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import socket
 from pathlib import Path
 from typing import Annotated
 
@@ -40,7 +41,7 @@ def live(
         raise InputError(f"holds no {PROGRESS}", where=str(folder), mend="give the --out folder of autotune run")
     token = token_for(listen, token)
     bound = listening(listen, port)
-    host = f"[{listen}]" if ":" in listen else listen
+    host = socket.gethostname() if listen in ("0.0.0.0", "::") else f"[{listen}]" if ":" in listen else listen
     url = f"http://{host}:{bound.getsockname()[1]}/" + (f"?token={token}" if token else "")
     if beside_run:
         if os.name == "posix":
