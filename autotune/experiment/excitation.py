@@ -24,6 +24,7 @@ from autotune.experiment.result import Progress, State
 from autotune.experiment.rig import Rig
 from autotune.experiment.run import OnProgress, envelope_of, float_on, recording_metadata
 from autotune.experiment.verify import law_for
+from autotune.experiment.warm import warm_up
 from autotune.recording import Recording, RecordingWriter, read_recording
 
 Kind: TypeAlias = Literal["staircase", "triangle", "random steps", "sweep", "pulses"]
@@ -144,6 +145,8 @@ def run_excitation(
         What ended it; the rig is safe and the recording readable.
     """
     limits, dt_s = config.limits, config.signals.sample_time_s
+    pattern = excitation.pattern(dt_s)
+    warm_up()
     writer = RecordingWriter(recording, ("t", "u", "y", "r", "dither"), recording_metadata(config))
     with ControlLoop(rig=rig, envelope=envelope_of(config), writer=writer, extra=("r", "dither")) as loop:
         loop.note(excitation={"kind": excitation.kind} | excitation.settings())
@@ -151,7 +154,6 @@ def run_excitation(
         drive = _Drive(loop, config, u_hold, excitation.amplitude if excitation.on == "command" else 0.0)
         loop.watch = Watch(y_centre=config.operating_point.y, afloat=True)
         drive.settle(excitation.hold_s)
-        pattern = excitation.pattern(dt_s)
         start_s, share, alarmed_s = loop.tick.t_s, 1.0, -math.inf
         for k, wanted in enumerate(pattern):
             tick = loop.tick
