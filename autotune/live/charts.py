@@ -32,6 +32,37 @@ Options = dict[str, Any]
 STACK = {"stack": "band", "stackStrategy": "all"}
 
 
+class Pictures:
+    """The charts of a story, computed once for all pages that show the same.
+
+    Parameters
+    ----------
+    story : Story
+        What is drawn.
+    """
+
+    def __init__(self, story: Story) -> None:
+        self._story = story
+        self._strips: dict[float, tuple[tuple[int, int], Options]] = {}
+        self._news = -1
+        self._facts: tuple[Options, Options, float, Options] = ({}, {}, 1.0, {})
+
+    def strip(self, span_s: float) -> Options:
+        """Return the strip chart of the last ``span_s`` [s]."""
+        state = (len(self._story.rows.t), self._story.news)
+        if self._strips.get(span_s, (None, {}))[0] != state:
+            self._strips[span_s] = (state, strip_options(self._story, span_s))
+        return self._strips[span_s][1]
+
+    def facts(self) -> tuple[Options, Options, float, Options]:
+        """Return Bode diagram, regions, how many times larger these are drawn, and steps, empty where none are."""
+        story = self._story
+        if self._news != story.news:
+            self._news = story.news
+            self._facts = (bode_options(story), *regions_options(story), steps_options(story) if story.steps else {})
+        return self._facts
+
+
 def strip_options(story: Story, span_s: float) -> Options:
     """Return y with its limits and the set-point over u with its limits, for the last ``span_s`` [s]."""
     now_s = story.now_s

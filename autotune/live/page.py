@@ -12,12 +12,14 @@ from nicegui.events import KeyEventArguments
 
 from autotune.controller import PIDController
 from autotune.experiment.loop import SAFE
-from autotune.live.charts import bode_options, regions_options, steps_options, strip_options
+from autotune.live.charts import Pictures
 from autotune.live.controls import Controls
 from autotune.live.story import Story
 
 #: what the strip chart shows [s]
 SPANS = {20.0: "20 s", 60.0: "60 s", math.inf: "All"}
+#: shortest time between two pictures [s]
+PICTURE_S = 0.4
 #: longest wait for a browser to say that it has drawn before it is sent the next picture [s]
 DRAWING_S = 10.0
 #: silence after which the reader is told that nothing comes [s]
@@ -70,6 +72,8 @@ class Screen:
     ----------
     story : Story
         What is shown; somebody else polls it.
+    pictures : Pictures
+        Its charts.
     controls : Controls
         Which page may act, and what its actions do.
     client : Client
@@ -81,8 +85,8 @@ class Screen:
         The browser tab it is in; kept through a reload, None before it has connected.
     """
 
-    def __init__(self, story: Story, controls: Controls, client: Client) -> None:
-        self._story, self._controls, self._client = story, controls, client
+    def __init__(self, story: Story, pictures: Pictures, controls: Controls, client: Client) -> None:
+        self._story, self._pictures, self._controls, self._client = story, pictures, controls, client
         self.tab: str | None = None
         self._span_s = 60.0 if story.ended is None else math.inf
         self._shown: tuple[Any, ...] = ()
@@ -175,24 +179,23 @@ class Screen:
             return
         self._show_words()
         now_s = time.monotonic()
-        if self._drawing and now_s - self._drawn_s < DRAWING_S:
+        if now_s - self._drawn_s < (DRAWING_S if self._drawing else PICTURE_S):
             return
         story = self._story
         rows, facts = (len(story.rows.t), self._span_s), (story.news, self._dark.value)
         if (rows, facts) == self._shown:
             return
         if self._shown[1:] != (facts,):
-            self._show(self._bode, bode_options(story))
-            plane, times = regions_options(story)
+            bode, plane, times, steps = self._pictures.facts()
+            self._show(self._bode, bode)
             self._show(self._plane, plane)
             self._plane_note.text = (
                 f"95 % regions, drawn {times:g} times as large." if times > 1.0 else "95 % regions in their true size."
             )
-            if story.steps:
-                self._show(self._steps, steps_options(story))
+            self._show(self._steps, steps)
         self._shown = (rows, facts)
         self._drawing, self._drawn_s = True, now_s
-        self._show(self._strip, strip_options(story, self._span_s))
+        self._show(self._strip, self._pictures.strip(self._span_s))
 
     @staticmethod
     def _show(chart: ui.echart, options: dict[str, Any]) -> None:
@@ -343,9 +346,10 @@ def _gain_rows(story: Story) -> list[tuple[str, str, str]]:
 
 def build(story: Story, controls: Controls, screens: set[Screen]) -> Callable[[Client], None]:
     """Return the function that builds a page for a browser that asks for one."""
+    pictures = Pictures(story)
 
     def page(client: Client) -> None:
-        screen = Screen(story, controls, client)
+        screen = Screen(story, pictures, controls, client)
         screens.add(screen)
         client.on_connect(screen.arrive)
         client.on_delete(lambda: screens.discard(screen))
