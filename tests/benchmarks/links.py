@@ -1,9 +1,10 @@
 """One experiment over every link: do the ball's Bode points agree?
 
 The configurations of ``configs/ball_*.toml``, which differ in their table ``[rig]`` only, are run in process, replayed
-from the recording of that run, and against the firmware in simavr with the host in the loop and with the relay on the
-device, all in virtual time; then in real time, 65 s each, over the lines that ``LINKS="tcp rtu tls serial"`` names
-(TCP by default; none where it is empty). Each is served by ``autotune rig`` in a process of its own.
+from the recording of that run, through the Modbus register map without a socket, and against the firmware in simavr
+with the host in the loop and with the relay on the device, all in virtual time; then in real time, 65 s each, over the
+lines that ``LINKS="tcp rtu tls serial"`` names (TCP by default; none where it is empty), each served by
+``autotune rig`` in a process of its own.
 
 A point is divided by the ball's own response at its frequency, so that points of different frequencies can be compared.
 *from truth* and *from in process* are the sums of their squared distances in standard deviations, on their own and on
@@ -33,8 +34,9 @@ from autotune.errors import AutotuneError
 from autotune.experiment.rig import Rig
 from autotune.experiment.run import run_experiment
 from autotune.points import FrequencyPoint
-from drivers import open_rig
+from drivers import open_rig, twin_of
 from sim.plant import make_plant
+from tests.benchmarks.memory import on_registers
 from tests.drivers.bench import certificates_by_the_book
 from tests.drivers.firmware_build import build_uno
 from tests.drivers.simavr_bench import Uno, twin_ball, virtual_rig
@@ -106,6 +108,10 @@ def virtual_runs(folder: Path) -> Iterator[tuple[str, tuple[FrequencyPoint, ...]
     yield "in process", run_experiment(opened(config, config.rig), config, recording).points
     replay = ReplaySettings(kind="replay", recording=str(recording))
     yield "replay", run_experiment(opened(config, replay), config, folder / "replay.csv").points
+    config = load_config(CONFIGS / "ball_modbus_tcp.toml")
+    twin = twin_of(config.rig)
+    rig = on_registers(config, make_plant("ball", seed=twin.seed, noise=twin.noise))
+    yield "Modbus registers", run_experiment(rig, config, folder / "registers.csv").points
     elf = build_uno(folder)
     config = load_config(CONFIGS / "ball_serial.toml")
     for relay in ("host", "device"):

@@ -44,6 +44,7 @@ class Operator:
     state: str
     wait: int
     sees: str = ""
+    waits: bool = False
 
     def watch(self, progress: Progress) -> None:
         """Look at the progress bar."""
@@ -52,7 +53,8 @@ class Operator:
 
     def command(self) -> None:
         """Live through one command, or any other access of the rig."""
-        if self.sees == self.state:
+        self.waits |= self.sees == self.state
+        if self.waits:  # also into the next state, where this one was short
             self.wait -= 1
             if self.wait == 0:
                 signal.raise_signal(signal.SIGINT)
@@ -106,12 +108,16 @@ def stop_in(state: str, seed: int) -> Outcome:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "recording.csv"
         ended, status = "completed", 0
+        # a process that was started in the background ignores Ctrl-C until told otherwise
+        before = signal.signal(signal.SIGINT, signal.default_int_handler)
         try:
             _stage(state, rig, config, path)
         except OperatorStop as error:
             ended, status = str(error), error.exit_status
         except KeyboardInterrupt:  # outside the loop; the command line says the same of it
             ended, status = "stopped by Ctrl-C", OperatorStop.exit_status
+        finally:
+            signal.signal(signal.SIGINT, before)
         rows = len(read_recording(path)) if state != "hand-over" else 0
         if state == "hand-over":
             recoverable = OLD in (rig.read_gains(), Journal(path).unfinished())
