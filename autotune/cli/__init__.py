@@ -39,12 +39,15 @@ from autotune.cli import (  # noqa: E402, F401, I001
     batch,
     prove,
     rig,
+    init,
+    doctor,
     files,
 )
 
 
 #: what --help groups together, in the order of the work
 TOUR = {
+    "Before the first run": ("init", "doctor", "schema"),
     "At a rig": ("run", "deploy", "verify", "live", "dither", "investigate", "probe", "ports", "rig"),
     "From recordings to a controller": ("tune", "identify", "reduce", "design", "margins", "controller"),
     "In operation, and where model and rig differ": ("watch", "simulate", "diagnose", "batch", "prove"),

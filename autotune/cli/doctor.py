@@ -1,0 +1,274 @@
+"""Command: is this computer ready for a rig; what is not is said with its mend."""
+
+from __future__ import annotations
+
+import os
+import platform
+import shutil
+import socket
+import tempfile
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from importlib import metadata
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+from packaging.requirements import Requirement
+from rich.console import Console
+
+from autotune.cli import app
+from autotune.errors import InputError
+
+if TYPE_CHECKING:
+    from autotune.config import Config
+
+DISTRIBUTION = "relay-autotune"
+#: an hour of four columns at 1 kHz is about 150 MB
+SPACE_MB = 500.0
+#: period and number of the deadlines that the scheduler is tried with
+PERIOD_S, DEADLINES = 0.01, 100
+
+
+@dataclass(frozen=True, kw_only=True)
+class Check:
+    """What was looked at, what was found, and the mend where something is wrong.
+
+    Attributes
+    ----------
+    subject, found : str
+        What was looked at, and what was found.
+    verdict : {"ok", "note", "wrong"}
+        A note lets a run go on, something wrong does not.
+    mend : str
+        What to do about it.
+    """
+
+    subject: str
+    found: str
+    verdict: Literal["ok", "note", "wrong"] = "ok"
+    mend: str = ""
+
+
+@app.command()
+def doctor(
+    config: Annotated[
+        Path | None, typer.Argument(metavar="[CONFIG.toml]", help="configuration whose rig is looked for too")
+    ] = None,
+) -> None:
+    """Check environment, clock, ports, permissions, write access and compiled code; say the mend. Commands nothing."""
+    console = Console(highlight=False, soft_wrap=True)
+    wrong = []
+    for check in _checks(config):
+        console.print(f"{check.verdict:<5}  {check.subject}: {check.found}", markup=False)
+        if check.mend:
+            console.print(f"       -> {check.mend}", markup=False)
+        if check.verdict == "wrong":
+            wrong.append(check)
+    if wrong:
+        names = ", ".join(check.subject for check in wrong)
+        raise InputError(f"not ready for a run: {names}", where="autotune doctor", mend=wrong[0].mend)
+    console.print("ready")
+
+
+def _checks(config: Path | None) -> Iterator[Check]:
+    yield _python()
+    yield from _packages()
+    yield _extra()
+    yield _compiled()
+    yield from _writing(Path.cwd())
+    content, check = _configuration(config)
+    if check is not None:
+        yield check
+    yield from _clock(content.signals.sample_time_s if content else None)
+    yield from _serial_ports()
+    if content is not None:
+        yield from _rig(content)
+
+
+def _python() -> Check:
+    found = f"{platform.python_version()} on {platform.system()} {platform.machine()}, {os.cpu_count()} processors"
+    return Check(subject="Python", found=found)
+
+
+def _packages() -> Iterator[Check]:
+    """Compare what is installed with what the project asks for."""
+    try:
+        asked = [Requirement(line) for line in metadata.requires(DISTRIBUTION) or []]
+    except metadata.PackageNotFoundError:
+        mend = "pip install -e . in the project's folder"
+        yield Check(subject="packages", found=f"{DISTRIBUTION} is not installed", verdict="wrong", mend=mend)
+        return
+    amiss = [_missing(one) for one in asked if one.marker is None or one.marker.evaluate({"extra": ""})]
+    amiss = [words for words in amiss if words]
+    if amiss:
+        mend = f"pip install --upgrade {DISTRIBUTION}, or pip install -e . in a checkout"
+        yield Check(subject="packages", found="; ".join(amiss), verdict="wrong", mend=mend)
+    else:
+        yield Check(subject="packages", found=f"{DISTRIBUTION} {metadata.version(DISTRIBUTION)} and all it needs")
+
+
+def _missing(asked: Requirement) -> str:
+    try:
+        version = metadata.version(asked.name)
+    except metadata.PackageNotFoundError:
+        return f"{asked.name} is missing"
+    return "" if asked.specifier.contains(version, prereleases=True) else f"{asked.name} {version}, not {asked}"
+
+
+def _extra() -> Check:
+    if _missing(Requirement("nicegui")):
+        mend = f"pip install '{DISTRIBUTION}[live]' for run --live"
+        return Check(subject="live page", found="not installed", verdict="note", mend=mend)
+    return Check(subject="live page", found=f"nicegui {metadata.version('nicegui')}")
+
+
+def _compiled() -> Check:
+    """Say whether the inner loops are compiled already, and whether they can be kept."""
+    import autotune
+
+    package = Path(autotune.__file__).parent
+    given = os.environ.get("NUMBA_CACHE_DIR")
+    own = Path(given) if given else package
+    kept = sum(1 for _ in own.rglob("*.nbi")) if own.is_dir() else 0
+    subject = "compiled code"
+    # where the package cannot be written the compiler keeps its code in the user's cache folder
+    places = [own] if given else [package, Path.home()]
+    if not any(os.access(place, os.W_OK) for place in places):
+        mend = "set NUMBA_CACHE_DIR to a folder you may write; every run compiles for about a minute otherwise"
+        return Check(subject=subject, found=f"cannot be kept in {places[0]}", verdict="note", mend=mend)
+    if not kept:
+        mend = "nothing to do: the first run compiles for about a minute"
+        return Check(subject=subject, found="none yet", verdict="note", mend=mend)
+    return Check(subject=subject, found=f"{kept} functions kept in {own}")
+
+
+def _writing(folder: Path) -> Iterator[Check]:
+    try:
+        with tempfile.NamedTemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        mend = "change to a folder you may write; recordings go there"
+        yield Check(subject="write access", found=f"{folder}: {error.strerror}", verdict="wrong", mend=mend)
+        return
+    free_MB = shutil.disk_usage(folder).free / 1e6
+    enough = free_MB >= SPACE_MB
+    yield Check(
+        subject="write access",
+        found=f"{folder}, {free_MB / 1e3:.1f} GB free",
+        verdict="ok" if enough else "note",
+        mend="" if enough else "a long recording may fill the disk: a sample is on disk before it is used",
+    )
+
+
+def _configuration(path: Path | None) -> tuple[Config | None, Check | None]:
+    from autotune.config import load_config
+
+    if path is None:
+        return None, None
+    try:
+        content = load_config(path)
+    except InputError as error:
+        found = f"{error.where}: {error.what}"
+        return None, Check(subject="configuration", found=found, verdict="wrong", mend=error.mend or "mend the file")
+    return content, Check(subject="configuration", found=f"{path}: {content.rig.kind}, {content.name}")
+
+
+def _clock(sample_time_s: float | None) -> Iterator[Check]:
+    """Try absolute deadlines as a run keeps them, for a second."""
+    from drivers.clock import MonotonicClock
+
+    info = time.get_clock_info("perf_counter")
+    subject = "clock"
+    found = f"monotonic, resolution {info.resolution * 1e9:.0f} ns"
+    if not info.monotonic or info.resolution > 1e-4:
+        yield Check(subject=subject, found=found, verdict="wrong", mend="run on a computer with a fine monotonic clock")
+    else:
+        yield Check(subject=subject, found=found)
+    clock = MonotonicClock()
+    start = clock.now()
+    late = []
+    for k in range(1, DEADLINES + 1):
+        deadline = start + k * PERIOD_S
+        clock.sleep_until(deadline)
+        late.append(clock.now() - deadline)
+    late.sort()
+    usual, worst = late[len(late) // 2], late[-1]
+    allowed = 0.5 * (sample_time_s if sample_time_s is not None else PERIOD_S)
+    found = f"deadlines {usual * 1e6:.0f} us late in the median, {worst * 1e3:.2f} ms at worst in {DEADLINES}"
+    mend = "" if worst <= allowed else (
+        f"over {allowed * 1e3:g} ms, half a sample: close other programs, or let the device run the law by itself"
+    )  # fmt: skip
+    yield Check(subject="scheduling", found=found, verdict="note" if mend else "ok", mend=mend)
+
+
+def _serial_ports() -> Iterator[Check]:
+    from drivers.ports import serial_ports
+
+    found = serial_ports()
+    if not found:
+        yield Check(subject="serial ports", found="none")
+    for port in found:
+        yield _permission("serial port", port.device)
+
+
+def _permission(subject: str, device: str) -> Check:
+    if not Path(device).exists():
+        mend = "plug it in, or take another: autotune ports lists them"
+        return Check(subject=subject, found=f"{device}: no such device", verdict="wrong", mend=mend)
+    if os.access(device, os.R_OK | os.W_OK):
+        return Check(subject=subject, found=f"{device}, may be read and written")
+    mend = f"sudo usermod -aG {_group(device)} $USER, then log in again"
+    return Check(subject=subject, found=f"{device}: permission denied", verdict="note", mend=mend)
+
+
+def _group(device: str) -> str:
+    try:
+        return Path(device).group()
+    except (KeyError, NotImplementedError):
+        return "dialout"
+
+
+def _rig(content: Config) -> Iterator[Check]:
+    """Look for the rig of a configuration: its device, its address, its files. Nothing is sent to it."""
+    from autotune.config.rig import (
+        ModbusRtuSettings,
+        ModbusTcpSettings,
+        ModbusTlsSettings,
+        ReplaySettings,
+        SerialSettings,
+    )
+
+    match content.rig:
+        case ModbusTcpSettings() | ModbusTlsSettings():
+            if isinstance(content.rig, ModbusTlsSettings):
+                files = (content.rig.ca_file, content.rig.cert_file, content.rig.key_file)
+                yield from (_file(name) for name in files)
+            yield _address(content.rig.host, content.rig.port, content.rig.timeout_s)
+        case ModbusRtuSettings() | SerialSettings():
+            check = _permission("the rig's port", content.rig.device)
+            yield replace(check, verdict="wrong") if check.mend else check  # this port is needed, others are not
+        case ReplaySettings():
+            yield _file(content.rig.recording)
+        case _:
+            yield Check(subject="the rig", found="simulated, in this process")
+
+
+def _file(name: str) -> Check:
+    if os.access(name, os.R_OK):
+        return Check(subject=name, found="may be read")
+    mend = "give its path as seen from this folder; docs/modbus_tls.md makes certificates"
+    return Check(subject=name, found="cannot be read", verdict="wrong", mend=mend)
+
+
+def _address(host: str, port: int, timeout_s: float) -> Check:
+    """Open a connection and close it: no byte is sent."""
+    subject = "the rig's address"
+    try:
+        with socket.create_connection((host, port), timeout=max(1.0, timeout_s)):
+            return Check(subject=subject, found=f"{host}:{port} takes connections")
+    except OSError as error:
+        found = f"{host}:{port}: {error.strerror or error}"
+    mend = "switch it on, check cable and address; of a twin: start autotune rig first"
+    return Check(subject=subject, found=found, verdict="wrong", mend=mend)

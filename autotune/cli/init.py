@@ -1,0 +1,321 @@
+"""Command: a commented configuration from few questions, or from flags."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal, get_args
+
+import typer
+from pydantic import BaseModel
+from rich.console import Console
+
+from autotune.cli import app
+from autotune.errors import InputError
+
+Kind = Literal["simulated", "modbus_tcp", "modbus_tls", "modbus_rtu", "serial"]
+Plant = Literal["ball", "servo", "two_tank", "thermal"]
+Table = dict[str, Any]
+
+#: what is known of the simulated plants
+PLANTS: Mapping[Plant, Table] = {
+    "ball": {
+        "rig": {"seed": 1, "noise": 0.35},
+        "signals": {"sample_time_s": 0.01, "u_unit": "V", "y_unit": "V", "u_step": 10.0 / 4096.0},
+        "limits": {"u_min": 0.0, "u_max": 10.0, "u_safe": 0.0, "u_rate": 200.0, "y_min": 1.0, "y_max": 9.0,
+                   "swing": 3.0, "time_s": 180.0},
+        "operating_point": {"y": 5.0, "u_guess": 5.0, "u_uncertainty": 0.5, "approach": "ramp"},
+        "experiment": {"gain_sd": 0.0035, "budget_s": 58.0},
+        "controller": {"K": -0.01, "Ti_s": 6.0},
+    },
+    "servo": {
+        "signals": {"sample_time_s": 0.002, "u_unit": "V", "y_unit": "rad"},
+        "limits": {"u_min": -10.0, "u_max": 10.0, "u_safe": 0.0, "y_min": -3.0, "y_max": 3.0, "swing": 0.5,
+                   "time_s": 120.0},
+        "operating_point": {"y": 0.0, "u_guess": 0.0, "u_uncertainty": 0.3, "approach": "hold"},
+        "experiment": {"budget_s": 30.0},
+        "design": {"noise_gain": 20.0},
+        "controller": {"K": 1.0, "Ti_s": 1.0},
+    },
+    "two_tank": {
+        "rig": {"start": "level"},
+        "signals": {"sample_time_s": 1.0, "u_unit": "V", "y_unit": "cm"},
+        "limits": {"u_min": 0.0, "u_max": 10.0, "u_safe": 0.0, "y_min": 5.0, "y_max": 15.0, "swing": 2.0,
+                   "time_s": 20000.0},
+        "operating_point": {"y": 10.0, "u_guess": 3.0, "u_uncertainty": 0.4, "approach": "hold"},
+        "experiment": {"budget_s": 7200.0},
+        "design": {"noise_gain": 5.0},
+        "controller": {"K": 0.5, "Ti_s": 200.0},
+    },
+    "thermal": {
+        "rig": {"start": "warm"},
+        "signals": {"sample_time_s": 1.0, "u_unit": "%", "y_unit": "degC"},
+        "limits": {"u_min": 0.0, "u_max": 100.0, "u_safe": 0.0, "y_min": 30.0, "y_max": 70.0, "swing": 15.0,
+                   "time_s": 20000.0},
+        "operating_point": {"y": 50.0, "u_guess": 18.0, "u_uncertainty": 3.0, "approach": "hold"},
+        "experiment": {"budget_s": 7200.0},
+        "design": {"noise_gain": 20.0},
+        "controller": {"K": 0.5, "Ti_s": 200.0},
+        "verification": {"disturbance_step": 3.0},
+    },
+}  # fmt: skip
+
+
+@app.command()
+def init(
+    config: Annotated[Path, typer.Argument(metavar="CONFIG.toml", help="file to write; never overwritten")],
+    kind: Annotated[Kind | None, typer.Option(help="how the rig is reached")] = None,
+    plant: Annotated[
+        Plant | None, typer.Option(help="which simulated plant; of a real rig: the plant of its twin for --dry-run")
+    ] = None,
+    host: Annotated[str | None, typer.Option(help="address of a Modbus TCP or TLS device")] = None,
+    device: Annotated[str | None, typer.Option(help="serial device, see autotune ports")] = None,
+    y_register: Annotated[
+        str | None, typer.Option(metavar="TABLE:ADDRESS:TYPE", help="Modbus register of y, e.g. input:0:int16")
+    ] = None,
+    u_register: Annotated[
+        str | None, typer.Option(metavar="TABLE:ADDRESS:TYPE", help="Modbus register of u, e.g. holding:0:int16")
+    ] = None,
+    y_span: Annotated[
+        tuple[float, float] | None, typer.Option(help="y at count 0 and at full scale of a microcontroller [y unit]")
+    ] = None,
+    u_span: Annotated[
+        tuple[float, float] | None, typer.Option(help="u at count 0 and at full scale of a microcontroller [u unit]")
+    ] = None,
+    sample_time: Annotated[float | None, typer.Option(help="control period [s]")] = None,
+    u_unit: Annotated[str | None, typer.Option(help="unit of the command")] = None,
+    y_unit: Annotated[str | None, typer.Option(help="unit of the measurement")] = None,
+    u_range: Annotated[tuple[float, float] | None, typer.Option(help="lowest and highest command [u unit]")] = None,
+    u_safe: Annotated[float | None, typer.Option(help="command the rig may be left with [u unit]")] = None,
+    y_range: Annotated[
+        tuple[float, float] | None, typer.Option(help="lowest and highest y of the experiment [y unit]")
+    ] = None,
+    y: Annotated[float | None, typer.Option(help="y of the operating point [y unit]")] = None,
+    u: Annotated[float | None, typer.Option(help="command that holds y there, about [u unit]")] = None,
+) -> None:
+    """Write a commented configuration; asks at a terminal for what no flag says."""
+    from autotune.config import Config, validated
+
+    if config.exists():
+        raise InputError("exists already", where=str(config), mend="choose another name; nothing is overwritten")
+    questions = _Questions()
+    chosen: Kind = questions.ask("--kind", kind, f"how is the rig reached ({', '.join(get_args(Kind))})", _kind)
+    if chosen == "simulated":
+        name: Plant = questions.ask("--plant", plant, f"which plant ({', '.join(PLANTS)})", _plant)
+        questions.require()
+        content = _simulated(name)
+    else:
+        reached = _reached(questions, chosen, host, device, y_register, u_register, y_span, u_span)
+        answers = {
+            "u_unit": questions.ask("--u-unit", u_unit, "unit of the command u", str, ""),
+            "y_unit": questions.ask("--y-unit", y_unit, "unit of the measurement y", str, ""),
+            "sample_time_s": questions.ask("--sample-time", sample_time, "control period [s]", float),
+            "u_range": questions.ask("--u-range", u_range, "lowest and highest command u the rig may see", _pair),
+            "u_safe": questions.ask("--u-safe", u_safe, "command at which the rig may be left alone", float),
+            "y_range": questions.ask("--y-range", y_range, "lowest and highest measurement y it may see", _pair),
+            "y": questions.ask("--y", y, "y of the operating point", float),
+            "u": questions.ask("--u", u, "command that holds it there, about", float),
+        }
+        questions.require()
+        content = _real(reached, answers, plant)
+    content = {"name": config.stem, **content}
+    validated(Config, content, str(config))
+    try:
+        with config.open("x", encoding="utf-8") as file:
+            file.write(_text(content, config))
+    except OSError as error:
+        raise InputError(f"cannot be written ({error.strerror})", where=str(config), mend="check the folder") from None
+    console = Console(highlight=False, soft_wrap=True)
+    console.print(f"wrote {config}", markup=False)
+    if chosen == "simulated":
+        console.print(f"next: autotune run {config} --out runs/{config.stem}", markup=False)
+    else:
+        console.print(f"next: read it through, then autotune doctor {config}, autotune probe {config}", markup=False)
+
+
+class _Questions:
+    """Take an answer from its flag, else ask; away from a terminal collect what is missing."""
+
+    def __init__(self) -> None:
+        self._missing: list[str] = []
+        self._asks = sys.stdin.isatty() and sys.stdout.isatty()
+
+    def ask(
+        self, flag: str, given: Any, question: str, convert: Callable[[str], Any], default: str | None = None
+    ) -> Any:
+        if given is not None:
+            return convert(given) if isinstance(given, str) else given
+        if not self._asks:
+            if default is None:
+                self._missing.append(flag)
+            return default
+        return typer.prompt(question, default=default, value_proc=_checked(convert))
+
+    def require(self) -> None:
+        """Refuse where an answer is missing.
+
+        Raises
+        ------
+        InputError
+            Names every flag that is missing.
+        """
+        if self._missing:
+            flags = ", ".join(self._missing)
+            raise InputError(f"{flags}: no answer", where="autotune init", mend="give them, or call it at a terminal")
+
+
+def _checked(convert: Callable[[str], Any]) -> Callable[[str], Any]:
+    """Let a question be asked again where its answer is refused."""
+
+    def check(answer: str) -> Any:
+        try:
+            return convert(answer)
+        except ValueError as error:
+            raise typer.BadParameter(error.what if isinstance(error, InputError) else str(error)) from None
+
+    return check
+
+
+def _one_of(answer: str, known: tuple[str, ...], flag: str) -> str:
+    if answer not in known:
+        raise InputError(f"{answer!r} is none of {', '.join(known)}", where=flag)
+    return answer
+
+
+def _kind(answer: str) -> str:
+    return _one_of(answer, get_args(Kind), "--kind")
+
+
+def _plant(answer: str) -> str:
+    return _one_of(answer, tuple(PLANTS), "--plant")
+
+
+def _pair(answer: str) -> tuple[float, float]:
+    parts = answer.replace(",", " ").split()
+    if len(parts) != 2:
+        raise InputError(f"{answer!r}: two numbers are wanted", where="autotune init")
+    return float(parts[0]), float(parts[1])
+
+
+def _register(answer: str) -> Table:
+    parts = answer.split(":")
+    if len(parts) != 3 or not parts[1].isdigit():
+        raise InputError(f"{answer!r}: TABLE:ADDRESS:TYPE is wanted", where="register", mend="e.g. input:0:int16")
+    return {"table": parts[0], "address": int(parts[1]), "type": parts[2]}
+
+
+def _reached(
+    questions: _Questions,
+    kind: Kind,
+    host: str | None,
+    device: str | None,
+    y_register: str | None,
+    u_register: str | None,
+    y_span: tuple[float, float] | None,
+    u_span: tuple[float, float] | None,
+) -> Table:
+    """Return the table [rig] of a real rig."""
+    rig: Table = {"kind": kind}
+    if kind in ("modbus_tcp", "modbus_tls"):
+        rig["host"] = questions.ask("--host", host, "address of the device", str)
+    else:
+        rig["device"] = questions.ask("--device", device, "serial device (autotune ports lists them)", str)
+    if kind == "serial":
+        rig["y_span"] = questions.ask("--y-span", y_span, "y at count 0 and at the converter's full scale", _pair)
+        rig["u_span"] = questions.ask("--u-span", u_span, "u at duty 0 and at duty 1", _pair)
+        return rig
+    if kind == "modbus_tls":
+        rig |= {f"{which}_file": f"certificates/{name}" for which, name in _CERTIFICATES.items()}
+    y = questions.ask("--y-register", y_register, "register of y, TABLE:ADDRESS:TYPE, e.g. input:0:int16", _register)
+    u = questions.ask("--u-register", u_register, "register of u, TABLE:ADDRESS:TYPE, e.g. holding:0:int16", _register)
+    return rig | {"registers": {"y": y, "u": u}}
+
+
+_CERTIFICATES = {"ca": "ca.pem", "cert": "host.pem", "key": "host.key"}
+
+
+def _simulated(plant: Plant) -> Table:
+    known = dict(PLANTS[plant])
+    return {"rig": {"kind": "simulated", "plant": plant, **known.pop("rig", {})}, **known}
+
+
+def _real(rig: Table, answers: Table, plant: Plant | None) -> Table:
+    """Return the configuration of a real rig: what was answered, and cautious values that follow from it."""
+    u_min, u_max = answers["u_range"]
+    y_min, y_max = answers["y_range"]
+    room = min(answers["y"] - y_min, y_max - answers["y"])
+    if not room > 0.0:
+        raise InputError(f"y = {answers['y']:g} is not within {y_min:g}..{y_max:g}", where="operating_point.y")
+    # a quarter of the room leaves the rest to overshoot; rounded to what a person would have written
+    swing = _rounded(0.25 * room)
+    if plant is not None:
+        rig = rig | {"twin": {"plant": plant, **PLANTS[plant].get("rig", {})}}
+    return {
+        "rig": rig,
+        "signals": {name: answers[name] for name in ("sample_time_s", "u_unit", "y_unit")},
+        "limits": {"u_min": u_min, "u_max": u_max, "u_safe": answers["u_safe"],
+                   "y_min": y_min, "y_max": y_max, "swing": swing, "time_s": 600.0},
+        "operating_point": {"y": answers["y"], "u_guess": answers["u"],
+                            "u_uncertainty": _rounded(0.05 * (u_max - u_min)), "approach": "hold"},
+        "experiment": {"points": 5, "budget_s": 300.0},
+    }  # fmt: skip
+
+
+def _rounded(value: float) -> float:
+    return float(f"{value:.2g}")
+
+
+def _text(content: Table, path: Path) -> str:
+    """Return the file: every key with its description, those left at their defaults as comments."""
+    from autotune.config import Config
+
+    lines = [f"# {path.name}: what autotune run does, and on what. A line that begins with #: is a default."]
+    lines += ["# autotune schema --out config.schema.json lets editors complete the keys.", ""]
+    lines += [f"name = {_value(content['name'])}"]
+    for name, field in Config.model_fields.items():
+        if name == "name":
+            continue
+        model = _model(field.annotation, content.get(name, {}))
+        if model is not None:
+            lines += _section(name, model, content.get(name))
+    return "\n".join(lines) + "\n"
+
+
+def _model(annotation: Any, given: Mapping[str, Any]) -> type[BaseModel] | None:
+    """Return the settings that a key holds: of the kinds of a union the one that was given."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        kinds = annotation.model_fields.get("kind")
+        return None if kinds and "kind" in given and given["kind"] not in get_args(kinds.annotation) else annotation
+    models = (_model(part, given) for part in get_args(annotation))
+    return next((model for model in models if model is not None), None)
+
+
+def _section(path: str, model: type[BaseModel], given: Mapping[str, Any] | None) -> list[str]:
+    """Return a table and the tables in it; a table that was not given stays a comment."""
+    given_here = given or {}
+    written, after = [], []
+    for name, field in sorted(model.model_fields.items(), key=lambda named: named[0] != "kind"):
+        inner = None if path.endswith("registers") else _model(field.annotation, {})
+        if inner is not None:
+            if name in given_here:
+                after += _section(f"{path}.{name}", inner, given_here[name])
+            continue
+        value = given_here.get(name, field.default)
+        shown = "" if value is None or (field.is_required() and name not in given_here) else f" {_value(value)}"
+        mark = "" if name in given_here else "#: "
+        written.append((f"{mark}{name} ={shown}", field.description or "how the rig is reached"))
+    head = f"[{path}]" if given is not None else f"#: [{path}]"
+    width = min(max((len(line) for line, _ in written), default=0), 44)
+    says = " ".join((model.__doc__ or "").replace("``", "").split())
+    return ["", f"# {says}", head, *(f"{line:<{width}}  # {text}".rstrip(" #") for line, text in written), *after]
+
+
+def _value(value: Any) -> str:
+    """Return a value as TOML writes it, on one line."""
+    if isinstance(value, Mapping):
+        return "{ " + ", ".join(f"{key} = {_value(one)}" for key, one in value.items()) + " }"
+    if isinstance(value, tuple | list):
+        return "[" + ", ".join(_value(one) for one in value) + "]"
+    return json.dumps(value, ensure_ascii=False)

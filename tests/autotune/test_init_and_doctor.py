@@ -1,0 +1,155 @@
+"""First steps: a configuration from few answers, and whether this computer is ready."""
+
+from __future__ import annotations
+
+import os
+import pty
+import socket
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from autotune.cli import app
+from autotune.config import load_config
+from autotune.config.rig import SerialSettings
+from autotune.errors import InputError
+
+CONFIGS = Path(__file__).resolve().parents[2] / "configs"
+REAL = [
+    *("--sample-time", "0.1", "--u-unit", "V", "--y-unit", "cm"),
+    *("--u-range", "0", "10", "--u-safe", "0", "--y-range", "10", "90", "--y", "50", "--u", "4"),
+]
+MODBUS = ["--y-register", "input:0:float32", "--u-register", "holding:0:float32"]
+
+
+def command(*arguments: str | Path) -> str:
+    return CliRunner().invoke(app, [*map(str, arguments)], catch_exceptions=False, standalone_mode=False).output
+
+
+@pytest.mark.parametrize(
+    ("plant", "file"), [("ball", "ball_sim"), ("servo", "servo_sim"), ("two_tank", "two_tank_sim")]
+)
+def test_a_simulated_rig_is_described_as_the_shipped_configuration_does(tmp_path: Path, plant: str, file: str) -> None:
+    path = tmp_path / "rig.toml"
+    command("init", path, "--kind", "simulated", "--plant", plant)
+    shipped = load_config(CONFIGS / f"{file}.toml")
+    assert load_config(path).model_copy(update={"name": shipped.name}) == shipped
+
+
+@pytest.mark.parametrize(
+    ("kind", "reached"),
+    [
+        ("modbus_tcp", ["--host", "10.0.0.2", *MODBUS]),
+        ("modbus_tls", ["--host", "10.0.0.2", *MODBUS]),
+        ("modbus_rtu", ["--device", "/dev/ttyUSB0", *MODBUS]),
+        ("serial", ["--device", "/dev/ttyACM0", "--y-span", "0", "100", "--u-span", "0", "10"]),
+    ],
+)
+def test_what_is_written_loads_and_keeps_the_answers(tmp_path: Path, kind: str, reached: list[str]) -> None:
+    path = tmp_path / "rig.toml"
+    command("init", path, "--kind", kind, *reached, *REAL, "--plant", "ball")
+    config = load_config(path)
+    assert config.rig.kind == kind
+    assert (config.limits.u_min, config.limits.u_max, config.limits.u_safe) == (0.0, 10.0, 0.0)
+    assert (config.operating_point.y, config.operating_point.u_guess) == (50.0, 4.0)
+    assert config.operating_point.y - config.limits.swing >= config.limits.y_min
+
+
+def test_every_key_of_the_schema_is_in_the_file_with_its_meaning_and_every_default_can_be_uncommented(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "rig.toml"
+    command(
+        "init", path, "--kind", "serial", "--device", "/dev/ttyACM0", "--y-span", "0", "9", "--u-span", "0", "9", *REAL
+    )
+    text = path.read_text()
+    for name in set(SerialSettings.model_fields) - {"twin"}:
+        assert f"{name} = " in text
+    assert "silence of the host after which the device is safe [s]" in text
+    lines = [line.removeprefix("#: ") for line in text.splitlines()]
+    valued = [line for line in lines if "=" not in line or line.split("#")[0].split("=", 1)[1].strip()]
+    sections = tomllib.loads("\n".join(valued).replace("[controller]\n", ""))
+    assert sections["design"]["specification"] == "Spec1"
+
+
+def test_away_from_a_terminal_every_missing_answer_is_named_and_nothing_is_written(tmp_path: Path) -> None:
+    path = tmp_path / "rig.toml"
+    with pytest.raises(InputError, match=r"--host, --y-register.*--u-safe"):
+        command("init", path, "--kind", "modbus_tcp")
+    with pytest.raises(InputError, match="u_safe = 0 must lie within"):
+        command("init", path, "--kind", "modbus_tcp", "--host", "h", *MODBUS, *REAL, "--u-range", "2", "10")
+    assert not path.exists()
+
+
+def test_a_file_that_exists_is_not_overwritten(tmp_path: Path) -> None:
+    path = tmp_path / "rig.toml"
+    path.write_text("mine")
+    with pytest.raises(InputError, match="nothing is overwritten"):
+        command("init", path, "--kind", "simulated", "--plant", "ball")
+    assert path.read_text() == "mine"
+
+
+def test_at_a_terminal_questions_are_asked_and_asked_again_after_a_wrong_answer(tmp_path: Path) -> None:
+    leader, follower = pty.openpty()
+    child = subprocess.Popen(
+        [sys.executable, "-m", "autotune.cli", "init", "rig.toml"],
+        cwd=tmp_path, stdin=follower, stdout=follower, stderr=follower,
+    )  # fmt: skip
+    os.close(follower)
+    os.write(leader, b"simulated\nbowl\nball\n")
+    said = b""
+    while True:
+        try:
+            said += os.read(leader, 4096)
+        except OSError:  # the other end is closed
+            break
+    os.close(leader)
+    assert child.wait() == 0, said.decode()
+    assert b"'bowl' is none of ball, servo, two_tank, thermal" in said
+    assert load_config(tmp_path / "rig.toml").rig.kind == "simulated"
+
+
+def test_a_computer_that_runs_these_tests_is_ready(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    said = command("doctor", CONFIGS / "ball_sim.toml")
+    assert "ready" in said
+    assert "deadlines" in said
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_rig_that_takes_no_connection_and_a_device_that_is_not_there_are_wrong(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))  # bound, and nobody listens
+        port = taken.getsockname()[1]
+        text = (CONFIGS / "ball_modbus_tcp.toml").read_text()
+        Path("tcp.toml").write_text(text.replace("port = 5020", f"port = {port}"))
+        with pytest.raises(InputError, match=r"not ready for a run: the rig's address; switch it on"):
+            command("doctor", "tcp.toml")
+    text = (CONFIGS / "ball_serial.toml").read_text()
+    Path("serial.toml").write_text(text.replace("/tmp/autotune-ball-serial", str(tmp_path / "no-port")))
+    with pytest.raises(InputError, match=r"not ready for a run: the rig's port.*autotune ports"):
+        command("doctor", "serial.toml")
+
+
+def test_a_configuration_that_does_not_load_and_certificates_that_are_missing_are_wrong(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("broken.toml").write_text('name = "x"\n')
+    with pytest.raises(InputError, match="configuration"):
+        command("doctor", "broken.toml")
+    with pytest.raises(InputError, match=r"certificates/ca\.pem, certificates/host\.pem, certificates/host\.key"):
+        command("doctor", CONFIGS / "ball_modbus_tls.toml")
+
+
+def test_a_compiler_that_cannot_keep_its_code_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "missing"))
+    assert "set NUMBA_CACHE_DIR to a folder you may write" in command("doctor")
