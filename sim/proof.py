@@ -9,8 +9,7 @@ import hashlib
 import json
 import math
 import subprocess
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -35,7 +34,6 @@ class Campaign:
     seeds: range
     tool: tuple[str, ...]
     extra: tuple[str, ...] = ()
-    workers: int = 2
 
     def case(self, seed: int) -> Path:
         """Folder of a case: model and recordings."""
@@ -66,16 +64,8 @@ def seal(campaign: Campaign) -> str:
     return digest.hexdigest()
 
 
-def diagnose_all(campaign: Campaign, chosen: Sequence[int], done: Callable[[int], None]) -> None:
-    """Diagnose the chosen cases that are not diagnosed yet, several at a time; ``done`` is told each seed."""
-    with ThreadPoolExecutor(campaign.workers) as pool:
-        running = {pool.submit(_diagnose, campaign, seed): seed for seed in chosen}
-        for future in as_completed(running):
-            future.result()
-            done(running[future])
-
-
-def _diagnose(campaign: Campaign, seed: int) -> None:
+def diagnose(campaign: Campaign, seed: int) -> None:
+    """Let the tool diagnose one case; one that is diagnosed already stays as it is."""
     out, case = campaign.diagnosis(seed), campaign.case(seed)
     if (out / "finished").exists():
         return

@@ -6,6 +6,7 @@ import json
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -28,14 +29,20 @@ def prove(
     seed: Annotated[int, typer.Option(min=0, help="seed of the first case; below 100000 is for calibration")] = 100_000,
     workers: Annotated[int, typer.Option(min=1, help="diagnoses at the same time")] = 2,
     without: Annotated[str, typer.Option(help="ablation: leave this entry out of the catalogue, try its cases")] = "",
+    scheduler: Annotated[
+        str | None, typer.Option(metavar="ADDRESS", help="existing Dask scheduler, tcp://host:8786, with its workers")
+    ] = None,
 ) -> None:
     """Conceal effects in simulated recordings, diagnose them as a user would, reveal the answers and count."""
-    from sim.proof import Campaign, conceal, diagnose_all, keep_failures, mark_all, seal
+    from autotune.batch.engine import cluster, run_all
+    from sim.proof import Campaign, conceal, diagnose, keep_failures, mark_all, seal
     from sim.score import table
 
     tool = (sys.executable, "-m", "autotune.cli")
     extra = ("--without", without) if without else ()
-    campaign = Campaign(out=out, seeds=range(seed, seed + cases), tool=tool, extra=extra, workers=workers)
+    if scheduler is not None:
+        out = out.absolute()  # its workers were started elsewhere
+    campaign = Campaign(out=out, seeds=range(seed, seed + cases), tool=tool, extra=extra)
     console = Console(highlight=False)
     for _ in track(conceal(campaign), "making cases", total=cases, console=console):
         pass
@@ -45,9 +52,13 @@ def prove(
     chosen = _cases_of(campaign.out, campaign.seeds, without)
     if not chosen:
         raise InputError(f"no case of this campaign conceals {without}: ask for more cases")
-    with Progress(console=console) as progress:
+    # each diagnosis is a program of its own, so a thread of this process is enough to start it
+    with cluster(workers, scheduler, processes=False) as client, Progress(console=console) as progress:
         task = progress.add_task("diagnosing", total=len(chosen))
-        diagnose_all(campaign, chosen, lambda _seed: progress.advance(task))
+        for _, failure in run_all(client, partial(diagnose, campaign), {str(case): case for case in chosen}):
+            if failure is not None:
+                raise failure
+            progress.advance(task)
     if seal(campaign) != digest:
         raise InputError(f"{out / 'sealed'}: an answer changed while the cases were diagnosed; start a fresh campaign")
     marks = mark_all(campaign, chosen)

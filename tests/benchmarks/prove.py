@@ -13,16 +13,18 @@ import sys
 import tempfile
 import tomllib
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy.signal import lfilter, savgol_filter
 
+from autotune.batch.engine import cluster, run_all
 from autotune.diagnosis.selection import score, search
 from autotune.models import read_model
 from autotune.recording import read_recording
-from sim.proof import Campaign, conceal, diagnose_all, forecast_nrmse, mark_all, seal
+from sim.proof import Campaign, conceal, diagnose, forecast_nrmse, mark_all, seal
 from sim.score import confusion, table, wilson
 
 #: What a term of the regression would be called, were it physics.
@@ -255,7 +257,9 @@ def main() -> None:
     for _ in conceal(campaign):
         pass
     print(f"{cases} cases in {out}, answers sealed: SHA-256 {seal(campaign)}")
-    diagnose_all(campaign, list(seeds), lambda _seed: None)
+    with cluster(processes=False) as client:
+        for _, failure in run_all(client, partial(diagnose, campaign), {str(seed): seed for seed in seeds}):
+            assert failure is None, failure
     marks = mark_all(campaign, list(seeds))
     for row in table(marks):
         interval = f"({100 * row.interval[0]:.0f}-{100 * row.interval[1]:.0f} %)" if row.interval else ""

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from sim.proof import Campaign, conceal, diagnose_all, keep_failures, mark_all, seal
+from sim.proof import Campaign, conceal, diagnose, keep_failures, mark_all, seal
 
 ALWAYS_NONE = """
 import json, pathlib, sys
@@ -25,16 +25,17 @@ else:
 def campaign(tmp_path):
     tool = tmp_path / "tool.py"
     tool.write_text(ALWAYS_NONE)
-    return Campaign(out=tmp_path / "proof", seeds=range(66, 69), tool=(sys.executable, str(tool)), workers=1)
+    return Campaign(out=tmp_path / "proof", seeds=range(66, 69), tool=(sys.executable, str(tool)))
 
 
 def test_a_campaign_is_sealed_diagnosed_and_marked_and_goes_on_where_it_was_stopped(campaign):
     assert list(conceal(campaign)) == [66, 67, 68]
     before = seal(campaign)
-    done = []
-    diagnose_all(campaign, [66], done.append)
-    diagnose_all(campaign, list(campaign.seeds), done.append)
-    assert sorted(done) == [66, 66, 67, 68]
+    diagnose(campaign, 66)
+    first = (campaign.diagnosis(66) / "finished").stat().st_mtime_ns
+    for seed in campaign.seeds:
+        diagnose(campaign, seed)
+    assert (campaign.diagnosis(66) / "finished").stat().st_mtime_ns == first
     assert seal(campaign) == before
     marks = mark_all(campaign, list(campaign.seeds))
     for m in marks:
@@ -59,7 +60,7 @@ def test_a_tool_that_fails_on_a_case_has_said_nothing(campaign, tmp_path):
     (tmp_path / "tool.py").write_text("import sys; sys.exit('no')")
     campaign = replace(campaign, seeds=range(67, 68))
     list(conceal(campaign))
-    diagnose_all(campaign, [67], lambda _seed: None)
+    diagnose(campaign, 67)
     (m,) = mark_all(campaign, [67])
     assert m.verdict == "failed"
     assert m.failed
