@@ -123,6 +123,12 @@ class Onlookers:
             self.browser.stdin.write("\n")
             self.browser.stdin.flush()
 
+    @property
+    def cpu_s(self) -> float:
+        """Processor time that the page's process has taken [s]."""
+        times = psutil.Process(self._server).cpu_times()
+        return float(times.user + times.system)
+
     def leave(self) -> None:
         """End all of them."""
         self.become("ten pages")
@@ -132,11 +138,12 @@ class Onlookers:
         os.kill(self._server, signal.SIGTERM)
 
 
-def measure(folder: Path, rounds: int) -> dict[str, list[np.ndarray]]:
-    """Return the lateness of every sample [s], a list of turns for each condition."""
+def measure(folder: Path, rounds: int) -> tuple[dict[str, list[np.ndarray]], dict[str, float]]:
+    """Return the lateness of every sample [s], turns by condition, and the processor time of the page [s]."""
     wide = {"time_s": 1e6, "swing": 100.0, "y_min": -100.0, "y_max": 100.0}
     config = ball_config(limits=wide, signals={"sample_time_s": PERIOD_S})
     found: dict[str, list[np.ndarray]] = defaultdict(list)
+    taken: dict[str, float] = defaultdict(float)
     with RunLog(folder / "progress.jsonl") as log, LivePage(folder, "127.0.0.1", 0, None) as page:
         log.begin(config)
         writer = RecordingWriter(log.recording(folder / "recording.csv"), ("t", "u", "y"))
@@ -147,10 +154,12 @@ def measure(folder: Path, rounds: int) -> dict[str, list[np.ndarray]]:
                     for condition in map(str, rng.permutation(CONDITIONS)):
                         onlookers.become(condition)
                         tell(progress(loop.tick.t_s, f"{condition}, turn {turn}"))
+                        before_s = onlookers.cpu_s
                         found[condition].append(lateness(loop))
+                        taken[condition] += onlookers.cpu_s - before_s
         finally:
             onlookers.leave()
-    return found
+    return found, taken
 
 
 def lateness(loop: ControlLoop) -> np.ndarray:
@@ -187,12 +196,13 @@ def main() -> None:
     start_s = time.process_time()
     with tempfile.TemporaryDirectory() as folder:
         try:
-            found = measure(Path(folder), rounds)
+            found, taken = measure(Path(folder), rounds)
         except AutotuneError as error:
             console.print(f"stopped: {error}")
             return
     table = Table(
-        "onlookers", "samples", "median [us]", "mean [us]", "p99 [us]", "worst [us]", "mean / without", "95 %",
+        "onlookers", "samples", "median [us]", "mean [us]", "p99 [us]", "worst [us]",
+        "mean / without", "95 %", "page's CPU",
         title=f"Lateness of a {1e3 * PERIOD_S:g} ms loop, {rounds} turns of {TURN_S - CATCH_UP_S:g} s",
     )  # fmt: skip
     base = [float(turn.mean()) for turn in found["without"]]
@@ -202,7 +212,14 @@ def main() -> None:
         low, high = ratio_interval(means, base)
         spread = (np.median(late), late.mean(), np.quantile(late, 0.99), late.max())
         cells = [f"{value:.0f}" for value in spread]
-        table.add_row(name, str(late.size), *cells, f"{np.mean(means) / np.mean(base):.2f}", f"{low:.2f} to {high:.2f}")
+        table.add_row(
+            name,
+            str(late.size),
+            *cells,
+            f"{np.mean(means) / np.mean(base):.2f}",
+            f"{low:.2f} to {high:.2f}",
+            f"{100 * taken[name] / (TURN_S * rounds):.0f} %",
+        )
     console.print(table)
     medians = {name: float(np.median(np.concatenate(turns))) for name, turns in found.items()}
     worst = max(value / medians["without"] for value in medians.values())
