@@ -220,7 +220,7 @@ def _equation(leftover: Leftover) -> tuple[tuple[Term, ...], Place, float]:
     """Select up to three terms, all added at one place, as long as held-out windows ask for one more."""
     pool = [c for c in _candidates(leftover) if leftover.is_new(c.column)]
     before = leftover.cross_validated(np.zeros((leftover.e.size, 0)))
-    least = max(LEAST_SHARE * (before - leftover.rows), LEAST_DECREASE)
+    least = max(LEAST_SHARE * (before - leftover.floor), LEAST_DECREASE)
     chosen: list[_Candidate] = []
     error = before
     groups = [[c for c in pool if c.place == place] for place in leftover.signals]

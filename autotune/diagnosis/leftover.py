@@ -14,6 +14,7 @@ from autotune.arrays import BoolArray, FloatArray, IntArray
 from autotune.diagnosis import kernel
 from autotune.diagnosis.data import Data
 from autotune.diagnosis.fitting import Fit
+from autotune.diagnosis.noise import noise_from_differences
 from autotune.diagnosis.simulation import Simulator
 
 Place: TypeAlias = Literal["actuator", "plant", "sensor"]
@@ -39,6 +40,9 @@ class Leftover:
         self.J = self.freed(result.jacobian[0])
         self._own = np.linalg.svd(self.J / np.maximum(np.linalg.norm(self.J, axis=0), 1e-300), full_matrices=False)[0]
         self.rows = data.rows
+        # where the misfit is so large that it was taken for noise, the floor is what changes from row to row alone
+        jitter = noise_from_differences(result.residuals, data.good).total_sd / data.noise.total_sd
+        self.floor = data.rows * min(1.0, jitter**2)
         number = np.zeros(result.e.size, dtype=np.int64)
         for i, (a, b) in enumerate(result.windows):
             number[a:b] = i
@@ -153,7 +157,7 @@ class Leftover:
 
     def explained(self, error: float, before: float) -> float:
         """Return the share of the held-out misfit above the noise that is gone."""
-        return float(np.clip((before - error) / max(before - self.rows, LEAST_SHARE * self.rows), 0.0, 1.0))
+        return float(np.clip((before - error) / max(before - self.floor, LEAST_SHARE * self.floor), 0.0, 1.0))
 
 
 def _smoothed(e: FloatArray, starts: IntArray, stops: IntArray, rows: int) -> FloatArray:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -10,7 +12,8 @@ from autotune.diagnosis.description import Description, describe
 from autotune.diagnosis.diagnose import diagnose
 from autotune.diagnosis.retuning import prepare
 from autotune.diagnosis.samples import inspect
-from autotune.recording import Recording
+from autotune.models import read_model
+from autotune.recording import Recording, read_recording
 from tests.autotune.diagnosis.servo_rigs import servo_model, servo_recording
 
 
@@ -75,3 +78,18 @@ def test_a_diagnosis_is_described_only_where_nothing_explains_it() -> None:
     explained = diagnose(servo_model(), [servo_recording(13)], without=nothing_fits).as_json()
     assert explained["verdict"] == "none"
     assert "description" not in explained
+
+
+@pytest.mark.parametrize(
+    ("rig", "term", "signal"), [("silverbox", "position^3", "position"), ("emps", "sign(speed)", "speed")]
+)
+def test_a_real_rig_without_its_effect_in_the_catalogue_is_described_by_the_law_of_its_makers(
+    shared: Path, rig: str, term: str, signal: str
+) -> None:
+    recording = read_recording(shared / "data" / rig / "fit.csv")
+    data, result = prepare(read_model(shared / "data" / rig / "model.toml"), [recording], inspect([recording])[0])
+    found = describe(result, data)
+    assert found.terms[0].text == term
+    assert found.terms[0].value < 0.0  # a hardening spring, a friction
+    assert found.curve.signal == signal
+    assert found.explained > 0.9
