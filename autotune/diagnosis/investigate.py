@@ -13,7 +13,7 @@ from autotune.diagnosis.diagnose import diagnose
 from autotune.diagnosis.discrimination import LEAST_DISCRIMINATION, Plan, alive, decided, general, plan_in
 from autotune.diagnosis.result import Diagnosis
 from autotune.diagnosis.simulation import assemble
-from autotune.errors import AutotuneError
+from autotune.errors import AutotuneError, InputError
 from autotune.experiment.excitation import run_excitation
 from autotune.experiment.rig import Rig
 from autotune.experiment.run import OnProgress
@@ -21,6 +21,8 @@ from autotune.models import Model
 from autotune.recording import Recording, write_recording
 
 Report = Callable[[str, float], None]
+#: Share of the longest time on the rig that an excitation may take; the rest is for the way to the operating point.
+LARGEST_SHARE = 0.8
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -147,11 +149,17 @@ def investigate(
     Raises
     ------
     InputError
-        No excitation fits into the limits, or an integrating plant without a stated law.
+        No excitation fits into the limits or the time, or an integrating plant without a stated law.
     ExperimentStopped, LinkError, OperatorStop
         What ended a round; the rig is safe, and what was known before has been kept.
     """
     duration_s = config.experiment.budget_s if duration_s is None else duration_s
+    if duration_s > LARGEST_SHARE * config.limits.time_s:
+        raise InputError(
+            f"{duration_s:g} s under excitation leave too little of limits.time_s = {config.limits.time_s:g} s",
+            where="--duration",
+            mend=f"ask for at most {LARGEST_SHARE * config.limits.time_s:.4g} s, or raise limits.time_s",
+        )
     rig_time_s = rounds * duration_s if rig_time_s is None else rig_time_s
     law = None
     if config.controller is not None:

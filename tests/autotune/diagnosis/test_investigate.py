@@ -125,6 +125,13 @@ def test_an_integrating_plant_is_not_driven_without_a_control_law() -> None:
         excitations(assemble(servo_model()), config, 20.0)
 
 
+def test_an_excitation_longer_than_the_rig_may_be_used_is_refused_before_the_rig_is_touched(tmp_path: Path) -> None:
+    rig = SimulatedRig(tanks(6), u_safe=0.0)
+    with pytest.raises(InputError, match=r"limits\.time_s"):
+        investigate(rig, tanks_config(), tanks_model(), [], tmp_path, duration_s=19000.0)
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_fault_in_a_round_leaves_the_rig_safe_and_says_in_which_round(tmp_path: Path) -> None:
     rig = SimulatedRig(FaultyPlant(tanks(5), (Fault(kind="cut link", start_s=1000.0),)), u_safe=0.0)
     kept: list[Investigation] = []
