@@ -8,6 +8,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import signal
 import subprocess
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -21,6 +22,7 @@ from sim.score import Mark, mark
 
 Json = dict[str, Any]
 FIRST_PROOF_SEED = 100_000  # below: calibration
+STOPPED = 130  # exit status of a program that the operator stopped
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,7 +67,13 @@ def seal(campaign: Campaign) -> str:
 
 
 def diagnose(campaign: Campaign, seed: int) -> None:
-    """Let the tool diagnose one case; one that is diagnosed already stays as it is."""
+    """Let the tool diagnose one case; one that is diagnosed already stays as it is.
+
+    Raises
+    ------
+    InterruptedError
+        Ctrl-C reached the tool; a continued campaign diagnoses the case again.
+    """
     out, case = campaign.diagnosis(seed), campaign.case(seed)
     if (out / "finished").exists():
         return
@@ -77,6 +85,8 @@ def diagnose(campaign: Campaign, seed: int) -> None:
         horizon = f"{json.loads(campaign.answer(seed).read_text(encoding='utf-8'))['horizon']:g}"
         words = ["simulate", "--model", str(out / "extended_model.toml"), str(case / "unseen.csv")]
         said = _run(campaign, [*words, "--horizon", horizon, "--out", str(out / "unseen_sim.csv")])
+    if said.returncode in (STOPPED, -signal.SIGINT):
+        raise InterruptedError(f"the operator stopped the diagnosis of case {seed}")  # it is not finished
     (out / "stderr.txt").write_text(said.stderr, encoding="utf-8")
     (out / "finished").write_text(f"{said.returncode}\n", encoding="utf-8")
 

@@ -20,7 +20,7 @@ Answer = TypeVar("Answer")
 
 #: The profiler's samples would fill the memory. No task waits at a worker, or it would share the blame for its death.
 _EMBEDDED = {"distributed.worker.profile.enabled": False, "distributed.scheduler.worker-saturation": 1.0}
-#: A task that ends with an error of its surroundings (a network drive) is tried this many times more.
+#: What a task ends with may be of its surroundings (a network drive) and pass.
 _RETRIES = 2
 #: An existing scheduler must answer, and have a worker, within this time [s].
 _PATIENCE_S = 30.0
@@ -110,7 +110,7 @@ def _version() -> str:
 
 
 def run_all(
-    client: Client, function: Callable[[Given], Answer], tasks: Mapping[str, Given]
+    client: Client, function: Callable[[Given], Answer], tasks: Mapping[str, Given], *, retries: int = _RETRIES
 ) -> Iterator[tuple[str, Answer | Exception]]:
     """Run a function on every task, as many at a time as there are workers.
 
@@ -122,6 +122,8 @@ def run_all(
         Pure, from one task to one answer; both are sent between processes.
     tasks : mapping of str to object
         By name.
+    retries : int
+        How often a task that ended with an exception is tried again.
 
     Yields
     ------
@@ -135,7 +137,7 @@ def run_all(
     A task whose worker was killed is given to another; one that has killed four workers is given up (Dask's
     ``distributed.scheduler.allowed-failures``). Answers are let go of as they are yielded, so memory stays flat.
     """
-    futures = client.map(function, list(tasks.values()), pure=False, retries=_RETRIES)
+    futures = client.map(function, list(tasks.values()), pure=False, retries=retries)
     names = {future.key: name for future, name in zip(futures, tasks, strict=True)}
     finished = as_completed(futures)
     del futures

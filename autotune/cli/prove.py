@@ -55,7 +55,8 @@ def prove(
     # each diagnosis is a program of its own, so a thread of this process is enough to start it
     with cluster(workers, scheduler, processes=False) as client, Progress(console=console) as progress:
         task = progress.add_task("diagnosing", total=len(chosen))
-        for _, failure in run_all(client, partial(diagnose, campaign), {str(case): case for case in chosen}):
+        named = {str(case): case for case in chosen}
+        for _, failure in run_all(client, partial(diagnose, campaign), named, retries=0):
             if failure is not None:
                 raise failure
             progress.advance(task)

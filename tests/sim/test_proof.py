@@ -65,3 +65,15 @@ def test_a_tool_that_fails_on_a_case_has_said_nothing(campaign, tmp_path):
     assert m.verdict == "failed"
     assert m.failed
     assert "no" in (campaign.diagnosis(67) / "stderr.txt").read_text()
+
+
+def test_a_case_that_the_operator_stopped_is_diagnosed_again(campaign, tmp_path):
+    campaign = replace(campaign, seeds=range(67, 68))
+    list(conceal(campaign))
+    tool = (tmp_path / "tool.py").read_text()
+    (tmp_path / "tool.py").write_text("import os, signal; os.kill(os.getpid(), signal.SIGINT)")
+    with pytest.raises(InterruptedError):
+        diagnose(campaign, 67)
+    (tmp_path / "tool.py").write_text(tool)
+    diagnose(campaign, 67)
+    assert (campaign.diagnosis(67) / "finished").read_text() == "0\n"
