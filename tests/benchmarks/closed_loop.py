@@ -16,6 +16,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from autotune.batch.engine import cluster, run_all
 from autotune.errors import IdentificationError
 from autotune.identification.closed_loop.confidence import inside_region, pole_covariance, response_covariance
 from autotune.identification.closed_loop.order import choose_order, fixed_order
@@ -243,11 +244,19 @@ def coverage(count: int) -> None:
     print(f"{int(np.isinf(norms).sum())} models that the true controller does not stabilise")
 
 
+def order_of(seed: int) -> int:
+    """Return the order that is chosen for one set."""
+    d = example_set(seed)
+    return choose_order(d.u, d.y).estimate.model.order
+
+
 def orders(count: int) -> None:
     found: Counter[int] = Counter()
-    for seed in range(count):
-        d = example_set(seed)
-        found[choose_order(d.u, d.y).estimate.model.order] += 1
+    with cluster() as client:
+        for _, order in run_all(client, order_of, {str(seed): seed for seed in range(count)}, retries=0):
+            if isinstance(order, Exception):
+                raise order
+            found[order] += 1
     print(f"order chosen in {count} sets: " + ", ".join(f"{k}: {v}" for k, v in sorted(found.items())))
 
 

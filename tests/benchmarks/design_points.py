@@ -11,11 +11,12 @@ import math
 import os
 import tempfile
 import time
-from collections.abc import Iterator
 from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
 
+from autotune.batch.engine import cluster, run_all
 from autotune.config import load_config
 from autotune.design.margins import Margins, margins
 from autotune.design.robust import design_on_points
@@ -31,28 +32,37 @@ from tests.autotune.design.plants import BALL, REDUCED, measured
 CONFIG = Path(__file__).resolve().parents[2] / "configs" / "ball_sim.toml"
 
 
-def experiments(count: int) -> Iterator[tuple[FrequencyPoint, ...]]:
-    """Yield the points of every experiment; one that ends early is not forgiven."""
+Row: TypeAlias = tuple[Margins, Design, float, float]
+
+
+def points_of(seed: int) -> tuple[FrequencyPoint, ...]:
+    """Return the points of one experiment; one that ends early is not forgiven."""
     if os.environ.get("POINTS") == "drawn":
-        yield from (measured(BALL, seed) for seed in range(count))
-        return
-    config = load_config(CONFIG)
+        return measured(BALL, seed)
     with tempfile.TemporaryDirectory() as folder:
-        for seed in range(1, count + 1):
-            rig = SimulatedRig(make_ball(seed=seed, noise=0.35), u_safe=0.0)
-            yield run_experiment(rig, config, Path(folder) / f"{seed}.csv").points
+        rig = SimulatedRig(make_ball(seed=seed, noise=0.35), u_safe=0.0)
+        return run_experiment(rig, load_config(CONFIG), Path(folder) / "recording.csv").points
+
+
+def row_of(seed: int) -> Row:
+    """Return margins and design of one experiment, processor time of the design [s], norm with the reduced model."""
+    points = points_of(seed)
+    start = time.process_time()
+    found = design_on_points(points, spec1(0.1))
+    spent = time.process_time() - start
+    reduced = design(reduce_points(points).transfer_function(), spec1(0.1), certificate=False).controller
+    return margins(BALL, found.controller), found, spent, margins(BALL, reduced).h2
 
 
 def main() -> None:
     count = int(os.environ.get("EXPERIMENTS", "40"))
-    design_on_points(measured(BALL, None), spec1(0.1))  # compile
-    rows: list[tuple[Margins, Design, float, float]] = []
-    for points in experiments(count):
-        start = time.process_time()
-        found = design_on_points(points, spec1(0.1))
-        spent = time.process_time() - start
-        reduced = design(reduce_points(points).transfer_function(), spec1(0.1), certificate=False).controller
-        rows.append((margins(BALL, found.controller), found, spent, margins(BALL, reduced).h2))
+    rows: list[Row] = []
+    with cluster() as client:
+        client.run(design_on_points, measured(BALL, None), spec1(0.1))  # compile, or load from the disk
+        for _, row in run_all(client, row_of, {str(seed): seed for seed in range(1, count + 1)}, retries=0):
+            if isinstance(row, Exception):
+                raise row
+            rows.append(row)
     known = design(BALL, spec1(0.1))
     papers = margins(BALL, design(REDUCED, spec1(0.1), certificate=False).controller)
     norms = np.array([m.h2 for m, *_ in rows])

@@ -10,11 +10,13 @@ import os
 import tempfile
 import time
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from autotune.arrays import FloatArray
+from autotune.batch.engine import cluster, run_all
 from autotune.config import load_config
 from autotune.errors import AutotuneError
 from autotune.experiment.result import ExperimentResult, Segment
@@ -82,6 +84,12 @@ def outcome(seed: int, folder: Path) -> Outcome:
     return scored(result, rig, recording, cpu_s)
 
 
+def load_kernels() -> None:
+    """Compile, or load from the disk, before processor time is taken."""
+    with tempfile.TemporaryDirectory() as folder:
+        outcome(0, Path(folder))
+
+
 def scored(result: ExperimentResult, rig: WatchedRig, recording: Path, cpu_s: float) -> Outcome:
     points = [segment.point for segment in result.segments]
     truth = rig.ball.response(np.array([point.omega_rad_s for point in points]))
@@ -112,15 +120,14 @@ def scored(result: ExperimentResult, rig: WatchedRig, recording: Path, cpu_s: fl
 
 def main() -> None:
     seeds = int(os.environ.get("SEEDS", "50"))
-    outcomes, failures = [], []
+    first = int(os.environ.get("FIRST_SEED", "1"))
+    tasks = {f"seed {seed}": seed for seed in range(first, first + seeds)}
     with tempfile.TemporaryDirectory() as folder:
-        outcome(0, Path(folder))  # compiles
-        first = int(os.environ.get("FIRST_SEED", "1"))
-        for seed in range(first, first + seeds):
-            try:
-                outcomes.append(outcome(seed, Path(folder)))
-            except AutotuneError as error:
-                failures.append(f"seed {seed}: {error}")
+        with cluster() as client:
+            client.run(load_kernels)
+            found = dict(run_all(client, partial(outcome, folder=Path(folder)), tasks, retries=0))
+    failures = [f"{name}: {found.pop(name)}" for name in tasks if isinstance(found[name], AutotuneError)]
+    outcomes = [found[name] for name in tasks if name in found]
     errors = np.array([one.errors for one in outcomes])
     gain = np.abs(np.abs(1.0 + errors) - 1.0)
     phase = np.abs(np.degrees(np.angle(1.0 + errors)))
