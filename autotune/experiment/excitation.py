@@ -17,12 +17,12 @@ from autotune.arrays import FloatArray
 from autotune.config import Config
 from autotune.controller import PIDController
 from autotune.design.law import LawState, PILaw
-from autotune.experiment.approach import preflight
+from autotune.experiment.approach import approach, find_midpoint, preflight
 from autotune.experiment.limits import Watch
 from autotune.experiment.loop import ControlLoop, Tick
 from autotune.experiment.result import Progress, State
 from autotune.experiment.rig import Rig
-from autotune.experiment.run import OnProgress, envelope_of, float_on, recording_metadata
+from autotune.experiment.run import OnProgress, envelope_of, recording_metadata
 from autotune.experiment.verify import law_for
 from autotune.experiment.warm import warm_up
 from autotune.recording import Recording, RecordingWriter, read_recording
@@ -173,11 +173,22 @@ def run_excitation(
 
 
 def _brought_there(loop: ControlLoop, config: Config) -> float:
-    """Bring the plant to its operating point, and return the command that is believed to hold it."""
-    if config.operating_point.approach == "ramp":
-        return float_on(loop, config).midpoint
-    preflight(loop, config, lambda _: None)
-    return config.operating_point.u_guess
+    """Bring the plant to its operating point, slowly moving, and return the command that is believed to hold it."""
+
+    def silent(_: str) -> None:
+        return
+
+    known = preflight(loop, config, silent)
+    if config.operating_point.approach == "hold":
+        return config.operating_point.u_guess
+    known, oscillation = find_midpoint(loop, config, approach(loop, config, known, silent), silent)
+    # y turns midway between two switches: handed over there, a slow law does not have to stop a plant in full swing
+    half = float(np.median(np.diff(oscillation.edges[-5:]))) if len(oscillation.edges) > 1 else 0.0
+    while not oscillation.step()[1]:
+        pass
+    for _ in range(round(0.5 * half)):
+        oscillation.step()
+    return known.midpoint
 
 
 class _Drive:
@@ -191,7 +202,7 @@ class _Drive:
         if config.controller is not None:
             present = PIDController(K=config.controller.K, Ti_s=config.controller.Ti_s)
             self._law = law_for(present, config.limits, config.signals.sample_time_s, reserve)
-            self._state = self._law.initial(u_hold, self._centre, loop.tick.y)
+            self._state = self._law.initial(u_hold, self._centre, self._centre)
 
     def away(self, tick: Tick) -> float:
         """Return how far y is from the operating point, beyond the noise [y unit]."""

@@ -60,6 +60,16 @@ def test_the_ball_under_random_steps_stays_in_its_envelope_and_the_excited_rows_
     assert seen.metadata["controller"]["K"] == -0.01
 
 
+@pytest.mark.parametrize("seed", [1, 3, 6])
+def test_a_slow_law_is_handed_a_plant_that_hardly_moves(tmp_path: Path, seed: int) -> None:
+    config = ball_config(signals={"sample_time_s": 0.02})
+    one = Excitation(kind="staircase", on="set-point", amplitude=0.5, hold_s=2.5, duration_s=2.0)
+    run_excitation(ball_rig(seed=seed), config, tmp_path / "rig.csv", one)
+    whole = read_recording(tmp_path / "rig.csv")
+    y = np.convolve(whole.y[np.isfinite(whole["r"])], np.ones(10) / 10, "valid")
+    assert np.max(np.abs(y - 5.0)) < 0.5 * config.limits.swing
+
+
 def test_a_pattern_that_is_too_large_is_halved_before_the_limit_ends_it(tmp_path: Path) -> None:
     config = ball_config()
     one = Excitation(kind="staircase", on="set-point", amplitude=2.8, hold_s=6.0, duration_s=30.0)
