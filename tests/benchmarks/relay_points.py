@@ -122,10 +122,9 @@ def main() -> None:
     seeds = int(os.environ.get("SEEDS", "50"))
     first = int(os.environ.get("FIRST_SEED", "1"))
     tasks = {f"seed {seed}": seed for seed in range(first, first + seeds)}
-    with tempfile.TemporaryDirectory() as folder:
-        with cluster() as client:
-            client.run(load_kernels)
-            found = dict(run_all(client, partial(outcome, folder=Path(folder)), tasks, retries=0))
+    with tempfile.TemporaryDirectory() as folder, cluster() as client:
+        client.run(load_kernels)
+        found = dict(run_all(client, partial(outcome, folder=Path(folder)), tasks, retries=0))
     failures = [f"{name}: {found.pop(name)}" for name in tasks if isinstance(found[name], AutotuneError)]
     outcomes = [found[name] for name in tasks if name in found]
     errors = np.array([one.errors for one in outcomes])
