@@ -11,7 +11,6 @@ import typer
 from autotune.cli import app
 
 if TYPE_CHECKING:
-    from autotune.controller import Controller
     from autotune.diagnosis.investigate import Investigation
 
 ROUNDS = "rounds.json"
@@ -42,7 +41,6 @@ def investigate(
     """Run the experiments that tell apart what a model may leave out, until one hypothesis is left."""
     from autotune.cli.common import ProgressBar, new_folder, rig_of
     from autotune.config import load_config
-    from autotune.controller import PIDController
     from autotune.diagnosis.investigate import investigate as find_out
     from autotune.models import read_model
     from autotune.recording import read_recording
@@ -52,12 +50,10 @@ def investigate(
     given = [read_recording(path) for path in recordings or []]
     rig = rig_of(content, dry_run)
     new_folder(out, ROUNDS)
-    stated = content.controller
-    law = PIDController(K=stated.K, Ti_s=stated.Ti_s) if stated else None
     with ProgressBar() as bar:
         known = find_out(
             rig, content, nominal, given, out, rounds=rounds, duration_s=duration, rig_time_s=rig_time,
-            without=without or (), report=bar.work, on_progress=bar.show, keep=lambda known: _keep(known, out, law),
+            without=without or (), report=bar.work, on_progress=bar.show, keep=lambda known: _keep(known, out),
         )  # fmt: skip
     for one in known.rounds:
         kind, on = one.plan.excitation.kind, one.plan.excitation.on
@@ -69,7 +65,7 @@ def investigate(
     typer.echo(f"rounds.json, diagnosis.json, extended_model.toml and report.html are in {out}")
 
 
-def _keep(known: Investigation, out: Path, law: Controller | None) -> None:
+def _keep(known: Investigation, out: Path) -> None:
     """Write what is known so far; a later stop leaves it there."""
     from autotune.diagnosis.simulation import entry_of
     from autotune.models import write_model
@@ -82,4 +78,4 @@ def _keep(known: Investigation, out: Path, law: Controller | None) -> None:
     found.write(out / "diagnosis.json")
     equations = {effect.name: entry_of(effect.name).equation for effect in found.extended_model.effects}
     write_model(found.extended_model, out / "extended_model.toml", equations)
-    write_investigation_page(known, found, out / "report.html", law)
+    write_investigation_page(known, found, out / "report.html")

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 from autotune.config import Config
-from autotune.controller import Controller, PIDController
 from autotune.diagnosis.diagnose import diagnose
 from autotune.diagnosis.discrimination import LEAST_DISCRIMINATION, Plan, alive, decided, general, plan_in
 from autotune.diagnosis.result import Diagnosis
@@ -161,10 +160,7 @@ def investigate(
             mend=f"ask for at most {LARGEST_SHARE * config.limits.time_s:.4g} s, or raise limits.time_s",
         )
     rig_time_s = rounds * duration_s if rig_time_s is None else rig_time_s
-    law = None
-    if config.controller is not None:
-        law = PIDController(K=config.controller.K, Ti_s=config.controller.Ti_s)
-    found = diagnose(model, recordings, law, without, report) if recordings else None
+    found = diagnose(model, recordings, None, without, report) if recordings else None
     before = () if found is None else _believed(found)
     known = Investigation(diagnosis=found, recordings=tuple(recordings), before=before, rounds=(), ended="")
     while True:
@@ -174,7 +170,7 @@ def investigate(
             known = replace(known, ended=ended)
             keep(known)
             return known
-        known = _round(known, plan, rig, config, model, out, law, without, report, on_progress, keep)
+        known = _round(known, plan, rig, config, model, out, without, report, on_progress, keep)
 
 
 def _next(
@@ -217,7 +213,6 @@ def _round(
     config: Config,
     model: Model,
     out: Path,
-    law: Controller | None,
     without: Sequence[str],
     report: Report,
     on_progress: OnProgress | None,
@@ -233,7 +228,7 @@ def _round(
     path = out / f"recording_{number}.csv"
     write_recording(seen, path)
     recordings = (*known.recordings, replace(seen, name=str(path)))
-    found = diagnose(model, recordings, law, without, report)
+    found = diagnose(model, recordings, None, without, report)
     one = Round(
         number=number, recording=path.name, plan=plan, verdict=found.verdict, candidates=_believed(found)
     )  # fmt: skip

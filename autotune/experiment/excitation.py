@@ -166,7 +166,8 @@ def run_excitation(
             drive.step(share * float(wanted), on_setpoint=excitation.on == "set-point")
         loop.metadata["excitation"] |= {"start_s": start_s, "end_s": loop.tick.t_s, "share_at_end": share}
         if config.controller is not None:
-            loop.metadata["controller"] = {"kind": "pi", "K": config.controller.K, "Ti_s": config.controller.Ti_s}
+            # not as [controller]: the loop ran this law itself, there is no other's law to be checked
+            loop.metadata["law"] = {"kind": "pi", "K": config.controller.K, "Ti_s": config.controller.Ti_s}
         end_s = loop.tick.t_s
     # stamps in the file are rounded: half a sample to either side
     return read_recording(recording).between(start_s - 0.5 * dt_s, end_s - 0.5 * dt_s)

@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import os
 
-from autotune.controller import Controller
 from autotune.diagnosis.investigate import Investigation
 from autotune.diagnosis.result import Diagnosis
 from autotune.report.diagnosis_page import write_diagnosis_page
 from autotune.report.page import Section, Table
 
 
-def write_investigation_page(
-    known: Investigation, found: Diagnosis, path: str | os.PathLike[str], controller: Controller | None = None
-) -> None:
+def write_investigation_page(known: Investigation, found: Diagnosis, path: str | os.PathLike[str]) -> None:
     """Write the page of an investigation.
 
     Parameters
@@ -24,10 +21,8 @@ def write_investigation_page(
         Over all its recordings.
     path : path
         File to write.
-    controller : Controller, optional
-        The stated law.
     """
-    write_diagnosis_page(found, path, controller, (_rounds(known),))
+    write_diagnosis_page(found, path, before=(_rounds(known),))
 
 
 def _rounds(known: Investigation) -> Section:

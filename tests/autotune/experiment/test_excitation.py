@@ -57,7 +57,7 @@ def test_the_ball_under_random_steps_stays_in_its_envelope_and_the_excited_rows_
     assert np.all((whole.u >= config.limits.u_min) & (whole.u <= config.limits.u_max))
     assert np.max(np.abs(seen.y - 5.0)) < config.limits.swing + 0.35
     assert np.all(np.isfinite(seen["r"]))
-    assert seen.metadata["controller"]["K"] == -0.01
+    assert seen.metadata["law"]["K"] == -0.01
 
 
 @pytest.mark.parametrize("seed", [1, 3, 6])
