@@ -22,7 +22,7 @@ from autotune.experiment.limits import Watch
 from autotune.experiment.loop import ControlLoop, Tick
 from autotune.experiment.result import Progress, State
 from autotune.experiment.rig import Rig
-from autotune.experiment.run import OnProgress, envelope_of, recording_metadata
+from autotune.experiment.run import OnProgress, envelope_of, recording_metadata, wait_for_rest
 from autotune.experiment.verify import law_for
 from autotune.experiment.warm import warm_up
 from autotune.recording import Recording, RecordingWriter, read_recording
@@ -152,8 +152,9 @@ def run_excitation(
         loop.note(excitation={"kind": excitation.kind} | excitation.settings())
         u_hold = _brought_there(loop, config)
         drive = _Drive(loop, config, u_hold, excitation.amplitude if excitation.on == "command" else 0.0)
-        loop.watch = Watch(y_centre=config.operating_point.y, afloat=True)
         drive.settle(excitation.hold_s)
+        # until here a plant that was left at its safe output may still have been on its way
+        loop.watch = Watch(y_centre=config.operating_point.y, afloat=True)
         start_s, share, alarmed_s = loop.tick.t_s, 1.0, -math.inf
         for k, wanted in enumerate(pattern):
             tick = loop.tick
@@ -179,6 +180,8 @@ def _brought_there(loop: ControlLoop, config: Config) -> float:
     def silent(_: str) -> None:
         return
 
+    if config.operating_point.approach == "ramp":
+        wait_for_rest(loop, config)
     known = preflight(loop, config, silent)
     if config.operating_point.approach == "hold":
         return config.operating_point.u_guess

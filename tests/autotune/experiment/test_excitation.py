@@ -9,10 +9,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from autotune.config import load_config
 from autotune.errors import ExperimentStopped
 from autotune.experiment.excitation import KINDS, Excitation, Kind, run_excitation
 from autotune.recording import read_recording
-from tests.autotune.experiment.rigs import ball_config, ball_rig
+from drivers.simulated import SimulatedRig
+from sim.plant import make_plant
+from tests.autotune.experiment.rigs import CONFIG, ball_config, ball_rig
 
 
 @given(
@@ -68,6 +71,24 @@ def test_a_slow_law_is_handed_a_plant_that_hardly_moves(tmp_path: Path, seed: in
     whole = read_recording(tmp_path / "rig.csv")
     y = np.convolve(whole.y[np.isfinite(whole["r"])], np.ones(10) / 10, "valid")
     assert np.max(np.abs(y - 5.0)) < 0.5 * config.limits.swing
+
+
+def test_a_second_excitation_waits_until_the_ball_has_sunk(tmp_path: Path) -> None:
+    config, rig = ball_config(), ball_rig()
+    one = Excitation(kind="sweep", on="command", amplitude=0.02, hold_s=2.0, duration_s=3.0)
+    for name in ("first.csv", "second.csv"):
+        seen = run_excitation(rig, config, tmp_path / name, one)
+        assert np.max(np.abs(seen.y - 5.0)) < config.limits.swing + 0.35
+
+
+def test_tanks_that_have_run_dry_are_filled_to_their_operating_point_again(tmp_path: Path) -> None:
+    config = load_config(CONFIG.parent / "two_tank_sim.toml")
+    plant = make_plant("two_tank", start="level")
+    plant.advance(0.0, 900.0)
+    assert plant.y_true < config.limits.y_min
+    one = Excitation(kind="triangle", on="set-point", amplitude=0.5, hold_s=200.0, duration_s=800.0)
+    seen = run_excitation(SimulatedRig(plant, u_safe=0.0), config, tmp_path / "rig.csv", one)
+    assert np.max(np.abs(seen.y - 10.0)) < config.limits.swing
 
 
 def test_a_pattern_that_is_too_large_is_halved_before_the_limit_ends_it(tmp_path: Path) -> None:
