@@ -53,7 +53,7 @@ class Campaign:
                 content = json.loads(self.file(loop.name).read_text(encoding="utf-8"))
             except (OSError, ValueError):
                 continue
-            if content["asked"] == self._digest(loop):
+            if content.get("asked") == self._digest(loop):
                 rows[loop.name] = Row(**content["row"])
         return rows
 

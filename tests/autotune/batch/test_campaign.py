@@ -113,9 +113,9 @@ def test_results_do_not_depend_on_the_workers(designed, tmp_path, two_workers):
         assert (alone / name).read_bytes() == (tmp_path / name).read_bytes()
 
 
-def test_the_command_runs_a_campaign_on_an_existing_scheduler_and_continues_it(designed, tmp_path, scheduler):
+def test_the_command_runs_a_campaign_on_an_existing_scheduler_and_continues_it(designed, tmp_path, two_workers):
     path, alone, _ = designed
-    words = ["batch", str(path), "--out", str(tmp_path), "--scheduler", scheduler]
+    words = ["batch", str(path), "--out", str(tmp_path), "--scheduler", two_workers.scheduler_info()["address"]]
     said = CliRunner().invoke(app, words, catch_exceptions=False)
     assert "Of 4 loops, 1 need action, 2 could not be analysed, 1 are fine." in said.output
     assert (alone / RESULTS).read_bytes() == (tmp_path / RESULTS).read_bytes()

@@ -39,7 +39,7 @@ def test_a_killed_worker_costs_only_its_task(two_workers, tmp_path):
 
 
 def test_a_task_that_kills_every_worker_ends_as_its_own_failure(two_workers, monkeypatch):
-    monkeypatch.setattr(two_workers.cluster.scheduler, "allowed_failures", 1)
+    monkeypatch.setattr(two_workers.cluster.scheduler, "allowed_failures", 0)
 
     def dies(_: int) -> None:
         os.kill(os.getpid(), signal.SIGKILL)
