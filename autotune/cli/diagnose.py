@@ -84,4 +84,6 @@ def diagnose(
     write_diagnosis_page(found, out / "report.html", law)
     for sentence in found.sentences:
         typer.echo(sentence)
+    if found.description is not None:
+        typer.echo(found.description.sentence)
     typer.echo(f"diagnosis.json, extended_model.toml and report.html are in {out}")

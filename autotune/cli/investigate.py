@@ -59,8 +59,10 @@ def investigate(
         kind, on = one.plan.excitation.kind, one.plan.excitation.on
         best = ", ".join(f"{name} {p:.2f}" for name, p in one.candidates[:2])
         typer.echo(f"round {one.number}, {kind} on the {on}: {one.verdict}; {best}")
-    for sentence in known.diagnosis.sentences if known.diagnosis else ():
-        typer.echo(sentence)
+    found = known.diagnosis
+    if found is not None:
+        described = () if found.description is None else (found.description.sentence,)
+        typer.echo("\n".join((*found.sentences, *described)))
     typer.echo(f"ended: {known.ended}")
     typer.echo(f"rounds.json, diagnosis.json, extended_model.toml and report.html are in {out}")
 
