@@ -17,11 +17,12 @@ _TITLES: dict[Attention, str] = {
     "look": "Deserves a look",
     "fine": "Fine",
 }
-_WORDS: dict[Attention, str] = {
-    "act": "need action",
-    "failed": "could not be analysed",
-    "look": "deserve a look",
-    "fine": "are fine",
+#: Of one loop, of several.
+_WORDS: dict[Attention, tuple[str, str]] = {
+    "act": ("needs action", "need action"),
+    "failed": ("could not be analysed", "could not be analysed"),
+    "look": ("deserves a look", "deserve a look"),
+    "fine": ("is fine", "are fine"),
 }
 _COLOURS: dict[Attention, str] = {"act": RED, "failed": GREY, "look": ORANGE, "fine": GREEN}
 
@@ -40,7 +41,11 @@ def campaign_page(settings: CampaignSettings, rows: Sequence[Row]) -> Page:
     """
     counts = Counter(row.attention for row in rows)
     tone: Tone = "bad" if counts["act"] else "warn" if counts["failed"] or counts["look"] else "good"
-    said = ", ".join(f"{counts[attention]} {_WORDS[attention]}" for attention in ATTENTION if counts[attention])
+    said = ", ".join(
+        f"{counts[attention]} {_WORDS[attention][counts[attention] > 1]}"
+        for attention in ATTENTION
+        if counts[attention]
+    )
     asked_modulus, asked_phase = settings.design.margins
     summary = ["Sorted by what needs attention first; all figures are in results.parquet."]
     if settings.task == "design":
@@ -131,8 +136,7 @@ _COLUMNS: dict[str, _Columns] = {
     },
     "diagnose": {
         "verdict": lambda row: row.verdict or "",
-        "effects (probability)": lambda row: row.effects or "",
-        "error, after, (noise)": _error,
+        "error → after (noise)": _error,
         "record": _record,
     },
 }
@@ -152,7 +156,7 @@ def _present_margins(settings: CampaignSettings, rows: Sequence[Row]) -> tuple[S
                 x=[row.phase_now_deg for row in of_kind],
                 y=[row.modulus_now for row in of_kind],
                 text=[row.loop for row in of_kind],
-                name=_WORDS[attention],
+                name=_TITLES[attention].lower(),
                 mode="markers",
                 marker={"color": _COLOURS[attention], "size": 9},
                 hovertemplate="%{text}<br>%{x:.0f} deg, %{y:.2f}<extra></extra>",

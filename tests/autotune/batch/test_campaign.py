@@ -117,7 +117,7 @@ def test_the_command_runs_a_campaign_on_an_existing_scheduler_and_continues_it(d
     path, alone, _ = designed
     words = ["batch", str(path), "--out", str(tmp_path), "--scheduler", two_workers.scheduler_info()["address"]]
     said = CliRunner().invoke(app, words, catch_exceptions=False)
-    assert "Of 4 loops, 1 need action, 2 could not be analysed, 1 are fine." in said.output
+    assert "Of 4 loops, 1 needs action, 2 could not be analysed, 1 is fine." in said.output
     assert (alone / RESULTS).read_bytes() == (tmp_path / RESULTS).read_bytes()
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert page.index("<td>hot</td>") < page.index("<td>broken</td>") < page.index("<td>good</td>")
