@@ -79,11 +79,21 @@ def stated_law(metadata: Mapping[str, Any], controller: Controller | None) -> tu
 
 
 def fitted_law(r: Recording) -> tuple[FloatArray, FloatArray]:
-    """Return K and K/T_I with their covariance, the dither's colour taken for an AR(8) noise."""
+    """Return K and K/T_I with their covariance, the dither's colour taken for an AR(8) noise.
+
+    A row's command may follow from that row's sample or, where command and sample are exchanged at one instant, from
+    the one before: the rows themselves say which, by what they leave unexplained.
+    """
     e = np.nan_to_num(r["r"] - r.y)
-    integral = np.concatenate([[0.0], np.cumsum(0.5 * (e[1:] + e[:-1]) * np.diff(r.t))])
+    at_once = _law_of(r.t, r.u, e)
+    one_before = _law_of(r.t[1:], r.u[1:], e[:-1])
+    return min(at_once, one_before, key=lambda found: found[2])[:2]
+
+
+def _law_of(t: FloatArray, u: FloatArray, e: FloatArray) -> tuple[FloatArray, FloatArray, float]:
+    """Return K, K/T_I and bias, their covariance, and the variance left, of commands from errors row by row."""
+    integral = np.concatenate([[0.0], np.cumsum(0.5 * (e[1:] + e[:-1]) * np.diff(t))])
     X = np.column_stack([e, integral, np.ones(e.size)])
-    u = r.u
     weights = np.linalg.lstsq(X, u, rcond=None)[0]
     for _ in range(3):
         residual = u - X @ weights
@@ -92,8 +102,8 @@ def fitted_law(r: Recording) -> tuple[FloatArray, FloatArray]:
         uw = np.convolve(u, filtered)[: e.size][filtered.size :]
         weights = np.linalg.lstsq(Xw, uw, rcond=None)[0]
     left = uw - Xw @ weights
-    covariance = np.linalg.pinv(Xw.T @ Xw) * float(left @ left) / max(left.size - 3, 1)
-    return weights, covariance
+    variance = float(left @ left) / max(left.size - 3, 1)
+    return weights, np.linalg.pinv(Xw.T @ Xw) * variance, variance
 
 
 def _prewhitening(residual: FloatArray, order: int = 8) -> FloatArray:

@@ -22,8 +22,9 @@ from autotune.experiment.limits import Watch
 from autotune.experiment.loop import ControlLoop
 from autotune.experiment.result import Progress, State
 from autotune.experiment.rig import HoldsGains, Rig
-from autotune.experiment.run import OnProgress, envelope_of, float_on, recording_metadata
+from autotune.experiment.run import OnProgress, envelope_of, float_on, recording_metadata, wait_for_rest
 from autotune.experiment.verify import law_for
+from autotune.experiment.warm import warm_up
 from autotune.recording import RecordingWriter
 
 #: First dither, and the largest one, as shares of the command's room on its narrower side.
@@ -146,6 +147,7 @@ def run_dither(
     shortest, longest = _dwell_rows(dwell_s, rows, dt_s)
     limits, centre = config.limits, config.operating_point.y
     writer = RecordingWriter(recording, ("t", "u", "y", "r", "dither"), recording_metadata(config))
+    warm_up()
     with ControlLoop(rig=rig, envelope=envelope_of(config), writer=writer, extra=("r", "dither")) as loop:
         controller = present_controller(rig, config)
         u_hold = _bring_to_operating_point(loop, config)
@@ -224,5 +226,6 @@ def _next(amplitude: float, departure: float, swing: float, largest: float) -> f
 def _bring_to_operating_point(loop: ControlLoop, config: Config) -> float:
     """Return the command that holds the plant there: measured on the way, or what the rig applies now."""
     if config.operating_point.approach == "ramp":
+        wait_for_rest(loop, config)
         return float_on(loop, config).midpoint
     return loop.tick.u
