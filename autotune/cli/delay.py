@@ -184,6 +184,8 @@ def _watch_rig(config: Config, out: Path, settings: _Tracking, duration_s: float
     try:
         run_dither(rig_of(config), config, recording, duration_s=duration_s, amplitude=dither)
     finally:
+        if not recording.exists():  # nothing will ever come
+            fits.terminate()
         fits.join()
 
 
@@ -195,13 +197,15 @@ def _follow(recording: Path, out: Path, settings: _Tracking, quiet_s: float) -> 
 
     while quiet_s > 0.0 and not recording.exists():
         time.sleep(0.1)
-    done, retune_at, rows = -math.inf, None, -1
+    done, retune_at, rows, size = -math.inf, None, -1, -1
     quiet_since = time.monotonic()
     with out.open("w", encoding="utf-8") as table:
         while True:
+            if recording.stat().st_size > size:  # it may grow for long before the loop is in operation
+                size, quiet_since = recording.stat().st_size, time.monotonic()
             record = _of_operation(recording) if quiet_s == 0.0 else _readable(recording)
             if record is not None and len(record) > rows:
-                rows, quiet_since = len(record), time.monotonic()
+                rows = len(record)
                 length = settings.window_s if settings.window_s is not None else 0.2 * record.duration_s
                 if quiet_s == 0.0 or record.t[-1] - record.t[0] >= length:
                     for fitted in track(
