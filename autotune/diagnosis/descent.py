@@ -14,6 +14,9 @@ from autotune.diagnosis.parameters import Parametrisation
 from autotune.diagnosis.simulation import Simulator, assemble
 from autotune.errors import AutotuneError, IdentificationError
 
+#: Damping below which a small decrease means that the bottom is reached.
+SETTLED = 1e-7
+
 
 @dataclass(frozen=True, eq=False)
 class Spot:
@@ -189,10 +192,17 @@ def descend(
         trial = [x - move for x, move in zip(spot.x0, moves, strict=True)]
         new = attempted(problem, spot.theta + step, trial)
         decrease = -np.inf if new is None else cost - problem.cost(new.e, new.theta, prior)
+        if new is not None and decrease < 0.6 * promised:
+            # start states follow the step in theta to first order alone: they are put right before it is judged
+            settled = resettled(problem, new, derivatives[1], damping)
+            better = -np.inf if settled is None else cost - problem.cost(settled.e, settled.theta, prior)
+            if better > decrease:
+                new, decrease = settled, better
         if new is not None and decrease > 0.0:
             spot = new
             damping = max(damping / 10.0, 1e-9)
-            if decrease < tolerance + 1e-5 * cost and (fresh or decrease > 0.5 * promised):
+            small = decrease < tolerance + 1e-5 * cost and (fresh or decrease > 0.5 * promised)
+            if small and damping < SETTLED:  # damped, a step along a flat valley is small far from its end
                 break
             if decrease < 0.6 * promised:
                 derivatives = None
@@ -223,6 +233,13 @@ def _step(
     step[~may] = 0.0
     step /= max(1.0, float(np.max(np.abs(step) / problem.reach, initial=0.0)))
     return np.asarray(step)
+
+
+def resettled(problem: Problem, spot: Spot, Jx: FloatArray, damping: float) -> Spot | None:
+    """Return a point with the start states that fit its theta, one linear step from where they are."""
+    gain = eliminate(problem, (np.empty((spot.e.size, 0)), Jx), spot.e, damping)[2]
+    moves = problem.per_recording(problem.scales * gain)
+    return attempted(problem, spot.theta, [x - move for x, move in zip(spot.x0, moves, strict=True)])
 
 
 def continued(problem: Problem, spot: Spot) -> Spot:

@@ -18,8 +18,8 @@ from autotune.diagnosis.law import law_effect
 from autotune.diagnosis.result import Candidate, Diagnosis, FitQuality, FoundEffect, OperatingRange, Verdict
 from autotune.diagnosis.retuning import COARSE, misfit
 from autotune.diagnosis.samples import SampleEffect, inspect, jitter_effect
-from autotune.diagnosis.search import Hypothesis
-from autotune.diagnosis.selection import Report, Search, score, search
+from autotune.diagnosis.search import Hypothesis, score
+from autotune.diagnosis.selection import Report, Search, search
 from autotune.diagnosis.simulation import entry_of
 from autotune.errors import InputError
 from autotune.models import Effect, Model, Parameter
@@ -31,6 +31,8 @@ NUMBERS_DECREASE = 25.0
 OFFSET_SIGMAS = 6.0
 #: Correlation of the noise from which on it is a disturbance of the plant's, not of single samples.
 SLOW_NOISE = 0.8
+#: Limit that nothing reaches.
+NEVER = 1e18
 #: Evidence from which on what single rows show is sure, and its share of what an effect of the chain gains.
 SURE, SAMPLE_SHARE = 60.0, 0.2
 
@@ -238,7 +240,10 @@ def _readable(effect: Effect) -> Mapping[str, Parameter]:
 
 
 def _with_uncertainty(h: Hypothesis, effects: tuple[Effect, ...]) -> tuple[Effect, ...]:
-    """Return the effects with the standard deviations of their fit; NaN for a number that the data did not feel."""
+    """Return the effects with the standard deviations of their fit; NaN for a number that the data did not feel.
+
+    A limit that was not felt is none: where it came to rest, further excitation would meet it.
+    """
     result, p = [], h.fit.parametrisation
     sd = np.sqrt(np.maximum(np.diag(h.fit.covariance), 0.0))
     spans: dict[tuple[int, int], float] = {}
@@ -250,6 +255,9 @@ def _with_uncertainty(h: Hypothesis, effects: tuple[Effect, ...]) -> tuple[Effec
             key: replace(q, sd=spans.get((number, j), math.nan) or math.nan)
             for j, (key, q) in enumerate(effect.parameters.items())
         }
+        for key, none in (("low", -NEVER), ("high", NEVER)):
+            if key in parameters and not math.isfinite(parameters[key].sd):
+                parameters[key] = replace(parameters[key], value=none)
         result.append(replace(effect, parameters=MappingProxyType(parameters)))
     return tuple(result)
 

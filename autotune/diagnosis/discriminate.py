@@ -7,7 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from autotune.diagnosis.result import FoundEffect, NextExperiment, Verdict
-from autotune.diagnosis.selection import Search, score
+from autotune.diagnosis.search import score
+from autotune.diagnosis.selection import Search
 from autotune.diagnosis.simulation import entry_of
 
 

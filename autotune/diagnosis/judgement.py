@@ -16,8 +16,8 @@ from autotune.diagnosis.fitting import Fit, fit
 from autotune.diagnosis.noise import noise_from_differences
 from autotune.diagnosis.result import Candidate, FitQuality
 from autotune.diagnosis.retuning import BLOCKS, misfit, whiteness
-from autotune.diagnosis.search import RUNAWAY, Hypothesis
-from autotune.diagnosis.selection import Search, own, score, simplicity_lead
+from autotune.diagnosis.search import RUNAWAY, Hypothesis, score
+from autotune.diagnosis.selection import Search, own, simplicity_lead
 
 #: Residual variance over the noise's (see :func:`autotune.diagnosis.retuning.misfit`) up to which a model is adequate,
 #: beside one standard deviation of that ratio.
@@ -78,7 +78,7 @@ def rivals(found: Search, doubt: float) -> tuple[Candidate, ...]:
     """
     pool = [found.retuned, *found.singles, *found.pairs, *found.triples]
     chosen = found.chosen
-    lead = simplicity_lead(found.retuned.fit, min(pool, key=score))
+    lead = simplicity_lead(found.retuned.fit, min(pool, key=score), found.data)
     scores: dict[str, float] = {}
     for h in pool:
         refused = h.parameters > chosen.parameters and 0.0 < score(chosen) - score(h) < lead

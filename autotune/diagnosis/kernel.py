@@ -372,6 +372,8 @@ def run(
     plain = not (forced or linear_hold or on[:S_LOW].any())
     stretch = 1.0 + (E[CLOCK] if on[CLOCK] else 0.0)
     node_length = step / NODES
+    remembering = on[A_BACKLASH] or on[A_STICTION]
+    carried, past = np.full(4, u[0] - u_offset), 0
     for window in range(starts.size):
         first = starts[window]
         last = stops[window]
@@ -383,8 +385,14 @@ def run(
         while j + 1 < N and t[0] + (t[j + 1] - t[0]) * stretch + delay <= t[first] + 1e-9:
             j += 1
         w = u[j] - u_offset
+        # play and stiction remember all commands before the window
+        while remembering and past <= j:
+            _actuator(u[past], u_offset, 0.0, 0.0, E, on, carried)
+            past += 1
         memory[:3] = w
         memory[3] = 0.0
+        if remembering:
+            memory[:2] = carried[:2]
         for k in range(first, last):
             z = _tap(taps, OUTPUT, x) + gains[3] * w
             out[k, 0] = _sensor(z, y_offset, t[k] - t[0], E, on) if sensing else z + y_offset

@@ -36,6 +36,15 @@ class Hypothesis:
         return sum(f.kind == "effect" for f in self.fit.parametrisation.free)
 
 
+def score(h: Hypothesis) -> float:
+    """Return the cost with what free numbers have to pay: ln N each of the effects', 1 each start state.
+
+    A block that an effect adds brings start states to every window, each of which takes 1 of chi2 from noise alone.
+    """
+    states = sum(Q.shape[1] for Q in h.fit.states_explain)
+    return float(h.fit.cost + h.parameters * np.log(h.fit.rows) + states)
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Promise:
     """A starting point, the decrease of chi2 that the first order promises from it, and the size it promises it at."""
@@ -289,14 +298,14 @@ def extend(
         effect for group in ranked[:most] if group[0].decrease > least for effect in _distinct(group)[:starts_each]
     ]
     begun = [h for h in pool.map(lambda effect: _begun(base.fit, effect, data), starts) if h is not None]
-    begun.sort(key=lambda h: h.fit.cost)
+    begun.sort(key=score)
     finished = [h for k, h in enumerate(begun) if _goes_on(h, begun[:k], base)]
     fits: dict[str, Hypothesis] = {}
     for h in pool.map(lambda h: _finished(h, data), finished):
         known = fits.get(h.names[-1])
-        if known is None or h.fit.cost < known.fit.cost:
+        if known is None or score(h) < score(known):
             fits[h.names[-1]] = h
-    return sorted(fits.values(), key=lambda h: h.fit.cost)
+    return sorted(fits.values(), key=score)
 
 
 def _goes_on(h: Hypothesis, better: Sequence[Hypothesis], base: Hypothesis) -> bool:

@@ -9,7 +9,7 @@ import numpy as np
 from autotune.controller import Controller
 from autotune.diagnosis.description import Curve, Description
 from autotune.diagnosis.result import Diagnosis, FoundEffect
-from autotune.diagnosis.selection import score
+from autotune.diagnosis.search import score
 from autotune.report.page import Figure, Page, Section, Table, Tone, write_page
 from autotune.report.screen_figures import curve_figure, screen_sections, trace_figures
 

@@ -20,7 +20,7 @@ import numpy as np
 from autotune.diagnosis import judgement
 from autotune.diagnosis.diagnose import diagnose
 from autotune.diagnosis.retuning import BLOCKS, misfit, whiteness
-from autotune.diagnosis.selection import score
+from autotune.diagnosis.search import score
 from autotune.models import read_model
 from autotune.recording import read_recording
 from sim.proof import FIRST_PROOF_SEED, Campaign, conceal

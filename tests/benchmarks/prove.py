@@ -21,7 +21,8 @@ import numpy as np
 from scipy.signal import lfilter, savgol_filter
 
 from autotune.batch.engine import cluster, run_all
-from autotune.diagnosis.selection import score, search
+from autotune.diagnosis.search import score
+from autotune.diagnosis.selection import search
 from autotune.models import read_model
 from autotune.recording import read_recording
 from sim.proof import Campaign, conceal, diagnose, forecast_nrmse, mark_all, seal
