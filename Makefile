@@ -1,10 +1,10 @@
-# Two commands do everything on a fresh machine with Python >= 3.11: make run, make test.
+# Two commands do everything on a fresh machine with Python >= 3.11: make run, make test. make docs builds the site.
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 OUT ?= runs/ball_sim
 
-.PHONY: run test lint types imports unit bench clean
+.PHONY: run test lint types imports unit bench docs figures clean
 
 run: $(VENV)/.run
 	rm -rf $(OUT)
@@ -28,15 +28,28 @@ unit: $(VENV)/.test
 bench: $(VENV)/.test
 	$(BIN)/python -m tests.benchmarks
 
+docs: $(VENV)/.docs
+	rm -rf docs/api/autotune docs/api/drivers docs/api/sim docs/_build
+	$(BIN)/sphinx-build -q -W --keep-going -b html docs docs/_build
+	@echo "site: docs/_build/index.html"
+
+figures: $(VENV)/.docs
+	$(BIN)/python -m docs.draw_figures
+
 $(VENV)/.run: pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit("Python >= 3.11 is needed, this is " + sys.version.split()[0] if sys.version_info < (3, 11) else 0)'
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e .
+	@echo "Installing into $(VENV): about 1 GB, one to five minutes. The first run then compiles for about a minute."
+	$(BIN)/python -m pip install --disable-pip-version-check -e .
 	touch $@
 
 $(VENV)/.test: $(VENV)/.run
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[test]'
 	touch $@
 
+$(VENV)/.docs: $(VENV)/.run
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[docs]'
+	touch $@
+
 clean:
-	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache runs
+	rm -rf docs/_build docs/api/autotune docs/api/drivers docs/api/sim $(VENV) .mypy_cache .ruff_cache .pytest_cache runs

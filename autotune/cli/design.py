@@ -6,11 +6,12 @@ import json
 import math
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias
 
 import typer
 
 from autotune.cli import app
+from autotune.design.forms import Form, to_form
 from autotune.errors import InputError
 
 if TYPE_CHECKING:
@@ -125,26 +126,14 @@ def margins_command(
     typer.echo(f"wrote {out}")
 
 
-class Target(StrEnum):
-    """What the controller is written as."""
-
-    ISA = "isa"
-    PARALLEL = "parallel"
-    SERIES = "series"
-    VELOCITY = "velocity"
-    SIEMENS = "siemens"
-    ROCKWELL_DEPENDENT = "rockwell-dependent"
-    ROCKWELL_INDEPENDENT = "rockwell-independent"
-    SCHNEIDER_MIXED = "schneider-mixed"
-    SCHNEIDER_PARALLEL = "schneider-parallel"
-    C = "c"
-    ST = "st"
+#: what the controller is written as: a maker's form, or its law as code
+Target: TypeAlias = Literal[Form, "c", "st"]
 
 
 @app.command("controller")
 def controller_command(
     controller: Annotated[Path, typer.Option(help="controller file (TOML) of kind pi or pid")],
-    form: Annotated[Target, typer.Option(help="a maker's form, or c or st for the law as code")] = Target.ISA,
+    form: Annotated[Target, typer.Option(help="a maker's form, or c or st for the law as code")] = "isa",
     sample_time: Annotated[float, typer.Option(help="time between samples, for velocity, c and st [s]")] = 0.01,
     u_span: Annotated[float, typer.Option(help="engineering span of the output, for percent forms [u unit]")] = 1.0,
     y_span: Annotated[float, typer.Option(help="engineering span of the measurement [y unit]")] = 1.0,
@@ -161,7 +150,7 @@ def controller_command(
         raise InputError(
             "has num and den", where=str(controller), mend='forms are of controllers of kind "pi" or "pid"'
         )
-    if form in (Target.C, Target.ST):
+    if form == "c" or form == "st":
         from autotune.design.codegen import c_source, structured_text
         from autotune.design.law import PILaw
 
@@ -172,12 +161,9 @@ def controller_command(
             u_max=math.inf if u_max is None else u_max,
             u_rate=math.inf if u_rate is None else u_rate,
         )
-        text = c_source(law) if form is Target.C else structured_text(law)
+        text = c_source(law) if form == "c" else structured_text(law)
     else:
-        from autotune.design.forms import FORMS, to_form
-
-        named = next(name for name in FORMS if name == form.value)
-        found = to_form(c, named, u_span=u_span, y_span=y_span, sample_time_s=sample_time)
+        found = to_form(c, form, u_span=u_span, y_span=y_span, sample_time_s=sample_time)
         text = "".join(f"{name} = {value:.6g}\n" for name, value in found.values.items())
     if out is None:
         typer.echo(text, nl=False)
