@@ -42,6 +42,8 @@ def law_effect(recordings: Sequence[Recording], controller: Controller | None = 
         stated = stated_law(r.metadata, controller)
         if stated is None or "r" not in r.extra or not np.all(np.isfinite(r["r"])):
             continue
+        if np.ptp(r.u) == 0.0:
+            continue  # a command that stands at its limit tells nothing of the law
         K, Ti = stated
         estimate, covariance = fitted_law(r)
         names = ["gain_factor"] + (["T_I_factor"] if np.isfinite(Ti) else [])

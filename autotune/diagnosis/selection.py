@@ -22,9 +22,9 @@ from autotune.diagnosis.windows import slowest_lag_s
 from autotune.models import Model
 from autotune.recording import Recording
 
-#: Decrease of the score that an effect must bring: what chance brings among some two hundred starts (a narrow resonance
-#: brings 34 on clean recordings), with a margin; weak effects that can be told bring a hundred and more.
-LEAST_DECREASE = 45.0
+#: Decrease of the score that an effect must bring: what chance brings among some two hundred starts, with a margin (on
+#: clean recordings nothing brought 15); weak effects that can be told bring a hundred and more, some 40.
+LEAST_DECREASE = 30.0
 #: Shift of an effect's size, as a logarithm, that gets a fit out of a crease.
 NUDGE = 0.06
 #: Effects whose thresholds make the criterion rough.

@@ -64,6 +64,11 @@ def complete(row: Json, names: Sequence[str]) -> bool:
     return all(any(n in group for group in accept) for n in names) and all(group & set(names) for group in accept)
 
 
+def true(row: Json, names: Sequence[str]) -> bool:
+    """Whether names are effects of a case: what the samples alone show is no part of a hypothesis."""
+    return all(any(n in group for group in row["accept"]) for n in names if n != "none")
+
+
 def loss(rows: Sequence[Json], temperature: float, doubt: float) -> float:
     """Return the mean log loss of the best hypothesis's probability over cases that found one adequate."""
     total = 0.0
@@ -73,7 +78,7 @@ def loss(rows: Sequence[Json], temperature: float, doubt: float) -> float:
             scores[name] = min(scores.get(name, math.inf), value)
         best = judgement.weighed(scores, temperature * row["excess"], doubt)[0]
         p = min(max(best.probability, 1e-6), 0.99)
-        total -= math.log(p if complete(row, best.name.split("+")) else 1.0 - p)
+        total -= math.log(p if true(row, best.name.split("+")) else 1.0 - p)
     return total / max(len(rows), 1)
 
 
