@@ -35,8 +35,6 @@ ATTENTION: tuple[Attention, ...] = ("act", "failed", "look", "fine")
 _SLUGGISH = 1.5
 #: Margins that are missed by less than this share are kept, within what a recording tells.
 _TOLERANCE = 0.1
-#: Below this phase [deg] a PI has no use for a point, and another turn could not be told from a rise.
-_LOWEST_PHASE_DEG = -270.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -222,7 +220,7 @@ def _finding(work: Work, row: Row) -> Finding:
     row = replace(row, points=len(points), omega_low_rad_s=min(omega), omega_high_rad_s=max(omega))
     if settings.task == "identify":
         return Finding(row=row, points=points_to_json(points))
-    analysis = analyse(_of_use(points), settings.design, compare=False)
+    analysis = analyse(points, settings.design, compare=False)
     return Finding(
         row=_designed(row, analysis, present, settings), points=points_to_json(points), result=analysis_json(analysis)
     )
@@ -278,15 +276,6 @@ def _opened(piece: Recording) -> FrequencyEstimate:
     return estimate
 
 
-def _of_use(points: Sequence[FrequencyPoint]) -> list[FrequencyPoint]:
-    """Return the points up to the frequency where the plant's phase, unwrapped from the lowest, is below -270 deg."""
-    ordered = sorted(points, key=lambda point: point.omega_rad_s)
-    phase = np.degrees(np.unwrap([point.phase_rad for point in ordered]))
-    of_positive_gain = phase - 180.0 * math.ceil((phase[0] - 30.0) / 180.0)
-    beyond = np.flatnonzero(of_positive_gain < _LOWEST_PHASE_DEG)
-    return ordered[: int(beyond[0])] if beyond.size else ordered
-
-
 def _designed(row: Row, analysis: Analysis, present: Controller | None, settings: CampaignSettings) -> Row:
     reduced, c, m = analysis.reduced, analysis.controller, analysis.margins
     row = replace(
@@ -305,8 +294,8 @@ def _designed(row: Row, analysis: Analysis, present: Controller | None, settings
     )
     if present is not None:
         row = _compared(row, present, margins(analysis.fit.plant, present), settings)
-    if row.attention == "fine" and (analysis.warnings or not analysis.scaled.holds):
-        doubt = analysis.warnings[0] if analysis.warnings else "criterion (10) does not hold: measure more points"
+    if row.attention == "fine" and (analysis.reduced.warnings or not analysis.scaled.holds):
+        doubt = analysis.reduced.warnings[0] if analysis.reduced.warnings else "criterion (10) does not hold: measure more points"
         return replace(row, attention="look", reason=doubt)
     return row
 

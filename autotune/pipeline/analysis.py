@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+
+import numpy as np
 
 from autotune.config.procedure import DesignSettings
 from autotune.controller import PIDController
@@ -16,6 +19,9 @@ from autotune.errors import AutotuneError
 from autotune.identification.parametric import PlantFit, fit_plant
 from autotune.identification.reduction import ReducedModel, reduce_points
 from autotune.points import FrequencyPoint
+
+#: Below this phase [deg] a PI has no use for a point, and another turn could not be told from a rise.
+LOWEST_PHASE_DEG = -270.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,7 +76,7 @@ def analyse(points: Sequence[FrequencyPoint], settings: DesignSettings, *, compa
     Parameters
     ----------
     points : sequence of FrequencyPoint
-        At least three, spanning -135 degrees.
+        At least three, spanning -135 degrees; those past -270 degrees are left out, with a warning.
     settings : DesignSettings
         Structure, specification, and whether to design on the reduced model or straight on the points.
     compare : bool
@@ -81,6 +87,10 @@ def analyse(points: Sequence[FrequencyPoint], settings: DesignSettings, *, compa
     IdentificationError, DesignError
         The points do not determine a model, or no controller meets the specification.
     """
+    measured = sorted(points, key=lambda point: point.omega_rad_s)
+    points = of_use(measured)
+    left_out = len(measured) - len(points)
+    beyond = (f"{left_out} points past {LOWEST_PHASE_DEG:g} deg were left out: a PI has no use for them",)
     fit = fit_plant(points)
     reduced = reduce_points(points)
     H_r = reduced.transfer_function()
@@ -94,7 +104,7 @@ def analyse(points: Sequence[FrequencyPoint], settings: DesignSettings, *, compa
     controller = designed.controller
     achieved = margins(fit.plant, controller)
     return Analysis(
-        points=tuple(sorted(points, key=lambda point: point.omega_rad_s)),
+        points=tuple(measured),
         fit=fit,
         reduced=reduced,
         design=designed,
@@ -102,8 +112,17 @@ def analyse(points: Sequence[FrequencyPoint], settings: DesignSettings, *, compa
         margins=achieved,
         unscaled=validate(fit.plant, H_r, controller),
         scaled=validate(fit.plant, H_r, controller, scaling=loop_scaling(H_r, controller)),
-        warnings=reduced.warnings,
+        warnings=(*(beyond if left_out else ()), *reduced.warnings),
     )
+
+
+def of_use(points: Sequence[FrequencyPoint]) -> list[FrequencyPoint]:
+    """Return the points up to the frequency where the plant's phase, unwrapped from the lowest, is below -270 deg."""
+    ordered = sorted(points, key=lambda point: point.omega_rad_s)
+    phase = np.degrees(np.unwrap([point.phase_rad for point in ordered]))
+    of_positive_gain = phase - 180.0 * math.ceil((phase[0] - 30.0) / 180.0)
+    beyond = np.flatnonzero(of_positive_gain < LOWEST_PHASE_DEG)
+    return ordered[: int(beyond[0])] if beyond.size else ordered
 
 
 def _or_reason(make: Callable[[], Design]) -> Design | str:

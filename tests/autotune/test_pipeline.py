@@ -225,3 +225,13 @@ def test_no_recording_is_ever_overwritten(tmp_path: Path) -> None:
         path.touch()
         names.append(path.name)
     assert names == ["recording.csv", "recording-2.csv", "recording-3.csv"]
+
+
+def test_points_past_a_pi_s_use_are_left_out_of_the_analysis_and_said() -> None:
+    plant = TransferFunction(num=(2.0,), den=(1.0, 1.0), delay_s=1.0)
+    of_use = points_of(plant, np.array([0.3, 0.7, 1.2, 1.8, 2.5]), 1e-3)  # phases to -211 degrees
+    beyond = points_of(plant, np.array([4.0, 6.0, 8.0]), 1e-3)  # phases to -541 degrees, which wrap to -181
+    alone, whole = (analyse(p, DesignSettings(), compare=False) for p in (of_use, [*of_use, *beyond]))
+    assert whole.design == alone.design
+    assert whole.points == (*of_use, *beyond)
+    assert whole.warnings == ("3 points past -270 deg were left out: a PI has no use for them", *alone.warnings)
