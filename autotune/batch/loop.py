@@ -294,8 +294,9 @@ def _designed(row: Row, analysis: Analysis, present: Controller | None, settings
     )
     if present is not None:
         row = _compared(row, present, margins(analysis.fit.plant, present), settings)
-    if row.attention == "fine" and (analysis.reduced.warnings or not analysis.scaled.holds):
-        doubt = analysis.reduced.warnings[0] if analysis.reduced.warnings else "criterion (10) does not hold: measure more points"
+    doubts = analysis.reduced.warnings
+    if row.attention == "fine" and (doubts or not analysis.scaled.holds):
+        doubt = doubts[0] if doubts else "criterion (10) does not hold: measure more points"
         return replace(row, attention="look", reason=doubt)
     return row
 
