@@ -34,7 +34,7 @@ apidoc_modules = [
     }
     for name in ("autotune", "drivers", "sim")
 ]
-autodoc_mock_imports = ["fastapi", "nicegui"]  # the extra of the live page
+autodoc_mock_imports = ["fastapi", "nicegui", "starlette", "uvicorn"]  # the extra of the live page
 autodoc_member_order = "bysource"
 autodoc_typehints = "none"  # the docstrings say shapes and units
 autodoc_default_options = {"members": True, "undoc-members": False}
