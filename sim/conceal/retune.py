@@ -180,7 +180,8 @@ def retune(
             J[:, i] = (residual(d) - e) / (d[i] - at[i])
         H, g = J.T @ J, J.T @ e
         gain = 0.0
-        held = (abs(at[:count]) >= bound[:count]) & (at[:count] * g < 0.0)
+        # a number at its bound stays there; one that the records do not feel, as with a command that never moves, too
+        held = ((abs(at[:count]) >= bound[:count]) & (at[:count] * g < 0.0)) | (np.diag(H) == 0.0)
         for _ in range(6):
             M = H + damping * np.diag(np.diag(H))
             M[held, :], M[:, held] = 0.0, 0.0
