@@ -25,6 +25,9 @@ from autotune.diagnosis.selection import Search, own, simplicity_lead
 #: Residual variance over the noise's (see :func:`autotune.diagnosis.retuning.misfit`) up to which a model is adequate,
 #: beside one standard deviation of that ratio.
 ADEQUATE = 1.04
+#: The same for a residual without any slow part: then what is more is jitter that the differences of coloured noise did
+#: not show, and physics left out would have been slow.
+ADEQUATE_QUICK, QUICK = 1.12, 1.0
 #: The same for the slow part of the residual, after its own AR(2) has been taken out, beside two standard deviations.
 WHITE = 1.15
 #: Misfit of a model without effects from which on something must be missing, although no effect is worth it; clean
@@ -42,16 +45,17 @@ TEMPERATURE = 3.0
 
 def is_adequate(result: Fit, data: Data) -> bool:
     """Whether a residual is noise: no more variance than its jitter shows, and no slow part."""
-    return misfit(result, data) < _allowed(result) and is_white(result, data)
+    return misfit(result, data) < _allowed(result, data) and is_white(result, data)
 
 
-def _allowed(result: Fit) -> float:
-    return ADEQUATE + math.sqrt(2.0 / result.rows)
+def _allowed(result: Fit, data: Data) -> float:
+    bound = ADEQUATE_QUICK if is_white(result, data, QUICK) else ADEQUATE
+    return bound + math.sqrt(2.0 / result.rows)
 
 
-def is_white(result: Fit, data: Data) -> bool:
+def is_white(result: Fit, data: Data, bound: float = WHITE) -> bool:
     """Whether a residual has no slow part beyond what chance brings."""
-    return whiteness(result, data) < WHITE + 2.0 * math.sqrt(2.0 / (BLOCKS * len(result.windows)))
+    return whiteness(result, data) < bound + 2.0 * math.sqrt(2.0 / (BLOCKS * len(result.windows)))
 
 
 def dominates(quality: FitQuality) -> bool:
@@ -117,7 +121,7 @@ def doubt_of(result: Fit, data: Data, dominant: bool) -> float:
     the two weigh the same, but for an effect that explains most of what retuning leaves far above the noise.
     """
     if is_adequate(result, data):
-        excess = max(misfit(result, data) - 1.0, 0.0) / (_allowed(result) - 1.0)
+        excess = max(misfit(result, data) - 1.0, 0.0) / (_allowed(result, data) - 1.0)
         return UNKNOWN + (1.0 - UNKNOWN) * excess**4
     return HALF_EXPLAINED if dominant else 1.0
 

@@ -23,7 +23,7 @@ from autotune.models import Model
 from autotune.recording import Recording
 
 #: Decrease of the score that an effect must bring: what chance brings among some two hundred starts, with a margin (on
-#: clean recordings nothing brought 15); weak effects that can be told bring a hundred and more, some 40.
+#: clean recordings nothing brought more than 15); weak effects that can be told bring a hundred and more, some 40.
 LEAST_DECREASE = 30.0
 #: Shift of an effect's size, as a logarithm, that gets a fit out of a crease.
 NUDGE = 0.06
