@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -52,13 +53,19 @@ class Data:
             return self
         if all(len(a) <= LEAST_WINDOWS_KEPT for a in self.starts):
             return self
-        starts, stops, good = [], [], []
-        for r, a, b, ok in zip(self.recordings, self.starts, self.stops, self.good, strict=True):
+        chosen = []
+        for r, a, ok in zip(self.recordings, self.starts, self.good, strict=True):
             count = min(len(a), max(LEAST_WINDOWS_KEPT, round(len(a) / share)))
             far = [extreme(np.where(ok, x, np.median(x[ok]))) for x in (r.u, r.y) for extreme in (np.argmin, np.argmax)]
             extremes = np.clip(np.searchsorted(a, far, side="right") - 1, 0, len(a) - 1)
             evenly = np.linspace(0, len(a) - 1, count).round().astype(np.int64)
-            keep = np.union1d(evenly, extremes)
+            chosen.append(np.union1d(evenly, extremes))
+        return self.only(chosen)
+
+    def only(self, chosen: Iterable[IntArray | BoolArray]) -> Data:
+        """Return the data with the chosen windows of every recording, by number or by mask; no other row counts."""
+        starts, stops, good = [], [], []
+        for keep, a, b, ok in zip(chosen, self.starts, self.stops, self.good, strict=True):
             inside = np.zeros(ok.size, dtype=bool)
             for first, last in zip(a[keep], b[keep], strict=True):
                 inside[first:last] = True

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import replace
 
 import numpy as np
 
@@ -155,18 +154,10 @@ def held_out(found: Search) -> tuple[FitQuality, bool]:
 
 def _half(data: Data, which: int) -> Data:
     """Return every second window of the data, or block of windows where there are few."""
-    starts, stops, good = [], [], []
-    number = which
-    for a, b, ok in zip(data.starts, data.stops, data.good, strict=True):
+    chosen = []
+    for a in data.starts:
         # few windows may go by direction one and one: then blocks of them are taken
         block = 1 if len(a) >= 8 else max(1, len(a) // 2)
-        keep = (np.arange(len(a)) // block) % 2 == number % 2
-        if not keep.any():
-            keep[:] = True
-        inside = np.zeros(ok.size, dtype=bool)
-        for first, last in zip(a[keep], b[keep], strict=True):
-            inside[first:last] = True
-        starts.append(a[keep])
-        stops.append(b[keep])
-        good.append(ok & inside)
-    return replace(data, starts=tuple(starts), stops=tuple(stops), good=tuple(good))
+        keep = (np.arange(len(a)) // block) % 2 == which % 2
+        chosen.append(keep if keep.any() else np.ones(len(a), dtype=bool))
+    return data.only(chosen)
