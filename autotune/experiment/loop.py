@@ -25,6 +25,8 @@ from autotune.recording import RecordingWriter
 
 #: longest wait without looking for a stop signal [s]
 SLICE_S = 0.1
+#: what an onlooker's Abort arrives as; Ctrl-C itself where the system has no signal to spare
+ABORT = getattr(signal, "SIGUSR1", signal.SIGINT)
 #: samples behind the schedule at which the loop gives up: a command that late belongs to another plant state
 LATE_SAMPLES = 10
 #: what lies at least between two rows [s], where a virtual clock stands still
@@ -384,11 +386,11 @@ def _reason(error: BaseException | None) -> dict[str, Any]:
 
 @contextlib.contextmanager
 def _signals(on_signal: Any) -> Iterator[None]:
-    """Turn Ctrl-C and SIGTERM into a flag that the loop looks at, so that no frame on the link is torn in two."""
+    """Turn Ctrl-C, SIGTERM and Abort into a flag the loop looks at, so that no frame on the link is torn in two."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    names = {signal.SIGINT: "Ctrl-C", signal.SIGTERM: "SIGTERM"}
+    names = {ABORT: "Abort on the live page", signal.SIGINT: "Ctrl-C", signal.SIGTERM: "SIGTERM"}
 
     def handle(number: int, _frame: FrameType | None) -> None:
         on_signal(names[signal.Signals(number)])

@@ -28,6 +28,8 @@ INK = "getComputedStyle(document.body).color"
 
 Options = dict[str, Any]
 
+#: what a name stands on, so that no curve crosses it
+PLATE = {":backgroundColor": "getComputedStyle(document.body).backgroundColor", "padding": [1, 3]}
 #: the band is its width on its lower edge, which may be negative
 STACK = {"stack": "band", "stackStrategy": "all"}
 
@@ -259,7 +261,7 @@ def _bars(x: FloatArray, y: FloatArray, half: FloatArray, colour: str, *, grid: 
 
 def _marks(lines: list[tuple[float, str]], instants: list[tuple[float, str]]) -> Options:
     def mark(where: dict[str, float], text: str, colour: str, label: Options) -> Options:
-        shown = {"formatter": text, "show": bool(text), ":color": INK, "fontSize": 11} | label
+        shown = {"formatter": text, "show": bool(text), ":color": INK, "fontSize": 11, **PLATE} | label
         return where | {"lineStyle": {"color": colour, "type": "dotted"}, "label": shown}
 
     limits = [mark({"yAxis": value}, text, RED, {"position": "insideEndTop"}) for value, text in lines]

@@ -221,10 +221,8 @@ class Screen:
     def _state_text(self) -> str:
         story = self._story
         if story.ended is not None:
-            reason, status = story.ended
-            reason = f"{story.state}: Abort on the live page" if self._controls.aborted and status == 130 else reason
             left = "the rig has its safe output" if story.output == SAFE else f"safe output {story.output or 'unknown'}"
-            return f"Ended: {reason}; {left}."
+            return f"Ended: {story.ended}; {left}."
         if self._controls.run_is_gone:
             return "The run is gone without a word: it was killed. The device's own dead-man timer has to act."
         if story.waiting_s:

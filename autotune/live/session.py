@@ -9,6 +9,7 @@ from __future__ import annotations
 import _thread
 import importlib.util
 import queue
+import signal
 import subprocess
 import sys
 import threading
@@ -19,6 +20,7 @@ from typing import Self
 from rich.console import Console
 
 from autotune.errors import InputError
+from autotune.experiment.loop import ABORT
 
 #: what the page may ask; anything else on the pipe is no action
 ACTIONS = ("abort", "keep", "restore")
@@ -86,6 +88,8 @@ class LivePage:
             raise InputError(
                 "did not start, its reason is above", where="live page", mend="give another --listen or --port"
             )
+        # outside the control loop, which has a handler of its own, Abort ends the command as Ctrl-C does
+        self._handler = signal.signal(ABORT, signal.default_int_handler)
         self._hearing = threading.Thread(target=self._hear, daemon=True)
         self._hearing.start()
         self._console.print(f"live page: {self.url}", markup=False)
@@ -109,7 +113,7 @@ class LivePage:
         for line in self.process.stdout:
             action = line.strip()
             if action == "abort":
-                _thread.interrupt_main()
+                _thread.interrupt_main(ABORT)
             elif action in ACTIONS:
                 self._answers.put(action)
         self._answers.put("keep")  # the page is gone: nobody will answer
@@ -128,4 +132,5 @@ class LivePage:
             self.process.terminate()
             self.process.wait()
         self._hearing.join()
+        signal.signal(ABORT, self._handler)
         self.process.stdout.close()

@@ -92,8 +92,8 @@ class Story:
         What was found so far; None, empty or False before.
     waiting_s : float
         How long the operator may decide otherwise [s], 0 while there is nothing to decide.
-    ended : (str, int) or None
-        Reason and exit status.
+    ended : str or None
+        Reason.
     output : str
         How the rig was left, once that is known.
 
@@ -127,7 +127,7 @@ class Story:
         self.accepted, self.verdict = False, ""
         self.gains: Gains | None = None
         self.waiting_s = 0.0
-        self.ended: tuple[str, int] | None = None
+        self.ended: str | None = None
         self.output = ""
 
     def poll(self) -> bool:
@@ -174,7 +174,7 @@ class Story:
             case "waiting":
                 self.waiting_s = event["patience_s"]
             case "ended":
-                self.ended, self.waiting_s = (event["reason"], event["exit_status"]), 0.0
+                self.ended, self.waiting_s = event["reason"], 0.0
                 self.output = self._output()
 
     def _output(self) -> str:

@@ -212,7 +212,8 @@ def test_abort_brings_the_rig_to_its_safe_output_within_one_control_period(
                 before = len(read_recording(tmp_path / "out" / "recording.csv"))
                 page.keyboard.press("Escape")
                 expect(page.get_by_role("status")).to_have_text(
-                    "Ended: preflight: Abort on the live page; the rig has its safe output.", timeout=LIMIT_MS
+                    re.compile("^Ended: preflight: stopped by Abort on the live page; .*the rig has its safe output"),
+                    timeout=LIMIT_MS,
                 )
                 page.context.close()
             except BaseException:
@@ -225,6 +226,7 @@ def test_abort_brings_the_rig_to_its_safe_output_within_one_control_period(
     assert recording.u[-1] == device.output == 0.0
     assert [change.cause for change in device.history][-1] != "dead-man"
     assert run.returncode == 130
-    assert "stopped by" in errors
+    assert "stopped by Abort on the live page" in errors
+    assert "stopped by Abort on the live page" in recording.metadata["ended"]["reason"]
     ended = json.loads((tmp_path / "out" / "progress.jsonl").read_text().splitlines()[-1])
     assert ended["exit_status"] == 130
