@@ -30,7 +30,7 @@ import numpy as np
 
 from autotune.config import Config
 from autotune.controller import PIDController
-from autotune.errors import AutotuneError, OperatorStop
+from autotune.errors import AutotuneError, ExperimentStopped, OperatorStop
 from autotune.experiment.result import Progress
 from autotune.experiment.verify import Verification, smoothed
 from autotune.models import TransferFunction
@@ -54,6 +54,7 @@ class RunLog:
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self._file = open(path, "ab", buffering=0)  # noqa: SIM115 - closed by __exit__
         self._last: tuple[Any, ...] = ()
+        self._exit_status = 0
 
     def begin(self, config: Config) -> None:
         """Say what is commissioned."""
@@ -101,6 +102,7 @@ class RunLog:
 
     def verified(self, verification: Verification) -> None:
         """Say how the new loop behaves on the rig beside what was predicted."""
+        self._exit_status = 0 if verification.accepted else ExperimentStopped.exit_status
         test, prediction = verification.test, verification.prediction
         usable = np.isfinite(verification.y)
         measured = smoothed(np.interp(test.t, test.t[usable], verification.y[usable]), test)
@@ -137,7 +139,7 @@ class RunLog:
     ) -> None:
         match error:
             case None:
-                self._write("ended", reason="completed", exit_status=0)
+                self._write("ended", reason="completed", exit_status=self._exit_status)
             case AutotuneError():
                 self._write("ended", reason=str(error), exit_status=error.exit_status)
             case KeyboardInterrupt():

@@ -79,3 +79,7 @@ def batch(
         console.print("and more, in the report", markup=False)
     console.print(page.verdict, markup=False)
     console.print(f"report: {out / 'report.html'}, table: {out / RESULTS}", markup=False)
+    if counts["failed"] == len(ordered):
+        raise InputError(
+            "no loop could be analysed", where=str(campaign), mend="the reason of each is above and in the report"
+        )

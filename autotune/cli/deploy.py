@@ -129,6 +129,8 @@ def verify(
     console = Console(highlight=False, soft_wrap=True)
     console.print(page.verdict, markup=False)
     console.print(f"report: {folder / 'verify.html'}", markup=False)
+    if not verification.accepted:
+        raise typer.Exit(ExperimentStopped.exit_status)
 
 
 def _gains(controller: Path | None, design: Path | None, run: Path | None) -> PIDController:

@@ -12,7 +12,7 @@ from rich.console import Console
 from autotune.cli import app
 from autotune.cli.common import ProgressBar, new_folder, rig_of
 from autotune.cli.live import LISTEN, PORT, TOKEN
-from autotune.errors import InputError
+from autotune.errors import ExperimentStopped, InputError
 
 if TYPE_CHECKING:
     from autotune.config import Config
@@ -84,6 +84,8 @@ def run(
         for sentence in found.sentences if found is not None else ():
             console.print(sentence, markup=False)
         console.print(f"report: {folder / 'report.html'}", markup=False)
+    if missed:
+        raise typer.Exit(ExperimentStopped.exit_status)
 
 
 def _configuration(config: Path | None, out: Path | None, resume: Path | None, dry_run: bool) -> Config:

@@ -177,7 +177,8 @@ def _verdict(tuning: Tuning, signals: SignalSettings) -> tuple[str, bool]:
     if tuning.verification is None:
         return f"{gains}: designed, not verified on the rig.", False
     if tuning.verification.accepted:
-        where = "the rig holds it now" if tuning.deployed else "the controller file is ready to be entered"
+        held = "the rig holds its old gains" if tuning.old_controller else "its gains are in result.json"
+        where = "the rig holds it now" if tuning.deployed else held
         return f"Accepted: {gains}; {tuning.verification.reason}; {where}.", True
     return f"Not accepted: {gains}; {tuning.verification.reason}. The old gains were kept.", False
 

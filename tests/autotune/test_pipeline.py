@@ -8,7 +8,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
+from autotune.cli import app
 from autotune.config import Config, load_config
 from autotune.config.procedure import DesignSettings
 from autotune.controller import PIDController
@@ -17,11 +19,10 @@ from autotune.experiment.rig import Reading
 from autotune.experiment.verify import Verification, run_verification
 from autotune.identification.parametric import fit_plant
 from autotune.models import TransferFunction
-from autotune.pipeline import Tuning, analyse, hand_over, tune
+from autotune.pipeline import analyse, hand_over, tune
 from autotune.pipeline.deployment import deploy
 from autotune.pipeline.folder import differences, next_free, read_interrupted, store_config, stored_config
-from autotune.pipeline.mismatch import around_operating_point, diagnose_run, resting_command
-from autotune.pipeline.result import append_diagnosis
+from autotune.pipeline.mismatch import around_operating_point, resting_command
 from autotune.points import FrequencyPoint
 from autotune.recording import read_recording
 from drivers.simulated import SimulatedRig
@@ -99,6 +100,7 @@ def test_a_plant_that_changed_is_noticed_and_the_old_gains_stay(tmp_path: Path) 
     assert not tuning.deployed
     assert rig.read_gains() == OLD
     assert rig.command == 0.0
+    assert json.loads((tmp_path / "progress.jsonl").read_text().splitlines()[-1])["exit_status"] == 3
 
 
 def test_gains_that_cannot_be_written_are_taken_back(tmp_path: Path) -> None:
@@ -159,20 +161,21 @@ def sections(config: Config, **changes: dict[str, Any]) -> Config:
     )
 
 
-@pytest.fixture(scope="module")
-def loaded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Config, Tuning, Path]:
-    folder = tmp_path_factory.mktemp("loaded")
+@pytest.fixture
+def loaded() -> tuple[Config, Loaded]:
     config = sections(
         load_config(CONFIGS / "ball_sim.toml"),
         signals={"sample_time_s": 0.03}, experiment={"points": 3, "budget_s": 25.0}, verification={"duration_s": 8.0},
     )  # fmt: skip
-    rig = Loaded(make_plant("ball", seed=4, noise=0.1), u_safe=0.0, controller=OLD)
-    return config, tune(rig, config, folder), folder
+    return config, Loaded(make_plant("ball", seed=4, noise=0.1), u_safe=0.0, controller=OLD)
 
 
-def test_the_fitted_plant_explains_the_sweep_around_its_operating_point(loaded: tuple[Config, Tuning, Path]) -> None:
-    config, tuning, folder = loaded
-    sweep = around_operating_point(read_recording(folder / "recording.csv"))
+def test_the_fitted_plant_explains_the_sweep_around_its_operating_point(
+    loaded: tuple[Config, Loaded], tmp_path: Path
+) -> None:
+    config, rig = loaded
+    tuning = tune(rig, config, tmp_path, verify=False)
+    sweep = around_operating_point(read_recording(tmp_path / "recording.csv"))
     assert sweep is not None
     assert sweep.t[0] == pytest.approx(tuning.experiment.segments[0].start_s)
     assert np.abs(sweep.y - 5.0).max() < 3.0  # the floor, at 10 V, is not in it
@@ -181,24 +184,26 @@ def test_the_fitted_plant_explains_the_sweep_around_its_operating_point(loaded: 
     assert u_rest == pytest.approx(truth, abs=5e-4)
 
 
-def test_a_load_in_the_midst_of_the_verification_is_found_in_the_runs_own_recordings(
-    loaded: tuple[Config, Tuning, Path],
+def test_a_load_in_the_midst_of_the_verification_fails_the_run_and_is_found_in_its_own_recordings(
+    loaded: tuple[Config, Loaded], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    config, tuning, folder = loaded
-    assert tuning.verification is not None
-    assert not tuning.verification.accepted
-    files = [folder / "recording.csv", folder / "verification.csv"]
-    found = diagnose_run(config, tuning.experiment, tuning.analysis.fit, files, lambda what, share: None)
-    append_diagnosis(folder / "result.json", found)
-    assert found.verdict == "effect"
-    assert found.effects[0].name == "environment.step_load"
-    recording, start_s, _ = found.effects[0].windows[0]
+    config, rig = loaded
+    store_config(config, tmp_path)
+    monkeypatch.setattr("autotune.cli.run.rig_of", lambda _: rig)
+    done = CliRunner().invoke(app, ["run", str(tmp_path / "config.toml"), "--out", str(tmp_path / "out")])
+    assert done.exit_code == 3, done.output
+    assert "Not accepted" in done.output
+    assert rig.read_gains() == OLD
+    result = json.loads((tmp_path / "out" / "result.json").read_text())
+    assert not result["verification"]["accepted"]
+    found = result["diagnosis"]
+    effect = found["effects"][0]
+    assert (found["verdict"], effect["name"]) == ("effect", "environment.step_load")
+    recording, start_s, _ = effect["windows"][0]
     assert recording == 1
     assert start_s == pytest.approx(28.0, abs=0.5)
-    assert found.effects[0].parameters["amplitude"].value == pytest.approx(-0.03, rel=0.1)
-    told = json.loads((folder / "result.json").read_text())["diagnosis"]
-    assert (told["verdict"], told["effects"][0]["name"]) == ("effect", "environment.step_load")
-    assert told["next_experiment"]
+    assert effect["parameters"]["amplitude"]["value"] == pytest.approx(-0.03, rel=0.1)
+    assert found["next_experiment"]
 
 
 def test_the_stored_configuration_is_the_one_that_was_given(tmp_path: Path) -> None:

@@ -81,6 +81,16 @@ def test_a_campaign_that_cannot_be_meant_is_refused(tmp_path, text, said):
         read_campaign(tmp_path / "c.toml")
 
 
+def test_a_campaign_in_which_nothing_can_be_analysed_is_refused_and_leaves_the_reasons(tmp_path, two_workers):
+    (tmp_path / "c.toml").write_text('name = "a"\n[[loop]]\nname = "TIC1"\nfile = "gone.csv"\n')
+    arguments = ["batch", str(tmp_path / "c.toml"), "--out", str(tmp_path / "out")]
+    done = CliRunner().invoke(app, [*arguments, "--scheduler", two_workers.cluster.scheduler_address])
+    assert isinstance(done.exception, InputError)
+    assert "no loop could be analysed" in str(done.exception)
+    assert "failed  TIC1: " in done.output
+    assert (tmp_path / "out" / "report.html").stat().st_size > 0
+
+
 def test_what_needs_attention_comes_first_and_a_failing_loop_is_a_row_with_its_reason(designed):
     _, _, rows = designed
     assert [(row.loop, row.attention) for row in rows] == [
