@@ -206,7 +206,7 @@ class ModbusLink:
                 return len(answer.bits) == 8 * ((block.count + 7) // 8)
             return len(answer.registers) == block.count
 
-        answer, attempts = self._exchange(ask, belongs, function, f"{block.table} {block.address}")
+        answer, attempts = self._exchange(ask, belongs, function, block.table, block.address)
         return ([int(bit) for bit in answer.bits[: block.count]] if is_bits else answer.registers), attempts > 1
 
     def write(self, table: str, address: int, words: Sequence[int]) -> bool:
@@ -242,7 +242,7 @@ class ModbusLink:
             return answer.registers == [value] if len(words) == 1 else answer.count == len(words)
 
         function = 5 if table == "coil" else 6 if len(words) == 1 else 16
-        _, attempts = self._exchange(ask, belongs, function, f"{table} {address}")
+        _, attempts = self._exchange(ask, belongs, function, table, address)
         return attempts > 1
 
     def _exchange(
@@ -250,7 +250,8 @@ class ModbusLink:
         ask: Callable[[Any], ModbusPDU],
         belongs: Callable[[ModbusPDU], bool],
         function: int,
-        place: str,
+        table: str,
+        address: int,
     ) -> tuple[ModbusPDU, int]:
         """Ask until an answer belongs to the request; return it and the number of attempts."""
         what, mend = "no answer", "check cable, power and unit_id, or raise timeout_s"
@@ -271,18 +272,19 @@ class ModbusLink:
             except ModbusException:  # time-out, or bytes that are no frame
                 what, mend = "no answer", "check cable, power and unit_id, or raise timeout_s"
                 continue
-            if answer.function_code & 0x7F != function or not (answer.isError() or belongs(answer)):
+            refused = answer.isError()
+            if answer.function_code & 0x7F != function or not (refused or belongs(answer)):
                 what, mend = "the answer belongs to another request", "let only one master talk to the device"
                 continue
             self._is_clean = True
-            if not answer.isError():
+            if not refused:
                 return answer, attempt
             code = answer.exception_code
             what, mend = _EXCEPTIONS.get(code, (f"answers with exception {code}", "see the device's manual"))
             what = f"the device {what}"
             if code not in _BUSY:
-                raise DeviceRefused(what, where=f"{self.where}, {place}", mend=mend)
-        raise LinkError(what, where=f"{self.where}, {place}", mend=mend)
+                raise DeviceRefused(what, where=f"{self.where}, {table} {address}", mend=mend)
+        raise LinkError(what, where=f"{self.where}, {table} {address}", mend=mend)
 
     def _flush(self) -> None:
         """Make sure that no earlier answer can be taken for the next one.

@@ -115,7 +115,7 @@ class Codec:
         register = self.register
         if not math.isfinite(value):
             raise InputError(f"{value} is not a value", where=self.name, mend="give a finite number")
-        count = (value - register.offset) / register.scale
+        count = (value - self._offset) / self._scale
         if self._count is None:
             if value not in (0.0, 1.0):
                 raise InputError(f"{value:g} does not fit a bit", where=self.name, mend="give 0 or 1")
