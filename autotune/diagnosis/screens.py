@@ -15,7 +15,7 @@ from autotune.arrays import FloatArray
 from autotune.controller import Controller
 from autotune.diagnosis.data import Data
 from autotune.diagnosis.fitting import Fit
-from autotune.diagnosis.law import fitted_law, stated_law
+from autotune.diagnosis.law import shown_law, stated_law
 from autotune.diagnosis.samples import frozen_rows, lattice_step
 from autotune.recording import Recording
 
@@ -161,24 +161,19 @@ def value_screen(recordings: Sequence[Recording]) -> ValueScreen:
 
 
 def law_screen(recordings: Sequence[Recording], controller: Controller | None = None) -> LawScreen | None:
-    """Recompute u from r and y by the stated law; nothing where no recording has a set-point and a stated PI law."""
+    """Recompute u from r and y by the stated law; nothing where no recording has a set-point and a stated law."""
     for number, r in enumerate(recordings):
         stated = stated_law(r.metadata, controller)
-        if stated is None or "r" not in r.extra or not np.all(np.isfinite(r["r"])):
+        shown = None if stated is None else shown_law(r, stated)
+        if shown is None:
             continue
-        K, Ti = stated
-        e = np.nan_to_num(r["r"] - r.y)
-        integral = np.concatenate([[0.0], np.cumsum(0.5 * (e[1:] + e[:-1]) * np.diff(r.t))])
-        law = K * (e + integral / Ti)
-        law += float(np.median(r.u - law))
-        share = float(np.std(r.u - law) / max(float(np.std(r.u)), 1e-300))
-        found, covariance = fitted_law(r)
-        shown, sd = found[0] / K, float(np.sqrt(covariance[0, 0])) / abs(K)
+        share = float(np.std(r.u - shown.recomputed) / float(np.std(r.u)))
+        gain = shown.factors["gain_factor"]
         says = (
             f"The stated law leaves {100 * share:.2g} % of the spread of u (what was added to its output counts); "
-            f"the recording shows {shown:.3g} ± {1.96 * sd:.2g} of the stated gain."
+            f"the recording shows {gain.value:.3g} ± {1.96 * gain.sd:.2g} of the stated gain."
         )
-        return LawScreen(number=number, t=r.t, recorded=r.u, recomputed=law, sentence=says)
+        return LawScreen(number=number, t=r.t, recorded=r.u, recomputed=shown.recomputed, sentence=says)
     return None
 
 
