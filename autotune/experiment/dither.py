@@ -24,7 +24,6 @@ from autotune.experiment.result import Progress, State
 from autotune.experiment.rig import HoldsGains, Rig
 from autotune.experiment.run import OnProgress, envelope_of, float_on, recording_metadata, wait_for_rest
 from autotune.experiment.verify import law_for
-from autotune.experiment.warm import warm_up
 from autotune.recording import RecordingWriter
 
 #: First dither, and the largest one, as shares of the command's room on its narrower side.
@@ -147,7 +146,6 @@ def run_dither(
     shortest, longest = _dwell_rows(dwell_s, rows, dt_s)
     limits, centre = config.limits, config.operating_point.y
     writer = RecordingWriter(recording, ("t", "u", "y", "r", "dither"), recording_metadata(config))
-    warm_up()
     with ControlLoop(rig=rig, envelope=envelope_of(config), writer=writer, extra=("r", "dither")) as loop:
         controller = present_controller(rig, config)
         u_hold = _bring_to_operating_point(loop, config)

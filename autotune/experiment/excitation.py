@@ -24,7 +24,6 @@ from autotune.experiment.result import Progress, State
 from autotune.experiment.rig import Rig
 from autotune.experiment.run import OnProgress, envelope_of, recording_metadata, wait_for_rest
 from autotune.experiment.verify import law_for
-from autotune.experiment.warm import warm_up
 from autotune.recording import Recording, RecordingWriter, read_recording
 
 Kind: TypeAlias = Literal["staircase", "triangle", "random steps", "sweep", "pulses"]
@@ -146,7 +145,6 @@ def run_excitation(
     """
     limits, dt_s = config.limits, config.signals.sample_time_s
     pattern = excitation.pattern(dt_s)
-    warm_up()
     writer = RecordingWriter(recording, ("t", "u", "y", "r", "dither"), recording_metadata(config))
     with ControlLoop(rig=rig, envelope=envelope_of(config), writer=writer, extra=("r", "dither")) as loop:
         loop.note(excitation={"kind": excitation.kind} | excitation.settings())

@@ -21,6 +21,7 @@ from autotune.experiment.limits import Envelope, Watch
 from autotune.experiment.monitor import ReadingMonitor
 from autotune.experiment.rig import Exchanges, Reading, Rig, Row
 from autotune.experiment.rows import KEPT_ROWS, RecentRows
+from autotune.experiment.warm import warm_up
 from autotune.recording import RecordingWriter
 
 #: longest wait without looking for a stop signal [s]
@@ -173,6 +174,7 @@ class ControlLoop:
         return self._writer.path
 
     def __enter__(self) -> Self:
+        warm_up()
         self._exits.enter_context(_signals(self._on_signal))
         try:
             self.rig.open()

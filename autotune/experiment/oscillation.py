@@ -169,9 +169,11 @@ class Oscillation:
         if expected or runs_away:
             level = self.settings.midpoint + self._state.level * self.settings.amplitude
             return ExperimentStopped(
-                f"saturated, or under a load: y = {y:.4g} left the swing of {limits.swing:g} around"
-                f" {self.settings.y_centre:g} at the command {level:.4g}, where by the points it should turn",
-                mend="look for an actuator at its end, or a load; else choose another operating point",
+                f"y does not follow the command: {y:.4g} left the swing of {limits.swing:g} around"
+                f" {self.settings.y_centre:g} at the command {level:.4g}, where it should turn (saturated, stuck or"
+                " reversed actuator, load, or sensor)",
+                mend="look at the actuator's end and direction, for a load, at the sensor; else choose another operating"
+                " point",
             )
         return error
 

@@ -20,7 +20,6 @@ from autotune.experiment.relay import RelaySettings
 from autotune.experiment.result import ExperimentResult, Part, Progress, Segment, State
 from autotune.experiment.rig import Rig, RunsLaws
 from autotune.experiment.sweep import doubts, missing_phases, sweep
-from autotune.experiment.warm import warm_up
 from autotune.recording import RecordingWriter
 
 #: rows whose mean is compared with that of as many rows before, to see whether y stands still
@@ -83,7 +82,6 @@ def run_experiment(
         known = Known(first_move_s=math.nan, link_rad_s=last.get("link_rad_s", math.inf))
         return _result(final, config, earlier.parts, Timing.from_table(last.get("timing", {})), known)
     writer = RecordingWriter(recording, ("t", "u", "y"), recording_metadata(config))
-    warm_up()
     with ControlLoop(rig=rig, envelope=envelope_of(config), writer=writer) as loop:
         return experiment_on(loop, config, earlier=earlier, on_progress=on_progress)
 

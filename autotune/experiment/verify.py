@@ -25,7 +25,6 @@ from autotune.experiment.prediction import Prediction, predict
 from autotune.experiment.result import Progress, State
 from autotune.experiment.rig import Exchanges, Rig, RunsLaws
 from autotune.experiment.run import OnProgress, envelope_of, float_on, recording_metadata, wait_for_rest
-from autotune.experiment.warm import warm_up
 from autotune.identification.parametric import PlantFit
 from autotune.recording import RecordingWriter
 
@@ -287,7 +286,6 @@ def run_verification(
     test = plan_test(config.verification, config.limits, law, fit, crossover_rad_s)
     law = law_for(controller, config.limits, config.signals.sample_time_s, float(test.disturbance[-1]))
     writer = RecordingWriter(recording, ("t", "u", "y", "r"), recording_metadata(config))
-    warm_up()
     with ControlLoop(rig=rig, envelope=envelope_of(config), writer=writer, extra=("r",)) as loop:
         loop.metadata["controller"] = {"kind": controller.kind, "K": controller.K, "Ti_s": controller.Ti_s}
         if config.operating_point.approach == "ramp":

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 
 import numpy as np
 
@@ -11,6 +12,7 @@ from autotune.identification.frequency.limit_cycle import WholePeriods
 from autotune.identification.frequency.limit_cycle_points import limit_cycle_points
 
 
+@functools.cache
 def warm_up() -> None:
     """Estimate the points of a made-up limit cycle, and forget them.
 

@@ -41,7 +41,7 @@ PLANT_FAULTS = (
     ("not a number", 0.0, ("not a number",)),
     ("spikes", 9.9, ("completed", "garbled", "jumps", "limit reached")),
     ("sensor at full scale", 10.0, ("stale sensor", "limit reached", "jumps", "out of range")),
-    ("stuck actuator", 0.0, ("does not follow", "limit reached", "no oscillation", "saturated, or under")),
+    ("stuck actuator", 0.0, ("does not follow", "limit reached", "no oscillation")),
     ("inverted actuator", 5.0, ("wrong sign", "limit reached", "does not follow", "no oscillation")),
     ("cut link", 0.0, ("link",)),
 )
