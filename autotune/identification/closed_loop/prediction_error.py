@@ -24,8 +24,9 @@ _LINEAR_ROWS = 2000
 #: A search that could gain less than this is near enough to its end to tell whether a constant is missing.
 _NEAR = 1.0
 #: Means above this share of the motion are an operating point, about which everything is computed: far from it, the
-#: constant and the dynamics hang together.
-_OPERATING_POINT = 0.2
+#: constant and the dynamics hang together. A constant comes with it, for a sample mean is not the equilibrium. Smaller
+#: means are left to the test: those of a slow loop stray by tenths of its motion, and a constant costs precision.
+_OPERATING_POINT = 1.0
 #: Smaller innovations, relative to the output, are rounding.
 _NOISE_FREE = 1e-11
 #: Innovations this small say that the record has no noise in it.
@@ -112,8 +113,9 @@ def prediction_error(
     feedthrough : bool
         Estimate D; otherwise D is zero (y is measured before its row's u acts).
     offset : bool
-        Estimate a constant where the data ask for one (a gain in -2 log likelihood above log N), so that means and an
-        integrator's bias need not be known; a constant that is not there costs precision at low frequency.
+        Estimate a constant where the signals move about an operating point or the data ask for one (a gain in -2 log
+        likelihood above log N), so that means and an integrator's bias need not be known; a constant that is not there
+        costs precision at low frequency.
     max_iterations : int
         Accepted steps after which the search ends unconverged.
 
@@ -138,7 +140,15 @@ def prediction_error(
     u_past, y_now = u_past - u_level, y_now - y_level
     predictor = _initial_predictor(start, feedthrough=feedthrough, n_y=y.shape[1])
     predictor = _with_initial_state(predictor, u_past, y_now)
-    search = _search(predictor, u_past, y_now, feedthrough=feedthrough, offset=offset, max_iterations=max_iterations)
+    search = _search(
+        predictor,
+        u_past,
+        y_now,
+        feedthrough=feedthrough,
+        offset=offset,
+        constant=bool(np.any(u_level) or np.any(y_level)),
+        max_iterations=max_iterations,
+    )
     return _estimate(start, search, y_now, u_level, y_level)
 
 
@@ -181,10 +191,17 @@ class _Search:
 
 
 def _search(
-    predictor: Predictor, u: FloatArray, y: FloatArray, *, feedthrough: bool, offset: bool, max_iterations: int
+    predictor: Predictor,
+    u: FloatArray,
+    y: FloatArray,
+    *,
+    feedthrough: bool,
+    offset: bool,
+    constant: bool,
+    max_iterations: int,
 ) -> _Search:
-    """Search from a predictor, without a constant until, near the end, the score test asks for one."""
-    damping, iterations, converged, constant = 0.0, 0, False, False
+    """Search from a predictor, without a constant, if none is given, until near the end the score test asks for one."""
+    damping, iterations, converged = 0.0, 0, False
     errors = scatter(predictor.F, predictor.H, predictor.x0, u, y)
     floor = len(y) * (_NOISE_FREE * np.std(y, axis=0)) ** 2
     n_y = y.shape[1]

@@ -176,6 +176,13 @@ def test_constant_is_estimated_where_the_data_ask_for_one_only() -> None:
     assert rest[0] < 1e-3
 
 
+def test_stray_mean_of_a_slow_loop_is_no_operating_point() -> None:
+    d = example_set(180)
+    assert abs(d.y.mean()) > 0.2 * d.y.std()  # zero in the long run
+    found, without = fixed_order(d.u, d.y, 5), fixed_order(d.u, d.y, 5, offset=False)
+    np.testing.assert_allclose(found.model.poles, without.model.poles, rtol=1e-6)
+
+
 def test_residuals_are_white_at_the_right_order_only() -> None:
     d = example_set(16)
     low, right = fixed_order(d.u, d.y, 3), fixed_order(d.u, d.y, 5)
