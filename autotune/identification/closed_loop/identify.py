@@ -12,6 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from autotune.arrays import ComplexArray, FloatArray
 from autotune.controller import Controller
@@ -150,25 +151,34 @@ def identify_closed_loop(
     law = _checked_law(recording, controller, r, warnings)
     scale_u, scale_y = float(np.std(u)), float(np.std(y))
     u_1, y_1 = ((u - u.mean()) / scale_u)[:, None], ((y - y.mean()) / scale_y)[:, None]
-    motion = _look(u_1, y_1, r, recording.name)
-    evidence: tuple[Candidate, ...] = ()
-    if order is None:
-        choice = choose_order(u_1, y_1, max_order=max_order, progress=progress)
-        estimate, evidence = choice.estimate, choice.evidence
-    else:
-        if order < 1 or (delay or 0) < 0:
-            raise InputError(f"order {order}, delay {delay}", mend="the order is at least 1, the dead time at least 0")
-        progress(f"order {order}")
-        estimate = fixed_order(u_1, y_1, order, delay=delay or 0)
-    errors = residuals(estimate, u_1, y_1)
-    white = whiteness(estimate, errors)
-    estimate = in_units(estimate, scale_u, scale_y, dt_s)
-    omega = _grid(recording) if omega_rad_s is None else np.asarray(omega_rad_s, dtype=np.float64)
-    result = _report(estimate, omega, law, motion, white)
-    if not result.excitation.enough:
-        result = replace(result, proposal=_proposal(result, limits or recorded_limits(u, y)))
+    with threadpool_limits(1):  # threads spin longer on these small matrices than they work
+        motion = _look(u_1, y_1, r, recording.name)
+        estimate, evidence = _fitted(u_1, y_1, order, delay, max_order, progress)
+        white = whiteness(estimate, residuals(estimate, u_1, y_1))
+        estimate = in_units(estimate, scale_u, scale_y, dt_s)
+        omega = _grid(recording) if omega_rad_s is None else np.asarray(omega_rad_s, dtype=np.float64)
+        result = _report(estimate, omega, law, motion, white)
+        if not result.excitation.enough:
+            result = replace(result, proposal=_proposal(result, limits or recorded_limits(u, y)))
     _further_warnings(result, evidence, r, warnings)
     return replace(result, evidence=evidence, warnings=tuple(warnings))
+
+
+def _fitted(
+    u: FloatArray,
+    y: FloatArray,
+    order: int | None,
+    delay: int | None,
+    max_order: int,
+    progress: Callable[[str], None],
+) -> tuple[PredictionErrorEstimate, tuple[Candidate, ...]]:
+    if order is None:
+        choice = choose_order(u, y, max_order=max_order, progress=progress)
+        return choice.estimate, choice.evidence
+    if order < 1 or (delay or 0) < 0:
+        raise InputError(f"order {order}, delay {delay}", mend="the order is at least 1, the dead time at least 0")
+    progress(f"order {order}")
+    return fixed_order(u, y, order, delay=delay or 0), ()
 
 
 def usable_stretch(recording: Recording) -> tuple[Recording, tuple[str, ...]]:
