@@ -1,8 +1,12 @@
-"""Constants of the diagnosis's judgement, fitted on concealed cases that are none of the proof's.
+"""Constants of the diagnosis's judgement, counted on concealed cases that are none of the proof's.
 
-``python -m tests.benchmarks calibrate`` diagnoses AUTOTUNE_CALIBRATE_CASES cases (4; a fit worth its name takes 100)
-from seed AUTOTUNE_CALIBRATE_SEED (5000) on, in the folder AUTOTUNE_CALIBRATE_OUT or a temporary one. What a case
-showed is kept there, so that an interrupted run continues and a longer one adds to it.
+``python -m tests.benchmarks calibrate`` reads the finished diagnoses of the campaign in AUTOTUNE_CALIBRATE_OUT, as
+``autotune prove --seed 7000 --cases 200 --out DIR`` leaves them, whether or not all are finished; without it a campaign
+of AUTOTUNE_CALIBRATE_CASES (4) cases from seed AUTOTUNE_CALIBRATE_SEED (5000) on is made in a temporary folder. What
+the extended models leave of the recordings is computed again and kept in the folder's ``shown``.
+
+One bound of adequacy is tried at a time, the others as they are in use. Probabilities are those of diagnosis.json, at
+another temperature raised to a power: candidates below 1e-4 are not in it, which counts where the temperature doubles.
 """
 
 from __future__ import annotations
@@ -10,104 +14,247 @@ from __future__ import annotations
 import json
 import math
 import os
+import sys
 import tempfile
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from autotune.diagnosis import judgement
-from autotune.diagnosis.diagnose import diagnose
-from autotune.diagnosis.retuning import BLOCKS, misfit, whiteness
-from autotune.diagnosis.search import score
+from autotune.diagnosis.data import Data
+from autotune.diagnosis.diagnose import probability_of
+from autotune.diagnosis.fitting import Fit, fit
+from autotune.diagnosis.noise import noise_from_differences
+from autotune.diagnosis.parameters import parametrise
+from autotune.diagnosis.result import Candidate, FitQuality
+from autotune.diagnosis.retuning import BLOCKS, floored, misfit, whiteness
+from autotune.diagnosis.samples import inspect
+from autotune.diagnosis.windows import LAGS_PER_WINDOW, slowest_lag_s, window_rows
 from autotune.models import read_model
 from autotune.recording import read_recording
-from sim.proof import FIRST_PROOF_SEED, Campaign, conceal
+from sim.proof import FIRST_PROOF_SEED, Campaign, conceal, diagnose
+from sim.score import calibration_error
 
 Json = dict[str, Any]
-TEMPERATURES = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 9.0)
-DOUBTS = (0.005, 0.01, 0.02, 0.03, 0.05, 0.1)
+#: What single rows and the law show: no bound of adequacy decides on these.
+OF_ROWS = frozenset(
+    (
+        "sensor.quantisation", "sensor.dropout", "sensor.outliers", "sensor.saturation", "timing.jitter",
+        "controller.law",
+    )
+)  # fmt: skip
+GRIDS: Mapping[str, Sequence[float]] = {
+    "ADEQUATE": (1.0, 1.01, 1.02, 1.04, 1.06, 1.08, 1.12),
+    "ADEQUATE_QUICK": (1.04, 1.06, 1.08, 1.12, 1.16, 1.2, 1.3),
+    "QUICK": (0.8, 0.9, 1.0, 1.05, 1.1),
+    "WHITE": (0.9, 0.95, 1.0, 1.05, 1.08, 1.1, 1.12, 1.15, 1.2, 1.3),
+    "MISSING": (1.01, 1.02, 1.03, 1.05, 1.08, 1.12),
+    "DOMINANT": (0.35, 0.5, 0.7, 0.8, 0.9, 0.95),
+    "FAR_FROM_NOISE": (3.0, 6.0, 12.0, 25.0),
+}
+TEMPERATURES = (1.5, 2.0, 3.0, 4.0, 5.0, 6.0)
+DOUBTS = (0.01, 0.02, 0.03, 0.05, 0.07, 0.1, 0.15, 0.2)
 
 
-def shown(campaign: Campaign, seed: int) -> Json:
-    """Diagnose one case; scores, misfit and the like with the sealed answer beside them."""
-    kept = campaign.out / "shown" / f"case_{seed:06d}.json"
+@dataclass(frozen=True, kw_only=True)
+class Shown:
+    """What one case showed.
+
+    ``names`` are the effects of the extended model; ``excess`` and ``slow`` the residual's variance and slow power over
+    the noise's, less what chance adds to them; ``candidates`` and ``stated`` are names with probabilities.
+    """
+
+    case: str
+    kind: str
+    accept: Sequence[Sequence[str]]
+    nuisance: Sequence[str]
+    verdict: str
+    names: Sequence[str]
+    misfit: float
+    excess: float
+    slow: float
+    fit: Mapping[str, float]
+    candidates: Sequence[tuple[str, float]]
+    stated: Sequence[tuple[str, float]]
+
+    @property
+    def right(self) -> bool:
+        """Whether the extended model has all the effects of the case and none besides."""
+        every = all(any(n in group for group in self.accept) for n in self.names)
+        return self.kind != "outside" and every and all(set(group) & set(self.names) for group in self.accept)
+
+    @property
+    def quality(self) -> FitQuality:
+        """Errors on rows that were not fitted."""
+        return FitQuality(**{key: self.fit[key] for key in ("nominal", "retuned", "extended", "noise_floor")})
+
+
+def shown(campaign: Campaign, seed: int) -> Shown:
+    """Compute what a case's extended model leaves; what was kept of an earlier time is read."""
+    folder, case = campaign.diagnosis(seed), campaign.case(seed)
+    kept = campaign.out / "shown" / f"{folder.name}.json"
     if kept.exists():
-        return dict(json.loads(kept.read_text(encoding="utf-8")))
-    case, answer = campaign.case(seed), json.loads(campaign.answer(seed).read_text(encoding="utf-8"))
-    recordings = [read_recording(case / f"{name}.csv") for name in ("rec1", "rec2")]
-    said = diagnose(read_model(case / "model.toml"), recordings)
-    found = said.search
-    fit = found.chosen.fit
-    pool = (found.retuned, *found.singles, *found.pairs, *found.triples)
-    row = {
-        "kind": answer["kind"],
-        "accept": [e["accept"] for e in answer["effects"]],
-        "scores": [["+".join(h.names) or "none", score(h)] for h in pool],
-        "excess": max(1.0, fit.chi2 / fit.rows),
-        "chosen": list(found.chosen.names),
-        "adequate": judgement.is_adequate(fit, found.data),
-        "misfit": misfit(fit, found.data) - math.sqrt(2.0 / fit.rows),
-        "slow": whiteness(fit, found.data) - 2.0 * math.sqrt(2.0 / (BLOCKS * len(fit.windows))),
-        "far": said.fit.retuned**2 / max(said.fit.noise_floor, 1e-12) ** 2,
-        "verdict": said.verdict,
-    }
+        return Shown(**json.loads(kept.read_text(encoding="utf-8")))
+    answer = json.loads(campaign.answer(seed).read_text(encoding="utf-8"))
+    said = json.loads((folder / "diagnosis.json").read_text(encoding="utf-8"))
+    names, result, data = left_by(case, folder)
+    row = Shown(
+        case=folder.name,
+        kind=answer["kind"],
+        accept=[e["accept"] for e in answer["effects"]],
+        nuisance=answer["nuisance"],
+        verdict=said["verdict"],
+        names=names,
+        misfit=misfit(result, data),
+        excess=misfit(result, data) - math.sqrt(2.0 / result.rows),
+        slow=whiteness(result, data) - 2.0 * math.sqrt(2.0 / (BLOCKS * len(result.windows))),
+        fit=said["fit"],
+        candidates=[(c["name"], c["probability"]) for c in said["candidates"]],
+        stated=[(e["name"], e["probability"]) for e in said["effects"]],
+    )
     kept.parent.mkdir(parents=True, exist_ok=True)
-    kept.write_text(json.dumps(row), encoding="utf-8")
+    kept.write_text(json.dumps(asdict(row)), encoding="utf-8")
     return row
 
 
-def complete(row: Json, names: Sequence[str]) -> bool:
-    """Whether names are all the effects of a case and none besides."""
-    accept = [set(group) for group in row["accept"]]
-    return all(any(n in group for group in accept) for n in names) and all(group & set(names) for group in accept)
+def left_by(case: Path, diagnosis: Path) -> tuple[list[str], Fit, Data]:
+    """Fit the start states of an extended model to a case's recordings, its numbers as they are."""
+    recordings = [read_recording(case / f"{name}.csv") for name in ("rec1", "rec2")]
+    good = inspect(recordings)[0]
+    model, nominal = read_model(diagnosis / "extended_model.toml"), read_model(case / "model.toml")
+    windows = [window_rows(r, LAGS_PER_WINDOW * slowest_lag_s(nominal)) for r in recordings]
+    data = Data(
+        recordings=tuple(recordings),
+        good=tuple(good),
+        starts=tuple(starts for starts, _ in windows),
+        stops=tuple(stops for _, stops in windows),
+        noise=floored(noise_from_differences([r.y for r in recordings], good), recordings),
+    )
+    size = float(np.std(np.concatenate([r.u for r in recordings]))) or 1.0
+    p = parametrise(replace(model, effects=()), model.effects, size, recordings[0].sample_time_s)
+    none = np.zeros(p.centre.size, dtype=bool)
+    result = fit(p, data, free=none, iterations=20)
+    data = replace(data, noise=floored(noise_from_differences(result.residuals, good), recordings))
+    return [e.name for e in model.effects], fit(p, data, x0=result.x0, free=none, iterations=20), data
 
 
-def true(row: Json, names: Sequence[str]) -> bool:
-    """Whether names are effects of a case: what the samples alone show is no part of a hypothesis."""
-    return all(any(n in group for group in row["accept"]) for n in names if n != "none")
+def judged(row: Shown, constants: Mapping[str, float]) -> str:
+    """Verdict on a case by other constants: abstained, named or neither."""
+    white = row.slow < constants["WHITE"]
+    bound = constants["ADEQUATE_QUICK" if row.slow < constants["QUICK"] else "ADEQUATE"]
+    adequate = white and row.excess < bound
+    if row.names:
+        left = row.quality.retuned**2 - row.quality.noise_floor**2
+        far = row.quality.retuned**2 > constants["FAR_FROM_NOISE"] * row.quality.noise_floor**2
+        most = row.quality.retuned**2 - row.quality.extended**2 > constants["DOMINANT"] * left
+        return "named" if adequate or (far and most) else "abstained"
+    return "abstained" if not adequate and row.misfit > constants["MISSING"] else "neither"
 
 
-def loss(rows: Sequence[Json], temperature: float, doubt: float) -> float:
-    """Return the mean log loss of the best hypothesis's probability over cases that found one adequate."""
-    total = 0.0
-    for row in rows:
-        scores: dict[str, float] = {}
-        for name, value in row["scores"]:
-            scores[name] = min(scores.get(name, math.inf), value)
-        best = judgement.weighed(scores, temperature * row["excess"], doubt)[0]
-        p = min(max(best.probability, 1e-6), 0.99)
-        total -= math.log(p if true(row, best.name.split("+")) else 1.0 - p)
-    return total / max(len(rows), 1)
+def counts(rows: Sequence[Shown], constants: Mapping[str, float]) -> tuple[int, int, int]:
+    """Count right hypotheses refused, wrong ones accepted, and clean cases in which something is missed."""
+    said = [(row, judged(row, constants)) for row in rows]
+    return (
+        sum(word == "abstained" for row, word in said if row.right and row.names),
+        sum(word == "named" for row, word in said if not row.right),
+        sum(word != "neither" for row, word in said if row.kind == "clean"),
+    )
+
+
+def at(row: Shown, temperature: float, doubt: float) -> list[tuple[str, float, bool]]:
+    """Names put forward with their probabilities at another temperature and doubt, and whether each is right."""
+    power = judgement.TEMPERATURE / temperature
+    known = {name: p**power for name, p in row.candidates if name != "unknown" and p > 0.0}
+    best = max(known.values())
+    given = dict(row.candidates).get("unknown", 0.0) / max(
+        dict(row.candidates)[max(known, key=lambda n: known[n])], 1e-9
+    )
+    # beyond the least doubt stands what the misfit adds
+    more = max(given - judgement.UNKNOWN, 0.0) / (1.0 - judgement.UNKNOWN)
+    weights = {name: w / best for name, w in known.items()}
+    weights["unknown"] = doubt + (1.0 - doubt) * more
+    total = sum(weights.values())
+    candidates = [Candidate(name=name, probability=w / total) for name, w in weights.items()]
+    own = {name for group in row.accept for name in group}
+    spared = set(row.nuisance) - own
+    return [
+        (name, p if name in OF_ROWS or name == "actuator.offset" else probability_of(name, candidates), name in own)
+        for name, p in row.stated
+        if name not in spared
+    ]
+
+
+def calibration(rows: Sequence[Shown], temperature: float, doubt: float) -> tuple[float, float, int, int, int]:
+    """Return log loss, expected error, and among statements with p >= 0.95 the wrong ones, all of them, and all."""
+    statements = [(p, ok) for row in rows for _, p, ok in at(row, temperature, doubt)]
+    loss = -float(np.mean([math.log(min(max(p if ok else 1.0 - p, 1e-6), 1.0)) for p, ok in statements]))
+    sure = [ok for p, ok in statements if p >= 0.95]
+    return loss, calibration_error(statements), sure.count(False), len(sure), len(statements)
+
+
+def finished(campaign: Campaign) -> list[int]:
+    """Seeds of the campaign's cases that are diagnosed."""
+    return [seed for seed in campaign.seeds if (campaign.diagnosis(seed) / "diagnosis.json").exists()]
+
+
+def campaign_in(folder: str) -> Campaign:
+    """Return the campaign of a folder, or make a small one."""
+    if folder:
+        out = Path(folder)
+        seeds = [int(p.stem.removeprefix("case_")) for p in (out / "sealed").glob("case_*.json")]
+        if not seeds:
+            raise SystemExit(f"{out} holds no campaign: make one with autotune prove --seed 7000 --out {out}")
+        campaign = Campaign(out=out, seeds=range(min(seeds), max(seeds) + 1), tool=())
+    else:
+        count, first = (
+            int(os.environ.get(f"AUTOTUNE_CALIBRATE_{n}", d)) for n, d in (("CASES", "4"), ("SEED", "5000"))
+        )
+        out = Path(tempfile.mkdtemp(prefix="autotune-calibrate-"))
+        campaign = Campaign(out=out, seeds=range(first, first + count), tool=(sys.executable, "-m", "autotune.cli"))
+    if campaign.seeds.stop > FIRST_PROOF_SEED:
+        raise SystemExit(f"seeds from {FIRST_PROOF_SEED} on are the proof's")
+    return campaign
 
 
 def main() -> None:
-    """Print the constants that fit, beside those in use."""
-    count, first = (int(os.environ.get(f"AUTOTUNE_CALIBRATE_{n}", d)) for n, d in (("CASES", "4"), ("SEED", "5000")))
-    if first + count > FIRST_PROOF_SEED:
-        raise SystemExit(f"seeds from {FIRST_PROOF_SEED} on are the proof's")
-    out = Path(os.environ.get("AUTOTUNE_CALIBRATE_OUT", "") or tempfile.mkdtemp(prefix="autotune-calibrate-"))
-    campaign = Campaign(out=out, seeds=range(first, first + count), tool=())
-    rows = [shown(campaign, seed) for seed in conceal(campaign)]
-    whole = [r for r in rows if r["kind"] == "clean" or (r["chosen"] and complete(r, r["chosen"]))]
-    other = [r for r in rows if r["chosen"] and not complete(r, r["chosen"])]
-    print(f"{count} cases from seed {first}: {len(whole)} explained by the truth, {len(other)} by something else")
-    for key, constant in (("misfit", "ADEQUATE"), ("slow", "WHITE")):
-        right, wrong = [r[key] for r in whole], [r[key] for r in other]
-        bound = float(np.quantile(right, 0.98)) if right else math.nan
-        passed = sum(w < bound for w in wrong)
-        print(
-            f"  {constant:12s} {getattr(judgement, constant):.3f} in use, 98 % of the right are below {bound:.3f}, ",
-            end="",
-        )
-        print(f"as are {passed} of {len(wrong)} wrong")
-    far = [r["far"] for r in other if not r["adequate"]]
-    if far:
-        print(f"  FAR_FROM_NOISE {judgement.FAR_FROM_NOISE:g} in use, wrong and inadequate ones reach {max(far):.2f}")
-    named = [r for r in rows if r["adequate"] and r["chosen"]]
-    best = min((loss(named, t, d), t, d) for t in TEMPERATURES for d in DOUBTS) if named else (math.nan,) * 3
-    used = loss(named, judgement.TEMPERATURE, judgement.UNKNOWN)
-    print(f"  TEMPERATURE  {judgement.TEMPERATURE:g} in use, {best[1]:g} fits")
-    print(f"  UNKNOWN      {judgement.UNKNOWN:g} in use, {best[2]:g} fits")
-    print(f"  log loss {used:.4f} in use, {best[0]:.4f} fitted, over {len(named)} statements")
+    """Print for every constant what other values would do."""
+    campaign = campaign_in(os.environ.get("AUTOTUNE_CALIBRATE_OUT", ""))
+    if campaign.tool:
+        for seed in conceal(campaign):
+            diagnose(campaign, seed)
+    rows = [shown(campaign, seed) for seed in finished(campaign)]
+    kinds = ", ".join(f"{count} {kind}" for kind, count in sorted(Counter(r.kind for r in rows).items()))
+    print(f"{len(rows)} cases diagnosed in {campaign.out}: {kinds}")
+    chain = [r for r in rows if not OF_ROWS & {name for name, _ in r.stated if name not in r.nuisance}]
+    in_use = {name: float(getattr(judgement, name)) for name in GRIDS}
+    explained = sum(r.right and bool(r.names) for r in chain)
+    print(f"{len(chain)} of them decided by adequacy, {explained} explained by the truth")
+    print("  right refused / wrong accepted / clean alarmed, one constant moved at a time:")
+    for name, grid in GRIDS.items():
+        tried = " ".join(f"{v:g}: {'/'.join(map(str, counts(chain, {**in_use, name: v})))}" for v in grid)
+        print(f"  {name:15s} {in_use[name]:g} in use;  {tried}")
+    print("  log loss / expected error / wrong of those at p >= 0.95:")
+    for name, pairs in (
+        ("TEMPERATURE", [(t, judgement.UNKNOWN) for t in TEMPERATURES]),
+        ("UNKNOWN", [(judgement.TEMPERATURE, d) for d in DOUBTS]),
+    ):
+        print(f"  {name:15s} {getattr(judgement, name):g} in use")
+        for t, d in pairs:
+            loss, error, wrong, sure, count = calibration(rows, t, d)
+            value = t if name == "TEMPERATURE" else d
+            print(f"    {value:5g}: {loss:.4f} / {error:.4f} / {wrong} of {sure}, {count} in all")
+    single: dict[str, list[bool]] = {}
+    for row in rows:
+        for name, _, ok in at(row, judgement.TEMPERATURE, judgement.UNKNOWN):
+            single.setdefault(name if name in OF_ROWS else "of the chain", []).append(ok)
+    print("  right of those named:", ", ".join(f"{n} {sum(oks)}/{len(oks)}" for n, oks in sorted(single.items())))
+    halves = [ok for r in rows if r.verdict == "effect" and judged(r, {**in_use, "DOMINANT": math.inf}) == "abstained"
+              for name, _, ok in at(r, judgement.TEMPERATURE, judgement.UNKNOWN) if name not in OF_ROWS]  # fmt: skip
+    print(
+        f"  HALF_EXPLAINED  {judgement.HALF_EXPLAINED:g} in use; right of those named without being adequate:", end=" "
+    )
+    print(f"{sum(halves)}/{len(halves)}")
