@@ -12,7 +12,7 @@ import time
 import tracemalloc
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -43,6 +43,7 @@ POLES = PLANT.poles[[3, 0, 1]]  # P1 = 0.7319+0.6007i, P2 = 1, P3 = 0.9681+0.148
 LOOP = feedback(PLANT, CONTROLLER)
 LOOP_NORM = h2_norm(LOOP)
 MARKOV = CONTROLLER.markov_parameters(20)
+HAS_PARSIM_K = importlib.util.find_spec("sippy_unipi") is not None
 
 #: RMSE of P1, P2, P3, median relative H2 error of G/(1+GC), models the true C does not stabilise: an independent
 #: computation of the same example with other seeds, for comparison. Its ORT is not reproduced: with p = f = 20 ORT and
@@ -111,27 +112,54 @@ def bound(sets: Sequence[LoopData]) -> np.ndarray:
     return np.sqrt(total / len(sets))
 
 
-def score(method: Method, sets: Sequence[LoopData]) -> tuple[np.ndarray, float, int, int, float]:
-    """Return RMSE of the poles, median relative H2 error of the loop, unstable loops, failures, CPU per set [s]."""
-    errors, norms, unstable, failed = [], [], 0, 0
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Scores:
+    """What one method made of each set; NaN where it failed.
+
+    Attributes
+    ----------
+    squares : (sets, 3) array
+        Squared errors of P1, P2, P3.
+    norms : (sets,) array
+        Relative H2 error of the loop, infinite where the true controller does not stabilise the model.
+    cpu_s : float
+        Mean CPU time per set [s].
+    """
+
+    squares: np.ndarray
+    norms: np.ndarray
+    cpu_s: float
+
+    @property
+    def figures(self) -> np.ndarray:
+        """RMSE of P1, P2, P3 and the median H2 error."""
+        return _figures(self.squares, self.norms)
+
+
+def _figures(squares: np.ndarray, norms: np.ndarray) -> np.ndarray:
+    return np.append(np.sqrt(np.nanmean(squares, axis=0)), np.nanmedian(norms))
+
+
+def loop_error(model: InnovationModel) -> float:
+    """Return the relative H2 error of G/(1 + G C), infinite where the true controller does not stabilise the model."""
+    loop = feedback(model, CONTROLLER)
+    return h2_norm(difference(loop, LOOP)) / LOOP_NORM if spectral_radius(loop.A) < 1.0 else np.inf
+
+
+def score(method: Method, sets: Sequence[LoopData]) -> Scores:
     method(sets[0])  # compile and warm up
-    began = time.process_time()
-    models: list[InnovationModel] = []
-    for d in sets:
+    squares, norms = np.full((len(sets), 3), np.nan), np.full(len(sets), np.nan)
+    spent = 0.0
+    for k, d in enumerate(sets):
+        began = time.process_time()
         try:
-            models.append(method(d))
+            model = method(d)
         except IdentificationError:
-            failed += 1
-    spent = (time.process_time() - began) / len(sets)
-    for model in models:
-        errors.append(np.abs(nearest(model) - POLES) ** 2)
-        loop = feedback(model, CONTROLLER)
-        if spectral_radius(loop.A) < 1.0:
-            norms.append(h2_norm(difference(loop, LOOP)) / LOOP_NORM)
-        else:
-            unstable += 1
-            norms.append(np.inf)
-    return np.sqrt(np.mean(errors, axis=0)), float(np.median(norms)), unstable, failed, spent
+            continue
+        finally:
+            spent += time.process_time() - began
+        squares[k], norms[k] = np.abs(nearest(model) - POLES) ** 2, loop_error(model)
+    return Scores(squares=squares, norms=norms, cpu_s=spent / len(sets))
 
 
 def _row(name: str, rmse: np.ndarray, norm: float | None, unstable: int | None, more: str = "") -> None:
@@ -147,26 +175,44 @@ def _row(name: str, rmse: np.ndarray, norm: float | None, unstable: int | None, 
 
 def table(count: int) -> None:
     sets = [example_set(seed) for seed in range(count)]
-    methods = dict(METHODS)
-    if importlib.util.find_spec("sippy_unipi") is not None:
-        methods["PARSIM-K (sippy_unipi)"] = parsim_k
-    else:
-        print("PARSIM-K is left out: pip install --no-deps --target DIR sippy_unipi tf2ss casadi sympy mpmath, then")
-        print("  PYTHONPATH=DIR python -m tests.benchmarks closed_loop")
+    methods = METHODS | ({"PARSIM-K (sippy_unipi)": parsim_k} if HAS_PARSIM_K else {})
     print(f"{count} sets of {len(sets[0].u)} rows, seeds 0 to {count - 1}")
     print(f"{'':30s} RMSE P1, P2, P3, h2, destabilising | the same, independent reference (other seeds)")
     limit = bound(sets)
     _row("Cramer-Rao bound", limit, None, None)
-    spent: dict[str, float] = {}
     for name, method in methods.items():
-        rmse, norm, unstable, failed, spent[name] = score(method, sets)
+        found = score(method, sets)
+        rmse, norm = found.figures[:3], float(found.figures[3])
         efficiency = " ".join(f"{value:.2f}" for value in (limit / rmse) ** 2)
-        _row(name, rmse, norm, unstable, f"efficiency {efficiency}, {1e3 * spent[name]:.1f} ms, {failed} failed")
+        failed, unstable = int(np.isnan(found.norms).sum()), int(np.isinf(found.norms).sum())
+        _row(name, rmse, norm, unstable, f"efficiency {efficiency}, {1e3 * found.cpu_s:.1f} ms, {failed} failed")
     print(f"median of that error which the bound leaves to an unbiased estimator: {_attainable():.4f}")
-    if "PARSIM-K (sippy_unipi)" in spent:
-        _race(sets[:50])
     variances = [_paper(d).innovation_covariance[0, 0] for d in sets]
     print(f"mean variance of the paper's method {np.mean(variances):.4f} (paper 0.1023, reference 0.1074, true 0.1111)")
+
+
+def duel(count: int) -> None:
+    """Print the default's figures beside PARSIM-K's on the same sets, with paired 95 % bootstrap intervals."""
+    if not HAS_PARSIM_K:
+        print("PARSIM-K is left out: pip install --no-deps --target DIR sippy_unipi tf2ss casadi sympy mpmath, then")
+        print("  PYTHONPATH=DIR python -m tests.benchmarks closed_loop")
+        return
+    sets = [example_set(seed) for seed in range(count)]
+    own, other = score(METHODS["default (polished)"], sets), score(parsim_k, sets)
+    rng = np.random.default_rng(0)
+    drawn = []
+    for _ in range(4000):
+        at = rng.integers(0, count, count)
+        drawn.append(_figures(own.squares[at], own.norms[at]) - _figures(other.squares[at], other.norms[at]))
+    low, high = np.quantile(drawn, [0.025, 0.975], axis=0)
+    print(f"the default beside PARSIM-K on the same {count} sets; difference with its paired 95 % bootstrap interval")
+    rows = zip(("RMSE P1", "RMSE P2", "RMSE P3", "median h2"), own.figures, other.figures, low, high, strict=True)
+    for name, ours, theirs, least, most in rows:
+        verdict = "better" if most < 0.0 else "worse" if least > 0.0 else "no difference shown"
+        print(f"  {name:9s} {ours:.5f} {theirs:.5f}  {ours - theirs:+.5f} ({least:+.5f} to {most:+.5f}): {verdict}")
+    mean_square = [float(np.sqrt(np.nanmean(found.norms**2))) for found in (own, other)]
+    print(f"  root mean square of h2 {mean_square[0]:.4f} {mean_square[1]:.4f}")
+    _race(sets[:50])
 
 
 def _race(sets: Sequence[LoopData]) -> None:
@@ -190,9 +236,10 @@ def _race(sets: Sequence[LoopData]) -> None:
 def _attainable(draws: int = 50_000) -> float:
     """Return the median relative H2 error of the loop that errors of the Cramer-Rao covariance cause, to first order.
 
-    The information is that of a long record at the true model, scaled to the sets' length, no constant estimated.
+    The information is that of a long record at the true model, scaled to the sets' length, no constant estimated and
+    the initial state as good as known.
     """
-    d = example_set(0, rows=100_000)
+    d = example_set(0, rows=1_000_000)  # the slow modes' information takes that many for a percent
     truth = prediction_error(PLANT, d.u, d.y, offset=False, max_iterations=0)
     model, covariance = truth.model, truth.covariance * truth.rows / len(example_set(0).u)
     terms = 600
@@ -227,9 +274,7 @@ def coverage(count: int) -> None:
         except IdentificationError:
             failed += 1
             continue
-        loop = feedback(estimate.model, CONTROLLER)
-        stable = spectral_radius(loop.A) < 1.0
-        norms.append(h2_norm(difference(loop, LOOP)) / LOOP_NORM if stable else np.inf)
+        norms.append(loop_error(estimate.model))
         response.append(inside_region(estimate.model.response(omega)[:, 0, 0] - truth, covariance))
         found = estimate.model.poles
         at = [int(np.argmin(np.abs(found - pole))) for pole in POLES]
@@ -278,6 +323,7 @@ def linear_time(rows_max: int) -> None:
 def main() -> None:
     count = int(os.environ.get("SETS", "100"))
     table(min(count, 100))
+    duel(count)
     coverage(count)
     orders(min(count, 100))
     linear_time(int(os.environ.get("ROWS_MAX", "300000")))
