@@ -20,6 +20,8 @@ POWERLESS = 1.25
 PROVEN = 2
 #: rows that the noise is judged on
 NOISE_ROWS = 100
+#: rows in which y leaves its limits by a sensor's jump, and standard deviations of a step between rows that are one
+JUMP_ROWS, JUMP_SIGMAS = 6, 6.0
 #: half-width of the noise, as a part of limits.swing, from which on a relay that fails has failed on it
 NOISY_SHARE = 0.25
 
@@ -33,6 +35,14 @@ def noise_half(loop: ControlLoop) -> float:
     y = loop.history(max(0, loop.tick.k - NOISE_ROWS))[2]
     bends = np.abs(np.diff(y[np.isfinite(y)], 2))
     return 2.0 * 1.4826 * float(np.median(bends)) / math.sqrt(6.0) if bends.size else 0.0
+
+
+def jumped(loop: ControlLoop) -> bool:
+    """Return whether y came where it is in one step that no earlier one resembles."""
+    y = loop.history(max(0, loop.tick.k - NOISE_ROWS))[2]
+    steps = np.abs(np.diff(y[np.isfinite(y)]))
+    usual = 1.4826 * float(np.median(steps[:-JUMP_ROWS])) if steps.size > 2 * JUMP_ROWS else math.inf
+    return bool(np.any(steps[-JUMP_ROWS:] > JUMP_SIGMAS * usual)) and usual > 0.0
 
 
 def too_noisy(loop: ControlLoop) -> bool:
@@ -156,6 +166,12 @@ class Oscillation:
         away = y - self.settings.y_centre
         if type(error) is not ExperimentStopped or abs(away) <= limits.swing:
             return error
+        if jumped(self.loop):
+            return ExperimentStopped(
+                f"the sensor jumps: y = {y:.4g} left the swing of {limits.swing:g} around {self.settings.y_centre:g} in"
+                " one step",
+                mend="check the sensor, its wiring and its scaling in the configuration",
+            )
         if too_noisy(self.loop):
             return ExperimentStopped(
                 f"drowned in noise: y = {y:.4g} left the swing of {limits.swing:g} around {self.settings.y_centre:g},"
@@ -172,8 +188,7 @@ class Oscillation:
                 f"y does not follow the command: {y:.4g} left the swing of {limits.swing:g} around"
                 f" {self.settings.y_centre:g} at the command {level:.4g}, where it should turn (saturated, stuck or"
                 " reversed actuator, load, or sensor)",
-                mend="look at the actuator's end and direction, for a load, at the sensor; else choose another operating"
-                " point",
+                mend="look at actuator and sensor, and for a load; else choose another operating point",
             )
         return error
 
