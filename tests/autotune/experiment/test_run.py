@@ -166,6 +166,15 @@ def test_every_fault_has_its_verdict_ends_safe_and_keeps_the_recording(verdict: 
     assert recording.metadata["ended"]["reason"] == str(stop.value)
 
 
+@pytest.mark.parametrize("start_s", [40.7, 43.5])
+def test_a_sensor_that_jumps_no_further_than_y_may_is_not_taken_for_the_actuator(
+    start_s: float, tmp_path: Path
+) -> None:
+    rig = ball_rig(seed=2, faults=[Fault(kind="sensor at full scale", start_s=start_s, value=9.0)])
+    with pytest.raises(ExperimentStopped, match="the sensor jumps: y = 9 .* in one step"):
+        run_experiment(rig, ball_config(), tmp_path / "r.csv")
+
+
 @pytest.mark.parametrize("value", [0.0, 10.0])
 def test_spikes_of_the_sensor_are_survived(value: float, tmp_path: Path) -> None:
     rig = ball_rig(seed=2, faults=[Fault(kind="spikes", value=value)])
