@@ -171,7 +171,7 @@ def test_a_sensor_that_jumps_no_further_than_y_may_is_not_taken_for_the_actuator
     start_s: float, tmp_path: Path
 ) -> None:
     rig = ball_rig(seed=2, faults=[Fault(kind="sensor at full scale", start_s=start_s, value=9.0)])
-    with pytest.raises(ExperimentStopped, match="the sensor jumps: y = 9 .* in one step"):
+    with pytest.raises(ExperimentStopped, match=r"the sensor jumps: y = 9 .* in one step"):
         run_experiment(rig, ball_config(), tmp_path / "r.csv")
 
 
