@@ -4,10 +4,13 @@ import json
 import os
 import re
 import shutil
+import signal
+import socket
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, closing
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -15,10 +18,13 @@ import pytest
 import tomli_w
 from playwright.sync_api import Browser, Page, expect, sync_playwright
 
+from autotune.cli.common import rig_of
 from autotune.cli.served import device_of
 from autotune.config import load_config
+from autotune.experiment.rig import HoldsGains
 from autotune.live.session import LivePage
 from autotune.pipeline import tune
+from autotune.pipeline.deployment import read_gains
 from autotune.recording import read_recording
 from sim.modbus_rig import ModbusRig, TcpTransport
 from tests.autotune.experiment.rigs import ball_config, ball_rig
@@ -163,6 +169,70 @@ def test_by_keyboard_alone_the_old_gains_are_asked_back(opened: Callable[..., Pa
             break
     page.keyboard.press("Enter")
     assert not deciding.keep(LIMIT_MS / 1000)
+
+
+def test_gains_that_are_not_wanted_are_taken_back_from_the_rig(opened: Callable[..., Page], tmp_path: Path) -> None:
+    config = ball_config(signals={"sample_time_s": 0.03}, experiment={"points": 3, "budget_s": 25.0})
+    rig = rig_of(config)
+    assert isinstance(rig, HoldsGains)
+    with LivePage(tmp_path, "127.0.0.1", 0, None) as live, ThreadPoolExecutor(1) as worker:
+        run = worker.submit(tune, rig, config, tmp_path, keep=live.keep)
+        with closing(opened(live.url).context) as context:
+            (page,) = context.pages
+            page.get_by_role("button", name="Restore old gains").click(timeout=LIMIT_MS)
+            expect(page.locator(".outcome")).to_contain_text("The rig holds the old gains.", timeout=LIMIT_MS)
+        tuning = run.result()
+    assert tuning.verification is not None
+    assert tuning.verification.accepted
+    assert not tuning.deployed
+    assert rig.read_gains() == tuning.old_controller
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("choice", "held"), [("Keep new gains", "new"), ("Restore old gains", "old")], ids=["keep", "restore"]
+)
+def test_a_whole_run_on_a_rig_process_is_followed_and_decided_in_the_browser(
+    opened: Callable[..., Page], tmp_path: Path, choice: str, held: str
+) -> None:
+    content = load_config(CONFIGS / "ball_modbus_tcp.toml").model_dump(exclude_none=True)
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        content["rig"]["port"] = free.getsockname()[1]
+    file, out = tmp_path / "ball.toml", tmp_path / "out"
+    file.write_text(tomli_w.dumps(content))
+    with ExitStack() as stack:
+
+        def started(*words: str) -> subprocess.Popen[str]:
+            command = [sys.executable, "-u", "-m", "autotune.cli", *words]
+            child = stack.enter_context(subprocess.Popen(command, stdout=subprocess.PIPE, text=True))
+            stack.callback(child.send_signal, signal.SIGINT)
+            return child
+
+        serving = started("rig", str(file))
+        assert serving.stdout is not None
+        assert any("serving" in line for line in serving.stdout)
+        run = started("run", str(file), "--out", str(out), "--live")
+        assert run.stdout is not None
+        page = opened(run.stdout.readline().split()[-1])
+        status, ellipses = page.get_by_role("status"), set()
+        for number in (2, 3, 4):
+            expect(status).to_have_text(re.compile(f"point {number} of 5"), timeout=LIMIT_MS)
+            ellipses.add(page.locator(".plane canvas").evaluate("one => one.toDataURL()"))
+        assert len(ellipses) == 3
+        expect(status).to_have_text(re.compile("new gains. Keep them"), timeout=2 * LIMIT_MS)
+        expect(page.locator(".gains")).to_have_text(re.compile(r"-0\.01\s*-0\.02"))
+        page.wait_for_function("document.querySelector('.steps canvas').toDataURL().length > 20000")
+        page.get_by_role("button", name=choice).click()
+        expect(status).to_have_text(re.compile("^Ended: completed"), timeout=LIMIT_MS)
+        expect(page.locator(".outcome")).to_contain_text(f"The rig holds the {held} gains.")
+        page.context.close()
+        assert run.wait() == 0
+        rig = rig_of(load_config(file))
+        assert isinstance(rig, HoldsGains)
+        gains = read_gains(rig)
+    new = json.loads((out / "result.json").read_text())["controller"]
+    wanted = (new["K"], new["Ti_s"]) if held == "new" else (-0.01, 6.0)
+    assert (gains.K, gains.Ti_s) == pytest.approx(wanted, rel=1e-3)
 
 
 def test_one_page_holds_the_controls_through_a_reload_and_another_takes_them_when_it_is_closed(
