@@ -173,7 +173,7 @@ def _actuator() -> tuple[Entry, ...]:
             name="actuator.stiction",
             equation="w stays until |u - w| > band, then jumps to u",
             parameters=(Quantity(name="band", unit="{u}", slot=k.A_STICTION),),
-            starts=lambda s: [(c * s.w,) for c in (0.02, 0.06, 0.15, 0.35)],
+            starts=lambda s: [],
             confusable=("actuator.backlash", "actuator.quantisation"),
             reference="Stenman, Gustafsson and Forsman, Int. J. Adapt. Control 17, 2003",
         ),
@@ -501,3 +501,17 @@ def _rest() -> tuple[Entry, ...]:
 
 #: Effects that are fitted by simulation, by their names.
 CATALOGUE: dict[str, Entry] = {entry.name: entry for entry in (*_actuator(), *_plant(), *_sensor(), *_rest())}
+
+#: Structures that are searched beside the effects and are none: what one of them explains better is not an effect's.
+STRUCTURES: dict[str, Entry] = {
+    "plant.slow_mode": Entry(
+        name="plant.slow_mode",
+        equation="times ((1 - share) time_constant s + 1) / (time_constant s + 1)",
+        parameters=(Quantity(name="share", unit="", scale="real"), Quantity(name="time_constant", unit="s")),
+        starts=lambda s: [(0.03, c * s.lag_s) for c in (2.5, 8.0)],
+        needs="level",
+        confusable=("plant.hysteresis", "environment.step_load", "environment.drifting_load"),
+        places=("plant", "sensor"),
+        reference="Ljung, System Identification, 2nd ed., sec. 16.4: the order of a linear model",
+    )
+}

@@ -63,6 +63,13 @@ class Problem:
         #: Largest step of every number in one iteration: a factor e for chain and effect sizes
         self.reach = np.array([0.5 if f.kind in ("gain", "den", "num") else 1.0 for f in parametrisation.free])
         self.reach[[f.kind == "effect" and not f.positive for f in parametrisation.free]] = 5.0
+        #: Steps of the derivatives
+        self.nudge = np.array([1e-2 if f.kind == "effect" else 1e-3 for f in parametrisation.free])
+        for i, f in enumerate(parametrisation.free):
+            if f.name == "environment.periodic_load.frequency":
+                # a frequency acts by the angle it adds until a recording's end
+                angle = 2.0 * np.pi * np.exp(parametrisation.centre[i]) * max(r.duration_s for r in data.recordings)
+                self.reach[i], self.nudge[i] = 1.0 / angle, 0.05 / angle
         lengths = [len(r) for r in data.recordings]
         edges = np.cumsum([0, *lengths])
         #: First row of every window and the row after its last, in the concatenated residual
@@ -126,7 +133,7 @@ class Problem:
         return J, Jx
 
     def _column(self, i: int, theta: FloatArray, x0: list[FloatArray], e: FloatArray) -> FloatArray:
-        h = 1e-3 if self.parametrisation.free[i].kind != "effect" else 1e-2
+        h = self.nudge[i]
         moved = theta.copy()
         moved[i] += h
         column = (self.spot(moved, x0).e - e) / h

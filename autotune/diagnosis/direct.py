@@ -10,9 +10,13 @@ from autotune.arrays import FloatArray
 from autotune.diagnosis.data import Data
 from autotune.diagnosis.fitting import Fit
 from autotune.diagnosis.parameters import effect_with
-from autotune.diagnosis.search import Promise, promise
+from autotune.diagnosis.search import RUNAWAY, Promise, direction, promise
 from autotune.models import Effect
 
+#: Steps in which a frequency is searched, in units of one over the longest recording's duration.
+RESOLVED = 0.1
+#: Bands of stiction that are tried: the smallest and the largest as a share of the command's size, count.
+BANDS_TRIED = (0.01, 0.6, 54)
 #: Candidate times of a step per recording.
 STEP_TIMES = 16
 #: Steps of a converter that are tried: the smallest as a share of the standard deviation of u, span as a factor, count.
@@ -87,7 +91,7 @@ def periodic_load_starts(base: Fit, data: Data, lag_s: float, count: int = 3) ->
     lag_s : float
         The plant's slowest lag [s]: far above its corner no load shows.
     count : int
-        Number of lines, each with two phases.
+        Number of lines.
     """
     duration = max(r.duration_s for r in data.recordings)
     dt = data.recordings[0].sample_time_s
@@ -99,10 +103,21 @@ def periodic_load_starts(base: Fit, data: Data, lag_s: float, count: int = 3) ->
     inner = np.flatnonzero((power[1:-1] >= power[:-2]) & (power[1:-1] >= power[2:])) + 1
     lines = inner[np.argsort(-power[inner])][:count]
     size = 0.02 * max(float(np.nanmax(np.abs(s[:, 3]))) for s in base.signals) or 1.0
-    phases = ((size, 1e-3 * size), (1e-3 * size, size))
-    return [
-        effect_with("environment.periodic_load", (a, b, float(frequencies[line]))) for line in lines for a, b in phases
-    ]
+
+    def sinusoid(frequency: float) -> tuple[float, Effect]:
+        """Return the decrease of chi2 that both parts together promise at a frequency, and the load."""
+        parts = ((size, 0.0, frequency), (0.0, size, frequency))
+        try:
+            D = np.column_stack([direction(base, effect_with("environment.periodic_load", p), data) for p in parts])
+        except RUNAWAY:
+            return 0.0, effect_with("environment.periodic_load", parts[0])
+        a = np.linalg.lstsq(D, -base.e)[0]
+        load = (float(size * a[0]), float(size * a[1]), frequency)
+        return float(-base.e @ D @ a), effect_with("environment.periodic_load", load)
+
+    # the load's own frequency lies beside the residual's line: within a tenth of what the recordings resolve
+    near = [[float(frequencies[line]) + k * RESOLVED / duration for k in range(-2, 3)] for line in lines]
+    return [max((sinusoid(f) for f in group), key=lambda found: found[0])[1] for group in near]
 
 
 def quantisation_starts(base: Fit, data: Data, pool: Executor) -> list[Effect]:
@@ -146,3 +161,39 @@ def quantisation_starts(base: Fit, data: Data, pool: Executor) -> list[Effect]:
         closer = tried(near)
         best = closer if closer.decrease > best.decrease else best
     return [best.effect]
+
+
+def stiction_starts(base: Fit, data: Data, pool: Executor, w: float) -> list[Effect]:
+    """Return the most promising bands of a valve that sticks: every band moves other jumps, so peaks are narrow.
+
+    Parameters
+    ----------
+    base : Fit
+        What stiction is added to.
+    data : Data
+        Recordings.
+    pool : Executor
+        Where simulations run.
+    w : float
+        Size of the command's deviations.
+
+    Returns
+    -------
+    list of Effect
+        At most two ``actuator.stiction``.
+    """
+
+    def tried(bands: FloatArray) -> list[Promise]:
+        effects = [effect_with("actuator.stiction", (float(band),)) for band in bands]
+        return sorted(pool.map(lambda e: promise(base, e, data), effects), key=lambda p: -p.decrease)
+
+    low, high, count = BANDS_TRIED
+    best = tried(w * np.geomspace(low, high, count))[:3]
+    ratio = (high / low) ** (1.0 / (count - 1))
+    for _ in range(2):
+        around = np.concatenate(
+            [p.effect.parameters["band"].value * ratio ** np.array([-0.6, -0.3, 0.3, 0.6]) for p in best]
+        )
+        best = sorted((*best, *tried(around)), key=lambda p: -p.decrease)[:2]
+        ratio **= 0.3
+    return [p.effect for p in best if p.decrease > 0.0]

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from autotune.arrays import FloatArray, IntArray
+from autotune.arrays import BoolArray, FloatArray, IntArray
 from autotune.diagnosis.fitting import state_scales
 from autotune.diagnosis.simulation import Simulator, assemble
 from autotune.errors import InputError
@@ -31,15 +31,18 @@ class _Estimator:
     """What a state estimate needs that stays the same from window to window."""
 
     sim: Simulator
+    linear: Simulator
     recording: Recording
     good: FloatArray
     scales: FloatArray
     bias_size: float
 
-    def run(self, first: int, last: int, z: FloatArray) -> FloatArray:
+    def run(self, first: int, last: int, z: FloatArray, linear: bool = False) -> FloatArray:
         """Return simulated readings of rows first to last from the state (and bias) z, in units of the scales."""
         n = self.scales.size
-        sim = self.sim if z.size == n else replace(self.sim, u_offset=self.sim.u_offset + z[n] * self.bias_size)
+        sim = self.linear if linear else self.sim
+        if z.size > n:
+            sim = replace(sim, u_offset=sim.u_offset + z[n] * self.bias_size)
         cut = replace(self.recording, t=self.recording.t[:last], u=self.recording.u[:last],
                       y=self.recording.y[:last], extra={})  # fmt: skip
         starts: IntArray = np.array([first], dtype=np.int64)
@@ -50,19 +53,33 @@ class _Estimator:
         y, ok = self.recording.y[first:last], self.good[first:last].astype(bool)
         start = self.sim.rest_state(self.recording.u[max(first - 1, 0)], float(y[ok][0]) if ok.any() else 0.0)
         z = np.append(start / self.scales, [0.0] * bias)
-        r = np.where(ok, y - self.run(first, last, z), 0.0)
+        if self.sim.on.any():
+            # from rest no derivative leads out of dry friction: the linear chain tells how fast the plant was
+            moving = self._fitted(first, last, z, y, ok, 2, linear=True)
+            z = min(z, moving, key=lambda s: float(np.sum((y - self.run(first, last, s))[ok] ** 2)))
+        return self._fitted(first, last, z, y, ok, iterations, linear=False)
+
+    def _fitted(
+        self, first: int, last: int, z: FloatArray, y: FloatArray, ok: BoolArray, iterations: int, linear: bool
+    ) -> FloatArray:
+        """Return the least-squares state near z."""
+
+        def left(state: FloatArray) -> FloatArray:
+            return np.where(ok, y - self.run(first, last, state, linear), 0.0)
+
+        r = left(z)
         damping = 1e-6
         for _ in range(iterations):
             J = np.empty((r.size, z.size))
             for i in range(z.size):
                 moved = z.copy()
                 moved[i] += 1e-3
-                J[:, i] = (np.where(ok, y - self.run(first, last, moved), 0.0) - r) / 1e-3
+                J[:, i] = (left(moved) - r) / 1e-3
             H = J.T @ J
             # what the rows do not tell (a lag of milliseconds, seconds ago) stays where rest put it
             H += np.diag(damping * np.diag(H) + 1e-9 * float(np.trace(H)) + 1e-300)
             step = -np.linalg.solve(H, J.T @ r)
-            new = np.where(ok, y - self.run(first, last, z + step), 0.0)
+            new = left(z + step)
             if not np.all(np.isfinite(new)) or new @ new > r @ r:
                 damping = max(damping, 1e-6) * 100.0
                 continue
@@ -103,6 +120,7 @@ def forecast(model: Model, recording: Recording, horizon_s: float | None = None)
     sim = assemble(model)
     estimator = _Estimator(
         sim=sim,
+        linear=replace(sim, on=np.zeros_like(sim.on), forced=False, falling=sim.chain),
         recording=recording,
         good=good.astype(np.float64),
         scales=state_scales(sim, [recording.u], [recording.y[good]]),

@@ -19,6 +19,10 @@ Kind: TypeAlias = Literal["gain", "den", "num", "delay", "u_offset", "effect"]
 NOMINAL_SPREAD = 0.2
 #: Parameters that no derivative tells: a direct search sets them.
 FOUND_DIRECTLY = ("recording", "time", "end", "origin")
+#: Of those, the ones that are numbers free to fit noise.
+COUNTED = ("time", "origin")
+#: Amplitudes of a sinusoid's two parts.
+QUADRATURES = frozenset(("in_phase", "quadrature"))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -187,7 +191,6 @@ def parametrise(
     effects: Sequence[Effect],
     input_size: float,
     sample_time_s: float,
-    sizes: Sequence[Sequence[float]] | None = None,
 ) -> Parametrisation:
     """Set a model's numbers and those of effects free.
 
@@ -199,8 +202,6 @@ def parametrise(
         Effects at their starting values. Parameters that count or mark stay as they are.
     input_size, sample_time_s : float
         As in :func:`chain_parameters`.
-    sizes : sequence of sequence of float, optional
-        Natural size of each effect parameter; its starting value by default.
 
     Returns
     -------
@@ -214,9 +215,10 @@ def parametrise(
             if key in FOUND_DIRECTLY:
                 continue
             positive = scales.get(key, "positive") == "positive"
-            size = abs(parameter.value) or 1.0
-            if sizes is not None:
-                size = sizes[number][j] or size
+            # of a sinusoid's two parts one may be near zero: both have the size of the whole
+            parts = [q.value for k, q in effect.parameters.items() if {k, key} <= QUADRATURES]
+            size = math.hypot(*parts) if parts else abs(parameter.value)
+            size = size or 1.0
             free.append(
                 Free(name=f"{effect.name}.{key}", kind="effect", index=(number, j), positive=positive, size=size)
             )

@@ -12,11 +12,12 @@ import numpy as np
 from autotune.arrays import FloatArray
 from autotune.diagnosis.catalogue import CATALOGUE, Entry, Range
 from autotune.diagnosis.data import Data
+from autotune.diagnosis.descent import bounded
 from autotune.diagnosis.fitting import Fit, fit, residual_at
 from autotune.diagnosis.kernel import I_LEVELS
-from autotune.diagnosis.parameters import Parametrisation, effect_with, parametrise
-from autotune.diagnosis.simulation import Simulator
-from autotune.errors import AutotuneError
+from autotune.diagnosis.parameters import COUNTED, FOUND_DIRECTLY, Parametrisation, effect_with, parametrise
+from autotune.diagnosis.simulation import Simulator, entry_of
+from autotune.errors import AutotuneError, IdentificationError
 from autotune.models import Effect, Model
 
 #: What a fit raises where the simulation runs away: that start is no hypothesis.
@@ -32,8 +33,10 @@ class Hypothesis:
 
     @property
     def parameters(self) -> int:
-        """Free numbers beyond those of the nominal structure."""
-        return sum(f.kind == "effect" for f in self.fit.parametrisation.free)
+        """Free numbers beyond those of the nominal structure, those that a direct search sets included."""
+        p = self.fit.parametrisation
+        direct = sum(key in COUNTED for e in p.model.effects for key in e.parameters)
+        return direct + sum(f.kind == "effect" for f in p.free)
 
 
 def score(h: Hypothesis) -> float:
@@ -122,10 +125,13 @@ def carried_states(base: Fit, effect: Effect, model: Model, data: Data) -> tuple
         pairs = zip(data.recordings, data.starts, strict=True)
         first = [r.u[np.maximum(s - 1, 0)] - base.sim.u_offset for r, s in pairs]
         return tuple(np.column_stack([u, x]) for u, x in zip(first, base.x0, strict=True))
-    if effect.name in ("sensor.lag", "plant.resonance"):
+    if effect.name in ("sensor.lag", "plant.resonance", "plant.slow_mode"):
         out = [x @ base.sim.chain.taps[3] for x in base.x0]
         if effect.name == "sensor.lag":
             return tuple(np.column_stack([x, y]) for x, y in zip(base.x0, out, strict=True))
+        if effect.name == "plant.slow_mode":
+            share = effect.parameters["share"].value
+            return tuple(np.column_stack([x, share * y]) for x, y in zip(base.x0, out, strict=True))
         omega = 2.0 * np.pi * effect.parameters["frequency"].value
         return tuple(np.column_stack([x, y / omega**2, 0.0 * y]) for x, y in zip(base.x0, out, strict=True))
     return base.x0
@@ -152,6 +158,21 @@ def promise(base: Fit, effect: Effect, data: Data) -> Promise:
     return promises(base, effect, data)[0]
 
 
+def direction(base: Fit, effect: Effect, data: Data) -> FloatArray:
+    """Return how an effect moves the whitened residual, freed of what the numbers already free could explain.
+
+    Raises
+    ------
+    AutotuneError, OverflowError, LinAlgError
+        The simulation runs away with the effect.
+    """
+    p, theta, states = extended(base, effect, data)
+    moved = residual_at(p, data, theta, states) - base.e
+    if not bounded(moved):
+        raise IdentificationError("the simulation runs away", where=effect.name)
+    return base.unexplained(moved)
+
+
 def _promise(base: Fit, effect: Effect, data: Data) -> tuple[Promise, float]:
     """Return what is promised, and how far the effect moves the reading as a share of chi2.
 
@@ -159,19 +180,14 @@ def _promise(base: Fit, effect: Effect, data: Data) -> tuple[Promise, float]:
     of |e + a d|^2 over 0 <= a <= 4 is promised, over -20 <= a <= 20 for an effect of either sign.
     """
     nothing = Promise(effect=effect, decrease=0.0, scaled=effect)
-    p, theta, states = extended(base, effect, data)
     try:
-        e = residual_at(p, data, theta, states)
-    except (AutotuneError, OverflowError):
+        d = direction(base, effect, data)
+    except RUNAWAY:
         return nothing, RAN_AWAY
-    # a simulation that runs away is finite for a while
-    if not np.max(np.abs(e), initial=0.0) < 1e15:
-        return nothing, RAN_AWAY
-    d = base.unexplained(e - base.e)
     slope, curvature = -float(d @ base.e), float(d @ d)
     if curvature == 0.0:
         return nothing, 0.0
-    signed = any(f.kind == "effect" and not f.positive for f in p.free[base.theta.size :])
+    signed = any(q.scale == "real" for q in entry_of(effect.name).parameters if q.name not in FOUND_DIRECTLY)
     low, high = (-20.0, 20.0) if signed else (0.0, 4.0)
     if not _amplitudes(effect):
         low, high = 0.0, 1.0  # a limit or a step is not made larger by a factor
@@ -194,10 +210,12 @@ SHRINKINGS, RAN_AWAY = 4, 1e6
 #: Parameters that an effect is about proportional to: the first order tells their size.
 AMPLITUDES = frozenset(
     ("level", "breakaway", "half_width", "width", "band", "time_constant", "delay", "second_order", "third_order",
-     "coefficient", "slope", "amplitude", "in_phase", "quadrature", "error", "rate")
+     "coefficient", "slope", "share", "amplitude", "in_phase", "quadrature", "error", "rate")
 )  # fmt: skip
 #: Parameters of those names that are something else.
-NO_AMPLITUDES = frozenset((("plant.hysteresis", "width"), ("actuator.rate_limit", "rate")))
+NO_AMPLITUDES = frozenset(
+    (("plant.hysteresis", "width"), ("actuator.rate_limit", "rate"), ("actuator.stiction", "band"))
+)
 
 
 def _amplitudes(effect: Effect) -> list[str]:

@@ -11,13 +11,13 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from autotune.arrays import BoolArray, FloatArray
-from autotune.diagnosis.catalogue import CATALOGUE, Entry
+from autotune.diagnosis.catalogue import CATALOGUE, STRUCTURES, Entry
 from autotune.diagnosis.data import Data
-from autotune.diagnosis.direct import periodic_load_starts, quantisation_starts, step_load_starts
+from autotune.diagnosis.direct import periodic_load_starts, quantisation_starts, step_load_starts, stiction_starts
 from autotune.diagnosis.fitting import Fit, fit, start_states
 from autotune.diagnosis.noise import Noise, noise_from_differences
 from autotune.diagnosis.retuning import COARSE, floored, misfit, prepare
-from autotune.diagnosis.search import RUNAWAY, Hypothesis, extend, score
+from autotune.diagnosis.search import RUNAWAY, Hypothesis, extend, score, signal_ranges
 from autotune.diagnosis.windows import slowest_lag_s
 from autotune.models import Model
 from autotune.recording import Recording
@@ -25,8 +25,8 @@ from autotune.recording import Recording
 #: Decrease of the score that an effect must bring: what chance brings among some two hundred starts, with a margin (on
 #: clean recordings nothing brought more than 15); weak effects that can be told bring a hundred and more, some 40.
 LEAST_DECREASE = 30.0
-#: Shift of an effect's size, as a logarithm, that gets a fit out of a crease.
-NUDGE = 0.06
+#: Shifts of an effect's size, as a logarithm, that get a fit out of a crease.
+NUDGES = (-0.06, 0.06, -0.02, 0.02)
 #: Effects whose thresholds make the criterion rough.
 ROUGH = frozenset(
     ("actuator.dead_zone", "actuator.backlash", "actuator.stiction", "actuator.quantisation", "plant.coulomb_friction",
@@ -85,7 +85,7 @@ def _polish(h: Hypothesis, data: Data, base: Fit, rounds: int) -> Hypothesis:
     best = fit(p, data, h.fit.theta, settled.x0, iterations=30, rounds=rounds)
     positive = np.array([f.kind == "effect" and f.positive for f in p.free])
     rough = ROUGH & set(h.names)
-    for shift in (-NUDGE, NUDGE) if rough and positive.any() else ():
+    for shift in NUDGES if rough and positive.any() else ():
         # thresholds make the criterion rough: a nudge gets a fit out of a crease
         again = fit(p, data, best.theta + shift * positive, best.x0, iterations=15, rounds=2)
         best = again if again.cost < best.cost else best
@@ -169,7 +169,7 @@ def search(
     Forward search with a beam: pairs are built on the best four singles, whether or not these help alone, so that
     partners that only help together are found as long as one of them is among the four.
     """
-    entries = [entry for name, entry in CATALOGUE.items() if name not in without]
+    entries = [entry for name, entry in (CATALOGUE | STRUCTURES).items() if name not in without]
     with threadpool_limits(1), ThreadPoolExecutor(2) as pool:
         report("retuning", 0.0)
         data, base = prepare(model, recordings, good)
@@ -218,6 +218,8 @@ def _searched(data: Data, base: Fit, nominal: Fit, entries: Sequence[Entry], poo
     if len(chosen.names) > 1:
         report("dropping what is not needed", 0.85)
         chosen = _pruned(chosen, singles, data, pool)
+    if STRUCTURES.keys() & set(chosen.names):
+        chosen = retuned
     return replace(_found(data, nominal, retuned, singles), pairs=tuple(pairs), triples=tuple(triples), chosen=chosen)
 
 
@@ -343,6 +345,8 @@ def simplicity_lead(base: Fit, best: Hypothesis, data: Data) -> float:
 
 def _found(data: Data, nominal: Fit, retuned: Hypothesis, singles: Sequence[Hypothesis] = ()) -> Search:
     chosen = singles[0] if singles and worth(retuned, singles[0]) else retuned
+    if STRUCTURES.keys() & set(chosen.names):
+        chosen = retuned
     return Search(
         data=data, nominal=nominal, retuned=retuned, singles=tuple(singles), pairs=(), triples=(), chosen=chosen
     )
@@ -366,6 +370,8 @@ def grown(
         extra += periodic_load_starts(base.fit, data, slowest_lag_s(base.fit.parametrisation.model))
     if "actuator.quantisation" in names:
         extra += quantisation_starts(base.fit, data, pool)
+    if "actuator.stiction" in names:
+        extra += stiction_starts(base.fit, data, pool, signal_ranges(base.fit, data).w)
     return extend(base, data, pool, entries, most=most, extra=extra, starts_each=starts_each, least=least)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from autotune.arrays import FloatArray, IntArray
 from autotune.diagnosis import kernel
-from autotune.diagnosis.catalogue import CATALOGUE, Entry, Quantity
+from autotune.diagnosis.catalogue import CATALOGUE, STRUCTURES, Entry, Quantity
 from autotune.diagnosis.chain import Chain, build_chain
 from autotune.errors import InputError
 from autotune.models import Block, Effect, Model, TransferFunction
@@ -175,6 +175,8 @@ def assemble(model: Model) -> Simulator:
                 on[kernel.A_FALL] = 1
             case "plant.resonance":
                 blocks = _with_resonance(blocks, effect, model.name)
+            case "plant.slow_mode":
+                blocks = _with_slow_mode(blocks, effect, model.name)
             case "timing.dead_time":
                 blocks = _with_delay(blocks, _value(effect, "delay", model.name))
             case "actuator.offset":
@@ -217,6 +219,8 @@ def entry_of(name: str, where: str = "catalogue") -> Entry:
     """
     if name == "actuator.offset":
         return _OFFSET
+    if name in STRUCTURES:
+        return STRUCTURES[name]
     if name not in CATALOGUE:
         raise InputError(f"effect {name!r} cannot be simulated", where=where, mend="use a name of the catalogue")
     return CATALOGUE[name]
@@ -273,6 +277,12 @@ def _with_resonance(blocks: tuple[Block, ...], effect: Effect, where: str) -> tu
     den = (1.0 / omega**2, 2.0 * _value(effect, "damping", where) / omega, 1.0)
     mode = Block(name="resonance", place="sensor", dynamics=TransferFunction(num=(1.0,), den=den))
     return (*blocks, mode)
+
+
+def _with_slow_mode(blocks: tuple[Block, ...], effect: Effect, where: str) -> tuple[Block, ...]:
+    T, share = _value(effect, "time_constant", where), _value(effect, "share", where)
+    lag = TransferFunction(num=((1.0 - share) * T, 1.0), den=(T, 1.0))
+    return (*blocks, Block(name="slow mode", place="sensor", dynamics=lag))
 
 
 def _with_delay(blocks: tuple[Block, ...], delay_s: float) -> tuple[Block, ...]:
