@@ -8,7 +8,7 @@ import sys
 
 import tests.benchmarks
 
-names = sorted(module.name for module in pkgutil.iter_modules(tests.benchmarks.__path__) if module.name != "__main__")
+names = sorted(module.name for module in pkgutil.iter_modules(tests.benchmarks.__path__) if module.name[0] != "_")
 wanted = sys.argv[1:] or names
 for name in wanted:
     if name not in names:
