@@ -29,13 +29,13 @@ STOPPED = 130  # exit status of a program that the operator stopped
 class Campaign:
     """Where a campaign lies and what it runs.
 
-    ``tool`` is the command that diagnoses, ``extra`` further arguments of its ``diagnose``.
+    ``tool`` is the command that diagnoses, ``without`` an effect that is left out of its catalogue.
     """
 
     out: Path
-    seeds: range
+    seeds: Sequence[int]
     tool: tuple[str, ...]
-    extra: tuple[str, ...] = ()
+    without: str = ""
 
     def case(self, seed: int) -> Path:
         """Folder of a case: model and recordings."""
@@ -46,8 +46,14 @@ class Campaign:
         return self.out / "sealed" / f"case_{seed:06d}.json"
 
     def diagnosis(self, seed: int) -> Path:
-        """Folder of the tool's output."""
-        return self.out / "diagnoses" / f"case_{seed:06d}"
+        """Folder of the tool's output, apart for each effect that is left out."""
+        kind = Path("without", self.without) if self.without else Path("diagnoses")
+        return self.out / kind / f"case_{seed:06d}"
+
+    @property
+    def finished(self) -> list[int]:
+        """Seeds whose cases the tool has had."""
+        return [seed for seed in self.seeds if (self.diagnosis(seed) / "finished").exists()]
 
 
 def conceal(campaign: Campaign) -> Iterator[int]:
@@ -66,6 +72,16 @@ def seal(campaign: Campaign) -> str:
     return digest.hexdigest()
 
 
+def singles(campaign: Campaign) -> dict[str, list[int]]:
+    """Seeds of the cases that conceal one effect of the catalogue, by its name."""
+    found: dict[str, list[int]] = {}
+    for seed in campaign.seeds:
+        answer = json.loads(campaign.answer(seed).read_text(encoding="utf-8"))
+        if answer["kind"] == "single":
+            found.setdefault(answer["effects"][0]["name"], []).append(seed)
+    return found
+
+
 def diagnose(campaign: Campaign, seed: int) -> None:
     """Let the tool diagnose one case; one that is diagnosed already stays as it is.
 
@@ -79,7 +95,8 @@ def diagnose(campaign: Campaign, seed: int) -> None:
         return
     out.mkdir(parents=True, exist_ok=True)
     records = [str(case / "rec1.csv"), str(case / "rec2.csv")]
-    words = ["diagnose", "--model", str(case / "model.toml"), *records, "--out", str(out), *campaign.extra]
+    words = ["diagnose", "--model", str(case / "model.toml"), *records, "--out", str(out)]
+    words += ["--without", campaign.without] if campaign.without else []
     said = _run(campaign, words)
     if said.returncode == 0:
         horizon = f"{json.loads(campaign.answer(seed).read_text(encoding='utf-8'))['horizon']:g}"

@@ -46,6 +46,11 @@ class Mark:
         return self.verdict != "effect"
 
     @property
+    def withdrawn(self) -> bool:
+        """Whether an effect that is not in the catalogue became unexplained, or its equivalent was named."""
+        return self.verdict == "unexplained" or self.first_right
+
+    @property
     def failed(self) -> bool:
         """Whether the case is worth studying: anything asked of it is missing."""
         asked = {
@@ -207,6 +212,11 @@ def table(marks: Sequence[Mark]) -> list[Row]:
         ),
         _share("extended worse than retuned on unseen", 0.0, worse, at_most=True),
     ]
+
+
+def resolved(ties: Sequence[bool]) -> Row:
+    """Row of the proof's table: whether each tie was resolved by one experiment."""
+    return _share("a tie resolved by one experiment of the tool's choosing", 0.85, ties)
 
 
 _ALARMS = ("effect", "unexplained")

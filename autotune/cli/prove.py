@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import json
+import shutil
 import sys
-from collections.abc import Sequence
-from dataclasses import asdict
-from functools import partial
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
@@ -19,7 +19,11 @@ from autotune.cli import app
 from autotune.errors import InputError
 
 if TYPE_CHECKING:
-    from sim.score import Mark
+    from sim.proof import Campaign
+    from sim.score import Mark, Row
+
+#: Time under excitation of the experiment that decides a tie [s].
+TIE_DURATION_S = 16.0
 
 
 @app.command()
@@ -27,52 +31,117 @@ def prove(
     out: Annotated[Path, typer.Option(help="folder of the campaign; an interrupted one is continued there")],
     cases: Annotated[int, typer.Option(min=1, help="number of concealed cases")] = 600,
     seed: Annotated[int, typer.Option(min=0, help="seed of the first case; below 100000 is for calibration")] = 100_000,
+    ties: Annotated[int, typer.Option(min=0, help="rigs that a first recording leaves open, one experiment each")] = 24,
     workers: Annotated[int, typer.Option(min=1, help="diagnoses at the same time")] = 2,
-    without: Annotated[str, typer.Option(help="ablation: leave this entry out of the catalogue, try its cases")] = "",
+    without: Annotated[
+        str, typer.Option(help="ablation: leave this entry out of the catalogue and try its cases; 'all': each in turn")
+    ] = "",
+    most: Annotated[int, typer.Option(min=1, help="ablation: most cases of an entry")] = 3,
     scheduler: Annotated[
         str | None, typer.Option(metavar="ADDRESS", help="existing Dask scheduler, tcp://host:8786, with its workers")
     ] = None,
 ) -> None:
     """Conceal effects in simulated recordings, diagnose them as a user would, reveal the answers and count."""
-    from autotune.batch.engine import cluster, run_all
-    from sim.proof import Campaign, conceal, diagnose, keep_failures, mark_all, seal
-    from sim.score import table
+    from sim.proof import Campaign, conceal, keep_failures, mark_all, seal
+    from sim.score import resolved, table
 
-    tool = (sys.executable, "-m", "autotune.cli")
-    extra = ("--without", without) if without else ()
     if scheduler is not None:
         out = out.absolute()  # its workers were started elsewhere
-    campaign = Campaign(out=out, seeds=range(seed, seed + cases), tool=tool, extra=extra)
+    campaign = Campaign(out=out, seeds=range(seed, seed + cases), tool=(sys.executable, "-m", "autotune.cli"))
     console = Console(highlight=False)
     for _ in track(conceal(campaign), "making cases", total=cases, console=console):
         pass
     digest = seal(campaign)
     _publish(out / "seal.txt", digest)
     console.print(f"answers sealed, SHA-256 {digest}")
-    chosen = _cases_of(campaign.out, campaign.seeds, without)
-    if not chosen:
-        raise InputError(f"no case of this campaign conceals {without}: ask for more cases")
-    # each diagnosis is a program of its own, so a thread of this process is enough to start it
+    if without:
+        _ablate(console, campaign, without, most, workers, scheduler)
+        return
+    _diagnose_all(console, [(campaign, case) for case in campaign.seeds], workers, scheduler)
+    tried = [tie_resolved(out / "ties", seed + i) for i in track(range(ties), "ties", console=console)]
+    if seal(campaign) != digest:
+        raise InputError(f"{out / 'sealed'}: an answer changed while the cases were diagnosed; start a fresh campaign")
+    marks = mark_all(campaign, list(campaign.seeds))
+    rows = [*table(marks), resolved([one["resolved"] for one in tried if one["experiment"]])]
+    result = {
+        "seed": seed,
+        "cases": cases,
+        "sha256": digest,
+        "table": [asdict(row) for row in rows],
+        "marks": [asdict(m) for m in marks],
+        "ties": tried,
+    }
+    (out / "proof.json").write_text(json.dumps(result, indent=1), encoding="utf-8")
+    _print_confusion(console, marks)
+    _print_table(console, rows)
+    failures = keep_failures(campaign, marks)
+    console.print(f"answers revealed; {sum(m.failed for m in marks)} of {len(marks)} cases to study in {failures}")
+
+
+def _diagnose_all(console: Console, tasks: Sequence[tuple[Campaign, int]], workers: int, scheduler: str | None) -> None:
+    """Diagnose cases of campaigns; each diagnosis is a program of its own, so a thread is enough to start it."""
+    from autotune.batch.engine import cluster, run_all
+
     with cluster(workers, scheduler, processes=False) as client, Progress(console=console) as progress:
-        task = progress.add_task("diagnosing", total=len(chosen))
-        named = {str(case): case for case in chosen}
-        for _, failure in run_all(client, partial(diagnose, campaign), named, retries=0):
+        task = progress.add_task("diagnosing", total=len(tasks))
+        for _, failure in run_all(client, _diagnose, {str(i): one for i, one in enumerate(tasks)}, retries=0):
             if failure is not None:
                 raise failure
             progress.advance(task)
-    if seal(campaign) != digest:
-        raise InputError(f"{out / 'sealed'}: an answer changed while the cases were diagnosed; start a fresh campaign")
-    marks = mark_all(campaign, chosen)
-    rows = [asdict(row) for row in table(marks)]
-    result = {"seed": seed, "cases": cases, "sha256": digest, "table": rows, "marks": [asdict(m) for m in marks]}
-    (out / "proof.json").write_text(json.dumps(result, indent=1), encoding="utf-8")
-    _print_confusion(console, marks)
-    if without:
-        _print_ablation(console, marks, without)
-    else:
-        _print_table(console, marks)
-    failures = keep_failures(campaign, marks)
-    console.print(f"answers revealed; {sum(m.failed for m in marks)} of {len(marks)} cases to study in {failures}")
+
+
+def _diagnose(task: tuple[Campaign, int]) -> None:
+    from sim.proof import diagnose
+
+    diagnose(*task)
+
+
+def tie_resolved(out: Path, seed: int) -> dict[str, Any]:
+    """Give a rig that a gentle recording leaves open one round of ``investigate``.
+
+    Parameters
+    ----------
+    out : Path
+        Folder of all ties; what one of them gave is kept there and not computed again.
+    seed : int
+        Of the tie, see :mod:`sim.ties`.
+
+    Returns
+    -------
+    dict
+        ``left_out``, ``before`` and ``after`` (best name with its probability), ``experiment``, empty where the first
+        recording left nothing open, ``right_before`` and ``resolved``.
+    """
+    from autotune.config import load_config
+    from autotune.diagnosis.investigate import investigate
+    from autotune.models import read_model
+    from autotune.recording import read_recording
+    from drivers.simulated import SimulatedRig
+    from sim.ties import draw, write
+
+    folder = out / f"tie_{seed:06d}"
+    kept = folder / "tie.json"
+    if kept.exists():
+        return dict(json.loads(kept.read_text(encoding="utf-8")))
+    shutil.rmtree(folder, ignore_errors=True)  # what an interrupted one has left
+    tie = draw(seed)
+    write(tie, folder)
+    known = investigate(
+        SimulatedRig(tie.rig(), u_safe=0.0), load_config(folder / "config.toml"), read_model(folder / "model.toml"),
+        [read_recording(folder / "first.csv")], folder, rounds=1, duration_s=TIE_DURATION_S,
+    )  # fmt: skip
+    (old, p), one = known.before[0], known.rounds[0] if known.rounds else None
+    new, q = one.candidates[0] if one is not None else (old, p)
+    answer = {
+        "left_out": tie.left_out,
+        "before": f"{old} {p:.2f}",
+        "experiment": "" if one is None else f"{one.plan.excitation.kind} on the {one.plan.excitation.on}",
+        "after": f"{new} {q:.2f}",
+        "right_before": bool(tie.names & set(old.split("+"))),
+        "resolved": bool(tie.names & set(new.split("+"))),
+    }
+    kept.write_text(json.dumps(answer), encoding="utf-8")
+    return answer
 
 
 def _publish(path: Path, digest: str) -> None:
@@ -82,16 +151,28 @@ def _publish(path: Path, digest: str) -> None:
     path.write_text(digest + "\n", encoding="utf-8")
 
 
-def _cases_of(out: Path, seeds: range, name: str) -> list[int]:
-    """Seeds of the cases to try: all, or the singles that conceal one effect."""
-    if not name:
-        return list(seeds)
-    chosen = []
-    for seed in seeds:
-        answer = json.loads((out / "sealed" / f"case_{seed:06d}.json").read_text(encoding="utf-8"))
-        if answer["kind"] == "single" and answer["effects"][0]["name"] == name:
-            chosen.append(seed)
-    return chosen
+def _ablate(console: Console, campaign: Campaign, without: str, most: int, workers: int, scheduler: str | None) -> None:
+    """Leave entries out of the catalogue in turn and try the singles that conceal them, one of each entry at a time.
+
+    What is finished is printed however it ends; the same command goes on where it was stopped.
+    """
+    from sim.proof import mark_all, singles
+
+    found = singles(campaign)
+    if without != "all" and without not in found:
+        raise InputError(f"no case of this campaign conceals {without}: ask for more cases")
+    chosen = {name: found[name][:most] for name in sorted(found) if without in ("all", name)}
+    tasks = [
+        (replace(campaign, without=name), seed)
+        for turn in range(most)
+        for name, seeds in chosen.items()
+        for seed in seeds[turn : turn + 1]
+    ]
+    try:
+        _diagnose_all(console, tasks, workers, scheduler)
+    finally:
+        ablated = {name: replace(campaign, without=name, seeds=seeds) for name, seeds in chosen.items()}
+        _print_ablation(console, {name: mark_all(one, one.finished) for name, one in ablated.items()})
 
 
 def _print_confusion(console: Console, marks: Sequence[Mark]) -> None:
@@ -103,11 +184,9 @@ def _print_confusion(console: Console, marks: Sequence[Mark]) -> None:
     console.print(view)
 
 
-def _print_table(console: Console, marks: Sequence[Mark]) -> None:
-    from sim.score import table
-
+def _print_table(console: Console, rows: Sequence[Row]) -> None:
     view = Table("figure", "asked", "measured", "95 % interval", "of", "met", title="Proof on concealed cases")
-    for row in table(marks):
+    for row in rows:
         share = row.interval is not None
         value = f"{100 * row.value:.1f} %" if share else f"{row.value:.3f}"
         interval = f"{100 * row.interval[0]:.1f} to {100 * row.interval[1]:.1f} %" if row.interval else ""
@@ -116,12 +195,19 @@ def _print_table(console: Console, marks: Sequence[Mark]) -> None:
     console.print(view)
 
 
-def _print_ablation(console: Console, marks: Sequence[Mark], name: str) -> None:
+def _print_ablation(console: Console, ablated: Mapping[str, Sequence[Mark]]) -> None:
     from sim.score import wilson
 
+    view = Table("left out", "cases", "unexplained, or its equivalent", "place right", "said instead", title="Ablation")
+    for name, marks in ablated.items():
+        withdrawn, placed = (sum(hits) for hits in ([m.withdrawn for m in marks], [m.place_right for m in marks]))
+        said = ", ".join(m.named[0] if m.named else m.verdict for m in marks if not m.withdrawn)
+        view.add_row(name, str(len(marks)), str(withdrawn), str(placed), said)
+    console.print(view)
+    every = [m for marks in ablated.values() for m in marks]
     for what, hits in (
-        ("turned to unexplained", [m.verdict == "unexplained" for m in marks]),
-        ("still at the right place", [m.place_right for m in marks]),
+        ("unexplained, or its equivalent", [m.withdrawn for m in every]),
+        ("at the right place", [m.place_right for m in every]),
     ):
         low, high = wilson(sum(hits), len(hits))
-        console.print(f"without {name}: {what} {sum(hits)} of {len(hits)} ({100 * low:.0f} to {100 * high:.0f} %)")
+        console.print(f"{what}: {sum(hits)} of {len(hits)} ({100 * low:.0f} to {100 * high:.0f} %)")

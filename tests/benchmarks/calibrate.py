@@ -196,11 +196,6 @@ def calibration(rows: Sequence[Shown], temperature: float, doubt: float) -> tupl
     return loss, calibration_error(statements), sure.count(False), len(sure), len(statements)
 
 
-def finished(campaign: Campaign) -> list[int]:
-    """Seeds of the campaign's cases that are diagnosed."""
-    return [seed for seed in campaign.seeds if (campaign.diagnosis(seed) / "diagnosis.json").exists()]
-
-
 def campaign_in(folder: str) -> Campaign:
     """Return the campaign of a folder, or make a small one."""
     if folder:
@@ -215,7 +210,7 @@ def campaign_in(folder: str) -> Campaign:
         )
         out = Path(tempfile.mkdtemp(prefix="autotune-calibrate-"))
         campaign = Campaign(out=out, seeds=range(first, first + count), tool=(sys.executable, "-m", "autotune.cli"))
-    if campaign.seeds.stop > FIRST_PROOF_SEED:
+    if max(campaign.seeds) >= FIRST_PROOF_SEED:
         raise SystemExit(f"seeds from {FIRST_PROOF_SEED} on are the proof's")
     return campaign
 
@@ -226,7 +221,8 @@ def main() -> None:
     if campaign.tool:
         for seed in conceal(campaign):
             diagnose(campaign, seed)
-    rows = [shown(campaign, seed) for seed in finished(campaign)]
+    told = [seed for seed in campaign.finished if (campaign.diagnosis(seed) / "diagnosis.json").exists()]
+    rows = [shown(campaign, seed) for seed in told]
     kinds = ", ".join(f"{count} {kind}" for kind, count in sorted(Counter(r.kind for r in rows).items()))
     print(f"{len(rows)} cases diagnosed in {campaign.out}: {kinds}")
     chain = [r for r in rows if not OF_ROWS & {name for name, _ in r.stated if name not in r.nuisance}]
