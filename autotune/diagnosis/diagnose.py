@@ -76,10 +76,12 @@ def diagnose(
         if len(r) < 100 or np.isfinite(r.y).sum() < 100:
             raise InputError(f"{len(r)} rows", where=r.name, mend="a diagnosis needs at least 100 finite readings")
     report("looking at the samples", 0.0)
-    good, seen = inspect(recordings)
+    good, seen = inspect(recordings, without)
     left_out = [*without, *(effect.name for effect in seen)]
     found = search(model, recordings, good, left_out, report)
-    also = (jitter_effect(found.retuned.fit, recordings), law_effect(recordings, controller))
+    # a reading that was rounded is off by less where it stands still: that is no jitter
+    rounded = any(s.name == "sensor.quantisation" for s in seen)
+    also = (None if rounded else jitter_effect(found.retuned.fit, recordings), law_effect(recordings, controller))
     strong = [s for s in also if s is not None and s.name not in without]
     # what the samples show explains the residual better than an effect of the chain does, or not at all
     gained = score(found.retuned) - score(found.chosen)
@@ -97,7 +99,7 @@ def diagnose(
     if any(s.name == "timing.jitter" for s in strong) or (seen and gained < SURE):
         found = replace(found, chosen=found.retuned)
     report("checking on held-out rows", 0.9)
-    return _judge(found, [s for s in (*seen, *strong) if s.name not in without], model)
+    return _judge(found, [*seen, *strong], model)
 
 
 def _judge(found: Search, samples: list[SampleEffect], model: Model) -> Diagnosis:

@@ -6,7 +6,7 @@ are left out of every fit.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -98,8 +98,17 @@ def spikes(y: FloatArray, good: BoolArray) -> BoolArray:
     return found
 
 
-def inspect(recordings: Sequence[Recording]) -> tuple[list[BoolArray], list[SampleEffect]]:
+def inspect(
+    recordings: Sequence[Recording], without: Collection[str] = ()
+) -> tuple[list[BoolArray], list[SampleEffect]]:
     """Look at the readings of all recordings.
+
+    Parameters
+    ----------
+    recordings : sequence of Recording
+        What was measured.
+    without : collection of str
+        Effects that are not looked for: their rows count like any other.
 
     Returns
     -------
@@ -114,20 +123,20 @@ def inspect(recordings: Sequence[Recording]) -> tuple[list[BoolArray], list[Samp
     step = lattice_step(np.concatenate([r.y for r in recordings]))
     if step > 0.0:
         # on a lattice equal readings are no dropout, and a spike is measured in steps
-        return good, _quantisation(recordings, step, unit)
+        return good, _quantisation(recordings, step, unit) if "sensor.quantisation" not in without else []
     clipped, levels = _clipped(recordings)
-    if levels:
+    if levels and "sensor.saturation" not in without:
         effects.append(_saturation(recordings, clipped, levels, unit))
         good = [g & ~c for g, c in zip(good, clipped, strict=True)]
     frozen = [frozen_rows(r.y) & ~c for r, c in zip(recordings, clipped, strict=True)]
     count = sum(int(f.sum()) for f in frozen)
     total = sum(len(r) for r in recordings)
-    if count >= 6 and count > 1e-3 * total:
+    if count >= 6 and count > 1e-3 * total and "sensor.dropout" not in without:
         effects.append(_dropout(recordings, frozen, count / total))
         good = [g & ~f for g, f in zip(good, frozen, strict=True)]
     lone = [spikes(r.y, g) for r, g in zip(recordings, good, strict=True)]
     count = sum(int(s.sum()) for s in lone)
-    if count >= 3:
+    if count >= 3 and "sensor.outliers" not in without:
         heights = np.concatenate(
             [np.abs(r.y - _neighbours(r.y, g))[s] for r, g, s in zip(recordings, good, lone, strict=True)]
         )
@@ -139,15 +148,18 @@ def inspect(recordings: Sequence[Recording]) -> tuple[list[BoolArray], list[Samp
 def _clipped(recordings: Sequence[Recording]) -> tuple[list[BoolArray], dict[str, float]]:
     """Return the rows that stand at the readings' largest or smallest value, where that value is an end stop.
 
-    Continuous readings hardly ever take their extreme value twice; a converter's end takes it again and again.
+    Continuous readings hardly ever take their extreme value twice; a converter's end takes it again and again, or once
+    for a time while no reading is repeated anywhere else.
     """
     y = np.concatenate([r.y for r in recordings])
+    ends = (float(np.nanmin(y)), float(np.nanmax(y)))
+    elsewhere = any(bool(np.any(frozen_rows(r.y) & ~np.isin(r.y, ends))) for r in recordings)
     rows = [np.zeros(len(r), dtype=bool) for r in recordings]
     levels: dict[str, float] = {}
-    for key, level in (("low", float(np.nanmin(y))), ("high", float(np.nanmax(y)))):
+    for key, level in zip(("low", "high"), ends, strict=True):
         at = [r.y == level for r in recordings]
         runs = sum(int(np.sum(a[1:] & ~a[:-1]) + a[0]) for a in at)
-        if sum(int(a.sum()) for a in at) >= 5 and runs >= 2:
+        if sum(int(a.sum()) for a in at) >= 5 and (runs >= 2 or not elsewhere):
             levels[key] = level
             rows = [a | b for a, b in zip(rows, at, strict=True)]
     return rows, levels

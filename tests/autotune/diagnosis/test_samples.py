@@ -48,6 +48,25 @@ def test_frozen_readings_are_left_out_and_named_with_their_times() -> None:
     assert effects[0].windows[0] == pytest.approx((0, 5.0, 5.08))
 
 
+def test_a_reading_that_stands_once_at_its_largest_value_met_an_end_stop() -> None:
+    k, level = np.arange(3000), 5.9
+    growing = 5.0 + (0.5 + k / 6000.0) * np.sin(0.01 * k) + 0.001 * np.random.default_rng(1).normal(size=k.size)
+    y = rounded(np.minimum(growing, level))  # only the last crest reaches it
+    r = Recording(t=0.01 * k, u=np.zeros(y.size), y=y)
+    _, effects = inspect([r])
+    assert [e.name for e in effects] == ["sensor.saturation"]
+    assert effects[0].parameters["high"].value == pytest.approx(level)
+
+
+def test_what_is_not_looked_for_is_left_in_the_readings() -> None:
+    y = rounded(signal(1))
+    for first in (500, 1200, 2000):
+        y[first : first + 8] = y[first - 1]
+    good, effects = inspect([Recording(t=0.01 * np.arange(y.size), u=np.zeros(y.size), y=y)], ["sensor.dropout"])
+    assert not effects
+    assert good[0].all()
+
+
 def test_spikes_are_left_out_and_their_size_is_told() -> None:
     y = rounded(signal(2))
     rows = np.array([300, 900, 1500, 2100, 2700])
