@@ -58,7 +58,6 @@ PLANTS: Mapping[Plant, Table] = {
         "experiment": {"budget_s": 7200.0},
         "design": {"noise_gain": 20.0},
         "controller": {"K": 0.5, "Ti_s": 200.0},
-        "verification": {"disturbance_step": 3.0},
     },
 }  # fmt: skip
 

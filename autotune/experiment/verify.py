@@ -13,7 +13,7 @@ from scipy.ndimage import uniform_filter1d
 
 from autotune.arrays import FloatArray
 from autotune.config import Config
-from autotune.config.procedure import LimitSettings, VerificationSettings
+from autotune.config.procedure import LimitSettings
 from autotune.controller import PIDController
 from autotune.design.law import PILaw
 from autotune.design.margins import Margins, margins
@@ -123,15 +123,13 @@ class Verification:
     predicted_sd: StepFigures
 
 
-def plan_test(
-    settings: VerificationSettings, limits: LimitSettings, law: PILaw, fit: PlantFit, crossover_rad_s: float
-) -> StepTest:
-    """Choose steps that show well above the noise and stay within half of the allowed swing.
+def plan_test(config: Config, law: PILaw, fit: PlantFit, crossover_rad_s: float) -> StepTest:
+    """Choose steps that show well above the noise and stay within half of the allowed swing, and of the command's room.
 
     Parameters
     ----------
-    settings, limits : VerificationSettings, LimitSettings
-        What the configuration asks for and allows.
+    config : Config
+        What is asked for and allowed.
     law : PILaw
         The law to be verified.
     fit : PlantFit
@@ -139,6 +137,7 @@ def plan_test(
     crossover_rad_s : float
         Gain crossover of the new loop [rad/s], which sets the duration.
     """
+    settings, limits, u_guess = config.verification, config.limits, config.operating_point.u_guess
     T_s = law.sample_time_s
     c = law.controller
     slow = 4.0 * c.Ti_s if math.isfinite(c.Ti_s) else 0.0
@@ -149,7 +148,8 @@ def plan_test(
     if load is None:
         quiet, unit = np.zeros(count), np.ones(count)
         unit_response = predict(fit.plant, [fit.plant], law, quiet, unit, 0.0, np.random.default_rng(0)).y
-        load = 0.4 * limits.swing / float(np.abs(unit_response).max())
+        room = min(limits.u_max - u_guess, u_guess - limits.u_min)
+        load = min(0.4 * limits.swing / float(np.abs(unit_response).max()), 0.5 * room)
     late = np.arange(2 * count) >= count
     return StepTest(
         t=np.arange(2 * count, dtype=np.float64) * T_s,
@@ -283,7 +283,7 @@ def run_verification(
     crossover_rad_s = expected_margins(fit, controller).crossover_rad_s
     if isinstance(rig, Exchanges) and not isinstance(rig, RunsLaws):
         fit = _delayed(fit, config.signals.sample_time_s)  # its commands act one sample after what they come from
-    test = plan_test(config.verification, config.limits, law, fit, crossover_rad_s)
+    test = plan_test(config, law, fit, crossover_rad_s)
     law = law_for(controller, config.limits, config.signals.sample_time_s, float(test.disturbance[-1]))
     writer = RecordingWriter(recording, ("t", "u", "y", "r"), recording_metadata(config))
     with ControlLoop(rig=rig, envelope=envelope_of(config), writer=writer, extra=("r",)) as loop:

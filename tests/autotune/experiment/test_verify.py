@@ -39,7 +39,7 @@ def fitted() -> object:
 
 FIT = fitted()
 LAW = law_for(PI, CONFIG.limits, 0.01)
-TEST = plan_test(CONFIG.verification, CONFIG.limits, LAW, FIT, 1.4)
+TEST = plan_test(CONFIG, LAW, FIT, 1.4)
 
 
 def measured(plant: TransferFunction, seed: int) -> tuple[np.ndarray, np.ndarray]:
@@ -56,6 +56,11 @@ def test_the_steps_stay_within_half_of_the_swing() -> None:
     y, _ = measured(BALL, 0)
     assert np.abs(smoothed(y - TEST.setpoint, TEST)).max() < 0.5 * CONFIG.limits.swing
     assert quiet.size == TEST.t.size
+
+
+def test_the_load_leaves_half_of_the_commands_room_to_a_plant_that_hardly_answers() -> None:
+    weak = replace(FIT, plant=replace(FIT.plant, num=tuple(1e-4 * b for b in FIT.plant.num)))
+    assert plan_test(CONFIG, LAW, weak, 1.4).disturbance[-1] == 2.5  # u_guess 5 V of 0 to 10 V
 
 
 def test_the_true_plant_is_accepted_and_a_gain_or_delay_of_half_as_much_again_is_not() -> None:
