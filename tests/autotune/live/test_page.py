@@ -196,27 +196,31 @@ def test_a_whole_run_on_a_rig_process_is_followed_and_decided_in_the_browser(
     opened: Callable[..., Page], tmp_path: Path, choice: str, held: str
 ) -> None:
     content = load_config(CONFIGS / "ball_modbus_tcp.toml").model_dump(exclude_none=True)
+    content |= {"verification": {"duration_s": 8.0}}
+    content["experiment"] |= {"points": 3, "budget_s": 25.0}
     with socket.create_server(("127.0.0.1", 0)) as free:
         content["rig"]["port"] = free.getsockname()[1]
     file, out = tmp_path / "ball.toml", tmp_path / "out"
     file.write_text(tomli_w.dumps(content))
     with ExitStack() as stack:
 
-        def started(*words: str) -> subprocess.Popen[str]:
-            command = [sys.executable, "-u", "-m", "autotune.cli", *words]
+        def started(priority: str, *words: str) -> subprocess.Popen[str]:
+            # 100 Hz beside a browser that draws: rig and loop go first where they may
+            first = ["chrt", priority, "10"] if os.geteuid() == 0 else []
+            command = [*first, sys.executable, "-u", "-m", "autotune.cli", *words]
             child = stack.enter_context(subprocess.Popen(command, stdout=subprocess.PIPE, text=True))
             stack.callback(child.send_signal, signal.SIGINT)
             return child
 
-        serving = started("rig", str(file))
+        serving = started("-r", "rig", str(file))
         assert serving.stdout is not None
         assert any("serving" in line for line in serving.stdout)
-        run = started("run", str(file), "--out", str(out), "--live")
+        run = started("-Rr", "run", str(file), "--out", str(out), "--live")
         assert run.stdout is not None
         page = opened(run.stdout.readline().split()[-1])
         status, ellipses = page.get_by_role("status"), set()
-        for number in (2, 3, 4):
-            expect(status).to_have_text(re.compile(f"point {number} of 5"), timeout=LIMIT_MS)
+        for number in (1, 2, 3):
+            expect(status).to_have_text(re.compile(f"point {number} of 3"), timeout=LIMIT_MS)
             ellipses.add(page.locator(".plane canvas").evaluate("one => one.toDataURL()"))
         assert len(ellipses) == 3
         expect(status).to_have_text(re.compile("new gains. Keep them"), timeout=2 * LIMIT_MS)
