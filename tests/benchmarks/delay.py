@@ -9,6 +9,7 @@ import os
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from scipy.integrate import solve_ivp
@@ -22,6 +23,7 @@ from autotune.identification.delay.two_delays import two_delays
 from autotune.recording import Recording
 from tests.autotune.identification.delay_examples import X0, A, B, example_2, response, u_example_1, u_example_2
 from tests.autotune.identification.test_modulating import INTERVALS, a1_of_example_1, example_3
+from tests.benchmarks._side_by_side import print_all
 
 RUNS = int(os.environ.get("DELAY_RUNS", "20"))
 
@@ -54,42 +56,50 @@ def example_1() -> None:
     )
 
 
-def table_1() -> None:
-    count = max(400, 20 * RUNS)
-    print(f"\nExample 2, Table 1, {count} runs: a1, a0, b, h. Misprint: the step is (L/2 pi) atan2(b2, b1). The errors")
+#: noise -> means and sd of a1, a0, b, h as printed
+TABLE_1 = {
+    1: ([-1.20, -0.35, 2.00, 4.00], [0.020, 0.007, 0.04, 0.015]),
+    2: ([-1.20, -0.35, 2.00, 4.00], [0.028, 0.010, 0.05, 0.023]),
+    5: ([-1.17, -0.34, 1.94, 3.97], [0.084, 0.029, 0.17, 0.065]),
+    10: ([-1.12, -0.32, 1.84, 3.91], [0.15, 0.055, 0.33, 0.132]),
+}
+SETS_OF_TABLE_1 = max(400, 20 * RUNS)
+
+
+def head_of_table_1() -> None:
+    print(f"\nExample 2, Table 1, {SETS_OF_TABLE_1} runs: a1, a0, b, h. Misprint: the step is (L/2 pi) atan2(b2, b1).")
     print(
-        "have heavy tails, so that the sd of 100 runs, as printed, scatters: the range below holds 95 % of sets of 100"
+        "The errors have heavy tails, so that the sd of 100 runs, as printed, scatters: the range below holds 95 % of"
     )
-    print("(drawn from ours), and the last column says how many of a hundred sets have a smaller sd than the paper's.")
-    print("Its row for noise 2 is 20-30 % too small against its own scaling.")
-    paper = {
-        1: ([-1.20, -0.35, 2.00, 4.00], [0.020, 0.007, 0.04, 0.015]),
-        2: ([-1.20, -0.35, 2.00, 4.00], [0.028, 0.010, 0.05, 0.023]),
-        5: ([-1.17, -0.34, 1.94, 3.97], [0.084, 0.029, 0.17, 0.065]),
-        10: ([-1.12, -0.32, 1.84, 3.91], [0.15, 0.055, 0.33, 0.132]),
-    }
+    print(
+        "sets of 100 (drawn from ours), and the last column says how many of a hundred sets have a smaller sd than the"
+    )
+    print("paper's. Its row for noise 2 is 20-30 % too small against its own scaling.")
+
+
+def table_1(sd: int) -> None:
+    printed_mean, printed_sd = TABLE_1[sd]
     record = example_2()
-    for sd, (printed_mean, printed_sd) in paper.items():
-        rng = np.random.default_rng(sd)
-        found, seconds, steps = [], [], []
-        for _ in range(count):
-            run = replace(record, y=record.y + noise(len(record), sd, rng))
-            begun = time.process_time()
-            estimate = modulated_delay(run, 2, INTERVALS)
-            seconds.append(time.process_time() - begun)
-            found.append([estimate.a[1], estimate.a[0], estimate.b, estimate.delay_s])
-            steps.append(estimate.iterations)
-        ours = np.array(found)
-        sets = np.array([ours[rng.integers(0, count, 100)].std(axis=0, ddof=1) for _ in range(2000)])
-        low, high = np.percentile(sets, [2.5, 97.5], axis=0)
-        below = 100.0 * np.mean(sets < printed_sd, axis=0)
-        print(f"  noise {sd}: {np.median(steps):.0f} steps, {_ms(seconds)}")
-        for q, name in enumerate(("a1", "a0", "b", "h")):
-            print(
-                f"    {name:2}: mean {ours[:, q].mean():.3f} (paper {printed_mean[q]:.2f}), sd"
-                f" {ours[:, q].std(ddof=1):.4f} (paper {printed_sd[q]:.3f}), sets of 100 {low[q]:.4f} to {high[q]:.4f},"
-                f" paper above {below[q]:.0f} of 100"
-            )
+    rng = np.random.default_rng(sd)
+    found, seconds, steps = [], [], []
+    for _ in range(SETS_OF_TABLE_1):
+        run = replace(record, y=record.y + noise(len(record), sd, rng))
+        begun = time.process_time()
+        estimate = modulated_delay(run, 2, INTERVALS)
+        seconds.append(time.process_time() - begun)
+        found.append([estimate.a[1], estimate.a[0], estimate.b, estimate.delay_s])
+        steps.append(estimate.iterations)
+    ours = np.array(found)
+    sets = np.array([ours[rng.integers(0, len(ours), 100)].std(axis=0, ddof=1) for _ in range(2000)])
+    low, high = np.percentile(sets, [2.5, 97.5], axis=0)
+    below = 100.0 * np.mean(sets < printed_sd, axis=0)
+    print(f"  noise {sd}: {np.median(steps):.0f} steps, {_ms(seconds)}")
+    for q, name in enumerate(("a1", "a0", "b", "h")):
+        print(
+            f"    {name:2}: mean {ours[:, q].mean():.3f} (paper {printed_mean[q]:.2f}), sd"
+            f" {ours[:, q].std(ddof=1):.4f} (paper {printed_sd[q]:.3f}), sets of 100 {low[q]:.4f} to {high[q]:.4f},"
+            f" paper above {below[q]:.0f} of 100"
+        )
 
 
 def sensitivities(t: np.ndarray, delay_s: float) -> np.ndarray:
@@ -182,32 +192,38 @@ def _numbers(values: np.ndarray, digits: int) -> str:
     return " ".join(f"{value:.{digits}f}" for value in values)
 
 
-def second_table() -> None:
+def head_of_second_table() -> None:
     print(
         "\nSecond table, polished, no starting value: a0, a1, b, h. The ratio and the coverage are measured against the"
     )
     print("estimate linearised at the truth, whose sd is the bound; those of the runs alone scatter by")
     print(f"{1 / np.sqrt(2 * RUNS):.2f} and {100 * np.sqrt(0.05 * 0.95 / RUNS):.0f} points (sd).")
     print("Cramer-Rao bound at noise 5: a1 .00205, a0 .00046, b .0025, h .00088; paper's starred: .002 .0005 .002 .001")
-    for delay_s in (0.05, 1.0, 2.0, 4.0, 6.0, 8.0, 10.0):
-        case = Efficiency(example_2(delay_s, past_s=12.0), delay_s, largest=12.0)
-        for sd in (5.0, 10.0, 20.0):
-            case.row(sd, f"105 s, h {delay_s:g}, noise {sd:g}", int(1000 * delay_s + sd))
-    for duration_s in (10.0, 15.0, 30.0, 60.0):
-        case = Efficiency(example_2(4.0, duration_s, past_s=12.0), 4.0, largest=12.0)
-        for sd in (5.0, 10.0, 20.0):
-            case.row(sd, f"{duration_s:g} s, h 4, noise {sd:g}", int(duration_s + sd))
-    print("  past input unknown (y from h on is used; the bound is that of those rows)")
-    for delay_s in (0.05, 4.0, 10.0):
-        Efficiency(example_2(delay_s), delay_s, largest=30.0).row(
-            10.0, f"105 s, h {delay_s:g}, noise 10", int(1000 * delay_s)
-        )
 
 
-def coloured_noise() -> None:
+def over_delays(delay_s: float) -> None:
+    case = Efficiency(example_2(delay_s, past_s=12.0), delay_s, largest=12.0)
+    for sd in (5.0, 10.0, 20.0):
+        case.row(sd, f"105 s, h {delay_s:g}, noise {sd:g}", int(1000 * delay_s + sd))
+
+
+def over_durations(duration_s: float) -> None:
+    case = Efficiency(example_2(4.0, duration_s, past_s=12.0), 4.0, largest=12.0)
+    for sd in (5.0, 10.0, 20.0):
+        case.row(sd, f"{duration_s:g} s, h 4, noise {sd:g}", int(duration_s + sd))
+
+
+def past_unknown(delay_s: float) -> None:
+    label = f"105 s, h {delay_s:g}, noise 10, past input unknown (y from h on is used; the bound is that of those rows)"
+    Efficiency(example_2(delay_s), delay_s, largest=30.0).row(10.0, label, int(1000 * delay_s))
+
+
+def coloured_head() -> None:
     print("\nAR(1) noise of sd 5 on Example 2 at 500 Hz: the bound is that of the known colour; a0, a1, b, h")
-    for ar in (0.0, 0.5, 0.9, 0.98):
-        Efficiency(example_2(past_s=8.0), 4.0, largest=8.0, ar=ar).row(5.0, f"AR(1) {ar:4.2f}", int(100 * ar))
+
+
+def coloured_noise(ar: float) -> None:
+    Efficiency(example_2(past_s=8.0), 4.0, largest=8.0, ar=ar).row(5.0, f"AR(1) {ar:4.2f}", int(100 * ar))
 
 
 def table_2() -> None:
@@ -290,13 +306,26 @@ def linear_time() -> None:
         )
 
 
+def warm_up() -> None:
+    identify_delay(replace(example_2(rate_hz=50.0), name="warm-up"), 2)
+
+
 def main() -> None:
     print(f"{RUNS} runs per row")
-    identify_delay(replace(example_2(rate_hz=50.0), name="warm-up"), 2)
-    table_1()
-    table_2()
-    example_1()
-    examples_4_and_5()
-    linear_time()
-    coloured_noise()
-    second_table()
+    print_all(
+        [
+            head_of_table_1,
+            *(partial(table_1, sd) for sd in TABLE_1),
+            table_2,
+            example_1,
+            examples_4_and_5,
+            coloured_head,
+            *(partial(coloured_noise, ar) for ar in (0.0, 0.5, 0.9, 0.98)),
+            head_of_second_table,
+            *(partial(over_delays, delay_s) for delay_s in (0.05, 1.0, 2.0, 4.0, 6.0, 8.0, 10.0)),
+            *(partial(over_durations, duration_s) for duration_s in (10.0, 15.0, 30.0, 60.0)),
+            *(partial(past_unknown, delay_s) for delay_s in (0.05, 4.0, 10.0)),
+        ],
+        warm_up,
+    )
+    linear_time()  # alone: it measures the memory of its process
