@@ -116,7 +116,7 @@ def closed_loop_json(result: ClosedLoopIdentification) -> dict[str, Any]:
         "warnings": list(result.warnings),
     }
     if result.law is not None:
-        share = result.law.unexplained
+        share = result.law.beyond_rounding
         content["controller"] = {
             "unexplained": share if math.isfinite(share) else None,
             "r_enters_at": result.law.summation,

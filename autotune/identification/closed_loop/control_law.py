@@ -40,17 +40,26 @@ class LawCheck:
         Root mean square of the command's motion that the law does not explain, relative to that motion.
     gain_ratio : float
         Gain with which the law would explain the most, 1 where the file is right.
+    rounding : float
+        The part of ``unexplained`` that rounding the command to its resolution in the recording can have made; none of
+        what another gain would explain.
     """
 
     controller: DiscreteController
     summation: Summation
     unexplained: float
     gain_ratio: float
+    rounding: float
+
+    @property
+    def beyond_rounding(self) -> float:
+        """Unexplained share of the command's motion that its rounding does not account for."""
+        return math.sqrt(self.unexplained**2 - self.rounding**2)
 
     @property
     def contradicts(self) -> bool:
         """Whether the recorded command cannot have come from this law."""
-        return not self.unexplained <= CONTRADICTION
+        return not self.beyond_rounding <= CONTRADICTION
 
 
 def check_law(
@@ -89,20 +98,20 @@ def check_law(
 
     Notes
     -----
-    Rows in which the command sits at its extremes (saturated) are left out. Quantisation of the command counts as
-    unexplained.
+    Rows in which the command sits at its extremes (saturated) are left out. A converter, or a log with few digits,
+    rounds the command after the law: errors uniform over the smallest difference between recorded values are allowed.
     """
     own = u - (np.zeros_like(u) if added is None else added)
     reference = np.zeros_like(u) if r is None else r
-    rows = _unsaturated(u)
+    rows, step = _unsaturated(u), _resolution(u)
     checks = []
     for law in discrete_laws(controller, sample_time_s):
         for late in (0, 1):  # computed from this row's measurement, or from the one before
             num = (0.0,) * late + law.num
             named = DiscreteController(num=num, den=law.den, sample_time_s=sample_time_s)
-            checks.append(_check(named, "set-point", own, reference - y, rows))
+            checks.append(_check(named, "set-point", own, reference - y, rows, step))
             if r is not None:
-                checks.append(_check(named, "command", own - reference, -y, rows))
+                checks.append(_check(named, "command", own - reference, -y, rows, step))
     return min(checks, key=lambda check: check.unexplained)
 
 
@@ -149,23 +158,27 @@ def _discretised(law: TransferFunction, sample_time_s: float, method: Method) ->
 
 
 def _check(
-    law: DiscreteController, summation: Summation, own: FloatArray, error: FloatArray, rows: FloatArray
+    law: DiscreteController, summation: Summation, own: FloatArray, error: FloatArray, rows: FloatArray, step: float
 ) -> LawCheck:
     skip = max(len(law.num), len(law.den)) - 1
     moved = lfilter(law.den, [1.0], own)[skip:]
     said = lfilter(law.num, [1.0], error)[skip:]
     kept = np.convolve(rows, np.ones(skip + 1), mode="valid") >= skip + 1
     if kept.sum() < 10:
-        return LawCheck(controller=law, summation=summation, unexplained=math.inf, gain_ratio=math.nan)
+        return LawCheck(controller=law, summation=summation, unexplained=math.inf, gain_ratio=math.nan, rounding=0.0)
     moved, said = moved[kept] - moved[kept].mean(), said[kept] - said[kept].mean()
     motion = float(np.sqrt(np.mean(moved**2)))
     rest = float(np.sqrt(np.mean((moved - said) ** 2)))
     power = float(said @ said)
+    gain = float(moved @ said) / power if power > 0 else math.nan
+    by_no_gain = float(np.sqrt(np.mean((moved - gain * said) ** 2))) if power > 0 else rest
+    rounded = step / math.sqrt(12.0) * float(np.linalg.norm(law.den))
     return LawCheck(
         controller=law,
         summation=summation,
         unexplained=rest / motion if motion > 0 else math.inf,
-        gain_ratio=float(moved @ said) / power if power > 0 else math.nan,
+        gain_ratio=gain,
+        rounding=min(rounded, by_no_gain, rest) / motion if motion > 0 else 0.0,
     )
 
 
@@ -177,3 +190,9 @@ def _unsaturated(u: FloatArray) -> FloatArray:
         if 0.01 * len(u) < at.sum() < 0.9 * len(u):
             keep[at] = 0.0
     return keep
+
+
+def _resolution(signal: FloatArray) -> float:
+    """Return the smallest difference between the values (N,) of a signal; below a millionth of its range it is none."""
+    apart = np.diff(np.unique(signal))
+    return float(np.min(apart, where=apart > 1e-6 * np.ptp(signal), initial=np.inf)) if apart.size else 0.0

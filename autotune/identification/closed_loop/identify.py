@@ -254,19 +254,20 @@ def _checked_law(
     added = recording.extra.get("dither")
     added = added if added is not None and np.all(np.isfinite(added)) else None
     law = check_law(controller, recording.u, recording.y, r, recording.sample_time_s, added=added)
+    left = law.beyond_rounding
     if law.contradicts and r is None:
         warnings.append("r was not recorded, so the controller file cannot be checked against the data")
         return law
     if law.contradicts:
         hint = f"; a gain {law.gain_ratio:.3g} times as large would explain most" if law.gain_ratio > 0 else ""
         raise InputError(
-            f"the controller file contradicts the data: {100 * law.unexplained:.0f} % of the command's motion does not "
+            f"the controller file contradicts the data: {100 * left:.0f} % of the command's motion does not "
             f"come from this law (at most {100 * CONTRADICTION:.0f} % may){hint}",
             where=recording.name,
             mend="mend the file, or leave --controller away: the plant is identified without it",
         )
-    if law.unexplained > CONTRADICTION / 5.0:
-        warnings.append(f"the controller file leaves {100 * law.unexplained:.1f} % of the command's motion unexplained")
+    if left > CONTRADICTION / 5.0:
+        warnings.append(f"the controller file leaves {100 * left:.1f} % of the command's motion unexplained")
     return law
 
 

@@ -181,6 +181,16 @@ def test_controller_that_contradicts_the_data_is_refused_with_the_gain_that_woul
         identify_closed_loop(ball_loop(gain=1.5), controller=LAW)
 
 
+def test_converter_that_rounds_the_command_does_not_contradict_the_law() -> None:
+    right, wrong = (ball_loop(gain=gain) for gain in (1.0, 1.5))
+    law = check_law(LAW, np.round(right.u / 0.002) * 0.002, right.y, right["r"], DT)
+    assert law.unexplained > 0.2  # a step of the converter is two thirds of the law's rms step
+    assert law.beyond_rounding < 0.06
+    law = check_law(LAW, np.round(wrong.u / 0.002) * 0.002, wrong.y, wrong["r"], DT)
+    assert law.contradicts
+    assert law.gain_ratio == pytest.approx(1.5, rel=0.02)
+
+
 def test_additive_excitation_is_recognised() -> None:
     d = example_set(3)
     law = DiscreteController(num=tuple(CONTROLLER_NUM), den=tuple(CONTROLLER_DEN), sample_time_s=1.0)
