@@ -156,7 +156,7 @@ class Screen:
                 ui.button("Restore old gains", on_click=lambda: self._on_choice("restore"), color=None).classes(
                     "plain"
                 ).props("flat")
-                self._choice_note = ui.label().classes("note")
+                ui.label("Without an answer the new gains stay.").classes("note")
 
     @property
     def is_connected(self) -> bool:
@@ -231,8 +231,10 @@ class Screen:
 
     def _left_text(self) -> str:
         story = self._story
-        if story.ended is not None or story.waiting_s:
+        if story.ended is not None:
             return f"{story.now_s:.0f} s on the rig"
+        if story.waiting_s:
+            return f"{story.decision_s:.0f} s left to decide; without an answer the new gains stay"
         left = (
             f"{story.remaining_s:.0f} s left in this state"
             if math.isfinite(story.remaining_s)
@@ -267,7 +269,6 @@ class Screen:
         for button in self._choice:
             if isinstance(button, ui.button):
                 button.set_enabled(self._holds_controls)
-        self._choice_note.text = f"Without an answer within {story.waiting_s:.0f} s the new gains stay."
         if self._gains_news == story.news:
             return
         self._gains_news = story.news

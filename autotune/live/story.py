@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import time
 import tomllib
 from array import array
 from dataclasses import dataclass, field
@@ -127,6 +128,7 @@ class Story:
         self.accepted, self.verdict = False, ""
         self.gains: Gains | None = None
         self.waiting_s = 0.0
+        self._asked_s = 0.0
         self.ended: str | None = None
         self.output = ""
 
@@ -172,7 +174,7 @@ class Story:
                 self.gains = Gains(old=old, new=_controller(event["new"]), deployed=event["deployed"])
                 self.waiting_s = 0.0
             case "waiting":
-                self.waiting_s = event["patience_s"]
+                self.waiting_s, self._asked_s = event["patience_s"], time.monotonic()
             case "ended":
                 self.ended, self.waiting_s = event["reason"], 0.0
                 self.output = self._output()
@@ -241,6 +243,11 @@ class Story:
     def remaining_s(self) -> float:
         """Rig time that the present state is still expected to take [s]; NaN while nobody can know."""
         return max(0.0, self._remaining_s - (self.now_s - self._told_s))
+
+    @property
+    def decision_s(self) -> float:
+        """Time left to decide otherwise, counted from when this process heard of it [s]."""
+        return max(0.0, self.waiting_s - (time.monotonic() - self._asked_s))
 
     def relay_text(self) -> str:
         """Return what the relay does now, in words; nothing while none runs."""

@@ -158,6 +158,7 @@ def test_light_or_dark_narrow_or_wide_everything_can_be_read(opened: Callable[..
 
 def test_by_keyboard_alone_the_old_gains_are_asked_back(opened: Callable[..., Page], deciding: LivePage) -> None:
     page = opened(deciding.url)
+    expect(page.locator(".left")).to_have_text(re.compile(r"^\d+ s left to decide"), timeout=LIMIT_MS)
     take, restore = (page.get_by_role("button", name=name) for name in ("Take the controls", "Restore old gains"))
     expect(page.locator("header .note")).to_have_text(re.compile("holds the controls"), timeout=LIMIT_MS)
     if take.is_visible():  # the page of another test had them
