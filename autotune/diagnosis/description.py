@@ -31,6 +31,8 @@ SMOOTHINGS = (1e-4, 1e-3, 1e-2, 1e-1, 1.0)
 LEVEL = 1e-3
 #: Share of a signal's size within which its sign passes through zero.
 SOFT_SIGN = 0.02
+#: Delays of a reading that are tried: how many, the shortest in rows, and the longest as a fraction of a window.
+DELAYS, SHORTEST_DELAY, DELAYS_PER_WINDOW = 16, 4.0, 3.0
 _ADDS_TO = {"actuator": "the command", "plant": "the plant's input", "sensor": "the reading"}
 
 
@@ -216,16 +218,44 @@ def _candidates(leftover: Leftover) -> Iterator[_Candidate]:
         yield _Candidate(place=place, text="time", unit=unit, factor=1.0 / _size(clock), column=column)
 
 
+def _memories(leftover: Leftover) -> Iterator[_Candidate]:
+    """Yield what a sensor may add that no function of one instant is: readings of some time before, and the command.
+
+    The command is the one held while the reading was taken: that of the row itself follows the reading's noise.
+    """
+    data, values = leftover.data, leftover.signals["sensor"].get("reading")
+    unit = leftover.unit["sensor"]
+    held = [np.concatenate([r.u[:1], r.u[:-1]]) - leftover.result.sim.u_offset for r in data.recordings]
+    if np.ptp(np.concatenate(held)) > 0.0:
+        size = _size(held)
+        column = leftover.shown("sensor", [w / size for w in held])
+        yield _Candidate(place="sensor", text="command", unit=unit, factor=1.0 / size, column=column)
+    if values is None:
+        return
+    Ts, size = data.sample_times[0], _size(values)
+    longest = max(int(np.max(b - a)) for a, b in zip(data.starts, data.stops, strict=True)) * Ts / DELAYS_PER_WINDOW
+    for delay in np.geomspace(SHORTEST_DELAY * Ts, max(longest, 2.0 * SHORTEST_DELAY * Ts), DELAYS):
+        before = [np.interp(r.t - delay, r.t, y) / size for r, y in zip(data.recordings, values, strict=True)]
+        column, text = leftover.shown("sensor", before), f"(reading {delay:.3g} s before)"
+        yield _Candidate(place="sensor", text=text, unit=unit, factor=1.0 / size, column=column)
+
+
 def _equation(leftover: Leftover) -> tuple[tuple[Term, ...], Place, float]:
-    """Select up to three terms, all added at one place, as long as held-out windows ask for one more."""
-    pool = [c for c in _candidates(leftover) if leftover.is_new(c.column)]
+    """Select up to three terms of one place and kind, as long as held-out windows ask for one more."""
+    pool, memories = (
+        [c for c in some if leftover.is_new(c.column)] for some in (_candidates(leftover), _memories(leftover))
+    )
     before = leftover.cross_validated(np.zeros((leftover.e.size, 0)))
     least = max(LEAST_SHARE * (before - leftover.floor), LEAST_DECREASE)
     chosen: list[_Candidate] = []
     error = before
-    groups = [[c for c in pool if c.place == place] for place in leftover.signals]
+    groups = [*([c for c in pool if c.place == place] for place in leftover.signals), memories]
     for size in range(1, MOST_TERMS + 1):
-        found, i = min((leftover.best_subset([c.column for c in group], size), i) for i, group in enumerate(groups))
+        found, i = min(
+            (leftover.best_subset([c.column for c in group], size), i)
+            for i, group in enumerate(groups)
+            if len(group) >= size
+        )
         if error - found[0] < least:
             break
         error, chosen = found[0], [groups[i][k] for k in found[1]]

@@ -10,7 +10,7 @@ from types import MappingProxyType
 import numpy as np
 
 from autotune.controller import Controller
-from autotune.diagnosis.description import describe
+from autotune.diagnosis.description import Description, describe
 from autotune.diagnosis.discriminate import next_experiment
 from autotune.diagnosis.fitting import Fit
 from autotune.diagnosis.judgement import MISSING, dominates, doubt_of, held_out, is_adequate, is_white, rivals
@@ -112,7 +112,8 @@ def _judge(found: Search, samples: list[SampleEffect], model: Model) -> Diagnosi
     verdict = _verdict(found, samples, adequate, offset is not None)
     candidates = rivals(found, doubt)
     effects = _effects(found, samples, offset, candidates) if verdict == "effect" else ()
-    places = _places(effects) if verdict == "effect" else (_suspected(found) if verdict == "unexplained" else ())
+    description = describe(found.retuned.fit, found.data) if verdict == "unexplained" else None
+    places = _places(effects) if description is None else _suspected(found, description)
     use = chosen if extended_is_better and verdict in ("effect", "unexplained") else found.retuned
     extended = model if verdict == "none" else use.fit.model
     clips = [Effect(name=s.name, parameters=s.parameters) for s in samples if s.name == "sensor.saturation"]
@@ -126,7 +127,7 @@ def _judge(found: Search, samples: list[SampleEffect], model: Model) -> Diagnosi
         next_experiment=next_experiment(found, effects, verdict),
         extended_model=extended,
         sentences=_sentences(verdict, effects, quality, places),
-        description=describe(found.retuned.fit, found.data) if verdict == "unexplained" else None,
+        description=description,
         search=found,
     )
 
@@ -274,10 +275,10 @@ def _places(effects: Sequence[FoundEffect]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(place for e in effects for place in e.places))
 
 
-def _suspected(found: Search) -> tuple[str, ...]:
-    """Return the places of the candidates that come nearest to an explanation."""
+def _suspected(found: Search, description: Description) -> tuple[str, ...]:
+    """Return where a description adds its terms, and the places of the candidates nearest to an explanation."""
     ranked = sorted((*found.singles, *found.pairs), key=score)
-    places: dict[str, None] = {}
+    places: dict[str, None] = {description.place: None} if description.terms else {}
     for h in ranked[:3]:
         for name in h.names:
             entry = entry_of(name)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -59,6 +60,19 @@ def test_a_damper_on_one_side_is_half_straight_and_half_bent_and_only_the_bent_h
     found = described(*(servo_recording(seed, lambda x, v: -0.1 * max(v, 0.0)) for seed in (7, 8)))
     assert [t.text for t in found.terms] == ["|speed|"]
     assert found.terms[0].value == pytest.approx(-0.05, rel=0.1)
+
+
+def test_a_sensor_that_sees_the_past_or_the_command_is_described_as_such() -> None:
+    """An echo of 0.2 after 0.5 s, and a twentieth of the command held while the reading was taken."""
+    plain = [servo_recording(seed) for seed in (14, 15)]
+    echoes = [replace(r, y=r.y + 0.2 * np.interp(r.t - 0.5, r.t, r.y)) for r in plain]
+    found = described(*echoes)
+    assert found.place == "sensor"
+    assert all(t.text.startswith("(reading") for t in found.terms)
+    leaks = [replace(r, y=r.y + 0.05 * np.append(r.u[0], r.u[:-1])) for r in plain]
+    found = described(*leaks)
+    assert [t.text for t in found.terms] == ["command"]
+    assert found.terms[0].value == pytest.approx(0.05, rel=0.1)
 
 
 def test_noise_alone_is_not_described() -> None:
