@@ -90,14 +90,15 @@ def main() -> None:
 
 
 def _leave(line: str, status: int) -> NoReturn:
-    Console(stderr=True, highlight=False, soft_wrap=True).print(f"autotune: {line}", markup=False)
+    if line:
+        Console(stderr=True, highlight=False, soft_wrap=True).print(f"autotune: {line}", markup=False)
     sys.exit(status)
 
 
 def _usage(error: Any) -> str:
-    """Return what was wrong with the call in one line, and where its help is; the help itself for an empty call."""
+    """Return what was wrong with the call in one line, and where its help is; nothing where the help was shown."""
     line = str(error.format_message())
-    if "\n" in line or not isinstance(error, UsageError):
+    if not line or "\n" in line or not isinstance(error, UsageError):
         return line
     context = error.ctx
     return f"{line} See: {context.command_path if context else 'autotune'} --help"
