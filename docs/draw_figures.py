@@ -1,7 +1,7 @@
 """``make figures``: commission the simulated ball and draw the pictures of the pages from its files.
 
-The curves are vector graphics; ``report.png`` is the head of the run's own report as Chromium shows it, where there
-is one.
+The curves are vector graphics; ``report.png`` and ``live.png`` are the run's own pages as Chromium shows them, where
+there is one.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import shutil
 import subprocess
 import tempfile
 import tomllib
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -54,6 +55,7 @@ def main() -> None:
         recordings = [read_recording(out / part.recording) for part in tuning.experiment.parts]
         write_page(run_page(config.name, config.signals, recordings, tuning, None), out / "report.html")
         _report(out / "report.html")
+        _live(out, Path(folder) / "live")
 
 
 def _save(figure: Any, name: str) -> None:
@@ -133,6 +135,34 @@ def _report(page: Path) -> None:
             ],
             check=True, capture_output=True,
         )  # fmt: skip
+
+
+def _live(out: Path, folder: Path) -> None:
+    """Show the live page in the midst of the sweep."""
+    chromium = shutil.which("chromium")
+    if chromium is None or find_spec("playwright") is None or find_spec("nicegui") is None:
+        print("live.png is left as it is: apt-get install chromium, pip install 'relay-autotune[live,test]'")
+        return
+    from playwright.sync_api import sync_playwright
+
+    from autotune.live.session import LivePage
+
+    folder.mkdir()
+    events = (out / "progress.jsonl").read_text(encoding="utf-8").splitlines(keepends=True)
+    until = next(i for i, event in enumerate(events) if "point 5 of" in event)
+    (folder / "progress.jsonl").write_text("".join(events[:until]), encoding="utf-8")
+    now_s = json.loads(events[until])["elapsed_s"] - 1.0
+    rows = (out / "recording.csv").read_text(encoding="utf-8").splitlines(keepends=True)
+    known = [row for row in rows if not row[0].isdigit() or float(row.split(",")[0]) < now_s]
+    (folder / "recording.csv").write_text("".join(known), encoding="utf-8")
+    with LivePage(folder, "127.0.0.1", 0, None) as live, sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
+        page = browser.new_page(viewport={"width": 1500, "height": 900})
+        page.goto(live.url)
+        page.get_by_text("This page holds the controls").wait_for()
+        page.wait_for_function("[...document.querySelectorAll('canvas')].every(c => c.toDataURL().length > 5000)")
+        page.screenshot(path=HERE / "live.png")
+        browser.close()
 
 
 if __name__ == "__main__":

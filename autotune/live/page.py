@@ -106,6 +106,7 @@ class Screen:
             self._time_section()
             self._outcome_section()
             self._frequency_section()
+        self._show_words()  # so that a browser shows nothing for a moment that is not so
 
     def _bar(self) -> None:
         with ui.element("header").classes("bar"):
