@@ -54,7 +54,7 @@ GRIDS: Mapping[str, Sequence[float]] = {
     "WHITE": (0.9, 0.95, 1.0, 1.05, 1.08, 1.1, 1.12, 1.15, 1.2, 1.3),
     "MISSING": (1.01, 1.02, 1.03, 1.05, 1.08, 1.12),
     "DOMINANT": (0.35, 0.5, 0.7, 0.8, 0.9, 0.95),
-    "FAR_FROM_NOISE": (3.0, 6.0, 12.0, 25.0),
+    "FAR_FROM_NOISE": (4.0, 6.0, 7.0, 8.0, 10.0, 15.0),
 }
 TEMPERATURES = (1.5, 2.0, 3.0, 4.0, 5.0, 6.0)
 DOUBTS = (0.01, 0.02, 0.03, 0.05, 0.07, 0.1, 0.15, 0.2)
@@ -233,7 +233,8 @@ def main() -> None:
     for name, grid in GRIDS.items():
         tried = " ".join(f"{v:g}: {'/'.join(map(str, counts(chain, {**in_use, name: v})))}" for v in grid)
         print(f"  {name:15s} {in_use[name]:g} in use;  {tried}")
-    print("  log loss / expected error / wrong of those at p >= 0.95:")
+    rows = [r for r in rows if r not in chain or judged(r, in_use) == "named"]
+    print("  log loss / expected error / wrong of those at p >= 0.95, of what is named with the bounds in use:")
     for name, pairs in (
         ("TEMPERATURE", [(t, judgement.UNKNOWN) for t in TEMPERATURES]),
         ("UNKNOWN", [(judgement.TEMPERATURE, d) for d in DOUBTS]),
