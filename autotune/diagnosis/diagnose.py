@@ -118,18 +118,19 @@ def _judge(found: Search, samples: list[SampleEffect], model: Model) -> Diagnosi
     extended = model if verdict == "none" else use.fit.model
     clips = [Effect(name=s.name, parameters=s.parameters) for s in samples if s.name == "sensor.saturation"]
     extended = replace(extended, effects=(*_with_uncertainty(use, extended.effects), *clips))
-    return Diagnosis(
+    said = Diagnosis(
         verdict=verdict,
         effects=effects,
         candidates=candidates,
         places=places,
         fit=quality,
-        next_experiment=next_experiment(found, effects, verdict),
+        next_experiment=None,
         extended_model=extended,
         sentences=_sentences(verdict, effects, quality, places),
         description=description,
         search=found,
     )
+    return replace(said, next_experiment=next_experiment(said))
 
 
 def _verdict(found: Search, samples: list[SampleEffect], adequate: bool, offset: bool) -> Verdict:

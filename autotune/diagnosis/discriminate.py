@@ -1,38 +1,88 @@
-"""The next experiment: what to record to tell apart what the recordings leave open."""
+"""The next experiment: what to record to tell apart what the recordings leave open.
+
+Where hypotheses are left, the experiment is planned as ``autotune investigate`` plans it on a rig, see
+:mod:`autotune.diagnosis.discrimination`, within what the recordings have shown of the rig.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
 
 import numpy as np
 
-from autotune.diagnosis.result import FoundEffect, NextExperiment, Verdict
-from autotune.diagnosis.search import score
-from autotune.diagnosis.selection import Search
+from autotune.config import Config
+from autotune.config.procedure import ControllerSettings, LimitSettings, OperatingPointSettings, SignalSettings
+from autotune.controller import PIDController
+from autotune.diagnosis.discrimination import LEAST_DISCRIMINATION, alive, plan_in
+from autotune.diagnosis.law import stated_law
+from autotune.diagnosis.result import Diagnosis, FoundEffect, NextExperiment
 from autotune.diagnosis.simulation import entry_of
+from autotune.errors import InputError
+
+#: Rows of a planned experiment: enough to rank the kinds.
+PLANNED_ROWS = 1000
 
 
-def next_experiment(found: Search, effects: Sequence[FoundEffect], verdict: Verdict) -> NextExperiment | None:
+def next_experiment(found: Diagnosis) -> NextExperiment | None:
     """Return the experiment that would decide most, None where nothing is open.
 
     Parameters
     ----------
-    found : Search
-        Hypotheses with their fits.
-    effects : sequence of FoundEffect
-        What was named.
-    verdict : str
-        The verdict.
+    found : Diagnosis
+        Its verdict, effects, candidates and search.
     """
-    if verdict in ("none", "parameters"):
+    if found.verdict in ("none", "parameters"):
         return None
-    for effect in effects:
+    for effect in found.effects:
         if len(effect.places) > 1:
             return _extra_signal(effect)
-    ranked = sorted((h for h in (*found.singles, *found.pairs) if h.names), key=score)
-    if verdict == "unexplained" or (len(ranked) > 1 and score(ranked[1]) - score(ranked[0]) < 20.0):
-        return _larger_swing(found, [" + ".join(h.names) for h in ranked[:2]])
-    return None
+    if found.verdict == "effect" and len(alive(found)) < 2:
+        return None
+    return _planned(found) or (_larger_swing(found) if found.verdict == "unexplained" else None)
+
+
+def _planned(found: Diagnosis) -> NextExperiment | None:
+    """Return the experiment that separates the hypotheses alive best; nothing where none does."""
+    if len(alive(found)) < 2:
+        return None
+    recorded = as_recorded(found)
+    rows = min(PLANNED_ROWS, *(len(r) for r in found.search.data.recordings))
+    try:
+        plan = plan_in(found, recorded, rows * recorded.signals.sample_time_s)
+    except InputError:  # an integrating plant without a stated law
+        return None
+    if plan is None or plan.discrimination < LEAST_DISCRIMINATION:
+        return None
+    return NextExperiment(
+        purpose="tell " + " from ".join(plan.between),
+        kind=plan.excitation.kind,
+        settings={k: float(f"{v:.4g}") if isinstance(v, float) else v for k, v in plan.excitation.settings().items()},
+        expected=f"where one is true the others miss it by {plan.discrimination:.3g} noise variances on average",
+    )
+
+
+def as_recorded(found: Diagnosis) -> Config:
+    """Return limits, operating point and law as the recordings show them: a plan goes no further than they went."""
+    recordings = found.search.data.recordings
+    u, y = (np.concatenate([getattr(r, key) for r in recordings]) for key in ("u", "y"))
+    y = y[np.isfinite(y)]
+    centre = float(np.median(y))
+    controller = None
+    for r in recordings:
+        stated = stated_law(r.metadata, None)
+        if stated is not None and isinstance(stated.controller, PIDController):
+            controller = ControllerSettings(K=stated.controller.K, Ti_s=min(stated.controller.Ti_s, 1e9))
+    # no rig is meant by it, so that none is given
+    return Config.model_construct(
+        name="as recorded",
+        signals=SignalSettings(sample_time_s=recordings[0].sample_time_s),
+        limits=LimitSettings(
+            u_min=float(u.min()), u_max=float(u.max()), u_safe=float(np.median(u)), y_min=float(y.min()),
+            y_max=float(y.max()), swing=float(np.max(np.abs(y - centre))),
+        ),
+        operating_point=OperatingPointSettings(y=centre, u_guess=float(np.median(u)), u_uncertainty=float(np.ptp(u))),
+        controller=controller,
+    )  # fmt: skip
 
 
 def _extra_signal(effect: FoundEffect) -> NextExperiment:
@@ -53,16 +103,21 @@ def _extra_signal(effect: FoundEffect) -> NextExperiment:
     )
 
 
-def _larger_swing(found: Search, names: list[str]) -> NextExperiment:
-    u = np.concatenate([r.u for r in found.data.recordings])
-    middle, span = float(np.median(u)), float(np.ptp(u))
-    lag = 1.0 / max(float(np.min(np.abs(np.linalg.eigvals(found.chosen.fit.sim.chain.A)) + 1e-9)), 1e-6)
+def _larger_swing(found: Diagnosis) -> NextExperiment:
+    """Return a staircase as wide as the recordings: of the command, of the set-point where the plant integrates."""
+    chain, recordings = found.search.chosen.fit.sim.chain, found.search.data.recordings
+    on, name = ("y", "set-point") if chain.is_integrating else ("u", "command")
+    values = np.concatenate([getattr(r, on)[np.isfinite(getattr(r, on))] for r in recordings])
+    middle, span = float(np.median(values)), float(np.ptp(values))
+    rates = np.abs(np.linalg.eigvals(chain.A))
+    lag = 1.0 / max(float(np.min(rates[rates > 1e-6 * rates.max()], initial=math.inf)), 1e-6)
     return NextExperiment(
-        purpose="tell " + " from ".join(names) if len(names) > 1 else "see where the misfit comes from",
+        purpose="see where the misfit comes from",
         kind="staircase",
         settings={
+            "on": name,
             "levels": [round(middle + share * span, 6) for share in (-0.5, -0.25, 0.0, 0.25, 0.5)],
-            "hold_s": round(min(5.0 * lag, 0.2 * found.data.recordings[0].duration_s), 3),
+            "hold_s": round(min(5.0 * lag, 0.2 * recordings[0].duration_s), 3),
         },
         expected="gain, lag and start-up delay at every level and in both directions: what depends on level, on speed, "
         "on direction or on time shows separately",
