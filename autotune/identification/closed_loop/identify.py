@@ -41,6 +41,8 @@ from autotune.recording import Recording
 _LOOK_ROWS = 20_000
 #: Time stamps may stray this far from the grid, as a share of the sample time.
 _JITTER = 0.25
+#: Poles and zeros of the noise model beyond this are one for all that a record can tell.
+_ON_THE_CIRCLE = 0.999
 #: Fewest rows a closed-loop identification accepts.
 _FEWEST_ROWS = 60
 
@@ -362,7 +364,16 @@ def _further_warnings(
             f"the residuals are not white (probability {result.whiteness.probability:.1g}): the model leaves dynamics "
             "or a nonlinearity out, and its regions are too small"
         )
+    model = result.estimate.model
+    spread = 2.0 * np.sqrt(np.trace(result.pole_covariance, axis1=1, axis2=2))
+    integrators = int(np.sum(np.abs(result.poles) > _ON_THE_CIRCLE - spread))
+    trends = int(np.sum(np.abs(np.linalg.eigvals(model.A - model.K @ model.C)) > _ON_THE_CIRCLE))
+    if trends > integrators and not result.estimate.noise_free:
+        warnings.append(
+            f"the noise model takes out more trends ({trends}) than the plant integrates ({integrators}): the record "
+            "is too short to tell noise from drift, and the regions are too small; record several times as long"
+        )
     if not result.estimate.converged:
         warnings.append("the polish stopped before it converged; try a lower --order")
-    if evidence and result.estimate.model.order == max(candidate.order for candidate in evidence):
-        warnings.append(f"the best order is the highest tried, {result.estimate.model.order}: try --max-order")
+    if evidence and model.order == max(candidate.order for candidate in evidence):
+        warnings.append(f"the best order is the highest tried, {model.order}: try --max-order")

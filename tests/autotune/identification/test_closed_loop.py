@@ -108,6 +108,13 @@ def test_loop_moved_by_feedback_alone_is_refused_and_says_why() -> None:
         identify_closed_loop(without_r(still))
 
 
+def test_record_too_short_to_tell_noise_from_drift_says_that_its_regions_are_too_small() -> None:
+    short, long = (ball_loop(rows=rows, noise=0.2, dither=0.0125, period=0, seed=9) for rows in (300, 3000))
+    said = "takes out more trends"
+    assert any(said in warning for warning in identify_closed_loop(short, order=2).warnings)
+    assert not any(said in warning for warning in identify_closed_loop(long, order=2).warnings)
+
+
 def test_missing_r_is_said_where_the_command_is_rich_enough() -> None:
     found = identify_closed_loop(without_r(ball_loop(period=0, dither=0.02)), order=2)
     assert any("r was not recorded" in warning for warning in found.warnings)
