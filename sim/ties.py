@@ -162,7 +162,7 @@ def draw(seed: int) -> Tie:
 
 
 def write(tie: Tie, folder: Path) -> None:
-    """Write ``model.toml``, ``config.toml`` and the gentle recording ``first.csv`` of a tie."""
+    """Write ``model.toml``, ``config.toml`` and the gentle recording ``first.csv`` of a tie with its sidecar."""
     random = np.random.default_rng((tie.seed, 2))
     gain, tau = GAIN * random.uniform(0.85, 1.15), TAU * random.uniform(0.85, 1.15)
     folder.mkdir(parents=True, exist_ok=True)
@@ -177,3 +177,4 @@ def write(tie: Tie, folder: Path) -> None:
         plant.advance(u, SAMPLE_TIME_S)
         rows.append(f"{k * SAMPLE_TIME_S:.2f},{u:.6g},{y:.6g}")
     (folder / "first.csv").write_text("\n".join(rows) + "\n", encoding="utf-8")
+    (folder / "first.toml").write_text(f'[controller]\nkind = "P"\nK = {CONTROLLER_GAIN}\n', encoding="utf-8")

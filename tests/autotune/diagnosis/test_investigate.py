@@ -14,15 +14,18 @@ from autotune.cli import app
 from autotune.config import Config, load_config
 from autotune.diagnosis.catalogue import CATALOGUE
 from autotune.diagnosis.diagnose import diagnose
+from autotune.diagnosis.discriminate import as_recorded
 from autotune.diagnosis.discrimination import alive, excitations, planned_recording
 from autotune.diagnosis.investigate import Investigation, investigate
 from autotune.diagnosis.simulation import assemble
 from autotune.errors import ExperimentStopped, InputError
-from autotune.models import Block, Model, Port, TransferFunction, write_model
-from autotune.recording import Recording, write_recording
+from autotune.experiment.excitation import Excitation
+from autotune.models import Block, Model, Port, TransferFunction, read_model, write_model
+from autotune.recording import Recording, read_recording, write_recording
 from drivers.simulated import SimulatedRig
 from sim.imperfections import Fault, FaultyPlant
 from sim.tank import TwoTank, TwoTankSettings
+from sim.ties import draw, write
 from tests.autotune.diagnosis.servo_rigs import servo_model
 
 CONFIGS = Path(__file__).resolve().parents[3] / "configs"
@@ -162,3 +165,27 @@ def test_the_command_ends_at_once_where_the_simulation_explains_the_recording(tm
     assert json.loads((tmp_path / "out" / "diagnosis.json").read_text())["verdict"] in ("none", "parameters")
     assert "How it was learnt" in (tmp_path / "out" / "report.html").read_text()
     assert not list((tmp_path / "out").glob("rig_*.csv"))
+
+
+def test_a_diagnosis_asks_for_an_experiment_between_the_hypotheses_left_that_goes_no_further_than_the_recording(
+    tmp_path: Path,
+) -> None:
+    """Gentle steps of a servo with dry friction leave open whether it slides or creeps before it slides."""
+    write(draw(3999), tmp_path)
+    recording = read_recording(tmp_path / "first.csv")
+    frictions = ("plant.coulomb_friction", "plant.hysteresis")
+    found = diagnose(
+        read_model(tmp_path / "model.toml"), [recording], without=[name for name in CATALOGUE if name not in frictions]
+    )
+    asked = found.next_experiment
+    assert asked is not None
+    left = [name for name in frictions if name in asked.purpose]
+    assert len(left) == 2
+    assert set(left) <= set(alive(found))
+    planned = planned_recording(
+        found.search.retuned.fit.sim, as_recorded(found), Excitation(kind=asked.kind, **asked.settings)
+    )
+    assert planned is not None
+    for now, then in ((planned.u, recording.u), (planned.y, recording.y)):
+        assert then.min() <= now.min()
+        assert now.max() <= then.max()
