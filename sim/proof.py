@@ -102,7 +102,7 @@ def diagnose(campaign: Campaign, seed: int) -> None:
         horizon = f"{json.loads(campaign.answer(seed).read_text(encoding='utf-8'))['horizon']:g}"
         words = ["simulate", "--model", str(out / "extended_model.toml"), str(case / "unseen.csv")]
         said = _run(campaign, [*words, "--horizon", horizon, "--out", str(out / "unseen_sim.csv")])
-    if said.returncode in (STOPPED, -signal.SIGINT):
+    if said.returncode in (STOPPED, -signal.SIGINT, -signal.SIGTERM):
         raise InterruptedError(f"the operator stopped the diagnosis of case {seed}")  # it is not finished
     (out / "stderr.txt").write_text(said.stderr, encoding="utf-8")
     (out / "finished").write_text(f"{said.returncode}\n", encoding="utf-8")
