@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from sim.proof import Campaign, conceal, diagnose, keep_failures, mark_all, seal
+from sim.proof import Campaign, conceal, diagnose, keep_failures, mark_all, seal, singles
 
 ALWAYS_NONE = """
 import json, pathlib, sys
@@ -43,6 +43,13 @@ def test_a_campaign_is_sealed_diagnosed_and_marked_and_goes_on_where_it_was_stop
         assert m.verdict_right == (answer["verdict"] == "none")
         if answer["improvable"]:  # this program cheats: its forecast is the measurement itself
             assert m.gap > 1.0
+    ablated = replace(campaign, without="plant.leak")  # what it says is kept apart
+    assert ablated.finished == []
+    diagnose(ablated, 67)
+    assert ablated.finished == [67]
+    assert campaign.finished == [66, 67, 68]
+    for name, seeds in singles(campaign).items():
+        assert all(name in campaign.answer(seed).read_text() for seed in seeds)
     text = keep_failures(campaign, marks).read_text()
     assert text.count("case_") == sum(m.failed for m in marks) > 0
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sim.score import calibration_error, confusion, mark, table, wilson
+from sim.score import calibration_error, confusion, mark, resolved, table, wilson
 
 ANSWER = {
     "kind": "single",
@@ -60,6 +60,17 @@ def test_outside_the_catalogue_the_place_still_counts():
     assert m.place_right
     assert m.gap is None
     assert mark("c", OUTSIDE, said("effect", "sensor.lag"), None).right == (False,)
+
+
+def test_an_effect_left_out_of_the_catalogue_is_withdrawn_where_nothing_or_its_equivalent_is_named():
+    said_instead = [said("unexplained"), said("effect", "actuator.lag"), said("effect", "sensor.drift"), said("none")]
+    assert [mark("c", ANSWER, one, 0.2).withdrawn for one in said_instead] == [True, True, False, False]
+
+
+def test_ties_are_a_row_of_the_table():
+    row = resolved([True] * 9 + [False])
+    assert (row.value, row.count, row.met) == (0.9, 10, True)
+    assert row.interval == pytest.approx(wilson(9, 10))
 
 
 def test_an_extended_model_worse_than_the_retuned_one_is_told():
