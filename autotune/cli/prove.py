@@ -198,16 +198,21 @@ def _print_table(console: Console, rows: Sequence[Row]) -> None:
 def _print_ablation(console: Console, ablated: Mapping[str, Sequence[Mark]]) -> None:
     from sim.score import wilson
 
-    view = Table("left out", "cases", "unexplained, or its equivalent", "place right", "said instead", title="Ablation")
-    for name, marks in ablated.items():
+    view = Table("left out", "cases", "withdrawn", "place right", "said instead", title="Ablation")
+    for column in view.columns:
+        column.overflow = "fold"
+    for name, marks in ((name, marks) for name, marks in ablated.items() if marks):
         withdrawn, placed = (sum(hits) for hits in ([m.withdrawn for m in marks], [m.place_right for m in marks]))
         said = ", ".join(m.named[0] if m.named else m.verdict for m in marks if not m.withdrawn)
         view.add_row(name, str(len(marks)), str(withdrawn), str(placed), said)
     console.print(view)
     every = [m for marks in ablated.values() for m in marks]
     for what, hits in (
-        ("unexplained, or its equivalent", [m.withdrawn for m in every]),
+        ("withdrawn (unexplained, or its equivalent named)", [m.withdrawn for m in every]),
         ("at the right place", [m.place_right for m in every]),
     ):
         low, high = wilson(sum(hits), len(hits))
         console.print(f"{what}: {sum(hits)} of {len(hits)} ({100 * low:.0f} to {100 * high:.0f} %)")
+    untried = ", ".join(name for name, marks in ablated.items() if not marks)
+    if untried:
+        console.print(f"not tried yet: {untried}")
