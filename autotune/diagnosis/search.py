@@ -214,8 +214,11 @@ AMPLITUDES = frozenset(
 )  # fmt: skip
 #: Parameters of those names that are something else.
 NO_AMPLITUDES = frozenset(
-    (("plant.hysteresis", "width"), ("actuator.rate_limit", "rate"), ("actuator.stiction", "band"))
-)
+    (
+        ("plant.hysteresis", "width"), ("actuator.rate_limit", "rate"), ("actuator.stiction", "band"),
+        ("plant.slow_mode", "time_constant"),
+    )
+)  # fmt: skip
 
 
 def _amplitudes(effect: Effect) -> list[str]:
