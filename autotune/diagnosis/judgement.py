@@ -37,9 +37,10 @@ MISSING = 1.05
 #: Share of the retuned model's excess misfit that an effect must explain where nothing explains all of it, and how
 #: many times the noise's variance the retuned model's error must have: nearer to the noise adequacy is asked for.
 DOMINANT, FAR_FROM_NOISE = 0.35, 8.0
-#: Weight of a cause outside the catalogue, beside the best hypothesis's 1: where that explains the recordings, and
-#: where it explains most of what retuning leaves far above the noise.
-UNKNOWN, HALF_EXPLAINED = 0.05, 0.25
+#: Weight of a cause outside the catalogue, beside the best hypothesis's 1: where one effect explains the recordings,
+#: where several together do (two shapes can imitate a third), and where the best explains most of what retuning leaves
+#: far above the noise.
+UNKNOWN, UNKNOWN_TO_PAIRS, HALF_EXPLAINED = 0.03, 0.07, 0.25
 #: Scale of the log-odds: one unit of chi2 counts this much less than for ideal noise.
 TEMPERATURE = 3.0
 
@@ -123,7 +124,8 @@ def doubt_of(result: Fit, data: Data, dominant: bool) -> float:
     """
     if is_adequate(result, data):
         excess = max(misfit(result, data) - 1.0, 0.0) / (_allowed(result, data) - 1.0)
-        return UNKNOWN + (1.0 - UNKNOWN) * excess**4
+        least = UNKNOWN_TO_PAIRS if len(result.parametrisation.model.effects) > 1 else UNKNOWN
+        return least + (1.0 - least) * excess**4
     return HALF_EXPLAINED if dominant else 1.0
 
 

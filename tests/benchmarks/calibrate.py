@@ -165,18 +165,15 @@ def counts(rows: Sequence[Shown], constants: Mapping[str, float]) -> tuple[int, 
     )
 
 
-def at(row: Shown, temperature: float, doubt: float) -> list[tuple[str, float, bool]]:
-    """Names put forward with their probabilities at another temperature and doubt, and whether each is right."""
+def at(row: Shown, temperature: float, doubts: tuple[float, float]) -> list[tuple[str, float, bool]]:
+    """Names put forward with their probabilities at another temperature and doubt, and whether each is right.
+
+    ``doubts`` are the least weights of what is unknown beside one effect and beside several.
+    """
     power = judgement.TEMPERATURE / temperature
     known = {name: p**power for name, p in row.candidates if name != "unknown" and p > 0.0}
     best = max(known.values())
-    given = dict(row.candidates).get("unknown", 0.0) / max(
-        dict(row.candidates)[max(known, key=lambda n: known[n])], 1e-9
-    )
-    # beyond the least doubt stands what the misfit adds
-    more = max(given - judgement.UNKNOWN, 0.0) / (1.0 - judgement.UNKNOWN)
-    weights = {name: w / best for name, w in known.items()}
-    weights["unknown"] = doubt + (1.0 - doubt) * more
+    weights = {name: w / best for name, w in known.items()} | {"unknown": doubt(row, doubts)}
     total = sum(weights.values())
     candidates = [Candidate(name=name, probability=w / total) for name, w in weights.items()]
     own = {name for group in row.accept for name in group}
@@ -188,9 +185,21 @@ def at(row: Shown, temperature: float, doubt: float) -> list[tuple[str, float, b
     ]
 
 
-def calibration(rows: Sequence[Shown], temperature: float, doubt: float) -> tuple[float, float, int, int, int]:
+def doubt(row: Shown, doubts: tuple[float, float]) -> float:
+    """Weight of what is unknown, see :func:`autotune.diagnosis.judgement.doubt_of`."""
+    bound = judgement.ADEQUATE_QUICK if row.slow < judgement.QUICK else judgement.ADEQUATE
+    allowed = bound + row.misfit - row.excess
+    if row.slow >= judgement.WHITE or row.misfit >= allowed:
+        return judgement.HALF_EXPLAINED if judgement.dominates(row.quality) else 1.0
+    least = doubts[len(row.names) > 1]
+    return least + (1.0 - least) * (max(row.misfit - 1.0, 0.0) / (allowed - 1.0)) ** 4
+
+
+def calibration(
+    rows: Sequence[Shown], temperature: float, doubts: tuple[float, float]
+) -> tuple[float, float, int, int, int]:
     """Return log loss, expected error, and among statements with p >= 0.95 the wrong ones, all of them, and all."""
-    statements = [(p, ok) for row in rows for _, p, ok in at(row, temperature, doubt)]
+    statements = [(p, ok) for row in rows for _, p, ok in at(row, temperature, doubts)]
     loss = -float(np.mean([math.log(min(max(p if ok else 1.0 - p, 1e-6), 1.0)) for p, ok in statements]))
     sure = [ok for p, ok in statements if p >= 0.95]
     return loss, calibration_error(statements), sure.count(False), len(sure), len(statements)
@@ -231,26 +240,27 @@ def main() -> None:
     print(f"{len(chain)} of them decided by adequacy, {explained} explained by the truth")
     print("  right refused / wrong accepted / clean alarmed, one constant moved at a time:")
     for name, grid in GRIDS.items():
-        tried = " ".join(f"{v:g}: {'/'.join(map(str, counts(chain, {**in_use, name: v})))}" for v in grid)
-        print(f"  {name:15s} {in_use[name]:g} in use;  {tried}")
+        moved = " ".join(f"{v:g}: {'/'.join(map(str, counts(chain, {**in_use, name: v})))}" for v in grid)
+        print(f"  {name:15s} {in_use[name]:g} in use;  {moved}")
     rows = [r for r in rows if r not in chain or judged(r, in_use) == "named"]
     print("  log loss / expected error / wrong of those at p >= 0.95, of what is named with the bounds in use:")
-    for name, pairs in (
-        ("TEMPERATURE", [(t, judgement.UNKNOWN) for t in TEMPERATURES]),
-        ("UNKNOWN", [(judgement.TEMPERATURE, d) for d in DOUBTS]),
+    T, one, more = judgement.TEMPERATURE, judgement.UNKNOWN, judgement.UNKNOWN_TO_PAIRS
+    for name, value, tried in (
+        ("TEMPERATURE", T, [(t, t, (one, more)) for t in TEMPERATURES]),
+        ("UNKNOWN", one, [(d, T, (d, more)) for d in DOUBTS]),
+        ("UNKNOWN_TO_PAIRS", more, [(d, T, (one, d)) for d in DOUBTS]),
     ):
-        print(f"  {name:15s} {getattr(judgement, name):g} in use")
-        for t, d in pairs:
-            loss, error, wrong, sure, count = calibration(rows, t, d)
-            value = t if name == "TEMPERATURE" else d
-            print(f"    {value:5g}: {loss:.4f} / {error:.4f} / {wrong} of {sure}, {count} in all")
+        print(f"  {name:16s} {value:g} in use")
+        for at_value, t, doubts in tried:
+            loss, error, wrong, sure, count = calibration(rows, t, doubts)
+            print(f"    {at_value:5g}: {loss:.4f} / {error:.4f} / {wrong} of {sure}, {count} in all")
     single: dict[str, list[bool]] = {}
     for row in rows:
-        for name, _, ok in at(row, judgement.TEMPERATURE, judgement.UNKNOWN):
+        for name, _, ok in at(row, T, (one, more)):
             single.setdefault(name if name in OF_ROWS else "of the chain", []).append(ok)
     print("  right of those named:", ", ".join(f"{n} {sum(oks)}/{len(oks)}" for n, oks in sorted(single.items())))
     halves = [ok for r in rows if r.verdict == "effect" and judged(r, {**in_use, "DOMINANT": math.inf}) == "abstained"
-              for name, _, ok in at(r, judgement.TEMPERATURE, judgement.UNKNOWN) if name not in OF_ROWS]  # fmt: skip
+              for name, _, ok in at(r, T, (one, more)) if name not in OF_ROWS]  # fmt: skip
     print(
         f"  HALF_EXPLAINED  {judgement.HALF_EXPLAINED:g} in use; right of those named without being adequate:", end=" "
     )
