@@ -23,7 +23,7 @@ from autotune.pipeline import analyse, hand_over, tune
 from autotune.pipeline.deployment import deploy
 from autotune.pipeline.folder import differences, next_free, read_interrupted, store_config, stored_config
 from autotune.pipeline.mismatch import around_operating_point, resting_command
-from autotune.points import FrequencyPoint
+from autotune.points import FrequencyPoint, points_to_json
 from autotune.recording import read_recording
 from drivers.simulated import SimulatedRig
 from sim.plant import make_plant
@@ -128,6 +128,21 @@ def test_gains_on_trial_are_taken_back_where_the_plant_is_not_the_measured_one(t
     done = deploy(rig, new, tmp_path / "journal.jsonl", agree=lambda old, to_be: None, try_out=try_out)
     assert not done.kept
     assert rig.read_gains() == OLD
+    assert rig.command == 0.0
+
+
+def test_a_verification_of_a_plant_that_is_not_the_measured_one_ends_with_status_3(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rig = Changing(make_plant("ball", seed=4, noise=0.1), u_safe=0.0, controller=PIDController(K=-0.0247, Ti_s=3.6))
+    monkeypatch.setattr("autotune.cli.deploy.rig_of", lambda _: rig)
+    points = tmp_path / "points.json"
+    measured = points_of(BALL, np.array([0.9, 1.5, 2.4, 3.5, 5.0]), 0.004)
+    points.write_text(json.dumps({"points": points_to_json(measured)}), encoding="utf-8")
+    words = ["verify", str(CONFIGS / "ball_sim.toml"), "--points", str(points), "--out", str(tmp_path)]
+    done = CliRunner().invoke(app, words)
+    assert done.exit_code == 3, done.output
+    assert "Not accepted" in done.output
     assert rig.command == 0.0
 
 
