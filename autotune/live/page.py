@@ -53,9 +53,11 @@ body { color: var(--ink); background: var(--paper); font: 16px/1.45 system-ui, "
   gap: 0.2rem 1.6rem; font-variant-numeric: tabular-nums; margin: 0.5rem 0; }
 .gains .here { font-weight: 700; }
 .choice { display: flex; flex-wrap: wrap; gap: 0.5rem 1rem; align-items: center; margin-top: 0.5rem; }
-@media (min-width: 1000px) { .page { grid-template-columns: minmax(0, 3fr) minmax(0, 2fr); }
-  .time, .outcome { grid-column: 1; } .frequency { grid-column: 2; grid-row: 2 / span 3; }
-  .warnings { grid-column: 1 / -1; } }
+.asked .outcome { order: -1; }
+@media (min-width: 1000px) {
+  .page { grid-template-columns: minmax(0, 3fr) minmax(0, 2fr); grid-template-rows: auto auto 1fr; }
+  .warnings { grid-row: 1; grid-column: 1 / -1; } .frequency { grid-row: 2 / span 2; grid-column: 2; }
+  .time, .asked .outcome { grid-row: 2; grid-column: 1; } .outcome, .asked .time { grid-row: 3; grid-column: 1; } }
 @media (max-width: 520px) { body { font-size: 15px; } .abort { width: 100%; } }
 """
 
@@ -101,7 +103,7 @@ class Screen:
         ui.on("colours", self._redraw)
         ui.keyboard(self._on_key, repeating=False, ignore=[])
         self._bar()
-        with ui.element("main").classes("page"):
+        with ui.element("main").classes("page") as self._main:
             self._warnings = ui.label().classes("warn warnings").props("role=alert")
             self._time_section()
             self._outcome_section()
@@ -157,7 +159,6 @@ class Screen:
                 ui.button("Restore old gains", on_click=lambda: self._on_choice("restore"), color=None).classes(
                     "plain"
                 ).props("flat")
-                ui.label("Without an answer the new gains stay.").classes("note")
 
     @property
     def is_connected(self) -> bool:
@@ -215,6 +216,7 @@ class Screen:
         self._abort.set_visibility(self._may_abort)
         self._take.set_visibility(acts and not over and controls.holder is None)
         self._role.text = self._role_text(acts, over)
+        self._main.classes(**{"add" if story.waiting_s else "remove": "asked"})
         self._outcome.set_visibility(bool(story.verdict or story.gains))
         if story.verdict or story.gains:
             self._show_outcome()
