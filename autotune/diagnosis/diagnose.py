@@ -10,6 +10,7 @@ from types import MappingProxyType
 import numpy as np
 
 from autotune.controller import Controller
+from autotune.diagnosis.catalogue import STRUCTURES
 from autotune.diagnosis.description import Description, describe
 from autotune.diagnosis.discriminate import next_experiment
 from autotune.diagnosis.fitting import Fit
@@ -19,7 +20,7 @@ from autotune.diagnosis.result import Candidate, Diagnosis, FitQuality, FoundEff
 from autotune.diagnosis.retuning import COARSE, misfit
 from autotune.diagnosis.samples import SampleEffect, inspect, jitter_effect
 from autotune.diagnosis.search import Hypothesis, score
-from autotune.diagnosis.selection import Report, Search, search
+from autotune.diagnosis.selection import Report, Search, search, worth
 from autotune.diagnosis.simulation import entry_of
 from autotune.errors import InputError
 from autotune.models import Effect, Model, Parameter
@@ -136,11 +137,19 @@ def _judge(found: Search, samples: list[SampleEffect], model: Model) -> Diagnosi
 def _verdict(found: Search, samples: list[SampleEffect], adequate: bool, offset: bool) -> Verdict:
     if found.chosen.names and not samples:
         return "effect" if adequate else "unexplained"
+    if not samples and _is_of_another_structure(found):
+        return "unexplained"
     if samples or (offset and adequate):
         return "effect"
     if not adequate:
         return "unexplained" if misfit(found.chosen.fit, found.data) > MISSING else _numbers(found)
     return _numbers(found)
+
+
+def _is_of_another_structure(found: Search) -> bool:
+    """Whether a structure that is no effect explains more than any effect does, and enough to be believed."""
+    best = min((found.retuned, *found.singles, *found.pairs, *found.triples), key=score)
+    return bool(STRUCTURES.keys() & set(best.names)) and worth(found.retuned, best)
 
 
 def _numbers(found: Search) -> Verdict:

@@ -212,7 +212,7 @@ def campaign_in(folder: str) -> Campaign:
         seeds = [int(p.stem.removeprefix("case_")) for p in (out / "sealed").glob("case_*.json")]
         if not seeds:
             raise SystemExit(f"{out} holds no campaign: make one with autotune prove --seed 7000 --out {out}")
-        campaign = Campaign(out=out, seeds=range(min(seeds), max(seeds) + 1), tool=())
+        campaign = Campaign(out=out, seeds=sorted(seeds), tool=())
     else:
         count, first = (
             int(os.environ.get(f"AUTOTUNE_CALIBRATE_{n}", d)) for n, d in (("CASES", "4"), ("SEED", "5000"))
