@@ -298,7 +298,8 @@ def _plant() -> tuple[Entry, ...]:
                 Quantity(name="low", unit="{y}", scale="real", slot=k.STOP_LOW),
                 Quantity(name="high", unit="{y}", scale="real", slot=k.STOP_HIGH),
             ),
-            starts=lambda s: _limits(s.y_low, s.y_high, (0.02, 0.1)),
+            # readings at a stop lie around it: it is beyond all but the farthest
+            starts=lambda s: _limits(s.y_low, s.y_high, (-0.005, 0.02, 0.1)),
             confusable=("sensor.saturation",),
             reference=khalil,
         ),

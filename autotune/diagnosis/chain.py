@@ -6,7 +6,9 @@ are in controllable form. Forces enter at the input of the first plant block, in
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property, lru_cache
 
 import numpy as np
 
@@ -52,6 +54,11 @@ class Chain:
         """Number of states."""
         return int(self.A.shape[0])
 
+    @cached_property
+    def fastest_of_plant(self) -> float:
+        """Largest rate of the plant's own poles [rad/s]."""
+        return float(np.max(np.abs(np.linalg.eigvals(self.A[self.plant, self.plant]))))
+
     @property
     def is_mechanical(self) -> bool:
         """Whether the plant has a speed and a position."""
@@ -85,12 +92,20 @@ def _realise(block: Block) -> tuple[FloatArray, FloatArray, FloatArray, float]:
 
 
 def build_chain(model: Model) -> Chain:
-    """Arrange a model's blocks in state space.
+    """Arrange a model's blocks in state space, see :func:`chain_of`; its effects are not looked at."""
+    return chain_of(model.blocks, model.name)
+
+
+@lru_cache(maxsize=64)
+def chain_of(blocks: tuple[Block, ...], name: str) -> Chain:
+    """Arrange blocks in state space; a fit asks for the same ones again and again.
 
     Parameters
     ----------
-    model : Model
-        The chain; its effects are not looked at.
+    blocks : tuple of Block
+        The chain.
+    name : str
+        The model's name, for errors.
 
     Returns
     -------
@@ -102,10 +117,10 @@ def build_chain(model: Model) -> Chain:
     InputError
         A chain without any dynamics, or of more than 12 states.
     """
-    order = sum(len(block.dynamics.den) - 1 for block in model.blocks)
+    order = sum(len(block.dynamics.den) - 1 for block in blocks)
     if not 1 <= order <= 12:
-        raise InputError(f"the chain has {order} states", where=model.name, mend="diagnosis handles 1 to 12 states")
-    plant = _plant_blocks(model)
+        raise InputError(f"the chain has {order} states", where=name, mend="diagnosis handles 1 to 12 states")
+    plant = _plant_blocks(blocks)
     A, B = np.zeros((order, order)), np.zeros((order, kernel.INPUTS))
     taps, gains = np.zeros((5, order)), np.ones(4)
     gains[2:] = 0.0
@@ -113,7 +128,7 @@ def build_chain(model: Model) -> Chain:
     row, direct = np.zeros(order), np.array([1.0, 0.0, 0.0])
     at = 0
     edges = [order, 0]
-    for number, block in enumerate(model.blocks):
+    for number, block in enumerate(blocks):
         a, b, c, d = _realise(block)
         n = b.size
         if number == plant[0]:
@@ -136,16 +151,16 @@ def build_chain(model: Model) -> Chain:
         at += n
     taps[kernel.OUTPUT], gains[3] = row, direct[0]
     return Chain(A=A, B=B, taps=taps, gains=gains, where=where,
-                 delay_s=sum(block.dynamics.delay_s for block in model.blocks), plant=slice(*edges))  # fmt: skip
+                 delay_s=sum(block.dynamics.delay_s for block in blocks), plant=slice(*edges))  # fmt: skip
 
 
-def _plant_blocks(model: Model) -> list[int]:
+def _plant_blocks(blocks: Sequence[Block]) -> list[int]:
     """Return the numbers of the plant's dynamic blocks; without any, of the slowest block."""
-    dynamic = [i for i, b in enumerate(model.blocks) if len(b.dynamics.den) > 1]
-    plant = [i for i in dynamic if model.blocks[i].place == "plant"]
+    dynamic = [i for i, b in enumerate(blocks) if len(b.dynamics.den) > 1]
+    plant = [i for i in dynamic if blocks[i].place == "plant"]
 
     def slowness(i: int) -> float:
-        den = model.blocks[i].dynamics.den
+        den = blocks[i].dynamics.den
         return float("inf") if den[-1] == 0.0 else abs(den[0] / den[-1]) ** (1.0 / (len(den) - 1))
 
     return plant or [max(dynamic, key=slowness)]

@@ -111,7 +111,7 @@ def periodic_load_starts(base: Fit, data: Data, lag_s: float, count: int = 3) ->
             D = np.column_stack([direction(base, effect_with("environment.periodic_load", p), data) for p in parts])
         except RUNAWAY:
             return 0.0, effect_with("environment.periodic_load", parts[0])
-        a = np.linalg.lstsq(D, -base.e)[0]
+        a = np.linalg.lstsq(D.T @ base.without_numbers(D), -D.T @ base.e)[0]
         load = (float(size * a[0]), float(size * a[1]), frequency)
         return float(-base.e @ D @ a), effect_with("environment.periodic_load", load)
 

@@ -45,7 +45,8 @@ class Fit:
     signals : tuple of (N, 4) array
         Simulated reading, speed, position, plant input.
     explained : (N, q) array
-        Orthonormal columns: what moving the free numbers can explain of a residual beyond the start states.
+        What moving the free numbers can explain of a residual beyond the start states: columns that are orthonormal
+        together with the rows of what is believed of the numbers.
     states_explain : tuple of (L, m) array
         The same for the start state of every window.
     jacobian : (N, p) and (N, n) array
@@ -87,12 +88,19 @@ class Fit:
         """The fitted model."""
         return self.parametrisation.with_values(self.theta)
 
-    def unexplained(self, direction: FloatArray) -> FloatArray:
-        """Return what is left of a whitened direction when all free numbers and states may move against it."""
+    def without_states(self, direction: FloatArray) -> FloatArray:
+        """Return what is left of a whitened direction when all start states may move against it."""
         left = direction.copy()
         for (a, b), Q in zip(self.windows, self.states_explain, strict=True):
             left[a:b] -= Q @ (Q.T @ left[a:b])
-        return np.asarray(left - self.explained @ (self.explained.T @ left))
+        return left
+
+    def without_numbers(self, direction: FloatArray) -> FloatArray:
+        """Return what is left of a direction freed of start states when the free numbers may move against it too.
+
+        They pay for how far they move from what is believed: what bends them far is not explained by them whole.
+        """
+        return np.asarray(direction - self.explained @ (self.explained.T @ direction))
 
     @property
     def cost(self) -> float:
@@ -231,7 +239,7 @@ def _finish(problem: Problem, spot: Spot, derivatives: Derivatives, may: BoolArr
         residuals=tuple(whiten(spot.signals, problem.data)[0]),
         whitened=tuple(np.split(spot.e, edges)),
         signals=tuple(spot.signals),
-        explained=_basis(J_left),
+        explained=_basis(J_left, prior),
         jacobian=derivatives,
         states_explain=tuple(_basis(derivatives[1][a:b]) for a, b in windows),
         windows=tuple(windows),
@@ -241,12 +249,16 @@ def _finish(problem: Problem, spot: Spot, derivatives: Derivatives, may: BoolArr
     )
 
 
-def _basis(J: FloatArray) -> FloatArray:
-    """Return orthonormal columns that span the well-determined part of J's columns."""
+def _basis(J: FloatArray, prior: FloatArray | None = None) -> FloatArray:
+    """Return columns that span the well-determined part of J's columns: orthonormal with the rows of the prior."""
     norms = np.linalg.norm(J, axis=0)
-    scaled = J[:, norms > 1e-9] / norms[norms > 1e-9]
+    felt = norms > 1e-9
+    scaled = J[:, felt] / norms[felt]
     if scaled.shape[1] == 0:
         return np.zeros((J.shape[0], 0))
-    values, vectors = np.linalg.eigh(scaled.T @ scaled)
+    H = scaled.T @ scaled
+    if prior is not None:
+        H += np.diag((prior[felt] / norms[felt]) ** 2)
+    values, vectors = np.linalg.eigh(H)
     keep = values > 1e-8 * values[-1]
     return np.asarray(scaled @ (vectors[:, keep] / np.sqrt(values[keep])))

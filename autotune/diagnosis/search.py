@@ -159,7 +159,7 @@ def promise(base: Fit, effect: Effect, data: Data) -> Promise:
 
 
 def direction(base: Fit, effect: Effect, data: Data) -> FloatArray:
-    """Return how an effect moves the whitened residual, freed of what the numbers already free could explain.
+    """Return how an effect moves the whitened residual, freed of what the start states could explain.
 
     Raises
     ------
@@ -170,21 +170,23 @@ def direction(base: Fit, effect: Effect, data: Data) -> FloatArray:
     moved = residual_at(p, data, theta, states) - base.e
     if not bounded(moved):
         raise IdentificationError("the simulation runs away", where=effect.name)
-    return base.unexplained(moved)
+    return base.without_states(moved)
 
 
 def _promise(base: Fit, effect: Effect, data: Data) -> tuple[Promise, float]:
     """Return what is promised, and how far the effect moves the reading as a share of chi2.
 
     The direction d = e(with effect) - e(without) is freed of what the numbers already free could explain; the decrease
-    of |e + a d|^2 over 0 <= a <= 4 is promised, over -20 <= a <= 20 for an effect of either sign.
+    of |e + a d|^2 over 0 <= a <= 4 is promised, over -20 <= a <= 20 for an effect of either sign. After a blow
+    everything goes another way, which no first order tells: a hard stop that is touched promises a little always.
     """
     nothing = Promise(effect=effect, decrease=0.0, scaled=effect)
     try:
         d = direction(base, effect, data)
     except RUNAWAY:
         return nothing, RAN_AWAY
-    slope, curvature = -float(d @ base.e), float(d @ d)
+    # the fit is at rest: its numbers have nothing to gain by themselves, and what they believe is weighed with chi2
+    slope, curvature = -float(d @ base.e), float(d @ base.without_numbers(d))
     if curvature == 0.0:
         return nothing, 0.0
     signed = any(q.scale == "real" for q in entry_of(effect.name).parameters if q.name not in FOUND_DIRECTLY)
@@ -193,17 +195,21 @@ def _promise(base: Fit, effect: Effect, data: Data) -> tuple[Promise, float]:
         low, high = 0.0, 1.0  # a limit or a step is not made larger by a factor
     a = float(np.clip(slope / curvature, low, high))
     scaled = _scaled(effect, a, 20.0 if signed else 2.0)
-    return Promise(effect=effect, decrease=2.0 * a * slope - a * a * curvature, scaled=scaled), curvature / base.chi2
+    least = min(TOUCHED, curvature) if effect.name == HARD_STOP else 0.0
+    decrease = max(2.0 * a * slope - a * a * curvature, least)
+    return Promise(effect=effect, decrease=decrease, scaled=scaled), curvature / base.chi2
 
 
 #: Decrease that an effect's direction may have, as a share of chi2, before it is taken for too large to be linear.
 LINEAR_SHARE = 0.3
+#: Decrease that a hard stop promises that is touched.
+HARD_STOP, TOUCHED = "plant.hard_stop", 20.0
 #: Steps of a fit after which it is decided whether it goes on.
 FIRST_STEPS = 3
 #: Effects whose fits are finished, and fits of one effect.
 FINISHED, MOST_EACH = 4, 2
-#: Share of the best fit's decrease from which on any other is finished too.
-NEAR = 0.8
+#: Share of the best fit's decrease from which on any other is finished too, and of the best of the same effect.
+NEAR, SECOND = 0.8, 0.5
 #: Most simulations of one effect while it is shrunk, and the share of chi2 that a simulation counts that ran away.
 SHRINKINGS, RAN_AWAY = 4, 1e6
 
@@ -315,9 +321,8 @@ def extend(
     """Fit the most promising effects on top of a base, best first."""
     promises = best_promises(base.fit, data, CATALOGUE.values() if entries is None else entries, pool, extra)
     ranked = sorted(promises.values(), key=lambda group: -group[0].decrease)
-    starts = [
-        effect for group in ranked[:most] if group[0].decrease > least for effect in _distinct(group)[:starts_each]
-    ]
+    tried = [*ranked[:most], *(group for group in ranked[most:] if group[0].effect.name == HARD_STOP)]
+    starts = [effect for group in tried if group[0].decrease > least for effect in _distinct(group)[:starts_each]]
     begun = [h for h in pool.map(lambda effect: _begun(base.fit, effect, data), starts) if h is not None]
     begun.sort(key=score)
     finished = [h for k, h in enumerate(begun) if _goes_on(h, begun[:k], base)]
@@ -331,8 +336,10 @@ def extend(
 
 def _goes_on(h: Hypothesis, better: Sequence[Hypothesis], base: Hypothesis) -> bool:
     """Whether a fit that has begun is worth finishing: among the best few, or near them, and not one name too often."""
-    if sum(other.names == h.names for other in better) >= MOST_EACH:
+    same = [other for other in better if other.names == h.names]
+    gained = base.fit.cost - h.fit.cost
+    if len(same) >= MOST_EACH or (same and gained < SECOND * (base.fit.cost - same[0].fit.cost)):
         return False
     lead = base.fit.cost - better[0].fit.cost if better else 0.0
     names = {other.names for other in better} | {h.names}
-    return len(names) <= FINISHED or base.fit.cost - h.fit.cost > NEAR * lead
+    return len(names) <= FINISHED or gained > NEAR * lead

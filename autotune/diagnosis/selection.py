@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from types import MappingProxyType
@@ -19,14 +19,14 @@ from autotune.diagnosis.noise import Noise, noise_from_differences
 from autotune.diagnosis.retuning import COARSE, floored, misfit, prepare
 from autotune.diagnosis.search import RUNAWAY, Hypothesis, extend, score, signal_ranges
 from autotune.diagnosis.windows import slowest_lag_s
-from autotune.models import Model
+from autotune.models import Effect, Model
 from autotune.recording import Recording
 
 #: Decrease of the score that an effect must bring: what chance brings among some two hundred starts, with a margin (on
 #: clean recordings nothing brought more than 15); weak effects that can be told bring a hundred and more, some 40.
 LEAST_DECREASE = 30.0
-#: Shifts of an effect's size, as a logarithm, that get a fit out of a crease.
-NUDGES = (-0.06, 0.06, -0.02, 0.02)
+#: Shift of an effect's size, as a logarithm, that gets a fit out of a crease; stiction's creases are narrow.
+NUDGE, NARROW = 0.06, 0.02
 #: Effects whose thresholds make the criterion rough.
 ROUGH = frozenset(
     ("actuator.dead_zone", "actuator.backlash", "actuator.stiction", "actuator.quantisation", "plant.coulomb_friction",
@@ -68,6 +68,12 @@ class Search:
     triples: tuple[Hypothesis, ...]
     chosen: Hypothesis
 
+    @property
+    def is_outside(self) -> bool:
+        """Whether no effect is chosen because a structure that is none explains the recordings better."""
+        best = min((self.retuned, *self.singles, *self.pairs, *self.triples), key=score)
+        return not self.chosen.names and bool(STRUCTURES.keys() & set(best.names)) and worth(self.retuned, best)
+
 
 def polish(h: Hypothesis, data: Data, base: Fit, rounds: int = 4) -> Hypothesis | None:
     """Fit a hypothesis of the screening to all data; nothing where its simulation runs away on rows not screened."""
@@ -80,14 +86,18 @@ def polish(h: Hypothesis, data: Data, base: Fit, rounds: int = 4) -> Hypothesis 
 def _polish(h: Hypothesis, data: Data, base: Fit, rounds: int) -> Hypothesis:
     """Fit the start states that the screening has not seen first, then everything."""
     p = h.fit.parametrisation
-    none = np.zeros(h.fit.theta.size, dtype=bool)
-    settled = fit(p, data, h.fit.theta, states_for(h.fit, data, base), free=none)
-    best = fit(p, data, h.fit.theta, settled.x0, iterations=30, rounds=rounds)
+    if h.fit.rows == data.rows:
+        best = fit(p, data, h.fit.theta, h.fit.x0, iterations=30, rounds=rounds, inherit=h.fit)
+    else:
+        none = np.zeros(h.fit.theta.size, dtype=bool)
+        settled = fit(p, data, h.fit.theta, states_for(h.fit, data, base), free=none)
+        best = fit(p, data, h.fit.theta, settled.x0, iterations=30, rounds=rounds)
     positive = np.array([f.kind == "effect" and f.positive for f in p.free])
     rough = ROUGH & set(h.names)
-    for shift in NUDGES if rough and positive.any() else ():
+    nudge = NARROW if "actuator.stiction" in rough else NUDGE
+    for shift in (-nudge, nudge) if rough and positive.any() else ():
         # thresholds make the criterion rough: a nudge gets a fit out of a crease
-        again = fit(p, data, best.theta + shift * positive, best.x0, iterations=15, rounds=2)
+        again = fit(p, data, best.theta + shift * positive, best.x0, iterations=8, rounds=1, inherit=best)
         best = again if again.cost < best.cost else best
     return replace(h, fit=_timed(best, data))
 
@@ -118,7 +128,7 @@ def _moved(result: Fit, number: int, shift: float, data: Data) -> Fit | None:
     effects[number] = replace(effects[number], parameters=MappingProxyType(moved))
     try:
         there = replace(p, model=replace(p.model, effects=tuple(effects)))
-        return fit(there, data, result.theta, result.x0, iterations=4, rounds=1)
+        return fit(there, data, result.theta, result.x0, iterations=4, rounds=1, inherit=result)
     except RUNAWAY:
         return None
 
@@ -192,9 +202,11 @@ def _searched(data: Data, base: Fit, nominal: Fit, entries: Sequence[Entry], poo
     screen = (
         retuned if few is data else Hypothesis(names=(), fit=fit(base.parametrisation, few, base.theta, own(base, few)))
     )
-    candidates = grown(screen, few, pool, entries, most=7)
+    lattices = lattice_starts(screen, few, pool, [entry.name for entry in entries])
+    candidates = grown(screen, few, pool, entries, most=7, lattices=lattices)
     if bent(base):
-        candidates = merged(candidates, grown(_unbent(base, few), few, pool, entries, most=7))
+        unbent = grown(_unbent(base, few), few, pool, entries, most=7, starts_each=2, lattices=lattices)
+        candidates = merged(candidates, unbent)
     singles = polished(candidates, 3, data, base, pool)
     if singles and misfit(base, data) > COARSE:
         data, base, few = _finer(singles[0], base, data)
@@ -352,6 +364,14 @@ def _found(data: Data, nominal: Fit, retuned: Hypothesis, singles: Sequence[Hypo
     )
 
 
+def lattice_starts(base: Hypothesis, data: Data, pool: Executor, names: Collection[str]) -> list[Effect]:
+    """Return starts for what moves the command in steps: a long search, whose result hardly depends on the base."""
+    starts = quantisation_starts(base.fit, data, pool) if "actuator.quantisation" in names else []
+    if "actuator.stiction" in names:
+        starts += stiction_starts(base.fit, data, pool, signal_ranges(base.fit, data).w)
+    return starts
+
+
 def grown(
     base: Hypothesis,
     data: Data,
@@ -360,18 +380,16 @@ def grown(
     most: int,
     starts_each: int = 4,
     least: float = 3.0,
+    lattices: Sequence[Effect] = (),
 ) -> list[Hypothesis]:
-    """Return fits of a base with one more effect, what a direct search starts included."""
-    names = {entry.name for entry in entries}
-    extra = []
+    """Return fits of a base with one more effect, what a direct search starts included; lattices where known."""
+    names = {entry.name for entry in entries} - set(base.names)
+    extra = list(lattices)
     if "environment.step_load" in names:
         extra += step_load_starts(base.fit, data, pool)
     if "environment.periodic_load" in names:
         extra += periodic_load_starts(base.fit, data, slowest_lag_s(base.fit.parametrisation.model))
-    if "actuator.quantisation" in names:
-        extra += quantisation_starts(base.fit, data, pool)
-    if "actuator.stiction" in names:
-        extra += stiction_starts(base.fit, data, pool, signal_ranges(base.fit, data).w)
+    extra += [] if lattices else lattice_starts(base, data, pool, names)
     return extend(base, data, pool, entries, most=most, extra=extra, starts_each=starts_each, least=least)
 
 

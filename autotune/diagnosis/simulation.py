@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 
 from autotune.arrays import FloatArray, IntArray
 from autotune.diagnosis import kernel
 from autotune.diagnosis.catalogue import CATALOGUE, STRUCTURES, Entry, Quantity
-from autotune.diagnosis.chain import Chain, build_chain
+from autotune.diagnosis.chain import Chain, chain_of
 from autotune.errors import InputError
 from autotune.models import Block, Effect, Model, TransferFunction
 from autotune.recording import Recording
@@ -53,8 +54,7 @@ class Simulator:
         """Return the longest sub-step [s] for a sample time: shorter where forces change within a sample."""
         pieces = 4 if self.linear_hold else 1
         if self.forced:
-            rate = float(np.max(np.abs(np.linalg.eigvals(self.chain.A[self.chain.plant, self.chain.plant]))))
-            pieces = max(pieces, math.ceil(rate * dt_s / 0.2))
+            pieces = max(pieces, math.ceil(self.chain.fastest_of_plant * dt_s / 0.2))
         for slot, least in _STEPPED.items():
             if self.on[slot]:
                 pieces = max(pieces, least)
@@ -96,10 +96,7 @@ class Simulator:
         """
         dt = recording.sample_time_s if sample_time_s is None else sample_time_s
         step = self.step_s(dt)
-        rising = kernel.transition_table(self.chain.A, self.chain.B, step)
-        falling = rising
-        if self.falling is not self.chain:
-            falling = kernel.transition_table(self.falling.A, self.falling.B, step)
+        rising, falling = _table(self.chain, step), _table(self.falling, step)
         out = np.full((len(recording), kernel.SIGNALS), np.nan)
         rows = np.zeros(1, dtype=np.int64) if starts is None else starts
         states = np.atleast_2d(x0)
@@ -135,6 +132,12 @@ class Simulator:
         rhs = np.append(-chain.B[:, 0] / scale * (u - self.u_offset), weight * aim)
         state = np.linalg.lstsq(lhs, rhs, rcond=1e-12)[0]
         return np.asarray(state).reshape(n)
+
+
+@lru_cache(maxsize=64)
+def _table(chain: Chain, step_s: float) -> FloatArray:
+    """Return a chain's transitions for a step: the same for all recordings, and for all effects that add no block."""
+    return np.asarray(kernel.transition_table(chain.A, chain.B, step_s))
 
 
 def assemble(model: Model) -> Simulator:
@@ -183,8 +186,8 @@ def assemble(model: Model) -> Simulator:
                 u_offset -= _value(effect, "offset", model.name)
             case _:
                 _fill_slots(entry, effect, E, on, model)
-    chain = build_chain(replace(model, blocks=blocks))
-    falling = chain if fall is None else build_chain(replace(model, blocks=fall))
+    chain = chain_of(blocks, model.name)
+    falling = chain if fall is None else chain_of(fall, model.name)
     _check(chain, E, on, model)
     return Simulator(
         chain=chain,

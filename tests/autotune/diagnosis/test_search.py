@@ -1,0 +1,81 @@
+"""What the search must find although nothing smooth leads there: a load's phase, a sticking valve, a slow mode."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+
+from autotune.diagnosis.catalogue import CATALOGUE
+from autotune.diagnosis.direct import periodic_load_starts, stiction_starts
+from autotune.diagnosis.fitting import fit
+from autotune.diagnosis.retuning import prepare
+from autotune.diagnosis.samples import inspect
+from autotune.diagnosis.search import extended
+from autotune.diagnosis.selection import search
+from autotune.models import Block, Model, Port, TransferFunction
+from autotune.recording import Recording
+from tests.autotune.diagnosis.servo_rigs import servo_model, servo_recording
+
+
+def valve(band: float, seed: int, rows: int = 600) -> Recording:
+    """Lag of 2 s behind a valve that stays until the command is ``band`` away, then jumps to it."""
+    rng = np.random.default_rng(seed)
+    dt, w, x = 0.1, 0.0, 0.0
+    u = 0.5 * np.sin(np.arange(rows) * dt * 0.7) + np.repeat(rng.uniform(-0.5, 0.5, rows // 50 + 1), 50)[:rows]
+    y = np.empty(rows)
+    for k in range(rows):
+        y[k] = x
+        w = u[k] if abs(u[k] - w) > band else w
+        x = w + (x - w) * np.exp(-dt / 2.0)
+    return Recording(t=dt * np.arange(rows), u=u, y=y + 0.01 * rng.normal(size=rows))
+
+
+def tank(share: float, seed: int, rows: int = 800) -> Recording:
+    """Lag of 10 s of whose reading a share follows with a further 60 s."""
+    rng = np.random.default_rng(seed)
+    dt, x, slow = 1.0, 0.0, 0.0
+    u = np.repeat(rng.uniform(-1.0, 1.0, rows // 40 + 1), 40)[:rows]
+    y = np.empty(rows)
+    for k in range(rows):
+        y[k] = (1.0 - share) * x + share * slow
+        for _ in range(10):
+            slow += dt / 10 * (x - slow) / 60.0
+            x = u[k] + (x - u[k]) * np.exp(-dt / 10 / 10.0)
+    return Recording(t=dt * np.arange(rows), u=u, y=y + 0.01 * rng.normal(size=rows))
+
+
+def lag(time_constant: float) -> Model:
+    block = Block(name="lag", place="plant", dynamics=TransferFunction(num=(1.0,), den=(time_constant, 1.0)))
+    return Model(name="lag", input=Port(unit="V"), output=Port(unit="m"), blocks=(block,))
+
+
+def test_a_loads_frequency_is_found_to_a_hundredth_of_what_the_recording_resolves() -> None:
+    hertz, rows = 1.3956, 1000
+    rigs = []
+    for seed in (1, 2):
+        clock = iter(np.repeat(np.arange(rows) * 0.02, 5) + np.tile(np.arange(5) * 0.004, rows))
+        rigs.append(servo_recording(seed, lambda x, v, t=clock: 0.1 * np.sin(2.0 * np.pi * hertz * next(t)), rows=rows))
+    data, base = prepare(servo_model(), rigs, inspect(rigs)[0])
+    start = periodic_load_starts(base, data, 0.23)[0]
+    p, theta, states = extended(base, start, data)
+    found = fit(p, data, theta, states, iterations=30).model.effects[0].parameters
+    assert abs(found["frequency"].value - hertz) < 0.01 / (rows * 0.02)
+    assert np.hypot(found["in_phase"].value, found["quadrature"].value) == pytest.approx(0.1, rel=0.03)
+
+
+def test_the_band_of_a_sticking_valve_is_found_on_a_criterion_of_narrow_peaks() -> None:
+    r = [valve(0.083, 3), valve(0.083, 4)]
+    data, base = prepare(lag(2.0), r, inspect(r)[0])
+    with ThreadPoolExecutor(1) as pool:
+        starts = stiction_starts(base, data, pool, 1.0)
+    assert starts[0].parameters["band"].value == pytest.approx(0.083, rel=0.02)
+
+
+def test_what_a_slow_mode_explains_better_than_any_effect_is_named_after_none() -> None:
+    r = [tank(0.08, 5), tank(0.08, 6)]
+    few = ("plant.hysteresis", "environment.drifting_load", "actuator.lag")
+    found = search(lag(11.0), r, inspect(r)[0], [name for name in CATALOGUE if name not in few])
+    assert found.singles[0].names == ("plant.slow_mode",)
+    assert found.chosen.names == ()
