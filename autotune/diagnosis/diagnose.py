@@ -142,8 +142,7 @@ def _verdict(found: Search, samples: list[SampleEffect], adequate: bool, offset:
     if samples or (offset and adequate):
         return "effect"
     if not adequate:
-        missing = found.is_outside or misfit(found.chosen.fit, found.data) > MISSING
-        return "unexplained" if missing else _numbers(found)
+        return "unexplained" if misfit(found.chosen.fit, found.data) > MISSING else _numbers(found)
     return _numbers(found)
 
 

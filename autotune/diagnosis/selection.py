@@ -68,12 +68,6 @@ class Search:
     triples: tuple[Hypothesis, ...]
     chosen: Hypothesis
 
-    @property
-    def is_outside(self) -> bool:
-        """Whether no effect is chosen because a structure that is none explains the recordings better."""
-        best = min((self.retuned, *self.singles, *self.pairs, *self.triples), key=score)
-        return not self.chosen.names and bool(STRUCTURES.keys() & set(best.names)) and worth(self.retuned, best)
-
 
 def polish(h: Hypothesis, data: Data, base: Fit, rounds: int = 4) -> Hypothesis | None:
     """Fit a hypothesis of the screening to all data; nothing where its simulation runs away on rows not screened."""

@@ -29,7 +29,7 @@ def valve(band: float, seed: int, rows: int = 600) -> Recording:
         y[k] = x
         w = u[k] if abs(u[k] - w) > band else w
         x = w + (x - w) * np.exp(-dt / 2.0)
-    return Recording(t=dt * np.arange(rows), u=u, y=y + 0.01 * rng.normal(size=rows))
+    return Recording(t=np.arange(rows, dtype=np.float64) * dt, u=u, y=y + 0.01 * rng.normal(size=rows))
 
 
 def tank(share: float, seed: int, rows: int = 800) -> Recording:
@@ -43,7 +43,7 @@ def tank(share: float, seed: int, rows: int = 800) -> Recording:
         for _ in range(10):
             slow += dt / 10 * (x - slow) / 60.0
             x = u[k] + (x - u[k]) * np.exp(-dt / 10 / 10.0)
-    return Recording(t=dt * np.arange(rows), u=u, y=y + 0.01 * rng.normal(size=rows))
+    return Recording(t=np.arange(rows, dtype=np.float64) * dt, u=u, y=y + 0.01 * rng.normal(size=rows))
 
 
 def lag(time_constant: float) -> Model:
@@ -53,10 +53,16 @@ def lag(time_constant: float) -> Model:
 
 def test_a_loads_frequency_is_found_to_a_hundredth_of_what_the_recording_resolves() -> None:
     hertz, rows = 1.3956, 1000
-    rigs = []
-    for seed in (1, 2):
-        clock = iter(np.repeat(np.arange(rows) * 0.02, 5) + np.tile(np.arange(5) * 0.004, rows))
-        rigs.append(servo_recording(seed, lambda x, v, t=clock: 0.1 * np.sin(2.0 * np.pi * hertz * next(t)), rows=rows))
+
+    def shaken(seed: int) -> Recording:
+        clock = iter(0.02 * np.repeat(np.arange(rows), 5) + 0.004 * np.tile(np.arange(5), rows))
+
+        def load(x: float, v: float) -> float:
+            return 0.1 * float(np.sin(2.0 * np.pi * hertz * next(clock)))
+
+        return servo_recording(seed, load, rows=rows)
+
+    rigs = [shaken(1), shaken(2)]
     data, base = prepare(servo_model(), rigs, inspect(rigs)[0])
     start = periodic_load_starts(base, data, 0.23)[0]
     p, theta, states = extended(base, start, data)
