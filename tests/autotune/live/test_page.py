@@ -219,11 +219,11 @@ def test_a_whole_run_on_a_rig_process_is_followed_and_decided_in_the_browser(
         run = started("-Rr", "run", str(file), "--out", str(out), "--live")
         assert run.stdout is not None
         page = opened(run.stdout.readline().split()[-1])
-        status, ellipses = page.get_by_role("status"), set()
+        status, plane, ellipses = page.get_by_role("status"), "document.querySelector('.plane canvas').toDataURL()", []
         for number in (1, 2, 3):
             expect(status).to_have_text(re.compile(f"point {number} of 3"), timeout=LIMIT_MS)
-            ellipses.add(page.locator(".plane canvas").evaluate("one => one.toDataURL()"))
-        assert len(ellipses) == 3
+            page.wait_for_function(f"seen => !seen.includes({plane})", arg=ellipses)
+            ellipses.append(page.evaluate(plane))
         expect(status).to_have_text(re.compile("new gains. Keep them"), timeout=2 * LIMIT_MS)
         expect(page.locator(".gains")).to_have_text(re.compile(r"-0\.01\s*-0\.02"))
         page.wait_for_function("document.querySelector('.steps canvas').toDataURL().length > 20000")
