@@ -34,9 +34,10 @@ WHITE = 1.10
 #: Misfit of a model without effects from which on something must be missing, although no effect is worth it; clean
 #: recordings leave up to 1.02.
 MISSING = 1.05
-#: Share of the retuned model's excess misfit that an effect must explain where nothing explains all of it, and how
-#: many times the noise's variance the retuned model's error must have: nearer to the noise adequacy is asked for.
+#: Share of the retuned model's excess misfit that effects must explain where nothing explains all of it, by how many
+#: times the noise's variance the retuned model's error has: nearer to the noise adequacy is asked for.
 DOMINANT, FAR_FROM_NOISE = 0.35, 8.0
+NEARLY_ALL, CLEAR_OF_NOISE = 0.80, 2.0
 #: Weight of a cause outside the catalogue, beside the best hypothesis's 1: where one effect explains the recordings,
 #: where several together do (two shapes can imitate a third), and where the best explains most of what retuning leaves
 #: far above the noise.
@@ -66,9 +67,11 @@ def dominates(quality: FitQuality) -> bool:
     On real rigs something always remains; an effect is named all the same when on rows that were not fitted it takes
     away most of the variance that retuning leaves above the noise.
     """
-    left = quality.retuned**2 - quality.noise_floor**2
-    far = quality.retuned**2 > FAR_FROM_NOISE * quality.noise_floor**2
-    return far and quality.retuned**2 - quality.extended**2 > DOMINANT * left
+    retuned, noise = quality.retuned**2, quality.noise_floor**2
+    return any(
+        retuned > far * noise and retuned - quality.extended**2 > share * (retuned - noise)
+        for share, far in ((DOMINANT, FAR_FROM_NOISE), (NEARLY_ALL, CLEAR_OF_NOISE))
+    )
 
 
 def rivals(found: Search, doubt: float) -> tuple[Candidate, ...]:

@@ -55,6 +55,8 @@ GRIDS: Mapping[str, Sequence[float]] = {
     "MISSING": (1.01, 1.02, 1.03, 1.05, 1.08, 1.12),
     "DOMINANT": (0.35, 0.5, 0.7, 0.8, 0.9, 0.95),
     "FAR_FROM_NOISE": (4.0, 6.0, 7.0, 8.0, 10.0, 15.0),
+    "NEARLY_ALL": (0.6, 0.7, 0.75, 0.8, 0.85, 0.9, 1.0),
+    "CLEAR_OF_NOISE": (1.2, 1.5, 2.0, 2.5, 3.0),
 }
 TEMPERATURES = (1.5, 2.0, 3.0, 4.0, 5.0, 6.0)
 DOUBTS = (0.01, 0.02, 0.03, 0.05, 0.07, 0.1, 0.15, 0.2)
@@ -148,10 +150,13 @@ def judged(row: Shown, constants: Mapping[str, float]) -> str:
     bound = constants["ADEQUATE_QUICK" if row.slow < constants["QUICK"] else "ADEQUATE"]
     adequate = white and row.excess < bound
     if row.names:
-        left = row.quality.retuned**2 - row.quality.noise_floor**2
-        far = row.quality.retuned**2 > constants["FAR_FROM_NOISE"] * row.quality.noise_floor**2
-        most = row.quality.retuned**2 - row.quality.extended**2 > constants["DOMINANT"] * left
-        return "named" if adequate or (far and most) else "abstained"
+        retuned, noise = row.quality.retuned**2, row.quality.noise_floor**2
+        most = any(
+            retuned > constants[far] * noise
+            and retuned - row.quality.extended**2 > constants[share] * (retuned - noise)
+            for share, far in (("DOMINANT", "FAR_FROM_NOISE"), ("NEARLY_ALL", "CLEAR_OF_NOISE"))
+        )
+        return "named" if adequate or most else "abstained"
     return "abstained" if not adequate and row.misfit > constants["MISSING"] else "neither"
 
 
@@ -259,8 +264,9 @@ def main() -> None:
         for name, _, ok in at(row, T, (one, more)):
             single.setdefault(name if name in OF_ROWS else "of the chain", []).append(ok)
     print("  right of those named:", ", ".join(f"{n} {sum(oks)}/{len(oks)}" for n, oks in sorted(single.items())))
-    halves = [ok for r in rows if r.verdict == "effect" and judged(r, {**in_use, "DOMINANT": math.inf}) == "abstained"
-              for name, _, ok in at(r, T, (one, more)) if name not in OF_ROWS]  # fmt: skip
+    strict = in_use | {"DOMINANT": math.inf, "NEARLY_ALL": math.inf}
+    half = [r for r in rows if r.verdict == "effect" and judged(r, strict) == "abstained"]
+    halves = [ok for r in half for name, _, ok in at(r, T, (one, more)) if name not in OF_ROWS]
     print(
         f"  HALF_EXPLAINED  {judgement.HALF_EXPLAINED:g} in use; right of those named without being adequate:", end=" "
     )
