@@ -105,12 +105,11 @@ def diagnose(
 
 def _judge(found: Search, samples: list[SampleEffect], model: Model) -> Diagnosis:
     chosen = found.chosen
-    adequate = is_adequate(chosen.fit, found.data)
+    whole = is_adequate(chosen.fit, found.data)
     offset = _offset(chosen.fit)
     quality, extended_is_better = held_out(found)
     doubt = doubt_of(chosen.fit, found.data, dominates(quality))
-    adequate |= dominates(quality)
-    verdict = _verdict(found, samples, adequate, offset is not None)
+    verdict = _verdict(found, samples, whole or dominates(quality), offset is not None)
     candidates = rivals(found, doubt)
     effects = _effects(found, samples, offset, candidates) if verdict == "effect" else ()
     description = describe(found.retuned.fit, found.data) if verdict == "unexplained" else None
@@ -127,7 +126,7 @@ def _judge(found: Search, samples: list[SampleEffect], model: Model) -> Diagnosi
         fit=quality,
         next_experiment=None,
         extended_model=extended,
-        sentences=_sentences(verdict, effects, quality, places),
+        sentences=_sentences(verdict, effects, quality, places, whole or bool(samples)),
         description=description,
         search=found,
     )
@@ -297,7 +296,7 @@ def _suspected(found: Search, description: Description) -> tuple[str, ...]:
 
 
 def _sentences(
-    verdict: Verdict, effects: Sequence[FoundEffect], quality: FitQuality, places: Sequence[str]
+    verdict: Verdict, effects: Sequence[FoundEffect], quality: FitQuality, places: Sequence[str], whole: bool
 ) -> tuple[str, ...]:
     errors = (
         f"Held-out error, as a share of the spread of y: nominal {quality.nominal:.3g}, retuned {quality.retuned:.3g}, "
@@ -310,7 +309,8 @@ def _sentences(
             first = "The structure is right, its numbers are not: retuned, the simulation explains the recordings."
         case "effect":
             names = " and ".join(f"{e.name} (probability {e.probability:.2f})" for e in effects)
-            first = f"Physics was left out: {names}."
+            rest = "" if whole else " What is left is not noise: something smaller is missing as well."
+            first = f"Physics was left out: {names}.{rest}"
         case _:
             first = f"Something is missing that no candidate explains to within noise; it shows at {', '.join(places)}."
     return first, errors
