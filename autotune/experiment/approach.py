@@ -22,6 +22,8 @@ from autotune.identification.frequency.limit_cycle_points import limit_cycle_poi
 from autotune.points import FrequencyPoint
 
 PREFLIGHT_SAMPLES = 60
+#: share of these that may take longer than 0.8 of the sample time
+SLOW_SHARE = 0.05
 #: readings that a movement is judged on
 LOOK_BACK = 8
 #: smoothing of the relay while nothing is known of the plant
@@ -106,9 +108,11 @@ def preflight(loop: ControlLoop, config: Config, tell: Tell) -> Known:
     y = y[np.isfinite(y)]
     timing = loop.timing
     typical, late, _ = timing.latency_s
-    if late > 0.8 * loop.sample_time_s:
+    # one hiccup of the computer is none of the link's
+    if loop.slower_than(0.8 * loop.sample_time_s) > SLOW_SHARE:
         raise LinkError(
-            f"link too slow: a reading takes {1e3 * late:.3g} ms, the sample time is {1e3 * loop.sample_time_s:.3g} ms",
+            f"link too slow: a reading takes {1e3 * typical:.3g} ms, up to {1e3 * late:.3g} ms in 99 %,"
+            f" the sample time is {1e3 * loop.sample_time_s:.3g} ms",
             where="preflight",
             mend="raise signals.sample_time_s, or use a faster link",
         )

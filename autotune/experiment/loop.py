@@ -273,6 +273,10 @@ class ControlLoop:
             unusable=self._rows.unusable,
         )
 
+    def slower_than(self, latency_s: float) -> float:
+        """Return the share of the latest readings that took longer [s]."""
+        return sum(value > latency_s for value in self._latency) / max(len(self._latency), 1)
+
     def comment(self, text: str) -> None:
         """Write a line into the recording for a person who reads it."""
         self._writer.comment(text)
