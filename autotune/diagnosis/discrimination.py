@@ -66,21 +66,22 @@ def alive(found: Diagnosis) -> dict[str, tuple[Hypothesis, float]]:
     ----------
     found : Diagnosis
         With candidates and search; ``unknown`` is no hypothesis that predicts anything. The chosen hypothesis is
-        always among those returned, however little is left for it.
+        always among those returned, however little is left for it; one that adds to it for nothing is not.
     """
     search = found.search
+    least = frozenset(search.chosen.names)
     pool = {frozenset(h.names): h for h in (search.retuned, *search.singles, *search.pairs, *search.triples)}
     believed = {candidate.name: candidate.probability for candidate in found.candidates}
     chosen = "+".join(search.chosen.names) or "none"
     classes: dict[frozenset[str], tuple[str, Hypothesis, float]] = {}
     for name, probability in ({chosen: 0.0} | believed).items():
         names = frozenset() if name == "none" else frozenset(name.split("+"))
-        if names not in pool:
+        if names not in pool or (names > least and not _gains(pool[names], search.chosen)):
             continue
         label, h, p = classes.get(_class(names), (name, pool[names], 0.0))
         classes[_class(names)] = (label, h, p + probability)
     total = sum(p for _, _, p in classes.values()) or 1.0
-    kept = classes[_class(frozenset(search.chosen.names))][0]
+    kept = classes[_class(least)][0]
     ranked = sorted(((label, h, p / total) for label, h, p in classes.values()), key=lambda c: -c[2])
     few = [one for one in ranked if one[2] >= ALIVE][:MOST_ALIVE]
     few += [one for one in ranked if one[0] == kept and one not in few]
@@ -93,6 +94,11 @@ def decided(found: Diagnosis) -> str:
     best, (h, p) = next(iter(hypotheses.items()))
     same = _class(frozenset(h.names)) == _class(frozenset(found.search.chosen.names))
     return best if same and (len(hypotheses) == 1 or p >= DECIDED) else ""
+
+
+def _gains(h: Hypothesis, chosen: Hypothesis) -> bool:
+    """Whether a richer hypothesis explains more than chance brings to its further numbers."""
+    return chosen.fit.cost - h.fit.cost > h.parameters - chosen.parameters
 
 
 def _class(names: frozenset[str]) -> frozenset[str]:
