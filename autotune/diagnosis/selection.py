@@ -37,6 +37,9 @@ FAR_BEHIND = (0.3, 60.0)
 #: Score that a hypothesis with more free numbers must be ahead of one with fewer; a hundredth of what it explains where
 #: that is more and the misfit of the best is more than noise has.
 SIMPLER, NOISE_ALONE = 6.0, 1.02
+#: Misfit from which on what is wrong with all of them rules, and not noise; the lead is then this share of what the
+#: best explains: a real rig's every imperfection is more than its noise, and little of it is worth a name.
+MODEL_ERROR, MODEL_ERROR_SHARE = 2.0, 0.12
 #: Rows on which hypotheses are screened; those that lead are fitted to all.
 SCREENING_ROWS = 4500
 Report = Callable[[str, float], None]
@@ -224,6 +227,8 @@ def _searched(data: Data, base: Fit, nominal: Fit, entries: Sequence[Entry], poo
     if len(chosen.names) > 1:
         report("dropping what is not needed", 0.85)
         chosen = _pruned(chosen, singles, data, pool)
+    if misfit(chosen.fit, data) > MODEL_ERROR:
+        chosen = simplest([chosen, *(h for h in (*singles, *pairs) if h.parameters < chosen.parameters)], data, base)
     if STRUCTURES.keys() & set(chosen.names):
         chosen = retuned
     return replace(_found(data, nominal, retuned, singles), pairs=tuple(pairs), triples=tuple(triples), chosen=chosen)
@@ -323,13 +328,17 @@ def polished(ranked: Sequence[Hypothesis], count: int, data: Data, base: Fit, po
     fits = pool.map(lambda h: polish(h, data, base), few)
     done = sorted((h for h in fits if h is not None), key=score)
     if done:
-        lead = simplicity_lead(base, done[0], data)
-        near = [h for h in done if score(h) - score(done[0]) < lead]
-        simplest = min(near, key=lambda h: (h.parameters, score(h)))
-        if simplest.parameters < done[0].parameters:
-            done.remove(simplest)
-            done.insert(0, simplest)
+        first = simplest(done, data, base)
+        done.remove(first)
+        done.insert(0, first)
     return done
+
+
+def simplest(ranked: Sequence[Hypothesis], data: Data, base: Fit) -> Hypothesis:
+    """Return the hypothesis of the fewest numbers that is not far enough behind the first one."""
+    lead = simplicity_lead(base, ranked[0], data)
+    near = [h for h in ranked if score(h) - score(ranked[0]) < lead]
+    return min(near, key=lambda h: (h.parameters, score(h)))
 
 
 def _far_behind(h: Hypothesis, best: Hypothesis, base: Fit) -> bool:
@@ -344,9 +353,11 @@ def simplicity_lead(base: Fit, best: Hypothesis, data: Data) -> float:
 
     Where even the best leaves more than noise, its score counts what is wrong with all of them, and more is asked.
     """
-    if misfit(best.fit, data) < NOISE_ALONE:
+    left = misfit(best.fit, data)
+    if left < NOISE_ALONE:
         return SIMPLER
-    return max(SIMPLER, 0.01 * (base.cost - best.fit.cost))
+    share = MODEL_ERROR_SHARE if left > MODEL_ERROR else 0.01
+    return max(SIMPLER, share * (base.cost - best.fit.cost))
 
 
 def _found(data: Data, nominal: Fit, retuned: Hypothesis, singles: Sequence[Hypothesis] = ()) -> Search:
