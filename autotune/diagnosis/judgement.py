@@ -21,7 +21,7 @@ from autotune.diagnosis.noise import noise_from_differences
 from autotune.diagnosis.result import Candidate, FitQuality
 from autotune.diagnosis.retuning import BLOCKS, misfit, whiteness
 from autotune.diagnosis.search import RUNAWAY, Hypothesis, score
-from autotune.diagnosis.selection import Search, own, simplicity_lead
+from autotune.diagnosis.selection import Search, final_lead, own
 
 #: Residual variance over the noise's (see :func:`autotune.diagnosis.retuning.misfit`) up to which a model is adequate,
 #: beside one standard deviation of that ratio.
@@ -91,7 +91,7 @@ def rivals(found: Search, doubt: float) -> tuple[Candidate, ...]:
     """
     pool = [found.retuned, *found.singles, *found.pairs, *found.triples]
     chosen = found.chosen
-    lead = simplicity_lead(found.retuned.fit, min(pool, key=score), found.data)
+    lead = final_lead(found.retuned.fit, min(pool, key=score), found.data)
     scores: dict[str, float] = {}
     for h in pool:
         refused = h.parameters > chosen.parameters and 0.0 < score(chosen) - score(h) < lead

@@ -228,7 +228,8 @@ def _searched(data: Data, base: Fit, nominal: Fit, entries: Sequence[Entry], poo
         report("dropping what is not needed", 0.85)
         chosen = _pruned(chosen, singles, data, pool)
     if misfit(chosen.fit, data) > MODEL_ERROR:
-        chosen = simplest([chosen, *(h for h in (*singles, *pairs) if h.parameters < chosen.parameters)], data, base)
+        fewer = [h for h in (*singles, *pairs) if h.parameters < chosen.parameters]
+        chosen = simplest([chosen, *fewer], final_lead(base, chosen, data))
     if STRUCTURES.keys() & set(chosen.names):
         chosen = retuned
     return replace(_found(data, nominal, retuned, singles), pairs=tuple(pairs), triples=tuple(triples), chosen=chosen)
@@ -328,15 +329,14 @@ def polished(ranked: Sequence[Hypothesis], count: int, data: Data, base: Fit, po
     fits = pool.map(lambda h: polish(h, data, base), few)
     done = sorted((h for h in fits if h is not None), key=score)
     if done:
-        first = simplest(done, data, base)
+        first = simplest(done, simplicity_lead(base, done[0], data))
         done.remove(first)
         done.insert(0, first)
     return done
 
 
-def simplest(ranked: Sequence[Hypothesis], data: Data, base: Fit) -> Hypothesis:
-    """Return the hypothesis of the fewest numbers that is not far enough behind the first one."""
-    lead = simplicity_lead(base, ranked[0], data)
+def simplest(ranked: Sequence[Hypothesis], lead: float) -> Hypothesis:
+    """Return the hypothesis of the fewest numbers that is less than a lead behind the first one."""
     near = [h for h in ranked if score(h) - score(ranked[0]) < lead]
     return min(near, key=lambda h: (h.parameters, score(h)))
 
@@ -353,11 +353,17 @@ def simplicity_lead(base: Fit, best: Hypothesis, data: Data) -> float:
 
     Where even the best leaves more than noise, its score counts what is wrong with all of them, and more is asked.
     """
-    left = misfit(best.fit, data)
-    if left < NOISE_ALONE:
+    if misfit(best.fit, data) < NOISE_ALONE:
         return SIMPLER
-    share = MODEL_ERROR_SHARE if left > MODEL_ERROR else 0.01
-    return max(SIMPLER, share * (base.cost - best.fit.cost))
+    return max(SIMPLER, 0.01 * (base.cost - best.fit.cost))
+
+
+def final_lead(base: Fit, best: Hypothesis, data: Data) -> float:
+    """Return the same for the choice among all that were found, where the model's error may be what is left."""
+    lead = simplicity_lead(base, best, data)
+    if misfit(best.fit, data) < MODEL_ERROR:
+        return lead
+    return max(lead, MODEL_ERROR_SHARE * (base.cost - best.fit.cost))
 
 
 def _found(data: Data, nominal: Fit, retuned: Hypothesis, singles: Sequence[Hypothesis] = ()) -> Search:
