@@ -173,8 +173,10 @@ def _watch_rig(config: Config, out: Path, settings: _Tracking, duration_s: float
 
     from autotune.cli.common import new_folder, rig_of
     from autotune.experiment.dither import run_dither
+    from autotune.experiment.warm import warm_up
 
     new_folder(out, "recording.csv")
+    warm_up()  # a first compilation may take longer than a recording may be quiet
     recording = out / "recording.csv"
     quiet_s = max(5.0, 20.0 * config.signals.sample_time_s)
     fits = multiprocessing.get_context("spawn").Process(
