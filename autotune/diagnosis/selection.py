@@ -66,9 +66,9 @@ class Search:
     data: Data
     nominal: Fit
     retuned: Hypothesis
-    singles: tuple[Hypothesis, ...]
-    pairs: tuple[Hypothesis, ...]
-    triples: tuple[Hypothesis, ...]
+    singles: tuple[Hypothesis, ...] = ()
+    pairs: tuple[Hypothesis, ...] = ()
+    triples: tuple[Hypothesis, ...] = ()
     chosen: Hypothesis
 
 
@@ -188,7 +188,8 @@ def search(
             return _searched(data, base, nominal, entries, pool, report)
         except RUNAWAY:
             # what breaks off explains nothing: the retuned model stands, and is judged by its misfit
-            return _found(data, nominal, Hypothesis(names=(), fit=base))
+            retuned = Hypothesis(names=(), fit=base)
+            return Search(data=data, nominal=nominal, retuned=retuned, chosen=retuned)
 
 
 def _searched(data: Data, base: Fit, nominal: Fit, entries: Sequence[Entry], pool: Executor, report: Report) -> Search:
@@ -211,7 +212,7 @@ def _searched(data: Data, base: Fit, nominal: Fit, entries: Sequence[Entry], poo
         candidates = [_again(h, few) for h in candidates[:3]]
         singles = polished(candidates, 3, data, base, pool)
     if not singles or not (worth(retuned, singles[0]) or misfit(base, data) > 1.1):
-        return _found(data, nominal, retuned, singles)
+        return Search(data=data, nominal=nominal, retuned=retuned, singles=tuple(singles), chosen=retuned)
     if worth(retuned, singles[0]):
         chosen = singles[0]
     report("pairs of effects", 0.4)
@@ -230,9 +231,15 @@ def _searched(data: Data, base: Fit, nominal: Fit, entries: Sequence[Entry], poo
     if misfit(chosen.fit, data) > MODEL_ERROR:
         fewer = [h for h in (*singles, *pairs) if h.parameters < chosen.parameters]
         chosen = simplest([chosen, *fewer], final_lead(base, chosen, data))
-    if STRUCTURES.keys() & set(chosen.names):
-        chosen = retuned
-    return replace(_found(data, nominal, retuned, singles), pairs=tuple(pairs), triples=tuple(triples), chosen=chosen)
+    return Search(
+        data=data,
+        nominal=nominal,
+        retuned=retuned,
+        singles=tuple(singles),
+        pairs=tuple(pairs),
+        triples=tuple(triples),
+        chosen=retuned if STRUCTURES.keys() & set(chosen.names) else chosen,
+    )
 
 
 def _paired(
@@ -364,15 +371,6 @@ def final_lead(base: Fit, best: Hypothesis, data: Data) -> float:
     if misfit(best.fit, data) < MODEL_ERROR:
         return lead
     return max(lead, MODEL_ERROR_SHARE * (base.cost - best.fit.cost))
-
-
-def _found(data: Data, nominal: Fit, retuned: Hypothesis, singles: Sequence[Hypothesis] = ()) -> Search:
-    chosen = singles[0] if singles and worth(retuned, singles[0]) else retuned
-    if STRUCTURES.keys() & set(chosen.names):
-        chosen = retuned
-    return Search(
-        data=data, nominal=nominal, retuned=retuned, singles=tuple(singles), pairs=(), triples=(), chosen=chosen
-    )
 
 
 def lattice_starts(base: Hypothesis, data: Data, pool: Executor, names: Collection[str]) -> list[Effect]:
