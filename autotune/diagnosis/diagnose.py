@@ -108,8 +108,9 @@ def _judge(found: Search, samples: list[SampleEffect], model: Model) -> Diagnosi
     whole = is_adequate(chosen.fit, found.data)
     offset = _offset(chosen.fit)
     quality, extended_is_better = held_out(found)
-    doubt = doubt_of(chosen.fit, found.data, dominates(quality))
-    verdict = _verdict(found, samples, whole or dominates(quality), offset is not None)
+    most = dominates(quality)
+    doubt = doubt_of(chosen.fit, found.data, most)
+    verdict = _verdict(found, samples, whole or most, offset is not None)
     candidates = rivals(found, doubt)
     effects = _effects(found, samples, offset, candidates) if verdict == "effect" else ()
     description = describe(found.retuned.fit, found.data) if verdict == "unexplained" else None

@@ -11,7 +11,7 @@ nothing: ``DOMINANT``, ``FAR_FROM_NOISE`` and ``HALF_EXPLAINED`` keep what the b
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -61,16 +61,19 @@ def is_white(result: Fit, data: Data, bound: float = WHITE) -> bool:
     return whiteness(result, data) < bound + 2.0 * math.sqrt(2.0 / (BLOCKS * len(result.windows)))
 
 
-def dominates(quality: FitQuality) -> bool:
+def dominates(
+    quality: FitQuality,
+    shares: Sequence[tuple[float, float]] = ((DOMINANT, FAR_FROM_NOISE), (NEARLY_ALL, CLEAR_OF_NOISE)),
+) -> bool:
     """Whether the chosen effects explain most of a misfit that nothing explains whole.
 
     On real rigs something always remains; an effect is named all the same when on rows that were not fitted it takes
-    away most of the variance that retuning leaves above the noise.
+    away most of the variance that retuning leaves above the noise: a share of it where the retuned error's variance is
+    so many times the noise's, for any of the pairs ``shares``.
     """
     retuned, noise = quality.retuned**2, quality.noise_floor**2
     return any(
-        retuned > far * noise and retuned - quality.extended**2 > share * (retuned - noise)
-        for share, far in ((DOMINANT, FAR_FROM_NOISE), (NEARLY_ALL, CLEAR_OF_NOISE))
+        retuned > far * noise and retuned - quality.extended**2 > share * (retuned - noise) for share, far in shares
     )
 
 

@@ -150,12 +150,8 @@ def judged(row: Shown, constants: Mapping[str, float]) -> str:
     bound = constants["ADEQUATE_QUICK" if row.slow < constants["QUICK"] else "ADEQUATE"]
     adequate = white and row.excess < bound
     if row.names:
-        retuned, noise = row.quality.retuned**2, row.quality.noise_floor**2
-        most = any(
-            retuned > constants[far] * noise
-            and retuned - row.quality.extended**2 > constants[share] * (retuned - noise)
-            for share, far in (("DOMINANT", "FAR_FROM_NOISE"), ("NEARLY_ALL", "CLEAR_OF_NOISE"))
-        )
+        names = (("DOMINANT", "FAR_FROM_NOISE"), ("NEARLY_ALL", "CLEAR_OF_NOISE"))
+        most = judgement.dominates(row.quality, [(constants[share], constants[far]) for share, far in names])
         return "named" if adequate or most else "abstained"
     return "abstained" if not adequate and row.misfit > constants["MISSING"] else "neither"
 
