@@ -16,6 +16,7 @@ from autotune.diagnosis.descent import bounded
 from autotune.diagnosis.fitting import Fit, fit, residual_at
 from autotune.diagnosis.kernel import I_LEVELS
 from autotune.diagnosis.parameters import COUNTED, FOUND_DIRECTLY, Parametrisation, effect_with, parametrise
+from autotune.diagnosis.restarts import restarted
 from autotune.diagnosis.simulation import Simulator, entry_of
 from autotune.errors import AutotuneError, IdentificationError
 from autotune.models import Effect, Model
@@ -296,7 +297,8 @@ def _finished(h: Hypothesis, data: Data) -> Hypothesis:
     """Go on with a fit that has begun; where it began to run away, what it had reached stands."""
     try:
         f = h.fit
-        return replace(h, fit=fit(f.parametrisation, data, f.theta, f.x0, iterations=30, inherit=f))
+        result = fit(f.parametrisation, data, f.theta, f.x0, iterations=30, inherit=f)
+        return replace(h, fit=restarted(result, data) if HARD_STOP in h.names else result)
     except RUNAWAY:
         return h
 
