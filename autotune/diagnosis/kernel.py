@@ -39,6 +39,9 @@ SLOTS = 47
 # Positions in the vector of structure integers.
 I_ACTUATOR, I_SPEED, I_POSITION, I_LEVELS = range(4)
 
+#: For what runs in every step and allocates nothing: counting references to its arrays took nine tenths of the time.
+_inlined = njit(cache=True, nogil=True, forceinline=True, _nrt=False)
+
 
 @njit(cache=True, nogil=True)
 def transition_table(A: FloatArray, B: FloatArray, step: float) -> FloatArray:
@@ -71,7 +74,7 @@ def transition_table(A: FloatArray, B: FloatArray, step: float) -> FloatArray:
     return table
 
 
-@njit(cache=True, nogil=True)
+@_inlined
 def _actuator(
     u: float, offset: float, dt: float, time: float, E: FloatArray, on: IntArray, memory: FloatArray
 ) -> float:
@@ -108,7 +111,7 @@ def _actuator(
     return w
 
 
-@njit(cache=True, nogil=True)
+@_inlined
 def _load(time: float, recording: int, E: FloatArray, on: IntArray) -> float:
     """Return the environment's force at the plant's input at a time of a recording."""
     load = 0.0
@@ -123,13 +126,13 @@ def _load(time: float, recording: int, E: FloatArray, on: IntArray) -> float:
     return load
 
 
-@njit(cache=True, nogil=True)
+@_inlined
 def _root_excess(x: float, level: float) -> float:
     """Return x - q(x) for q(x) = 2 X0 (sqrt(1 + x/X0) - 1): what a square-root outflow lacks against a linear one."""
     return x - 2.0 * level * (math.sqrt(max(1.0 + x / level, 0.0)) - 1.0)
 
 
-@njit(cache=True, nogil=True)
+@_inlined
 def _force(
     plant_in: float, v: float, x: float, y_offset: float, gain: float, hysteresis: float, E: FloatArray, on: IntArray
 ) -> float:
@@ -154,7 +157,7 @@ def _force(
     return force
 
 
-@njit(cache=True, nogil=True)
+@_inlined
 def _sensor(z: float, y_offset: float, time: float, E: FloatArray, on: IntArray) -> float:
     """Return the reading for the last block's output z, effects of the sensor applied in their physical order."""
     if on[S_SECOND]:
@@ -175,7 +178,7 @@ def _sensor(z: float, y_offset: float, time: float, E: FloatArray, on: IntArray)
     return reading
 
 
-@njit(cache=True, nogil=True, inline="always")
+@_inlined
 def _linear(table: FloatArray, node: float, x: FloatArray, w: float, out: FloatArray) -> None:
     """Write the state after one step under the command alone; in place through ``out``."""
     n = x.size
@@ -198,7 +201,7 @@ def _linear(table: FloatArray, node: float, x: FloatArray, w: float, out: FloatA
         x[row] = out[row]
 
 
-@njit(cache=True, nogil=True)
+@_inlined
 def _advance(table: FloatArray, node: float, x: FloatArray, w: float, out: FloatArray, column: FloatArray) -> None:
     """Write the state after one step under the command alone, and the step's response to a unit force."""
     n = x.size
@@ -220,7 +223,7 @@ def _advance(table: FloatArray, node: float, x: FloatArray, w: float, out: Float
         column[row] = force
 
 
-@njit(cache=True, nogil=True, inline="always")
+@_inlined
 def _tap(taps: FloatArray, row: int, x: FloatArray) -> float:
     total = 0.0
     for k in range(x.size):
@@ -228,7 +231,7 @@ def _tap(taps: FloatArray, row: int, x: FloatArray) -> float:
     return total
 
 
-@njit(cache=True, nogil=True)
+@_inlined
 def _friction(free: float, per_force: float, v: float, E: FloatArray, on: IntArray) -> float:
     """Return the dry friction force that opposes motion: what stops the speed, at most the friction level."""
     level = E[COULOMB]
@@ -241,7 +244,7 @@ def _friction(free: float, per_force: float, v: float, E: FloatArray, on: IntArr
     return float(min(max(needed, -level), level))
 
 
-@njit(cache=True, nogil=True)
+@_inlined
 def _stop(x: FloatArray, y_offset: float, where: IntArray, E: FloatArray, on: IntArray) -> None:
     """Hold the position inside the hard stops; a blow against a stop is inelastic."""
     p = where[I_POSITION]
@@ -256,7 +259,7 @@ def _stop(x: FloatArray, y_offset: float, where: IntArray, E: FloatArray, on: In
             x[v] = 0.0
 
 
-@njit(cache=True, nogil=True)
+@_inlined
 def _state_force(
     x: FloatArray, w: float, hysteresis: float, gains: FloatArray, y_offset: float, taps: FloatArray, E: FloatArray,
     on: IntArray,
@@ -269,7 +272,7 @@ def _state_force(
     return float(force)
 
 
-@njit(cache=True, nogil=True)
+@_inlined
 def _push(
     table: FloatArray, node: float, w: float, load: float, smooth: bool, gains: FloatArray, y_offset: float,
     taps: FloatArray, E: FloatArray, on: IntArray, x: FloatArray, free: FloatArray, column: FloatArray,
