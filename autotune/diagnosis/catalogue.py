@@ -95,7 +95,8 @@ class Entry:
     confusable : tuple of str
         Effects that can look alike.
     same : tuple of str
-        Effects that cannot be told apart from it with command and measurement alone; itself not counted.
+        Effects that cannot be told apart from it with command and measurement alone; itself not counted. Drifts of
+        load and sensor are the same on a chain that settles; on others one of them simply explains nothing.
     places : tuple of str
         Where it may sit, several where command and measurement cannot say.
     reference : str
@@ -432,7 +433,8 @@ def _sensor() -> tuple[Entry, ...]:
             equation="y = z + rate t",
             parameters=(Quantity(name="rate", unit="{y}/s", scale="real", slot=k.S_DRIFT),),
             starts=lambda s: [(0.01 * s.y / s.duration_s,)],
-            confusable=("environment.drifting_load", "actuator.gain_drift"),
+            confusable=("actuator.gain_drift",),
+            same=("environment.drifting_load",),
             reference=ljung,
         ),
     )
@@ -493,7 +495,8 @@ def _rest() -> tuple[Entry, ...]:
             parameters=(Quantity(name="rate", unit="{f}/s", scale="real", slot=k.DRIFTING),),
             starts=lambda s: [(0.01 * s.f / s.duration_s,)],
             forced=True,
-            confusable=("sensor.drift", "actuator.gain_drift"),
+            confusable=("actuator.gain_drift",),
+            same=("sensor.drift",),
             places=("environment", "actuator", "plant"),
             reference="Astrom and Hagglund, Advanced PID Control, 2006, ch. 4",
         ),

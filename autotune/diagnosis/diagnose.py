@@ -11,10 +11,22 @@ import numpy as np
 
 from autotune.controller import Controller
 from autotune.diagnosis.catalogue import STRUCTURES
+from autotune.diagnosis.constancy import Variation, largest_variation
 from autotune.diagnosis.description import Description, describe
 from autotune.diagnosis.discriminate import next_experiment
 from autotune.diagnosis.fitting import Fit
-from autotune.diagnosis.judgement import MISSING, dominates, doubt_of, held_out, is_adequate, is_white, rivals
+from autotune.diagnosis.judgement import (
+    MISSING,
+    UNKNOWN,
+    dominates,
+    doubt_of,
+    held_out,
+    is_adequate,
+    is_constant,
+    is_white,
+    leaves_little,
+    rivals,
+)
 from autotune.diagnosis.law import law_effect
 from autotune.diagnosis.result import Candidate, Diagnosis, FitQuality, FoundEffect, OperatingRange, Verdict
 from autotune.diagnosis.retuning import COARSE, misfit
@@ -36,6 +48,8 @@ SLOW_NOISE = 0.8
 NEVER = 1e18
 #: Evidence from which on what single rows show is sure, and its share of what an effect of the chain gains.
 SURE, SAMPLE_SHARE = 60.0, 0.2
+#: Probabilities stated of what single rows show, with that evidence and with less.
+SURELY, PROBABLY = 1.0 / (1.0 + UNKNOWN), 0.85
 
 
 def diagnose(
@@ -105,20 +119,22 @@ def diagnose(
 
 def _judge(found: Search, samples: list[SampleEffect], model: Model) -> Diagnosis:
     chosen = found.chosen
-    whole = is_adequate(chosen.fit, found.data)
+    varies, gained = largest_variation(chosen.fit, found.data), score(found.retuned) - score(chosen)
+    constant = is_constant(varies, gained)
+    whole = constant and is_adequate(chosen.fit, found.data)
     offset = _offset(chosen.fit)
     quality, extended_is_better = held_out(found)
-    most = dominates(quality)
-    doubt = doubt_of(chosen.fit, found.data, most)
-    verdict = _verdict(found, samples, whole or most, offset is not None)
+    most = dominates(quality) or leaves_little(varies, gained)
+    doubt = doubt_of(chosen.fit, found.data, whole, most)
+    verdict = _verdict(found, samples, whole or most, constant, offset is not None)
     candidates = rivals(found, doubt)
-    effects = _effects(found, samples, offset, candidates) if verdict == "effect" else ()
+    effects = _effects(found, samples, offset, candidates, 1.0 / (1.0 + doubt)) if verdict == "effect" else ()
     description = describe(found.retuned.fit, found.data) if verdict == "unexplained" else None
-    places = _places(effects) if description is None else _suspected(found, description)
+    places = _places(effects) if description is None else _suspected(found, description, None if constant else varies)
     use = chosen if extended_is_better and verdict in ("effect", "unexplained") else found.retuned
     extended = model if verdict == "none" else use.fit.model
-    clips = [Effect(name=s.name, parameters=s.parameters) for s in samples if s.name == "sensor.saturation"]
-    extended = replace(extended, effects=(*_with_uncertainty(use, extended.effects), *clips))
+    ends = [Effect(name=s.name, parameters=s.parameters) for s in samples if _simulated(s, use.fit)]
+    extended = replace(extended, effects=(*_with_uncertainty(use, extended.effects), *ends))
     said = Diagnosis(
         verdict=verdict,
         effects=effects,
@@ -127,17 +143,17 @@ def _judge(found: Search, samples: list[SampleEffect], model: Model) -> Diagnosi
         fit=quality,
         next_experiment=None,
         extended_model=extended,
-        sentences=_sentences(verdict, effects, quality, places, whole or bool(samples)),
+        sentences=_sentences(verdict, effects, quality, places, whole or bool(samples), None if constant else varies),
         description=description,
         search=found,
     )
     return replace(said, next_experiment=next_experiment(said))
 
 
-def _verdict(found: Search, samples: list[SampleEffect], adequate: bool, offset: bool) -> Verdict:
+def _verdict(found: Search, samples: list[SampleEffect], adequate: bool, constant: bool, offset: bool) -> Verdict:
     if found.chosen.names and not samples:
         return "effect" if adequate else "unexplained"
-    if not samples and _is_of_another_structure(found):
+    if not samples and (_is_of_another_structure(found) or not constant):
         return "unexplained"
     if samples or (offset and adequate):
         return "effect"
@@ -182,7 +198,11 @@ def probability_of(name: str, candidates: Sequence[Candidate]) -> float:
 
 
 def _effects(
-    found: Search, samples: list[SampleEffect], offset: _Offset | None, candidates: Sequence[Candidate]
+    found: Search,
+    samples: list[SampleEffect],
+    offset: _Offset | None,
+    candidates: Sequence[Candidate],
+    known: float,
 ) -> tuple[FoundEffect, ...]:
     chosen = found.chosen
     everywhere = tuple((i, float(r.t[0]), float(r.t[-1])) for i, r in enumerate(found.data.recordings))
@@ -191,9 +211,8 @@ def _effects(
         weight = _weight(found, effect.name)
         effects.append((weight, _found_effect(effect, found, candidates, everywhere)))
     for s in samples:
-        confident = 0.97 if s.evidence > 60.0 else 0.85
         effects.append((s.evidence, FoundEffect(
-            name=s.name, probability=confident, places=(s.name.partition(".")[0],),
+            name=s.name, probability=SURELY if s.evidence > SURE else PROBABLY, places=(s.name.partition(".")[0],),
             parameters=MappingProxyType(s.parameters), equation=s.equation, windows=s.windows or everywhere,
         )))  # fmt: skip
     ranked = [e for _, e in sorted(effects, key=lambda pair: -pair[0])]
@@ -202,7 +221,7 @@ def _effects(
         unit = found.chosen.fit.parametrisation.model.input.unit
         parameter = {"offset": Parameter(value=offset.value, sd=offset.sd, unit=unit)}
         ranked.append(FoundEffect(
-            name="actuator.offset", probability=0.9, places=entry.places, parameters=MappingProxyType(parameter),
+            name="actuator.offset", probability=known, places=entry.places, parameters=MappingProxyType(parameter),
             equation=entry.equation, windows=everywhere,
         ))  # fmt: skip
     return tuple(ranked)
@@ -281,14 +300,27 @@ def _range(found: Search, place: str) -> OperatingRange:
     return OperatingRange(signal=name, low=float(np.nanmin(values)), high=float(np.nanmax(values)))
 
 
+def _simulated(effect: SampleEffect, result: Fit) -> bool:
+    """Whether a simulation is nearer to the readings with what their samples show; beside much noise no rounding is."""
+    if effect.name != "sensor.quantisation":
+        return effect.name == "sensor.saturation"
+    step = effect.parameters["step"].value
+    y = [s[:, 0] + e for s, e in zip(result.signals, result.residuals, strict=True)]
+    rounded = [r - step * np.round(s[:, 0] / step) for r, s in zip(y, result.signals, strict=True)]
+    squares = [float(np.nansum(np.concatenate(e) ** 2)) for e in (rounded, result.residuals)]
+    return squares[0] < squares[1]
+
+
 def _places(effects: Sequence[FoundEffect]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(place for e in effects for place in e.places))
 
 
-def _suspected(found: Search, description: Description) -> tuple[str, ...]:
-    """Return where a description adds its terms, and the places of the candidates nearest to an explanation."""
+def _suspected(found: Search, description: Description, varies: Variation | None) -> tuple[str, ...]:
+    """Return where a description adds its terms, where what varies enters, and the places of the nearest candidates."""
     ranked = sorted((*found.singles, *found.pairs), key=score)
     places: dict[str, None] = {description.place: None} if description.terms else {}
+    if varies is not None:
+        places[varies.place] = None
     for h in ranked[:3]:
         for name in h.names:
             entry = entry_of(name)
@@ -297,7 +329,12 @@ def _suspected(found: Search, description: Description) -> tuple[str, ...]:
 
 
 def _sentences(
-    verdict: Verdict, effects: Sequence[FoundEffect], quality: FitQuality, places: Sequence[str], whole: bool
+    verdict: Verdict,
+    effects: Sequence[FoundEffect],
+    quality: FitQuality,
+    places: Sequence[str],
+    whole: bool,
+    varies: Variation | None,
 ) -> tuple[str, ...]:
     errors = (
         f"Held-out error, as a share of the spread of y: nominal {quality.nominal:.3g}, retuned {quality.retuned:.3g}, "
@@ -314,4 +351,4 @@ def _sentences(
             first = f"Physics was left out: {names}.{rest}"
         case _:
             first = f"Something is missing that no candidate explains to within noise; it shows at {', '.join(places)}."
-    return first, errors
+    return (first, errors) if varies is None else (first, varies.sentence, errors)

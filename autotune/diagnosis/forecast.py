@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from autotune.arrays import BoolArray, FloatArray, IntArray
+from autotune.diagnosis import kernel
 from autotune.diagnosis.fitting import state_scales
 from autotune.diagnosis.simulation import Simulator, assemble
 from autotune.errors import InputError
@@ -118,6 +119,9 @@ def forecast(model: Model, recording: Recording, horizon_s: float | None = None)
     if good.sum() < 8:
         raise InputError("fewer than 8 finite readings", where=recording.name, mend="record longer")
     sim = assemble(model)
+    step = float(sim.E[kernel.S_QUANTUM]) if sim.on[kernel.S_QUANTUM] else 0.0
+    # no derivative leads through a converter's steps: states are estimated without them
+    sim = replace(sim, on=np.where(np.arange(sim.on.size) == kernel.S_QUANTUM, 0, sim.on))
     estimator = _Estimator(
         sim=sim,
         linear=replace(sim, on=np.zeros_like(sim.on), forced=False, falling=sim.chain),
@@ -128,10 +132,15 @@ def forecast(model: Model, recording: Recording, horizon_s: float | None = None)
     )
     if horizon_s is None:
         rows = max(len(recording) // 10, min(len(recording), 8))
-        return estimator.run(0, len(recording), estimator.estimate(0, rows, bias=False))
+        return _rounded(estimator.run(0, len(recording), estimator.estimate(0, rows, bias=False)), step)
     if not horizon_s >= 2.0 * recording.sample_time_s:
         raise InputError(f"horizon = {horizon_s:g} s", where="--horizon", mend="give at least two sample times")
-    return _windowed(estimator, horizon_s)
+    return _rounded(_windowed(estimator, horizon_s), step)
+
+
+def _rounded(y: FloatArray, step: float) -> FloatArray:
+    """Return what a converter makes of readings; a step of 0 is none."""
+    return step * np.floor(y / step + 0.5) if step > 0.0 else y
 
 
 def _windowed(estimator: _Estimator, horizon_s: float) -> FloatArray:

@@ -15,6 +15,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from autotune.diagnosis.constancy import Variation
 from autotune.diagnosis.data import Data
 from autotune.diagnosis.fitting import Fit, fit
 from autotune.diagnosis.noise import noise_from_differences
@@ -31,6 +32,12 @@ ADEQUATE = 1.04
 ADEQUATE_QUICK, QUICK = 1.12, 1.0
 #: The same for the slow part of the residual, after its own AR(2) has been taken out, beside two standard deviations.
 WHITE = 1.10
+#: Chi-square of the largest of some hundred score tests (see :mod:`autotune.diagnosis.constancy`) from which on
+#: something swings or leads past the chain that the model does not have, and its least share of what effects gained:
+#: right models leave up to 15 (where thresholds make fits rough two hundredths of what they gain), wrong ones a third.
+INCONSTANT, OF_THE_GAINED = 25.0, 0.1
+#: The same share below which effects are named although what they leave is not noise.
+REST_OF_THE_GAINED = 0.04
 #: Misfit of a model without effects from which on something must be missing, although no effect is worth it; clean
 #: recordings leave up to 1.02.
 MISSING = 1.05
@@ -38,10 +45,9 @@ MISSING = 1.05
 #: times the noise's variance the retuned model's error has: nearer to the noise adequacy is asked for.
 DOMINANT, FAR_FROM_NOISE = 0.35, 8.0
 NEARLY_ALL, CLEAR_OF_NOISE = 0.80, 2.0
-#: Weight of a cause outside the catalogue, beside the best hypothesis's 1: where one effect explains the recordings,
-#: where several together do (two shapes can imitate a third), and where the best explains most of what retuning leaves
-#: far above the noise.
-UNKNOWN, UNKNOWN_TO_PAIRS, HALF_EXPLAINED = 0.03, 0.07, 0.25
+#: Weight of a cause outside the catalogue, beside 1 of all hypotheses: where the best explains the recordings, and
+#: where it explains most of what retuning leaves but not all.
+UNKNOWN, HALF_EXPLAINED = 0.03, 0.5
 #: Scale of the log-odds: one unit of chi2 counts this much less than for ideal noise.
 TEMPERATURE = 3.0
 
@@ -59,6 +65,16 @@ def _allowed(result: Fit, data: Data) -> float:
 def is_white(result: Fit, data: Data, bound: float = WHITE) -> bool:
     """Whether a residual has no slow part beyond what chance brings."""
     return whiteness(result, data) < bound + 2.0 * math.sqrt(2.0 / (BLOCKS * len(result.windows)))
+
+
+def is_constant(varies: Variation, gained: float) -> bool:
+    """Whether what a model leaves neither swings nor goes past its chain, beside the score that its effects gained."""
+    return varies.gain < max(INCONSTANT, OF_THE_GAINED * gained)
+
+
+def leaves_little(varies: Variation, gained: float) -> bool:
+    """Whether what effects leave is so small beside the score they gained that it is the fit's own roughness."""
+    return varies.gain < REST_OF_THE_GAINED * gained
 
 
 def dominates(
@@ -85,7 +101,7 @@ def rivals(found: Search, doubt: float) -> tuple[Candidate, ...]:
     found : Search
         Hypotheses with their fits.
     doubt : float
-        Weight of a cause outside the catalogue beside the best hypothesis's 1, see :func:`doubt_of`.
+        Weight of a cause outside the catalogue beside 1 of all hypotheses together, see :func:`doubt_of`.
 
     Notes
     -----
@@ -113,26 +129,26 @@ def weighed(scores: Mapping[str, float], scale: float, doubt: float) -> tuple[Ca
     scale : float
         Units of score that count as one.
     doubt : float
-        Weight of what is none of them, beside 1 of the best.
+        Weight of what is none of them, beside 1 of all together.
     """
     best = min(scores.values())
-    weights = {name: math.exp(-(value - best) / (2.0 * scale)) for name, value in scores.items()} | {"unknown": doubt}
+    weights = {name: math.exp(-(value - best) / (2.0 * scale)) for name, value in scores.items()}
+    weights["unknown"] = doubt * sum(weights.values())
     total = sum(weights.values())
     ranked = sorted(weights.items(), key=lambda item: -item[1])
     return tuple(Candidate(name=name, probability=w / total) for name, w in ranked if w / total > 1e-4)[:12]
 
 
-def doubt_of(result: Fit, data: Data, dominant: bool) -> float:
-    """Return the weight of a cause outside the catalogue, beside 1 of the best hypothesis.
+def doubt_of(result: Fit, data: Data, adequate: bool, most: bool) -> float:
+    """Return the weight of a cause outside the catalogue, beside 1 of all hypotheses together.
 
     Small where the residual is noise, and the larger the nearer its misfit comes to the bound of adequacy; beyond it
-    the two weigh the same, but for an effect that explains most of what retuning leaves far above the noise.
+    the two weigh the same, but for effects that explain most of what retuning leaves.
     """
-    if is_adequate(result, data):
+    if adequate:
         excess = max(misfit(result, data) - 1.0, 0.0) / (_allowed(result, data) - 1.0)
-        least = UNKNOWN_TO_PAIRS if len(result.parametrisation.model.effects) > 1 else UNKNOWN
-        return least + (1.0 - least) * excess**4
-    return HALF_EXPLAINED if dominant else 1.0
+        return UNKNOWN + (1.0 - UNKNOWN) * excess**4
+    return HALF_EXPLAINED if most else 1.0
 
 
 def held_out(found: Search) -> tuple[FitQuality, bool]:

@@ -90,8 +90,12 @@ class Leftover:
 
     def is_new(self, column: FloatArray) -> bool:
         """Whether a direction is more than what the model's own numbers can do."""
-        left = column - self._own @ (self._own.T @ column)
+        left = self.beyond_numbers(column)
         return bool(left @ left > NEW * (column @ column))
+
+    def beyond_numbers(self, direction: FloatArray) -> FloatArray:
+        """Return a freed direction, (N,) or (N, q), without what the model's own numbers explain."""
+        return np.asarray(direction - self._own @ (self._own.T @ direction))
 
     def _signals(self) -> dict[Place, dict[str, list[FloatArray]]]:
         """Return the signals that something missing may depend on, per place and recording; silent ones left out.

@@ -31,7 +31,8 @@ def test_rivals_share_the_probability_and_less_evidence_never_weighs_more(
     ranked = weighed(scores, scale, doubt)
     named = {c.name: c.probability for c in ranked}
     assert sum(named.values()) == pytest.approx(1.0, abs=1e-3)
-    assert named["unknown"] == pytest.approx(doubt * max(p for n, p in named.items() if n != "unknown"), rel=1e-6)
+    # a weight of doubt beside 1 of all hypotheses together, however many share that 1
+    assert named["unknown"] == pytest.approx(doubt / (1.0 + doubt), rel=1e-3)
     known = sorted(set(named) - {"unknown"}, key=lambda name: scores[name])
     assert all(named[a] >= named[b] for a, b in itertools.pairwise(known))
 

@@ -1,0 +1,143 @@
+"""Whether what a fitted model holds constant is constant: score tests against what swings, and against paths it lacks.
+
+A parameter that swings in time adds to the chain what it multiplies, times the swing: a gain the command, a stiffness
+the position, a lag or delay the rate of the reading. Each of these signals, times cos and sin of every frequency that
+the recordings resolve, is sent through the linear chain; what it would explain of the residual beyond start states and
+free numbers is chi-square of two degrees where the model is right (Rao's score test). No fit is needed, and nothing is
+assumed of the swing's shape: a switch or a sweep has parts at those frequencies too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+
+from autotune.arrays import FloatArray
+from autotune.diagnosis.data import Data
+from autotune.diagnosis.fitting import Fit
+from autotune.diagnosis.leftover import NEW, Leftover, Place
+from autotune.diagnosis.windows import slowest_lag_s
+
+#: Fastest swing that is looked for, in cycles per slowest lag, and the most frequencies.
+FASTEST, MOST_FREQUENCIES = 0.3, 120
+#: Delays of an echo that is looked for, in slowest lags.
+ECHOES = (0.5, 0.75, 1.0, 1.35, 1.8, 2.4)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Variation:
+    """What explains most of a residual among what swings and what is missing as a path.
+
+    Attributes
+    ----------
+    gain : float
+        Decrease of chi2 that it promises, in units of the residual's own variance.
+    place : str
+        Where it enters.
+    what : str
+        The signal that is multiplied or added.
+    period_s : float
+        Of the swing [s]; infinite for what does not swing.
+    """
+
+    gain: float
+    place: Place
+    what: str
+    period_s: float
+
+    @property
+    def sentence(self) -> str:
+        """What a reader is told."""
+        if np.isfinite(self.period_s):
+            return f"What is left swings with a period of about {self.period_s:.2g} s together with {self.what}."
+        return f"What is left goes with {self.what}."
+
+
+def largest_variation(result: Fit, data: Data) -> Variation:
+    """Return what explains most of a fit's residual among swings and paths that its model does not have.
+
+    Parameters
+    ----------
+    result : Fit
+        A fit at its minimum.
+    data : Data
+        What it was fitted to.
+
+    Returns
+    -------
+    Variation
+        The largest of some two hundred chi-square values of two degrees of freedom: on recordings of a model that is
+        right it stays below 20 (about one in two hundred exceeds it).
+
+    Notes
+    -----
+    Linear in the effect and quasi-static in the swing: what is far from both is found with less power, and a model that
+    is right is not accused more often. No signal knows the noise of the row that is tested, so feedback brings no bias.
+    """
+    left = Leftover(result, data)
+    e = left.beyond_numbers(left.e)
+    variance = float(e @ e) / left.rows
+    lag, longest = slowest_lag_s(result.model), max(r.duration_s for r in data.recordings)
+    count = int(min(FASTEST * longest / max(lag, 1e-12), MOST_FREQUENCIES))
+    entries = [(*signal, k / longest) for signal in _multiplied(left) for k in range(count + 1)]
+    entries += [(*signal, 0.0) for signal in _paths(left, lag)]
+
+    def gained(entry: tuple[Place, str, Sequence[FloatArray], float]) -> float:
+        place, _, signals, frequency = entry
+        waves = (np.cos, np.sin) if frequency else (np.cos,)
+        columns = [left.shown(place, _swinging(data, signals, wave, frequency)) for wave in waves]
+        return _explained(np.column_stack(columns), e, left) / variance
+
+    with ThreadPoolExecutor(2) as pool:
+        gains = list(pool.map(gained, entries))
+    gain, (place, what, _, frequency) = max(zip(gains, entries, strict=True), key=lambda pair: pair[0])
+    return Variation(gain=gain, place=place, what=what, period_s=1.0 / frequency if frequency else np.inf)
+
+
+def _multiplied(left: Leftover) -> Iterator[tuple[Place, str, list[FloatArray]]]:
+    """Yield what a swing would multiply: place, name, and signal per recording."""
+    sim, recordings = left.result.sim, left.data.recordings
+    out = [np.nan_to_num(s) for s in left.result.signals]
+    yield "plant", "a load", [np.ones(len(r)) for r in recordings]
+    yield "actuator", "the command, as a gain that changes would", [r.u - sim.u_offset for r in recordings]
+    yield "plant", "the position or level, as a stiffness or leak that changes would", [s[:, 2] for s in out]
+    yield "sensor", "the reading, as a sensor's gain that changes would", [s[:, 0] - sim.y_offset for s in out]
+    # from the row before: the row after has felt the command that answers this row's noise
+    rates = [np.diff(s[:, 0], prepend=s[0, 0]) / np.gradient(r.t) for s, r in zip(out, recordings, strict=True)]
+    yield "sensor", "the rate of the reading, as a lag or delay that changes would", rates
+
+
+def _paths(left: Leftover, lag_s: float) -> Iterator[tuple[Place, str, list[FloatArray]]]:
+    """Yield what a path that the chain lacks would add to the reading: place, name, and signal per recording."""
+    sim, recordings = left.result.sim, left.data.recordings
+    # the command held until the row: the row's own already answers its noise
+    held = [np.concatenate([r.u[:1], r.u[:-1]]) - sim.u_offset for r in recordings]
+    yield "sensor", "the command itself, as cross-talk to the reading would", held
+    for delay in (d * lag_s for d in ECHOES):
+        past = [
+            np.interp(r.t - delay, r.t, np.nan_to_num(s[:, 0]) - sim.y_offset)
+            for s, r in zip(left.result.signals, recordings, strict=True)
+        ]
+        yield "sensor", f"the reading {delay:.2g} s before, as an echo would", past
+
+
+def _swinging(
+    data: Data, signals: Sequence[FloatArray], wave: Callable[[FloatArray], FloatArray], frequency_hz: float
+) -> list[FloatArray]:
+    """Return signals times a wave of every recording's own time."""
+    angles = [2.0 * np.pi * frequency_hz * (r.t - r.t[0]) for r in data.recordings]
+    return [s * wave(a) for s, a in zip(signals, angles, strict=True)]
+
+
+def _explained(X: FloatArray, e: FloatArray, left: Leftover) -> float:
+    """Return the decrease of |e|^2 by columns, as far as free numbers cannot imitate them."""
+    before = np.sum(X**2, axis=0)
+    X = left.beyond_numbers(X)
+    new = np.sum(X**2, axis=0) > NEW * before
+    if not new.any():
+        return 0.0
+    Q = np.linalg.qr(X[:, new] / np.sqrt(before[new]))[0]
+    return float(np.sum((Q.T @ e) ** 2))
