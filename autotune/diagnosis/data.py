@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from numba import njit
 
 from autotune.arrays import BoolArray, FloatArray, IntArray
 from autotune.diagnosis.noise import Noise
@@ -84,28 +85,23 @@ class Data:
         """Sample time of every recording [s]."""
         return tuple(r.sample_time_s for r in self.recordings)
 
-    @cached_property
-    def _filtered_rows(self) -> tuple[tuple[tuple[IntArray, ...], BoolArray], ...]:
-        """Per recording the rows that have a row before them at each lag, and those whose innovation counts."""
-        result = []
-        for good, starts in zip(self.good, self.starts, strict=True):
-            use, fresh = good.copy(), np.zeros(good.size, dtype=bool)
-            fresh[starts] = True
-            rows = []
-            for lag in range(1, len(self.noise.ar) + 1):
-                back = np.flatnonzero(~fresh[lag:]) + lag
-                use[back] &= good[back - lag]
-                fresh[1:] |= fresh[:-1]  # a row that near to a start has no older one
-                rows.append(back)
-            result.append((tuple(rows), use))
-        return tuple(result)
-
     def whitened(self, residuals: list[FloatArray]) -> list[FloatArray]:
         """Return the residuals whitened by the noise model, zero where a row or one that it needs does not count."""
-        result = []
-        for r, (rows, use) in zip(residuals, self._filtered_rows, strict=True):
-            e = r.copy()
-            for lag, (a, back) in enumerate(zip(self.noise.ar, rows, strict=True), start=1):
-                e[back] -= a * r[back - lag]
-            result.append(np.where(use, e / self.noise.sd, 0.0))
-        return result
+        ar, sd = np.array(self.noise.ar), self.noise.sd
+        rows = zip(residuals, self.good, self.starts, strict=True)
+        return [_innovations(r, good, starts, ar, sd) for r, good, starts in rows]
+
+
+@njit(cache=True, nogil=True)
+def _innovations(r: FloatArray, good: BoolArray, starts: IntArray, ar: FloatArray, sd: float) -> FloatArray:
+    """Return e_k = (r_k - a1 r_{k-1} - ...) / sd, r before a start taken for zero."""
+    e = np.zeros(r.size)
+    for w in range(starts.size):
+        for k in range(starts[w], starts[w + 1] if w + 1 < starts.size else r.size):
+            counts, total = good[k], r[k]
+            for lag in range(1, min(k - starts[w], ar.size) + 1):
+                counts = counts and good[k - lag]
+                total -= ar[lag - 1] * r[k - lag]
+            if counts:
+                e[k] = total / sd
+    return e

@@ -6,9 +6,10 @@ from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
-from autotune.arrays import BoolArray, FloatArray
+from autotune.arrays import BoolArray, FloatArray, IntArray
 from autotune.diagnosis.data import Data
 from autotune.diagnosis.parameters import Parametrisation
 from autotune.diagnosis.simulation import Simulator, assemble
@@ -75,8 +76,6 @@ class Problem:
         #: First row of every window and the row after its last, in the concatenated residual
         self.first = np.concatenate([e + a for e, a in zip(edges, data.starts, strict=False)])
         self.last = np.concatenate([e + b for e, b in zip(edges, data.stops, strict=False)])
-        #: Rows inside windows, one window after the other
-        self.inside = np.concatenate([np.arange(a, b) for a, b in zip(self.first, self.last, strict=True)])
         #: How many windows every recording has
         self.counts = [len(a) for a in data.starts]
 
@@ -159,24 +158,29 @@ def eliminate(
         (W, n) and (W, n, p) array: start states that explain the rest, in units of their scales.
     """
     J, Jx = derivatives
-    n = Jx.shape[1]
-    X, lengths = Jx[problem.inside], problem.last - problem.first
-    both = np.column_stack([X, e[problem.inside], J[problem.inside]])
-    offsets = np.concatenate([[0], np.cumsum(lengths)[:-1]])
-    products = np.add.reduceat(X[:, :, None] * both[:, None, :], offsets, axis=0)
-    G = products[:, :, :n]
-    # a little of the prior that start states are of the signals' size keeps unfelt ones in place
-    G = G + damping * G * np.eye(n) + (1e-2 + 1e-10 * np.trace(G, axis1=1, axis2=2))[:, None, None] * np.eye(n)
+    left = np.column_stack([e, J])
     try:
-        gains = np.linalg.solve(G, products[:, :, n:])
+        gains = _freed(left, Jx, problem.first, problem.last, damping)
     except np.linalg.LinAlgError as failure:
         raise IdentificationError("the start states cannot be told from the data", where="fit") from failure
-    left = both[:, n:]
-    spread = np.repeat(gains, lengths, axis=0)
-    left = left - np.einsum("kn,knp->kp", X, spread)
-    e_left, J_left = e.copy(), J.copy()
-    e_left[problem.inside], J_left[problem.inside] = left[:, 0], left[:, 1:]
-    return e_left, J_left, gains[:, :, 0], gains[:, :, 1:]
+    return left[:, 0], left[:, 1:], gains[:, :, 0], gains[:, :, 1:]
+
+
+@njit(cache=True, nogil=True)
+def _freed(left: FloatArray, Jx: FloatArray, first: IntArray, last: IntArray, damping: float) -> FloatArray:
+    """Free columns of what each window's start state explains, in place; return the states that do, (W, n, columns)."""
+    n = Jx.shape[1]
+    gains = np.empty((first.size, n, left.shape[1]))
+    for w in range(first.size):
+        X, Y = Jx[first[w] : last[w]], left[first[w] : last[w]]
+        G = X.T @ X
+        # a little of the prior that start states are of the signals' size keeps unfelt ones in place
+        least = 1e-2 + 1e-10 * np.trace(G)
+        for i in range(n):
+            G[i, i] += damping * G[i, i] + least
+        gains[w] = np.linalg.solve(G, X.T @ Y)
+        Y -= X @ gains[w]
+    return gains
 
 
 def descend(
