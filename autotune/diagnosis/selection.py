@@ -26,6 +26,9 @@ from autotune.recording import Recording
 #: Decrease of the score that an effect must bring: what chance brings among some two hundred starts, with a margin (on
 #: clean recordings nothing brought more than 15); weak effects that can be told bring a hundred and more, some 40.
 LEAST_DECREASE = 30.0
+#: The same where a number of the nominal structure lies beyond belief without the effect, by that many of its prior's
+#: standard deviations: a lag that has to be tripled is no wrong number.
+LEAST_BEYOND_BELIEF, BEYOND_BELIEF = 16.0, 4.0
 #: Shift of an effect's size, as a logarithm, that gets a fit out of a crease; stiction's creases are narrow.
 NUDGE, NARROW = 0.06, 0.02
 #: Effects whose thresholds make the criterion rough.
@@ -311,10 +314,10 @@ def _again(h: Hypothesis, data: Data) -> Hypothesis:
     return replace(h, fit=fit(h.fit.parametrisation, data, h.fit.theta, h.fit.x0, iterations=20))
 
 
-def bent(result: Fit) -> bool:
+def bent(result: Fit, far: float = 2.0) -> bool:
     """Whether retuning moved a gain or lag so far that it must stand for something else."""
     away = np.abs(result.theta - result.parametrisation.centre) / result.parametrisation.spreads
-    return bool(np.max(away, initial=0.0) > 2.0)
+    return bool(np.max(away, initial=0.0) > far)
 
 
 def _unbent(base: Fit, data: Data) -> Hypothesis:
@@ -421,7 +424,8 @@ def _larger(
 def worth(smaller: Hypothesis, larger: Hypothesis) -> bool:
     """Whether a larger hypothesis explains enough more to be believed."""
     excess = max(1.0, larger.fit.chi2 / larger.fit.rows)
-    return bool(score(smaller) - score(larger) > LEAST_DECREASE * excess)
+    least = LEAST_BEYOND_BELIEF if bent(smaller.fit, BEYOND_BELIEF) else LEAST_DECREASE
+    return bool(score(smaller) - score(larger) > least * excess)
 
 
 def needed(smaller: Hypothesis, larger: Hypothesis, data: Data) -> bool:
