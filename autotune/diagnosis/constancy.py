@@ -1,4 +1,4 @@
-"""Whether what a fitted model holds constant is constant: score tests against what swings, and against paths it lacks.
+"""Whether what a fitted model holds constant is: score tests against what swings, bends, or goes past its chain.
 
 A parameter that swings in time adds to the chain what it multiplies, times the swing: a gain the command, a stiffness
 the position, a lag or delay the rate of the reading. Each of these signals, times cos and sin of every frequency that
@@ -29,7 +29,7 @@ ECHOES = (0.5, 0.75, 1.0, 1.35, 1.8, 2.4)
 
 @dataclass(frozen=True, kw_only=True)
 class Variation:
-    """What explains most of a residual among what swings and what is missing as a path.
+    """What explains most of a residual among what swings, bends, or is missing as a path.
 
     Attributes
     ----------
@@ -57,7 +57,7 @@ class Variation:
 
 
 def largest_variation(result: Fit, data: Data) -> Variation:
-    """Return what explains most of a fit's residual among swings and paths that its model does not have.
+    """Return what explains most of a fit's residual among swings, bends and paths that its model does not have.
 
     Parameters
     ----------
@@ -83,7 +83,7 @@ def largest_variation(result: Fit, data: Data) -> Variation:
     lag, longest = slowest_lag_s(result.model), max(r.duration_s for r in data.recordings)
     count = int(min(FASTEST * longest / max(lag, 1e-12), MOST_FREQUENCIES))
     entries = [(*signal, k / longest) for signal in _multiplied(left) for k in range(count + 1)]
-    entries += [(*signal, 0.0) for signal in _paths(left, lag)]
+    entries += [(*signal, 0.0) for signal in (*_bends(left), *_paths(left, lag))]
 
     def gained(entry: tuple[Place, str, Sequence[FloatArray], float]) -> float:
         place, _, signals, frequency = entry
@@ -108,6 +108,24 @@ def _multiplied(left: Leftover) -> Iterator[tuple[Place, str, list[FloatArray]]]
     # from the row before: the row after has felt the command that answers this row's noise
     rates = [np.diff(s[:, 0], prepend=s[0, 0]) / np.gradient(r.t) for s, r in zip(out, recordings, strict=True)]
     yield "sensor", "the rate of the reading, as a lag or delay that changes would", rates
+
+
+def _bends(left: Leftover) -> Iterator[tuple[Place, str, list[FloatArray]]]:
+    """Yield what a static curve would add: second and third powers of each signal, place, and a gain over position."""
+    sim, out = left.result.sim, [np.nan_to_num(s) for s in left.result.signals]
+    speed, position, force = ([s[:, column] for s in out] for column in (1, 2, 3))
+    curved: list[tuple[Place, str, list[FloatArray]]] = [
+        ("actuator", "the command", [r.u - sim.u_offset for r in left.data.recordings]),
+        ("plant", "the position or level", position),
+        ("sensor", "the reading", [s[:, 0] - sim.y_offset for s in out]),
+    ]
+    if sim.chain.is_mechanical:
+        curved.append(("plant", "the speed", speed))
+    for place, what, signals in curved:
+        yield place, f"the square of {what}", [s**2 for s in signals]
+        yield place, f"the cube of {what}", [s**3 for s in signals]
+    products = [x * f for x, f in zip(position, force, strict=True)]
+    yield "plant", "the position or level times the plant's input", products
 
 
 def _paths(left: Leftover, lag_s: float) -> Iterator[tuple[Place, str, list[FloatArray]]]:

@@ -10,8 +10,8 @@ from types import MappingProxyType
 import numpy as np
 
 from autotune.controller import Controller
+from autotune.diagnosis.adequacy import Left, is_white, left_by
 from autotune.diagnosis.catalogue import STRUCTURES
-from autotune.diagnosis.constancy import Variation, largest_variation
 from autotune.diagnosis.description import Description, describe
 from autotune.diagnosis.discriminate import next_experiment
 from autotune.diagnosis.fitting import Fit
@@ -21,10 +21,6 @@ from autotune.diagnosis.judgement import (
     dominates,
     doubt_of,
     held_out,
-    is_adequate,
-    is_constant,
-    is_white,
-    leaves_little,
     rivals,
 )
 from autotune.diagnosis.law import law_effect
@@ -119,18 +115,16 @@ def diagnose(
 
 def _judge(found: Search, samples: list[SampleEffect], model: Model) -> Diagnosis:
     chosen = found.chosen
-    varies, gained = largest_variation(chosen.fit, found.data), score(found.retuned) - score(chosen)
-    constant = is_constant(varies, gained)
-    whole = constant and is_adequate(chosen.fit, found.data)
+    left = left_by(found)
     offset = _offset(chosen.fit)
     quality, extended_is_better = held_out(found)
-    most = dominates(quality) or leaves_little(varies, gained)
-    doubt = doubt_of(chosen.fit, found.data, whole, most)
-    verdict = _verdict(found, samples, whole or most, constant, offset is not None)
+    most = dominates(quality) or left.is_little
+    doubt = doubt_of(left, most)
+    verdict = _verdict(found, samples, left, left.is_noise or most, offset is not None)
     candidates = rivals(found, doubt)
     effects = _effects(found, samples, offset, candidates, 1.0 / (1.0 + doubt)) if verdict == "effect" else ()
     description = describe(found.retuned.fit, found.data) if verdict == "unexplained" else None
-    places = _places(effects) if description is None else _suspected(found, description, None if constant else varies)
+    places = _places(effects) if description is None else _suspected(found, description, left)
     use = chosen if extended_is_better and verdict in ("effect", "unexplained") else found.retuned
     extended = model if verdict == "none" else use.fit.model
     ends = [Effect(name=s.name, parameters=s.parameters) for s in samples if _simulated(s, use.fit)]
@@ -143,22 +137,23 @@ def _judge(found: Search, samples: list[SampleEffect], model: Model) -> Diagnosi
         fit=quality,
         next_experiment=None,
         extended_model=extended,
-        sentences=_sentences(verdict, effects, quality, places, whole or bool(samples), None if constant else varies),
+        sentences=_sentences(verdict, effects, quality, places, left, bool(samples)),
+        left=left,
         description=description,
         search=found,
     )
     return replace(said, next_experiment=next_experiment(said))
 
 
-def _verdict(found: Search, samples: list[SampleEffect], adequate: bool, constant: bool, offset: bool) -> Verdict:
+def _verdict(found: Search, samples: list[SampleEffect], left: Left, adequate: bool, offset: bool) -> Verdict:
     if found.chosen.names and not samples:
         return "effect" if adequate else "unexplained"
-    if not samples and (_is_of_another_structure(found) or not constant):
+    if not samples and (_is_of_another_structure(found) or not left.is_constant):
         return "unexplained"
     if samples or (offset and adequate):
         return "effect"
     if not adequate:
-        return "unexplained" if misfit(found.chosen.fit, found.data) > MISSING else _numbers(found)
+        return "unexplained" if left.misfit > MISSING else _numbers(found)
     return _numbers(found)
 
 
@@ -315,12 +310,12 @@ def _places(effects: Sequence[FoundEffect]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(place for e in effects for place in e.places))
 
 
-def _suspected(found: Search, description: Description, varies: Variation | None) -> tuple[str, ...]:
+def _suspected(found: Search, description: Description, left: Left) -> tuple[str, ...]:
     """Return where a description adds its terms, where what varies enters, and the places of the nearest candidates."""
     ranked = sorted((*found.singles, *found.pairs), key=score)
     places: dict[str, None] = {description.place: None} if description.terms else {}
-    if varies is not None:
-        places[varies.place] = None
+    if not left.is_constant:
+        places[left.varies.place] = None
     for h in ranked[:3]:
         for name in h.names:
             entry = entry_of(name)
@@ -333,8 +328,8 @@ def _sentences(
     effects: Sequence[FoundEffect],
     quality: FitQuality,
     places: Sequence[str],
-    whole: bool,
-    varies: Variation | None,
+    left: Left,
+    samples: bool,
 ) -> tuple[str, ...]:
     errors = (
         f"Held-out error, as a share of the spread of y: nominal {quality.nominal:.3g}, retuned {quality.retuned:.3g}, "
@@ -347,8 +342,10 @@ def _sentences(
             first = "The structure is right, its numbers are not: retuned, the simulation explains the recordings."
         case "effect":
             names = " and ".join(f"{e.name} (probability {e.probability:.2f})" for e in effects)
-            rest = "" if whole else " What is left is not noise: something smaller is missing as well."
+            rest = (
+                "" if left.is_noise or samples else " What is left is not noise: something smaller is missing as well."
+            )
             first = f"Physics was left out: {names}.{rest}"
         case _:
             first = f"Something is missing that no candidate explains to within noise; it shows at {', '.join(places)}."
-    return (first, errors) if varies is None else (first, varies.sentence, errors)
+    return (first, errors) if left.is_constant else (first, left.varies.sentence, errors)

@@ -1,11 +1,9 @@
-"""Judgement: whether a fit is adequate, how probable a hypothesis is beside its rivals, errors on held-out windows.
+"""Judgement: how much effects explain, how probable a hypothesis is beside its rivals, errors on held-out windows.
 
 The constants were counted on concealed cases, none of them of the proof: ``python -m tests.benchmarks calibrate``
-prints for each what other values do. The bounds stand where nothing that is right is refused any more: true models
-leave a misfit of at most 1.01 and a slow part of at most 1.07 beside their scatter; creep and delays that swing, which
-the best of the catalogue imitates, leave 1.12 and more. Temperature and doubt stand where the log loss is flat and what
-is stated with a probability is as often true. On real rigs, where no model is adequate, the concealed cases say
-nothing: ``DOMINANT``, ``FAR_FROM_NOISE`` and ``HALF_EXPLAINED`` keep what the best explains there and refuse the rest.
+prints for each what other values do. Temperature and doubt stand where the log loss is flat and what is stated with a
+probability is as often true. On real rigs, where no model is adequate, the concealed cases say nothing: ``DOMINANT``,
+``FAR_FROM_NOISE`` and ``HALF_EXPLAINED`` keep what the best explains there and refuse the rest.
 """
 
 from __future__ import annotations
@@ -15,29 +13,14 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from autotune.diagnosis.constancy import Variation
+from autotune.diagnosis.adequacy import Left
 from autotune.diagnosis.data import Data
-from autotune.diagnosis.fitting import Fit, fit
+from autotune.diagnosis.fitting import fit
 from autotune.diagnosis.noise import noise_from_differences
 from autotune.diagnosis.result import Candidate, FitQuality
-from autotune.diagnosis.retuning import BLOCKS, misfit, whiteness
 from autotune.diagnosis.search import RUNAWAY, Hypothesis, score
 from autotune.diagnosis.selection import Search, final_lead, own
 
-#: Residual variance over the noise's (see :func:`autotune.diagnosis.retuning.misfit`) up to which a model is adequate,
-#: beside one standard deviation of that ratio.
-ADEQUATE = 1.04
-#: The same for a residual without any slow part: then what is more is jitter that the differences of coloured noise did
-#: not show, and physics left out would have been slow.
-ADEQUATE_QUICK, QUICK = 1.12, 1.0
-#: The same for the slow part of the residual, after its own AR(2) has been taken out, beside two standard deviations.
-WHITE = 1.10
-#: Chi-square of the largest of some hundred score tests (see :mod:`autotune.diagnosis.constancy`) from which on
-#: something swings or leads past the chain that the model does not have, and its least share of what effects gained:
-#: right models leave up to 15 (where thresholds make fits rough two hundredths of what they gain), wrong ones a third.
-INCONSTANT, OF_THE_GAINED = 25.0, 0.1
-#: The same share below which effects are named although what they leave is not noise.
-REST_OF_THE_GAINED = 0.04
 #: Misfit of a model without effects from which on something must be missing, although no effect is worth it; clean
 #: recordings leave up to 1.02.
 MISSING = 1.05
@@ -50,31 +33,6 @@ NEARLY_ALL, CLEAR_OF_NOISE = 0.80, 2.0
 UNKNOWN, HALF_EXPLAINED = 0.03, 0.5
 #: Scale of the log-odds: one unit of chi2 counts this much less than for ideal noise.
 TEMPERATURE = 3.0
-
-
-def is_adequate(result: Fit, data: Data) -> bool:
-    """Whether a residual is noise: no more variance than its jitter shows, and no slow part."""
-    return misfit(result, data) < _allowed(result, data) and is_white(result, data)
-
-
-def _allowed(result: Fit, data: Data) -> float:
-    bound = ADEQUATE_QUICK if is_white(result, data, QUICK) else ADEQUATE
-    return bound + math.sqrt(2.0 / result.rows)
-
-
-def is_white(result: Fit, data: Data, bound: float = WHITE) -> bool:
-    """Whether a residual has no slow part beyond what chance brings."""
-    return whiteness(result, data) < bound + 2.0 * math.sqrt(2.0 / (BLOCKS * len(result.windows)))
-
-
-def is_constant(varies: Variation, gained: float) -> bool:
-    """Whether what a model leaves neither swings nor goes past its chain, beside the score that its effects gained."""
-    return varies.gain < max(INCONSTANT, OF_THE_GAINED * gained)
-
-
-def leaves_little(varies: Variation, gained: float) -> bool:
-    """Whether what effects leave is so small beside the score they gained that it is the fit's own roughness."""
-    return varies.gain < REST_OF_THE_GAINED * gained
 
 
 def dominates(
@@ -139,14 +97,14 @@ def weighed(scores: Mapping[str, float], scale: float, doubt: float) -> tuple[Ca
     return tuple(Candidate(name=name, probability=w / total) for name, w in ranked if w / total > 1e-4)[:12]
 
 
-def doubt_of(result: Fit, data: Data, adequate: bool, most: bool) -> float:
+def doubt_of(left: Left, most: bool) -> float:
     """Return the weight of a cause outside the catalogue, beside 1 of all hypotheses together.
 
-    Small where the residual is noise, and the larger the nearer its misfit comes to the bound of adequacy; beyond it
+    Small where what is left is noise, and the larger the nearer its misfit comes to the bound of adequacy; beyond it
     the two weigh the same, but for effects that explain most of what retuning leaves.
     """
-    if adequate:
-        excess = max(misfit(result, data) - 1.0, 0.0) / (_allowed(result, data) - 1.0)
+    if left.is_noise:
+        excess = max(left.misfit - 1.0, 0.0) / (left.allowed - 1.0)
         return UNKNOWN + (1.0 - UNKNOWN) * excess**4
     return HALF_EXPLAINED if most else 1.0
 

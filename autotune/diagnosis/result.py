@@ -10,6 +10,7 @@ from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
+from autotune.diagnosis.adequacy import Left
 from autotune.diagnosis.description import Description
 from autotune.diagnosis.selection import Search
 from autotune.models import Model, Parameter
@@ -89,6 +90,8 @@ class Diagnosis:
         The model to go on with.
     sentences : tuple of str
         The finding in words.
+    left : Left
+        What the chosen model leaves, and whether that is noise.
     description : Description, optional
         What is left of the residual as a function of the signals, where no effect of the catalogue explains it; not a
         cause.
@@ -104,6 +107,7 @@ class Diagnosis:
     next_experiment: NextExperiment | None
     extended_model: Model
     sentences: tuple[str, ...]
+    left: Left
     description: Description | None
     search: Search
 
@@ -124,6 +128,7 @@ class Diagnosis:
                 "extended": self.fit.extended,
                 "noise_floor": self.fit.noise_floor,
             },
+            "left": self.left.as_json(),
             "next_experiment": None
             if following is None
             else {

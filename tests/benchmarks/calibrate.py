@@ -2,8 +2,7 @@
 
 ``python -m tests.benchmarks calibrate`` reads the finished diagnoses of the campaign in AUTOTUNE_CALIBRATE_OUT, as
 ``autotune prove --seed 7000 --cases 200 --out DIR`` leaves them, whether or not all are finished; without it a campaign
-of AUTOTUNE_CALIBRATE_CASES (4) cases from seed AUTOTUNE_CALIBRATE_SEED (5000) on is made in a temporary folder. What
-the extended models leave of the recordings is computed again and kept in the folder's ``shown``.
+of AUTOTUNE_CALIBRATE_CASES (4) cases from seed AUTOTUNE_CALIBRATE_SEED (5000) on is made in a temporary folder.
 
 One bound of adequacy is tried at a time, the others as they are in use. Probabilities are those of diagnosis.json, at
 another temperature raised to a power: candidates below 1e-4 are not in it, which counts where the temperature doubles.
@@ -18,24 +17,18 @@ import sys
 import tempfile
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from autotune.diagnosis import judgement
-from autotune.diagnosis.data import Data
+from autotune.diagnosis import adequacy, judgement
+from autotune.diagnosis.adequacy import Left
+from autotune.diagnosis.constancy import Variation
 from autotune.diagnosis.diagnose import probability_of
-from autotune.diagnosis.fitting import Fit, fit
-from autotune.diagnosis.noise import noise_from_differences
-from autotune.diagnosis.parameters import parametrise
 from autotune.diagnosis.result import Candidate, FitQuality
-from autotune.diagnosis.retuning import BLOCKS, floored, misfit, whiteness
-from autotune.diagnosis.samples import inspect
-from autotune.diagnosis.windows import LAGS_PER_WINDOW, slowest_lag_s, window_rows
 from autotune.models import read_model
-from autotune.recording import read_recording
 from sim.proof import FIRST_PROOF_SEED, Campaign, conceal, diagnose
 from sim.score import calibration_error
 
@@ -52,6 +45,9 @@ GRIDS: Mapping[str, Sequence[float]] = {
     "ADEQUATE_QUICK": (1.04, 1.06, 1.08, 1.12, 1.16, 1.2, 1.3),
     "QUICK": (0.8, 0.9, 1.0, 1.05, 1.1),
     "WHITE": (0.9, 0.95, 1.0, 1.05, 1.08, 1.1, 1.12, 1.15, 1.2, 1.3),
+    "INCONSTANT": (12.0, 15.0, 18.0, 20.0, 25.0, 30.0, 40.0, 60.0),
+    "OF_THE_GAINED": (0.0, 0.02, 0.05, 0.1, 0.2, 0.4),
+    "REST_OF_THE_GAINED": (0.0, 0.01, 0.02, 0.04, 0.08, 0.16),
     "MISSING": (1.01, 1.02, 1.03, 1.05, 1.08, 1.12),
     "DOMINANT": (0.35, 0.5, 0.7, 0.8, 0.9, 0.95),
     "FAR_FROM_NOISE": (4.0, 6.0, 7.0, 8.0, 10.0, 15.0),
@@ -66,20 +62,17 @@ DOUBTS = (0.01, 0.02, 0.03, 0.05, 0.07, 0.1, 0.15, 0.2)
 class Shown:
     """What one case showed.
 
-    ``names`` are the effects of the extended model; ``excess`` and ``slow`` the residual's variance and slow power over
-    the noise's, less what chance adds to them; ``candidates`` and ``stated`` are names with probabilities.
+    ``names`` are the effects of the extended model, ``left`` what that leaves, as diagnosis.json has it; ``candidates``
+    and ``stated`` are names with probabilities.
     """
 
-    case: str
     kind: str
     accept: Sequence[Sequence[str]]
     nuisance: Sequence[str]
     verdict: str
     names: Sequence[str]
-    misfit: float
-    excess: float
-    slow: float
-    fit: Mapping[str, float]
+    left: Json
+    quality: FitQuality
     candidates: Sequence[tuple[str, float]]
     stated: Sequence[tuple[str, float]]
 
@@ -90,70 +83,49 @@ class Shown:
         return self.kind != "outside" and every and all(set(group) & set(self.names) for group in self.accept)
 
     @property
-    def quality(self) -> FitQuality:
-        """Errors on rows that were not fitted."""
-        return FitQuality(**{key: self.fit[key] for key in ("nominal", "retuned", "extended", "noise_floor")})
+    def excess(self) -> float:
+        """Variance of what is left over the noise's, less what chance adds."""
+        return float(self.left["misfit"] - self.left["misfit_chance"])
+
+    @property
+    def slow(self) -> float:
+        """Slow power of what is left over the noise's, less what chance adds."""
+        return float(self.left["slow"] - 2.0 * self.left["slow_chance"])
 
 
 def shown(campaign: Campaign, seed: int) -> Shown:
-    """Compute what a case's extended model leaves; what was kept of an earlier time is read."""
-    folder, case = campaign.diagnosis(seed), campaign.case(seed)
-    kept = campaign.out / "shown" / f"{folder.name}.json"
-    if kept.exists():
-        return Shown(**json.loads(kept.read_text(encoding="utf-8")))
+    """Read a case's diagnosis beside its answer."""
+    folder = campaign.diagnosis(seed)
     answer = json.loads(campaign.answer(seed).read_text(encoding="utf-8"))
     said = json.loads((folder / "diagnosis.json").read_text(encoding="utf-8"))
-    names, result, data = left_by(case, folder)
-    row = Shown(
-        case=folder.name,
+    known = {effect.name for effect in read_model(campaign.case(seed) / "model.toml").effects}
+    return Shown(
         kind=answer["kind"],
         accept=[e["accept"] for e in answer["effects"]],
         nuisance=answer["nuisance"],
         verdict=said["verdict"],
-        names=names,
-        misfit=misfit(result, data),
-        excess=misfit(result, data) - math.sqrt(2.0 / result.rows),
-        slow=whiteness(result, data) - 2.0 * math.sqrt(2.0 / (BLOCKS * len(result.windows))),
-        fit=said["fit"],
+        names=[e.name for e in read_model(folder / "extended_model.toml").effects if e.name not in known],
+        left=said["left"],
+        quality=FitQuality(**{key: said["fit"][key] for key in ("nominal", "retuned", "extended", "noise_floor")}),
         candidates=[(c["name"], c["probability"]) for c in said["candidates"]],
         stated=[(e["name"], e["probability"]) for e in said["effects"]],
     )
-    kept.parent.mkdir(parents=True, exist_ok=True)
-    kept.write_text(json.dumps(asdict(row)), encoding="utf-8")
-    return row
-
-
-def left_by(case: Path, diagnosis: Path) -> tuple[list[str], Fit, Data]:
-    """Fit the start states of an extended model to a case's recordings, its numbers as they are."""
-    recordings = [read_recording(case / f"{name}.csv") for name in ("rec1", "rec2")]
-    good = inspect(recordings)[0]
-    model, nominal = read_model(diagnosis / "extended_model.toml"), read_model(case / "model.toml")
-    windows = [window_rows(r, LAGS_PER_WINDOW * slowest_lag_s(nominal)) for r in recordings]
-    data = Data(
-        recordings=tuple(recordings),
-        good=tuple(good),
-        starts=tuple(starts for starts, _ in windows),
-        stops=tuple(stops for _, stops in windows),
-        noise=floored(noise_from_differences([r.y for r in recordings], good), recordings),
-    )
-    size = float(np.std(np.concatenate([r.u for r in recordings]))) or 1.0
-    p = parametrise(replace(model, effects=()), model.effects, size, recordings[0].sample_time_s)
-    none = np.zeros(p.centre.size, dtype=bool)
-    result = fit(p, data, free=none, iterations=20)
-    data = replace(data, noise=floored(noise_from_differences(result.residuals, good), recordings))
-    return [e.name for e in model.effects], fit(p, data, x0=result.x0, free=none, iterations=20), data
 
 
 def judged(row: Shown, constants: Mapping[str, float]) -> str:
     """Verdict on a case by other constants: abstained, named or neither."""
     white = row.slow < constants["WHITE"]
     bound = constants["ADEQUATE_QUICK" if row.slow < constants["QUICK"] else "ADEQUATE"]
-    adequate = white and row.excess < bound
+    varies, gained = row.left["varies"]["chi2"], row.left["gained"]
+    constant = varies < max(constants["INCONSTANT"], constants["OF_THE_GAINED"] * gained)
+    adequate = white and constant and row.excess < bound
     if row.names:
         names = (("DOMINANT", "FAR_FROM_NOISE"), ("NEARLY_ALL", "CLEAR_OF_NOISE"))
         most = judgement.dominates(row.quality, [(constants[share], constants[far]) for share, far in names])
-        return "named" if adequate or most else "abstained"
-    return "abstained" if not adequate and row.misfit > constants["MISSING"] else "neither"
+        little = varies < constants["REST_OF_THE_GAINED"] * gained
+        return "named" if adequate or most or little else "abstained"
+    missing = not constant or (not adequate and row.left["misfit"] > constants["MISSING"])
+    return "abstained" if missing else "neither"
 
 
 def counts(rows: Sequence[Shown], constants: Mapping[str, float]) -> tuple[int, int, int]:
@@ -166,17 +138,12 @@ def counts(rows: Sequence[Shown], constants: Mapping[str, float]) -> tuple[int, 
     )
 
 
-def at(row: Shown, temperature: float, doubts: tuple[float, float]) -> list[tuple[str, float, bool]]:
-    """Names put forward with their probabilities at another temperature and doubt, and whether each is right.
-
-    ``doubts`` are the least weights of what is unknown beside one effect and beside several.
-    """
+def at(row: Shown, temperature: float, unknown: float) -> list[tuple[str, float, bool]]:
+    """Names put forward with their probabilities at another temperature and doubt, and whether each is right."""
     power = judgement.TEMPERATURE / temperature
     known = {name: p**power for name, p in row.candidates if name != "unknown" and p > 0.0}
-    best = max(known.values())
-    weights = {name: w / best for name, w in known.items()} | {"unknown": doubt(row, doubts)}
-    total = sum(weights.values())
-    candidates = [Candidate(name=name, probability=w / total) for name, w in weights.items()]
+    total = sum(known.values()) * (1.0 + doubt(row, unknown))
+    candidates = [Candidate(name=name, probability=w / total) for name, w in known.items()]
     own = {name for group in row.accept for name in group}
     spared = set(row.nuisance) - own
     return [
@@ -186,21 +153,18 @@ def at(row: Shown, temperature: float, doubts: tuple[float, float]) -> list[tupl
     ]
 
 
-def doubt(row: Shown, doubts: tuple[float, float]) -> float:
+def doubt(row: Shown, unknown: float) -> float:
     """Weight of what is unknown, see :func:`autotune.diagnosis.judgement.doubt_of`."""
-    bound = judgement.ADEQUATE_QUICK if row.slow < judgement.QUICK else judgement.ADEQUATE
-    allowed = bound + row.misfit - row.excess
-    if row.slow >= judgement.WHITE or row.misfit >= allowed:
-        return judgement.HALF_EXPLAINED if judgement.dominates(row.quality) else 1.0
-    least = doubts[len(row.names) > 1]
-    return least + (1.0 - least) * (max(row.misfit - 1.0, 0.0) / (allowed - 1.0)) ** 4
+    varies = Variation(gain=row.left["varies"]["chi2"], place="plant", what="", period_s=math.inf)
+    left = Left(varies=varies, **{key: value for key, value in row.left.items() if key != "varies"})
+    if not left.is_noise:
+        return judgement.HALF_EXPLAINED if judgement.dominates(row.quality) or left.is_little else 1.0
+    return unknown + (1.0 - unknown) * (max(left.misfit - 1.0, 0.0) / (left.allowed - 1.0)) ** 4
 
 
-def calibration(
-    rows: Sequence[Shown], temperature: float, doubts: tuple[float, float]
-) -> tuple[float, float, int, int, int]:
+def calibration(rows: Sequence[Shown], temperature: float, unknown: float) -> tuple[float, float, int, int, int]:
     """Return log loss, expected error, and among statements with p >= 0.95 the wrong ones, all of them, and all."""
-    statements = [(p, ok) for row in rows for _, p, ok in at(row, temperature, doubts)]
+    statements = [(p, ok) for row in rows for _, p, ok in at(row, temperature, unknown)]
     loss = -float(np.mean([math.log(min(max(p if ok else 1.0 - p, 1e-6), 1.0)) for p, ok in statements]))
     sure = [ok for p, ok in statements if p >= 0.95]
     return loss, calibration_error(statements), sure.count(False), len(sure), len(statements)
@@ -236,7 +200,7 @@ def main() -> None:
     kinds = ", ".join(f"{count} {kind}" for kind, count in sorted(Counter(r.kind for r in rows).items()))
     print(f"{len(rows)} cases diagnosed in {campaign.out}: {kinds}")
     chain = [r for r in rows if not OF_ROWS & {name for name, _ in r.stated if name not in r.nuisance}]
-    in_use = {name: float(getattr(judgement, name)) for name in GRIDS}
+    in_use = {name: float(getattr(judgement, name, None) or getattr(adequacy, name)) for name in GRIDS}
     explained = sum(r.right and bool(r.names) for r in chain)
     print(f"{len(chain)} of them decided by adequacy, {explained} explained by the truth")
     print("  right refused / wrong accepted / clean alarmed, one constant moved at a time:")
@@ -245,24 +209,23 @@ def main() -> None:
         print(f"  {name:15s} {in_use[name]:g} in use;  {moved}")
     rows = [r for r in rows if r not in chain or judged(r, in_use) == "named"]
     print("  log loss / expected error / wrong of those at p >= 0.95, of what is named with the bounds in use:")
-    T, one, more = judgement.TEMPERATURE, judgement.UNKNOWN, judgement.UNKNOWN_TO_PAIRS
+    T, unknown = judgement.TEMPERATURE, judgement.UNKNOWN
     for name, value, tried in (
-        ("TEMPERATURE", T, [(t, t, (one, more)) for t in TEMPERATURES]),
-        ("UNKNOWN", one, [(d, T, (d, more)) for d in DOUBTS]),
-        ("UNKNOWN_TO_PAIRS", more, [(d, T, (one, d)) for d in DOUBTS]),
+        ("TEMPERATURE", T, [(t, t, unknown) for t in TEMPERATURES]),
+        ("UNKNOWN", unknown, [(d, T, d) for d in DOUBTS]),
     ):
         print(f"  {name:16s} {value:g} in use")
-        for at_value, t, doubts in tried:
-            loss, error, wrong, sure, count = calibration(rows, t, doubts)
+        for at_value, t, d in tried:
+            loss, error, wrong, sure, count = calibration(rows, t, d)
             print(f"    {at_value:5g}: {loss:.4f} / {error:.4f} / {wrong} of {sure}, {count} in all")
     single: dict[str, list[bool]] = {}
     for row in rows:
-        for name, _, ok in at(row, T, (one, more)):
+        for name, _, ok in at(row, T, unknown):
             single.setdefault(name if name in OF_ROWS else "of the chain", []).append(ok)
     print("  right of those named:", ", ".join(f"{n} {sum(oks)}/{len(oks)}" for n, oks in sorted(single.items())))
-    strict = in_use | {"DOMINANT": math.inf, "NEARLY_ALL": math.inf}
+    strict = in_use | {"DOMINANT": math.inf, "NEARLY_ALL": math.inf, "REST_OF_THE_GAINED": 0.0}
     half = [r for r in rows if r.verdict == "effect" and judged(r, strict) == "abstained"]
-    halves = [ok for r in half for name, _, ok in at(r, T, (one, more)) if name not in OF_ROWS]
+    halves = [ok for r in half for name, _, ok in at(r, T, unknown) if name not in OF_ROWS]
     print(
         f"  HALF_EXPLAINED  {judgement.HALF_EXPLAINED:g} in use; right of those named without being adequate:", end=" "
     )
