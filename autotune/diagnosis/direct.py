@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from concurrent.futures import Executor
+from dataclasses import replace
 
 import numpy as np
+from scipy.signal import fftconvolve, lfilter
 
 from autotune.arrays import FloatArray
 from autotune.diagnosis.data import Data
@@ -12,6 +14,7 @@ from autotune.diagnosis.fitting import Fit
 from autotune.diagnosis.parameters import effect_with
 from autotune.diagnosis.search import RUNAWAY, Promise, direction, promise
 from autotune.models import Effect
+from autotune.recording import Recording
 
 #: Steps in which a frequency is searched, in units of one over the longest recording's duration.
 RESOLVED = 0.1
@@ -19,8 +22,9 @@ RESOLVED = 0.1
 BANDS_TRIED = (0.01, 0.6, 54)
 #: Candidate times of a step per recording.
 STEP_TIMES = 16
-#: Steps of a converter that are tried: the smallest as a share of the standard deviation of u, span as a factor, count.
-STEPS_TRIED = (0.15, 20.0, 32)
+#: Steps of a converter that are tried, as shares of the standard deviation of u; how closely, as a share of a line's
+#: width over u; lines that are looked at, and followed.
+STEPS_TRIED, LINE_SHARE, LINES_TRIED, LINES_KEPT = (0.02, 3.0), 0.3, 24, 2
 
 
 def step_load_starts(base: Fit, data: Data, pool: Executor) -> list[Effect]:
@@ -120,8 +124,32 @@ def periodic_load_starts(base: Fit, data: Data, lag_s: float, count: int = 3) ->
     return [max((sinusoid(f) for f in group), key=lambda found: found[0])[1] for group in near]
 
 
+def command_influence(base: Fit, data: Data) -> tuple[FloatArray, FloatArray]:
+    """Return the commands inside the windows, and how the misfit would fall with more of each: -0.5 d chi2/du.
+
+    The chain alone answers, its effects left aside, and rows are taken as equidistant: good enough to start from.
+    """
+    longest = max(int(np.max(b - a)) for a, b in zip(data.starts, data.stops, strict=True))
+    pulse = np.zeros(longest + 1)
+    pulse[1] = 1.0  # what stands in the first row has stood before it
+    dt, sim = data.recordings[0].sample_time_s, base.sim
+    still = replace(sim, on=np.zeros_like(sim.on), forced=False, falling=sim.chain, linear_hold=False)
+    struck = Recording(t=dt * np.arange(longest + 1, dtype=np.float64), u=sim.u_offset + pulse, y=0.0 * pulse)
+    answer = still.run(struck, np.zeros((1, sim.chain.order)))[1:, 0]
+    answer = lfilter([1.0, *(-a for a in data.noise.ar)], [1.0], answer - sim.y_offset) / data.noise.sd
+    commands, influence = [], []
+    for r, e, starts, stops in zip(data.recordings, base.whitened, data.starts, data.stops, strict=True):
+        for a, b in zip(starts, stops, strict=True):
+            commands.append(r.u[a:b])
+            influence.append(fftconvolve(e[a:b], answer[: b - a][::-1])[b - a - 1 :])
+    return np.concatenate(commands), np.concatenate(influence)
+
+
 def quantisation_starts(base: Fit, data: Data, pool: Executor) -> list[Effect]:
-    """Return the most promising lattice of the actuator's converter: step and origin on a grid, then around the best.
+    """Return the most promising lattice of the actuator's converter: lines of the residual over u, then around them.
+
+    A converter adds a saw-tooth of u, whose period is its step: its fundamental is a line of the influence's
+    periodogram over the command, as a periodic load's is one over time.
 
     Parameters
     ----------
@@ -138,29 +166,37 @@ def quantisation_starts(base: Fit, data: Data, pool: Executor) -> list[Effect]:
         At most one ``actuator.quantisation``. Its origin is the point of the lattice nearest to the middle of u, so
         that a small error of the step does not move the lattice away.
     """
-    u = np.concatenate([r.u for r in data.recordings])
-    middle, spread = float(np.median(u)), float(np.std(u))
+    u, influence = command_influence(base, data)
+    middle, spread, span = float(np.median(u)), float(np.std(u)), float(np.ptp(u))
     if spread == 0.0:
         return []
+    smallest, largest = STEPS_TRIED
+    per_step = np.arange(1.0 / (largest * spread), 1.0 / (smallest * spread), LINE_SHARE / span)
+    values, where = np.unique(u - middle, return_inverse=True)
+    weights = np.bincount(where, influence)
+    lines = np.array([weights @ np.exp(2j * np.pi * f * values) for f in per_step])
+    power = np.abs(lines)
+    inner = np.flatnonzero((power >= np.append(power[1:], 0.0)) & (power >= np.append(0.0, power[:-1])))
+    best_lines = inner[np.argsort(-power[inner])][:LINES_TRIED]
 
-    def tried(lattices: list[tuple[float, float]]) -> Promise:
+    def tried(lattices: list[tuple[float, float]]) -> list[Promise]:
         effects = [effect_with("actuator.quantisation", (step, middle + step * phase)) for step, phase in lattices]
-        return max(pool.map(lambda e: promise(base, e, data), effects), key=lambda p: p.decrease)
+        return sorted(pool.map(lambda e: promise(base, e, data), effects), key=lambda p: -p.decrease)
 
-    ratio = STEPS_TRIED[1] ** (1.0 / STEPS_TRIED[2])
-    steps = [STEPS_TRIED[0] * spread * ratio**i for i in range(STEPS_TRIED[2] + 1)]
-    turn = 0.25
-    best = tried([(step, turn * k) for step in steps for k in range(4)])
+    # round(x) - x = -sin(2 pi x)/pi + ...: where the line's phase puts the fall through zero there is a level
+    turns = (np.angle(lines) / (2.0 * np.pi) + 0.25 + 0.5) % 1.0 - 0.5
+    best = tried([(1.0 / per_step[i], turns[i]) for i in best_lines])[:LINES_KEPT]
+    width, turn = LINE_SHARE, 0.1
     for _ in range(4):
-        if best.decrease <= 0.0:
-            return []
-        ratio, turn = ratio**0.4, 0.4 * turn
-        q = best.effect.parameters
-        step, phase = q["step"].value, (q["origin"].value - middle) / q["step"].value
-        near = [(step * ratio**i, phase + turn * k) for i in (-1, 0, 1) for k in (-1, 0, 1) if i or k]
-        closer = tried(near)
-        best = closer if closer.decrease > best.decrease else best
-    return [best.effect]
+        near = []
+        for p in best:
+            q = p.effect.parameters
+            step, phase = q["step"].value, (q["origin"].value - middle) / q["step"].value
+            beside = [step / (1.0 + i * width * step / span) for i in (-1, 0, 1)]
+            near += [(h, phase + turn * k) for i, h in enumerate(beside) for k in (-1, 0, 1) if i != 1 or k]
+        best = sorted((*best, *tried(near)), key=lambda p: -p.decrease)[:LINES_KEPT]
+        width, turn = 0.5 * width, 0.5 * turn
+    return [best[0].effect] if best and best[0].decrease > 0.0 else []
 
 
 def stiction_starts(base: Fit, data: Data, pool: Executor, w: float) -> list[Effect]:

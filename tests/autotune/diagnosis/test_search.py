@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from autotune.diagnosis.catalogue import CATALOGUE
-from autotune.diagnosis.direct import periodic_load_starts, stiction_starts
+from autotune.diagnosis.direct import periodic_load_starts, quantisation_starts, stiction_starts
 from autotune.diagnosis.fitting import fit
 from autotune.diagnosis.retuning import prepare
 from autotune.diagnosis.samples import inspect
@@ -30,6 +30,19 @@ def valve(band: float, seed: int, rows: int = 600) -> Recording:
         w = u[k] if abs(u[k] - w) > band else w
         x = w + (x - w) * np.exp(-dt / 2.0)
     return Recording(t=np.arange(rows, dtype=np.float64) * dt, u=u, y=y + 0.01 * rng.normal(size=rows))
+
+
+def converted(step: float, origin: float, seed: int, rows: int = 2000) -> Recording:
+    """Lag of 2 s behind a converter of the command, which swings and jitters as a controller's does."""
+    rng = np.random.default_rng(seed)
+    dt, x = 0.1, 0.0
+    u = 0.7 * np.sin(np.arange(rows) * dt * 0.7) + 0.1 * rng.normal(size=rows)
+    y = np.empty(rows)
+    for k in range(rows):
+        y[k] = x
+        w = origin + step * np.floor((u[k] - origin) / step + 0.5)
+        x = w + (x - w) * np.exp(-dt / 2.0)
+    return Recording(t=np.arange(rows, dtype=np.float64) * dt, u=u, y=y + 0.04 * step * rng.normal(size=rows))
 
 
 def tank(share: float, seed: int, rows: int = 800) -> Recording:
@@ -77,6 +90,19 @@ def test_the_band_of_a_sticking_valve_is_found_on_a_criterion_of_narrow_peaks() 
     with ThreadPoolExecutor(1) as pool:
         starts = stiction_starts(base, data, pool, 1.0)
     assert starts[0].parameters["band"].value == pytest.approx(0.083, rel=0.02)
+
+
+@pytest.mark.parametrize("step", [0.03, 0.2, 0.9])
+def test_a_converters_step_is_a_line_of_the_residual_over_the_command(step: float) -> None:
+    # levels 0.41 + k step, a small share of the command's spread of 0.5 to twice of it
+    r = [converted(step, 0.41, 5), converted(step, 0.41, 6)]
+    data, base = prepare(lag(2.0), r, inspect(r)[0])
+    with ThreadPoolExecutor(1) as pool:
+        found = quantisation_starts(base, data, pool)[0].parameters
+    levels = (0.41 - found["origin"].value) / found["step"].value
+    # so near that the lattice is a tenth of a step off at most where u, within 1 V of its middle, is farthest
+    assert found["step"].value == pytest.approx(step, rel=0.1 * step)
+    assert levels == pytest.approx(round(levels), abs=0.1)
 
 
 def test_what_a_slow_mode_explains_better_than_any_effect_is_named_after_none() -> None:
