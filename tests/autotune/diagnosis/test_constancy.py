@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from autotune.arrays import FloatArray
+from autotune.diagnosis.adequacy import INCONSTANT
 from autotune.diagnosis.constancy import Variation, largest_variation
-from autotune.diagnosis.judgement import INCONSTANT
 from autotune.diagnosis.retuning import prepare
 from autotune.models import Block, Model, Port, TransferFunction
 from autotune.recording import Recording
