@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from autotune.diagnosis.forecast import forecast
 from autotune.errors import InputError
-from autotune.models import Block, Model, Port, TransferFunction
+from autotune.models import Block, Effect, Model, Parameter, Port, TransferFunction
 from autotune.recording import Recording
 
 
@@ -63,3 +65,15 @@ def test_without_a_horizon_the_state_comes_from_the_first_tenth() -> None:
 def test_a_horizon_below_two_samples_is_refused() -> None:
     with pytest.raises(InputError, match="horizon"):
         forecast(integrator(), recorded(), 0.03)
+
+
+def test_behind_a_coarse_converter_the_forecast_takes_its_steps() -> None:
+    step = 0.5
+    fine = recorded(noise=0.0)
+    r = Recording(t=fine.t, u=fine.u, y=step * np.floor(fine.y / step + 0.5))
+    model = integrator()
+    converter = Effect(name="sensor.quantisation", parameters={"step": Parameter(value=step)})
+    plain = np.abs(forecast(model, r, 3.0) - r.y)[300:]
+    stepped = np.abs(forecast(replace(model, effects=(converter,)), r, 3.0) - r.y)[300:]
+    assert np.sqrt(np.mean(plain**2)) > 0.9 * step / np.sqrt(12.0)  # no state explains the rounding
+    assert np.mean(stepped < 1e-9) > 0.9
