@@ -179,48 +179,28 @@ def _sensor(z: float, y_offset: float, time: float, E: FloatArray, on: IntArray)
 
 
 @_inlined
-def _linear(table: FloatArray, node: float, x: FloatArray, w: float, out: FloatArray) -> None:
-    """Write the state after one step under the command alone; in place through ``out``."""
-    n = x.size
+def _blend(table: FloatArray, node: float, slot: int, known: FloatArray, M: FloatArray) -> None:
+    """Write a step's transition matrix into a slot, unless it is there from a step of the same length."""
+    if abs(node - known[slot]) < 1e-8:
+        return
+    known[slot] = node
     i = int(node + 1e-6)
-    part = node - i
-    here = table[i]
-    for row in range(n):
-        total = here[row, n] * w
-        for k in range(n):
-            total += here[row, k] * x[k]
-        out[row] = total
-    if part > 1e-6 and i < NODES:
-        there = table[i + 1]
-        for row in range(n):
-            total = there[row, n] * w
-            for k in range(n):
-                total += there[row, k] * x[k]
-            out[row] += part * (total - out[row])
-    for row in range(n):
-        x[row] = out[row]
+    part = node - i if node - i > 1e-6 else 0.0
+    j = min(i + 1, NODES)
+    for row in range(M.shape[1]):
+        for k in range(M.shape[2]):
+            M[slot, row, k] = table[i, row, k] + part * (table[j, row, k] - table[i, row, k])
 
 
 @_inlined
-def _advance(table: FloatArray, node: float, x: FloatArray, w: float, out: FloatArray, column: FloatArray) -> None:
-    """Write the state after one step under the command alone, and the step's response to a unit force."""
+def _advance(M: FloatArray, slot: int, x: FloatArray, w: float, out: FloatArray) -> None:
+    """Write the state after one step under the command alone."""
     n = x.size
-    i = int(node + 1e-6)
-    part = node - i
-    blend = part > 1e-6 and i < NODES
     for row in range(n):
-        total = table[i, row, n] * w
-        force = table[i, row, n + 1]
+        total = M[slot, row, n] * w
         for k in range(n):
-            total += table[i, row, k] * x[k]
-        if blend:
-            other = table[i + 1, row, n] * w
-            for k in range(n):
-                other += table[i + 1, row, k] * x[k]
-            total += part * (other - total)
-            force += part * (table[i + 1, row, n + 1] - force)
+            total += M[slot, row, k] * x[k]
         out[row] = total
-        column[row] = force
 
 
 @_inlined
@@ -274,13 +254,15 @@ def _state_force(
 
 @_inlined
 def _push(
-    table: FloatArray, node: float, w: float, load: float, smooth: bool, gains: FloatArray, y_offset: float,
-    taps: FloatArray, E: FloatArray, on: IntArray, x: FloatArray, free: FloatArray, column: FloatArray,
-    end: FloatArray, memory: FloatArray,
+    M: FloatArray, slot: int, w: float, load: float, smooth: bool, gains: FloatArray, y_offset: float, taps: FloatArray,
+    E: FloatArray, on: IntArray, x: FloatArray, free: FloatArray, column: FloatArray, end: FloatArray,
+    memory: FloatArray,
 ) -> None:  # fmt: skip
     """Add to the force-free step what the forces do: Heun for smooth ones, implicit for dry friction."""
     n = x.size
     force = load
+    for i in range(n):
+        column[i] = M[slot, i, n + 1]
     if smooth:
         before = _state_force(x, w, memory[3], gains, y_offset, taps, E, on)
         for i in range(n):
@@ -298,11 +280,10 @@ def _push(
             free[i] += column[i] * friction
     if on[SQRT_2]:
         # the lower tank gets the upper one's true outflow and gives a square-root one itself
-        i = int(node + 1e-6)
         excess = _root_excess(_tap(taps, POSITION, x), E[SQRT_2]) / gains[1]
         excess -= _root_excess(_tap(taps, FIRST_LEVEL, x), E[SQRT_1]) if on[SQRT_1] else 0.0
         for row in range(n):
-            free[row] += table[i, row, n + 2] * excess
+            free[row] += M[slot, row, n + 2] * excess
 
 
 @njit(cache=True, nogil=True)
@@ -357,7 +338,7 @@ def run(
         Effect parameters and which of them act.
     forced : int
         Whether any effect acts as a force at the plant's input.
-    out : (N, SIGNALS) array
+    out : (SIGNALS, N) array
         Receives reading, speed, position and plant input at each row.
     ends : (W, n) array
         Receives the state at the next window's first row, for the last window at the last row.
@@ -369,11 +350,14 @@ def run(
     column = np.empty(n)
     end = np.empty(n)
     memory = np.zeros(4)
+    # transition matrices of a row's first and further steps, and of those under a falling actuator
+    M, known = np.empty((4, n, n + INPUTS)), np.full(4, -1.0)
     smooth = on[DRAG : POSITION_GAIN + 1].any() or on[SQRT_1] or on[HYSTERESIS : SINE_PHASE + 1].any()
     stopped = on[STOP_HIGH] or on[STOP_LOW]
     sensing = on[S_LOW : S_DRIFT + 1].any()
     plain = not (forced or linear_hold or on[:S_LOW].any())
-    stretch = 1.0 + (E[CLOCK] if on[CLOCK] else 0.0)
+    # when each command arrives at the chain
+    acts = t[0] + (t - t[0]) * (1.0 + (E[CLOCK] if on[CLOCK] else 0.0)) + delay
     node_length = step / NODES
     remembering = on[A_BACKLASH] or on[A_STICTION]
     carried, past = np.full(4, u[0] - u_offset), 0
@@ -383,9 +367,9 @@ def run(
         x[:] = x0[window]
         # the command in force at the window's start, dead time counted
         j = first
-        while j > 0 and t[0] + (t[j] - t[0]) * stretch + delay > t[first] + 1e-9:
+        while j > 0 and acts[j] > t[first] + 1e-9:
             j -= 1
-        while j + 1 < N and t[0] + (t[j + 1] - t[0]) * stretch + delay <= t[first] + 1e-9:
+        while j + 1 < N and acts[j + 1] <= t[first] + 1e-9:
             j += 1
         w = u[j] - u_offset
         # play and stiction remember all commands before the window
@@ -398,28 +382,31 @@ def run(
             memory[:2] = carried[:2]
         for k in range(first, last):
             z = _tap(taps, OUTPUT, x) + gains[3] * w
-            out[k, 0] = _sensor(z, y_offset, t[k] - t[0], E, on) if sensing else z + y_offset
-            out[k, 1] = _tap(taps, SPEED, x)
-            out[k, 2] = _tap(taps, POSITION, x)
-            out[k, 3] = _tap(taps, PLANT_IN, x) + gains[2] * w
+            out[0, k] = _sensor(z, y_offset, t[k] - t[0], E, on) if sensing else z + y_offset
+            out[1, k] = _tap(taps, SPEED, x)
+            out[2, k] = _tap(taps, POSITION, x)
+            out[3, k] = _tap(taps, PLANT_IN, x) + gains[2] * w
             if k + 1 >= N:
                 break
             now = t[k]
             while now < t[k + 1] - 1e-9 * step:
-                while j + 1 < N and t[0] + (t[j + 1] - t[0]) * stretch + delay <= now + 1e-6 * step:
+                while j + 1 < N and acts[j + 1] <= now + 1e-6 * step:
                     j += 1
                 until = t[k + 1]
-                if j + 1 < N:
-                    switch = t[0] + (t[j + 1] - t[0]) * stretch + delay
-                    if now < switch < until:
-                        until = switch
+                if j + 1 < N and now < acts[j + 1] < until:
+                    until = acts[j + 1]
                 pieces = max(1, math.ceil((until - now) / step - 1e-6))
                 dt = (until - now) / pieces
                 node = min(dt / node_length, float(NODES))
+                slot = 0 if now == t[k] else 1
+                _blend(rising, node, slot, known, M)
+                if on[A_FALL]:
+                    _blend(falling, node, slot + 2, known, M)
                 if plain:
                     w = u[j] - u_offset
                     for _ in range(pieces):
-                        _linear(rising, node, x, w, free)
+                        _advance(M, slot, x, w, free)
+                        x[:] = free
                     now = until
                     continue
                 for piece in range(pieces):
@@ -429,15 +416,12 @@ def run(
                         share = (begin + 0.5 * dt - delay - t[j]) / (t[j + 1] - t[j])
                         command += min(max(share, 0.0), 1.0) * (u[j + 1] - u[j])
                     w = _actuator(command, u_offset, dt, begin - t[0], E, on, memory)
-                    table = falling if on[A_FALL] and w < x[where[I_ACTUATOR]] else rising
+                    use = slot + 2 if on[A_FALL] and w < x[where[I_ACTUATOR]] else slot
+                    _advance(M, use, x, w, free)
                     if forced:
-                        _advance(table, node, x, w, free, column)
                         load = _load(begin + 0.5 * dt - t[0], recording, E, on)
-                        _push(table, node, w, load, smooth, gains, y_offset, taps, E, on, x, free, column, end, memory)
-                        for i in range(n):
-                            x[i] = free[i]
-                    else:
-                        _linear(table, node, x, w, free)
+                        _push(M, use, w, load, smooth, gains, y_offset, taps, E, on, x, free, column, end, memory)
+                    x[:] = free
                     if stopped:
                         _stop(x, y_offset, where, E, on)
                 now = until

@@ -97,7 +97,7 @@ class Simulator:
         dt = recording.sample_time_s if sample_time_s is None else sample_time_s
         step = self.step_s(dt)
         rising, falling = _table(self.chain, step), _table(self.falling, step)
-        out = np.full((len(recording), kernel.SIGNALS), np.nan)
+        out = np.full((kernel.SIGNALS, len(recording)), np.nan)
         rows = np.zeros(1, dtype=np.int64) if starts is None else starts
         states = np.atleast_2d(x0)
         until = np.append(rows[1:], len(recording)) if stops is None else stops
@@ -107,7 +107,7 @@ class Simulator:
             self.u_offset, self.y_offset, rising, falling, step, self.chain.taps, self.chain.gains, self.chain.where,
             self.E, self.on, int(self.forced), out, end_states,
         )  # fmt: skip
-        return out
+        return out.T
 
     def rest_state(self, u: float, y: float) -> FloatArray:
         """Return the state nearest to rest under a command that gives a reading.
