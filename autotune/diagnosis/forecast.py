@@ -37,6 +37,7 @@ class _Estimator:
     good: FloatArray
     scales: FloatArray
     bias_size: float
+    dt_s: float
 
     def run(self, first: int, last: int, z: FloatArray, linear: bool = False) -> FloatArray:
         """Return simulated readings of rows first to last from the state (and bias) z, in units of the scales."""
@@ -44,10 +45,10 @@ class _Estimator:
         sim = self.linear if linear else self.sim
         if z.size > n:
             sim = replace(sim, u_offset=sim.u_offset + z[n] * self.bias_size)
-        cut = replace(self.recording, t=self.recording.t[:last], u=self.recording.u[:last],
-                      y=self.recording.y[:last], extra={})  # fmt: skip
         starts: IntArray = np.array([first], dtype=np.int64)
-        return np.asarray(sim.run(cut, z[:n] * self.scales, starts)[first:, 0])
+        stops: IntArray = np.array([last], dtype=np.int64)
+        x0 = z[:n] * self.scales
+        return np.asarray(sim.run(self.recording, x0, starts, stops=stops, sample_time_s=self.dt_s)[first:last, 0])
 
     def estimate(self, first: int, last: int, bias: bool, iterations: int = 6) -> FloatArray:
         """Return the state at row first that fits rows first to last best (and a constant force, if asked)."""
@@ -129,6 +130,7 @@ def forecast(model: Model, recording: Recording, horizon_s: float | None = None)
         good=good.astype(np.float64),
         scales=state_scales(sim, [recording.u], [recording.y[good]]),
         bias_size=max(float(np.std(recording.u)), 1e-9),
+        dt_s=recording.sample_time_s,
     )
     if horizon_s is None:
         rows = max(len(recording) // 10, min(len(recording), 8))
