@@ -158,7 +158,7 @@ def _actuator() -> tuple[Entry, ...]:
             name="actuator.rate_limit",
             equation="|dw/dt| <= rate",
             parameters=(Quantity(name="rate", unit="{u}/s", slot=k.A_RATE),),
-            starts=lambda s: [(s.w / (c * s.lag_s),) for c in (0.03, 0.1, 0.4, 1.5)],
+            starts=lambda s: [(s.w / (c * s.lag_s),) for c in (0.03, 0.06, 0.1, 0.16, 0.25, 0.4, 0.6, 1.0, 1.5)],
             confusable=("actuator.lag",),
             reference=astrom,
         ),

@@ -18,7 +18,7 @@ import numpy as np
 from autotune.arrays import FloatArray
 from autotune.diagnosis.data import Data
 from autotune.diagnosis.fitting import Fit
-from autotune.diagnosis.leftover import NEW, Leftover, Place
+from autotune.diagnosis.leftover import NEW, Leftover, Place, filled
 from autotune.diagnosis.windows import slowest_lag_s
 
 #: Fastest swing that is looked for, in cycles per slowest lag, and the most frequencies.
@@ -100,7 +100,7 @@ def largest_variation(result: Fit, data: Data) -> Variation:
 def _multiplied(left: Leftover) -> Iterator[tuple[Place, str, list[FloatArray]]]:
     """Yield what a swing would multiply: place, name, and signal per recording."""
     sim, recordings = left.result.sim, left.data.recordings
-    out = [np.nan_to_num(s) for s in left.result.signals]
+    out = [filled(s) for s in left.result.signals]
     yield "plant", "a load", [np.ones(len(r)) for r in recordings]
     yield "actuator", "the command, as a gain that changes would", [r.u - sim.u_offset for r in recordings]
     yield "plant", "the position or level, as a stiffness or leak that changes would", [s[:, 2] for s in out]
@@ -112,7 +112,7 @@ def _multiplied(left: Leftover) -> Iterator[tuple[Place, str, list[FloatArray]]]
 
 def _bends(left: Leftover) -> Iterator[tuple[Place, str, list[FloatArray]]]:
     """Yield what a static curve would add: second and third powers of each signal, place, and a gain over position."""
-    sim, out = left.result.sim, [np.nan_to_num(s) for s in left.result.signals]
+    sim, out = left.result.sim, [filled(s) for s in left.result.signals]
     speed, position, force = ([s[:, column] for s in out] for column in (1, 2, 3))
     curved: list[tuple[Place, str, list[FloatArray]]] = [
         ("actuator", "the command", [r.u - sim.u_offset for r in left.data.recordings]),
@@ -136,7 +136,7 @@ def _paths(left: Leftover, lag_s: float) -> Iterator[tuple[Place, str, list[Floa
     yield "sensor", "the command itself, as cross-talk to the reading would", held
     for delay in (d * lag_s for d in ECHOES):
         past = [
-            np.interp(r.t - delay, r.t, np.nan_to_num(s[:, 0]) - sim.y_offset)
+            np.interp(r.t - delay, r.t, filled(s)[:, 0] - sim.y_offset)
             for s, r in zip(left.result.signals, recordings, strict=True)
         ]
         yield "sensor", f"the reading {delay:.2g} s before, as an echo would", past

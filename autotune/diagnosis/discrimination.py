@@ -263,7 +263,7 @@ def _told(
 ) -> tuple[Plan, FloatArray]:
     """Return an excitation with its expected discrimination, and all readings that the hypotheses predict."""
     model = found.search.retuned.fit.model
-    starts, stops = window_rows(planned, LAGS_PER_WINDOW * slowest_lag_s(model))
+    starts, stops = window_rows(planned, LAGS_PER_WINDOW * slowest_lag_s(model), float(planned.t[0]))
     data = Data(
         recordings=(planned,), good=(np.ones(len(planned), dtype=bool),), starts=(starts,), stops=(stops,),
         noise=found.search.data.noise, numbers=(len(found.search.data.recordings),),

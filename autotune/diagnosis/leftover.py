@@ -104,7 +104,7 @@ class Leftover:
         smoothed residual. A speed or level may not: a low-passed reading explains itself.
         """
         sim, data = self.result.sim, self.data
-        out = [np.nan_to_num(s) for s in self.result.signals]
+        out = [filled(s) for s in self.result.signals]
         command = [r.u - sim.u_offset for r in data.recordings]
         plant = {"level": [s[:, 2] for s in out], "plant input": [s[:, 3] for s in out]}
         if sim.chain.is_mechanical:
@@ -162,6 +162,13 @@ class Leftover:
     def explained(self, error: float, before: float) -> float:
         """Return the share of the held-out misfit above the noise that is gone."""
         return float(np.clip((before - error) / max(before - self.floor, LEAST_SHARE * self.floor), 0.0, 1.0))
+
+
+def filled(signals: FloatArray) -> FloatArray:
+    """Return simulated signals, (N, 4), rows outside all windows with what the nearest row before has, or the first."""
+    known = np.isfinite(signals[:, 0])
+    nearest = np.maximum.accumulate(np.where(known, np.arange(known.size), int(np.argmax(known))))
+    return np.asarray(np.nan_to_num(signals[nearest]))
 
 
 def _smoothed(e: FloatArray, starts: IntArray, stops: IntArray, rows: int) -> FloatArray:

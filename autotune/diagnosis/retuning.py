@@ -12,7 +12,7 @@ from autotune.diagnosis.data import Data
 from autotune.diagnosis.fitting import Fit, fit
 from autotune.diagnosis.noise import Noise, autoregressive, noise_from_differences
 from autotune.diagnosis.parameters import parametrise
-from autotune.diagnosis.windows import LAGS_PER_WINDOW, slowest_lag_s, window_rows
+from autotune.diagnosis.windows import LAGS_PER_WINDOW, known_from_s, slowest_lag_s, window_rows
 from autotune.models import Model
 from autotune.recording import Recording
 
@@ -42,10 +42,10 @@ def prepare(model: Model, recordings: Sequence[Recording], good: Sequence[BoolAr
     """
     length = LAGS_PER_WINDOW * slowest_lag_s(model)
     noise = floored(noise_from_differences([r.y for r in recordings], good), recordings)
-    windows = [window_rows(r, length) for r in recordings]
+    windows = [window_rows(r, length, known_from_s(model, r)) for r in recordings]
     data = Data(
         recordings=tuple(recordings),
-        good=tuple(good),
+        good=tuple(g & (np.arange(g.size) >= starts[0]) for g, (starts, _) in zip(good, windows, strict=True)),
         starts=tuple(starts for starts, _ in windows),
         stops=tuple(stops for _, stops in windows),
         noise=noise,
@@ -83,8 +83,9 @@ def whiteness(result: Fit, data: Data) -> float:
     """Return the residual's slow power in units of what noise has, after an AR(2) has taken its share."""
     noise = floored(autoregressive(result.residuals, data.good), data.recordings)
     slow = expected = 0.0
-    for e, starts in zip(replace(data, noise=noise).whitened(list(result.residuals)), data.starts, strict=True):
-        for part in np.split(e, starts[1:]):
+    whitened = replace(data, noise=noise).whitened(list(result.residuals))
+    for e, starts, stops in zip(whitened, data.starts, data.stops, strict=True):
+        for part in (e[a:b] for a, b in zip(starts, stops, strict=True)):
             width = max(4, part.size // BLOCKS)
             count = part.size // width
             means = part[: count * width].reshape(count, width).mean(axis=1) * np.sqrt(width)

@@ -245,8 +245,8 @@ def jitter_effect(result: Fit, recordings: Sequence[Recording]) -> SampleEffect 
     """
     slopes, squares = [], []
     for r, e, out in zip(recordings, result.residuals, result.signals, strict=True):
-        slope = np.gradient(np.nan_to_num(out[:, 0]), r.t)
-        use = (e != 0.0) & np.isfinite(out[:, 0])
+        slope = np.gradient(out[:, 0], r.t)
+        use = (e != 0.0) & np.isfinite(slope)
         slopes.append(slope[use] ** 2)
         # the fast part alone: slow misfit also grows with the slope
         fast = np.zeros_like(e)

@@ -16,6 +16,7 @@ from autotune.controller import Controller
 from autotune.diagnosis.data import Data
 from autotune.diagnosis.fitting import Fit
 from autotune.diagnosis.law import shown_law, stated_law
+from autotune.diagnosis.leftover import filled
 from autotune.diagnosis.samples import frozen_rows, lattice_step
 from autotune.recording import Recording
 
@@ -281,7 +282,7 @@ def direction_screen(result: Fit, data: Data) -> DirectionScreen | None:
     """Compare the residual where the simulated reading rises with where it falls."""
     sd, per_row = data.noise.total_sd, independent_share(result)
     good = np.concatenate(data.good) & np.isfinite(np.concatenate([s[:, 0] for s in result.signals]))
-    rates = [np.gradient(np.nan_to_num(s[:, 0]), r.t) for s, r in zip(result.signals, data.recordings, strict=True)]
+    rates = [np.gradient(filled(s)[:, 0], r.t) for s, r in zip(result.signals, data.recordings, strict=True)]
     rate = np.concatenate(rates)
     e = np.concatenate(result.residuals) / sd
     up, down = good & (rate > 0.0), good & (rate < 0.0)

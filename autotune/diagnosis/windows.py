@@ -13,6 +13,9 @@ from autotune.recording import Recording
 LAGS_PER_WINDOW = 10.0
 LEAST_ROWS = 60
 LEAST_WINDOWS = 3
+#: What was commanded before a recording begins is unknown: that many of the slowest lags after the dead time it acts no
+#: more (through a dead time, a rate limit); at most this share of the recording is left out.
+UNKNOWN_LAGS, MOST_LEFT_OUT = 1.0, 0.03
 
 
 def slowest_lag_s(model: Model) -> float:
@@ -23,7 +26,14 @@ def slowest_lag_s(model: Model) -> float:
     return float(1.0 / rates.min()) if rates.size else 0.0
 
 
-def window_rows(recording: Recording, length_s: float) -> tuple[IntArray, IntArray]:
+def known_from_s(model: Model, recording: Recording) -> float:
+    """Return the time from which on a recording's own commands tell what acts [s]."""
+    delay = sum(block.dynamics.delay_s for block in model.blocks)
+    unknown = delay + UNKNOWN_LAGS * slowest_lag_s(model)
+    return float(recording.t[0] + min(unknown, MOST_LEFT_OUT * recording.duration_s))
+
+
+def window_rows(recording: Recording, length_s: float, from_s: float) -> tuple[IntArray, IntArray]:
     """Return the rows where windows of about a length start, and those before which they end.
 
     Parameters
@@ -32,10 +42,12 @@ def window_rows(recording: Recording, length_s: float) -> tuple[IntArray, IntArr
         What is cut.
     length_s : float
         Length of a window [s].
+    from_s : float
+        Time before which no window starts [s].
     """
-    duration = recording.duration_s
+    duration = recording.t[-1] - from_s
     length = max(length_s, LEAST_ROWS * recording.sample_time_s)
     count = max(1, round(duration / length), min(LEAST_WINDOWS, len(recording) // LEAST_ROWS))
-    edges = recording.t[0] + duration / count * np.arange(count)
+    edges = from_s + duration / count * np.arange(count)
     starts = np.unique(np.searchsorted(recording.t, edges - 1e-9)).astype(np.int64)
     return starts, np.append(starts[1:], len(recording))
