@@ -21,12 +21,11 @@ SETTLED = 1e-7
 
 @dataclass(frozen=True, eq=False)
 class Spot:
-    """A point of the search with everything that was simulated there."""
+    """A point of the search with what its simulation left."""
 
     theta: FloatArray
     x0: list[FloatArray]
     sim: Simulator
-    signals: list[FloatArray]
     ends: list[FloatArray]
     e: FloatArray
 
@@ -34,22 +33,21 @@ class Spot:
 Derivatives: TypeAlias = tuple[FloatArray, FloatArray]
 
 
-def simulate(sim: Simulator, x0: list[FloatArray], data: Data) -> tuple[list[FloatArray], list[FloatArray]]:
-    """Return the signals of every recording, and the states that its windows end with."""
-    signals, ends = [], [np.empty_like(x) for x in x0]
+def simulate(
+    sim: Simulator, x0: list[FloatArray], data: Data, signals: int = 1
+) -> tuple[list[FloatArray], list[FloatArray]]:
+    """Return every recording's reading, or all its signals, and the states that its windows end with."""
+    result, ends = [], [np.empty_like(x) for x in x0]
     for i, (recording, x, starts) in enumerate(zip(data.recordings, x0, data.starts, strict=True)):
         number = data.numbers[i] if data.numbers else i
-        signals.append(sim.run(recording, x, starts, number, ends[i], data.stops[i], data.sample_times[i]))
-    return signals, ends
+        dt = data.sample_times[i]
+        result.append(sim.run(recording, x, starts, number, ends[i], data.stops[i], dt, signals))
+    return result, ends
 
 
-def whiten(signals: list[FloatArray], data: Data) -> tuple[list[FloatArray], FloatArray]:
-    """Return the residuals per recording, and whitened, all one after the other."""
-    residuals = []
-    for recording, out, good in zip(data.recordings, signals, data.good, strict=True):
-        r = np.where(good, recording.y - out[:, 0], 0.0)
-        residuals.append(r)
-    return residuals, np.concatenate(data.whitened(residuals))
+def whiten(signals: list[FloatArray], data: Data) -> FloatArray:
+    """Return the whitened residuals of all recordings, one after the other."""
+    return np.concatenate(data.whitened([r.y - out[:, 0] for r, out in zip(data.recordings, signals, strict=True)]))
 
 
 AnyArray: TypeAlias = NDArray[Any]
@@ -83,7 +81,7 @@ class Problem:
         """Simulate at a point."""
         sim = assemble(self.parametrisation.with_values(theta))
         signals, ends = simulate(sim, x0, self.data)
-        return Spot(theta, x0, sim, signals, ends, whiten(signals, self.data)[1])
+        return Spot(theta, x0, sim, ends, whiten(signals, self.data))
 
     def per_recording(self, values: AnyArray) -> list[AnyArray]:
         """Split what is known per window into recordings."""
@@ -117,7 +115,7 @@ class Problem:
             shifted = [x.copy() for x in spot.x0]
             for x in shifted:
                 x[:, j] += h
-            moved = whiten(simulate(spot.sim, shifted, self.data)[0], self.data)[1]
+            moved = whiten(simulate(spot.sim, shifted, self.data)[0], self.data)
             column = (moved - spot.e) * (self.scales[j] / h)
             Jx[:, j] = column if bounded(column) else 0.0
         return J, Jx

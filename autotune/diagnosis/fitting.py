@@ -15,7 +15,8 @@ import numpy as np
 
 from autotune.arrays import BoolArray, FloatArray, IntArray
 from autotune.diagnosis.data import Data
-from autotune.diagnosis.descent import Derivatives, Problem, Spot, bounded, continued, descend, eliminate, whiten
+from autotune.diagnosis.descent import Derivatives, Problem, Spot, bounded, continued, descend, eliminate, simulate
+from autotune.diagnosis.kernel import SIGNALS
 from autotune.diagnosis.parameters import Parametrisation
 from autotune.diagnosis.simulation import Simulator, assemble
 from autotune.errors import IdentificationError
@@ -229,6 +230,8 @@ def _finish(problem: Problem, spot: Spot, derivatives: Derivatives, may: BoolArr
     if not np.all(np.isfinite(H)):
         raise IdentificationError("derivatives leave the range of numbers", where="fit")
     edges = np.cumsum([len(r) for r in problem.data.recordings])[:-1]
+    signals = simulate(spot.sim, spot.x0, problem.data, SIGNALS)[0]
+    rows = zip(problem.data.recordings, signals, problem.data.good, strict=True)
     return Fit(
         parametrisation=problem.parametrisation,
         theta=spot.theta,
@@ -236,9 +239,9 @@ def _finish(problem: Problem, spot: Spot, derivatives: Derivatives, may: BoolArr
         chi2=chi2,
         penalty=float(np.sum((prior * (spot.theta - problem.parametrisation.centre)) ** 2)),
         covariance=np.asarray(np.linalg.pinv(H, rcond=1e-14, hermitian=True)),
-        residuals=tuple(whiten(spot.signals, problem.data)[0]),
+        residuals=tuple(np.where(good, r.y - out[:, 0], 0.0) for r, out, good in rows),
         whitened=tuple(np.split(spot.e, edges)),
-        signals=tuple(spot.signals),
+        signals=tuple(signals),
         explained=_basis(J_left, prior),
         jacobian=derivatives,
         states_explain=tuple(_basis(derivatives[1][a:b]) for a, b in windows),

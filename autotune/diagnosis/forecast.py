@@ -48,7 +48,8 @@ class _Estimator:
         starts: IntArray = np.array([first], dtype=np.int64)
         stops: IntArray = np.array([last], dtype=np.int64)
         x0 = z[:n] * self.scales
-        return np.asarray(sim.run(self.recording, x0, starts, stops=stops, sample_time_s=self.dt_s)[first:last, 0])
+        out = sim.run(self.recording, x0, starts, stops=stops, sample_time_s=self.dt_s, signals=1)
+        return np.asarray(out[first:last, 0])
 
     def estimate(self, first: int, last: int, bias: bool, iterations: int = 6) -> FloatArray:
         """Return the state at row first that fits rows first to last best (and a constant force, if asked)."""

@@ -338,8 +338,8 @@ def run(
         Effect parameters and which of them act.
     forced : int
         Whether any effect acts as a force at the plant's input.
-    out : (SIGNALS, N) array
-        Receives reading, speed, position and plant input at each row.
+    out : (SIGNALS, N) or (1, N) array
+        Receives reading, speed, position and plant input at each row, or the reading alone.
     ends : (W, n) array
         Receives the state at the next window's first row, for the last window at the last row.
     """
@@ -383,9 +383,10 @@ def run(
         for k in range(first, last):
             z = _tap(taps, OUTPUT, x) + gains[3] * w
             out[0, k] = _sensor(z, y_offset, t[k] - t[0], E, on) if sensing else z + y_offset
-            out[1, k] = _tap(taps, SPEED, x)
-            out[2, k] = _tap(taps, POSITION, x)
-            out[3, k] = _tap(taps, PLANT_IN, x) + gains[2] * w
+            if out.shape[0] > 1:
+                out[1, k] = _tap(taps, SPEED, x)
+                out[2, k] = _tap(taps, POSITION, x)
+                out[3, k] = _tap(taps, PLANT_IN, x) + gains[2] * w
             if k + 1 >= N:
                 break
             now = t[k]

@@ -69,6 +69,7 @@ class Simulator:
         ends: FloatArray | None = None,
         stops: IntArray | None = None,
         sample_time_s: float | None = None,
+        signals: int = kernel.SIGNALS,
     ) -> FloatArray:
         """Simulate a recording's rows.
 
@@ -88,16 +89,18 @@ class Simulator:
             Rows before which the windows end; the next window's start by default.
         sample_time_s : float, optional
             The recording's, where it is known already.
+        signals : int
+            How many signals are asked for: all, or 1 for the reading alone.
 
         Returns
         -------
-        (N, 4) array
+        (N, signals) array
             Reading, speed, position (or level) and plant input at each row; NaN outside the windows.
         """
         dt = recording.sample_time_s if sample_time_s is None else sample_time_s
         step = self.step_s(dt)
         rising, falling = _table(self.chain, step), _table(self.falling, step)
-        out = np.full((kernel.SIGNALS, len(recording)), np.nan)
+        out = np.full((signals, len(recording)), np.nan)
         rows = np.zeros(1, dtype=np.int64) if starts is None else starts
         states = np.atleast_2d(x0)
         until = np.append(rows[1:], len(recording)) if stops is None else stops
