@@ -19,7 +19,7 @@ from autotune.recording import Recording
 #: Steps in which a frequency is searched, in units of one over the longest recording's duration.
 RESOLVED = 0.1
 #: Bands of stiction that are tried: the smallest and the largest as a share of the command's size, count.
-BANDS_TRIED = (0.01, 0.6, 54)
+BANDS_TRIED = (0.002, 0.6, 75)
 #: Candidate times of a step per recording.
 STEP_TIMES = 16
 #: Steps of a converter that are tried, as shares of the standard deviation of u; how closely, as a share of a line's

@@ -19,6 +19,7 @@ from autotune.diagnosis.noise import Noise, noise_from_differences
 from autotune.diagnosis.restarts import restarted
 from autotune.diagnosis.retuning import COARSE, floored, misfit, prepare
 from autotune.diagnosis.search import HARD_STOP, RUNAWAY, Hypothesis, extend, score, signal_ranges
+from autotune.diagnosis.simulation import entry_of
 from autotune.diagnosis.windows import slowest_lag_s
 from autotune.models import Effect, Model
 from autotune.recording import Recording
@@ -234,6 +235,9 @@ def _searched(data: Data, base: Fit, nominal: Fit, entries: Sequence[Entry], poo
     if len(chosen.names) > 1:
         report("dropping what is not needed", 0.85)
         chosen = _pruned(chosen, singles, data, pool)
+    if len(chosen.names) > 1:
+        ranked = sorted((chosen, *_exchanged(chosen, data, pool, entries)), key=score)
+        pairs, chosen = [*pairs, *ranked], simplest(ranked, simplicity_lead(base, ranked[0], data))
     if misfit(chosen.fit, data) > MODEL_ERROR:
         fewer = [h for h in (*singles, *pairs) if h.parameters < chosen.parameters]
         chosen = simplest([chosen, *fewer], final_lead(base, chosen, data))
@@ -281,6 +285,21 @@ def _pruned(chosen: Hypothesis, singles: list[Hypothesis], data: Data, pool: Exe
             break
         chosen = best
     return chosen
+
+
+def _exchanged(chosen: Hypothesis, data: Data, pool: Executor, entries: Sequence[Entry]) -> list[Hypothesis]:
+    """Return fits with one effect exchanged for what it can be taken for.
+
+    Effects are added one by one: what stood in for another while its partner was missing would stay.
+    """
+    found: list[Hypothesis] = []
+    for index, name in enumerate(chosen.names):
+        smaller = _without(chosen, index, data)
+        confusable = {*entry_of(name).confusable} - {*chosen.names, *entry_of(name).same}
+        rivals = [entry for entry in entries if entry.name in confusable]
+        if smaller is not None and rivals:
+            found += grown(smaller, data, pool, rivals, most=len(rivals), starts_each=2)
+    return found
 
 
 def _without(h: Hypothesis, index: int, data: Data) -> Hypothesis | None:
