@@ -12,6 +12,7 @@ import numpy as np
 from autotune.controller import Controller
 from autotune.diagnosis.adequacy import Left, is_white, left_by
 from autotune.diagnosis.catalogue import STRUCTURES
+from autotune.diagnosis.constancy import largest_variation
 from autotune.diagnosis.description import Description, describe
 from autotune.diagnosis.discriminate import next_experiment
 from autotune.diagnosis.fitting import Fit
@@ -92,7 +93,10 @@ def diagnose(
     found = search(model, recordings, good, left_out, report)
     # a reading that was rounded is off by less where it stands still: that is no jitter
     rounded = any(s.name == "sensor.quantisation" for s in seen)
-    also = (None if rounded else jitter_effect(found.retuned.fit, recordings), law_effect(recordings, controller))
+    jitter = None if rounded else jitter_effect(found.retuned.fit, recordings)
+    if jitter is not None and largest_variation(found.retuned.fit, found.data).gain > jitter.evidence:
+        jitter = None  # what is left goes with a signal, and that grows with the slope too
+    also = (jitter, law_effect(recordings, controller))
     strong = [s for s in also if s is not None and s.name not in without]
     # what the samples show explains the residual better than an effect of the chain does, or not at all
     gained = score(found.retuned) - score(found.chosen)
