@@ -56,6 +56,7 @@ def diagnose(
     """Find where and why recordings differ from the simulation: numbers, missing physics, or something else."""
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+    from threadpoolctl import threadpool_limits
 
     from autotune.controller import read_controller
     from autotune.diagnosis.diagnose import diagnose as find
@@ -68,7 +69,8 @@ def diagnose(
     data = [read_recording(path) for path in recordings]
     law = None if controller is None else read_controller(controller)
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
+    # many short products: waiting for each other costs linear algebra's threads more than they save
+    with threadpool_limits(1), Progress(*columns, console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task("diagnosing", total=1.0)
         found = find(
             nominal,
