@@ -376,8 +376,10 @@ def run(
         while remembering and past <= j:
             _actuator(u[past], u_offset, 0.0, 0.0, E, on, carried)
             past += 1
-        memory[:3] = w
-        memory[3] = 0.0
+        if window == 0 or stops[window - 1] != first:  # else a rate limit and hysteresis go on where they were
+            memory[2] = w
+            memory[3] = 0.0
+        memory[:2] = w
         if remembering:
             memory[:2] = carried[:2]
         for k in range(first, last):
