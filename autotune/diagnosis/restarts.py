@@ -1,19 +1,27 @@
-"""Windows started anew: a start state that a stop or dry friction holds is not felt, and no descent brings it free."""
+"""Ways out of where no descent leads: start states that a stop holds, a converter's lattice a little off its levels."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from types import MappingProxyType
 
 import numpy as np
 
 from autotune.arrays import BoolArray, FloatArray
 from autotune.diagnosis.data import Data
-from autotune.diagnosis.fitting import Fit, fit, start_states
+from autotune.diagnosis.fitting import Fit, fit, residual_at, start_states
+from autotune.diagnosis.parameters import Parametrisation
 
 #: A window stands out whose misfit is this many times the median window's.
 STANDS_OUT = 1.5
 #: Share of a window on which a start state is found first: before a blow has carried its error far away.
 BEGINNING = 4
+#: How far a lattice is moved at first: its step as a share of what takes it a level off across u's span, its origin as
+#: a share of the step; how often these are halved.
+LATTICE_MOVES, HALVINGS = (0.5, 0.1), 5
+CONVERTER = "actuator.quantisation"
+#: Decrease of the cost from which on a moved lattice is taken, and moved again from there.
+LEAST_GAIN = 10.0
 
 
 def restarted(result: Fit, data: Data) -> Fit:
@@ -53,6 +61,64 @@ def restarted(result: Fit, data: Data) -> Fit:
         return result
     again = fit(p, data, result.theta, chosen(better, settled.x0), iterations=30, inherit=result)
     return again if again.cost < result.cost else result
+
+
+def realigned(result: Fit, data: Data) -> Fit:
+    """Return a fit whose converter has its lattice moved to where the levels are, where that explains more.
+
+    Parameters
+    ----------
+    result : Fit
+        Where a descent came to rest.
+    data : Data
+        What it was fitted to.
+
+    Returns
+    -------
+    Fit
+        A fit to the same data, of no greater cost; the same one where its model has no converter.
+
+    Notes
+    -----
+    Every point of u that a move takes to another level jumps: the criterion is a narrow well that derivatives do not
+    show. Steps and origins around are tried, all other numbers and the start states following to first order.
+    """
+    names = [e.name for e in result.parametrisation.model.effects]
+    if CONVERTER not in names:
+        return result
+    index = [f.name for f in result.parametrisation.free].index(f"{CONVERTER}.step")
+    span = max(float(np.ptp(r.u)) for r in data.recordings)
+
+    def moved(step: float, origin: float) -> tuple[float, Parametrisation, FloatArray]:
+        p, theta = _with_origin(result.parametrisation, names.index(CONVERTER), origin), result.theta.copy()
+        theta[index] = np.log(step)
+        left = result.without_numbers(result.without_states(residual_at(p, data, theta, result.x0)))
+        return float(left @ left), p, theta
+
+    q = result.model.effects[names.index(CONVERTER)].parameters
+    at = q["step"].value, q["origin"].value
+    before = best = moved(*at)
+    wide, turn = LATTICE_MOVES
+    for _ in range(HALVINGS):
+        step, origin = at
+        for i, k in ((i, k) for i in (-1, 0, 1) for k in (-1, 0, 1) if i or k):
+            there = step * (1.0 + i * wide * step / max(span, step)), origin + k * turn * step
+            tried = moved(*there)
+            if tried[0] < best[0]:
+                best, at = tried, there
+        wide, turn = 0.5 * wide, 0.5 * turn
+    if best is before:
+        return result
+    again = fit(best[1], data, best[2], result.x0, iterations=30, inherit=result)
+    return realigned(again, data) if again.cost < result.cost - LEAST_GAIN else result
+
+
+def _with_origin(p: Parametrisation, number: int, origin: float) -> Parametrisation:
+    effects = list(p.model.effects)
+    q = effects[number].parameters
+    there = MappingProxyType({**q, "origin": replace(q["origin"], value=origin)})
+    effects[number] = replace(effects[number], parameters=there)
+    return replace(p, model=replace(p.model, effects=tuple(effects)))
 
 
 def _misfits(result: Fit) -> FloatArray:

@@ -16,7 +16,7 @@ from autotune.diagnosis.descent import bounded
 from autotune.diagnosis.fitting import Fit, fit, residual_at
 from autotune.diagnosis.kernel import I_LEVELS
 from autotune.diagnosis.parameters import COUNTED, FOUND_DIRECTLY, Parametrisation, effect_with, parametrise
-from autotune.diagnosis.restarts import restarted
+from autotune.diagnosis.restarts import CONVERTER, realigned, restarted
 from autotune.diagnosis.simulation import Simulator, entry_of
 from autotune.errors import AutotuneError, IdentificationError
 from autotune.models import Effect, Model
@@ -298,9 +298,17 @@ def _finished(h: Hypothesis, data: Data) -> Hypothesis:
     try:
         f = h.fit
         result = fit(f.parametrisation, data, f.theta, f.x0, iterations=30, inherit=f)
-        return replace(h, fit=restarted(result, data) if HARD_STOP in h.names else result)
     except RUNAWAY:
         return h
+    return replace(h, fit=freed(result, data) if {HARD_STOP, CONVERTER} & set(h.names) else result)
+
+
+def freed(result: Fit, data: Data) -> Fit:
+    """Return a fit brought out of where no descent leads; itself where a simulation runs away on that way."""
+    try:
+        return realigned(restarted(result, data), data)
+    except RUNAWAY:
+        return result
 
 
 def _distinct(group: Sequence[Promise]) -> list[Effect]:

@@ -16,9 +16,8 @@ from autotune.diagnosis.data import Data
 from autotune.diagnosis.direct import periodic_load_starts, quantisation_starts, step_load_starts, stiction_starts
 from autotune.diagnosis.fitting import Fit, fit, start_states
 from autotune.diagnosis.noise import Noise, noise_from_differences
-from autotune.diagnosis.restarts import restarted
 from autotune.diagnosis.retuning import COARSE, floored, misfit, prepare
-from autotune.diagnosis.search import HARD_STOP, RUNAWAY, Hypothesis, extend, score, signal_ranges
+from autotune.diagnosis.search import HARD_STOP, RUNAWAY, Hypothesis, extend, freed, score, signal_ranges
 from autotune.diagnosis.simulation import entry_of
 from autotune.diagnosis.windows import slowest_lag_s
 from autotune.models import Effect, Model
@@ -94,8 +93,8 @@ def _polish(h: Hypothesis, data: Data, base: Fit, rounds: int) -> Hypothesis:
         none = np.zeros(h.fit.theta.size, dtype=bool)
         settled = fit(p, data, h.fit.theta, states_for(h.fit, data, base), free=none)
         best = fit(p, data, h.fit.theta, settled.x0, iterations=30, rounds=rounds)
-    if HARD_STOP in h.names:
-        best = restarted(best, data)
+    if (ROUGH | {HARD_STOP}) & set(h.names):
+        best = freed(best, data)
     positive = np.array([f.kind == "effect" and f.positive for f in p.free])
     rough = ROUGH & set(h.names)
     nudge = NARROW if "actuator.stiction" in rough else NUDGE

@@ -10,6 +10,8 @@ import pytest
 from autotune.diagnosis.catalogue import CATALOGUE
 from autotune.diagnosis.direct import periodic_load_starts, quantisation_starts, stiction_starts
 from autotune.diagnosis.fitting import fit
+from autotune.diagnosis.parameters import effect_with
+from autotune.diagnosis.restarts import realigned
 from autotune.diagnosis.retuning import prepare
 from autotune.diagnosis.samples import inspect
 from autotune.diagnosis.search import extended
@@ -103,6 +105,20 @@ def test_a_converters_step_is_a_line_of_the_residual_over_the_command(step: floa
     # so near that the lattice is a tenth of a step off at most where u, within 1 V of its middle, is farthest
     assert found["step"].value == pytest.approx(step, rel=0.1 * step)
     assert levels == pytest.approx(round(levels), abs=0.1)
+
+
+def test_a_lattice_that_is_off_its_levels_is_moved_onto_them() -> None:
+    r = [converted(0.05, 0.01, 7), converted(0.05, 0.01, 8)]
+    data, base = prepare(lag(2.0), r, inspect(r)[0])
+    found = []
+    for step, origin in ((0.0504, 0.012), (0.05, 0.01)):
+        p, theta, states = extended(base, effect_with("actuator.quantisation", (step, origin)), data)
+        found.append(fit(p, data, theta, states))
+    stuck, truth = found
+    moved = realigned(stuck, data)
+    assert stuck.cost > 1.1 * truth.cost
+    assert moved.cost < 1.02 * truth.cost
+    assert moved.model.effects[0].parameters["step"].value == pytest.approx(0.05, rel=0.002)
 
 
 def test_what_a_slow_mode_explains_better_than_any_effect_is_named_after_none() -> None:
