@@ -79,9 +79,16 @@ class Search:
 def polish(h: Hypothesis, data: Data, base: Fit, rounds: int = 4) -> Hypothesis | None:
     """Fit a hypothesis of the screening to all data; nothing where its simulation runs away on rows not screened."""
     try:
-        return _polish(h, data, base, rounds)
+        fitted = _polish(h, data, base, rounds)
     except RUNAWAY:
         return None
+    return None if _is_dry_friction(fitted, data) else fitted
+
+
+def _is_dry_friction(h: Hypothesis, data: Data) -> bool:
+    """Whether a servo's hysteresis turns within less than the noise: then it is Coulomb friction by another name."""
+    turns = [e.parameters["width"].value for e in h.fit.model.effects if e.name == "plant.hysteresis"]
+    return h.fit.sim.chain.is_mechanical and any(width < data.noise.total_sd for width in turns)
 
 
 def _polish(h: Hypothesis, data: Data, base: Fit, rounds: int) -> Hypothesis:
