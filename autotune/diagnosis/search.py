@@ -138,6 +138,19 @@ def carried_states(base: Fit, effect: Effect, model: Model, data: Data) -> tuple
     return base.x0
 
 
+def kept_states(name: str, order: int) -> slice:
+    """Return the states that stay when an effect is taken out of a chain of an order: all but those of its block."""
+    match name:
+        case "actuator.lag":
+            return slice(1, order)
+        case "sensor.lag" | "plant.slow_mode":
+            return slice(0, order - 1)
+        case "plant.resonance":
+            return slice(0, order - 2)
+        case _:
+            return slice(0, order)
+
+
 def promises(base: Fit, effect: Effect, data: Data) -> list[Promise]:
     """Return what the first order promises when an effect is added to a fit: near zero, and at the size given.
 

@@ -17,7 +17,7 @@ from autotune.diagnosis.direct import periodic_load_starts, quantisation_starts,
 from autotune.diagnosis.fitting import Fit, fit, start_states
 from autotune.diagnosis.noise import Noise, noise_from_differences
 from autotune.diagnosis.retuning import COARSE, floored, misfit, prepare
-from autotune.diagnosis.search import HARD_STOP, RUNAWAY, Hypothesis, extend, freed, score, signal_ranges
+from autotune.diagnosis.search import HARD_STOP, RUNAWAY, Hypothesis, extend, freed, kept_states, score, signal_ranges
 from autotune.diagnosis.simulation import entry_of
 from autotune.diagnosis.windows import slowest_lag_s
 from autotune.models import Effect, Model
@@ -41,6 +41,9 @@ FAR_BEHIND = (0.3, 60.0)
 #: Score that a hypothesis with more free numbers must be ahead of one with fewer; a hundredth of what it explains where
 #: that is more and the misfit of the best is more than noise has.
 SIMPLER, NOISE_ALONE = 6.0, 1.02
+#: The same where the best leaves noise alone, and what a further effect has to bring, as a share of what is explained:
+#: no simulation of blows and thresholds is more exact.
+SIMULATED = 2e-3
 #: Misfit from which on what is wrong with all of them rules, and not noise; the lead is then this share of what the
 #: best explains: a real rig's every imperfection is more than its noise, and little of it is worth a name.
 MODEL_ERROR, MODEL_ERROR_SHARE = 2.0, 0.12
@@ -231,16 +234,16 @@ def _searched(data: Data, base: Fit, nominal: Fit, entries: Sequence[Entry], poo
     report("pairs of effects", 0.4)
     wider = _paired(singles, candidates, data, few, pool, entries)
     pairs, triples = polished(wider, 2, data, base, pool), list[Hypothesis]()
-    if pairs and worth(retuned, pairs[0]) and needed(singles[0], pairs[0], data):
+    if pairs and worth(retuned, pairs[0]) and needed(singles[0], pairs[0], data, base):
         chosen = pairs[0]
         if misfit(pairs[0].fit, data) > 1.05:
             report("three effects", 0.8)
             triples = polished(_larger(wider, 1, few, pool, entries), 1, data, base, pool)
-        if triples and needed(pairs[0], triples[0], data):
+        if triples and needed(pairs[0], triples[0], data, base):
             chosen = triples[0]
     if len(chosen.names) > 1:
         report("dropping what is not needed", 0.85)
-        chosen = _pruned(chosen, singles, data, pool)
+        chosen = _pruned(chosen, singles, data, base, pool)
     if len(chosen.names) > 1:
         ranked = sorted((chosen, *_exchanged(chosen, data, pool, entries)), key=score)
         pairs, chosen = [*pairs, *ranked], simplest(ranked, simplicity_lead(base, ranked[0], data))
@@ -277,7 +280,7 @@ def _paired(
     return [h for h in wider if score(lead[0]) - score(h) > 5.0]
 
 
-def _pruned(chosen: Hypothesis, singles: list[Hypothesis], data: Data, pool: Executor) -> Hypothesis:
+def _pruned(chosen: Hypothesis, singles: list[Hypothesis], data: Data, base: Fit, pool: Executor) -> Hypothesis:
     """Drop effects whose removal costs less than they are worth; single effects found so join the singles."""
     while len(chosen.names) > 1:
         tried = pool.map(lambda i, h=chosen: _without(h, i, data), range(len(chosen.names)))
@@ -287,7 +290,7 @@ def _pruned(chosen: Hypothesis, singles: list[Hypothesis], data: Data, pool: Exe
         singles += [h for h in smaller if len(h.names) == 1]
         singles.sort(key=score)
         best = min(smaller, key=score)
-        if needed(best, chosen, data):
+        if needed(best, chosen, data, base):
             break
         chosen = best
     return chosen
@@ -317,9 +320,10 @@ def _without(h: Hypothesis, index: int, data: Data) -> Hypothesis | None:
         for f in (p.free[i] for i in keep)
     ]
     effects = tuple(e for i, e in enumerate(p.model.effects) if i != index)
+    x0 = [x[:, kept_states(p.model.effects[index].name, x.shape[1])] for x in h.fit.x0]
     smaller = replace(p, model=replace(p.model, effects=effects), free=tuple(moved), centre=p.centre[keep])
     try:
-        result = fit(smaller, data, h.fit.theta[keep], h.fit.x0, iterations=20, rounds=2)
+        result = fit(smaller, data, h.fit.theta[keep], x0, iterations=20, rounds=2)
     except RUNAWAY:
         return None
     return Hypothesis(names=tuple(e.name for e in effects), fit=result)
@@ -392,7 +396,7 @@ def simplicity_lead(base: Fit, best: Hypothesis, data: Data) -> float:
     Where even the best leaves more than noise, its score counts what is wrong with all of them, and more is asked.
     """
     if misfit(best.fit, data) < NOISE_ALONE:
-        return SIMPLER
+        return max(SIMPLER, SIMULATED * (base.cost - best.fit.cost))
     return max(SIMPLER, 0.01 * (base.cost - best.fit.cost))
 
 
@@ -453,10 +457,11 @@ def worth(smaller: Hypothesis, larger: Hypothesis) -> bool:
     return bool(score(smaller) - score(larger) > least * excess)
 
 
-def needed(smaller: Hypothesis, larger: Hypothesis, data: Data) -> bool:
+def needed(smaller: Hypothesis, larger: Hypothesis, data: Data, base: Fit) -> bool:
     """Whether one more effect is worth it and brings the residual to noise, or most of the way there.
 
     On a rig with disturbances of its own every further effect explains a little; that little is not physics.
     """
     before, after = misfit(smaller.fit, data) - 1.0, misfit(larger.fit, data) - 1.0
-    return worth(smaller, larger) and (after < 0.08 or after < 0.5 * before)
+    more = score(smaller) - score(larger) > SIMULATED * (base.cost - larger.fit.cost)
+    return more and worth(smaller, larger) and (after < 0.08 or after < 0.5 * before)
