@@ -30,7 +30,7 @@ DOMINANT, FAR_FROM_NOISE = 0.35, 8.0
 NEARLY_ALL, CLEAR_OF_NOISE = 0.80, 2.0
 #: Weight of a cause outside the catalogue, beside 1 of all hypotheses: where the best explains the recordings, and
 #: where it explains most of what retuning leaves but not all.
-UNKNOWN, HALF_EXPLAINED = 0.03, 0.5
+UNKNOWN, HALF_EXPLAINED = 0.03, 0.25
 #: Scale of the log-odds: one unit of chi2 counts this much less than for ideal noise.
 TEMPERATURE = 3.0
 
