@@ -170,7 +170,7 @@ def test_the_command_ends_at_once_where_the_simulation_explains_the_recording(tm
 def test_a_diagnosis_asks_for_an_experiment_between_the_hypotheses_left_that_goes_no_further_than_the_recording(
     tmp_path: Path,
 ) -> None:
-    """Gentle steps of a servo with a bent amplifier, a bend not looked for, can be taken for friction or a dead zone."""
+    """Gentle steps of a servo with a bent amplifier, a bend not looked for, pass for friction or a dead zone."""
     write(draw(4004), tmp_path)
     recording = read_recording(tmp_path / "first.csv")
     rivals = ("plant.coulomb_friction", "actuator.dead_zone")
