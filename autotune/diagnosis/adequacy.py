@@ -87,7 +87,7 @@ class Left:
     def as_json(self) -> dict[str, Any]:
         """Return the content of the key ``left`` of diagnosis.json."""
         period = self.varies.period_s
-        varies = {"chi2": self.varies.gain, "place": self.varies.place, "what": self.varies.what,
+        varies = {"chi2": self.varies.gain, "places": list(self.varies.places), "what": self.varies.what,
                   "period_s": period if math.isfinite(period) else None}  # fmt: skip
         return {
             "misfit": self.misfit,

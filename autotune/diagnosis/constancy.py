@@ -25,6 +25,16 @@ from autotune.diagnosis.windows import slowest_lag_s
 FASTEST, MOST_FREQUENCIES = 0.3, 120
 #: Delays of an echo that is looked for, in slowest lags.
 ECHOES = (0.5, 0.75, 1.0, 1.35, 1.8, 2.4)
+_LOAD, _GAIN = "a load", "the command, as a gain that changes would"
+_STIFFNESS = "the position or level, as a stiffness or leak that changes would"
+_LAG = "the rate of the reading, as a lag or delay that changes would"
+#: Where something may enter that one place of the chain cannot tell from another.
+_MAY_ENTER = {
+    _LOAD: ("environment", "actuator", "plant"),
+    _GAIN: ("actuator", "plant"),
+    _STIFFNESS: ("plant", "environment"),
+    _LAG: ("plant", "timing", "actuator", "sensor"),
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,8 +45,8 @@ class Variation:
     ----------
     gain : float
         Decrease of chi2 that it promises, in units of the residual's own variance.
-    place : str
-        Where it enters.
+    places : tuple of str
+        Where it may enter.
     what : str
         The signal that is multiplied or added.
     period_s : float
@@ -44,7 +54,7 @@ class Variation:
     """
 
     gain: float
-    place: Place
+    places: tuple[str, ...]
     what: str
     period_s: float
 
@@ -94,20 +104,21 @@ def largest_variation(result: Fit, data: Data) -> Variation:
     with ThreadPoolExecutor(2) as pool:
         gains = list(pool.map(gained, entries))
     gain, (place, what, _, frequency) = max(zip(gains, entries, strict=True), key=lambda pair: pair[0])
-    return Variation(gain=gain, place=place, what=what, period_s=1.0 / frequency if frequency else np.inf)
+    places = _MAY_ENTER.get(what, (place,))
+    return Variation(gain=gain, places=places, what=what, period_s=1.0 / frequency if frequency else np.inf)
 
 
 def _multiplied(left: Leftover) -> Iterator[tuple[Place, str, list[FloatArray]]]:
     """Yield what a swing would multiply: place, name, and signal per recording."""
     sim, recordings = left.result.sim, left.data.recordings
     out = [filled(s) for s in left.result.signals]
-    yield "plant", "a load", [np.ones(len(r)) for r in recordings]
-    yield "actuator", "the command, as a gain that changes would", [r.u - sim.u_offset for r in recordings]
-    yield "plant", "the position or level, as a stiffness or leak that changes would", [s[:, 2] for s in out]
+    yield "plant", _LOAD, [np.ones(len(r)) for r in recordings]
+    yield "actuator", _GAIN, [r.u - sim.u_offset for r in recordings]
+    yield "plant", _STIFFNESS, [s[:, 2] for s in out]
     yield "sensor", "the reading, as a sensor's gain that changes would", [s[:, 0] - sim.y_offset for s in out]
     # from the row before: the row after has felt the command that answers this row's noise
     rates = [np.diff(s[:, 0], prepend=s[0, 0]) / np.gradient(r.t) for s, r in zip(out, recordings, strict=True)]
-    yield "sensor", "the rate of the reading, as a lag or delay that changes would", rates
+    yield "sensor", _LAG, rates
 
 
 def _bends(left: Leftover) -> Iterator[tuple[Place, str, list[FloatArray]]]:

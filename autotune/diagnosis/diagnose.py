@@ -41,6 +41,8 @@ NUMBERS_DECREASE = 25.0
 OFFSET_SIGMAS = 6.0
 #: Correlation of the noise from which on it is a disturbance of the plant's, not of single samples.
 SLOW_NOISE = 0.8
+#: Held-out share of the misfit from which on a description tells where it adds its terms.
+TELLING = 0.5
 #: Limit that nothing reaches.
 NEVER = 1e18
 #: Evidence from which on what single rows show is sure, and its share of what an effect of the chain gains.
@@ -315,12 +317,13 @@ def _places(effects: Sequence[FoundEffect]) -> tuple[str, ...]:
 
 
 def _suspected(found: Search, description: Description, left: Left) -> tuple[str, ...]:
-    """Return where a description adds its terms, where what varies enters, and the places of the nearest candidates."""
-    ranked = sorted((*found.singles, *found.pairs), key=score)
-    places: dict[str, None] = {description.place: None} if description.terms else {}
+    """Return where what varies may enter and a description that tells much adds its terms; else where both might be."""
+    known: dict[str, None] = {description.place: None} if description.terms else {}
     if not left.is_constant:
-        places[left.varies.place] = None
-    for h in ranked[:3]:
+        telling = known if description.explained > TELLING else {}
+        return tuple(dict.fromkeys(left.varies.places) | telling)
+    places: dict[str, None] = dict(known)
+    for h in sorted((*found.singles, *found.pairs), key=score)[:3]:
         for name in h.names:
             entry = entry_of(name)
             places |= dict.fromkeys(entry.places or (entry.place,))

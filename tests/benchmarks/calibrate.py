@@ -155,7 +155,7 @@ def at(row: Shown, temperature: float, unknown: float) -> list[tuple[str, float,
 
 def doubt(row: Shown, unknown: float) -> float:
     """Weight of what is unknown, see :func:`autotune.diagnosis.judgement.doubt_of`."""
-    varies = Variation(gain=row.left["varies"]["chi2"], place="plant", what="", period_s=math.inf)
+    varies = Variation(gain=row.left["varies"]["chi2"], places=("plant",), what="", period_s=math.inf)
     left = Left(varies=varies, **{key: value for key, value in row.left.items() if key != "varies"})
     if not left.is_noise:
         return judgement.HALF_EXPLAINED if judgement.dominates(row.quality) or left.is_little else 1.0

@@ -77,10 +77,10 @@ def test_a_command_that_the_reading_hears_is_told_from_feedback() -> None:
     found = recorded(4, crosstalk=0.05, feedback=3.0)
     assert found.gain > INCONSTANT
     assert "cross-talk" in found.what
-    assert found.place == "sensor"
+    assert found.places == ("sensor",)
 
 
 def test_an_echo_of_the_reading_is_found() -> None:
     found = recorded(5, echo=0.1)
     assert found.gain > INCONSTANT
-    assert found.place == "sensor"
+    assert found.places == ("sensor",)
