@@ -20,7 +20,7 @@ from autotune.arrays import FloatArray
 from autotune.diagnosis.data import Data
 from autotune.diagnosis.fitting import Fit
 from autotune.diagnosis.leftover import DIRECTION, LEAST_SHARE, Leftover, Place, ridge
-from autotune.diagnosis.selection import LEAST_DECREASE
+from autotune.diagnosis.parsimony import LEAST_DECREASE
 
 #: Most terms that a person can still read as one equation.
 MOST_TERMS = 3

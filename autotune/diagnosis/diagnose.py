@@ -25,11 +25,12 @@ from autotune.diagnosis.judgement import (
     rivals,
 )
 from autotune.diagnosis.law import law_effect
+from autotune.diagnosis.parsimony import worth
 from autotune.diagnosis.result import Candidate, Diagnosis, FitQuality, FoundEffect, OperatingRange, Verdict
 from autotune.diagnosis.retuning import COARSE, misfit
 from autotune.diagnosis.samples import SampleEffect, inspect, jitter_effect
 from autotune.diagnosis.search import Hypothesis, score
-from autotune.diagnosis.selection import Report, Search, search, worth
+from autotune.diagnosis.selection import Report, Search, search
 from autotune.diagnosis.simulation import entry_of
 from autotune.errors import InputError
 from autotune.models import Effect, Model, Parameter

@@ -17,9 +17,11 @@ from autotune.diagnosis.adequacy import Left
 from autotune.diagnosis.data import Data
 from autotune.diagnosis.fitting import fit
 from autotune.diagnosis.noise import noise_from_differences
+from autotune.diagnosis.parsimony import final_lead
+from autotune.diagnosis.polishing import own
 from autotune.diagnosis.result import Candidate, FitQuality
 from autotune.diagnosis.search import RUNAWAY, Hypothesis, score
-from autotune.diagnosis.selection import Search, final_lead, own
+from autotune.diagnosis.selection import Search
 
 #: Misfit of a model without effects from which on something must be missing, although no effect is worth it; clean
 #: recordings leave up to 1.02.

@@ -5,48 +5,36 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from types import MappingProxyType
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from autotune.arrays import BoolArray, FloatArray
+from autotune.arrays import BoolArray
 from autotune.diagnosis.catalogue import CATALOGUE, STRUCTURES, Entry
 from autotune.diagnosis.data import Data
 from autotune.diagnosis.direct import periodic_load_starts, quantisation_starts, step_load_starts, stiction_starts
-from autotune.diagnosis.fitting import Fit, fit, start_states
+from autotune.diagnosis.fitting import Fit, fit
 from autotune.diagnosis.noise import Noise, noise_from_differences
+from autotune.diagnosis.parsimony import (
+    LEAST_DECREASE,
+    MODEL_ERROR,
+    bent,
+    final_lead,
+    needed,
+    simplest,
+    simplicity_lead,
+    worth,
+)
+from autotune.diagnosis.polishing import own, polish
 from autotune.diagnosis.retuning import COARSE, floored, misfit, prepare
-from autotune.diagnosis.search import HARD_STOP, RUNAWAY, Hypothesis, extend, freed, kept_states, score, signal_ranges
+from autotune.diagnosis.search import RUNAWAY, Hypothesis, extend, kept_states, score, signal_ranges
 from autotune.diagnosis.simulation import entry_of
 from autotune.diagnosis.windows import slowest_lag_s
 from autotune.models import Effect, Model
 from autotune.recording import Recording
 
-#: Decrease of the score that an effect must bring: what chance brings among some two hundred starts, with a margin (on
-#: clean recordings nothing brought more than 15); weak effects that can be told bring a hundred and more, some 40.
-LEAST_DECREASE = 30.0
-#: The same where a number of the nominal structure lies beyond belief without the effect, by that many of its prior's
-#: standard deviations: a lag that has to be tripled is no wrong number.
-LEAST_BEYOND_BELIEF, BEYOND_BELIEF = 16.0, 4.0
-#: Shift of an effect's size, as a logarithm, that gets a fit out of a crease; stiction's creases are narrow.
-NUDGE, NARROW = 0.06, 0.02
-#: Effects whose thresholds make the criterion rough.
-ROUGH = frozenset(
-    ("actuator.dead_zone", "actuator.backlash", "actuator.stiction", "actuator.quantisation", "plant.coulomb_friction",
-     "plant.stribeck_friction")
-)  # fmt: skip
 #: A screened hypothesis this share of the best one's decrease behind, and this much, is not fitted to all rows.
 FAR_BEHIND = (0.3, 60.0)
-#: Score that a hypothesis with more free numbers must be ahead of one with fewer; a hundredth of what it explains where
-#: that is more and the misfit of the best is more than noise has.
-SIMPLER, NOISE_ALONE = 6.0, 1.02
-#: The same where the best leaves noise alone, and what a further effect has to bring, as a share of what is explained:
-#: no simulation of blows and thresholds is more exact.
-SIMULATED = 2e-3
-#: Misfit from which on what is wrong with all of them rules, and not noise; the lead is then this share of what the
-#: best explains: a real rig's every imperfection is more than its noise, and little of it is worth a name.
-MODEL_ERROR, MODEL_ERROR_SHARE = 2.0, 0.12
 #: Rows on which hypotheses are screened; those that lead are fitted to all.
 SCREENING_ROWS = 4500
 Report = Callable[[str, float], None]
@@ -77,89 +65,6 @@ class Search:
     pairs: tuple[Hypothesis, ...] = ()
     triples: tuple[Hypothesis, ...] = ()
     chosen: Hypothesis
-
-
-def polish(h: Hypothesis, data: Data, base: Fit, rounds: int = 4) -> Hypothesis | None:
-    """Fit a hypothesis of the screening to all data; nothing where its simulation runs away on rows not screened."""
-    try:
-        fitted = _polish(h, data, base, rounds)
-    except RUNAWAY:
-        return None
-    return None if _is_dry_friction(fitted, data) else fitted
-
-
-def _is_dry_friction(h: Hypothesis, data: Data) -> bool:
-    """Whether a servo's hysteresis turns within less than the noise: then it is Coulomb friction by another name."""
-    turns = [e.parameters["width"].value for e in h.fit.model.effects if e.name == "plant.hysteresis"]
-    return h.fit.sim.chain.is_mechanical and any(width < data.noise.total_sd for width in turns)
-
-
-def _polish(h: Hypothesis, data: Data, base: Fit, rounds: int) -> Hypothesis:
-    """Fit the start states that the screening has not seen first, then everything."""
-    p = h.fit.parametrisation
-    if h.fit.rows == data.rows:
-        best = fit(p, data, h.fit.theta, h.fit.x0, iterations=30, rounds=rounds, inherit=h.fit)
-    else:
-        none = np.zeros(h.fit.theta.size, dtype=bool)
-        settled = fit(p, data, h.fit.theta, states_for(h.fit, data, base), free=none)
-        best = fit(p, data, h.fit.theta, settled.x0, iterations=30, rounds=rounds)
-    if (ROUGH | {HARD_STOP}) & set(h.names):
-        best = freed(best, data)
-    positive = np.array([f.kind == "effect" and f.positive for f in p.free])
-    rough = ROUGH & set(h.names)
-    nudge = NARROW if "actuator.stiction" in rough else NUDGE
-    for shift in (-nudge, nudge) if rough and positive.any() else ():
-        # thresholds make the criterion rough: a nudge gets a fit out of a crease
-        again = fit(p, data, best.theta + shift * positive, best.x0, iterations=8, rounds=1, inherit=best)
-        best = again if again.cost < best.cost else best
-    return replace(h, fit=_timed(best, data))
-
-
-def _timed(result: Fit, data: Data) -> Fit:
-    """Move a step load's time where a fit of everything else is better; a first-order look may take one far from it."""
-    effects = result.parametrisation.model.effects
-    number = next((i for i, e in enumerate(effects) if e.name == "environment.step_load"), None)
-    if number is None:
-        return result
-    step, least = max(r.duration_s for r in data.recordings) / 16.0, 2.0 * max(data.sample_times)
-    while step > least:
-        tried = [_moved(result, number, step * side, data) for side in (-1.0, 1.0)]
-        best = min((t for t in tried if t is not None), key=lambda t: t.cost, default=result)
-        if best.cost < result.cost - 1.0:
-            result = best
-        else:
-            step /= 2.5
-    return result
-
-
-def _moved(result: Fit, number: int, shift: float, data: Data) -> Fit | None:
-    """Fit again for a few steps with a step load's time moved; nothing where the simulation runs away."""
-    p = result.parametrisation
-    effects = list(p.model.effects)
-    time = effects[number].parameters["time"]
-    moved = {**effects[number].parameters, "time": replace(time, value=time.value + shift)}
-    effects[number] = replace(effects[number], parameters=MappingProxyType(moved))
-    try:
-        there = replace(p, model=replace(p.model, effects=tuple(effects)))
-        return fit(there, data, result.theta, result.x0, iterations=4, rounds=1, inherit=result)
-    except RUNAWAY:
-        return None
-
-
-def own(result: Fit, data: Data) -> list[FloatArray]:
-    """Return a fit's start states of the windows that thinned data have."""
-    pairs = zip(result.x0, result.starts, data.starts, strict=True)
-    return [x0[np.searchsorted(known, starts)] for x0, known, starts in pairs]
-
-
-def states_for(result: Fit, data: Data, base: Fit) -> tuple[FloatArray, ...]:
-    """Return start states for all windows: a fit's own where it has the window, else the base's or rest."""
-    states = start_states(result.sim, data)
-    if states[0].shape == base.x0[0].shape:
-        states = [x.copy() for x in base.x0]
-    for full, starts, x0, known in zip(states, data.starts, result.x0, result.starts, strict=True):
-        full[np.searchsorted(starts, known)] = x0
-    return tuple(states)
 
 
 def search(
@@ -343,12 +248,6 @@ def _again(h: Hypothesis, data: Data) -> Hypothesis:
     return replace(h, fit=fit(h.fit.parametrisation, data, h.fit.theta, h.fit.x0, iterations=20))
 
 
-def bent(result: Fit, far: float = 2.0) -> bool:
-    """Whether retuning moved a gain or lag so far that it must stand for something else."""
-    away = np.abs(result.theta - result.parametrisation.centre) / result.parametrisation.spreads
-    return bool(np.max(away, initial=0.0) > far)
-
-
 def _unbent(base: Fit, data: Data) -> Hypothesis:
     """Return the nominal structure with nominal numbers, the operating point alone fitted."""
     free = np.array([f.kind == "u_offset" for f in base.parametrisation.free])
@@ -377,35 +276,11 @@ def polished(ranked: Sequence[Hypothesis], count: int, data: Data, base: Fit, po
     return done
 
 
-def simplest(ranked: Sequence[Hypothesis], lead: float) -> Hypothesis:
-    """Return the hypothesis of the fewest numbers that is less than a lead behind the first one."""
-    near = [h for h in ranked if score(h) - score(ranked[0]) < lead]
-    return min(near, key=lambda h: (h.parameters, score(h)))
-
-
 def _far_behind(h: Hypothesis, best: Hypothesis, base: Fit) -> bool:
     """Whether a hypothesis is so far behind on the rows screened that all rows will not turn it."""
     share = h.fit.rows / base.rows
     behind, gained = score(h) - score(best), share * base.cost - best.fit.cost
     return behind > max(FAR_BEHIND[0] * gained, FAR_BEHIND[1])
-
-
-def simplicity_lead(base: Fit, best: Hypothesis, data: Data) -> float:
-    """Return by how much a richer hypothesis must beat a simpler one to be preferred, in units of the score.
-
-    Where even the best leaves more than noise, its score counts what is wrong with all of them, and more is asked.
-    """
-    if misfit(best.fit, data) < NOISE_ALONE:
-        return max(SIMPLER, SIMULATED * (base.cost - best.fit.cost))
-    return max(SIMPLER, 0.01 * (base.cost - best.fit.cost))
-
-
-def final_lead(base: Fit, best: Hypothesis, data: Data) -> float:
-    """Return the same for the choice among all that were found, where the model's error may be what is left."""
-    lead = simplicity_lead(base, best, data)
-    if misfit(best.fit, data) < MODEL_ERROR:
-        return lead
-    return max(lead, MODEL_ERROR_SHARE * (base.cost - best.fit.cost))
 
 
 def lattice_starts(base: Hypothesis, data: Data, pool: Executor, names: Collection[str]) -> list[Effect]:
@@ -448,20 +323,3 @@ def _larger(
             if key not in found or score(h) < score(found[key]):
                 found[key] = h
     return sorted(found.values(), key=score)
-
-
-def worth(smaller: Hypothesis, larger: Hypothesis) -> bool:
-    """Whether a larger hypothesis explains enough more to be believed."""
-    excess = max(1.0, larger.fit.chi2 / larger.fit.rows)
-    least = LEAST_BEYOND_BELIEF if bent(smaller.fit, BEYOND_BELIEF) else LEAST_DECREASE
-    return bool(score(smaller) - score(larger) > least * excess)
-
-
-def needed(smaller: Hypothesis, larger: Hypothesis, data: Data, base: Fit) -> bool:
-    """Whether one more effect is worth it and brings the residual to noise, or most of the way there.
-
-    On a rig with disturbances of its own every further effect explains a little; that little is not physics.
-    """
-    before, after = misfit(smaller.fit, data) - 1.0, misfit(larger.fit, data) - 1.0
-    more = score(smaller) - score(larger) > SIMULATED * (base.cost - larger.fit.cost)
-    return more and worth(smaller, larger) and (after < 0.08 or after < 0.5 * before)

@@ -1,0 +1,104 @@
+"""A hypothesis of the screening fitted to all rows: start states first, then everything, then out of creases."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import MappingProxyType
+
+import numpy as np
+
+from autotune.arrays import FloatArray
+from autotune.diagnosis.data import Data
+from autotune.diagnosis.fitting import Fit, fit, start_states
+from autotune.diagnosis.search import HARD_STOP, RUNAWAY, Hypothesis, freed
+
+#: Shift of an effect's size, as a logarithm, that gets a fit out of a crease; stiction's creases are narrow.
+NUDGE, NARROW = 0.06, 0.02
+#: Effects whose thresholds make the criterion rough.
+ROUGH = frozenset(
+    ("actuator.dead_zone", "actuator.backlash", "actuator.stiction", "actuator.quantisation", "plant.coulomb_friction",
+     "plant.stribeck_friction")
+)  # fmt: skip
+
+
+def polish(h: Hypothesis, data: Data, base: Fit, rounds: int = 4) -> Hypothesis | None:
+    """Fit a hypothesis of the screening to all data; nothing where its simulation runs away on rows not screened."""
+    try:
+        fitted = _polish(h, data, base, rounds)
+    except RUNAWAY:
+        return None
+    return None if _is_dry_friction(fitted, data) else fitted
+
+
+def _is_dry_friction(h: Hypothesis, data: Data) -> bool:
+    """Whether a servo's hysteresis turns within less than the noise: then it is Coulomb friction by another name."""
+    turns = [e.parameters["width"].value for e in h.fit.model.effects if e.name == "plant.hysteresis"]
+    return h.fit.sim.chain.is_mechanical and any(width < data.noise.total_sd for width in turns)
+
+
+def _polish(h: Hypothesis, data: Data, base: Fit, rounds: int) -> Hypothesis:
+    """Fit the start states that the screening has not seen first, then everything."""
+    p = h.fit.parametrisation
+    if h.fit.rows == data.rows:
+        best = fit(p, data, h.fit.theta, h.fit.x0, iterations=30, rounds=rounds, inherit=h.fit)
+    else:
+        none = np.zeros(h.fit.theta.size, dtype=bool)
+        settled = fit(p, data, h.fit.theta, states_for(h.fit, data, base), free=none)
+        best = fit(p, data, h.fit.theta, settled.x0, iterations=30, rounds=rounds)
+    if (ROUGH | {HARD_STOP}) & set(h.names):
+        best = freed(best, data)
+    positive = np.array([f.kind == "effect" and f.positive for f in p.free])
+    rough = ROUGH & set(h.names)
+    nudge = NARROW if "actuator.stiction" in rough else NUDGE
+    for shift in (-nudge, nudge) if rough and positive.any() else ():
+        # thresholds make the criterion rough: a nudge gets a fit out of a crease
+        again = fit(p, data, best.theta + shift * positive, best.x0, iterations=8, rounds=1, inherit=best)
+        best = again if again.cost < best.cost else best
+    return replace(h, fit=_timed(best, data))
+
+
+def _timed(result: Fit, data: Data) -> Fit:
+    """Move a step load's time where a fit of everything else is better; a first-order look may take one far from it."""
+    effects = result.parametrisation.model.effects
+    number = next((i for i, e in enumerate(effects) if e.name == "environment.step_load"), None)
+    if number is None:
+        return result
+    step, least = max(r.duration_s for r in data.recordings) / 16.0, 2.0 * max(data.sample_times)
+    while step > least:
+        tried = [_moved(result, number, step * side, data) for side in (-1.0, 1.0)]
+        best = min((t for t in tried if t is not None), key=lambda t: t.cost, default=result)
+        if best.cost < result.cost - 1.0:
+            result = best
+        else:
+            step /= 2.5
+    return result
+
+
+def _moved(result: Fit, number: int, shift: float, data: Data) -> Fit | None:
+    """Fit again for a few steps with a step load's time moved; nothing where the simulation runs away."""
+    p = result.parametrisation
+    effects = list(p.model.effects)
+    time = effects[number].parameters["time"]
+    moved = {**effects[number].parameters, "time": replace(time, value=time.value + shift)}
+    effects[number] = replace(effects[number], parameters=MappingProxyType(moved))
+    try:
+        there = replace(p, model=replace(p.model, effects=tuple(effects)))
+        return fit(there, data, result.theta, result.x0, iterations=4, rounds=1, inherit=result)
+    except RUNAWAY:
+        return None
+
+
+def own(result: Fit, data: Data) -> list[FloatArray]:
+    """Return a fit's start states of the windows that thinned data have."""
+    pairs = zip(result.x0, result.starts, data.starts, strict=True)
+    return [x0[np.searchsorted(known, starts)] for x0, known, starts in pairs]
+
+
+def states_for(result: Fit, data: Data, base: Fit) -> tuple[FloatArray, ...]:
+    """Return start states for all windows: a fit's own where it has the window, else the base's or rest."""
+    states = start_states(result.sim, data)
+    if states[0].shape == base.x0[0].shape:
+        states = [x.copy() for x in base.x0]
+    for full, starts, x0, known in zip(states, data.starts, result.x0, result.starts, strict=True):
+        full[np.searchsorted(starts, known)] = x0
+    return tuple(states)
