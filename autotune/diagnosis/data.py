@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -44,10 +44,11 @@ class Data:
     noise: Noise
     numbers: tuple[int, ...] = ()
 
-    def thinned(self, rows: int) -> Data:
+    def thinned(self, rows: int, telling: Sequence[BoolArray] | None = None) -> Data:
         """Return the data with windows left out evenly, until about as many rows count.
 
-        Windows in which u or y is largest or smallest stay: a limit that is rarely reached acts only there.
+        Windows in which u or y is largest or smallest stay, and those named as telling: a limit that is rarely reached
+        acts only there.
         """
         share = max(1.0, self.rows / rows)
         if share < 1.5:
@@ -55,12 +56,13 @@ class Data:
         if all(len(a) <= LEAST_WINDOWS_KEPT for a in self.starts):
             return self
         chosen = []
-        for r, a, ok in zip(self.recordings, self.starts, self.good, strict=True):
+        named = [np.zeros(len(a), dtype=bool) for a in self.starts] if telling is None else telling
+        for r, a, ok, tells in zip(self.recordings, self.starts, self.good, named, strict=True):
             count = min(len(a), max(LEAST_WINDOWS_KEPT, round(len(a) / share)))
             far = [extreme(np.where(ok, x, np.median(x[ok]))) for x in (r.u, r.y) for extreme in (np.argmin, np.argmax)]
             extremes = np.clip(np.searchsorted(a, far, side="right") - 1, 0, len(a) - 1)
             evenly = np.linspace(0, len(a) - 1, count).round().astype(np.int64)
-            chosen.append(np.union1d(evenly, extremes))
+            chosen.append(np.unique(np.concatenate([evenly, extremes, np.flatnonzero(tells)])))
         return self.only(chosen)
 
     def only(self, chosen: Iterable[IntArray | BoolArray]) -> Data:

@@ -29,6 +29,8 @@ SIGMAS = 6.0
 LEAST_CHANGE = 0.04
 #: Where a derivative's filter is not stated: variance that the stated law must leave beside what other gains leave.
 CLEARLY_MORE = 2.0
+#: Share of the rows at the command's ends from which on limits made it, not the law.
+MOST_AT_LIMITS = 0.2
 #: Shortest filter of a derivative that is looked for where none is stated, in sample times; the longest is T_d.
 SHORTEST_FILTER = 0.05
 EQUATIONS = {
@@ -185,7 +187,8 @@ def shown_law(r: Recording, stated: StatedLaw) -> ShownLaw | None:
     made one of samples: the rows themselves say which, by what is left unexplained. In closed loop the estimate is free
     of bias as far as the dither is white after its AR(8); T_d is known up to what the filter's form makes of it.
     """
-    if "r" not in r.extra or not np.all(np.isfinite(r["r"])) or np.ptp(r.u) == 0.0:
+    limited = float(np.mean((r.u == r.u.min()) | (r.u == r.u.max())))
+    if "r" not in r.extra or not np.all(np.isfinite(r["r"])) or limited > MOST_AT_LIMITS:
         return None
     ways = _ways(stated, r)
     if not ways:

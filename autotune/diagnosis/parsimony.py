@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numpy as np
-
 from autotune.diagnosis.data import Data
 from autotune.diagnosis.fitting import Fit
-from autotune.diagnosis.retuning import misfit
+from autotune.diagnosis.retuning import bent, misfit
 from autotune.diagnosis.search import Hypothesis, score
 
 #: Decrease of the score that an effect must bring: what chance brings among some two hundred starts, with a margin (on
@@ -50,12 +48,6 @@ def final_lead(base: Fit, best: Hypothesis, data: Data) -> float:
     if misfit(best.fit, data) < MODEL_ERROR:
         return lead
     return max(lead, MODEL_ERROR_SHARE * (base.cost - best.fit.cost))
-
-
-def bent(result: Fit, far: float = 2.0) -> bool:
-    """Whether retuning moved a gain or lag so far that it must stand for something else."""
-    away = np.abs(result.theta - result.parametrisation.centre) / result.parametrisation.spreads
-    return bool(np.max(away, initial=0.0) > far)
 
 
 def worth(smaller: Hypothesis, larger: Hypothesis) -> bool:

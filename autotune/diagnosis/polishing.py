@@ -10,6 +10,8 @@ import numpy as np
 from autotune.arrays import FloatArray
 from autotune.diagnosis.data import Data
 from autotune.diagnosis.fitting import Fit, fit, start_states
+from autotune.diagnosis.restarts import renewed
+from autotune.diagnosis.retuning import bent
 from autotune.diagnosis.search import HARD_STOP, RUNAWAY, Hypothesis, freed
 
 #: Shift of an effect's size, as a logarithm, that gets a fit out of a crease; stiction's creases are narrow.
@@ -17,7 +19,7 @@ NUDGE, NARROW = 0.06, 0.02
 #: Effects whose thresholds make the criterion rough.
 ROUGH = frozenset(
     ("actuator.dead_zone", "actuator.backlash", "actuator.stiction", "actuator.quantisation", "plant.coulomb_friction",
-     "plant.stribeck_friction")
+     "plant.stribeck_friction", "plant.hysteresis")
 )  # fmt: skip
 
 
@@ -47,6 +49,8 @@ def _polish(h: Hypothesis, data: Data, base: Fit, rounds: int) -> Hypothesis:
         best = fit(p, data, h.fit.theta, settled.x0, iterations=30, rounds=rounds)
     if (ROUGH | {HARD_STOP}) & set(h.names):
         best = freed(best, data)
+    if ROUGH & set(h.names) or bent(best):
+        best = renewed(best, data)
     positive = np.array([f.kind == "effect" and f.positive for f in p.free])
     rough = ROUGH & set(h.names)
     nudge = NARROW if "actuator.stiction" in rough else NUDGE

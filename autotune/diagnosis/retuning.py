@@ -11,7 +11,8 @@ from autotune.arrays import BoolArray
 from autotune.diagnosis.data import Data
 from autotune.diagnosis.fitting import Fit, fit
 from autotune.diagnosis.noise import Noise, autoregressive, noise_from_differences
-from autotune.diagnosis.parameters import parametrise
+from autotune.diagnosis.parameters import Parametrisation, parametrise
+from autotune.diagnosis.restarts import renewed
 from autotune.diagnosis.windows import LAGS_PER_WINDOW, known_from_s, slowest_lag_s, window_rows
 from autotune.models import Model
 from autotune.recording import Recording
@@ -60,7 +61,20 @@ def prepare(model: Model, recordings: Sequence[Recording], good: Sequence[BoolAr
             noise = Noise(sd=float(np.sqrt(np.mean(np.concatenate(result.residuals) ** 2))))
         data = replace(data, noise=floored(noise, recordings))
         result = fit(p, data, result.theta, result.x0, iterations=20)
-    return data, result
+    # start states that stayed behind while the numbers were wrong hold them back, and bend the chain
+    return data, renewed(result, data) if bent(result) else result
+
+
+def bent(result: Fit, far: float = 2.0) -> bool:
+    """Whether retuning moved a gain or lag so far that it must stand for something else."""
+    away = np.abs(result.theta - result.parametrisation.centre) / result.parametrisation.spreads
+    return bool(np.max(away, initial=0.0) > far)
+
+
+def at_operating_point(p: Parametrisation, data: Data) -> Fit:
+    """Return a fit of the operating point alone, all other numbers as they are believed."""
+    free = np.array([f.kind == "u_offset" for f in p.free])
+    return fit(p, data, free=free)
 
 
 def floored(noise: Noise, recordings: Sequence[Recording]) -> Noise:

@@ -18,7 +18,6 @@ from autotune.diagnosis.noise import Noise, noise_from_differences
 from autotune.diagnosis.parsimony import (
     LEAST_DECREASE,
     MODEL_ERROR,
-    bent,
     final_lead,
     needed,
     simplest,
@@ -26,7 +25,8 @@ from autotune.diagnosis.parsimony import (
     worth,
 )
 from autotune.diagnosis.polishing import own, polish
-from autotune.diagnosis.retuning import COARSE, floored, misfit, prepare
+from autotune.diagnosis.restarts import standing_out
+from autotune.diagnosis.retuning import COARSE, at_operating_point, bent, floored, misfit, prepare
 from autotune.diagnosis.search import RUNAWAY, Hypothesis, extend, kept_states, score, signal_ranges
 from autotune.diagnosis.simulation import entry_of
 from autotune.diagnosis.windows import slowest_lag_s
@@ -117,14 +117,16 @@ def _searched(data: Data, base: Fit, nominal: Fit, entries: Sequence[Entry], poo
     """Add effects in ones, twos and threes as far as the residual asks for them."""
     chosen = retuned = Hypothesis(names=(), fit=base)
     report("single effects", 0.1)
-    few = data.thinned(SCREENING_ROWS)
+    few = data.thinned(SCREENING_ROWS, standing_out(base))
     screen = (
         retuned if few is data else Hypothesis(names=(), fit=fit(base.parametrisation, few, base.theta, own(base, few)))
     )
     lattices = lattice_starts(screen, few, pool, [entry.name for entry in entries])
     candidates = grown(screen, few, pool, entries, most=7, lattices=lattices)
     if bent(base):
-        unbent = grown(_unbent(base, few), few, pool, entries, most=7, starts_each=2, lattices=lattices)
+        believed = Hypothesis(names=(), fit=at_operating_point(base.parametrisation, few))
+        lattices = lattice_starts(believed, few, pool, [entry.name for entry in entries])
+        unbent = grown(believed, few, pool, entries, most=7, starts_each=2, lattices=lattices)
         candidates = merged(candidates, unbent)
     singles = polished(candidates, 3, data, base, pool)
     if singles and misfit(base, data) > COARSE:
@@ -150,7 +152,7 @@ def _searched(data: Data, base: Fit, nominal: Fit, entries: Sequence[Entry], poo
         report("dropping what is not needed", 0.85)
         chosen = _pruned(chosen, singles, data, base, pool)
     if len(chosen.names) > 1:
-        ranked = sorted((chosen, *_exchanged(chosen, data, pool, entries)), key=score)
+        ranked = sorted((chosen, *_exchanged(chosen, data, base, pool, entries)), key=score)
         pairs, chosen = [*pairs, *ranked], simplest(ranked, simplicity_lead(base, ranked[0], data))
     if misfit(chosen.fit, data) > MODEL_ERROR:
         fewer = [h for h in (*singles, *pairs) if h.parameters < chosen.parameters]
@@ -201,7 +203,7 @@ def _pruned(chosen: Hypothesis, singles: list[Hypothesis], data: Data, base: Fit
     return chosen
 
 
-def _exchanged(chosen: Hypothesis, data: Data, pool: Executor, entries: Sequence[Entry]) -> list[Hypothesis]:
+def _exchanged(chosen: Hypothesis, data: Data, base: Fit, pool: Executor, entries: Sequence[Entry]) -> list[Hypothesis]:
     """Return fits with one effect exchanged for what it can be taken for.
 
     Effects are added one by one: what stood in for another while its partner was missing would stay.
@@ -212,8 +214,8 @@ def _exchanged(chosen: Hypothesis, data: Data, pool: Executor, entries: Sequence
         confusable = {*entry_of(name).confusable} - {*chosen.names, *entry_of(name).same}
         rivals = [entry for entry in entries if entry.name in confusable]
         if smaller is not None and rivals:
-            found += grown(smaller, data, pool, rivals, most=len(rivals), starts_each=2)
-    return found
+            found += grown(smaller, data, pool, rivals, most=len(rivals), starts_each=2)[:1]
+    return [h for h in pool.map(lambda h: polish(h, data, base), found) if h is not None]
 
 
 def _without(h: Hypothesis, index: int, data: Data) -> Hypothesis | None:
@@ -240,18 +242,13 @@ def _finer(best: Hypothesis, base: Fit, data: Data) -> tuple[Data, Fit, Data]:
     if misfit(best.fit, data) > COARSE:
         noise = Noise(sd=float(np.sqrt(np.mean(np.concatenate(best.fit.residuals) ** 2))))
     data = replace(data, noise=floored(noise, data.recordings))
-    return data, fit(base.parametrisation, data, base.theta, base.x0, iterations=20), data.thinned(SCREENING_ROWS)
+    base = fit(base.parametrisation, data, base.theta, base.x0, iterations=20)
+    return data, base, data.thinned(SCREENING_ROWS, standing_out(base))
 
 
 def _again(h: Hypothesis, data: Data) -> Hypothesis:
     """Fit a hypothesis again under another noise."""
     return replace(h, fit=fit(h.fit.parametrisation, data, h.fit.theta, h.fit.x0, iterations=20))
-
-
-def _unbent(base: Fit, data: Data) -> Hypothesis:
-    """Return the nominal structure with nominal numbers, the operating point alone fitted."""
-    free = np.array([f.kind == "u_offset" for f in base.parametrisation.free])
-    return Hypothesis(names=(), fit=fit(base.parametrisation, data, free=free))
 
 
 def merged(first: Sequence[Hypothesis], second: Sequence[Hypothesis]) -> list[Hypothesis]:
