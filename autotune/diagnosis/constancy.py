@@ -145,11 +145,9 @@ def _paths(left: Leftover, lag_s: float) -> Iterator[tuple[Place, str, list[Floa
     # the command held until the row: the row's own already answers its noise
     held = [np.concatenate([r.u[:1], r.u[:-1]]) - sim.u_offset for r in recordings]
     yield "sensor", "the command itself, as cross-talk to the reading would", held
+    readings = [filled(s)[:, 0] - sim.y_offset for s in left.result.signals]
     for delay in (d * lag_s for d in ECHOES):
-        past = [
-            np.interp(r.t - delay, r.t, filled(s)[:, 0] - sim.y_offset)
-            for s, r in zip(left.result.signals, recordings, strict=True)
-        ]
+        past = [np.interp(r.t - delay, r.t, y) for y, r in zip(readings, recordings, strict=True)]
         yield "sensor", f"the reading {delay:.2g} s before, as an echo would", past
 
 

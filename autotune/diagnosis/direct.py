@@ -10,9 +10,9 @@ from scipy.signal import fftconvolve, lfilter
 
 from autotune.arrays import FloatArray
 from autotune.diagnosis.data import Data
-from autotune.diagnosis.fitting import Fit
+from autotune.diagnosis.fitting import RUNAWAY, Fit
 from autotune.diagnosis.parameters import effect_with
-from autotune.diagnosis.search import RUNAWAY, Promise, direction, promise
+from autotune.diagnosis.search import Promise, direction, promise
 from autotune.models import Effect
 from autotune.recording import Recording
 

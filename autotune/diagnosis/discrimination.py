@@ -19,9 +19,9 @@ from autotune.arrays import FloatArray
 from autotune.config import Config
 from autotune.controller import PIDController
 from autotune.diagnosis.data import Data
-from autotune.diagnosis.fitting import Fit, fit
+from autotune.diagnosis.fitting import RUNAWAY, Fit, fit
 from autotune.diagnosis.result import Diagnosis
-from autotune.diagnosis.search import RUNAWAY, Hypothesis
+from autotune.diagnosis.search import Hypothesis
 from autotune.diagnosis.simulation import Simulator, entry_of
 from autotune.diagnosis.windows import LAGS_PER_WINDOW, slowest_lag_s, window_rows
 from autotune.errors import InputError

@@ -19,8 +19,11 @@ from autotune.diagnosis.descent import Derivatives, Problem, Spot, bounded, cont
 from autotune.diagnosis.kernel import SIGNALS
 from autotune.diagnosis.parameters import Parametrisation
 from autotune.diagnosis.simulation import Simulator, assemble
-from autotune.errors import IdentificationError
+from autotune.errors import AutotuneError, IdentificationError
 from autotune.models import Model
+
+#: What a fit raises where the simulation runs away: that start is no hypothesis.
+RUNAWAY = (AutotuneError, OverflowError, np.linalg.LinAlgError)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -15,12 +15,12 @@ import numpy as np
 
 from autotune.diagnosis.adequacy import Left
 from autotune.diagnosis.data import Data
-from autotune.diagnosis.fitting import fit
+from autotune.diagnosis.fitting import RUNAWAY, fit
 from autotune.diagnosis.noise import noise_from_differences
 from autotune.diagnosis.parsimony import final_lead
 from autotune.diagnosis.polishing import own
 from autotune.diagnosis.result import Candidate, FitQuality
-from autotune.diagnosis.search import RUNAWAY, Hypothesis, score
+from autotune.diagnosis.search import Hypothesis, score
 from autotune.diagnosis.selection import Search
 
 #: Misfit of a model without effects from which on something must be missing, although no effect is worth it; clean

@@ -9,10 +9,10 @@ import numpy as np
 
 from autotune.arrays import FloatArray
 from autotune.diagnosis.data import Data
-from autotune.diagnosis.fitting import Fit, fit, start_states
+from autotune.diagnosis.fitting import RUNAWAY, Fit, fit, start_states
 from autotune.diagnosis.restarts import renewed
 from autotune.diagnosis.retuning import bent
-from autotune.diagnosis.search import HARD_STOP, RUNAWAY, Hypothesis, freed
+from autotune.diagnosis.search import HARD_STOP, Hypothesis, freed
 
 #: Shift of an effect's size, as a logarithm, that gets a fit out of a crease; stiction's creases are narrow.
 NUDGE, NARROW = 0.06, 0.02

@@ -9,7 +9,7 @@ import numpy as np
 
 from autotune.arrays import BoolArray
 from autotune.diagnosis.data import Data
-from autotune.diagnosis.fitting import Fit, fit
+from autotune.diagnosis.fitting import RUNAWAY, Fit, fit
 from autotune.diagnosis.noise import Noise, autoregressive, noise_from_differences
 from autotune.diagnosis.parameters import Parametrisation, parametrise
 from autotune.diagnosis.restarts import renewed
@@ -61,8 +61,15 @@ def prepare(model: Model, recordings: Sequence[Recording], good: Sequence[BoolAr
             noise = Noise(sd=float(np.sqrt(np.mean(np.concatenate(result.residuals) ** 2))))
         data = replace(data, noise=floored(noise, recordings))
         result = fit(p, data, result.theta, result.x0, iterations=20)
-    # start states that stayed behind while the numbers were wrong hold them back, and bend the chain
-    return data, renewed(result, data) if bent(result) else result
+    return data, _straightened(result, data) if bent(result) else result
+
+
+def _straightened(result: Fit, data: Data) -> Fit:
+    """Free a bent chain of start states that stayed behind while its numbers were wrong and hold them back now."""
+    try:
+        return renewed(result, data)
+    except RUNAWAY:
+        return result
 
 
 def bent(result: Fit, far: float = 2.0) -> bool:

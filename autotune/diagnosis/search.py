@@ -13,16 +13,13 @@ from autotune.arrays import FloatArray
 from autotune.diagnosis.catalogue import CATALOGUE, Entry, Range
 from autotune.diagnosis.data import Data
 from autotune.diagnosis.descent import bounded
-from autotune.diagnosis.fitting import Fit, fit, residual_at
+from autotune.diagnosis.fitting import RUNAWAY, Fit, fit, residual_at
 from autotune.diagnosis.kernel import I_LEVELS
 from autotune.diagnosis.parameters import COUNTED, FOUND_DIRECTLY, Parametrisation, effect_with, parametrise
 from autotune.diagnosis.restarts import CONVERTER, realigned, restarted
 from autotune.diagnosis.simulation import Simulator, entry_of
-from autotune.errors import AutotuneError, IdentificationError
+from autotune.errors import IdentificationError
 from autotune.models import Effect, Model
-
-#: What a fit raises where the simulation runs away: that start is no hypothesis.
-RUNAWAY = (AutotuneError, OverflowError, np.linalg.LinAlgError)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -13,7 +13,7 @@ from autotune.arrays import BoolArray
 from autotune.diagnosis.catalogue import CATALOGUE, STRUCTURES, Entry
 from autotune.diagnosis.data import Data
 from autotune.diagnosis.direct import periodic_load_starts, quantisation_starts, step_load_starts, stiction_starts
-from autotune.diagnosis.fitting import Fit, fit
+from autotune.diagnosis.fitting import RUNAWAY, Fit, fit
 from autotune.diagnosis.noise import Noise, noise_from_differences
 from autotune.diagnosis.parsimony import (
     LEAST_DECREASE,
@@ -27,7 +27,7 @@ from autotune.diagnosis.parsimony import (
 from autotune.diagnosis.polishing import own, polish
 from autotune.diagnosis.restarts import standing_out
 from autotune.diagnosis.retuning import COARSE, at_operating_point, bent, floored, misfit, prepare
-from autotune.diagnosis.search import RUNAWAY, Hypothesis, extend, kept_states, score, signal_ranges
+from autotune.diagnosis.search import Hypothesis, extend, kept_states, score, signal_ranges
 from autotune.diagnosis.simulation import entry_of
 from autotune.diagnosis.windows import slowest_lag_s
 from autotune.models import Effect, Model
