@@ -77,6 +77,12 @@ class Data:
             good.append(ok & inside)
         return replace(self, starts=tuple(starts), stops=tuple(stops), good=tuple(good))
 
+    def joined(self, count: int) -> Data:
+        """Return the data with that many windows, one after the other, made into one; the last may be of fewer."""
+        pairs = zip(self.starts, self.stops, strict=True)
+        stops = tuple(np.append(a[count::count], b[-1]).astype(np.int64) for a, b in pairs)
+        return replace(self, starts=tuple(a[::count] for a in self.starts), stops=stops)
+
     @property
     def rows(self) -> int:
         """Rows that count."""

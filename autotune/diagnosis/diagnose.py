@@ -44,6 +44,8 @@ OFFSET_SIGMAS = 6.0
 SLOW_NOISE = 0.8
 #: Held-out share of the misfit from which on a description tells where it adds its terms.
 TELLING = 0.5
+#: Share of the squared error that a simulation with a converter's rounding may leave to be the better one.
+ROUNDING = 0.9
 #: Limit that nothing reaches.
 NEVER = 1e18
 #: Evidence from which on what single rows show is sure, and its share of what an effect of the chain gains.
@@ -125,7 +127,9 @@ def _judge(found: Search, samples: list[SampleEffect], model: Model) -> Diagnosi
     left = left_by(found)
     offset = _offset(chosen.fit)
     quality, extended_is_better = held_out(found)
-    most = dominates(quality) or left.is_little
+    # a load that comes when it is wanted explains a part of everything: that part is not enough
+    loads = all(entry_of(name).place == "environment" for name in chosen.names)
+    most = (dominates(quality) and not loads) or left.is_little
     doubt = doubt_of(left, most)
     verdict = _verdict(found, samples, left, left.is_noise or most, offset is not None)
     candidates = rivals(found, doubt)
@@ -310,7 +314,7 @@ def _simulated(effect: SampleEffect, result: Fit) -> bool:
     y = [s[:, 0] + e for s, e in zip(result.signals, result.residuals, strict=True)]
     rounded = [r - step * np.round(s[:, 0] / step) for r, s in zip(y, result.signals, strict=True)]
     squares = [float(np.nansum(np.concatenate(e) ** 2)) for e in (rounded, result.residuals)]
-    return squares[0] < squares[1]
+    return squares[0] < ROUNDING * squares[1]
 
 
 def _places(effects: Sequence[FoundEffect]) -> tuple[str, ...]:

@@ -15,9 +15,9 @@ import numpy as np
 
 from autotune.diagnosis.adequacy import Left
 from autotune.diagnosis.data import Data
-from autotune.diagnosis.fitting import RUNAWAY, fit
+from autotune.diagnosis.fitting import RUNAWAY, Fit, fit
 from autotune.diagnosis.noise import noise_from_differences
-from autotune.diagnosis.parsimony import final_lead
+from autotune.diagnosis.parsimony import final_lead, needed
 from autotune.diagnosis.polishing import own
 from autotune.diagnosis.result import Candidate, FitQuality
 from autotune.diagnosis.search import Hypothesis, score
@@ -66,16 +66,21 @@ def rivals(found: Search, doubt: float) -> tuple[Candidate, ...]:
     Notes
     -----
     A richer hypothesis that beats the chosen one by less than the lead that simplicity was given pays that lead here
-    too: the probabilities weigh what the choice weighed.
+    too, one that was not needed all that it is ahead as well: the probabilities weigh what the choice weighed.
     """
     pool = [found.retuned, *found.singles, *found.pairs, *found.triples]
     chosen = found.chosen
     lead = final_lead(found.retuned.fit, min(pool, key=score), found.data)
     scores: dict[str, float] = {}
     for h in pool:
-        refused = h.parameters > chosen.parameters and 0.0 < score(chosen) - score(h) < lead
+        ahead, pays = score(chosen) - score(h), 0.0
+        if h.parameters > chosen.parameters and ahead > 0.0:
+            if ahead < lead:
+                pays = lead
+            elif not needed(chosen, h, found.data, found.retuned.fit):
+                pays = ahead + lead
         name = "+".join(h.names) if h.names else "none"
-        scores[name] = min(scores.get(name, math.inf), score(h) + (lead if refused else 0.0))
+        scores[name] = min(scores.get(name, math.inf), score(h) + pays)
     return weighed(scores, TEMPERATURE * max(1.0, chosen.fit.chi2 / chosen.fit.rows), doubt)
 
 
@@ -112,24 +117,31 @@ def doubt_of(left: Left, most: bool) -> float:
 
 
 def held_out(found: Search) -> tuple[FitQuality, bool]:
-    """Return errors on every second window, with numbers fitted to the others, and whether the extended model wins."""
+    """Return errors on windows with numbers fitted to the others, and whether the extended model wins.
+
+    Every second window is left out, then the others: each half is tried with the numbers of the other one.
+    """
     data = found.data
-    odd, even = _half(data, 1), _half(data, 0)
-    y = np.concatenate([r.y[g] for r, g in zip(odd.recordings, odd.good, strict=True)])
+    halves = _half(data, 0), _half(data, 1)
+    y = np.concatenate([r.y[g] for r, g in zip(data.recordings, data.good, strict=True)])
     spread = float(np.std(y)) or 1.0
 
-    def error(h: Hypothesis, tune: bool) -> float:
+    def tested(h: Hypothesis, tune: bool, known: Data, unknown: Data) -> Fit:
         p, none = h.fit.parametrisation, np.zeros(h.fit.theta.size, dtype=bool)
         theta = h.fit.theta if tune else p.centre
         try:
             if tune:
-                theta = fit(p, even, theta, own(h.fit, even), iterations=6, rounds=1).theta
-            tested = fit(p, odd, theta, own(h.fit, odd), free=none, iterations=8)
+                theta = fit(p, known, theta, own(h.fit, known), iterations=6, rounds=1).theta
+            return fit(p, unknown, theta, own(h.fit, unknown), free=none, iterations=8)
         except RUNAWAY:
             # numbers from half the windows can run away on the other half: then those of all windows count
-            tested = h.fit
-        squares = sum(float(e @ e) for e in tested.residuals)
-        return math.sqrt(squares / max(tested.rows - sum(Q.shape[1] for Q in tested.states_explain), 1)) / spread
+            return h.fit
+
+    def error(h: Hypothesis, tune: bool) -> float:
+        fits = [tested(h, tune, *pair) for pair in (halves, halves[::-1])]
+        squares = sum(float(e @ e) for f in fits for e in f.residuals)
+        freedom = sum(f.rows - sum(Q.shape[1] for Q in f.states_explain) for f in fits)
+        return math.sqrt(squares / max(freedom, 1)) / spread
 
     nominal, retuned = error(found.retuned, tune=False), error(found.retuned, tune=True)
     extended = error(found.chosen, tune=True) if found.chosen.names else retuned

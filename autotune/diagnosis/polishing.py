@@ -12,7 +12,7 @@ from autotune.diagnosis.data import Data
 from autotune.diagnosis.fitting import RUNAWAY, Fit, fit, start_states
 from autotune.diagnosis.restarts import renewed
 from autotune.diagnosis.retuning import bent
-from autotune.diagnosis.search import HARD_STOP, Hypothesis, freed
+from autotune.diagnosis.search import HARD_STOP, Hypothesis, freed, is_stand_in
 
 #: Shift of an effect's size, as a logarithm, that gets a fit out of a crease; stiction's creases are narrow.
 NUDGE, NARROW = 0.06, 0.02
@@ -29,13 +29,7 @@ def polish(h: Hypothesis, data: Data, base: Fit, rounds: int = 4) -> Hypothesis 
         fitted = _polish(h, data, base, rounds)
     except RUNAWAY:
         return None
-    return None if _is_dry_friction(fitted, data) else fitted
-
-
-def _is_dry_friction(h: Hypothesis, data: Data) -> bool:
-    """Whether a servo's hysteresis turns within less than the noise: then it is Coulomb friction by another name."""
-    turns = [e.parameters["width"].value for e in h.fit.model.effects if e.name == "plant.hysteresis"]
-    return h.fit.sim.chain.is_mechanical and any(width < data.noise.total_sd for width in turns)
+    return None if is_stand_in(fitted, data) else fitted
 
 
 def _polish(h: Hypothesis, data: Data, base: Fit, rounds: int) -> Hypothesis:

@@ -313,6 +313,22 @@ def _finished(h: Hypothesis, data: Data) -> Hypothesis:
     return replace(h, fit=freed(result, data) if {HARD_STOP, CONVERTER} & set(h.names) else result)
 
 
+def is_stand_in(h: Hypothesis, data: Data) -> bool:
+    """Whether an effect came to where it is another one by its own name.
+
+    A servo's hysteresis that turns within less than the noise is Coulomb friction, one that never turns is a spring; a
+    load periodic in position of which not one period was travelled is a slope.
+    """
+    sizes = {(e.name, key): q.value for e in h.fit.model.effects for key, q in e.parameters.items()}
+    turn = sizes.get(("plant.hysteresis", "width"), 0.0)
+    longest = max(turn, sizes.get(("plant.sine_torque", "period"), 0.0))
+    if not longest:
+        return False
+    positions = np.concatenate([signals[:, 2] for signals in h.fit.signals])
+    travelled = float(np.nanmax(positions) - np.nanmin(positions))
+    return longest > travelled or (h.fit.sim.chain.is_mechanical and 0.0 < turn < data.noise.total_sd)
+
+
 def freed(result: Fit, data: Data) -> Fit:
     """Return a fit brought out of where no descent leads; itself where a simulation runs away on that way."""
     try:
@@ -348,6 +364,8 @@ def extend(
     finished = [h for k, h in enumerate(begun) if _goes_on(h, begun[:k], base)]
     fits: dict[str, Hypothesis] = {}
     for h in pool.map(lambda h: _finished(h, data), finished):
+        if is_stand_in(h, data):
+            continue
         known = fits.get(h.names[-1])
         if known is None or score(h) < score(known):
             fits[h.names[-1]] = h

@@ -26,8 +26,8 @@ from autotune.diagnosis.parsimony import (
 )
 from autotune.diagnosis.polishing import own, polish
 from autotune.diagnosis.restarts import standing_out
-from autotune.diagnosis.retuning import COARSE, at_operating_point, bent, floored, misfit, prepare
-from autotune.diagnosis.search import Hypothesis, extend, kept_states, score, signal_ranges
+from autotune.diagnosis.retuning import COARSE, LONGER, at_operating_point, bent, floored, holds, misfit, prepare
+from autotune.diagnosis.search import Hypothesis, extend, is_stand_in, kept_states, score, signal_ranges
 from autotune.diagnosis.simulation import entry_of
 from autotune.diagnosis.windows import slowest_lag_s
 from autotune.models import Effect, Model
@@ -95,22 +95,40 @@ def search(
     Notes
     -----
     Forward search with a beam: pairs are built on the best four singles, whether or not these help alone, so that
-    partners that only help together are found as long as one of them is among the four.
+    partners that only help together are found as long as one of them is among the four. What brings the residual to
+    noise must do so on longer windows too; else everything is searched again on those.
     """
     entries = [entry for name, entry in (CATALOGUE | STRUCTURES).items() if name not in without]
     with threadpool_limits(1), ThreadPoolExecutor(2) as pool:
-        report("retuning", 0.0)
-        data, base = prepare(model, recordings, good)
-        try:
-            nominal = fit(base.parametrisation, data, x0=base.x0, free=np.zeros(base.theta.size, dtype=bool))
-        except RUNAWAY:
-            nominal = base  # nominal numbers that run away have no error that could be told
-        try:
-            return _searched(data, base, nominal, entries, pool, report)
-        except RUNAWAY:
-            # what breaks off explains nothing: the retuned model stands, and is judged by its misfit
-            retuned = Hypothesis(names=(), fit=base)
-            return Search(data=data, nominal=nominal, retuned=retuned, chosen=retuned)
+        found = _on_windows(1, model, recordings, good, entries, pool, report)
+        if not holds(found.chosen.fit, found.data):
+            report("once more, on longer windows", 0.0)
+            found = _on_windows(LONGER, model, recordings, good, entries, pool, report)
+        return found
+
+
+def _on_windows(
+    times: int,
+    model: Model,
+    recordings: Sequence[Recording],
+    good: Sequence[BoolArray],
+    entries: Sequence[Entry],
+    pool: Executor,
+    report: Report,
+) -> Search:
+    """Search with windows so many times as long as usual."""
+    report("retuning", 0.0)
+    data, base = prepare(model, recordings, good, times)
+    try:
+        nominal = fit(base.parametrisation, data, x0=base.x0, free=np.zeros(base.theta.size, dtype=bool))
+    except RUNAWAY:
+        nominal = base  # nominal numbers that run away have no error that could be told
+    try:
+        return _searched(data, base, nominal, entries, pool, report)
+    except RUNAWAY:
+        # what breaks off explains nothing: the retuned model stands, and is judged by its misfit
+        retuned = Hypothesis(names=(), fit=base)
+        return Search(data=data, nominal=nominal, retuned=retuned, chosen=retuned)
 
 
 def _searched(data: Data, base: Fit, nominal: Fit, entries: Sequence[Entry], pool: Executor, report: Report) -> Search:
@@ -233,7 +251,8 @@ def _without(h: Hypothesis, index: int, data: Data) -> Hypothesis | None:
         result = fit(smaller, data, h.fit.theta[keep], x0, iterations=20, rounds=2)
     except RUNAWAY:
         return None
-    return Hypothesis(names=tuple(e.name for e in effects), fit=result)
+    h = Hypothesis(names=tuple(e.name for e in effects), fit=result)
+    return None if is_stand_in(h, data) else h
 
 
 def _finer(best: Hypothesis, base: Fit, data: Data) -> tuple[Data, Fit, Data]:

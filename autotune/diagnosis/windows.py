@@ -12,7 +12,7 @@ from autotune.recording import Recording
 #: Windows last this many of the slowest lag's time constants: long enough for structure to show.
 LAGS_PER_WINDOW = 10.0
 LEAST_ROWS = 60
-LEAST_WINDOWS = 3
+LEAST_WINDOWS = 6
 #: What was commanded before a recording begins is unknown: that many of the slowest lags after the dead time it acts no
 #: more (through a dead time, a rate limit); at most this share of the recording is left out.
 UNKNOWN_LAGS, MOST_LEFT_OUT = 1.0, 0.03

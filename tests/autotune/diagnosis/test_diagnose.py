@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 from autotune.cli import app
 from autotune.diagnosis.diagnose import diagnose
 from autotune.diagnosis.fitting import fit
+from autotune.diagnosis.forecast import forecast
 from autotune.diagnosis.retuning import prepare
 from autotune.diagnosis.samples import inspect
 from autotune.models import Block, Model, Port, TransferFunction, read_model
@@ -120,3 +121,18 @@ def test_a_lag_is_named_with_all_the_places_it_may_sit(shared: Path) -> None:
     assert found.effects[0].name in ("actuator.lag", "sensor.lag")
     assert {"actuator", "sensor"} <= set(found.places)
     assert found.next_experiment is not None
+
+
+@pytest.mark.parametrize("number", [1, 2])
+def test_the_lift_that_falls_with_height_is_found_in_a_real_tube(shared: Path, number: int) -> None:
+    folder = shared / "data" / "floatshield"
+    model = read_model(folder / ("model.toml" if number == 1 else "model_2.toml"))
+    found = diagnose(model, [read_recording(folder / f"fit_{number}.csv")])
+    leak = next(e for e in found.effects if e.name == "plant.leak")
+    assert leak.probability > 0.7
+    assert 0.07 < leak.parameters["rate"].value < 0.15
+    # on the half that no fit has seen; a linear model has 0.552 and 0.212 there
+    unseen = read_recording(folder / f"test_{number}.csv")
+    scored = unseen.t >= 3.0
+    error = float(np.std((forecast(found.extended_model, unseen, 3.0) - unseen.y)[scored]) / np.std(unseen.y[scored]))
+    assert error < {1: 0.434, 2: 0.212}[number]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -14,11 +15,11 @@ from autotune.diagnosis.parameters import effect_with
 from autotune.diagnosis.restarts import realigned
 from autotune.diagnosis.retuning import prepare
 from autotune.diagnosis.samples import inspect
-from autotune.diagnosis.search import extended
+from autotune.diagnosis.search import Hypothesis, extended, is_stand_in
 from autotune.diagnosis.selection import search
-from autotune.models import Block, Model, Port, TransferFunction
+from autotune.models import Block, Effect, Model, Port, TransferFunction
 from autotune.recording import Recording
-from tests.autotune.diagnosis.servo_rigs import servo_model, servo_recording
+from tests.autotune.diagnosis.servo_rigs import GAIN, servo_model, servo_recording
 
 
 def valve(band: float, seed: int, rows: int = 600) -> Recording:
@@ -127,3 +128,38 @@ def test_what_a_slow_mode_explains_better_than_any_effect_is_named_after_none() 
     found = search(lag(11.0), r, inspect(r)[0], [name for name in CATALOGUE if name not in few])
     assert found.singles[0].names == ("plant.slow_mode",)
     assert found.chosen.names == ()
+
+
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("plant.sine_torque", lambda way: (0.5 * way, 6.0 * way, 0.0)),
+        ("plant.hysteresis", lambda way: (1.2 * way, 4.0 * way)),
+    ],
+)
+def test_a_spring_by_another_name_is_refused(name: str, values: Callable[[float], tuple[float, ...]]) -> None:
+    r = [servo_recording(seed, lambda x, v: -0.3 * x) for seed in (1, 2)]
+    data, base = prepare(servo_model(), r, inspect(r)[0])
+    positions = np.concatenate([s[:, 2] for s in base.signals])
+    way = float(np.nanmax(positions) - np.nanmin(positions))
+
+    def fitted(effect: Effect) -> Hypothesis:
+        p, theta, states = extended(base, effect, data)
+        return Hypothesis(names=(effect.name,), fit=fit(p, data, theta, states, iterations=30))
+
+    spring = fitted(effect_with("plant.leak", (0.3 * GAIN,)))
+    other = fitted(effect_with(name, values(way)))
+    assert spring.fit.model.effects[0].parameters["rate"].value == pytest.approx(0.3 * GAIN, rel=0.05)
+    # as good an explanation to within a few units of chi2, at the price of more numbers
+    assert other.fit.chi2 < spring.fit.chi2 + 0.02 * (base.chi2 - spring.fit.chi2)
+    assert is_stand_in(other, data)
+    assert not is_stand_in(spring, data)
+
+
+def test_a_cogging_torque_that_was_travelled_over_is_no_stand_in() -> None:
+    r = [servo_recording(seed, lambda x, v: -0.1 * float(np.sin(2.0 * np.pi * x))) for seed in (1, 2)]
+    found = search(
+        servo_model(), r, inspect(r)[0], [n for n in CATALOGUE if n not in ("plant.sine_torque", "plant.leak")]
+    )
+    assert found.chosen.names == ("plant.sine_torque",)
+    assert found.chosen.fit.model.effects[0].parameters["period"].value == pytest.approx(1.0, rel=0.01)
