@@ -30,8 +30,6 @@ WHITE = 1.10
 #: something swings or leads past the chain that the model does not have, and its least share of what effects gained:
 #: right models leave up to 15 (where thresholds make fits rough two hundredths of what they gain), wrong ones a third.
 INCONSTANT, OF_THE_GAINED = 25.0, 0.1
-#: The same share below which effects are named although what they leave is not noise.
-REST_OF_THE_GAINED = 0.04
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,11 +73,6 @@ class Left:
     def is_constant(self) -> bool:
         """Whether nothing swings, bends or goes past the chain in it, beside what the effects gained."""
         return self.varies.gain < max(INCONSTANT, OF_THE_GAINED * self.gained)
-
-    @property
-    def is_little(self) -> bool:
-        """Whether what varies in it is so small beside what the effects gained that it is the fit's own roughness."""
-        return self.varies.gain < REST_OF_THE_GAINED * self.gained
 
     def _is_white(self, bound: float) -> bool:
         return self.slow < bound + 2.0 * self.slow_chance

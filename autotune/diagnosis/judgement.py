@@ -9,7 +9,7 @@ probability is as often true. On real rigs, where no model is adequate, the conc
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -26,10 +26,9 @@ from autotune.diagnosis.selection import Search
 #: Misfit of a model without effects from which on something must be missing, although no effect is worth it; clean
 #: recordings leave up to 1.02.
 MISSING = 1.05
-#: Share of the retuned model's excess misfit that effects must explain where nothing explains all of it, by how many
-#: times the noise's variance the retuned model's error has: nearer to the noise adequacy is asked for.
+#: Share of the retuned model's excess misfit that effects must explain where nothing explains all of it, and how many
+#: times the noise's variance the retuned model's error must have: nearer to the noise adequacy is asked for.
 DOMINANT, FAR_FROM_NOISE = 0.35, 8.0
-NEARLY_ALL, CLEAR_OF_NOISE = 0.80, 2.0
 #: Weight of a cause outside the catalogue, beside 1 of all hypotheses: where the best explains the recordings, and
 #: where it explains most of what retuning leaves but not all.
 UNKNOWN, HALF_EXPLAINED = 0.03, 0.25
@@ -37,20 +36,14 @@ UNKNOWN, HALF_EXPLAINED = 0.03, 0.25
 TEMPERATURE = 3.0
 
 
-def dominates(
-    quality: FitQuality,
-    shares: Sequence[tuple[float, float]] = ((DOMINANT, FAR_FROM_NOISE), (NEARLY_ALL, CLEAR_OF_NOISE)),
-) -> bool:
+def dominates(quality: FitQuality, share: float = DOMINANT, far: float = FAR_FROM_NOISE) -> bool:
     """Whether the chosen effects explain most of a misfit that nothing explains whole.
 
     On real rigs something always remains; an effect is named all the same when on rows that were not fitted it takes
-    away most of the variance that retuning leaves above the noise: a share of it where the retuned error's variance is
-    so many times the noise's, for any of the pairs ``shares``.
+    away a share of the variance that retuning leaves above the noise, where that is ``far`` times the noise's.
     """
     retuned, noise = quality.retuned**2, quality.noise_floor**2
-    return any(
-        retuned > far * noise and retuned - quality.extended**2 > share * (retuned - noise) for share, far in shares
-    )
+    return retuned > far * noise and retuned - quality.extended**2 > share * (retuned - noise)
 
 
 def rivals(found: Search, doubt: float) -> tuple[Candidate, ...]:

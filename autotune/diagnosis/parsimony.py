@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from autotune.diagnosis.data import Data
 from autotune.diagnosis.fitting import Fit
 from autotune.diagnosis.retuning import bent, misfit
-from autotune.diagnosis.search import Hypothesis, score
+from autotune.diagnosis.search import HARD_STOP, Hypothesis, score
 
 #: Decrease of the score that an effect must bring: what chance brings among some two hundred starts, with a margin (on
 #: clean recordings nothing brought more than 15); weak effects that can be told bring a hundred and more, some 40.
@@ -19,8 +19,8 @@ LEAST_BEYOND_BELIEF, BEYOND_BELIEF = 16.0, 4.0
 #: that is more and the misfit of the best is more than noise has.
 SIMPLER, NOISE_ALONE = 6.0, 1.02
 #: The same where the best leaves noise alone, and what a further effect has to bring, as a share of what is explained:
-#: no simulation of blows and thresholds is more exact.
-SIMULATED = 2e-3
+#: no simulation of thresholds is more exact; after a blow against a stop the least change of any number shows.
+SIMULATED, AFTER_BLOWS = 2e-3, 5e-3
 #: Misfit from which on what is wrong with all of them rules, and not noise; the lead is then this share of what the
 #: best explains: a real rig's every imperfection is more than its noise, and little of it is worth a name.
 MODEL_ERROR, MODEL_ERROR_SHARE = 2.0, 0.12
@@ -38,7 +38,7 @@ def simplicity_lead(base: Fit, best: Hypothesis, data: Data) -> float:
     Where even the best leaves more than noise, its score counts what is wrong with all of them, and more is asked.
     """
     if misfit(best.fit, data) < NOISE_ALONE:
-        return max(SIMPLER, SIMULATED * (base.cost - best.fit.cost))
+        return max(SIMPLER, _inexact(best) * (base.cost - best.fit.cost))
     return max(SIMPLER, 0.01 * (base.cost - best.fit.cost))
 
 
@@ -63,5 +63,10 @@ def needed(smaller: Hypothesis, larger: Hypothesis, data: Data, base: Fit) -> bo
     On a rig with disturbances of its own every further effect explains a little; that little is not physics.
     """
     before, after = misfit(smaller.fit, data) - 1.0, misfit(larger.fit, data) - 1.0
-    more = score(smaller) - score(larger) > SIMULATED * (base.cost - larger.fit.cost)
+    more = score(smaller) - score(larger) > _inexact(larger) * (base.cost - larger.fit.cost)
     return more and worth(smaller, larger) and (after < 0.08 or after < 0.5 * before)
+
+
+def _inexact(h: Hypothesis) -> float:
+    """Return the share of what is explained that a hypothesis's simulation may be wrong by."""
+    return AFTER_BLOWS if HARD_STOP in h.names else SIMULATED

@@ -47,12 +47,9 @@ GRIDS: Mapping[str, Sequence[float]] = {
     "WHITE": (0.9, 0.95, 1.0, 1.05, 1.08, 1.1, 1.12, 1.15, 1.2, 1.3),
     "INCONSTANT": (12.0, 15.0, 18.0, 20.0, 25.0, 30.0, 40.0, 60.0),
     "OF_THE_GAINED": (0.0, 0.02, 0.05, 0.1, 0.2, 0.4),
-    "REST_OF_THE_GAINED": (0.0, 0.01, 0.02, 0.04, 0.08, 0.16),
     "MISSING": (1.01, 1.02, 1.03, 1.05, 1.08, 1.12),
     "DOMINANT": (0.35, 0.5, 0.7, 0.8, 0.9, 0.95),
     "FAR_FROM_NOISE": (4.0, 6.0, 7.0, 8.0, 10.0, 15.0),
-    "NEARLY_ALL": (0.6, 0.7, 0.75, 0.8, 0.85, 0.9, 1.0),
-    "CLEAR_OF_NOISE": (1.2, 1.5, 2.0, 2.5, 3.0),
 }
 TEMPERATURES = (1.5, 2.0, 3.0, 4.0, 5.0, 6.0)
 DOUBTS = (0.01, 0.02, 0.03, 0.05, 0.07, 0.1, 0.15, 0.2)
@@ -120,10 +117,8 @@ def judged(row: Shown, constants: Mapping[str, float]) -> str:
     constant = varies < max(constants["INCONSTANT"], constants["OF_THE_GAINED"] * gained)
     adequate = white and constant and row.excess < bound
     if row.names:
-        names = (("DOMINANT", "FAR_FROM_NOISE"), ("NEARLY_ALL", "CLEAR_OF_NOISE"))
-        most = judgement.dominates(row.quality, [(constants[share], constants[far]) for share, far in names])
-        little = varies < constants["REST_OF_THE_GAINED"] * gained
-        return "named" if adequate or most or little else "abstained"
+        most = judgement.dominates(row.quality, constants["DOMINANT"], constants["FAR_FROM_NOISE"])
+        return "named" if adequate or most else "abstained"
     missing = not constant or (not adequate and row.left["misfit"] > constants["MISSING"])
     return "abstained" if missing else "neither"
 
@@ -158,7 +153,7 @@ def doubt(row: Shown, unknown: float) -> float:
     varies = Variation(gain=row.left["varies"]["chi2"], places=("plant",), what="", period_s=math.inf)
     left = Left(varies=varies, **{key: value for key, value in row.left.items() if key != "varies"})
     if not left.is_noise:
-        return judgement.HALF_EXPLAINED if judgement.dominates(row.quality) or left.is_little else 1.0
+        return judgement.HALF_EXPLAINED if judgement.dominates(row.quality) else 1.0
     return unknown + (1.0 - unknown) * (max(left.misfit - 1.0, 0.0) / (left.allowed - 1.0)) ** 4
 
 
@@ -223,7 +218,7 @@ def main() -> None:
         for name, _, ok in at(row, T, unknown):
             single.setdefault(name if name in OF_ROWS else "of the chain", []).append(ok)
     print("  right of those named:", ", ".join(f"{n} {sum(oks)}/{len(oks)}" for n, oks in sorted(single.items())))
-    strict = in_use | {"DOMINANT": math.inf, "NEARLY_ALL": math.inf, "REST_OF_THE_GAINED": 0.0}
+    strict = in_use | {"DOMINANT": math.inf}
     half = [r for r in rows if r.verdict == "effect" and judged(r, strict) == "abstained"]
     halves = [ok for r in half for name, _, ok in at(r, T, unknown) if name not in OF_ROWS]
     print(
