@@ -136,3 +136,10 @@ def test_the_lift_that_falls_with_height_is_found_in_a_real_tube(shared: Path, n
     scored = unseen.t >= 3.0
     error = float(np.std((forecast(found.extended_model, unseen, 3.0) - unseen.y)[scored]) / np.std(unseen.y[scored]))
     assert error < {1: 0.434, 2: 0.212}[number]
+
+
+def test_what_a_blow_makes_of_the_least_change_is_no_second_effect(shared: Path) -> None:
+    case = shared / "practice_cases" / "case_005"
+    found = diagnose(read_model(case / "model.toml"), [read_recording(case / f"rec{k}.csv") for k in (1, 2)])
+    assert [e.name for e in found.effects] == ["plant.hard_stop"]
+    assert found.effects[0].parameters["high"].value == pytest.approx(6.8958, abs=0.01)

@@ -11,9 +11,10 @@ from hypothesis import strategies as st
 
 from autotune.diagnosis.data import Data
 from autotune.diagnosis.fitting import fit
-from autotune.diagnosis.judgement import weighed
+from autotune.diagnosis.judgement import FAR_FROM_NOISE, dominates, weighed
 from autotune.diagnosis.noise import Noise
 from autotune.diagnosis.parameters import effect_with, parametrise
+from autotune.diagnosis.result import FitQuality
 from autotune.diagnosis.retuning import prepare
 from autotune.diagnosis.search import extended
 from autotune.models import Block, Model, Port, TransferFunction
@@ -35,6 +36,17 @@ def test_rivals_share_the_probability_and_less_evidence_never_weighs_more(
     assert named["unknown"] == pytest.approx(doubt / (1.0 + doubt), rel=1e-3)
     known = sorted(set(named) - {"unknown"}, key=lambda name: scores[name])
     assert all(named[a] >= named[b] for a, b in itertools.pairwise(known))
+
+
+@given(noise=st.floats(0.001, 1.0), far=st.floats(1.0, 30.0), share=st.floats(0.0, 1.0))
+def test_most_of_a_misfit_is_enough_only_far_from_the_noise(noise: float, far: float, share: float) -> None:
+    retuned = far * noise**2
+    extended = retuned - share * (retuned - noise**2)
+    quality = FitQuality(nominal=1.0, retuned=retuned**0.5, extended=extended**0.5, noise_floor=noise)
+    if far < 0.99 * FAR_FROM_NOISE or share < 0.3:
+        assert not dominates(quality)
+    elif far > 1.01 * FAR_FROM_NOISE and share > 0.4:
+        assert dominates(quality)
 
 
 def test_thinned_data_keep_the_windows_where_a_limit_is_reached() -> None:
