@@ -25,6 +25,9 @@ from autotune.diagnosis.windows import slowest_lag_s
 FASTEST, MOST_FREQUENCIES = 0.3, 120
 #: Delays of an echo that is looked for, in slowest lags.
 ECHOES = (0.5, 0.75, 1.0, 1.35, 1.8, 2.4)
+#: A swing that explains this share of what the best one explains cannot be told from it: a slow one of the gain is the
+#: command's or the reading's.
+AS_MUCH = 0.9
 _LOAD, _GAIN = "a load", "the command, as a gain that changes would"
 _STIFFNESS = "the position or level, as a stiffness or leak that changes would"
 _LAG = "the rate of the reading, as a lag or delay that changes would"
@@ -46,7 +49,7 @@ class Variation:
     gain : float
         Decrease of chi2 that it promises, in units of the residual's own variance.
     places : tuple of str
-        Where it may enter.
+        Where it may enter, or what explains about as much.
     what : str
         The signal that is multiplied or added.
     period_s : float
@@ -103,9 +106,11 @@ def largest_variation(result: Fit, data: Data) -> Variation:
 
     with ThreadPoolExecutor(2) as pool:
         gains = list(pool.map(gained, entries))
-    gain, (place, what, _, frequency) = max(zip(gains, entries, strict=True), key=lambda pair: pair[0])
-    places = _MAY_ENTER.get(what, (place,))
-    return Variation(gain=gain, places=places, what=what, period_s=1.0 / frequency if frequency else np.inf)
+    ranked = sorted(zip(gains, entries, strict=True), key=lambda pair: -pair[0])
+    gain, (_, what, _, frequency) = ranked[0]
+    near = [entry for g, entry in ranked if entry[3] and g >= AS_MUCH * gain] if frequency else [ranked[0][1]]
+    places = dict.fromkeys(p for place, name, _, _ in near for p in _MAY_ENTER.get(name, (place,)))
+    return Variation(gain=gain, places=tuple(places), what=what, period_s=1.0 / frequency if frequency else np.inf)
 
 
 def _multiplied(left: Leftover) -> Iterator[tuple[Place, str, list[FloatArray]]]:

@@ -56,6 +56,12 @@ def test_a_model_that_is_right_leaves_chance_in_open_and_closed_loop() -> None:
     assert 6.0 < float(np.median(gains)) < 14.0
 
 
+def test_a_slow_swing_of_the_gain_may_be_the_commands_or_the_readings() -> None:
+    slow, quick = (set(recorded(1, gain=swing(period_s, 0.1)).places) for period_s in (150.0, 8.0))
+    assert {"actuator", "plant", "sensor"} <= slow
+    assert quick == {"actuator", "plant"}
+
+
 def test_a_gain_that_swings_is_found_with_its_period() -> None:
     found = recorded(1, gain=swing(20.0, 0.1))
     assert found.gain > INCONSTANT
