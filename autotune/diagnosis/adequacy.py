@@ -30,6 +30,8 @@ WHITE = 1.10
 #: something swings or leads past the chain that the model does not have, and its least share of what effects gained:
 #: right models leave up to 15 (where thresholds make fits rough two hundredths of what they gain), wrong ones a third.
 INCONSTANT, OF_THE_GAINED = 25.0, 0.1
+#: Share of what effects gained from which on what they leave weighs as much as they do: real rigs leave up to a quarter.
+HALF_OF_THE_GAINED = 0.5
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,6 +75,11 @@ class Left:
     def is_constant(self) -> bool:
         """Whether nothing swings, bends or goes past the chain in it, beside what the effects gained."""
         return self.varies.gain < max(INCONSTANT, OF_THE_GAINED * self.gained)
+
+    @property
+    def is_lesser(self) -> bool:
+        """Whether what varies in it is less than half of what the effects gained."""
+        return self.varies.gain < HALF_OF_THE_GAINED * self.gained
 
     def _is_white(self, bound: float) -> bool:
         return self.slow < bound + 2.0 * self.slow_chance

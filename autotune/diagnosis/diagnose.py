@@ -129,7 +129,7 @@ def _judge(found: Search, samples: list[SampleEffect], model: Model) -> Diagnosi
     quality, extended_is_better = held_out(found)
     # a load that comes when it is wanted explains a part of everything: that part is not enough
     loads = all(entry_of(name).place == "environment" for name in chosen.names)
-    most = dominates(quality) and not loads
+    most = dominates(quality) and left.is_lesser and not loads
     doubt = doubt_of(left, most)
     verdict = _verdict(found, samples, left, left.is_noise or most, offset is not None)
     candidates = rivals(found, doubt)

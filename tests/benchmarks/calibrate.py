@@ -47,6 +47,7 @@ GRIDS: Mapping[str, Sequence[float]] = {
     "WHITE": (0.9, 0.95, 1.0, 1.05, 1.08, 1.1, 1.12, 1.15, 1.2, 1.3),
     "INCONSTANT": (12.0, 15.0, 18.0, 20.0, 25.0, 30.0, 40.0, 60.0),
     "OF_THE_GAINED": (0.0, 0.02, 0.05, 0.1, 0.2, 0.4),
+    "HALF_OF_THE_GAINED": (0.1, 0.3, 0.5, 0.8),
     "MISSING": (1.01, 1.02, 1.03, 1.05, 1.08, 1.12),
     "DOMINANT": (0.35, 0.5, 0.7, 0.8, 0.9, 0.95),
     "FAR_FROM_NOISE": (4.0, 6.0, 7.0, 8.0, 10.0, 15.0),
@@ -118,7 +119,8 @@ def judged(row: Shown, constants: Mapping[str, float]) -> str:
     adequate = white and constant and row.excess < bound
     if row.names:
         most = judgement.dominates(row.quality, constants["DOMINANT"], constants["FAR_FROM_NOISE"])
-        return "named" if adequate or most else "abstained"
+        lesser = varies < constants["HALF_OF_THE_GAINED"] * gained
+        return "named" if adequate or (most and lesser) else "abstained"
     missing = not constant or (not adequate and row.left["misfit"] > constants["MISSING"])
     return "abstained" if missing else "neither"
 
@@ -153,7 +155,7 @@ def doubt(row: Shown, unknown: float) -> float:
     varies = Variation(gain=row.left["varies"]["chi2"], places=("plant",), what="", period_s=math.inf)
     left = Left(varies=varies, **{key: value for key, value in row.left.items() if key != "varies"})
     if not left.is_noise:
-        return judgement.HALF_EXPLAINED if judgement.dominates(row.quality) else 1.0
+        return judgement.HALF_EXPLAINED if judgement.dominates(row.quality) and left.is_lesser else 1.0
     return unknown + (1.0 - unknown) * (max(left.misfit - 1.0, 0.0) / (left.allowed - 1.0)) ** 4
 
 
