@@ -30,7 +30,7 @@ WHITE = 1.10
 #: something swings or leads past the chain that the model does not have, and its least share of what effects gained:
 #: right models leave up to 15 (where thresholds make fits rough two hundredths of what they gain), wrong ones a third.
 INCONSTANT, OF_THE_GAINED = 25.0, 0.1
-#: Share of what effects gained from which on what they leave weighs as much as they do: real rigs leave up to a quarter.
+#: Share of what effects gained from which on what they leave weighs as much as they do; real rigs leave a quarter.
 HALF_OF_THE_GAINED = 0.5
 
 
