@@ -1,6 +1,6 @@
 """Judgement: how much effects explain, how probable a hypothesis is beside its rivals, errors on held-out windows.
 
-The constants were counted on concealed cases, none of them of the proof's first run: ``python -m tests.benchmarks calibrate``
+The constants were counted on concealed cases, none of them of the proof: ``python -m tests.benchmarks calibrate``
 prints for each what other values do. Temperature and doubt stand where the log loss is flat and what is stated with a
 probability is as often true. On real rigs, where no model is adequate, the concealed cases say nothing: ``DOMINANT``,
 ``FAR_FROM_NOISE`` and ``HALF_EXPLAINED`` keep what the best explains there and refuse the rest.
