@@ -98,7 +98,7 @@ def read_controller(path: str | os.PathLike[str]) -> Controller:
     try:
         content = tomllib.loads(Path(path).read_text(encoding="utf-8"))
     except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", where=where, mend="check the path") from None
+        raise InputError(f"cannot be read ({error.strerror})", where=where, remedy="check the path") from None
     except tomllib.TOMLDecodeError as error:
         raise InputError(f"not TOML: {error}", where=where) from None
     if "num" in content:
@@ -106,7 +106,7 @@ def read_controller(path: str | os.PathLike[str]) -> Controller:
     kind = str(content.get("kind", "")).lower()
     if kind not in ("pi", "pid"):
         raise InputError(
-            f"kind = {content.get('kind')!r}", where=where, mend='write kind = "pi" or "pid", or num and den'
+            f"kind = {content.get('kind')!r}", where=where, remedy='write kind = "pi" or "pid", or num and den'
         )
     number = {
         key: _number(content, key, where, default)
@@ -119,16 +119,16 @@ def read_controller(path: str | os.PathLike[str]) -> Controller:
         )
     }
     if not number["Ti_s"] > 0:
-        raise InputError(f"Ti_s = {number['Ti_s']:g}", where=where, mend="the integral time is a positive time in s")
+        raise InputError(f"Ti_s = {number['Ti_s']:g}", where=where, remedy="the integral time is a positive time in s")
     if number["Td_s"] < 0 or number["Tf_s"] < 0:
-        raise InputError("Td_s and Tf_s", where=where, mend="times are not negative")
+        raise InputError("Td_s and Tf_s", where=where, remedy="times are not negative")
     return PIDController(**number)
 
 
 def _number(content: dict[str, Any], key: str, where: str, default: float | None) -> float:
     value = content.get(key, default)
     if isinstance(value, bool) or not isinstance(value, int | float) or math.isnan(value):
-        raise InputError(f"{key} = {value!r}", where=where, mend=f"write {key} as a number")
+        raise InputError(f"{key} = {value!r}", where=where, remedy=f"write {key} as a number")
     return float(value)
 
 

@@ -1,4 +1,4 @@
-"""Failures as named verdicts: what happened, where, and the mend.
+"""Failures as named verdicts: what happened, where, and the remedy.
 
 Every error of the tool says these three things in one line; the command line prints that line and leaves with the
 exit status of the error's class (0 done, 2 input refused, 3 experiment stopped and rig safe, 130 stopped by the
@@ -19,21 +19,21 @@ class AutotuneError(Exception):
         What happened, in the reader's terms.
     where : str
         File, key, row, register or state it happened at.
-    mend : str
+    remedy : str
         What the reader can do about it.
     """
 
     exit_status: ClassVar[int] = 1
 
-    def __init__(self, what: str, *, where: str = "", mend: str = "") -> None:
-        super().__init__(what, where, mend)
+    def __init__(self, what: str, *, where: str = "", remedy: str = "") -> None:
+        super().__init__(what, where, remedy)
         self.what = what
         self.where = where
-        self.mend = mend
+        self.remedy = remedy
 
     def __str__(self) -> str:
         head = f"{self.where}: {self.what}" if self.where else self.what
-        return f"{head}; {self.mend}" if self.mend else head
+        return f"{head}; {self.remedy}" if self.remedy else head
 
 
 class InputError(AutotuneError, ValueError):

@@ -187,13 +187,13 @@ def read_model(path: str | os.PathLike[str]) -> Model:
     try:
         content = tomllib.loads(Path(path).read_text(encoding="utf-8"))
     except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", where=where, mend="check the path") from None
+        raise InputError(f"cannot be read ({error.strerror})", where=where, remedy="check the path") from None
     except tomllib.TOMLDecodeError as error:
         raise InputError(f"not TOML: {error}", where=where) from None
     _known(content, {"name", "input", "output", "block", "effect"}, where)
     blocks = content.get("block", [])
     if not isinstance(blocks, list) or not blocks:
-        raise InputError("no [[block]]", where=where, mend="a model needs at least one block")
+        raise InputError("no [[block]]", where=where, remedy="a model needs at least one block")
     return Model(
         name=str(content.get("name", Path(path).stem)),
         input=_port(content.get("input", {}), f"{where} [input]"),
@@ -208,12 +208,12 @@ def read_model(path: str | os.PathLike[str]) -> Model:
 def _known(table: Mapping[str, Any], keys: set[str], where: str) -> None:
     for key in table:
         if key not in keys:
-            raise InputError(f"unknown key {key!r}", where=where, mend=f"known are {', '.join(sorted(keys))}")
+            raise InputError(f"unknown key {key!r}", where=where, remedy=f"known are {', '.join(sorted(keys))}")
 
 
 def _real(value: Any, key: str, where: str) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
-        raise InputError(f"{key} = {value!r}", where=where, mend="write a finite number")
+        raise InputError(f"{key} = {value!r}", where=where, remedy="write a finite number")
     return float(value)
 
 
@@ -221,7 +221,7 @@ def _port(table: Mapping[str, Any], where: str) -> Port:
     _known(table, {"unit", "offset", "hold"}, where)
     hold = table.get("hold", "zero")
     if hold not in get_args(Hold):
-        raise InputError(f"hold = {hold!r}", where=where, mend='write "zero" (held command) or "linear"')
+        raise InputError(f"hold = {hold!r}", where=where, remedy='write "zero" (held command) or "linear"')
     return Port(unit=str(table.get("unit", "")), offset=_real(table.get("offset", 0.0), "offset", where), hold=hold)
 
 
@@ -229,19 +229,19 @@ def _block(table: Mapping[str, Any], where: str) -> Block:
     _known(table, {"name", "place", "num", "den", "delay", "output", "unit"}, where)
     place = table.get("place", "plant")
     if place not in get_args(Place):
-        raise InputError(f"place = {place!r}", where=where, mend=f"write one of {', '.join(get_args(Place))}")
+        raise InputError(f"place = {place!r}", where=where, remedy=f"write one of {', '.join(get_args(Place))}")
     coefficients = {}
     for key in ("num", "den"):
         values = table.get(key, [1.0])
         if not isinstance(values, list) or not values:
-            raise InputError(f"{key} = {values!r}", where=where, mend="write a list in descending powers of s")
+            raise InputError(f"{key} = {values!r}", where=where, remedy="write a list in descending powers of s")
         coefficients[key] = tuple(_real(value, key, where) for value in values)
     try:
         dynamics = TransferFunction(**coefficients, delay_s=_real(table.get("delay", 0.0), "delay", where))
     except InputError as error:
         raise InputError(error.what, where=where) from None
     if not dynamics.is_proper:
-        raise InputError("num has a higher degree than den", where=where, mend="a block must be proper")
+        raise InputError("num has a higher degree than den", where=where, remedy="a block must be proper")
     return Block(
         name=str(table.get("name", place)),
         place=place,
@@ -254,7 +254,7 @@ def _block(table: Mapping[str, Any], where: str) -> Block:
 def _effect(table: Mapping[str, Any], where: str) -> Effect:
     _known(table, {"name", "at", "parameters", "equation"}, where)
     if "." not in str(table.get("name", "")):
-        raise InputError(f"name = {table.get('name')!r}", where=where, mend="write PLACE.EFFECT of the catalogue")
+        raise InputError(f"name = {table.get('name')!r}", where=where, remedy="write PLACE.EFFECT of the catalogue")
     parameters = {}
     for key, entry in table.get("parameters", {}).items():
         given = entry if isinstance(entry, dict) else {"value": entry}

@@ -103,12 +103,12 @@ def read_points(path: str | os.PathLike[str]) -> tuple[FrequencyPoint, ...]:
         content = json.loads(Path(path).read_text(encoding="utf-8"))
         entries = content["points"]
     except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", where=where, mend="check the path") from None
+        raise InputError(f"cannot be read ({error.strerror})", where=where, remedy="check the path") from None
     except (ValueError, KeyError, TypeError):
         raise InputError(
             'is not a points file {"points": [...]}',
             where=where,
-            mend="write it with autotune identify frequency",
+            remedy="write it with autotune identify frequency",
         ) from None
     return points_from_json(entries, where)
 

@@ -62,17 +62,17 @@ class Recording:
                 raise InputError(
                     f"column {column!r} has {values.size} rows, t has {self.t.size}",
                     where=self.name,
-                    mend="give every column the same number of rows",
+                    remedy="give every column the same number of rows",
                 )
         if self.t.size < 2:
-            raise InputError(f"{self.t.size} row(s)", where=self.name, mend="a recording needs at least two rows")
+            raise InputError(f"{self.t.size} row(s)", where=self.name, remedy="a recording needs at least two rows")
         steps = np.diff(self.t)
         if not np.all(steps > 0):  # also catches NaN
             row = int(np.argmax(~(steps > 0))) + 1
             raise InputError(
                 f"time does not increase at data row {row + 1} (t = {self.t[row]:g} after {self.t[row - 1]:g})",
                 where=self.name,
-                mend="sort the rows by t and drop repeated stamps",
+                remedy="sort the rows by t and drop repeated stamps",
             )
 
     def __len__(self) -> int:
@@ -98,7 +98,7 @@ class Recording:
         """Return a column by its name in the file."""
         columns = {"t": self.t, "u": self.u, "y": self.y, **self.extra}
         if column not in columns:
-            raise InputError(f"no column {column!r}", where=self.name, mend=f"it has {', '.join(columns)}")
+            raise InputError(f"no column {column!r}", where=self.name, remedy=f"it has {', '.join(columns)}")
         return columns[column]
 
     def between(self, start_s: float, end_s: float) -> Recording:
@@ -145,7 +145,7 @@ class Recording:
                 raise InputError(
                     f"column {column!r} is not a number in {int(bad.sum())} row(s), first at t = {self.t[row]:g} s",
                     where=self.name,
-                    mend="cut the recording there or fill the gap with measured values",
+                    remedy="cut the recording there or fill the gap with measured values",
                 )
         return self
 
@@ -165,7 +165,7 @@ def read_recording(path: str | os.PathLike[str]) -> Recording:
     try:
         text = path.read_text(encoding="utf-8-sig", errors="replace")
     except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", where=str(path), mend="check the path") from None
+        raise InputError(f"cannot be read ({error.strerror})", where=str(path), remedy="check the path") from None
     if not text.endswith("\n"):
         text = text[: text.rfind("\n") + 1]
     lines = text.splitlines()
@@ -176,10 +176,10 @@ def read_recording(path: str | os.PathLike[str]) -> Recording:
         raise InputError(
             f"the header lacks {', '.join(missing)}",
             where=str(path),
-            mend="the first line that is no comment must name the columns t,u,y and any others",
+            remedy="the first line that is no comment must name the columns t,u,y and any others",
         )
     if len(set(header)) != len(header):
-        raise InputError("the header names a column twice", where=str(path), mend="give each column its own name")
+        raise InputError("the header names a column twice", where=str(path), remedy="give each column its own name")
     values = _parse(lines, header_at, len(header), path)
     columns = {name: np.ascontiguousarray(values[:, i]) for i, name in enumerate(header)}
     t, u, y = (columns.pop(name) for name in _REQUIRED)
@@ -212,7 +212,7 @@ def _parse_slowly(body: Sequence[str], header_at: int, width: int, path: Path) -
                 raise ValueError(f"{len(cells)} cells where the header has {width}")
             rows.append([float(cell) if cell.strip() else np.nan for cell in cells])
         except ValueError as error:
-            raise InputError(str(error), where=f"{path} line {number}", mend="mend or delete the line") from None
+            raise InputError(str(error), where=f"{path} line {number}", remedy="correct or delete the line") from None
     return np.array(rows, dtype=np.float64).reshape(-1, width)
 
 
@@ -223,7 +223,7 @@ def _read_sidecar(path: Path) -> Mapping[str, Any]:
     try:
         return MappingProxyType(tomllib.loads(sidecar.read_text(encoding="utf-8")))
     except tomllib.TOMLDecodeError as error:
-        raise InputError(f"not TOML: {error}", where=str(sidecar), mend="mend the line or move the file") from None
+        raise InputError(f"not TOML: {error}", where=str(sidecar), remedy="correct the line or move the file") from None
 
 
 class RecordingWriter:
@@ -253,7 +253,7 @@ class RecordingWriter:
             self._file = open(self.path, "xb", buffering=0)  # noqa: SIM115 - closed by close()
         except FileExistsError:
             raise InputError(
-                "a recording is already there", where=str(self.path), mend="choose another --out"
+                "a recording is already there", where=str(self.path), remedy="choose another --out"
             ) from None
         self._file.write((",".join(columns) + "\n").encode())
         self._write_sidecar()

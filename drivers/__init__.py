@@ -90,5 +90,5 @@ def twin_of(settings: RigSettings) -> SimulatedRigSettings:
                 kind="simulated", plant=twin.plant, seed=twin.seed, noise=twin.noise, start=twin.start
             )
     raise InputError(
-        "the rig has no simulated twin", where="rig.twin", mend='name its plant: [rig.twin] plant = "ball"'
+        "the rig has no simulated twin", where="rig.twin", remedy='name its plant: [rig.twin] plant = "ball"'
     )

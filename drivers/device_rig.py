@@ -159,7 +159,7 @@ class DeviceLawRig(SerialLineRig):
             raise InputError(
                 f"rows every {row_s:g} s are no multiple of the device's tick of {self._tick_s:g} s",
                 where="signals.sample_time_s",
-                mend="give a multiple of it",
+                remedy="give a multiple of it",
             )
         if not runs:
             self._link.forget()
@@ -186,7 +186,7 @@ class DeviceLawRig(SerialLineRig):
             raise LinkError(
                 f"the device's clock went {at_s - before_s:.4g} s over {ticks} ticks",
                 where=self._link.where,
-                mend="check the device's power and oscillator; its time stamps are not to be relied on",
+                remedy="check the device's power and oscillator; its time stamps are not to be relied on",
             )
         mean = (area - self._area) % _AREA_WRAP / ticks
         self._count, self._area, self._row_at_s = count, area, at_s

@@ -166,7 +166,7 @@ class ModbusLink:
                 raise ConnectionException("cannot be opened")
         except ConnectionException as error:
             raise LinkError(
-                f"no connection ({_words(error)})", where=self.where, mend="check address, cable and power"
+                f"no connection ({_words(error)})", where=self.where, remedy="check address, cable and power"
             ) from None
 
     def disconnect(self) -> None:
@@ -254,7 +254,7 @@ class ModbusLink:
         address: int,
     ) -> tuple[ModbusPDU, int]:
         """Ask until an answer belongs to the request; return it and the number of attempts."""
-        what, mend = "no answer", "check cable, power and unit_id, or raise timeout_s"
+        what, remedy = "no answer", "check cable, power and unit_id, or raise timeout_s"
         for attempt in range(1, self._settings.retries + 2):
             try:
                 if not self._is_clean:
@@ -263,28 +263,28 @@ class ModbusLink:
                 self._is_clean = False
                 answer = ask(self._client)
             except LinkError as error:
-                what, mend = error.what, error.mend
+                what, remedy = error.what, error.remedy
                 continue
             except ConnectionException as error:
-                what, mend = f"the connection was lost ({_words(error)})", "check cable and power of the device"
+                what, remedy = f"the connection was lost ({_words(error)})", "check cable and power of the device"
                 self._hang_up()
                 continue
             except ModbusException:  # time-out, or bytes that are no frame
-                what, mend = "no answer", "check cable, power and unit_id, or raise timeout_s"
+                what, remedy = "no answer", "check cable, power and unit_id, or raise timeout_s"
                 continue
             refused = answer.isError()
             if answer.function_code & 0x7F != function or not (refused or belongs(answer)):
-                what, mend = "the answer belongs to another request", "let only one master talk to the device"
+                what, remedy = "the answer belongs to another request", "let only one master talk to the device"
                 continue
             self._is_clean = True
             if not refused:
                 return answer, attempt
             code = answer.exception_code
-            what, mend = _EXCEPTIONS.get(code, (f"answers with exception {code}", "see the device's manual"))
+            what, remedy = _EXCEPTIONS.get(code, (f"answers with exception {code}", "see the device's manual"))
             what = f"the device {what}"
             if code not in _BUSY:
-                raise DeviceRefused(what, where=f"{self.where}, {table} {address}", mend=mend)
-        raise LinkError(what, where=f"{self.where}, {table} {address}", mend=mend)
+                raise DeviceRefused(what, where=f"{self.where}, {table} {address}", remedy=remedy)
+        raise LinkError(what, where=f"{self.where}, {table} {address}", remedy=remedy)
 
     def _flush(self) -> None:
         """Make sure that no earlier answer can be taken for the next one.
@@ -372,7 +372,7 @@ def _client(settings: AnyModbusSettings) -> _TcpClient | _RtuClient:
 def _tls_context(settings: ModbusTlsSettings) -> ssl.SSLContext:
     for path in (settings.ca_file, settings.cert_file, settings.key_file):
         if not Path(path).is_file():
-            raise InputError("no such certificate or key", where=path, mend="give PEM files in [rig]")
+            raise InputError("no such certificate or key", where=path, remedy="give PEM files in [rig]")
     try:
         context = ssl.create_default_context(cafile=settings.ca_file)
         context.minimum_version = ssl.TLSVersion.TLSv1_2
@@ -381,6 +381,6 @@ def _tls_context(settings: ModbusTlsSettings) -> ssl.SSLContext:
         raise InputError(
             f"certificate or key refused ({error.reason or error})",
             where=settings.cert_file,
-            mend="give the certificate and its own unencrypted key, both PEM",
+            remedy="give the certificate and its own unencrypted key, both PEM",
         ) from None
     return context

@@ -163,7 +163,7 @@ def _probe_one(link: ModbusLink, codec: Codec, expected: tuple[float, float] | N
     try:
         words = tuple(link.read(block)[0])
     except LinkError as error:
-        warning = f"{error.what}; {error.mend}"
+        warning = f"{error.what}; {error.remedy}"
         return ProbedRegister(name=codec.name, register=codec.register, words=(), value=math.nan, warnings=(warning,))
     return ProbedRegister(
         name=codec.name,

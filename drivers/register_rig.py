@@ -139,7 +139,7 @@ class RegisterRig:
             raise LinkError(
                 "the device took the actuator back",
                 where=self._link.where,
-                mend="its dead-man ran out or somebody disabled it: look why, then start again",
+                remedy="its dead-man ran out or somebody disabled it: look why, then start again",
             )
         return reading
 
@@ -198,7 +198,7 @@ class RegisterRig:
         raise LinkError(
             f"the device echoes heartbeat {echo:g}, not {self._beat}",
             where=self._link.where,
-            mend="it restarted, another master writes to it, or heartbeat_echo is mapped wrongly",
+            remedy="it restarted, another master writes to it, or heartbeat_echo is mapped wrongly",
         )
 
     def _ask(self) -> tuple[Reading, dict[str, float]]:
@@ -232,7 +232,7 @@ class RegisterRig:
                 raise LinkError(
                     "a command was sent twice and the device holds another one",
                     where=self._link.where,
-                    mend="let only one master write to the device, or raise timeout_s",
+                    remedy="let only one master write to the device, or raise timeout_s",
                 )
         self._beat = beat
         self._fed_s = self._clock.now()
@@ -249,9 +249,9 @@ class RegisterRig:
         codec = self._codecs[name]
         self._link.write(codec.register.table, codec.register.address, codec.encode(value))
 
-    def _require(self, holds: bool, what: str, mend: str) -> None:
+    def _require(self, holds: bool, what: str, remedy: str) -> None:
         if not holds:
-            raise LinkError(what, where=self._link.where, mend=mend)
+            raise LinkError(what, where=self._link.where, remedy=remedy)
 
 
 class GainRegisterRig(RegisterRig):
@@ -276,7 +276,7 @@ class GainRegisterRig(RegisterRig):
             What is read back differs, or the link broke; says what the device holds, as far as it is known.
         """
         if controller.kind != "pi":
-            raise InputError("the device holds a PI", where=self._link.where, mend="design one with --kind pi")
+            raise InputError("the device holds a PI", where=self._link.where, remedy="design one with --kind pi")
         self._link.connect()
         gains = {"K": controller.K, "Ti": controller.Ti_s}
         parts = self._gain_blocks()
@@ -297,7 +297,7 @@ class GainRegisterRig(RegisterRig):
         """
         for name in ("automatic", "setpoint"):
             if name not in self._codecs:
-                raise InputError(f"{name} is not mapped", where=self._link.where, mend=f"map rig.registers.{name}")
+                raise InputError(f"{name} is not mapped", where=self._link.where, remedy=f"map rig.registers.{name}")
         self._link.connect()
         self._put("setpoint", setpoint)
         self._put("automatic", 1.0)
@@ -326,7 +326,7 @@ class GainRegisterRig(RegisterRig):
             self._link.connect()
             self._write_checked(parts, old)
         except LinkError:
-            state, mend = "the device may hold old, new or mixed gains", "stop it and check its gains before it runs"
+            state, remedy = "the device may hold old, new or mixed gains", "stop it and check its gains before it runs"
         else:
-            state, mend = "the device holds its old gains again", cause.mend
-        return LinkError(f"the gains were not taken ({cause.what}); {state}", where=self._link.where, mend=mend)
+            state, remedy = "the device holds its old gains again", cause.remedy
+        return LinkError(f"the gains were not taken ({cause.what}); {state}", where=self._link.where, remedy=remedy)

@@ -114,11 +114,11 @@ class Codec:
         """
         register = self.register
         if not math.isfinite(value):
-            raise InputError(f"{value} is not a value", where=self.name, mend="give a finite number")
+            raise InputError(f"{value} is not a value", where=self.name, remedy="give a finite number")
         count = (value - self._offset) / self._scale
         if self._count is None:
             if value not in (0.0, 1.0):
-                raise InputError(f"{value:g} does not fit a bit", where=self.name, mend="give 0 or 1")
+                raise InputError(f"{value:g} does not fit a bit", where=self.name, remedy="give 0 or 1")
             return (int(value),)
         try:
             packed = self._count.pack(count if register.type == "float32" else round(count))
@@ -128,7 +128,7 @@ class Codec:
                 f"{value:g} does not fit the register ({register.type}, scale {register.scale:g}, "
                 f"offset {register.offset:g})",
                 where=self.name,
-                mend=f"stay within {low:g}..{high:g}, or correct type, scale and offset in the register map",
+                remedy=f"stay within {low:g}..{high:g}, or correct type, scale and offset in the register map",
             ) from None
         words = self._words.unpack(packed)
         return words[::-1] if self._is_reversed else words

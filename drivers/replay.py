@@ -77,7 +77,7 @@ class ReplayRig:
             raise LinkError(
                 f"the recording ends at t = {self._recording.t[-1]:g} s",
                 where=self._recording.name,
-                mend="replay it with the settings it was recorded with",
+                remedy="replay it with the settings it was recorded with",
             )
         self._row += 1
         t_s = float(self._recording.t[self._row])
@@ -104,7 +104,7 @@ class ReplayRig:
             raise LinkError(
                 f"command {u:g} at t = {self._recording.t[row]:g} s, where {recorded:g} was recorded",
                 where=self._recording.name,
-                mend="replay it with the settings it was recorded with",
+                remedy="replay it with the settings it was recorded with",
             )
 
     def make_safe(self) -> None:
@@ -116,7 +116,7 @@ class ReplayRig:
 
     def _require_open(self) -> None:
         if not self._is_open:
-            raise LinkError("the rig is not open", where=self._recording.name, mend="open it before the first sample")
+            raise LinkError("the rig is not open", where=self._recording.name, remedy="open it before the first sample")
 
 
 class ExchangeReplayRig(ReplayRig):

@@ -128,7 +128,7 @@ class SerialLink:
             try:
                 self._port = self._open_port(settings)
             except _OPEN_ERRORS as error:
-                raise LinkError(f"cannot be opened ({error})", where=self.where, mend=_CABLE) from None
+                raise LinkError(f"cannot be opened ({error})", where=self.where, remedy=_CABLE) from None
         until = self._clock.now() + settings.start_s  # opening restarts a board whose reset hangs on DTR
         while True:
             try:
@@ -176,7 +176,7 @@ class SerialLink:
             answer = self._answer(kind)
             if answer is not None:
                 return answer, sent_s, attempt > 0
-        raise LinkError(f"no answer to {kind.name}", where=self.where, mend=_CABLE)
+        raise LinkError(f"no answer to {kind.name}", where=self.where, remedy=_CABLE)
 
     def send(self, kind: Kind, *values: float) -> None:
         """Send a request whose answer arrives among the streamed rows."""
@@ -203,15 +203,15 @@ class SerialLink:
             for frame in self._receive(until):
                 if frame.version != VERSION:
                     raise DeviceRefused(
-                        f"speaks version {frame.version} of the protocol", where=self.where, mend=_FLASH
+                        f"speaks version {frame.version} of the protocol", where=self.where, remedy=_FLASH
                     )
                 if frame.kind == Kind.ROW:
                     self._arrived.append(frame)
                 elif frame.sequence == self._sequence:
                     answer = frame
         if answer is not None and answer.kind == Kind.REFUSED:
-            what, mend = _REASONS.get(int(answer.values[1]), ("refuses the request", _FLASH))
-            refusal = DeviceRefused(f"the device {what} ({kind.name})", where=self.where, mend=mend)
+            what, remedy = _REASONS.get(int(answer.values[1]), ("refuses the request", _FLASH))
+            refusal = DeviceRefused(f"the device {what} ({kind.name})", where=self.where, remedy=remedy)
             refusal.reason = int(answer.values[1])
             raise refusal
         return answer
@@ -224,7 +224,7 @@ class SerialLink:
             return self._decoder.feed(port.read(port.in_waiting or 1))
         except _LINE_ERRORS as error:
             self.disconnect()
-            raise LinkError(f"the line is gone ({error})", where=self.where, mend=_CABLE) from None
+            raise LinkError(f"the line is gone ({error})", where=self.where, remedy=_CABLE) from None
 
     def _write(self, data: bytes) -> None:
         port = self._opened
@@ -232,10 +232,10 @@ class SerialLink:
             port.write(data)
         except _LINE_ERRORS as error:
             self.disconnect()
-            raise LinkError(f"the line takes nothing ({error})", where=self.where, mend=_CABLE) from None
+            raise LinkError(f"the line takes nothing ({error})", where=self.where, remedy=_CABLE) from None
 
     @property
     def _opened(self) -> Port:
         if self._port is None:
-            raise LinkError("the line is not open", where=self.where, mend="open the rig first")
+            raise LinkError("the line is not open", where=self.where, remedy="open the rig first")
         return self._port

@@ -49,7 +49,7 @@ class _Scale:
         return InputError(
             f"{name} = {value:g} is outside {self.low:g}..{self.high:g}",
             where=f"rig.{name}_span",
-            mend="narrow the limits, or give the span that the converter really has",
+            remedy="narrow the limits, or give the span that the converter really has",
         )
 
 
@@ -93,7 +93,7 @@ class SerialLineRig:
         self._y = _Scale(low=settings.y_span[0], high=settings.y_span[1], full=1)
         self._u = _Scale(low=settings.u_span[0], high=settings.u_span[1], full=1)
         if self._y.unit == 0.0 or self._u.unit == 0.0:
-            raise InputError("the span is empty", where="rig.y_span, rig.u_span", mend="give two different values")
+            raise InputError("the span is empty", where="rig.y_span, rig.u_span", remedy="give two different values")
         for u in (*u_range, u_safe):
             if not min(settings.u_span) <= u <= max(settings.u_span):
                 raise self._u.refusal(u, "u")
@@ -197,11 +197,11 @@ class SerialLineRig:
                 self._connect()
                 self._set_gains(*old)
             except LinkError:
-                state, mend = "the device may hold old or new gains", "stop it and check its gains before it runs"
+                state, remedy = "the device may hold old or new gains", "stop it and check its gains before it runs"
             else:
-                state, mend = "the device holds its old gains again", error.mend
+                state, remedy = "the device holds its old gains again", error.remedy
             raise LinkError(
-                f"the gains were not taken ({error.what}); {state}", where=self._link.where, mend=mend
+                f"the gains were not taken ({error.what}); {state}", where=self._link.where, remedy=remedy
             ) from None
 
     def start_controller(self, setpoint: float) -> None:
@@ -268,21 +268,21 @@ class SerialLineRig:
         """Return a sample's state, once it is known that the device is the one that was opened."""
         if self._starts >= 0 and frame.values[4] != self._starts:
             self._is_commanding = False
-            raise LinkError("the device restarted", where=self._link.where, mend="check its power, then start again")
+            raise LinkError("the device restarted", where=self._link.where, remedy="check its power, then start again")
         return int(frame.values[3])
 
     def _ended(self, state: int) -> LinkError:
         why = "the device took the actuator back"
-        mend = "somebody else commands it: look who, then start again"
+        remedy = "somebody else commands it: look who, then start again"
         if state & _DEADMAN:
-            mend = "its dead-man ran out: unload the computer or raise rig.deadman_s"
+            remedy = "its dead-man ran out: unload the computer or raise rig.deadman_s"
         elif state & _LIMIT:
-            why, mend = "y passed its limit on the device", "look for a load on the rig, or widen limits.y_min..y_max"
+            why, remedy = "y passed its limit on the device", "look for a load on the rig, or widen limits.y_min..y_max"
         elif state & _TIME:
-            why, mend = "the device's law ended by itself: its time is over", "raise limits.time_s"
+            why, remedy = "the device's law ended by itself: its time is over", "raise limits.time_s"
         elif state & _OVERRUN:
-            why, mend = "the relay decided too often for its delay", "raise smoothing or hysteresis"
-        return LinkError(why, where=self._link.where, mend=mend)
+            why, remedy = "the relay decided too often for its delay", "raise smoothing or hysteresis"
+        return LinkError(why, where=self._link.where, remedy=remedy)
 
     def _steady(self, stamp_us: float, received_s: float, latency_s: float) -> float:
         """Return the device time [s] of a sample, once it is known to have gone on with the host's."""
@@ -293,7 +293,7 @@ class SerialLineRig:
             raise LinkError(
                 f"the device's clock went {passed_s:.4g} s while {host_s:.4g} s passed",
                 where=self._link.where,
-                mend="check the device's power and oscillator; its time stamps are not to be relied on",
+                remedy="check the device's power and oscillator; its time stamps are not to be relied on",
             )
         self._received_s, self._latency_s = received_s, latency_s
         return self._device_time_s
@@ -311,7 +311,7 @@ class SerialLineRig:
     def _require_pi(self, controller: PIDController) -> None:
         if controller.kind != "pi" or controller.setpoint_weight != 1.0:
             raise InputError(
-                "the device holds a PI without set-point weight", where=self._link.where, mend="design with --kind pi"
+                "the device holds a PI without set-point weight", where=self._link.where, remedy="design with --kind pi"
             )
 
     def _set_gains(self, K: float, Ti_s: float) -> None:
@@ -320,6 +320,6 @@ class SerialLineRig:
         if held != wanted:
             raise LinkError(f"read back {held} where {wanted} was written", where=self._link.where)
 
-    def _require(self, holds: bool, what: str, mend: str) -> None:
+    def _require(self, holds: bool, what: str, remedy: str) -> None:
         if not holds:
-            raise LinkError(what, where=self._link.where, mend=mend)
+            raise LinkError(what, where=self._link.where, remedy=remedy)

@@ -107,14 +107,14 @@ class SimulatedRig:
 
     def _require_open(self) -> None:
         if not self._is_open:
-            raise LinkError("the rig is not open", where="simulated rig", mend="open it before the first sample")
+            raise LinkError("the rig is not open", where="simulated rig", remedy="open it before the first sample")
 
     def _check_link(self) -> None:
         if isinstance(self.plant, FaultyPlant):
             try:
                 self.plant.check_link()
             except ConnectionError as error:
-                raise LinkError(str(error), where="simulated rig", mend="check the cable and the device") from error
+                raise LinkError(str(error), where="simulated rig", remedy="check the cable and the device") from error
 
 
 def open_simulated(

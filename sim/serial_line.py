@@ -61,7 +61,7 @@ class SerialLine:
         """Cut the cable: from now on nothing arrives anywhere."""
         self._is_cut.set()
 
-    def mend(self) -> None:
+    def join(self) -> None:
         """Join the cable again."""
         self._is_cut.clear()
 

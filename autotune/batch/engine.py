@@ -75,7 +75,7 @@ def cluster(workers: int | None = None, scheduler: str | None = None, *, process
     try:
         client = Client(scheduler, timeout=_PATIENCE_S)
     except (OSError, ValueError) as error:
-        raise InputError(f"no scheduler answers ({error})", where=scheduler, mend="start dask scheduler") from None
+        raise InputError(f"no scheduler answers ({error})", where=scheduler, remedy="start dask scheduler") from None
     with client:
         _check(client, scheduler)
         yield client
@@ -90,18 +90,20 @@ def _check(client: Client, scheduler: str) -> None:
     try:
         client.wait_for_workers(1, timeout=_PATIENCE_S)
     except TimeoutError:
-        raise InputError("no worker is connected", where=scheduler, mend=f"start dask worker {scheduler}") from None
+        raise InputError("no worker is connected", where=scheduler, remedy=f"start dask worker {scheduler}") from None
     try:
         versions = set(client.run(_version).values())
     except ImportError as error:
         raise InputError(
-            f"a worker cannot import the tool ({error})", where=scheduler, mend="install relay-autotune where they run"
+            f"a worker cannot import the tool ({error})",
+            where=scheduler,
+            remedy="install relay-autotune where they run",
         ) from None
     if versions != {_version()}:
         raise InputError(
             f"the workers have version {', '.join(sorted(versions))}, this is {_version()}",
             where=scheduler,
-            mend="install the same version where they run",
+            remedy="install the same version where they run",
         )
 
 

@@ -53,7 +53,7 @@ def read_export(
     """
     paths = list(prepared) or matches(Path(loop.file))
     if not paths:
-        raise InputError("no such file", where=loop.file, mend="check the key file of the loop")
+        raise InputError("no such file", where=loop.file, remedy="check the key file of the loop")
     names = columns_of(paths[0], export)
     tags = {"u": loop.u, "y": loop.y} | ({"r": loop.r or "r"} if loop.r or "r" in names else {})
     require(names, [export.time, *tags.values()], loop.file)
@@ -85,7 +85,7 @@ def columns_of(path: Path, export: ExportSettings) -> list[str]:
         with pyarrow.csv.open_csv(path, read_options=read, parse_options=parse) as reader:
             return list(reader.schema.names)
     except (pa.ArrowInvalid, UnicodeError) as error:
-        raise InputError(_first_line(error), where=str(path), mend="check [export]: delimiter, encoding") from None
+        raise InputError(_first_line(error), where=str(path), remedy="check [export]: delimiter, encoding") from None
 
 
 def require(names: Sequence[str], wanted: Iterable[str], where: str) -> None:
@@ -96,7 +96,7 @@ def require(names: Sequence[str], wanted: Iterable[str], where: str) -> None:
         near = difflib.get_close_matches(name, names, n=1, cutoff=0.5)
         shown = f"did you mean {near[0]!r}?" if near else f"it has {', '.join(names[:8])}{', ...' * (len(names) > 8)}"
         what = "no column" if name not in names else "more than one column"
-        raise InputError(f"{what} {name!r}", where=where, mend=shown)
+        raise InputError(f"{what} {name!r}", where=where, remedy=shown)
 
 
 def _csv_options(export: ExportSettings, wanted: Sequence[str] | None = None) -> tuple[Any, Any, Any]:
@@ -120,7 +120,7 @@ def _table(paths: Sequence[Path], wanted: Sequence[str], export: ExportSettings,
         read, parse, convert = _csv_options(export, wanted)
         return pa.concat_tables(pyarrow.csv.read_csv(path, read, parse, convert) for path in paths)
     except (pa.ArrowInvalid, pa.ArrowKeyError) as error:
-        raise InputError(_first_line(error), where=where, mend="mend the line, or leave the file out") from None
+        raise InputError(_first_line(error), where=where, remedy="correct the line, or leave the file out") from None
 
 
 def _first_line(error: Exception) -> str:
@@ -164,7 +164,7 @@ def seconds(column: Column, export: ExportSettings, where: str) -> FloatArray:
         raise InputError(
             f"the stamps of column {export.time!r} cannot be read ({_first_line(error)})",
             where=where,
-            mend="set export.time_format to their form, for example %d.%m.%Y %H:%M:%S",
+            remedy="set export.time_format to their form, for example %d.%m.%Y %H:%M:%S",
         ) from None
 
 
@@ -274,5 +274,7 @@ def to_parquet(
                     writer.write_table(table.set_column(0, fields[0], micro))
                     advance(file.tell() / size)
     except pa.ArrowInvalid as error:
-        raise InputError(_first_line(error), where=str(path), mend="mend the line, or leave the file out") from None
+        raise InputError(
+            _first_line(error), where=str(path), remedy="correct the line, or leave the file out"
+        ) from None
     part.replace(out)

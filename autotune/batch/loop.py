@@ -75,7 +75,7 @@ class Row:
     nominal, retuned, extended, noise_floor : float
         Simulation error on held-out rows over the spread of y.
     notes : str
-        What was mended, left out or doubtful.
+        What was corrected, left out or doubtful.
     """
 
     loop: str
@@ -245,7 +245,7 @@ def _points(
         found = identify_closed_loop(longest, controller=present)
         if not found.design_points:
             raise IdentificationError(
-                found.excitation.sentence, where=longest.name, mend="move the set-point, or dither"
+                found.excitation.sentence, where=longest.name, remedy="move the set-point, or dither"
             )
         return found.design_points, found.warnings
     estimates, refusals = [], []
@@ -271,7 +271,7 @@ def _opened(piece: Recording) -> FrequencyEstimate:
         raise IdentificationError(
             "the set-point never moves, so that the command may follow the feedback alone",
             where=piece.name,
-            mend='choose an interval with set-point steps or method = "closed-loop"; give no r where the loop was open',
+            remedy='take an interval with set-point steps or method = "closed-loop"; no r where the loop was open',
         )
     return estimate
 

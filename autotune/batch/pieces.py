@@ -35,7 +35,7 @@ class Record:
     bad : int
         Rows whose u or y is missing, no number, or of bad quality.
     notes : tuple of str
-        What was mended or left out.
+        What was corrected or left out.
     """
 
     pieces: tuple[Recording, ...]
@@ -101,7 +101,7 @@ def read_record(loop: LoopSettings, settings: CampaignSettings, prepared: Sequen
         raise InputError(
             f"no stretch of {_FEWEST_ROWS} good rows: the longest of {rows} rows has {longest}",
             where=loop.name,
-            mend="check tags and quality, or raise longest_gap_s",
+            remedy="check tags and quality, or raise longest_gap_s",
         )
     return Record(pieces=pieces, rows=rows, bad=int((~good).sum()), notes=tuple(notes))
 

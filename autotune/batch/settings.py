@@ -146,15 +146,15 @@ def read_campaign(path: str | os.PathLike[str]) -> tuple[CampaignSettings, tuple
     ]
     loops = tuple(validated(LoopSettings, row, where) for where, row in rows)
     if not loops:
-        raise InputError("no loop", where=str(path), mend=f"nothing matches {file.folder or file.loops}")
+        raise InputError("no loop", where=str(path), remedy=f"nothing matches {file.folder or file.loops}")
     twice = [name for name, times in Counter(loop.name for loop in loops).items() if times > 1]
     if twice:
-        raise InputError(f"the loop {twice[0]!r} is there twice", where=str(path), mend="give each its own name")
+        raise InputError(f"the loop {twice[0]!r} is there twice", where=str(path), remedy="give each its own name")
     if settings.task == "diagnose" and (without := [loop.name for loop in loops if not loop.model]):
         raise InputError(
             f"{without[0]!r} has no model ({len(without)} of {len(loops)} loops)",
             where=str(path),
-            mend="a diagnosis compares with a model: give the key model, or put it into [defaults]",
+            remedy="a diagnosis compares with a model: give the key model, or put it into [defaults]",
         )
     return settings, tuple(_absolute(loop, path.parent) for loop in loops)
 
@@ -163,9 +163,9 @@ def _toml(path: Path) -> dict[str, Any]:
     try:
         return tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", where=str(path), mend="check the path") from None
+        raise InputError(f"cannot be read ({error.strerror})", where=str(path), remedy="check the path") from None
     except tomllib.TOMLDecodeError as error:
-        raise InputError(f"not TOML: {error}", where=str(path), mend="mend the line") from None
+        raise InputError(f"not TOML: {error}", where=str(path), remedy="correct the line") from None
 
 
 def _rows(file: _CampaignFile, path: Path) -> list[tuple[str, dict[str, Any]]]:
@@ -180,7 +180,7 @@ def _rows(file: _CampaignFile, path: Path) -> list[tuple[str, dict[str, Any]]]:
             reader = csv.DictReader(lines, restkey="more cells than the header", restval="")
             return [(f"{table} line {reader.line_num}", row) for row in reader]
     except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", where=str(table), mend="check the key loops") from None
+        raise InputError(f"cannot be read ({error.strerror})", where=str(table), remedy="check the key loops") from None
 
 
 def matches(pattern: Path) -> list[Path]:

@@ -38,7 +38,7 @@ def batch(
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(f"cannot be made ({error.strerror})", where=str(out), mend="choose another --out") from None
+        raise InputError(f"cannot be made ({error.strerror})", where=str(out), remedy="choose another --out") from None
     work = Campaign(settings=settings, loops=loops, out=out.absolute())
     rows = work.done()
     console = Console(highlight=False, soft_wrap=True)
@@ -67,7 +67,7 @@ def batch(
                 raise OperatorStop(
                     f"stopped by the operator with {len(rows)} of {len(loops)} loops done",
                     where=str(out),
-                    mend="the same command continues",
+                    remedy="the same command continues",
                 ) from None
     ordered = write_results(rows.values(), work.out / RESULTS)
     page = campaign_page(settings, ordered)
@@ -81,5 +81,5 @@ def batch(
     console.print(f"report: {out / 'report.html'}, table: {out / RESULTS}", markup=False)
     if counts["failed"] == len(ordered):
         raise InputError(
-            "no loop could be analysed", where=str(campaign), mend="the reason of each is above and in the report"
+            "no loop could be analysed", where=str(campaign), remedy="the reason of each is above and in the report"
         )

@@ -162,7 +162,7 @@ def dither(
         raise InputError(
             f"the recording's sidecar {out.with_suffix('.toml')} would overwrite the configuration",
             where="--out",
-            mend="give the recording another name",
+            remedy="give the recording another name",
         )
     rig = rig_of(content)
     with ProgressBar() as bar:

@@ -34,9 +34,9 @@ def new_folder(out: Path, holds: str) -> None:
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(f"cannot be made ({error.strerror})", where=str(out), mend="choose another --out") from None
+        raise InputError(f"cannot be made ({error.strerror})", where=str(out), remedy="choose another --out") from None
     if (out / holds).exists():
-        raise InputError("holds a run already", where=str(out), mend="choose another --out; nothing is overwritten")
+        raise InputError("holds a run already", where=str(out), remedy="choose another --out; nothing is overwritten")
 
 
 class ProgressBar:

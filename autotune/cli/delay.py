@@ -250,7 +250,7 @@ def _of_operation(recording: Path) -> Recording:
     record = _in_operation(read_recording(recording))
     if record is None:
         raise InputError(
-            "column 'r' has no set-point in any row", where=str(recording), mend="record the loop in operation"
+            "column 'r' has no set-point in any row", where=str(recording), remedy="record the loop in operation"
         )
     return record
 

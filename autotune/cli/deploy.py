@@ -70,7 +70,9 @@ def deploy(
     if fit is not None:
         expected_margins(fit, new)
     if not yes and not sys.stdin.isatty():
-        raise InputError("nobody can be asked here", where="autotune deploy", mend="look at the gains, then give --yes")
+        raise InputError(
+            "nobody can be asked here", where="autotune deploy", remedy="look at the gains, then give --yes"
+        )
     rig = _with_gains(rig_of(content))
     folder = _folder(config, run, out)
     console = Console(highlight=False, soft_wrap=True)
@@ -139,17 +141,17 @@ def _gains(controller: Path | None, design: Path | None, run: Path | None) -> PI
     from autotune.pipeline.folder import RESULT, read_designed
 
     if controller is not None and design is not None:
-        raise InputError("both --controller and --design", where="gains", mend="give one of them")
+        raise InputError("both --controller and --design", where="gains", remedy="give one of them")
     if controller is not None:
         given = read_controller(controller)
         if not isinstance(given, PIDController):
-            raise InputError("no PI or PID", where=str(controller), mend="a rig's own controller takes K, Ti, Td")
+            raise InputError("no PI or PID", where=str(controller), remedy="a rig's own controller takes K, Ti, Td")
         return given
     if design is not None:
         return read_designed(design)
     if run is not None:
         return read_designed(run / RESULT)
-    raise InputError("no gains", where="gains", mend="give --controller, --design or --run")
+    raise InputError("no gains", where="gains", remedy="give --controller, --design or --run")
 
 
 def _plant(run: Path | None, points: Path | None) -> tuple[Measured, PlantFit]:
@@ -166,7 +168,7 @@ def _plant(run: Path | None, points: Path | None) -> tuple[Measured, PlantFit]:
         raise InputError(
             "there is nothing to predict the loop with",
             where="verification",
-            mend="give --run DIR or --points P.json (deploy without it: --no-verify)",
+            remedy="give --run DIR or --points P.json (deploy without it: --no-verify)",
         )
     return measured, fit_plant(measured.points)
 
@@ -178,7 +180,7 @@ def _with_gains(rig: Rig) -> HoldsGains:
         raise InputError(
             "the gains of the rig's own controller cannot be reached",
             where="rig",
-            mend="map rig.registers.K and Ti; or enter the gains by hand and run autotune verify --controller C.toml",
+            remedy="map rig.registers.K and Ti; or enter the gains by hand and run autotune verify --controller C.toml",
         )
     return rig
 
@@ -189,7 +191,9 @@ def _folder(config: Path, run: Path | None, out: Path | None) -> Path:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(f"cannot be made ({error.strerror})", where=str(folder), mend="choose another --out") from None
+        raise InputError(
+            f"cannot be made ({error.strerror})", where=str(folder), remedy="choose another --out"
+        ) from None
     return folder
 
 
@@ -207,7 +211,9 @@ def _restore_interrupted(rig: HoldsGains, journal: Path, console: Console, yes: 
     )
     if not yes and not typer.confirm("Restore those first?", default=True):
         raise InputError(
-            "refused: nothing was written", where=str(journal), mend="move the journal away if the gains are right now"
+            "refused: nothing was written",
+            where=str(journal),
+            remedy="move the journal away if the gains are right now",
         )
     restore(rig, old, journal)
     console.print("The old gains are in place again.")

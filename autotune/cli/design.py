@@ -148,7 +148,7 @@ def controller_command(
     c = read_controller(controller)
     if not isinstance(c, PIDController):
         raise InputError(
-            "has num and den", where=str(controller), mend='forms are of controllers of kind "pi" or "pid"'
+            "has num and den", where=str(controller), remedy='forms are of controllers of kind "pi" or "pid"'
         )
     if form == "c" or form == "st":
         from autotune.design.codegen import c_source, structured_text

@@ -1,4 +1,4 @@
-"""Command: is this computer ready for a rig; what is not is said with its mend."""
+"""Command: is this computer ready for a rig, and how to fix what is not."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ PERIOD_S, DEADLINES = 0.01, 100
 
 @dataclass(frozen=True, kw_only=True)
 class Check:
-    """What was looked at, what was found, and the mend where something is wrong.
+    """What was looked at, what was found, and the remedy where something is wrong.
 
     Attributes
     ----------
@@ -41,14 +41,14 @@ class Check:
         What was looked at, and what was found.
     verdict : {"ok", "note", "wrong"}
         A note lets a run go on, something wrong does not.
-    mend : str
+    remedy : str
         What to do about it.
     """
 
     subject: str
     found: str
     verdict: Literal["ok", "note", "wrong"] = "ok"
-    mend: str = ""
+    remedy: str = ""
 
 
 @app.command()
@@ -57,18 +57,18 @@ def doctor(
         Path | None, typer.Argument(metavar="[CONFIG.toml]", help="configuration whose rig is looked for too")
     ] = None,
 ) -> None:
-    """Check environment, clock, ports, permissions, write access and compiled code; say the mend. Commands nothing."""
+    """Check clock, ports, permissions and compiled code, and say how to fix what is wrong. Commands nothing."""
     console = Console(highlight=False, soft_wrap=True)
     wrong = []
     for check in _checks(config):
         console.print(f"{check.verdict:<5}  {check.subject}: {check.found}", markup=False)
-        if check.mend:
-            console.print(f"       -> {check.mend}", markup=False)
+        if check.remedy:
+            console.print(f"       -> {check.remedy}", markup=False)
         if check.verdict == "wrong":
             wrong.append(check)
     if wrong:
         names = ", ".join(check.subject for check in wrong)
-        raise InputError(f"not ready for a run: {names}", where="autotune doctor", mend=wrong[0].mend)
+        raise InputError(f"not ready for a run: {names}", where="autotune doctor", remedy=wrong[0].remedy)
     console.print("ready")
 
 
@@ -97,14 +97,14 @@ def _packages() -> Iterator[Check]:
     try:
         asked = [Requirement(line) for line in metadata.requires(DISTRIBUTION) or []]
     except metadata.PackageNotFoundError:
-        mend = "pip install -e . in the project's folder"
-        yield Check(subject="packages", found=f"{DISTRIBUTION} is not installed", verdict="wrong", mend=mend)
+        remedy = "pip install -e . in the project's folder"
+        yield Check(subject="packages", found=f"{DISTRIBUTION} is not installed", verdict="wrong", remedy=remedy)
         return
     amiss = [_missing(one) for one in asked if one.marker is None or one.marker.evaluate({"extra": ""})]
     amiss = [words for words in amiss if words]
     if amiss:
-        mend = f"pip install --upgrade {DISTRIBUTION}, or pip install -e . in a checkout"
-        yield Check(subject="packages", found="; ".join(amiss), verdict="wrong", mend=mend)
+        remedy = f"pip install --upgrade {DISTRIBUTION}, or pip install -e . in a checkout"
+        yield Check(subject="packages", found="; ".join(amiss), verdict="wrong", remedy=remedy)
     else:
         yield Check(subject="packages", found=f"{DISTRIBUTION} {metadata.version(DISTRIBUTION)} and all it needs")
 
@@ -119,8 +119,8 @@ def _missing(asked: Requirement) -> str:
 
 def _extra() -> Check:
     if _missing(Requirement("nicegui")):
-        mend = f"pip install '{DISTRIBUTION}[live]' for run --live"
-        return Check(subject="live page", found="not installed", verdict="note", mend=mend)
+        remedy = f"pip install '{DISTRIBUTION}[live]' for run --live"
+        return Check(subject="live page", found="not installed", verdict="note", remedy=remedy)
     return Check(subject="live page", found=f"nicegui {metadata.version('nicegui')}")
 
 
@@ -136,11 +136,11 @@ def _compiled() -> Check:
     # where the package cannot be written the compiler keeps its code in the user's cache folder
     places = [own] if given else [package, Path.home()]
     if not any(os.access(place, os.W_OK) for place in places):
-        mend = "set NUMBA_CACHE_DIR to a folder you may write; every run compiles for about a minute otherwise"
-        return Check(subject=subject, found=f"cannot be kept in {places[0]}", verdict="note", mend=mend)
+        remedy = "set NUMBA_CACHE_DIR to a folder you may write; every run compiles for about a minute otherwise"
+        return Check(subject=subject, found=f"cannot be kept in {places[0]}", verdict="note", remedy=remedy)
     if not kept:
-        mend = "nothing to do: the first run compiles for about a minute"
-        return Check(subject=subject, found="none yet", verdict="note", mend=mend)
+        remedy = "nothing to do: the first run compiles for about a minute"
+        return Check(subject=subject, found="none yet", verdict="note", remedy=remedy)
     return Check(subject=subject, found=f"{kept} functions kept in {own}")
 
 
@@ -149,8 +149,8 @@ def _writing(folder: Path) -> Iterator[Check]:
         with tempfile.NamedTemporaryFile(dir=folder):
             pass
     except OSError as error:
-        mend = "change to a folder you may write; recordings go there"
-        yield Check(subject="write access", found=f"{folder}: {error.strerror}", verdict="wrong", mend=mend)
+        remedy = "change to a folder you may write; recordings go there"
+        yield Check(subject="write access", found=f"{folder}: {error.strerror}", verdict="wrong", remedy=remedy)
         return
     free_MB = shutil.disk_usage(folder).free / 1e6
     enough = free_MB >= SPACE_MB
@@ -158,7 +158,7 @@ def _writing(folder: Path) -> Iterator[Check]:
         subject="write access",
         found=f"{folder}, {free_MB / 1e3:.1f} GB free",
         verdict="ok" if enough else "note",
-        mend="" if enough else "a long recording may fill the disk: a sample is on disk before it is used",
+        remedy="" if enough else "a long recording may fill the disk: a sample is on disk before it is used",
     )
 
 
@@ -171,7 +171,9 @@ def _configuration(path: Path | None) -> tuple[Config | None, Check | None]:
         content = load_config(path)
     except InputError as error:
         found = f"{error.where}: {error.what}"
-        return None, Check(subject="configuration", found=found, verdict="wrong", mend=error.mend or "mend the file")
+        return None, Check(
+            subject="configuration", found=found, verdict="wrong", remedy=error.remedy or "correct the file"
+        )
     return content, Check(subject="configuration", found=f"{path}: {content.rig.kind}, {content.name}")
 
 
@@ -183,7 +185,9 @@ def _clock(sample_time_s: float | None) -> Iterator[Check]:
     subject = "clock"
     found = f"monotonic, resolution {info.resolution * 1e9:.0f} ns"
     if not info.monotonic or info.resolution > 1e-4:
-        yield Check(subject=subject, found=found, verdict="wrong", mend="run on a computer with a fine monotonic clock")
+        yield Check(
+            subject=subject, found=found, verdict="wrong", remedy="run on a computer with a fine monotonic clock"
+        )
     else:
         yield Check(subject=subject, found=found)
     clock = MonotonicClock()
@@ -197,10 +201,10 @@ def _clock(sample_time_s: float | None) -> Iterator[Check]:
     usual, worst = late[len(late) // 2], late[-1]
     allowed = 0.5 * (sample_time_s if sample_time_s is not None else PERIOD_S)
     found = f"deadlines {usual * 1e6:.0f} us late in the median, {worst * 1e3:.2f} ms at worst in {DEADLINES}"
-    mend = "" if worst <= allowed else (
+    remedy = "" if worst <= allowed else (
         f"over {allowed * 1e3:g} ms, half a sample: close other programs, or let the device run the law by itself"
     )  # fmt: skip
-    yield Check(subject="scheduling", found=found, verdict="note" if mend else "ok", mend=mend)
+    yield Check(subject="scheduling", found=found, verdict="note" if remedy else "ok", remedy=remedy)
 
 
 def _serial_ports() -> Iterator[Check]:
@@ -215,12 +219,12 @@ def _serial_ports() -> Iterator[Check]:
 
 def _permission(subject: str, device: str) -> Check:
     if not Path(device).exists():
-        mend = "plug it in, or take another: autotune ports lists them"
-        return Check(subject=subject, found=f"{device}: no such device", verdict="wrong", mend=mend)
+        remedy = "plug it in, or take another: autotune ports lists them"
+        return Check(subject=subject, found=f"{device}: no such device", verdict="wrong", remedy=remedy)
     if os.access(device, os.R_OK | os.W_OK):
         return Check(subject=subject, found=f"{device}, may be read and written")
-    mend = f"sudo usermod -aG {_group(device)} $USER, then log in again"
-    return Check(subject=subject, found=f"{device}: permission denied", verdict="note", mend=mend)
+    remedy = f"sudo usermod -aG {_group(device)} $USER, then log in again"
+    return Check(subject=subject, found=f"{device}: permission denied", verdict="note", remedy=remedy)
 
 
 def _group(device: str) -> str:
@@ -248,7 +252,7 @@ def _rig(content: Config) -> Iterator[Check]:
             yield _address(content.rig.host, content.rig.port, content.rig.timeout_s)
         case ModbusRtuSettings() | SerialSettings():
             check = _permission("the rig's port", content.rig.device)
-            yield replace(check, verdict="wrong") if check.mend else check  # this port is needed, others are not
+            yield replace(check, verdict="wrong") if check.remedy else check  # this port is needed, others are not
         case ReplaySettings():
             yield _file(content.rig.recording)
         case _:
@@ -258,8 +262,8 @@ def _rig(content: Config) -> Iterator[Check]:
 def _file(name: str) -> Check:
     if os.access(name, os.R_OK):
         return Check(subject=name, found="may be read")
-    mend = "give its path as seen from this folder; docs/modbus_tls.md makes certificates"
-    return Check(subject=name, found="cannot be read", verdict="wrong", mend=mend)
+    remedy = "give its path as seen from this folder; docs/modbus_tls.md makes certificates"
+    return Check(subject=name, found="cannot be read", verdict="wrong", remedy=remedy)
 
 
 def _address(host: str, port: int, timeout_s: float) -> Check:
@@ -270,5 +274,5 @@ def _address(host: str, port: int, timeout_s: float) -> Check:
             return Check(subject=subject, found=f"{host}:{port} takes connections")
     except OSError as error:
         found = f"{host}:{port}: {error.strerror or error}"
-    mend = "switch it on, check cable and address; of a twin: start autotune rig first"
-    return Check(subject=subject, found=found, verdict="wrong", mend=mend)
+    remedy = "switch it on, check cable and address; of a twin: start autotune rig first"
+    return Check(subject=subject, found=found, verdict="wrong", remedy=remedy)

@@ -98,7 +98,7 @@ def init(
     from autotune.config import Config, validated
 
     if config.exists():
-        raise InputError("exists already", where=str(config), mend="choose another name; nothing is overwritten")
+        raise InputError("exists already", where=str(config), remedy="choose another name; nothing is overwritten")
     questions = _Questions()
     chosen: Kind = questions.ask("--kind", kind, f"how is the rig reached ({', '.join(get_args(Kind))})", _kind)
     if chosen == "simulated":
@@ -125,7 +125,9 @@ def init(
         with config.open("x", encoding="utf-8") as file:
             file.write(_text(content, config))
     except OSError as error:
-        raise InputError(f"cannot be written ({error.strerror})", where=str(config), mend="check the folder") from None
+        raise InputError(
+            f"cannot be written ({error.strerror})", where=str(config), remedy="check the folder"
+        ) from None
     console = Console(highlight=False, soft_wrap=True)
     console.print(f"wrote {config}", markup=False)
     if chosen == "simulated":
@@ -162,7 +164,7 @@ class _Questions:
         """
         if self._missing:
             flags = ", ".join(self._missing)
-            raise InputError(f"{flags}: no answer", where="autotune init", mend="give them, or call it at a terminal")
+            raise InputError(f"{flags}: no answer", where="autotune init", remedy="give them, or call it at a terminal")
 
 
 def _checked(convert: Callable[[str], Any]) -> Callable[[str], Any]:
@@ -201,7 +203,7 @@ def _pair(answer: str) -> tuple[float, float]:
 def _register(answer: str) -> Table:
     parts = answer.split(":")
     if len(parts) != 3 or not parts[1].isdigit():
-        raise InputError(f"{answer!r}: TABLE:ADDRESS:TYPE is wanted", where="register", mend="e.g. input:0:int16")
+        raise InputError(f"{answer!r}: TABLE:ADDRESS:TYPE is wanted", where="register", remedy="e.g. input:0:int16")
     return {"table": parts[0], "address": int(parts[1]), "type": parts[2]}
 
 

@@ -38,7 +38,7 @@ def live(
     from autotune.pipeline import PROGRESS
 
     if not beside_run and not (folder / PROGRESS).is_file():
-        raise InputError(f"holds no {PROGRESS}", where=str(folder), mend="give the --out folder of autotune run")
+        raise InputError(f"holds no {PROGRESS}", where=str(folder), remedy="give the --out folder of autotune run")
     token = token_for(listen, token)
     bound = listening(listen, port)
     host = socket.gethostname() if listen in ("0.0.0.0", "::") else f"[{listen}]" if ":" in listen else listen

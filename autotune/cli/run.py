@@ -101,7 +101,7 @@ def _configuration(config: Path | None, out: Path | None, resume: Path | None, d
     elif resume is not None:
         content = stored_config(resume)
     else:
-        raise InputError("CONFIG.toml is missing", where="autotune run", mend="autotune run CONFIG.toml --out DIR")
+        raise InputError("CONFIG.toml is missing", where="autotune run", remedy="autotune run CONFIG.toml --out DIR")
     # so that nobody goes on at the rig with what its twin has measured
     return content.model_copy(update={"rig": twin_of(content.rig)}) if dry_run else content
 

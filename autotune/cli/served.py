@@ -38,7 +38,7 @@ def modbus_settings(config: Config) -> AnyModbusSettings:
         raise InputError(
             f'kind = "{config.rig.kind}" has no registers',
             where="rig",
-            mend='give a Modbus rig: kind = "modbus_tcp", "modbus_tls" or "modbus_rtu"',
+            remedy='give a Modbus rig: kind = "modbus_tcp", "modbus_tls" or "modbus_rtu"',
         )
     return config.rig
 
@@ -77,7 +77,7 @@ def device_of(config: Config, plant: Plant | None = None) -> RegisterDevice:
         raise InputError(
             f"a dead-man of {twin.deadman_s:g} s runs out between two samples of {config.signals.sample_time_s:g} s",
             where="rig.twin.deadman_s",
-            mend="give it several sample times",
+            remedy="give it several sample times",
         )
     controller = config.controller
     return RegisterDevice(
@@ -111,7 +111,7 @@ def served(config: Config, device: RegisterDevice, *, refuse: Refusal | None = N
         return
     ca_file = settings.ca_file if isinstance(settings, ModbusTlsSettings) else None
     if isinstance(settings, ModbusTlsSettings) and not (twin.cert_file and twin.key_file):
-        raise InputError("the served twin has no certificate", where="rig.twin", mend="give cert_file and key_file")
+        raise InputError("the served twin has no certificate", where="rig.twin", remedy="give cert_file and key_file")
     transport_tcp = TcpTransport(
         address=twin.listen, port=settings.port, ca_file=ca_file, cert_file=twin.cert_file, key_file=twin.key_file
     )
@@ -139,14 +139,16 @@ def served_on_line(config: Config, settings: SerialSettings) -> Iterator[SerialR
         try:
             rig = SerialRig(device, end, y_span=settings.y_span, u_span=settings.u_span)
         except OSError as error:
-            raise InputError(f"cannot be opened ({error.strerror})", where=end, mend="give rig.twin.device") from None
+            raise InputError(f"cannot be opened ({error.strerror})", where=end, remedy="give rig.twin.device") from None
         with rig:
             yield rig
 
 
 def _twin(settings: AnyModbusSettings | SerialSettings) -> TwinSettings:
     if settings.twin is None:
-        raise InputError("the rig has no simulated twin", where="rig.twin", mend='name one: [rig.twin] plant = "ball"')
+        raise InputError(
+            "the rig has no simulated twin", where="rig.twin", remedy='name one: [rig.twin] plant = "ball"'
+        )
     return settings.twin
 
 
@@ -155,7 +157,7 @@ def _started(rig: ModbusRig) -> Iterator[ModbusRig]:
     try:
         rig.__enter__()
     except ConnectionError as error:
-        raise InputError(str(error), where="rig", mend="free the address or give another one") from None
+        raise InputError(str(error), where="rig", remedy="free the address or give another one") from None
     try:
         yield rig
     finally:
@@ -173,7 +175,7 @@ def _line_end(settings: ModbusRtuSettings | SerialSettings, twin: TwinSettings) 
         raise InputError(
             "exists already, so no pseudo-terminal can be linked there",
             where=settings.device,
-            mend="remove it, or name the other end of the line: rig.twin.device",
+            remedy="remove it, or name the other end of the line: rig.twin.device",
         )
     with SerialLine() as line:
         path.unlink(missing_ok=True)  # a link that an earlier run left behind

@@ -54,7 +54,7 @@ def load_config(path: str | os.PathLike[str]) -> Config:
     try:
         content = tomllib.loads(Path(path).read_text(encoding="utf-8"))
     except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", where=where, mend="check the path") from None
+        raise InputError(f"cannot be read ({error.strerror})", where=where, remedy="check the path") from None
     except tomllib.TOMLDecodeError as error:
         raise InputError(f"not TOML: {error}", where=where) from None
     return validated(Config, content, where)
@@ -97,15 +97,15 @@ def _refusal(error: ValidationError, root: type[BaseModel], where: str) -> Input
         key = str(first["loc"][-1])
         known = _known_keys(root, _key_path(first)[:-1])
         near = difflib.get_close_matches(key, known, n=1, cutoff=0.5)
-        mend = f"did you mean {near[0]!r}?" if near else f"known keys here: {', '.join(known)}"
-        return InputError(f"unknown key {path!r}{more}", where=where, mend=mend)
+        remedy = f"did you mean {near[0]!r}?" if near else f"known keys here: {', '.join(known)}"
+        return InputError(f"unknown key {path!r}{more}", where=where, remedy=remedy)
     if first["type"] == "missing":
-        return InputError(f"{path!r} is missing{more}", where=where, mend=_describe(root, _key_path(first)))
+        return InputError(f"{path!r} is missing{more}", where=where, remedy=_describe(root, _key_path(first)))
     value = first.get("input")
     shown = f" = {value!r}" if isinstance(value, str | int | float | bool) else ""
     reason = first["msg"].removeprefix("Value error, ")
     key = f"{path}{shown}: " if path else ""  # what holds between keys of the whole file has no path
-    return InputError(f"{key}{reason}{more}", where=where, mend=_describe(root, _key_path(first)))
+    return InputError(f"{key}{reason}{more}", where=where, remedy=_describe(root, _key_path(first)))
 
 
 def _key_path(detail: ErrorDetails) -> tuple[str | int, ...]:

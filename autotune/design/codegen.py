@@ -134,7 +134,7 @@ def _literal(value: float) -> str:
 
 def _constants(law: PILaw, name: str) -> dict[str, str | float]:
     if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name):
-        raise DesignError(f"{name!r} is no identifier", where="code generation", mend="letters, digits, underscore")
+        raise DesignError(f"{name!r} is no identifier", where="code generation", remedy="letters, digits, underscore")
     c, T_s = law.controller, law.sample_time_s
     return {
         "name": name,

@@ -98,7 +98,7 @@ def to_form(
             values = _series(c)
         case "velocity":
             if not sample_time_s > 0.0:
-                raise DesignError("the velocity form needs a sample time", where=form, mend="give it in seconds")
+                raise DesignError("the velocity form needs a sample time", where=form, remedy="give it in seconds")
             d, i = c.Td_s / sample_time_s, sample_time_s * integral
             values = {"q0": c.K * (1 + i + d), "q1": -c.K * (1 + 2 * d), "q2": c.K * d, "Tf_s": c.Tf_s}
         case "siemens":
@@ -170,13 +170,13 @@ def _inverse(rate: float) -> float:
 
 def _series(c: PIDController) -> dict[str, float]:
     if math.isinf(c.Ti_s):
-        raise DesignError("the series form needs integral action", where="series", mend="use the parallel form")
+        raise DesignError("the series form needs integral action", where="series", remedy="use the parallel form")
     discriminant = 1.0 - 4.0 * c.Td_s / c.Ti_s
     if discriminant < 0.0:
         raise DesignError(
             f"Ti = {c.Ti_s:.4g} s is below 4 Td = {4 * c.Td_s:.4g} s: the controller's zeros are complex",
             where="series",
-            mend="use a parallel form",
+            remedy="use a parallel form",
         )
     Ti = 0.5 * c.Ti_s * (1.0 + math.sqrt(discriminant))
     return {"K": c.K * Ti / c.Ti_s, "Ti_s": Ti, "Td_s": c.Ti_s - Ti, "Tf_s": c.Tf_s}
@@ -186,7 +186,7 @@ def _derivative_filtered(c: PIDController, form: str) -> tuple[float, float, flo
     """Return K, T_I, T_d, T_filter of K (1 + 1/(T_I s) + T_d s/(1 + T_filter s)) equal to C, by partial fractions."""
     if c.Tf_s == 0.0:
         if c.Td_s > 0.0:
-            raise DesignError("derivative action without filter", where=form, mend="give the controller a Tf above 0")
+            raise DesignError("derivative action without filter", where=form, remedy="give the controller a Tf above 0")
         return c.K, c.Ti_s, 0.0, 0.0
     share = 1.0 if math.isinf(c.Ti_s) else (c.Ti_s - c.Tf_s) / c.Ti_s
     Td = c.Td_s / share - c.Tf_s if share > 0.0 else -1.0
@@ -194,7 +194,7 @@ def _derivative_filtered(c: PIDController, form: str) -> tuple[float, float, flo
         raise DesignError(
             "this form filters the derivative only, and the controller's filter is slower than its derivative",
             where=form,
-            mend="filter the measurement ahead of the block with Tf, and enter the controller with Tf = 0 and Td = 0",
+            remedy="filter the measurement ahead of the block with Tf, and enter the controller with Tf = 0 and Td = 0",
         )
     return c.K * share, c.Ti_s * share, Td, c.Tf_s
 

@@ -68,12 +68,12 @@ def sampled_plant(plant: TransferFunction, largest_gain: float = 1.0) -> Sampled
     """
     num, den = np.array(plant.num), np.array(plant.den)
     if not np.any(num):
-        raise DesignError("the plant is zero", where="plant", mend="check the model's numerators")
+        raise DesignError("the plant is zero", where="plant", remedy="check the model's numerators")
     if num[-1] == 0.0:
         raise DesignError(
             "the plant has no gain at low frequency (a zero at s = 0)",
             where="plant",
-            mend="integral action cannot remove a disturbance there; design another structure",
+            remedy="integral action cannot remove a disturbance there; design another structure",
         )
     loudest = TransferFunction(num=tuple(largest_gain * b for b in plant.num), den=plant.den, delay_s=plant.delay_s)
     corners = characteristic_frequencies(loudest)
@@ -105,7 +105,7 @@ def on_grid(plant: TransferFunction, omega: FloatArray, sign: float) -> SampledP
     h = sign * plant.response(omega)
     if not np.all(np.isfinite(h)) or not np.all(np.abs(h) > 0.0):
         raise DesignError(
-            "the plant's response has a pole or a zero on the imaginary axis", where="plant", mend="move it aside"
+            "the plant's response has a pole or a zero on the imaginary axis", where="plant", remedy="move it aside"
         )
     return SampledPlant(
         omega=omega, h=h, weights=_h2_weights(omega, plant), turn=_denominator_turn(omega, plant), sign=sign

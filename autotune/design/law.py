@@ -79,14 +79,16 @@ class PILaw:
 
     def __post_init__(self) -> None:
         if not 0.0 < self.sample_time_s < math.inf:
-            raise InputError(f"sample time = {self.sample_time_s:g} s", where="control law", mend="it must be positive")
+            raise InputError(
+                f"sample time = {self.sample_time_s:g} s", where="control law", remedy="it must be positive"
+            )
         if not self.u_min < self.u_max:
             raise InputError(f"u_min = {self.u_min:g} is not below u_max = {self.u_max:g}", where="control law")
         if not self.u_rate > 0.0:
-            raise InputError(f"u_rate = {self.u_rate:g}", where="control law", mend="it must be positive")
+            raise InputError(f"u_rate = {self.u_rate:g}", where="control law", remedy="it must be positive")
         if self.tracking_time_s is not None and not self.tracking_time_s > 0.0:
             raise InputError(
-                f"tracking time = {self.tracking_time_s:g} s", where="control law", mend="make it positive"
+                f"tracking time = {self.tracking_time_s:g} s", where="control law", remedy="make it positive"
             )
 
     @property
@@ -139,7 +141,7 @@ class PILaw:
             For the next sample.
         """
         if not (math.isfinite(r) and math.isfinite(y)):
-            raise InputError(f"set-point {r} and measurement {y}", where="control law", mend="both must be finite")
+            raise InputError(f"set-point {r} and measurement {y}", where="control law", remedy="both must be finite")
         c, T_s = self.controller, self.sample_time_s
         y_f = state.y_filtered + T_s / (c.Tf_s + T_s) * (y - state.y_filtered)
         slope = 0.0 if math.isinf(c.Ti_s) else c.K * T_s / c.Ti_s

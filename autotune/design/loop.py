@@ -153,7 +153,7 @@ class ContinuousLoop:
         L = self.transfer_function
         D = np.polyadd(L.num, L.den)
         if not np.any(D):
-            raise DesignError("H C = -1 at every frequency", where="closed loop", mend="change the controller")
+            raise DesignError("H C = -1 at every frequency", where="closed loop", remedy="change the controller")
         if L.delay_s == 0.0:
             roots = np.roots(D)
             scale = np.maximum(np.abs(roots), 1e-300)
@@ -223,7 +223,7 @@ class SampledLoop:
         """Phi, Gamma_1 (older command), Gamma_0 (newer command), c and direct term of the sampled plant."""
         T_s = self.controller.sample_time_s
         if not self.plant.is_proper:
-            raise DesignError("the plant is not proper", where="sampled loop", mend="give it at least as many poles")
+            raise DesignError("the plant is not proper", where="sampled loop", remedy="give it at least as many poles")
         den = np.array(self.plant.den)
         order = len(den) - 1
         scale = characteristic_frequencies(self.plant)

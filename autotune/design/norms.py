@@ -93,7 +93,7 @@ def integral(f: Callable[[FloatArray], FloatArray], edges: FloatArray, relative_
     raise DesignError(
         "the H2 integral did not converge",
         where="H2 norm (11)",
-        mend="the closed loop is at the edge of stability: change the controller",
+        remedy="the closed loop is at the edge of stability: change the controller",
     )
 
 

@@ -143,7 +143,7 @@ def loop_scaling(plant: Plant, controller: Controller) -> float:
     loop = open_loop(plant, controller)
     crossover = phase_and_delay_margin(loop, loop.grid, loop.response(loop.grid))[2]
     if math.isnan(crossover):
-        raise DesignError("abs(L) is never 1, so the loop has no scaling of its own", where="nu-gap", mend="give k")
+        raise DesignError("abs(L) is never 1, so the loop has no scaling of its own", where="nu-gap", remedy="give k")
     return float(np.abs(loop.controller_response(np.array([crossover])))[0])
 
 

@@ -48,7 +48,7 @@ def best_pid(
     figures = evaluate_on(sampled.thinned(4), grid, specification)
     feasible = np.min(evaluated_slacks(figures, grid, specification), axis=1) >= 0.0
     if not np.any(feasible):
-        raise DesignError("no PID on the coarse grid meets the specification", where="synthesis", mend="use kind pi")
+        raise DesignError("no PID on the coarse grid meets the specification", where="synthesis", remedy="use kind pi")
     nodes = grid[feasible][np.argsort(figures[feasible, 0])]
     starts = [nodes[0]]
     for node in nodes[1:]:

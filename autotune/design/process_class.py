@@ -105,7 +105,7 @@ class ConsistentProcesses:
                 raise DesignError(
                     f"the points do not bound the {what} at every frequency",
                     where="points",
-                    mend="add points, or points with smaller regions",
+                    remedy="add points, or points with smaller regions",
                 )
             values[k] = program.getInfo().objective_function_value
         return values
@@ -155,7 +155,7 @@ def consistent_processes(
         Too few points, or points that contradict the class and each other; names the worst.
     """
     if len(points) < 3:
-        raise DesignError(f"{len(points)} points", where="points", mend="a design on points needs at least three")
+        raise DesignError(f"{len(points)} points", where="points", remedy="a design on points needs at least three")
     ordered = sorted(points, key=lambda point: point.omega_rad_s)
     omega = np.array([point.omega_rad_s for point in ordered])
     sign, log_gain, phase = _log_polar(ordered)
@@ -237,7 +237,7 @@ def _inflation(A: FloatArray, b: FloatArray, r: FloatArray, omega: FloatArray) -
         method="highs-ds",
     )
     if result.status != 0 or result.x is None:
-        raise DesignError("the points determine no process", where="points", mend="check their gains and phases")
+        raise DesignError("the points determine no process", where="points", remedy="check their gains and phases")
     least = float(result.x[-1])
     if least > _MOST_INFLATION:
         excess = (A @ result.x[:-1] - b) / r
@@ -246,7 +246,7 @@ def _inflation(A: FloatArray, b: FloatArray, r: FloatArray, omega: FloatArray) -
             f"the points contradict each other as those of an aperiodic process with dead time: their regions would "
             f"have to be {least:.1f} times as large, the one at {worst:.4g} rad/s first of all",
             where="points",
-            mend="measure that point again, or design on a model if the plant resonates",
+            remedy="measure that point again, or design on a model if the plant resonates",
         )
     return max(1.0, 1.1 * least)
 

@@ -110,7 +110,9 @@ def flat_transition(
     of its shape, not of all trajectories: a bang-bang one would be faster and rougher.
     """
     if len(plant.num) != 1 or plant.num[0] == 0.0:
-        raise DesignError("a plant with zeros is not flat in its output", where="reference", mend="leave the zeros out")
+        raise DesignError(
+            "a plant with zeros is not flat in its output", where="reference", remedy="leave the zeros out"
+        )
     order = len(plant.den) - 1
     shape = _smooth_step(2 * order + 3)
     _reachable(plant, y_start, y_end, u_rest, u_min, u_max)
@@ -132,7 +134,9 @@ def flat_transition(
     while excess(slow)[0] > 1.0:
         fast, slow = slow, 2.0 * slow
         if slow > 1e9 * slowest:
-            raise DesignError("no duration respects the limits", where="reference", mend="check u_rest and the limits")
+            raise DesignError(
+                "no duration respects the limits", where="reference", remedy="check u_rest and the limits"
+            )
     while slow / fast > 1.0 + _SHARE:
         middle = math.sqrt(slow * fast)
         fast, slow = (middle, slow) if excess(middle)[0] > 1.0 else (fast, middle)
@@ -175,5 +179,5 @@ def _reachable(
         raise DesignError(
             f"holding {y_end:g} takes u = {final:.4g}, outside {u_min:g} .. {u_max:g}",
             where="reference",
-            mend=f"the furthest output that can be held is {y_start + (bound - u_rest) / static:.4g}",
+            remedy=f"the furthest output that can be held is {y_start + (bound - u_rest) / static:.4g}",
         )

@@ -207,13 +207,13 @@ def _unreachable(plant: UncertainPlant, specification: Specification, kind: Kind
         return DesignError(
             "the points do not reach the frequencies where the loop would cross over",
             where="points",
-            mend="measure points with phases between -105 and -160 degrees, and beyond the crossover",
+            remedy="measure points with phases between -105 and -160 degrees, and beyond the crossover",
         )
     factor = math.floor(share * 100.0) / 100.0
     return DesignError(
         f"no {kind.upper()} keeps M_m {specification.modulus_margin:g} and "
         f"{math.degrees(specification.phase_margin_rad):g} deg for all plants through the points",
         where="synthesis",
-        mend=f"the nearest that one keeps is M_m {factor * specification.modulus_margin:.3f} and "
+        remedy=f"the nearest that one keeps is M_m {factor * specification.modulus_margin:.3f} and "
         f"{factor * math.degrees(specification.phase_margin_rad):.1f} deg; or measure with smaller regions",
     )

@@ -67,7 +67,7 @@ def place_poles(plant: TransferFunction, poles: Sequence[complex]) -> RST:
     if plant.delay_s > 0.0 or len(plant.num) > n:
         raise DesignError("pole placement is for strictly proper plants without dead time", where="RST")
     if len(poles) != 2 * n + 1:
-        raise DesignError(f"{len(poles)} poles", where="RST", mend=f"a plant of order {n} takes {2 * n + 1}")
+        raise DesignError(f"{len(poles)} poles", where="RST", remedy=f"a plant of order {n} takes {2 * n + 1}")
     roots = np.asarray(poles, dtype=np.complex128)
     if np.any(roots.real >= 0.0):
         raise DesignError("a pole is not in the left half plane", where="RST")
@@ -85,7 +85,7 @@ def place_poles(plant: TransferFunction, poles: Sequence[complex]) -> RST:
         matrix[k : k + n + 1, n + k] = B
     known = np.concatenate((A, np.zeros(n + 1)))  # A s^(n+1)
     if np.linalg.cond(matrix) > 1e14:
-        raise DesignError("the plant has a common factor or a zero at s = 0", where="RST", mend="cancel it first")
+        raise DesignError("the plant has a common factor or a zero at s = 0", where="RST", remedy="cancel it first")
     x = np.linalg.solve(matrix, (P - known)[1:])
     S = np.concatenate(([1.0], x[:n], [0.0])) * w ** np.arange(n + 2)
     R = x[n:] * w ** np.arange(1, n + 2)

@@ -75,7 +75,7 @@ class RSTLaw:
 
     def __post_init__(self) -> None:
         if not 0.0 < self.sample_time_s < math.inf:
-            raise InputError(f"sample time = {self.sample_time_s:g} s", where="RST law", mend="it must be positive")
+            raise InputError(f"sample time = {self.sample_time_s:g} s", where="RST law", remedy="it must be positive")
         if not self.u_min < self.u_max:
             raise InputError(f"u_min = {self.u_min:g} is not below u_max = {self.u_max:g}", where="RST law")
         c = self.controller
@@ -84,9 +84,9 @@ class RSTLaw:
         if np.any(np.roots(c.S[:-1]).real >= 0.0):
             raise DesignError("S has a second root at 0 or one in the right half plane", where="RST law")
         if len(c.R) == 1 and self.tracking_time_s is None:
-            raise DesignError("R has no root to take the tracking time from", where="RST law", mend="give one")
+            raise DesignError("R has no root to take the tracking time from", where="RST law", remedy="give one")
         if self.tracking_time_s is not None and not self.tracking_time_s > 0.0:
-            raise InputError(f"tracking time = {self.tracking_time_s:g} s", where="RST law", mend="make it positive")
+            raise InputError(f"tracking time = {self.tracking_time_s:g} s", where="RST law", remedy="make it positive")
 
     @cached_property
     def coefficients(self) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -116,7 +116,7 @@ class RSTLaw:
     def step(self, state: RSTState, r: float, y: float) -> tuple[float, RSTState]:
         """Return the command for this sample, within the limits, and the state for the next."""
         if not (math.isfinite(r) and math.isfinite(y)):
-            raise InputError(f"set-point {r} and measurement {y}", where="RST law", mend="both must be finite")
+            raise InputError(f"set-point {r} and measurement {y}", where="RST law", remedy="both must be finite")
         R, S, T = self.coefficients
         rs, ys, limited = (r, *state.r), (y, *state.y), np.array(state.u) - np.array(state.v)
         # sum (s_i - a_i) u + sum a_i v = sum s_i u - sum a_i (u - v)

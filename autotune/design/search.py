@@ -125,7 +125,7 @@ def polished(
         raise DesignError(
             "the search ended beside the constraints",
             where="synthesis",
-            mend="relax the margins by a thousandth, or report the plant",
+            remedy="relax the margins by a thousandth, or report the plant",
         )
     return best[1]
 

@@ -52,7 +52,7 @@ class Specification:
 
     def __post_init__(self) -> None:
         def refuse(name: str, value: float, allowed: str) -> None:
-            raise DesignError(f"{name} = {value:g}", where="specification", mend=f"it must be {allowed}")
+            raise DesignError(f"{name} = {value:g}", where="specification", remedy=f"it must be {allowed}")
 
         if not 0.0 < self.modulus_margin < 1.0:
             refuse("modulus margin", self.modulus_margin, "between 0 and 1")

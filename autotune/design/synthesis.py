@@ -149,7 +149,7 @@ def _unreachable(
         return DesignError(
             "no PI of the plant's sign within the noise gain stabilises this plant",
             where="synthesis",
-            mend=f"raise the noise gain above {specification.noise_gain:g}, or use another structure",
+            remedy=f"raise the noise gain above {specification.noise_gain:g}, or use another structure",
         )
     factor = math.floor(float(share[best]) * 1000.0) / 1000.0
     asked = f"M_m {specification.modulus_margin:g}, {math.degrees(specification.phase_margin_rad):g} deg"
@@ -163,5 +163,5 @@ def _unreachable(
     return DesignError(
         f"no PI reaches {asked} with noise gain {specification.noise_gain:g}",
         where="synthesis",
-        mend=f"the nearest that one reaches is {near}",
+        remedy=f"the nearest that one reaches is {near}",
     )

@@ -119,7 +119,7 @@ def chain_of(blocks: tuple[Block, ...], name: str) -> Chain:
     """
     order = sum(len(block.dynamics.den) - 1 for block in blocks)
     if not 1 <= order <= 12:
-        raise InputError(f"the chain has {order} states", where=name, mend="diagnosis handles 1 to 12 states")
+        raise InputError(f"the chain has {order} states", where=name, remedy="diagnosis handles 1 to 12 states")
     plant = _plant_blocks(blocks)
     A, B = np.zeros((order, order)), np.zeros((order, kernel.INPUTS))
     taps, gains = np.zeros((5, order)), np.ones(4)

@@ -87,11 +87,11 @@ def diagnose(
         No recording, fewer than 100 rows, or u that is not finite.
     """
     if not recordings:
-        raise InputError("no recording", where="diagnose", mend="give at least one")
+        raise InputError("no recording", where="diagnose", remedy="give at least one")
     for r in recordings:
         r.require_finite(("u",))
         if len(r) < 100 or np.isfinite(r.y).sum() < 100:
-            raise InputError(f"{len(r)} rows", where=r.name, mend="a diagnosis needs at least 100 finite readings")
+            raise InputError(f"{len(r)} rows", where=r.name, remedy="a diagnosis needs at least 100 finite readings")
     report("looking at the samples", 0.0)
     good, seen = inspect(recordings, without)
     left_out = [*without, *(effect.name for effect in seen)]

@@ -164,7 +164,7 @@ def excitations(sim: Simulator, config: Config, duration_s: float, seed: int = 0
         raise InputError(
             "the plant integrates and no present control law is stated",
             where="[controller]",
-            mend="write K and Ti_s of the loop as it is now",
+            remedy="write K and Ti_s of the loop as it is now",
         )
     dt, limits = config.signals.sample_time_s, config.limits
     slow = _slowest_s(sim, config)
@@ -312,6 +312,6 @@ def general(sim: Simulator, config: Config, duration_s: float, seed: int = 0) ->
     steps = [one for one in choices if one.kind == "random steps"]
     if not steps:
         raise InputError(
-            "no excitation fits into the limits", where="[limits]", mend="allow more swing, or a wider range of u"
+            "no excitation fits into the limits", where="[limits]", remedy="allow more swing, or a wider range of u"
         )
     return steps[0]

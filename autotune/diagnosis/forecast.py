@@ -119,7 +119,7 @@ def forecast(model: Model, recording: Recording, horizon_s: float | None = None)
     recording.require_finite(("u",))
     good = np.isfinite(recording.y)
     if good.sum() < 8:
-        raise InputError("fewer than 8 finite readings", where=recording.name, mend="record longer")
+        raise InputError("fewer than 8 finite readings", where=recording.name, remedy="record longer")
     sim = assemble(model)
     step = float(sim.E[kernel.S_QUANTUM]) if sim.on[kernel.S_QUANTUM] else 0.0
     # no derivative leads through a converter's steps: states are estimated without them
@@ -137,7 +137,7 @@ def forecast(model: Model, recording: Recording, horizon_s: float | None = None)
         rows = max(len(recording) // 10, min(len(recording), 8))
         return _rounded(estimator.run(0, len(recording), estimator.estimate(0, rows, bias=False)), step)
     if not horizon_s >= 2.0 * recording.sample_time_s:
-        raise InputError(f"horizon = {horizon_s:g} s", where="--horizon", mend="give at least two sample times")
+        raise InputError(f"horizon = {horizon_s:g} s", where="--horizon", remedy="give at least two sample times")
     return _rounded(_windowed(estimator, horizon_s), step)
 
 

@@ -157,7 +157,7 @@ def investigate(
         raise InputError(
             f"{duration_s:g} s under excitation leave too little of limits.time_s = {config.limits.time_s:g} s",
             where="--duration",
-            mend=f"ask for at most {LARGEST_SHARE * config.limits.time_s:.4g} s, or raise limits.time_s",
+            remedy=f"ask for at most {LARGEST_SHARE * config.limits.time_s:.4g} s, or raise limits.time_s",
         )
     rig_time_s = rounds * duration_s if rig_time_s is None else rig_time_s
     found = diagnose(model, recordings, None, without, report) if recordings else None

@@ -228,13 +228,13 @@ def entry_of(name: str, where: str = "catalogue") -> Entry:
     if name in STRUCTURES:
         return STRUCTURES[name]
     if name not in CATALOGUE:
-        raise InputError(f"effect {name!r} cannot be simulated", where=where, mend="use a name of the catalogue")
+        raise InputError(f"effect {name!r} cannot be simulated", where=where, remedy="use a name of the catalogue")
     return CATALOGUE[name]
 
 
 def _value(effect: Effect, key: str, where: str) -> float:
     if key not in effect.parameters:
-        raise InputError(f"{effect.name} lacks {key}", where=where, mend=f"add {key} to its parameters")
+        raise InputError(f"{effect.name} lacks {key}", where=where, remedy=f"add {key} to its parameters")
     return effect.parameters[key].value
 
 
@@ -245,10 +245,10 @@ def _fill_slots(entry: Entry, effect: Effect, E: FloatArray, on: IntArray, model
         slot = slots.get(key, optional.get(key, -1))
         if slot < 0:
             known = f"known: {', '.join(slots)}"
-            raise InputError(f"{effect.name} has no parameter {key!r}", where=model.name, mend=known)
+            raise InputError(f"{effect.name} has no parameter {key!r}", where=model.name, remedy=known)
         E[slot], on[slot] = parameter.value, 1
     if not on[[slot for slot in slots.values() if slot >= 0]].any() and slots:
-        raise InputError(f"{effect.name} has no parameters", where=model.name, mend=f"known: {', '.join(slots)}")
+        raise InputError(f"{effect.name} has no parameters", where=model.name, remedy=f"known: {', '.join(slots)}")
     if effect.name == "plant.radiation_loss":
         celsius = "c" in model.output.unit.lower()
         E[kernel.RADIATION_ZERO] = model.output.offset + (273.15 if celsius else 0.0)

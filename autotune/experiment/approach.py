@@ -114,7 +114,7 @@ def preflight(loop: ControlLoop, config: Config, tell: Tell) -> Known:
             f"link too slow: a reading takes {1e3 * typical:.3g} ms, up to {1e3 * late:.3g} ms in 99 %,"
             f" the sample time is {1e3 * loop.sample_time_s:.3g} ms",
             where="preflight",
-            mend="raise signals.sample_time_s, or use a faster link",
+            remedy="raise signals.sample_time_s, or use a faster link",
         )
     link_rad_s = supported_rad_s(timing, loop.sample_time_s, config.experiment.gain_sd, exact=loop.is_exact)
     tell(
@@ -131,7 +131,7 @@ def preflight(loop: ControlLoop, config: Config, tell: Tell) -> Known:
         raise ExperimentStopped(
             f"drowned in noise: y is restless by +-{noise_half:.3g} where limits.swing allows {config.limits.swing:g}",
             where="preflight",
-            mend="filter the measurement at the device, or allow more swing",
+            remedy="filter the measurement at the device, or allow more swing",
         )
     changes = float(np.mean(steps != 0.0))
     loop.monitor.noise = noise_half
@@ -159,7 +159,7 @@ def _check_at_rest(loop: ControlLoop, first_row: int, first: tuple[float, ...]) 
         raise ExperimentStopped(
             f"wrong sign, or the plant moves where it should rest: y went by {moved:.3g} at u = {loop.tick.u:.4g}",
             where="preflight",
-            mend="check the wiring and scaling of the actuator, and limits.u_safe",
+            remedy="check the wiring and scaling of the actuator, and limits.u_safe",
         )
 
 
@@ -214,7 +214,7 @@ def _ramp(loop: ControlLoop, config: Config, known: Known, tell: Tell, bracket: 
             raise ExperimentStopped(
                 f"the plant does not answer: y stays at {known.y_rest:.4g} up to the command {high:.4g}",
                 where="approach",
-                mend="look for a stuck or saturated actuator; else correct operating_point.u_guess or u_uncertainty",
+                remedy="look for a stuck or saturated actuator; else correct operating_point.u_guess or u_uncertainty",
             )
         tick = loop.step(loop.nearest(min(u, high)))
         moved = median(loop.monitor.recent) - known.y_rest
@@ -240,13 +240,13 @@ def _sign_of(moved: float, climbed: float, loop: ControlLoop, known: Known) -> i
             f"wrong sign, or the plant moves where it should rest: y went from {known.y_rest:.4g} to"
             f" {known.y_rest + moved:.4g} at the command {loop.tick.u:.4g}",
             where="approach",
-            mend="check the wiring and scaling of the actuator; else lower operating_point.u_guess",
+            remedy="check the wiring and scaling of the actuator; else lower operating_point.u_guess",
         )
     if known.plant_sign not in (0, sign):
         raise ExperimentStopped(
             f"wrong sign: y moved by {moved:.3g} when the command rose, plant_sign is {known.plant_sign}",
             where="approach",
-            mend="correct plant_sign, or check the wiring of actuator and sensor",
+            remedy="correct plant_sign, or check the wiring of actuator and sensor",
         )
     return sign
 
@@ -270,7 +270,7 @@ def _find_sign(loop: ControlLoop, config: Config, known: Known, tell: Tell) -> K
         raise ExperimentStopped(
             f"the plant does not answer: y stays within {distance:.3g} for commands {push:.3g} above and below u_guess",
             where="approach",
-            mend="look for a stuck actuator; else raise operating_point.u_uncertainty",
+            remedy="look for a stuck actuator; else raise operating_point.u_uncertainty",
         )
     # the command between the two at which y would have stood still
     balance = -(slopes[0] + slopes[1]) / (slopes[0] - slopes[1])
@@ -298,7 +298,7 @@ def find_midpoint(loop: ControlLoop, config: Config, known: Known, tell: Tell) -
         raise ExperimentStopped(
             f"saturated: the mid-point {known.midpoint:.4g} is at the end of the command's range",
             where="find the mid-point",
-            mend="choose another operating point, or widen limits.u_min..u_max",
+            remedy="choose another operating point, or widen limits.u_min..u_max",
         )
     settings = RelaySettings(
         y_centre=known.y_moved + LEAD * (point.y - known.y_moved),
@@ -360,14 +360,14 @@ def _balance(oscillation: Oscillation, config: Config, known: Known, tell: Tell)
                 raise ExperimentStopped(
                     f"drowned in noise: the relay switches on noise of +-{noise_half(loop):.3g} and not on y",
                     where="find the mid-point",
-                    mend="filter the measurement at the device, or allow more swing",
+                    remedy="filter the measurement at the device, or allow more swing",
                 )
             if tries > 12:
                 raise ExperimentStopped(
                     f"asymmetric: the command is on one side for {50 + 50 * abs(asymmetry):.0f} % of the time"
                     " in spite of a corrected mid-point",
                     where="find the mid-point",
-                    mend="look for a drifting load or an actuator that answers up and down differently",
+                    remedy="look for a drifting load or an actuator that answers up and down differently",
                 )
             oscillation.move_midpoint(mean)
             oscillation.edges = edges[-1:]

@@ -149,7 +149,7 @@ def read_earlier(paths: Sequence[Path], sample_time_s: float) -> Earlier:
         try:
             recording = read_recording(path)
         except InputError as error:
-            if "two rows" in error.mend:  # killed before its second row
+            if "two rows" in error.remedy:  # killed before its second row
                 continue
             raise
         cycles = _finished(recording, len(recordings))
@@ -181,5 +181,5 @@ def _finished(recording: Recording, part: int) -> list[Cycle]:
         return [Cycle.from_table(table, part) for table in recording.metadata.get("relay", [])]
     except (KeyError, TypeError) as error:
         raise InputError(
-            f"the sidecar's relay table lacks {error}", where=recording.name, mend="begin a new run instead"
+            f"the sidecar's relay table lacks {error}", where=recording.name, remedy="begin a new run instead"
         ) from None

@@ -82,12 +82,12 @@ class DeviceOscillation(Oscillation):
         if not limits.u_min <= low <= high <= limits.u_max:
             raise ExperimentStopped(
                 f"saturated: the relay's levels {low:.4g} and {high:.4g} leave {limits.u_min:g}..{limits.u_max:g}",
-                mend="choose another operating point, or a smaller relay_amplitude",
+                remedy="choose another operating point, or a smaller relay_amplitude",
             )
         if high - low > limits.u_rate * loop.sample_time_s:
             raise ExperimentStopped(
                 f"limit reached: the relay's step of {high - low:.4g} is more than limits.u_rate allows in one sample",
-                mend='ask for a smaller relay_amplitude, or let the host run it: rig.relay = "host"',
+                remedy='ask for a smaller relay_amplitude, or let the host run it: rig.relay = "host"',
             )
         reading = self._rig.start_relay(
             in_ticks(settings, loop.sample_time_s / self._rig.tick_s, self._rig.smoothing_max),

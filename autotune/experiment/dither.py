@@ -80,7 +80,7 @@ def present_controller(rig: Rig, config: Config) -> PIDController:
     if isinstance(rig, HoldsGains):
         return rig.read_gains()
     raise InputError(
-        "the present controller is not known", where="[controller]", mend="write K and Ti_s of the loop as it is now"
+        "the present controller is not known", where="[controller]", remedy="write K and Ti_s of the loop as it is now"
     )
 
 
@@ -152,7 +152,7 @@ def run_dither(
         room = min(limits.u_max - u_hold, u_hold - limits.u_min)
         if amplitude is not None and not 0.0 < amplitude < 0.9 * room:
             raise InputError(
-                f"amplitude = {amplitude:g}", where="dither", mend=f"choose it above 0 and below {0.9 * room:.3g}"
+                f"amplitude = {amplitude:g}", where="dither", remedy=f"choose it above 0 and below {0.9 * room:.3g}"
             )
         largest = LARGEST_SHARE * room if amplitude is None else amplitude
         law = law_for(controller, limits, dt_s, largest)
@@ -195,7 +195,7 @@ def _dwell_rows(dwell_s: tuple[float, float] | None, rows: int, dt_s: float) -> 
         raise InputError(
             f"dwell times {dwell_s[0]:g} to {dwell_s[1]:g} s",
             where="dither",
-            mend="give the shortest, then the longest",
+            remedy="give the shortest, then the longest",
         )
     shortest = max(1, round(dwell_s[0] / dt_s))
     return shortest, max(shortest + 1, round(dwell_s[1] / dt_s))

@@ -67,7 +67,7 @@ class Envelope:
         """
         if not math.isfinite(u):
             raise ExperimentStopped(
-                "the command is not a number", mend="report this, it is a defect of the control law"
+                "the command is not a number", remedy="report this, it is a defect of the control law"
             )
         low, high = self._reach(u_previous)
         u = min(max(u, low), high)
@@ -88,19 +88,19 @@ class Envelope:
         limits = self.settings
         if not math.isfinite(u):
             raise ExperimentStopped(
-                "the command is not a number", mend="report this, it is a defect of the control law"
+                "the command is not a number", remedy="report this, it is a defect of the control law"
             )
         if not limits.u_min <= u <= limits.u_max:
             raise ExperimentStopped(
                 f"limit reached: the command {u:g} is outside {limits.u_min:g}..{limits.u_max:g}",
-                mend="widen limits.u_min..u_max if the rig stands it, or ask for a smaller relay_amplitude",
+                remedy="widen limits.u_min..u_max if the rig stands it, or ask for a smaller relay_amplitude",
             )
         low, high = self._reach(u_previous)
         if not low <= u <= high:
             raise ExperimentStopped(
                 f"limit reached: the command moved from {u_previous:g} to {u:g} within one sample,"
                 f" more than limits.u_rate = {limits.u_rate:g} per second allows",
-                mend="raise limits.u_rate if the rig stands it",
+                remedy="raise limits.u_rate if the rig stands it",
             )
 
     def check_measurement(self, recent: tuple[float, ...], watch: Watch, noise: float = 0.0) -> None:
@@ -126,13 +126,13 @@ class Envelope:
         if watch.afloat and not limits.y_min - slack <= y <= limits.y_max + slack:
             raise ExperimentStopped(
                 f"limit reached: y = {y:.4g} is outside y_min..y_max = {limits.y_min:g}..{limits.y_max:g}",
-                mend="look for a load on the rig, or widen limits.y_min..y_max if the rig stands it",
+                remedy="look for a load on the rig, or widen limits.y_min..y_max if the rig stands it",
             )
         if watch.y_centre is not None and abs(y - watch.y_centre) > limits.swing + slack:
             raise ExperimentStopped(
                 f"limit reached: y = {y:.4g} is more than limits.swing = {limits.swing:g}"
                 f" from the operating point {watch.y_centre:g}",
-                mend="ask for a smaller relay_amplitude, or allow more swing",
+                remedy="ask for a smaller relay_amplitude, or allow more swing",
             )
 
     def check_time(self, elapsed_s: float) -> None:
@@ -145,7 +145,7 @@ class Envelope:
         """
         if elapsed_s > self.settings.time_s:
             raise ExperimentStopped(
-                f"time over: {elapsed_s:.4g} s on the rig", mend="raise limits.time_s, or ask for fewer points"
+                f"time over: {elapsed_s:.4g} s on the rig", remedy="raise limits.time_s, or ask for fewer points"
             )
 
     def _reach(self, u_previous: float) -> tuple[float, float]:

@@ -189,7 +189,7 @@ class ControlLoop:
         except BaseException as error:
             self._leave(error)
             if isinstance(error, KeyboardInterrupt):
-                raise OperatorStop("stopped by Ctrl-C", mend="run it again when ready") from error
+                raise OperatorStop("stopped by Ctrl-C", remedy="run it again when ready") from error
             raise
         return self
 
@@ -198,12 +198,12 @@ class ControlLoop:
     ) -> None:
         self._leave(error)
         if isinstance(error, KeyboardInterrupt):  # a Ctrl-C that no handler of ours caught (not the main thread)
-            raise OperatorStop("stopped by Ctrl-C", mend="run it again when ready") from error
+            raise OperatorStop("stopped by Ctrl-C", remedy="run it again when ready") from error
         if error is None and self.metadata["ended"]["output"] != SAFE:
             raise LinkError(
                 "the safe output could not be confirmed",
                 where="hand back",
-                mend="look at the rig: its dead-man timer has to act",
+                remedy="look at the rig: its dead-man timer has to act",
             )
 
     def nearest(self, u: float) -> float:
@@ -293,7 +293,7 @@ class ControlLoop:
         return ExperimentStopped(
             f"the recording cannot be written ({error.strerror})",
             where=str(self._writer.path),
-            mend="free space on the disk; no command is sent that is not on it first",
+            remedy="free space on the disk; no command is sent that is not on it first",
         )
 
     def _write_row(self, u: float, extra: Mapping[str, float]) -> None:
@@ -313,7 +313,7 @@ class ControlLoop:
         if behind > LATE_SAMPLES:
             raise LinkError(
                 f"link too slow: {behind:.0f} samples of {step:g} s behind the schedule",
-                mend="raise signals.sample_time_s, or unload the computer or the link",
+                remedy="raise signals.sample_time_s, or unload the computer or the link",
             )
         if behind > 1.0:
             self._missed += int(behind)
@@ -327,7 +327,7 @@ class ControlLoop:
 
     def _look_for_stop(self) -> None:
         if self._stop_signal:
-            raise OperatorStop(f"stopped by {self._stop_signal}", mend="run it again when ready")
+            raise OperatorStop(f"stopped by {self._stop_signal}", remedy="run it again when ready")
 
     @property
     def _is_written(self) -> bool:

@@ -73,14 +73,14 @@ class ReadingMonitor:
                 raise (LinkError if reading.suspect else ExperimentStopped)(
                     f"{reason}, {self._bad_run} reading(s) in a row",
                     where="sensor",
-                    mend="check the sensor, its wiring and its scaling in the configuration",
+                    remedy="check the sensor, its wiring and its scaling in the configuration",
                 )
             if len(self._usable) == 100 and self._usable.count(False) > 100 * GARBLED_SHARE:
                 raise ExperimentStopped(
                     f"garbled sensor: {self._usable.count(False)} of the last 100 readings were unusable"
                     f" (last: {reason})",
                     where="sensor",
-                    mend="check the sensor's wiring and shielding",
+                    remedy="check the sensor's wiring and shielding",
                 )
             return (self.recent[-1] if self.recent else math.nan), False
         self._bad_run = 0
@@ -108,7 +108,7 @@ class ReadingMonitor:
             raise ExperimentStopped(
                 f"stale sensor: y = {reading.y:.6g} has not changed for {self._repeats} samples",
                 where="sensor",
-                mend="check that the sensor runs and that the device sends new values",
+                remedy="check that the sensor runs and that the device sends new values",
             )
 
     def _check_followed(self, reading: Reading, u: float) -> None:
@@ -118,5 +118,5 @@ class ReadingMonitor:
             raise ExperimentStopped(
                 f"the actuator does not follow: commanded {u:.4g}, the device applies {reading.u_applied:.4g}",
                 where="actuator",
-                mend="look for saturation, a stuck actuator or a wrong scaling of the output",
+                remedy="look for saturation, a stuck actuator or a wrong scaling of the output",
             )

@@ -145,7 +145,7 @@ class Oscillation:
         if not limits.u_min <= u <= limits.u_max:
             raise ExperimentStopped(
                 f"saturated: the relay's level {u:.4g} is outside {limits.u_min:g}..{limits.u_max:g}",
-                mend="choose another operating point, or a smaller relay_amplitude",
+                remedy="choose another operating point, or a smaller relay_amplitude",
             )
         switched = before not in (0, self._state.level)
         if switched:
@@ -170,13 +170,13 @@ class Oscillation:
             return ExperimentStopped(
                 f"the sensor jumps: y = {y:.4g} left the swing of {limits.swing:g} around {self.settings.y_centre:g} in"
                 " one step",
-                mend="check the sensor, its wiring and its scaling in the configuration",
+                remedy="check the sensor, its wiring and its scaling in the configuration",
             )
         if too_noisy(self.loop):
             return ExperimentStopped(
                 f"drowned in noise: y = {y:.4g} left the swing of {limits.swing:g} around {self.settings.y_centre:g},"
                 f" and noise of +-{noise_half(self.loop):.3g} hides where it is",
-                mend="filter the measurement at the device, or allow more swing",
+                remedy="filter the measurement at the device, or allow more swing",
             )
         # a relay that has turned y before, or was chosen from measured points to do so, is not simply too strong
         expected = self._foreseen or len(self.edges) > PROVEN
@@ -188,7 +188,7 @@ class Oscillation:
                 f"y does not follow the command: {y:.4g} left the swing of {limits.swing:g} around"
                 f" {self.settings.y_centre:g} at the command {level:.4g}, where it should turn (saturated, stuck or"
                 " reversed actuator, load, or sensor)",
-                mend="look at actuator and sensor, and for a load; else choose another operating point",
+                remedy="look at actuator and sensor, and for a load; else choose another operating point",
             )
         return error
 
@@ -202,12 +202,12 @@ class Oscillation:
             raise ExperimentStopped(
                 f"wrong sign: y = {y:.4g} moves away from {self.settings.y_centre:.4g} under the command that"
                 " should bring it back",
-                mend="check operating_point.plant_sign and the wiring of the actuator",
+                remedy="check operating_point.plant_sign and the wiring of the actuator",
             )
         waited = tick.t_s - self._last_switch_s
         if waited > self._patience_s:
             raise ExperimentStopped(
                 f"no oscillation: the relay has not switched for {waited:.3g} s, y = {y:.4g} stays on one side of"
                 f" {self.settings.y_centre:.4g}",
-                mend="look for a stuck actuator or a load; else check operating_point.u_guess and u_uncertainty",
+                remedy="look for a stuck actuator or a load; else check operating_point.u_guess and u_uncertainty",
             )

@@ -175,7 +175,7 @@ def predicted(points: Sequence[FrequencyPoint], plant_sign: int, phase_rad: floa
         raise IdentificationError(
             "the plant's phase at the first oscillation is not between -90 and -180 degrees",
             where="relay experiment",
-            mend="the relay with delay suits plants that lag by more than an integrator; check plant_sign and filters",
+            remedy="the relay with delay suits plants lagging by more than an integrator; check plant_sign and filters",
         )
     wanted = math.log(math.tan(-phase_rad - math.pi / 2.0))
     nearest = sorted(usable, key=lambda entry: abs(entry[1] - wanted))[:2]

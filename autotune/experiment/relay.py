@@ -45,7 +45,7 @@ class RelaySettings:
 
     def __post_init__(self) -> None:
         if not self.amplitude > 0.0:
-            raise InputError(f"amplitude = {self.amplitude:g}", where="relay", mend="it must be positive")
+            raise InputError(f"amplitude = {self.amplitude:g}", where="relay", remedy="it must be positive")
         if self.hysteresis < 0.0 or self.delay_samples < 0.0 or self.smoothing < 1:
             raise InputError("hysteresis and delay must not be negative, smoothing at least 1", where="relay")
 

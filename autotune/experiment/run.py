@@ -156,7 +156,7 @@ def wait_for_rest(loop: ControlLoop, config: Config) -> None:
             return
     raise ExperimentStopped(
         f"drifting: y still moves {patience_s:.3g} s after the safe command was set",
-        mend="wait until the plant is at rest and try again",
+        remedy="wait until the plant is at rest and try again",
     )
 
 

@@ -95,7 +95,7 @@ def sweep(
         try:
             segment = measured(cycle, loop.history(), loop.sample_time_s, known.points if known.swept else ())
         except IdentificationError as error:
-            raise ExperimentStopped(error.what, where=State.SWEEP.value, mend=error.mend) from error
+            raise ExperimentStopped(error.what, where=State.SWEEP.value, remedy=error.remedy) from error
         segments.append(segment)
         loop.note(relay=[one.to_table() for one in segments[count:]])
         known = replace(

@@ -236,7 +236,7 @@ def expected_margins(fit: PlantFit, controller: PIDController) -> Margins:
         raise DesignError(
             f"on the measured plant K = {controller.K:.4g}, T_I = {controller.Ti_s:.4g} s make no stable loop",
             where="verification",
-            mend="nothing was tried on the rig; design the controller on this rig's points",
+            remedy="nothing was tried on the rig; design the controller on this rig's points",
         )
     return expected
 

@@ -161,17 +161,17 @@ def require_class_one(points: Sequence[FrequencyPoint], sign: int, *, sigmas: fl
                 raise IdentificationError(
                     f"the gain rises {between} (a resonance): outside class (1) of the reduced models",
                     where=_WHERE,
-                    mend="design on the points themselves",
+                    remedy="design on the points themselves",
                 )
             if phase[j] - phase[i] > sigmas * math.hypot(sd[i, 1], sd[j, 1]) + 1e-9:
                 raise IdentificationError(
                     f"the phase rises {between} (lead, or a wrong sign): outside class (1) of the reduced models",
                     where=_WHERE,
-                    mend="design on the points themselves, or check for harmonics of another experiment",
+                    remedy="design on the points themselves, or check for harmonics of another experiment",
                 )
     if phase[0] + sigmas * sd[0, 1] < -0.75 * math.pi:
         raise IdentificationError(
             f"the phase at the lowest point ({points[0].omega_rad_s:.4g} rad/s) is {math.degrees(phase[0]):.1f} deg",
             where=_WHERE,
-            mend="measure where the phase is above -135 deg: a PI cannot reach 45 deg of margin otherwise",
+            remedy="measure where the phase is above -135 deg: a PI cannot reach 45 deg of margin otherwise",
         )

@@ -91,7 +91,7 @@ def fit_plant(points: Sequence[FrequencyPoint]) -> PlantFit:
     """
     if len(points) < 3:
         raise IdentificationError(
-            f"{len(points)} frequency point(s)", where="fit of the plant", mend="measure at least three frequencies"
+            f"{len(points)} frequency point(s)", where="fit of the plant", remedy="measure at least three frequencies"
         )
     ordered = sorted(points, key=lambda point: point.omega_rad_s)
     omega = np.array([point.omega_rad_s for point in ordered])

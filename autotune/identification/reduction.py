@@ -120,14 +120,16 @@ def reduce_transfer_function(plant: TransferFunction) -> ReducedModel:
     corners = corners[corners > 1e-12 * max(corners.max(initial=1.0), 1e-300)]
     scales = [*corners, *([1.0 / plant.delay_s] if plant.delay_s > 0.0 else [])]
     if not scales or plant.integrators > 1:
-        raise IdentificationError("the plant is not in class (1)", where=_WHERE, mend="give it dynamics of that class")
+        raise IdentificationError(
+            "the plant is not in class (1)", where=_WHERE, remedy="give it dynamics of that class"
+        )
     omega = np.geomspace(1e-4 * min(scales), 1e2 * max(scales), 6000)
     low = plant.response(omega[:1])[0] * (1j if plant.integrators else 1.0)
     sign = 1 if low.real > 0.0 else -1
     envelope = envelope_of_transfer_function(plant, sign, omega)
     reached = np.flatnonzero(envelope.phase_rad <= -0.75 * math.pi)
     if not reached.size:
-        raise IdentificationError("its phase never reaches -135 deg", where=_WHERE, mend="no all-pass is needed here")
+        raise IdentificationError("its phase never reaches -135 deg", where=_WHERE, remedy="no all-pass is needed here")
     falling = slice(0, int(reached[0]) + 1)
     if np.any(np.diff(envelope.gain) > 1e-9 * envelope.gain[:-1]) or np.any(
         np.diff(envelope.phase_rad[falling]) > 1e-9
@@ -135,7 +137,7 @@ def reduce_transfer_function(plant: TransferFunction) -> ReducedModel:
         raise IdentificationError(
             "gain or phase rises with frequency: outside class (1) of the reduced models",
             where=_WHERE,
-            mend="design on the plant itself",
+            remedy="design on the plant itself",
         )
     static_gain = None if plant.integrators else abs(float(plant.num[-1] / plant.den[-1]))
     G_r, omega_0r, omega_d = _by_conditions(envelope, static_gain)
@@ -252,7 +254,7 @@ def _choose(fitted: Sequence[FrequencyPoint], fit: PlantFit, kind: Kind | None) 
         raise IdentificationError(
             f"the points {found}: G_r and omega_0r of (8) are not determined by them",
             where=_WHERE,
-            mend="measure the static gain (two steady states) and give it, or use the integrating model (24)",
+            remedy="measure the static gain (two steady states) and give it, or use the integrating model (24)",
         )
     if kind is not None:
         return kind, "asked for", ()
@@ -299,7 +301,7 @@ def _require_135(points: Sequence[FrequencyPoint], fit: PlantFit) -> None:
         raise IdentificationError(
             f"the points end at {points[-1].omega_rad_s:.4g} rad/s, well before the phase reaches -135 deg",
             where=_WHERE,
-            mend="measure a point at a higher frequency (less inserted delay)",
+            remedy="measure a point at a higher frequency (less inserted delay)",
         )
 
 
@@ -323,13 +325,13 @@ def _by_conditions(
         raise IdentificationError(
             "the phase never falls below that of the lag alone: omega_d is not determined",
             where=_WHERE,
-            mend="measure points at higher frequencies",
+            remedy="measure points at higher frequencies",
         )
     if np.max(rest[use]) >= _LARGEST_REST:
         raise IdentificationError(
             "the phase near -135 deg is known too poorly for an all-pass to bound it",
             where=_WHERE,
-            mend="measure that range with more amplitude or for longer",
+            remedy="measure that range with more amplitude or for longer",
         )
     inverse = np.tan(0.5 * np.maximum(rest[use], 0.0)) / omega[use]
     return G_r, omega_0r, float(1.0 / np.max(inverse))
@@ -348,7 +350,7 @@ def _lag(envelope: Envelope, static_gain: float, known: bool) -> tuple[float, fl
         ratio = (G_r / envelope.gain) ** 2 - 1.0
         some = ratio > 1e-8
         if not some.any():
-            raise IdentificationError("the gain does not fall", where=_WHERE, mend="measure at higher frequencies")
+            raise IdentificationError("the gain does not fall", where=_WHERE, remedy="measure at higher frequencies")
         pairs.append((float(G_r), float(np.max(envelope.omega_rad_s[some] / np.sqrt(ratio[some])))))
     return min(pairs, key=lambda pair: pair[0] ** 2 * pair[1])
 

@@ -107,7 +107,9 @@ def listening(host: str, port: int) -> socket.socket:
         return socket.create_server((host, port), family=family)
     except OSError as error:
         raise InputError(
-            f"cannot be listened on ({error.strerror})", where=f"{host}:{port}", mend="give another --listen or --port"
+            f"cannot be listened on ({error.strerror})",
+            where=f"{host}:{port}",
+            remedy="give another --listen or --port",
         ) from None
 
 

@@ -35,7 +35,7 @@ def require_extra() -> None:
         With the command that installs it.
     """
     if importlib.util.find_spec("nicegui") is None:
-        raise InputError("needs nicegui", where="live page", mend="pip install 'relay-autotune[live]'")
+        raise InputError("needs nicegui", where="live page", remedy="pip install 'relay-autotune[live]'")
 
 
 class LivePage:
@@ -86,7 +86,7 @@ class LivePage:
         if not self.url:
             self.process.wait()
             raise InputError(
-                "did not start, its reason is above", where="live page", mend="give another --listen or --port"
+                "did not start, its reason is above", where="live page", remedy="give another --listen or --port"
             )
         # outside the control loop, which has a handler of its own, Abort ends the command as Ctrl-C does
         self._handler = signal.signal(ABORT, signal.default_int_handler)

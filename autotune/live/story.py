@@ -140,7 +140,7 @@ class Story:
                 event = json.loads(line)
             except ValueError:
                 raise InputError(
-                    "holds a line that is not JSON", where=str(self._folder / PROGRESS), mend="give another folder"
+                    "holds a line that is not JSON", where=str(self._folder / PROGRESS), remedy="give another folder"
                 ) from None
             self._take(event)
         self.news += len(events)

@@ -63,7 +63,7 @@ class Journal:
             raise ExperimentStopped(
                 f"the journal cannot be written ({error.strerror})",
                 where=str(self.path),
-                mend="free space on the disk; no gains are written that are not in it first",
+                remedy="free space on the disk; no gains are written that are not in it first",
             ) from error
 
     def unfinished(self) -> PIDController | None:
@@ -87,7 +87,7 @@ class Journal:
             raise InputError(
                 f"not a journal of gains ({error})",
                 where=str(self.path),
-                mend="move it away, and check the rig's gains",
+                remedy="move it away, and check the rig's gains",
             ) from None
 
 
@@ -258,9 +258,9 @@ def _take_back(rig: HoldsGains, old: PIDController, notes: Journal, error: BaseE
     """Restore the old gains after an error, and raise one of its kind that says whether they are in place."""
     try:
         restore(rig, old, notes.path)
-        state, mend = "the old gains are in place again", "check the link and the rig, and deploy again"
+        state, remedy = "the old gains are in place again", "check the link and the rig, and deploy again"
     except AutotuneError as second:
         state = f"the old gains could not be written back ({second.what}): the rig may hold old, new or mixed gains"
-        mend = "stop it; once the link is back, autotune deploy offers to restore them"
+        remedy = "stop it; once the link is back, autotune deploy offers to restore them"
     if isinstance(error, AutotuneError):
-        raise type(error)(f"{what} ({error.what}); {state}", where="hand-over of the gains", mend=mend) from error
+        raise type(error)(f"{what} ({error.what}); {state}", where="hand-over of the gains", remedy=remedy) from error

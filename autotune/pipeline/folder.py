@@ -57,7 +57,7 @@ def stored_config(folder: Path) -> Config:
         There is none.
     """
     if not (folder / CONFIG).is_file():
-        raise InputError(f"no {CONFIG}", where=str(folder), mend="give the folder of a run that autotune run began")
+        raise InputError(f"no {CONFIG}", where=str(folder), remedy="give the folder of a run that autotune run began")
     return load_config(folder / CONFIG)
 
 
@@ -81,7 +81,9 @@ def read_measured(folder: Path) -> Measured:
     points = read_points(folder / RESULT)
     experiment = _read_json(folder / RESULT).get("experiment", {})
     if not points:
-        raise InputError("the run measured no points", where=str(folder / RESULT), mend="autotune run CONFIG --resume")
+        raise InputError(
+            "the run measured no points", where=str(folder / RESULT), remedy="autotune run CONFIG --resume"
+        )
     return Measured(points=points, noise_sd=experiment.get("noise_sd"), u_rest=experiment.get("u_rest"))
 
 
@@ -100,7 +102,9 @@ def read_designed(path: Path) -> PIDController:
         Ti_s = math.inf if design["Ti_s"] is None else float(design["Ti_s"])
     except (KeyError, TypeError, ValueError):
         raise InputError(
-            "holds no K, Ti_s, Td_s, Tf_s", where=str(path), mend="give a design.json or the folder of a completed run"
+            "holds no K, Ti_s, Td_s, Tf_s",
+            where=str(path),
+            remedy="give a design.json or the folder of a completed run",
         ) from None
     return PIDController(**gains, Ti_s=Ti_s, setpoint_weight=float(design.get("setpoint_weight", 1.0)))
 
@@ -109,11 +113,11 @@ def _read_json(path: Path) -> dict[str, Any]:
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", where=str(path), mend="check the path") from None
+        raise InputError(f"cannot be read ({error.strerror})", where=str(path), remedy="check the path") from None
     except ValueError as error:
         raise InputError(f"not JSON: {error}", where=str(path)) from None
     if not isinstance(content, dict):
-        raise InputError("not a result", where=str(path), mend="give a file that autotune wrote")
+        raise InputError("not a result", where=str(path), remedy="give a file that autotune wrote")
     return content
 
 
@@ -137,11 +141,11 @@ def read_interrupted(folder: Path, config: Config) -> Earlier:
         raise InputError(
             f"the configuration is not the one that the run began with: {'; '.join(different)}",
             where=str(folder),
-            mend=f"go on with {folder / CONFIG}, or begin a new run",
+            remedy=f"go on with {folder / CONFIG}, or begin a new run",
         )
     result = _read_json(folder / RESULT) if (folder / RESULT).exists() else {}  # a killed run leaves none
     if result.get("experiment", {}).get("reason") == "completed":
-        raise InputError("the run is complete", where=str(folder), mend="autotune verify tries its controller again")
+        raise InputError("the run is complete", where=str(folder), remedy="autotune verify tries its controller again")
     return read_earlier(recordings(folder), config.signals.sample_time_s)
 
 

@@ -80,7 +80,7 @@ def analysis_page(
     analysis : Analysis
         Points, model and controller.
     notes : sequence of str
-        What was left out or mended on the way to the points.
+        What was left out or corrected on the way to the points.
     """
     figures = tuple(
         Figure(figure=recording_figure(recording, signals.u_unit, signals.y_unit), caption=recording.name)
@@ -202,7 +202,7 @@ def _summary(tuning: Tuning, signals: SignalSettings, diagnosis: Diagnosis | Non
     lines.append(
         _next_step(tuning.verification)
         if diagnosis is None or diagnosis.verdict == "none"
-        else "Next: read below why the loop differs from its prediction, and mend that or the model."
+        else "Next: read below why the loop differs from its prediction, and correct that or the model."
     )
     return tuple(lines)
 

@@ -86,7 +86,7 @@ def test_exact_points_of_the_ball_give_the_optimum_of_its_reduced_model() -> Non
     assert analysis.scaled.holds
 
 
-def test_points_that_do_not_reach_135_degrees_are_refused_with_the_mend() -> None:
+def test_points_that_do_not_reach_135_degrees_are_refused_with_the_remedy() -> None:
     with pytest.raises(IdentificationError, match="higher frequency"):
         analyse(points_of(BALL, np.array([0.1, 0.2, 0.3]), 1e-3), DesignSettings())
 

@@ -269,10 +269,10 @@ def test_old_and_new_gains_are_shown_and_an_answer_of_no_writes_nothing(line: Li
 def test_without_a_person_and_without_yes_nothing_is_done(line: Line, tmp_path: Path) -> None:
     config = config_file(line, tmp_path)
     call = ["deploy", str(config), "--controller", str(tmp_path / "new.toml")]
-    for options, mend in ((["--no-verify"], "--yes"), ([], "--points")):
+    for options, remedy in ((["--no-verify"], "--yes"), ([], "--points")):
         error = CliRunner().invoke(app, [*call, *options]).exception
         assert isinstance(error, InputError)
-        assert mend in error.mend
+        assert remedy in error.remedy
     assert line.gains == OLD
 
 

@@ -149,7 +149,7 @@ def test_a_killed_run_is_gone_on_with_from_its_folder_alone(resumed: tuple[Path,
     assert "recording-2.csv" in (out / "report.html").read_text()
 
 
-def test_what_cannot_be_gone_on_with_is_refused_with_the_mend(resumed: tuple[Path, bytes], tmp_path: Path) -> None:
+def test_what_cannot_be_gone_on_with_is_refused_with_the_remedy(resumed: tuple[Path, bytes], tmp_path: Path) -> None:
     out, _ = resumed
     calls = {
         ("--resume", out): "autotune verify",

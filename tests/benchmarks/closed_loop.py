@@ -87,7 +87,7 @@ def _open_loop(d: LoopData) -> InnovationModel:
 
 
 def parsim_k(d: LoopData) -> InnovationModel:
-    """PARSIM-K of sippy_unipi with its recommended windows."""
+    """PARSIM-K of sippy_unipi with the windows its authors advise."""
     from sippy_unipi import system_identification
 
     model = system_identification(

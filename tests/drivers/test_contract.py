@@ -146,7 +146,7 @@ def test_a_cut_link_is_an_error_and_never_a_sample(bench: Bench) -> None:
         with pytest.raises(LinkError) as caught:
             bench.rig.read()
         assert str(caught.value).count("\n") == 0
-        assert caught.value.mend
+        assert caught.value.remedy
 
 
 @pytest.mark.parametrize("bench", MOVING, indirect=True)

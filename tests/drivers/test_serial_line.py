@@ -111,7 +111,7 @@ def test_a_device_that_restarts_ends_the_session() -> None:
             bench.rig.write(0.5)
         bench.rig.make_safe()
         bench.rig.close()
-        bench.rig.open()  # a new session is the mend
+        bench.rig.open()  # a new session is the remedy
         assert math.isfinite(bench.rig.read().y)
 
 

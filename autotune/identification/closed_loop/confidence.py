@@ -111,7 +111,7 @@ def _require_information(estimate: PredictionErrorEstimate) -> None:
         raise IdentificationError(
             f"the data do not determine a model of order {estimate.model.order} "
             f"(condition of the information {estimate.condition:.1e})",
-            mend="ask for a lower --order, or excite the loop with a richer set-point or dither",
+            remedy="ask for a lower --order, or excite the loop with a richer set-point or dither",
         )
 
 

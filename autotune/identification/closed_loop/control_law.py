@@ -130,7 +130,7 @@ def discrete_laws(controller: Controller, sample_time_s: float) -> tuple[Discret
                     f"the controller's sample time is {controller.sample_time_s:g} s, the recording's "
                     f"{sample_time_s:g} s",
                     where="controller",
-                    mend="give the controller at the recording's sample time",
+                    remedy="give the controller at the recording's sample time",
                 )
             return (controller,)
         case PIDController():
@@ -141,7 +141,7 @@ def discrete_laws(controller: Controller, sample_time_s: float) -> tuple[Discret
         raise InputError(
             "a controller with dead time or more zeros than poles has no single discrete law",
             where="controller",
-            mend="give num, den and sample_time_s of the law as it runs",
+            remedy="give num, den and sample_time_s of the law as it runs",
         )
     laws = []
     for method in _METHODS:

@@ -178,7 +178,7 @@ def _fitted(
         choice = choose_order(u, y, max_order=max_order, progress=progress)
         return choice.estimate, choice.evidence
     if order < 1 or (delay or 0) < 0:
-        raise InputError(f"order {order}, delay {delay}", mend="the order is at least 1, the dead time at least 0")
+        raise InputError(f"order {order}, delay {delay}", remedy="the order is at least 1, the dead time at least 0")
     progress(f"order {order}")
     return fixed_order(u, y, order, delay=delay or 0), ()
 
@@ -217,7 +217,7 @@ def usable_stretch(recording: Recording) -> tuple[Recording, tuple[str, ...]]:
         raise IdentificationError(
             f"the record is too short: {len(rows)} equidistant rows{cut}",
             where=recording.name,
-            mend=f"record at least {_FEWEST_ROWS} rows, better a thousand, with the set-point or a dither moving",
+            remedy=f"record at least {_FEWEST_ROWS} rows, better a thousand, with the set-point or a dither moving",
         )
     warnings = []
     t = recording.t[rows]
@@ -242,7 +242,7 @@ def _columns(recording: Recording) -> tuple[FloatArray, FloatArray, FloatArray |
     for name, values in (("u", recording.u), ("y", recording.y)):
         if np.ptp(values) <= 1e-12 * max(1.0, float(np.max(np.abs(values)))):
             raise IdentificationError(
-                f"{name} does not move", where=recording.name, mend="move the set-point or add a dither"
+                f"{name} does not move", where=recording.name, remedy="move the set-point or add a dither"
             )
     r = recording.extra.get("r")
     return recording.u, recording.y, r if r is not None and np.all(np.isfinite(r)) else None
@@ -266,7 +266,7 @@ def _checked_law(
             f"the controller file contradicts the data: {100 * left:.0f} % of the command's motion does not "
             f"come from this law (at most {100 * CONTRADICTION:.0f} % may){hint}",
             where=recording.name,
-            mend="mend the file, or leave --controller away: the plant is identified without it",
+            remedy="correct the file, or leave --controller away: the plant is identified without it",
         )
     if left > CONTRADICTION / 5.0:
         warnings.append(f"the controller file leaves {100 * left:.1f} % of the command's motion unexplained")

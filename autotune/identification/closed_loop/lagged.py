@@ -90,7 +90,7 @@ def lagged_factor(signals: Sequence[tuple[FloatArray, Sequence[int]]]) -> tuple[
     if end - start < width:
         raise IdentificationError(
             f"the record is too short: {max(end - start, 0)} usable rows for {width} lagged columns",
-            mend="record longer, or ask for a lower order",
+            remedy="record longer, or ask for a lower order",
         )
     R = np.zeros((0, width))
     step = max(BLOCK_ROWS, 4 * width)

@@ -87,7 +87,7 @@ def require_excitation(motion: float, *, r_recorded: bool, r_moves: bool, where:
         f"u is not persistently exciting: it follows from past u and y alone (all but {motion:.1e} of it), "
         f"and {reason}, so plant and inverse controller cannot be told apart",
         where=where,
-        mend="move the set-point or add a dither to the command while recording",
+        remedy="move the set-point or add a dither to the command while recording",
     )
 
 

@@ -167,7 +167,7 @@ def choose_order(
     if not fits:
         raise IdentificationError(
             f"no model of order 1 to {max(highest, 1)} could be fitted to {cut} rows",
-            mend="record longer and excite the loop more",
+            remedy="record longer and excite the loop more",
         )
     best = _parsimonious(fits)
     for delay in range(1, _dead_time(data, cut) + 1):

@@ -215,7 +215,7 @@ def _search(
         if len(y) * n_y <= directions.shape[1]:
             raise IdentificationError(
                 f"the record is too short: {len(y)} rows for {directions.shape[1]} parameters",
-                mend="record longer, or ask for a lower order",
+                remedy="record longer, or ask for a lower order",
             )
         total = whitened_equations(predictor, directions, u, y, errors, phi)
         used = directions.shape[1] - (n_y if offset and not constant else 0)

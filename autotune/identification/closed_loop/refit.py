@@ -1,4 +1,4 @@
-"""B and D again, from the prediction errors: the mend for methods that estimate A, C and K well and B badly."""
+"""B and D again, from the prediction errors: the remedy for methods that estimate A, C and K well and B badly."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def refit_inputs(model: InnovationModel, u: FloatArray, y: FloatArray, *, feedth
     Parameters
     ----------
     model : InnovationModel
-        A, C and K are kept (K is mended first where its predictor is not stable).
+        A, C and K are kept (K is replaced first where its predictor is not stable).
     u, y : (N, n_u), (N, n_y) arrays
         Command and measurement, zero mean.
     feedthrough : bool

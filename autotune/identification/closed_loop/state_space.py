@@ -192,7 +192,7 @@ def feedback(plant: InnovationModel, controller: InnovationModel) -> InnovationM
     B, C, D, Dc = plant.B, plant.C, plant.D, controller.D
     loop = np.eye(D.shape[0]) + D @ Dc
     if np.linalg.cond(loop) > 1e12:
-        raise IdentificationError("the loop is not well posed", where="feedback", mend="let D or D_c be zero")
+        raise IdentificationError("the loop is not well posed", where="feedback", remedy="let D or D_c be zero")
     M = np.linalg.inv(loop)
     # y = M (C x + D C_c x_c + D r + e), with x_c driven by -y as in (3): C_c x_c of the plain C(q) has the other sign
     Cy, Dr = np.asarray(M @ np.hstack([C, -D @ controller.C]), dtype=np.float64), M @ D

@@ -182,7 +182,7 @@ def regress_system(
 
 
 def with_stable_predictor(model: InnovationModel) -> InnovationModel:
-    """Return the model with a Kalman gain whose predictor is stable: the same noise spectrum, spectral factor mended.
+    """Return the model with a Kalman gain whose predictor is stable: the same spectrum, its factor made stable.
 
     Where no such gain is found (a pole on the unit circle that the noise does not reach) a little noise on every
     state is supposed.
@@ -199,10 +199,10 @@ def with_stable_predictor(model: InnovationModel) -> InnovationModel:
         except (np.linalg.LinAlgError, ValueError):
             continue
         gain = (model.A @ P @ model.C.T + K @ sigma) @ np.linalg.inv(model.C @ P @ model.C.T + sigma)
-        mended = replace(model, K=np.asarray(gain, dtype=np.float64))
-        if mended.predictor_radius < 0.9995:
-            return mended
-    raise IdentificationError("the start has no stable predictor", mend="ask for another --order")
+        stable = replace(model, K=np.asarray(gain, dtype=np.float64))
+        if stable.predictor_radius < 0.9995:
+            return stable
+    raise IdentificationError("the start has no stable predictor", remedy="ask for another --order")
 
 
 def pbsid_opt(

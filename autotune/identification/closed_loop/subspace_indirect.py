@@ -118,7 +118,7 @@ def indirect_subspace(
     M11 = M.block(0, 0)
     if np.min(np.abs(np.diag(M11))) <= _RANK * np.max(np.abs(np.diag(M11))):
         raise IdentificationError(
-            f"r is not persistently exciting of order {f}", mend="excite the loop with noise or many frequencies"
+            f"r is not persistently exciting of order {f}", remedy="excite the loop with noise or many frequencies"
         )
     # steps 1 and 2: first projection O_cl = M32 N2', its SVD (8)
     U_1, s_cl, V_1t = np.linalg.svd(M.block(2, 1), full_matrices=True)
@@ -299,7 +299,7 @@ def controller_markov_parameters(
     if order >= count * n_u:
         raise IdentificationError(
             "u - r is not a linear function of past y: no controller of moderate order explains it",
-            mend="check that r is the signal added to the command, or give the controller file",
+            remedy="check that r is the signal added to the command, or give the controller file",
         )
     free = U[:, order:].T
     return -markov_from_null_space(free, free @ M.block(2, 0), M.block(0, 0), n_u=n_y, n_y=n_u), order

@@ -99,16 +99,16 @@ def prepare(
     used = recording.t >= y_from
     if not used.any():
         raise InputError(
-            f"no row from t = {start_s:g} s on", where=recording.name, mend=f"it ends at {recording.t[-1]:g} s"
+            f"no row from t = {start_s:g} s on", where=recording.name, remedy=f"it ends at {recording.t[-1]:g} s"
         )
     if skip_missing:
         used &= np.isfinite(recording.y)
         if not used.any():
-            raise IdentificationError("no row has a y", where=recording.name, mend="check the sensor and the link")
+            raise IdentificationError("no row has a y", where=recording.name, remedy="check the sensor and the link")
     replace(recording, y=np.where(used, recording.y, 0.0)).require_finite(("y",))
     hold = hold if hold is not None else recording.metadata.get("hold", "zero")
     if hold not in ("zero", "linear"):
-        raise InputError(f"hold = {hold!r}", where=recording.name, mend='it is "zero" or "linear"')
+        raise InputError(f"hold = {hold!r}", where=recording.name, remedy='it is "zero" or "linear"')
     t = _snapped(recording)
     _require_no_gap(recording)
     ty, y = t[used], recording.y[used]
@@ -144,7 +144,7 @@ def _require_no_gap(recording: Recording) -> None:
         raise IdentificationError(
             f"a gap of {steps[row]:.3g} s after t = {recording.t[row]:g} s, where u is not known",
             where=recording.name,
-            mend="cut the recording there, or fill the rows with the input that acted",
+            remedy="cut the recording there, or fill the rows with the input that acted",
         )
 
 
@@ -154,14 +154,14 @@ def _require_motion(u: FloatArray, y: FloatArray, name: str) -> None:
         raise IdentificationError(
             f"the input is constant (u = {u[0]:g}): neither gain nor delay show",
             where=name,
-            mend="move u: a step, a relay, or a set-point change in closed loop",
+            remedy="move u: a step, a relay, or a set-point change in closed loop",
         )
     if np.ptp(y) <= scale * max(1.0, float(np.max(np.abs(y)))):
         what = "zero" if y[0] == 0.0 else f"constant (y = {y[0]:g})"
         raise IdentificationError(
             f"the output is {what} although u moves: nothing to identify",
             where=name,
-            mend="check the sensor and the actuator, or move u further than the sensor's resolution",
+            remedy="check the sensor and the actuator, or move u further than the sensor's resolution",
         )
 
 

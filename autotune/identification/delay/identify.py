@@ -117,7 +117,7 @@ def identify_delay(
     """
     say = progress if progress is not None else lambda _: None
     if not 1 <= order <= MAX_ORDER:
-        raise InputError(f"order {order}", where="order", mend=f"orders 1 to {MAX_ORDER} are supported")
+        raise InputError(f"order {order}", where="order", remedy=f"orders 1 to {MAX_ORDER} are supported")
     structure = Structure(order=order, integrator=integrator, offset=offset)
     data = prepare(
         recording, hold=hold, past_input=past_input, start_s=start_s, offset=offset, skip_missing=skip_missing
@@ -149,7 +149,7 @@ def _largest_delay(data: DelayData, max_delay_s: float | None) -> float:
         raise InputError(
             f"largest delay {max_delay_s:g} s lies outside the record of {reach:.4g} s",
             where=data.name,
-            mend=f"give --max-delay between 0 and {reach:.4g}, or record longer",
+            remedy=f"give --max-delay between 0 and {reach:.4g}, or record longer",
         )
     return max_delay_s
 
@@ -174,7 +174,7 @@ def _best_on_common_rows(data: DelayData, structure: Structure, candidates: list
         raise IdentificationError(
             f"no model of order {structure.order} explains the record with a finite response",
             where=data.name,
-            mend="an unstable plant needs a recording in closed loop that is short against its growth",
+            remedy="an unstable plant needs a recording in closed loop that is short against its growth",
         )
     return best
 
@@ -230,7 +230,7 @@ def _require_inside(data: DelayData, model: DelayModel, largest: float) -> None:
         raise IdentificationError(
             f"the delay lies at or beyond the largest one considered, {largest:.4g} s",
             where=data.name,
-            mend="give a larger --max-delay, and a record several times as long as the delay",
+            remedy="give a larger --max-delay, and a record several times as long as the delay",
         )
 
 
@@ -260,7 +260,7 @@ def _require_order(data: DelayData, structure: Structure, best: Point, model: De
                 f"the record does not determine order {structure.order}: order {lower.order} with a delay of "
                 f"{fitted.h:.3g} s explains it as well",
                 where=data.name,
-                mend=f"ask for --order {lower.order}, move u further and faster, or record relay cycles at two more "
+                remedy=f"ask for --order {lower.order}, move u further and faster, or record relay cycles at two more "
                 "inserted delays",
             )
 
@@ -274,8 +274,8 @@ def _undetermined(data: DelayData, model: DelayModel, largest: float, why: str) 
         f"delay {model.delay_s:.3g} +- {1.96 * model.standard_deviations[n + 1]:.2g} s of at most {largest:.4g} s)"
         f"{excites}",
         where=data.name,
-        mend="ask for a lower order, move u further, or add a step or relay cycles at two more inserted delays; where "
-        "the delay may be longer, give --max-delay and a longer record",
+        remedy="ask for a lower order, move u further, or add a step or relay cycles at two more inserted delays; "
+        "where the delay may be longer, give --max-delay and a longer record",
     )
 
 
@@ -283,5 +283,5 @@ def _too_short(data: DelayData, structure: Structure) -> IdentificationError:
     return IdentificationError(
         f"too few rows of y after the delay for {structure.parameters} parameters",
         where=data.name,
-        mend="record longer than the delay, or say what u was before the record (--past-input)",
+        remedy="record longer than the delay, or say what u was before the record (--past-input)",
     )

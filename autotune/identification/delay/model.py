@@ -123,12 +123,12 @@ def read_delay_model(path: str | os.PathLike[str]) -> DelayModel:
         diagonal = np.array([*sd, *[0.0] * (1 + len(a))], dtype=np.float64) ** 2
         covariance = np.array(content.get("covariance", np.diag(diagonal)), dtype=np.float64)
     except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", where=where, mend="check the path") from None
+        raise InputError(f"cannot be read ({error.strerror})", where=where, remedy="check the path") from None
     except (ValueError, KeyError, TypeError, IndexError):
         raise InputError(
             "is not a delay file with order, a, b, delay_s, initial_state, sd",
             where=where,
-            mend="write it with autotune identify delay",
+            remedy="write it with autotune identify delay",
         ) from None
     if not a or covariance.shape != (2 * len(a) + 3,) * 2 or not np.all(np.isfinite((*a, b, delay_s))):
         raise InputError("a, b, delay_s and sd do not belong together", where=where)

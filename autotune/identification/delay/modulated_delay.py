@@ -114,7 +114,7 @@ def modulated_delay(
             f"{len(intervals)} intervals, of which {_inside(recording, intervals, 0.0).sum()} within the record, for "
             f"{unknowns} unknowns",
             where="intervals",
-            mend="give more intervals",
+            remedy="give more intervals",
         )
     if exact and isinstance(window, SinePower):
         Y, of_input = _by_fourier_sums(recording, window, order, intervals, linear)
@@ -280,7 +280,7 @@ def _leaves_the_record(recording: Recording, h: float) -> IdentificationError:
     return IdentificationError(
         f"with a delay of {h:.4g} s the intervals leave the record",
         where=recording.name,
-        mend="start nearer to the delay, take shorter intervals, or use identify_delay, which needs no start",
+        remedy="start nearer to the delay, take shorter intervals, or use identify_delay, which needs no start",
     )
 
 

@@ -45,7 +45,7 @@ class SinePower:
             m is odd: the family of its shifts is not the cosines' and sines' of whole periods.
         """
         if self.m % 2:
-            raise InputError(f"sin^{self.m}", where="window", mend="the exact shift needs an even power")
+            raise InputError(f"sin^{self.m}", where="window", remedy="the exact shift needs an even power")
         half = self.m // 2
         terms = [(math.comb(self.m, half) / 2.0**self.m, 0.0)]
         for q in range(1, half + 1):
@@ -84,5 +84,5 @@ def require_window(window: Window, order: int) -> None:
     """
     if window.m < order:
         raise InputError(
-            f"window of power {window.m} for order {order}", where="window", mend=f"take a power of at least {order}"
+            f"window of power {window.m} for order {order}", where="window", remedy=f"take a power of at least {order}"
         )

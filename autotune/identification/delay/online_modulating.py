@@ -124,7 +124,7 @@ def follow(
         raise IdentificationError(
             f"the delay estimate left the record at t = {recording.t[lost]:g} s: lock was lost",
             where=recording.name,
-            mend="start nearer to the delay, later, or with a lower rate; identify_delay finds a start",
+            remedy="start nearer to the delay, later, or with a lower rate; identify_delay finds a start",
         )
     filled = recording.t - recording.t[0] > (order + 2) / forgetting + 10.0 * recording.sample_time_s
     state[~filled] = np.nan

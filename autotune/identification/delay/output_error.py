@@ -304,7 +304,7 @@ def polish(
         raise IdentificationError(
             f"{data.ty.size} rows of y remain for {structure.parameters} parameters",
             where=data.name,
-            mend="record longer than the delay, or say what u was before the record",
+            remedy="record longer than the delay, or say what u was before the record",
         )
     point = minimise(
         data, structure, solve_linear(data, structure, start.a, start.h), max_delay_s=max_delay_s, iterations=50
@@ -346,5 +346,5 @@ def _singular(data: DelayData, structure: Structure, information: FloatArray) ->
     return IdentificationError(
         f"the record does not determine order {n}: {', '.join(worst)} cannot be told apart",
         where=data.name,
-        mend="ask for a lower order, or excite more frequencies: a step, or relay cycles at two more inserted delays",
+        remedy="ask for a lower order, or excite more frequencies: a step, or relay cycles at two more inserted delays",
     )

@@ -127,7 +127,7 @@ def search(data: DelayData, structure: Structure, *, max_delay_s: float) -> list
         raise IdentificationError(
             f"no delay up to {max_delay_s:g} s gives a model of order {structure.order} with a finite response",
             where=data.name,
-            mend="give a larger --max-delay, a longer record, or a lower order",
+            remedy="give a larger --max-delay, a longer record, or a lower order",
         )
     return found
 

@@ -97,7 +97,7 @@ def track(
         raise InputError(
             f"window {window_s:g} s every {every_s:g} s on a record of {end - begin:.4g} s",
             where=recording.name,
-            mend="give positive times and a window shorter than the record",
+            remedy="give positive times and a window shorter than the record",
         )
     largest = 0.5 * window_s if max_delay_s is None else max_delay_s
     last: DelayModel | None = None

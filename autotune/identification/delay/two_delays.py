@@ -70,7 +70,7 @@ def two_delays(
     """
     lengths = np.array([T_2 - T_1 for T_1, T_2 in intervals])
     if lengths.size < 4 or np.ptp(lengths) > 1e-9 * lengths.max():
-        raise InputError(f"{lengths.size} intervals", where="intervals", mend="give at least four, all of one length")
+        raise InputError(f"{lengths.size} intervals", where="intervals", remedy="give at least four, all of one length")
     recording.require_finite()
     L = float(lengths[0])
     s = np.linspace(0.0, 1.0, max(64, round(L / recording.sample_time_s)) + 1)
@@ -92,7 +92,7 @@ def two_delays(
         matrix = np.column_stack([u @ f, u @ sine, -(x @ f), -(x @ sine)])
         b, b_sine, a, a_sine = np.linalg.lstsq(matrix, target, rcond=None)[0]
         if a == 0.0 or b == 0.0:
-            raise IdentificationError("a gain vanishes", where=recording.name, mend="the record excites too little")
+            raise IdentificationError("a gain vanishes", where=recording.name, remedy="the record excites too little")
         steps = np.arctan([a_sine / a, b_sine / b]) / omega  # the arctangent keeps a step below a quarter of L
         h1, h2 = h1 + float(steps[0]), h2 + float(steps[1])
         if np.max(np.abs(steps)) < 1e-7 * L:
@@ -108,6 +108,6 @@ def _shifted(recording: Recording, values: FloatArray, starts: FloatArray, offse
         raise IdentificationError(
             f"with a delay of {h:.4g} s the intervals leave the record",
             where=recording.name,
-            mend="start nearer to the delays or take shorter intervals",
+            remedy="start nearer to the delays or take shorter intervals",
         )
     return np.interp(at, recording.t, values)

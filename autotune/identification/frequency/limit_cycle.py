@@ -103,7 +103,7 @@ def relay_edges(t: FloatArray, u: FloatArray) -> RelayEdges:
     largest = float(increments.max())
     scale = float(np.max(np.abs(u))) if u.size else 0.0
     if largest <= 1e-9 * max(scale, 1e-300):
-        raise IdentificationError("the command never switches", where="limit cycle", mend="record a relay experiment")
+        raise IdentificationError("the command never switches", where="limit cycle", remedy="record a relay experiment")
     jump = float(np.median(increments[increments > 0.5 * largest]))
     times, rising = _switches(t, u, jump)
     if times.size:
@@ -117,7 +117,7 @@ def relay_edges(t: FloatArray, u: FloatArray) -> RelayEdges:
             raise IdentificationError(
                 "the command is not a relay's: it has more than two levels",
                 where="limit cycle",
-                mend="cut the segment to one relay setting, or use the estimate for other excitations",
+                remedy="cut the segment to one relay setting, or use the estimate for other excitations",
             )
     return RelayEdges(times_s=times, rising=rising, jump=jump)
 
@@ -141,6 +141,6 @@ def whole_periods(edges: RelayEdges, end_s: float) -> WholePeriods:
         raise IdentificationError(
             f"{edges.times_s.size} switches make fewer than two whole periods",
             where="limit cycle",
-            mend="record at least two whole periods at one relay setting, better three",
+            remedy="record at least two whole periods at one relay setting, better three",
         )
     return best

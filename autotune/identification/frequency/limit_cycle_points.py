@@ -149,7 +149,7 @@ def _orders(window: WholePeriods, t: FloatArray, good: BoolArray, highest: int) 
         raise IdentificationError(
             f"{per_period:.1f} samples per period of {window.period_s:g} s are too few",
             where="limit cycle",
-            mend="sample faster, or add delay to the relay so that it oscillates more slowly",
+            remedy="sample faster, or add delay to the relay so that it oscillates more slowly",
         )
     return tuple(range(1, max(3, min(highest, int(0.4 * per_period))) + 1))
 
@@ -229,7 +229,7 @@ def _points(
             raise IdentificationError(
                 f"the oscillation of y at {omega[0]:.4g} rad/s is drowned in noise of sd {noise.sd:.3g}",
                 where="limit cycle",
-                mend="raise the relay's amplitude or record more periods",
+                remedy="raise the relay's amplitude or record more periods",
             )
         points.append(
             FrequencyPoint(

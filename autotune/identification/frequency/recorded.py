@@ -43,7 +43,7 @@ class FrequencyEstimate:
     cycles : tuple of LimitCycle
         The limit cycles, where it was a relay's.
     notes : tuple of str
-        What was left out or mended, and why.
+        What was left out or corrected, and why.
     """
 
     points: tuple[FrequencyPoint, ...]
@@ -82,7 +82,7 @@ def frequency_points(recording: Recording, *, largest_relative_sd: float = 0.5) 
     recording.require_finite(("u",))
     if np.ptp(recording.u) <= 1e-12 * max(float(np.max(np.abs(recording.u))), 1e-300):
         raise IdentificationError(
-            "the command never changes", where=recording.name, mend="record an experiment that moves u"
+            "the command never changes", where=recording.name, remedy="record an experiment that moves u"
         )
     segments = relay_segments(recording)
     if sum(end - start for start, end in segments) >= _RELAY_PART * recording.duration_s or (
@@ -109,14 +109,16 @@ def _of_relay(
     points = sorted((point for cycle in cycles for point in cycle.points), key=lambda point: point.omega_rad_s)
     if not points:
         raise IdentificationError(
-            "no relay oscillation gave a point", where=recording.name, mend=notes[0] if notes else "record longer"
+            "no relay oscillation gave a point", where=recording.name, remedy=notes[0] if notes else "record longer"
         )
     return FrequencyEstimate(points=tuple(points), excitation="relay", cycles=tuple(cycles), notes=tuple(notes))
 
 
 def _of_spectra(recording: Recording, largest_relative_sd: float) -> FrequencyEstimate:
     if len(recording) < 4 * _LEAST_LINES:
-        raise IdentificationError(f"{len(recording)} rows are too few", where=recording.name, mend="record for longer")
+        raise IdentificationError(
+            f"{len(recording)} rows are too few", where=recording.name, remedy="record for longer"
+        )
     y, bad = clean_measurement(recording.t, recording.y, recording.name)
     t, u = recording.t, recording.u
     r = _moving_setpoint(recording)
@@ -145,7 +147,7 @@ def _of_spectra(recording: Recording, largest_relative_sd: float) -> FrequencyEs
         )
     if not kept:
         raise IdentificationError(
-            "no frequency stands above the noise", where=recording.name, mend="excite more strongly or for longer"
+            "no frequency stands above the noise", where=recording.name, remedy="excite more strongly or for longer"
         )
     return FrequencyEstimate(points=kept, excitation=kind, notes=tuple(notes))
 

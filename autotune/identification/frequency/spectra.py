@@ -67,7 +67,7 @@ def clean_measurement(t: FloatArray, y: FloatArray, name: str) -> tuple[FloatArr
         raise IdentificationError(
             f"{bad} of {y.size} samples of y are missing or wild",
             where=name,
-            mend="mend the sensor or its wiring and record again",
+            remedy="repair the sensor or its wiring and record again",
         )
     return (np.interp(t, t[good], y[good]) if bad else y), bad
 

@@ -213,7 +213,7 @@ def test_margins_out_of_reach_are_answered_with_the_nearest_reachable_ones() -> 
     fast = TransferFunction(num=(1.0,), den=(1.0, -1.0), delay_s=0.4)
     with pytest.raises(DesignError, match="nearest that one reaches is M_m") as caught:
         design(fast, spec2(100.0))
-    words = caught.value.mend.split()
+    words = caught.value.remedy.split()
     modulus, phase = float(words[words.index("M_m") + 1].rstrip(",")), float(words[-2])
     assert modulus < 0.8
     # what the message names can be had, to the digits it prints

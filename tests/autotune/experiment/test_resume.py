@@ -34,7 +34,7 @@ run_experiment(ball_rig(seed=7), ball_config(), sys.argv[1], on_progress=kill_in
 
 def stop_in_the_third_setting(progress: Progress) -> None:
     if len(progress.points) == 2:
-        raise OperatorStop("stopped by the test", mend="resume")
+        raise OperatorStop("stopped by the test", remedy="resume")
 
 
 @pytest.fixture(scope="module")

@@ -159,7 +159,7 @@ def test_every_fault_has_its_verdict_ends_safe_and_keeps_the_recording(verdict: 
         run_experiment(rig, ball_config(), tmp_path / "r.csv")
     assert stop.value.exit_status == 3
     assert "\n" not in str(stop.value)
-    assert stop.value.mend
+    assert stop.value.remedy
     assert rig.command == 0.0
     recording = read_recording(tmp_path / "r.csv")
     assert recording.u[-1] == 0.0

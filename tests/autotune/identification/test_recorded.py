@@ -136,7 +136,7 @@ def test_recordings_that_agree_are_merged_and_a_plant_that_changed_is_said() -> 
     assert changed.points[0].covariance[0][0] > same.points[0].covariance[0][0]
 
 
-def test_gaps_and_spikes_in_y_are_mended_and_said() -> None:
+def test_gaps_and_spikes_in_y_are_filled_and_said() -> None:
     rng = np.random.default_rng(4)
     recording = open_loop(random_binary(rng, 10), rng)
     y = recording.y.copy()

@@ -83,7 +83,7 @@ def test_the_browser_is_told_to_load_nothing_from_elsewhere() -> None:
     assert "http" not in policy
 
 
-def test_an_address_that_cannot_be_listened_on_is_refused_with_the_mend() -> None:
+def test_an_address_that_cannot_be_listened_on_is_refused_with_the_remedy() -> None:
     with listening("127.0.0.1", 0) as taken:
         taken.listen()
         with pytest.raises(InputError, match="another --listen or --port"):

@@ -90,7 +90,7 @@ def test_a_listener_hears_everything_and_the_file_only_what_changed(tmp_path: Pa
 
 def test_the_reason_for_the_end_is_told_by_whatever_ends_it(tmp_path: Path) -> None:
     with pytest.raises(ExperimentStopped), RunLog(tmp_path / "progress.jsonl"):
-        raise ExperimentStopped("limit reached", mend="look")
+        raise ExperimentStopped("limit reached", remedy="look")
     with pytest.raises(KeyboardInterrupt), RunLog(tmp_path / "progress.jsonl"):
         raise KeyboardInterrupt
     ends = [json.loads(line) for line in (tmp_path / "progress.jsonl").read_text().splitlines()]
