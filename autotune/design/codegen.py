@@ -64,7 +64,7 @@ VAR_OUTPUT
     U : LREAL;
 END_VAR
 VAR
-    INTEGRAL : LREAL;
+    I_PART : LREAL;
     Y_FILTERED : LREAL;
     Y_F : LREAL;
     V : LREAL;
@@ -72,14 +72,14 @@ END_VAR
 IF HOLD THEN
     U := LIMIT({u_min}, U_HELD, {u_max});
     Y_FILTERED := Y;
-    INTEGRAL := U - {K} * ({b} * R - Y) - {slope} * (R - Y);
+    I_PART := U - {K} * ({b} * R - Y) - {slope} * (R - Y);
 ELSE
     Y_F := Y_FILTERED + {alpha} * (Y - Y_FILTERED);
-    INTEGRAL := INTEGRAL + {slope} * (R - Y_F);
-    V := {K} * ({b} * R - Y_F) + INTEGRAL - {D} * (Y_F - Y_FILTERED);
+    I_PART := I_PART + {slope} * (R - Y_F);
+    V := {K} * ({b} * R - Y_F) + I_PART - {D} * (Y_F - Y_FILTERED);
     U := LIMIT(U - {move}, V, U + {move});
     U := LIMIT({u_min}, U, {u_max});
-    INTEGRAL := INTEGRAL + {tracking} * (U - V);
+    I_PART := I_PART + {tracking} * (U - V);
     Y_FILTERED := Y_F;
 END_IF;
 END_FUNCTION_BLOCK
