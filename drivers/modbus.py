@@ -13,6 +13,7 @@ What can go wrong, and what is done about it:
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import socket
 import ssl
@@ -29,15 +30,9 @@ from pymodbus.pdu import ModbusPDU
 
 from autotune.config.rig import AnyModbusSettings, ModbusRtuSettings, ModbusTcpSettings, ModbusTlsSettings
 from autotune.errors import InputError, LinkError
+from drivers.line_errors import LINE_ERRORS, line_errors
 from drivers.registers import Block
-
-_LINE_ERRORS: tuple[type[Exception], ...] = (OSError,)
-try:
-    import termios
-
-    _LINE_ERRORS += (termios.error,)  # raised for line settings that the device refuses; it is no OSError
-except ImportError:  # there is none outside POSIX
-    pass
+from drivers.session_lock import SessionLock
 
 # the library logs what is raised here anyway; without a handler Python would print it
 logging.getLogger("pymodbus").addHandler(logging.NullHandler())
@@ -53,6 +48,8 @@ _EXCEPTIONS = {
     11: ("does not answer its gateway", "check unit_id and the gateway"),
 }
 _BUSY = (5, 6)
+#: what the library raises where the line is gone, beside the line's own errors
+_LOST = (ConnectionException,)
 _READ = {
     "coil": (1, "read_coils"),
     "discrete": (2, "read_discrete_inputs"),
@@ -76,16 +73,16 @@ class _TcpClient(ModbusTcpClient):
         if self.socket is not None:
             return True
         address = (self.comm_params.host, self.comm_params.port)
+        plain = socket.create_connection(address, timeout=self.comm_params.timeout_connect)
         try:
-            plain = socket.create_connection(address, timeout=self.comm_params.timeout_connect)
             plain.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        except OSError as error:
-            raise ConnectionException(error.strerror or str(error)) from None
-        try:
             self.socket = self.tls.wrap_socket(plain, server_hostname=self.server_name) if self.tls else plain
-        except OSError as error:  # an SSLError is one
+        except ssl.SSLError as error:
             plain.close()
             raise ConnectionException(f"TLS: {error}") from None
+        except BaseException:
+            plain.close()
+            raise
         return True
 
 
@@ -96,29 +93,23 @@ class _RtuClient(ModbusSerialClient):
         """Open the serial device; return whether it is open."""
         if self.socket is None:
             settings = self.comm_params
-            try:
-                self.socket = serial.Serial(
-                    settings.host,
-                    baudrate=settings.baudrate,
-                    parity=settings.parity,
-                    stopbits=settings.stopbits,
-                    timeout=settings.timeout_connect,
-                    write_timeout=settings.timeout_connect,
-                    exclusive=True,
-                )
-            except _LINE_ERRORS as error:
-                raise ConnectionException(str(error)) from None
+            self.socket = serial.Serial(
+                settings.host,
+                baudrate=settings.baudrate,
+                parity=settings.parity,
+                stopbits=settings.stopbits,
+                timeout=settings.timeout_connect,
+                write_timeout=settings.timeout_connect,
+                exclusive=True,
+            )
         return True
 
     def recv(self, size: int | None) -> bytes:
         """Return what has come, at the latest after the time-out nothing."""
         if self.socket is None:
             raise ConnectionException("the line is closed")
-        try:
-            first = bytes(self.socket.read(1))
-            return first + bytes(self.socket.read(self.socket.in_waiting)) if first else first
-        except OSError as error:
-            raise ConnectionException(str(error)) from None
+        first = bytes(self.socket.read(1))
+        return first + bytes(self.socket.read(self.socket.in_waiting)) if first else first
 
 
 class ModbusLink:
@@ -128,10 +119,13 @@ class ModbusLink:
     ----------
     settings : ModbusTcpSettings, ModbusTlsSettings or ModbusRtuSettings
         Transport, unit id, time-outs.
+    exclusive : bool
+        Whether no other session of this computer may have the device meanwhile; not needed by who only reads.
     """
 
-    def __init__(self, settings: AnyModbusSettings) -> None:
+    def __init__(self, settings: AnyModbusSettings, *, exclusive: bool = True) -> None:
         self._settings = settings
+        self._lock = SessionLock(self.where, exclusive=exclusive)
         self._unit = settings.unit_id
         self._client: _TcpClient | _RtuClient | None = None
         self._is_clean = False  # whether nothing but the next answer can come
@@ -161,23 +155,30 @@ class ModbusLink:
         """
         if self._client is None:
             self._client = _client(self._settings)
+        is_new, is_first = self._client.socket is None, self._lock.take()
         try:
-            if not self._client.connect():
-                raise ConnectionException("cannot be opened")
-        except ConnectionException as error:
-            raise LinkError(
-                f"no connection ({_words(error)})", where=self.where, remedy="check address, cable and power"
-            ) from None
+            with line_errors(self.where, "no connection", "check address, cable and power", also=_LOST):
+                self._client.connect()
+        except LinkError:
+            if is_first:
+                self._lock.give_back()
+            raise
+        if is_new:  # on a connection that is made now nothing earlier can come; a serial line carries what it carried
+            self._is_clean = isinstance(self._client, _TcpClient)
 
     def disconnect(self) -> None:
-        """Disconnect; may be called more than once."""
+        """Disconnect; may be called more than once, and does not raise."""
         self._hang_up()
         self._client = None
         self._is_clean = False
+        self._lock.give_back()
 
     def distrust(self) -> None:
-        """Have the link flushed before the next request: an answer was not what it should be."""
-        self._is_clean = False
+        """Have a serial line flushed before the next request: an answer was not what it should be.
+
+        On TCP and TLS the transaction id has paired answer and request, so that another connection would not help.
+        """
+        self._is_clean = self._is_clean and isinstance(self._client, _TcpClient)
 
     def read(self, block: Block) -> tuple[Sequence[int], bool]:
         """Read a block of registers.
@@ -257,16 +258,9 @@ class ModbusLink:
         what, remedy = "no answer", "check cable, power and unit_id, or raise timeout_s"
         for attempt in range(1, self._settings.retries + 2):
             try:
-                if not self._is_clean:
-                    self._flush()
-                # stays so if the request is interrupted: its answer would be the next one's
-                self._is_clean = False
-                answer = ask(self._client)
+                answer = self._attempt(ask)
             except LinkError as error:
                 what, remedy = error.what, error.remedy
-                continue
-            except ConnectionException as error:
-                what, remedy = f"the connection was lost ({_words(error)})", "check cable and power of the device"
                 self._hang_up()
                 continue
             except ModbusException:  # time-out, or bytes that are no frame
@@ -286,6 +280,15 @@ class ModbusLink:
                 raise DeviceRefused(what, where=f"{self.where}, {table} {address}", remedy=remedy)
         raise LinkError(what, where=f"{self.where}, {table} {address}", remedy=remedy)
 
+    def _attempt(self, ask: Callable[[Any], ModbusPDU]) -> ModbusPDU:
+        """Ask once; whatever the line raises on the way is a LinkError."""
+        if not self._is_clean:
+            self._flush()
+        # stays so if the request is interrupted: its answer would be the next one's
+        self._is_clean = False
+        with line_errors(self.where, also=_LOST):
+            return ask(self._client)
+
     def _flush(self) -> None:
         """Make sure that no earlier answer can be taken for the next one.
 
@@ -302,14 +305,12 @@ class ModbusLink:
             return
         line = self._client.socket
         settings = self._settings
-        try:
+        with line_errors(self.where):
             line.timeout = max(0.002, 3.5 * 11 / line.baudrate)
             while line.read(1):
                 line.reset_input_buffer()
             self._await_markers(line, time.monotonic() + settings.late_reply_s)
             line.timeout = settings.timeout_s
-        except _LINE_ERRORS as error:
-            raise ConnectionException(str(error)) from None
 
     def _await_markers(self, line: serial.Serial, deadline: float) -> None:
         """Mark the end of earlier answers with reads of the unused function; return when all of them are answered."""
@@ -329,7 +330,9 @@ class ModbusLink:
 
     def _hang_up(self) -> None:
         if self._client is not None:
-            self._client.close()  # type: ignore[no-untyped-call]  # the library leaves it untyped
+            with contextlib.suppress(*LINE_ERRORS):  # it is gone already
+                self._client.close()  # type: ignore[no-untyped-call]  # the library leaves it untyped
+            self._client.socket = None
 
 
 def _answers(received: bytes, unit: int, function: int) -> int:
@@ -343,11 +346,6 @@ def _answers(received: bytes, unit: int, function: int) -> int:
             count += len(frame) == length and FramerRTU.compute_CRC(frame[:-2]).to_bytes(2, "big") == frame[-2:]
             at = received.find(head, at + 1)
     return count
-
-
-def _words(error: Exception) -> str:
-    """Return the library's message without its own prefix."""
-    return str(error).removeprefix("Modbus Error: ").removeprefix("[Connection] ").strip()
 
 
 def _client(settings: AnyModbusSettings) -> _TcpClient | _RtuClient:

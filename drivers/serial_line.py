@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import random
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Protocol
 
 import serial
@@ -17,20 +17,8 @@ import serial
 from autotune.config.rig import SerialSettings
 from autotune.errors import LinkError
 from autotune.experiment.rig import Clock
+from drivers.line_errors import LINE_ERRORS, line_errors
 from drivers.line_protocol import VERSION, Decoder, Frame, Kind, encode
-
-_LINE_ERRORS: tuple[type[Exception], ...] = (OSError,)
-try:
-    import termios
-
-    _LINE_ERRORS += (termios.error,)  # raised for line settings that the device refuses; it is no OSError
-except ImportError:  # there is none outside POSIX
-    pass
-
-_OPEN_ERRORS: tuple[type[Exception], ...] = (
-    *_LINE_ERRORS,
-    ValueError,
-)  # the latter for a speed that the port cannot run at
 
 _FLASH = "flash the firmware that belongs to this version"
 NOT_IN_COMMAND = 3
@@ -125,10 +113,8 @@ class SerialLink:
         """
         settings = self._settings
         if self._port is None:
-            try:
+            with line_errors(self.where, "cannot be opened", _CABLE, also=(ValueError,)):  # a speed it cannot run at
                 self._port = self._open_port(settings)
-            except _OPEN_ERRORS as error:
-                raise LinkError(f"cannot be opened ({error})", where=self.where, remedy=_CABLE) from None
         until = self._clock.now() + settings.start_s  # opening restarts a board whose reset hangs on DTR
         while True:
             try:
@@ -144,7 +130,7 @@ class SerialLink:
         self._arrived.clear()
         self._decoder.clear()
         if port is not None:
-            with contextlib.suppress(*_LINE_ERRORS):  # it is gone already
+            with contextlib.suppress(*LINE_ERRORS):  # it is gone already
                 port.close()
 
     def ask(self, kind: Kind, *values: float, retries: int | None = None) -> tuple[Frame, float, bool]:
@@ -219,20 +205,24 @@ class SerialLink:
     def _receive(self, until: float) -> list[Frame]:
         """Return the frames that are complete with the next bytes."""
         port = self._opened
-        try:
+        with self._or_closed("the line is gone"):
             port.timeout = max(0.0, until - self._clock.now())
             return self._decoder.feed(port.read(port.in_waiting or 1))
-        except _LINE_ERRORS as error:
-            self.disconnect()
-            raise LinkError(f"the line is gone ({error})", where=self.where, remedy=_CABLE) from None
 
     def _write(self, data: bytes) -> None:
         port = self._opened
-        try:
+        with self._or_closed("the line takes nothing"):
             port.write(data)
-        except _LINE_ERRORS as error:
+
+    @contextlib.contextmanager
+    def _or_closed(self, what: str) -> Iterator[None]:
+        """Close the line where it breaks."""
+        try:
+            with line_errors(self.where, what, _CABLE):
+                yield
+        except LinkError:
             self.disconnect()
-            raise LinkError(f"the line takes nothing ({error})", where=self.where, remedy=_CABLE) from None
+            raise
 
     @property
     def _opened(self) -> Port:

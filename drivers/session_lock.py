@@ -1,0 +1,77 @@
+"""One session per rig address on this computer: a lock that the operating system takes back when a process dies."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import os
+import tempfile
+from pathlib import Path
+
+from autotune.errors import LinkError
+
+try:
+    import fcntl
+except ImportError:  # outside POSIX there is no advisory lock; the look for another master remains
+    fcntl = None  # type: ignore[assignment]  # a module there, nothing here
+
+
+class SessionLock:
+    """A lock on a device's address, held by one session at a time, in this process or another.
+
+    Parameters
+    ----------
+    address : str
+        The device, as messages name it.
+    exclusive : bool
+        Whether to lock at all; a look that writes nothing need not.
+    """
+
+    def __init__(self, address: str, *, exclusive: bool = True) -> None:
+        self._address = address
+        self._exclusive = exclusive and fcntl is not None
+        self._file: int | None = None
+
+    def take(self) -> bool:
+        """Take the lock; return whether it was not held already.
+
+        Raises
+        ------
+        LinkError
+            Another session holds it.
+        """
+        if not self._exclusive or self._file is not None:
+            return False
+        digest = hashlib.sha256(self._address.encode()).hexdigest()[:16]
+        path = Path(tempfile.gettempdir()) / f"autotune-rig-{digest}.lock"
+        try:
+            # read-only is enough to lock, also on a file that another user has made
+            file = os.open(path, os.O_RDONLY | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o644)
+        except OSError as error:
+            raise LinkError(
+                f"the lock of its address cannot be opened ({error.strerror})",
+                where=str(path),
+                remedy="remove that file",
+            ) from None
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            os.close(file)
+            raise LinkError(
+                "another session on this computer has the rig",
+                where=self._address,
+                remedy="end it, or wait until it has",
+            ) from None
+        self._file = file
+        return True
+
+    def give_back(self) -> None:
+        """Give the lock back; may be called more than once."""
+        file, self._file = self._file, None
+        if file is not None:
+            with contextlib.suppress(OSError):
+                os.close(file)
+
+    def __del__(self) -> None:
+        """Give the lock back with the session that forgot to."""
+        self.give_back()
