@@ -5,14 +5,14 @@ from __future__ import annotations
 import sys
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias
 
 import typer
 from rich.console import Console
 
 from autotune.cli import app
 from autotune.cli.common import ProgressBar, rig_of
-from autotune.design.forms import Form
+from autotune.controller_forms import FORMS
 from autotune.errors import AutotuneError, ExperimentStopped, InputError
 
 if TYPE_CHECKING:
@@ -24,6 +24,10 @@ if TYPE_CHECKING:
     from autotune.experiment.verify import Verification
     from autotune.identification.parametric import PlantFit
     from autotune.pipeline.folder import Measured
+
+    Form: TypeAlias = str
+else:
+    Form = Literal[tuple(FORMS)]
 
 _CONFIG = Annotated[Path, typer.Argument(metavar="CONFIG.toml", help="configuration of the rig")]
 _CONTROLLER = Annotated[Path | None, typer.Option(metavar="C.toml", help="controller file with the gains")]
@@ -250,7 +254,7 @@ def _comparison(
     from rich.markup import escape
     from rich.table import Table
 
-    from autotune.design.forms import to_form
+    from autotune.controller_forms import to_form
     from autotune.design.margins import margins
 
     def shown(controller: PIDController) -> dict[str, str]:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias
 import typer
 
 from autotune.cli import app
-from autotune.design.forms import Form, to_form
+from autotune.controller_forms import FORMS, to_form
 from autotune.errors import InputError
 
 if TYPE_CHECKING:
@@ -127,7 +127,10 @@ def margins_command(
 
 
 #: what the controller is written as: a maker's form, or its law as code
-Target: TypeAlias = Literal[Form, "c", "st"]
+if TYPE_CHECKING:
+    Target: TypeAlias = str
+else:
+    Target = Literal[(*FORMS, "c", "st")]
 
 
 @app.command("controller")

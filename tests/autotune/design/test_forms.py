@@ -16,8 +16,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from autotune.controller import PIDController
+from autotune.controller_forms import FORMS, Settings, from_form, to_form
 from autotune.design.codegen import c_source, structured_text
-from autotune.design.forms import FORMS, Form, Settings, from_form, to_form
 from autotune.design.law import PILaw
 from autotune.errors import DesignError
 
@@ -27,7 +27,7 @@ OMEGA = np.geomspace(1e-3, 1e3, 50)
 def _by_the_manual(s: Settings) -> Any:
     """Feedback from -y to u that the settings amount to, written from the makers' formulas."""
     v, p = s.values, 1j * OMEGA
-    ratio = s.u_span / s.y_span
+    ratio = s.spans.ratio
     match s.form:
         case "siemens":
             integral = 1.0 / (v["Ti"] * p) if v["Ti"] else 0.0
@@ -44,6 +44,15 @@ def _by_the_manual(s: Settings) -> Any:
         case "schneider-parallel":
             integral = 1.0 / (v["ti"] * p) if v["ti"] else 0.0
             C = v["kp"] + ratio * (integral + v["td"] * p / (1.0 + v["td"] / v["kd"] * p))
+        case "proportional-band":
+            integral = 1.0 / (60.0 * v["reset_min"] * p)
+            C = (
+                100.0
+                * ratio
+                / v["PB_percent"]
+                * (1.0 + integral + 60.0 * v["rate_min"] * p)
+                / (1.0 + v["pv_filter_s"] * p)
+            )
         case "series":
             C = v["K"] * (1.0 + 1.0 / (v["Ti_s"] * p)) * (1.0 + v["Td_s"] * p) / (1.0 + v["Tf_s"] * p)
         case "parallel":
@@ -66,7 +75,7 @@ controllers = st.builds(
 @given(controller=controllers, u_span=st.floats(0.5, 100.0), y_span=st.floats(0.5, 100.0))
 @settings(max_examples=20)
 def test_settings_give_the_controllers_response_by_the_makers_formula(
-    form: Form, controller: PIDController, u_span: float, y_span: float
+    form: str, controller: PIDController, u_span: float, y_span: float
 ) -> None:
     found = to_form(controller, form, u_span=u_span, y_span=y_span)
     np.testing.assert_allclose(_by_the_manual(found), controller.response(OMEGA), rtol=1e-9)
@@ -75,9 +84,27 @@ def test_settings_give_the_controllers_response_by_the_makers_formula(
 @pytest.mark.parametrize("form", FORMS)
 @given(controller=controllers)
 @settings(max_examples=20)
-def test_round_trip(form: Form, controller: PIDController) -> None:
+def test_round_trip(form: str, controller: PIDController) -> None:
     back = from_form(to_form(controller, form, u_span=10.0, y_span=4.0, sample_time_s=0.05))
     np.testing.assert_allclose(back.response(OMEGA), controller.response(OMEGA), rtol=1e-6)
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_a_record_names_every_setting_of_its_form(form: str) -> None:
+    record, spans = FORMS[form], {"u_span": 10.0, "y_span": 4.0, "sample_time_s": 0.05}
+    given = to_form(PIDController(K=2.0, Ti_s=8.0, Td_s=1.0, Tf_s=0.2), form, **spans).values
+    assert set(record.settings) == set(given) - {"reverse_acting"}
+    assert set(record.signed) <= set(record.settings)
+    # a P controller needs none of the settings that a controller may lack
+    plain = PIDController(K=2.0, Ti_s=8.0 if form == "series" else math.inf)
+    lacking = {name: value for name, value in record.settings.items() if not math.isnan(value)}
+    assert {name: to_form(plain, form, **spans).values[name] for name in lacking} == lacking
+
+
+def test_proportional_band_is_the_span_in_percent_that_moves_the_output_fully() -> None:
+    # 50 degC of a span of 200 degC move a valve from 0 to 100 %: a band of 25 %, K = 2 %/degC
+    found = to_form(PIDController(K=2.0, Ti_s=90.0), "proportional-band", u_span=100.0, y_span=200.0).values
+    assert (found["PB_percent"], found["reset_min"]) == (25.0, 1.5)
 
 
 def test_velocity_form_sums_to_the_positional_law() -> None:
@@ -109,7 +136,7 @@ def test_rockwells_example_of_units() -> None:
         (PIDController(K=1.0, Ti_s=1.0), "velocity", "sample time"),
     ],
 )
-def test_what_a_form_cannot_say_is_refused(controller: PIDController, form: Form, reason: str) -> None:
+def test_what_a_form_cannot_say_is_refused(controller: PIDController, form: str, reason: str) -> None:
     with pytest.raises(DesignError, match=reason):
         to_form(controller, form)
 
