@@ -143,11 +143,25 @@ class Parameter:
 
 @dataclass(frozen=True, kw_only=True)
 class Effect:
-    """Physics added to the chain: an entry ``PLACE.EFFECT`` of the catalogue, where it acts, its parameters."""
+    """Physics added to a model: an entry ``PLACE.EFFECT`` of the catalogue, where it acts, its parameters.
+
+    Attributes
+    ----------
+    name, at : str
+        The catalogue's name, and where in a chain it acts.
+    parameters : mapping of str to Parameter
+        Its parameters.
+    state, input, port, column : str
+        The state, input, port or recorded column that it acts on, in models of equations or with several inputs.
+    """
 
     name: str
     at: str = ""
     parameters: Mapping[str, Parameter] = field(default_factory=lambda: MappingProxyType({}))
+    state: str = ""
+    input: str = ""
+    port: str = ""
+    column: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -200,7 +214,7 @@ def read_model(path: str | os.PathLike[str]) -> Model:
         output=_port(content.get("output", {}), f"{where} [output]"),
         blocks=tuple(_block(table, f"{where} [[block]] {i + 1}") for i, table in enumerate(blocks)),
         effects=tuple(
-            _effect(table, f"{where} [[effect]] {i + 1}") for i, table in enumerate(content.get("effect", []))
+            effect_of(table, f"{where} [[effect]] {i + 1}") for i, table in enumerate(content.get("effect", []))
         ),
     )
 
@@ -251,8 +265,10 @@ def _block(table: Mapping[str, Any], where: str) -> Block:
     )
 
 
-def _effect(table: Mapping[str, Any], where: str) -> Effect:
-    _known(table, {"name", "at", "parameters", "equation"}, where)
+def effect_of(table: Mapping[str, Any], where: str) -> Effect:
+    """Return the effect that an ``[[effect]]`` table states; ``where`` names it in messages."""
+    acts = ("at", "state", "input", "port", "column")
+    _known(table, {"name", "parameters", "equation", *acts}, where)
     if "." not in str(table.get("name", "")):
         raise InputError(f"name = {table.get('name')!r}", where=where, remedy="write PLACE.EFFECT of the catalogue")
     parameters = {}
@@ -262,7 +278,8 @@ def _effect(table: Mapping[str, Any], where: str) -> Effect:
         parameters[key] = Parameter(
             value=_real(given.get("value"), key, where), unit=str(given.get("unit", "")), sd=float(sd)
         )
-    return Effect(name=str(table["name"]), at=str(table.get("at", "")), parameters=MappingProxyType(parameters))
+    places = {key: str(table[key]) for key in acts if key in table}
+    return Effect(name=str(table["name"]), parameters=MappingProxyType(parameters), **places)
 
 
 def write_model(model: Model, path: str | os.PathLike[str], equations: Mapping[str, str] | None = None) -> None:
@@ -284,7 +301,7 @@ def write_model(model: Model, path: str | os.PathLike[str], equations: Mapping[s
         "block": [_block_table(block) for block in model.blocks],
     }
     if model.effects:
-        content["effect"] = [_effect_table(effect, (equations or {}).get(effect.name)) for effect in model.effects]
+        content["effect"] = [effect_table(effect, (equations or {}).get(effect.name)) for effect in model.effects]
     Path(path).write_bytes(tomli_w.dumps(content).encode())
 
 
@@ -304,10 +321,11 @@ def _block_table(block: Block) -> dict[str, Any]:
     return table | {key: value for key, value in optional.items() if value}
 
 
-def _effect_table(effect: Effect, equation: str | None) -> dict[str, Any]:
+def effect_table(effect: Effect, equation: str | None) -> dict[str, Any]:
+    """Return the ``[[effect]]`` table of an effect, with its equation for the reader."""
     table: dict[str, Any] = {"name": effect.name}
-    if effect.at:
-        table["at"] = effect.at
+    places = {key: getattr(effect, key) for key in ("at", "state", "input", "port", "column")}
+    table |= {key: value for key, value in places.items() if value}
     if equation:
         table["equation"] = equation
     table["parameters"] = {
