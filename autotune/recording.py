@@ -176,14 +176,14 @@ def read_recording(path: str | os.PathLike[str]) -> Recording:
         raise InputError(
             f"the header lacks {', '.join(missing)}",
             where=str(path),
-            remedy="the first line that is no comment must name the columns t,u,y and any others",
+            remedy="name the columns with --t --u --y, or write a file in the project's form with autotune import",
         )
     if len(set(header)) != len(header):
         raise InputError("the header names a column twice", where=str(path), remedy="give each column its own name")
     values = _parse(lines, header_at, len(header), path)
     columns = {name: np.ascontiguousarray(values[:, i]) for i, name in enumerate(header)}
     t, u, y = (columns.pop(name) for name in _REQUIRED)
-    return Recording(t=t, u=u, y=y, extra=MappingProxyType(columns), metadata=_read_sidecar(path), name=str(path))
+    return Recording(t=t, u=u, y=y, extra=MappingProxyType(columns), metadata=read_sidecar(path), name=str(path))
 
 
 def _parse(lines: Sequence[str], header_at: int, width: int, path: Path) -> FloatArray:
@@ -216,7 +216,26 @@ def _parse_slowly(body: Sequence[str], header_at: int, width: int, path: Path) -
     return np.array(rows, dtype=np.float64).reshape(-1, width)
 
 
-def _read_sidecar(path: Path) -> Mapping[str, Any]:
+def is_own_form(path: str | os.PathLike[str]) -> bool:
+    """Return whether a file is text whose first line that is no comment names the columns t, u and y with commas.
+
+    A file that cannot be read is taken as one, so that reading it says why.
+    """
+    if Path(path).suffix.lower() not in ("", ".csv", ".txt", ".part"):
+        return False
+    try:
+        with open(path, encoding="utf-8-sig", errors="replace") as file:
+            said = (line for line in file if line.strip() and not line.startswith("#"))
+            first, second = next(said, ""), next(said, "")
+    except OSError:
+        return True
+    header = [cell.strip() for cell in first.split(",")]
+    dates = "t" in header and len(cells := second.split(",")) == len(header) and ":" in cells[header.index("t")]
+    return not first or (set(header).issuperset(_REQUIRED) and not dates)
+
+
+def read_sidecar(path: Path) -> Mapping[str, Any]:
+    """Return what the TOML file of the same name says; nothing where there is none."""
     sidecar = path.with_suffix(".toml")
     if not sidecar.is_file():
         return MappingProxyType({})

@@ -1,26 +1,24 @@
-"""Columns of a historian's export: CSV or Parquet, stamps of any kind, text between the numbers, quality flags."""
+"""Signals of one loop from an export of many: its tags, its interval, and the Parquet file that all loops share."""
 
 from __future__ import annotations
 
-import difflib
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.compute as pc
-import pyarrow.csv
-import pyarrow.dataset
-import pyarrow.parquet
 
 from autotune.arrays import BoolArray, FloatArray
 from autotune.batch.settings import ExportSettings, LoopSettings, matches
 from autotune.errors import InputError
+from autotune.files.cells import Cells
+from autotune.files.reading import Signals, signals_of, stamp_form, stamps_of
+from autotune.files.signal_names import Roles, SignalNames, find_roles
+from autotune.files.stamps import seconds
+from autotune.files.table import Table, listed
+from autotune.files.text_file import beginning
+from autotune.files.workbook import PARQUET, WORKBOOKS, open_table, parquet_table
 
-Column: TypeAlias = Any  # pyarrow.ChunkedArray, which has no type information
-
-_NUMBER = r"^[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?$"
 _BLOCK_BYTES = 16 << 20
 
 
@@ -34,7 +32,7 @@ def read_export(
     loop : LoopSettings
         Its file, tags and interval.
     export : ExportSettings
-        How the file is written.
+        What is said of how the file is written.
     prepared : sequence of Path
         What :func:`to_parquet` made of the file, read in its place.
 
@@ -54,191 +52,59 @@ def read_export(
     paths = list(prepared) or matches(Path(loop.file))
     if not paths:
         raise InputError("no such file", where=loop.file, remedy="check the key file of the loop")
-    names = columns_of(paths[0], export)
-    tags = {"u": loop.u, "y": loop.y} | ({"r": loop.r or "r"} if loop.r or "r" in names else {})
-    require(names, [export.time, *tags.values()], loop.file)
-    flags = {signal: flag for signal, tag in tags.items() if (flag := _flag_of(tag, export)) in names}
-    wanted = sorted({export.time, *tags.values(), *flags.values()})
-    table = _within(_table(paths, wanted, export, loop.file), loop, export)
-    columns = {"t": seconds(table[export.time], export, loop.file)}
-    flagged = np.zeros(columns["t"].size, dtype=np.bool_)
-    for signal, tag in tags.items():
-        values, empty = _numbers(table[tag], export)
-        if signal in flags:
-            bad = ~_is_good(table[flags[signal]], export) & ~empty
-            flagged |= bad & (signal != "r")
-            values = np.where(bad, np.nan, values)
-        columns[signal] = _held(values, empty) if export.empty == "unchanged" else values
-    return columns, flagged
+    together = paths[0].suffix.lower() in PARQUET
+    tables = [parquet_table(paths)] if together else [open_table(path, export.form()) for path in paths]
+    read = [_signals(table, loop, export) for table in tables]
+    names = [name for name in ("t", "u", "y", "r") if all(name in signals.columns for signals in read)]
+    columns = {name: np.concatenate([signals.columns[name] for signals in read]) for name in names}
+    return columns, np.concatenate([signals.flagged for signals in read])
 
 
-def _flag_of(tag: str, export: ExportSettings) -> str:
-    return export.quality.replace("{tag}", tag)
+def _signals(table: Table, loop: LoopSettings, export: ExportSettings) -> Signals:
+    found = _roles(table, loop, export)
+    form = export.form()
+    signals = signals_of(table, found, form)
+    if not (loop.start or loop.end):
+        return signals
+    t = signals.columns["t"]
+    keep = np.ones(t.size, dtype=np.bool_)
+    for stamp, outside in ((loop.start, np.less), (loop.end, np.greater_equal)):
+        if stamp:
+            limit = seconds([stamp], signals.stamp, f"start or end of {loop.name}")[0]
+            keep &= ~outside(t, limit)
+    columns = {name: values[keep] for name, values in signals.columns.items()}
+    return Signals(columns=columns, flagged=signals.flagged[keep], stamp=signals.stamp, notes=signals.notes)
+
+
+def _roles(table: Table, loop: LoopSettings, export: ExportSettings) -> Roles:
+    """Return the columns that the loop names; the others as they are found out, where no doubt is left."""
+    r = loop.r or ("r" if "r" in table.names else "")
+    usual = {"u": "u", "y": "y"}
+    said = {key: getattr(loop, key) for key in ("u", "y") if getattr(loop, key) != usual[key] or key in table.names}
+    found = find_roles(table, SignalNames(t=export.time, r=r, **said))
+    if found.unsure:
+        raise InputError(
+            f"which column is {' and '.join(found.unsure)} is not sure; it has {listed(table.names)}",
+            where=table.path,
+            remedy="name them with u and y of the loop, and time in [export]",
+        )
+    return Roles(time=found.time, names=found.names, unsure=(), others=())
 
 
 def columns_of(path: Path, export: ExportSettings) -> list[str]:
     """Return the names of a file's columns."""
-    try:
-        if path.suffix == ".parquet":
-            return list(pyarrow.parquet.read_schema(path).names)
-        read, parse, _ = _csv_options(export)
-        with pyarrow.csv.open_csv(path, read_options=read, parse_options=parse) as reader:
-            return list(reader.schema.names)
-    except (pa.ArrowInvalid, UnicodeError) as error:
-        raise InputError(_first_line(error), where=str(path), remedy="check [export]: delimiter, encoding") from None
-
-
-def require(names: Sequence[str], wanted: Iterable[str], where: str) -> None:
-    """Refuse a file that lacks one of the columns, or has it twice; names the nearest."""
-    for name in wanted:
-        if names.count(name) == 1:
-            continue
-        near = difflib.get_close_matches(name, names, n=1, cutoff=0.5)
-        shown = f"did you mean {near[0]!r}?" if near else f"it has {', '.join(names[:8])}{', ...' * (len(names) > 8)}"
-        what = "no column" if name not in names else "more than one column"
-        raise InputError(f"{what} {name!r}", where=where, remedy=shown)
-
-
-def _csv_options(export: ExportSettings, wanted: Sequence[str] | None = None) -> tuple[Any, Any, Any]:
-    """Return how pyarrow is to read a CSV file: every cell as text, since one word among numbers would end it."""
-    return (
-        pyarrow.csv.ReadOptions(encoding=export.encoding, skip_rows=export.skip_rows, block_size=_BLOCK_BYTES),
-        pyarrow.csv.ParseOptions(delimiter=export.delimiter),
-        pyarrow.csv.ConvertOptions(
-            column_types=dict.fromkeys(wanted or (), pa.string()),
-            include_columns=list(wanted or ()),
-            strings_can_be_null=True,
-            null_values=[""],
-        ),
-    )
-
-
-def _table(paths: Sequence[Path], wanted: Sequence[str], export: ExportSettings, where: str) -> Any:
-    try:
-        if paths[0].suffix == ".parquet":
-            return pyarrow.dataset.dataset([str(path) for path in paths], format="parquet").to_table(columns=wanted)
-        read, parse, convert = _csv_options(export, wanted)
-        return pa.concat_tables(pyarrow.csv.read_csv(path, read, parse, convert) for path in paths)
-    except (pa.ArrowInvalid, pa.ArrowKeyError) as error:
-        raise InputError(_first_line(error), where=where, remedy="correct the line, or leave the file out") from None
-
-
-def _first_line(error: Exception) -> str:
-    return str(error).strip().splitlines()[0]
-
-
-def _within(table: Any, loop: LoopSettings, export: ExportSettings) -> Any:
-    """Return the rows from ``start`` up to, not with, ``end``."""
-    if not (loop.start or loop.end):
-        return table
-    t = seconds(table[export.time], export, loop.file)
-    keep = np.ones(t.size, dtype=np.bool_)
-    for stamp, outside in ((loop.start, np.less), (loop.end, np.greater_equal)):
-        if stamp:
-            limit = seconds(pa.chunked_array([[stamp]]), export, f"start or end of {loop.name}")[0]
-            keep &= ~outside(t, limit)
-    return table.filter(pa.array(keep))
-
-
-def seconds(column: Column, export: ExportSettings, where: str) -> FloatArray:
-    """Return stamps in seconds: since 1970 for dates, since their own zero for numbers; NaN for empty ones.
-
-    Raises
-    ------
-    InputError
-        A stamp that is neither; shows it.
-    """
-    try:
-        if _is_number(column.type):
-            return np.asarray(_float(column) * export.time_unit_s)
-        if pa.types.is_timestamp(column.type) or pa.types.is_date(column.type):
-            return _since_1970(column)
-        text = pc.utf8_trim_whitespace(_text(column))
-        if export.time_format is not None:
-            return _strptime(text, export.time_format)
-        number = pc.match_substring_regex(text, _NUMBER)
-        if pc.all(number).as_py():
-            return np.asarray(_float(pc.cast(text, pa.float64())) * export.time_unit_s)
-        return _iso_8601(text)
-    except pa.ArrowInvalid as error:
-        raise InputError(
-            f"the stamps of column {export.time!r} cannot be read ({_first_line(error)})",
-            where=where,
-            remedy="set export.time_format to their form, for example %d.%m.%Y %H:%M:%S",
-        ) from None
-
-
-def _strptime(text: Column, form: str) -> FloatArray:
-    """Return seconds since 1970; fractions of a second, which pyarrow does not parse, are taken off first."""
-    fraction: float | FloatArray = 0.0
-    if form.endswith("%f"):
-        mark, form = form[-3], form[:-3]
-        parts = pc.extract_regex(text, rf"^(?P<whole>.*)[{mark}](?P<fraction>\d+)$")
-        fraction = _float(pc.cast(pc.binary_join_element_wise("0", pc.struct_field(parts, "fraction"), "."), "double"))
-        text = pc.struct_field(parts, "whole")
-    return np.asarray(_since_1970(pc.strptime(text, format=form, unit="us")) + fraction)
-
-
-def _iso_8601(text: Column) -> FloatArray:
-    try:
-        return _since_1970(pc.cast(text, pa.timestamp("us", "UTC")))
-    except pa.ArrowInvalid:  # stamps without a zone
-        return _since_1970(pc.cast(text, pa.timestamp("us")))
-
-
-def _since_1970(column: Column) -> FloatArray:
-    zone = column.type.tz if pa.types.is_timestamp(column.type) else None
-    return np.asarray(1e-6 * _float(pc.cast(pc.cast(column, pa.timestamp("us", zone)), pa.int64())))
-
-
-def _is_number(kind: Any) -> bool:
-    return bool(pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_decimal(kind))
-
-
-def _text(column: Column) -> Column:
-    if pa.types.is_dictionary(column.type):
-        column = pc.cast(column, column.type.value_type)
-    return pc.cast(column, pa.string())
-
-
-def _float(column: Column) -> FloatArray:
-    return np.asarray(pc.cast(column, pa.float64(), safe=False).to_numpy(), dtype=np.float64)
-
-
-def _numbers(column: Column, export: ExportSettings) -> tuple[FloatArray, BoolArray]:
-    """Return the values, NaN for text that is no number, and which cells are empty."""
-    if _is_number(column.type) or pa.types.is_boolean(column.type):
-        return _float(column), np.asarray(column.is_null().to_numpy())
-    text = pc.utf8_trim_whitespace(_text(column))
-    empty = pc.fill_null(pc.equal(text, ""), True).to_numpy()
-    if export.decimal == ",":
-        text = pc.replace_substring(text, ",", ".")
-    text = pc.if_else(pc.match_substring_regex(text, _NUMBER), text, pa.scalar(None, pa.string()))
-    return _float(pc.cast(text, pa.float64())), np.asarray(empty)
-
-
-def _is_good(column: Column, export: ExportSettings) -> BoolArray:
-    """Return which flags are good; an empty one says nothing against its sample."""
-    words = {word.lower() for word in export.good}
-    if _is_number(column.type):
-        codes = [float(word) for word in words if word.replace(".", "", 1).isdigit()]
-        flags = _float(column)
-        return np.asarray(np.isin(flags, codes) | np.isnan(flags))
-    text = pc.utf8_lower(pc.utf8_trim_whitespace(_text(column)))
-    good = pc.or_(pc.is_in(text, value_set=pa.array([*sorted(words), ""])), pc.is_null(text))
-    return np.asarray(good.to_numpy())
-
-
-def _held(values: FloatArray, empty: BoolArray) -> FloatArray:
-    """Return the values with each empty cell as the one before it, bad or not."""
-    before = np.maximum.accumulate(np.where(empty, 0, np.arange(values.size)))
-    return np.asarray(values[before])
+    kind = path.suffix.lower()
+    if kind in PARQUET:
+        return list(parquet_table([path]).names)
+    if kind in WORKBOOKS:
+        return list(open_table(path, export.form()).names)
+    return list(beginning(path, export.form())[0].header.names)
 
 
 def to_parquet(
     path: Path, out: Path, wanted: Sequence[str], export: ExportSettings, advance: Callable[[float], None]
 ) -> None:
-    """Turn a CSV export into Parquet, block by block, so that each loop reads its own columns only.
+    """Turn a text export into Parquet, block by block, so that each loop reads its own columns only.
 
     Parameters
     ----------
@@ -249,7 +115,8 @@ def to_parquet(
     wanted : sequence of str
         Columns that some loop needs; the others are left behind.
     export : ExportSettings
-        How the export is written. Stamps are written as timestamps, all other cells as the text they are.
+        What is said of how the export is written. Stamps are written as timestamps, all other cells as the text they
+        are, with a decimal point.
     advance : callable
         Told the share of the file that has been read.
 
@@ -258,23 +125,75 @@ def to_parquet(
     InputError
         A column that is not there, a line of another length than the header, stamps that cannot be read.
     """
-    names = columns_of(path, export)
-    require(names, [export.time], str(path))
-    wanted = [export.time, *(name for name in wanted if name in names and name != export.time)]
-    read, parse, convert = _csv_options(export, wanted)
+    import pyarrow as pa
+    import pyarrow.csv
+    import pyarrow.parquet
+
+    table, options = _head(path, export)
+    time = table.name_of(export.time) if export.time else find_roles(table, SignalNames()).time
+    time = (time,) if isinstance(time, str) else time
+    if not time:
+        raise InputError("no column of time stamps is found", where=str(path), remedy="name it with time in [export]")
+    stamp = stamp_form(table, time, export.form())
+    kept = [name for name in wanted if name in table.names and name not in time]
+    read, parse, convert = options([*time, *kept])
     part, size = out.with_suffix(".part"), max(path.stat().st_size, 1)
     try:
         with path.open("rb") as file, pyarrow.csv.open_csv(file, read, parse, convert) as reader:
-            fields = [pa.field(name, pa.timestamp("us") if name == export.time else pa.string()) for name in wanted]
+            fields = [pa.field(time[0], pa.timestamp("us")), *(pa.field(name, pa.string()) for name in kept)]
             with pyarrow.parquet.ParquetWriter(part, pa.schema(fields), compression="zstd") as writer:
                 for batch in reader:
-                    table = pa.Table.from_batches([batch])
-                    stamps = np.rint(1e6 * seconds(table[export.time], export, str(path)))
-                    micro = pa.array(stamps, from_pandas=True).cast(pa.int64()).cast(pa.timestamp("us"))
-                    writer.write_table(table.set_column(0, fields[0], micro))
+                    cells: Mapping[str, Cells] = {name: _texts(batch.column(name)) for name in time}
+                    micro = np.rint(1e6 * stamps_of(table, time, cells, stamp))
+                    stamps = pa.array(micro, from_pandas=True).cast(pa.int64()).cast(pa.timestamp("us"))
+                    columns = [stamps, *(_pointed(batch.column(name), table.decimal) for name in kept)]
+                    writer.write_table(pa.Table.from_arrays(columns, schema=pa.schema(fields)))
                     advance(file.tell() / size)
     except pa.ArrowInvalid as error:
-        raise InputError(
-            _first_line(error), where=str(path), remedy="correct the line, or leave the file out"
-        ) from None
+        said = str(error).strip().splitlines()[0]
+        raise InputError(said, where=str(path), remedy="correct the line, or leave the file out") from None
     part.replace(out)
+
+
+def _head(path: Path, export: ExportSettings) -> tuple[Table, Callable[[Sequence[str]], tuple[Any, Any, Any]]]:
+    """Return an export's beginning as a table, and how pyarrow is to read some of its columns, every cell as text."""
+    import pyarrow as pa
+    import pyarrow.csv
+
+    from autotune.files.text_file import table_of
+
+    layout, encoding = beginning(path, export.form())
+    table = table_of(path, layout, encoding, export.form())
+
+    def options(columns: Sequence[str]) -> tuple[Any, Any, Any]:
+        return (
+            pyarrow.csv.ReadOptions(
+                encoding="utf8" if encoding == "utf-8" else encoding,
+                skip_rows=layout.skip,
+                block_size=_BLOCK_BYTES,
+                column_names=list(layout.header.names),
+            ),
+            pyarrow.csv.ParseOptions(delimiter=layout.delimiter),
+            pyarrow.csv.ConvertOptions(
+                column_types=dict.fromkeys(columns, pa.string()),
+                include_columns=list(columns),
+                strings_can_be_null=True,
+                null_values=[""],
+            ),
+        )  # fmt: skip
+
+    return table, options
+
+
+def _texts(column: Any) -> list[str]:
+    return ["" if cell is None else cell for cell in column.to_pylist()]
+
+
+def _pointed(column: Any, decimal: str) -> Any:
+    """Return numbers with a decimal point; a Parquet file no longer says which mark its text has."""
+    import pyarrow.compute as pc
+
+    if decimal == ".":
+        return column
+    plain = r"^\s*([+-]?\d+),(\d*(?:[eE][+-]?\d+)?)\s*$"
+    return pc.replace_substring_regex(column, plain, r"\1.\2")

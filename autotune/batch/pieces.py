@@ -10,14 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from autotune.arrays import BoolArray, FloatArray, IntArray
+from autotune.arrays import FloatArray
 from autotune.batch.export import read_export
-from autotune.batch.settings import CampaignSettings, ExportSettings, LoopSettings
+from autotune.batch.settings import CampaignSettings, ExportSettings, LoopSettings, matches
 from autotune.errors import InputError
-from autotune.recording import Recording, read_recording
+from autotune.files.reading import parts_of
+from autotune.recording import Recording, is_own_form, read_recording
 
-#: A gap this many usual steps long cuts a record, unless the campaign says otherwise.
-_LONGEST_GAP_STEPS = 10.0
 #: Fewer rows in one piece tell no method anything.
 _FEWEST_ROWS = 60
 
@@ -35,7 +34,7 @@ class Record:
     bad : int
         Rows whose u or y is missing, no number, or of bad quality.
     notes : tuple of str
-        What was corrected or left out.
+        What was put right or left out.
     """
 
     pieces: tuple[Recording, ...]
@@ -72,8 +71,9 @@ def read_record(loop: LoopSettings, settings: CampaignSettings, prepared: Sequen
     """
     metadata: Mapping[str, Any] = MappingProxyType({})
     notes: list[str] = []
-    if settings.export is None and loop.file.endswith(".csv"):
-        recording = read_recording(loop.file)
+    files = matches(Path(loop.file))
+    if settings.export is None and len(files) == 1 and is_own_form(files[0]):
+        recording = read_recording(files[0])
         columns = {"t": recording.t, "u": recording[loop.u], "y": recording[loop.y], **recording.extra}
         if loop.r:
             columns["r"] = recording[loop.r]
@@ -90,14 +90,12 @@ def read_record(loop: LoopSettings, settings: CampaignSettings, prepared: Sequen
         if signal in columns:
             columns[signal] = scale * columns[signal] + offset
     rows = columns["t"].size
-    columns = _stamped(columns, notes)
     good = np.isfinite(columns["u"]) & np.isfinite(columns["y"])
-    stretches = _stretches(columns["t"], good, settings.longest_gap_s, notes)
-    pieces = tuple(_piece(columns, at, metadata, loop) for at in stretches if at.size >= _FEWEST_ROWS)
-    if len(pieces) < len(stretches):
-        notes.append(f"{len(stretches) - len(pieces)} pieces of fewer than {_FEWEST_ROWS} good rows are left out")
+    t0 = columns["t"][np.isfinite(columns["t"])][:1]
+    parts = parts_of(columns, settings.longest_gap_s, notes, loop.name, _FEWEST_ROWS)
+    pieces = tuple(_piece(part, float(t0[0]), metadata, loop) for part in parts if _good_rows(part) >= _FEWEST_ROWS)
     if not pieces:
-        longest = max(at.size for at in stretches)
+        longest = max(map(_good_rows, parts))
         raise InputError(
             f"no stretch of {_FEWEST_ROWS} good rows: the longest of {rows} rows has {longest}",
             where=loop.name,
@@ -106,48 +104,13 @@ def read_record(loop: LoopSettings, settings: CampaignSettings, prepared: Sequen
     return Record(pieces=pieces, rows=rows, bad=int((~good).sum()), notes=tuple(notes))
 
 
-def _stamped(columns: dict[str, FloatArray], notes: list[str]) -> dict[str, FloatArray]:
-    """Leave out rows without a stamp and rows that repeat the stamp before them."""
-    stamped = np.isfinite(columns["t"])
-    columns = {name: values[stamped] for name, values in columns.items()}
-    repeats = np.concatenate([[False], np.diff(columns["t"]) == 0.0])
-    for lost, what in ((~stamped, "have no stamp"), (repeats, "repeat the stamp before them")):
-        if lost.any():
-            notes.append(f"{int(lost.sum())} rows {what} and are left out")
-    return {name: values[~repeats] for name, values in columns.items()}
+def _good_rows(part: Mapping[str, FloatArray]) -> int:
+    return int(np.isfinite(part["y"]).sum())
 
 
-def _stretches(t: FloatArray, good: BoolArray, longest_gap_s: float | None, notes: list[str]) -> list[IntArray]:
-    """Return the good rows of each stretch, in which no gap between them is longer and no stamp goes back."""
-    at: IntArray = np.flatnonzero(good)
-    if at.size < 2:
-        return [at]
-    back = np.concatenate([[0], np.cumsum(np.diff(t) < 0.0)])
-    steps = np.diff(t[at])
-    longest = longest_gap_s or _LONGEST_GAP_STEPS * float(np.median(np.abs(steps)))
-    goes_back, gap = np.diff(back[at]) > 0, steps > longest
-    for cut, what in ((goes_back, "stamps go back"), (gap & ~goes_back, f"a gap is longer than {longest:g} s")):
-        if cut.any():
-            notes.append(f"cut {int(cut.sum())} times where {what}")
-    return np.split(at, np.flatnonzero(goes_back | gap) + 1)
-
-
-def _piece(columns: dict[str, FloatArray], at: IntArray, metadata: Mapping[str, Any], loop: LoopSettings) -> Recording:
-    """Return the rows from the first to the last good one, units applied already."""
-    span = slice(int(at[0]), int(at[-1]) + 1)
-    t0 = columns["t"][0]
-    part = {name: values[span] for name, values in columns.items()}
-    part = {name: values[np.isfinite(part["u"])] for name, values in part.items()}
-    tells = np.isfinite(part["y"]) | np.concatenate([[True], np.diff(part["u"]) != 0.0])
-    part = {name: values[tells] for name, values in part.items()}
-    t, u, y = part.pop("t") - t0, part.pop("u"), part.pop("y")
-    if "r" in part:
-        part["r"] = _held(part["r"])
-    name = loop.name if span.start == 0 else f"{loop.name} from t = {t[0]:g} s"
-    return Recording(t=t, u=u, y=y, extra=MappingProxyType(part), metadata=metadata, name=name)
-
-
-def _held(r: FloatArray) -> FloatArray:
-    """Return the set-point with the value before each missing one; those at the beginning stay missing."""
-    before = np.maximum.accumulate(np.where(np.isfinite(r), np.arange(r.size), 0))
-    return np.asarray(r[before])
+def _piece(part: Mapping[str, FloatArray], t0: float, metadata: Mapping[str, Any], loop: LoopSettings) -> Recording:
+    """Return a stretch as a recording, units applied already."""
+    t = part["t"] - t0
+    extra = {name: values for name, values in part.items() if name not in ("t", "u", "y")}
+    name = loop.name if t[0] == 0.0 else f"{loop.name} from t = {t[0]:g} s"
+    return Recording(t=t, u=part["u"], y=part["y"], extra=MappingProxyType(extra), metadata=metadata, name=name)

@@ -14,6 +14,8 @@ from pydantic import Field, model_validator
 from autotune.config import validated
 from autotune.config.procedure import DesignSettings, Section
 from autotune.errors import InputError
+from autotune.files.cells import GOOD
+from autotune.files.table import FileForm
 
 _FILE = "recording of the loop, or the export that holds its tags; * for several files that follow in time"
 
@@ -51,35 +53,48 @@ class LoopSettings(Section):
 
 
 class ExportSettings(Section):
-    """How an export of a historian is written; without this table a CSV file is a recording with columns t,u,y."""
+    """How the files are written, as far as it is said; all else is found out from each file."""
 
-    time: Annotated[str, Field(description="column of the time stamps")] = "t"
-    time_format: Annotated[
-        str | None, Field(description="strptime format of the stamps, %f last; default ISO 8601, or numbers")
+    time: Annotated[str, Field(description="column of the time stamps; found out when empty")] = ""
+    time_format: Annotated[str | None, Field(description="strptime format of the stamps; found out when absent")] = None
+    time_unit_s: Annotated[
+        float | None, Field(gt=0, description="seconds in one unit of numeric stamps; found out when absent")
     ] = None
-    time_unit_s: Annotated[float, Field(gt=0, description="seconds in one unit of numeric stamps")] = 1.0
-    delimiter: Annotated[str, Field(min_length=1, max_length=1, description="between the cells of a CSV file")] = ","
-    decimal: Annotated[Literal[".", ","], Field(description="decimal mark of a CSV file")] = "."
-    encoding: Annotated[str, Field(description="character encoding of a CSV file")] = "utf8"
-    skip_rows: Annotated[int, Field(ge=0, description="lines above the header of a CSV file")] = 0
+    delimiter: Annotated[
+        str | None,
+        Field(min_length=1, max_length=1, description="between the cells of a text file; found out when absent"),
+    ] = None
+    decimal: Annotated[
+        Literal[".", ","] | None, Field(description="decimal mark of a text file; found out when absent")
+    ] = None
+    encoding: Annotated[str | None, Field(description="character encoding of a text file; found out when absent")] = (
+        None
+    )
+    skip_rows: Annotated[int | None, Field(ge=0, description="lines above the header; found out when absent")] = None
     empty: Annotated[
         Literal["missing", "unchanged"],
         Field(description="an empty cell is a missing sample, or (recorded on change) the value before it"),
     ] = "missing"
     quality: Annotated[
-        str, Field(description="name of a tag's quality column with {tag} in it; where there is none, all is good")
+        str, Field(description="name of a tag's quality column with {tag} in it; found by usual names when empty")
     ] = ""
     good: Annotated[
         tuple[str, ...], Field(description="words or codes that mean good; anything else is a bad sample")
-    ] = ("Good", "192")
+    ] = GOOD
 
     @model_validator(mode="after")
     def _names_a_tag(self) -> ExportSettings:
         if self.quality and "{tag}" not in self.quality:
             raise ValueError('quality must contain {tag}, for example "{tag}.quality"')
-        if self.time_format and "%f" in self.time_format and not self.time_format.endswith("%f"):
-            raise ValueError("%f must be the last of time_format")
         return self
+
+    def form(self) -> FileForm:
+        """Return what is said of how the files are written."""
+        return FileForm(
+            delimiter=self.delimiter, decimal=self.decimal, encoding=self.encoding, skip_rows=self.skip_rows,
+            time_format=self.time_format, time_unit_s=self.time_unit_s, quality=self.quality or None, good=self.good,
+            empty_unchanged=self.empty == "unchanged",
+        )  # fmt: skip
 
 
 class CampaignSettings(Section):

@@ -27,6 +27,7 @@ app.add_typer(identify, name="identify")
 
 # Each room of commands registers itself on the two apps above; the order here is the order in --help.
 from autotune.cli import (  # noqa: E402, F401, I001
+    recordings,
     run,
     deploy,
     live,
@@ -49,7 +50,7 @@ from autotune.cli import (  # noqa: E402, F401, I001
 TOUR = {
     "Before the first run": ("init", "doctor", "schema"),
     "At a rig": ("run", "deploy", "verify", "live", "dither", "investigate", "probe", "ports", "rig"),
-    "From recordings to a controller": ("tune", "identify", "reduce", "design", "margins", "controller"),
+    "From recordings to a controller": ("import", "tune", "identify", "reduce", "design", "margins", "controller"),
     "In operation, and where model and rig differ": ("watch", "simulate", "diagnose", "batch", "prove"),
 }
 

@@ -12,6 +12,7 @@ import typer
 from rich.console import Console
 
 from autotune.cli import app, identify
+from autotune.cli.recordings import R, T, U, Y, read_one, signal_names
 
 if TYPE_CHECKING:
     from autotune.identification.closed_loop.dither_proposal import DitherLimits
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
 
 @identify.command("closed-loop")
 def closed_loop(
-    recording: Annotated[Path, typer.Argument(help="CSV with t,u,y, and r where it is known", metavar="REC.csv")],
+    recording: Annotated[Path, typer.Argument(help="recording, with r where it is known", metavar="REC.csv")],
     out: Annotated[Path, typer.Option(help="JSON file to write the model and its response to")],
     order: Annotated[
         int | None, typer.Option(min=1, max=30, help="number of states; chosen from the data when absent")
@@ -37,14 +38,17 @@ def closed_loop(
     config: Annotated[
         Path | None, typer.Option(help="configuration of the rig: a dither is proposed within its limits")
     ] = None,
+    t: T = None,
+    u: U = None,
+    y: Y = None,
+    r: R = None,
 ) -> None:
     """Identify the plant from r, u and y recorded while its loop is closed."""
     from autotune.controller import read_controller
     from autotune.identification.closed_loop.identify import identify_closed_loop
-    from autotune.recording import read_recording
 
     console = Console(stderr=True, highlight=False)
-    data = read_recording(recording)
+    data = read_one(recording, signal_names(t, u, y, r))
     law = None if controller is None else read_controller(controller)
     with console.status("reading the loop") as status:
         result = identify_closed_loop(

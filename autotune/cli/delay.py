@@ -11,10 +11,12 @@ from typing import TYPE_CHECKING, Annotated, Literal, TextIO
 import typer
 
 from autotune.cli import app, identify
+from autotune.cli.recordings import R, T, U, Y, read_one, signal_names
 
 if TYPE_CHECKING:
     from autotune.config.loader import Config
     from autotune.controller import Controller
+    from autotune.files import SignalNames
     from autotune.identification.delay.model import DelayModel
     from autotune.identification.delay.tracking import Window
     from autotune.recording import Recording
@@ -37,7 +39,7 @@ class PastInput(StrEnum):
 
 @identify.command("delay")
 def identify_delay_command(
-    recording: Annotated[Path, typer.Argument(help="recording, CSV with columns t,u,y")],
+    recording: Annotated[Path, typer.Argument(help="recording of u and y")],
     out: Annotated[Path, typer.Option(help="file to write the model to, delay.json")],
     order: Annotated[int, typer.Option(min=1, max=4, help="order n of the model, 1 to 4")] = 2,
     max_delay: Annotated[
@@ -55,15 +57,18 @@ def identify_delay_command(
     integrator: Annotated[bool, typer.Option("--integrator", help="the plant integrates: a0 = 0")] = False,
     offset: Annotated[bool, typer.Option(help="estimate a constant offset of u or y")] = True,
     coloured: Annotated[bool, typer.Option(help="allow coloured (autoregressive) noise")] = True,
+    t: T = None,
+    u: U = None,
+    y: Y = None,
+    r: R = None,
 ) -> None:
     """Identify x^(n) = sum a_i x^(i) + b u(t - h) from a recording; no starting value is needed."""
     from rich.console import Console
 
     from autotune.identification.delay.identify import identify_delay
     from autotune.identification.delay.model import write_delay_model
-    from autotune.recording import read_recording
 
-    record = read_recording(recording)
+    record = read_one(recording, signal_names(t, u, y, r))
     with Console(stderr=True).status("searching the delay") as status:
         model = identify_delay(
             record,
@@ -105,6 +110,7 @@ class _Tracking:
     controller: Controller | None
     modulus_margin: float
     phase_margin_rad: float
+    names: SignalNames
 
 
 @app.command()
@@ -135,6 +141,10 @@ def watch(
     dither: Annotated[
         float | None, typer.Option(help="with CONFIG: half-amplitude added to the command [u unit]; found when absent")
     ] = None,
+    t: T = None,
+    u: U = None,
+    y: Y = None,
+    r: R = None,
 ) -> None:
     """Track gain, time constants and dead time, and say when the controller wants retuning.
 
@@ -154,6 +164,7 @@ def watch(
         controller=law,
         modulus_margin=modulus_margin,
         phase_margin_rad=math.radians(phase_margin),
+        names=signal_names(t, u, y, r),
     )
     if source.suffix.lower() != ".toml":
         _follow(source, out, settings, follow)
@@ -205,7 +216,7 @@ def _follow(recording: Path, out: Path, settings: _Tracking, quiet_s: float) -> 
         while True:
             if recording.stat().st_size > size:  # it may grow for long before the loop is in operation
                 size, quiet_since = recording.stat().st_size, time.monotonic()
-            record = _of_operation(recording) if quiet_s == 0.0 else _readable(recording)
+            record = _of_operation(recording, settings) if quiet_s == 0.0 else _readable(recording, settings)
             if record is not None and len(record) > rows:
                 rows = len(record)
                 length = settings.window_s if settings.window_s is not None else 0.2 * record.duration_s
@@ -242,12 +253,11 @@ def _in_operation(record: Recording) -> Recording | None:
     return record.between(float(closed[0]), np.inf) if closed.size > 1 else None
 
 
-def _of_operation(recording: Path) -> Recording:
+def _of_operation(recording: Path, settings: _Tracking) -> Recording:
     """Return a finished recording of the loop in operation."""
     from autotune.errors import InputError
-    from autotune.recording import read_recording
 
-    record = _in_operation(read_recording(recording))
+    record = _in_operation(read_one(recording, settings.names))
     if record is None:
         raise InputError(
             "column 'r' has no set-point in any row", where=str(recording), remedy="record the loop in operation"
@@ -255,13 +265,13 @@ def _of_operation(recording: Path) -> Recording:
     return record
 
 
-def _readable(recording: Path) -> Recording | None:
+def _readable(recording: Path, settings: _Tracking) -> Recording | None:
     """Return what a growing recording holds of the loop in operation, None while that is less than two rows."""
     from autotune.errors import InputError
-    from autotune.recording import read_recording
+    from autotune.files import read_recordings
 
     try:
-        return _in_operation(read_recording(recording))
+        return _in_operation(read_recordings(recording, settings.names).longest)
     except InputError:
         return None
 

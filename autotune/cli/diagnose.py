@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from autotune.cli import app
+from autotune.cli.recordings import R, T, U, Y, read_all, read_one, signal_names
 
 
 @app.command()
@@ -19,15 +20,18 @@ def simulate(
         float | None,
         typer.Option(help="length of the windows [s] before which the state is estimated anew; default: one free run"),
     ] = None,
+    t: T = None,
+    u: U = None,
+    y: Y = None,
+    r: R = None,
 ) -> None:
     """Simulate a model with a recording's u; with --horizon as a forecast, window after window."""
     import numpy as np
 
     from autotune.diagnosis.forecast import forecast
     from autotune.models import read_model
-    from autotune.recording import read_recording
 
-    data = read_recording(recording)
+    data = read_one(recording, signal_names(t, u, y, r))
     y_sim = forecast(read_model(model), data, horizon)
     out.parent.mkdir(parents=True, exist_ok=True)
     np.savetxt(out, np.column_stack([data.t, y_sim]), fmt="%.10g", delimiter=",", header="t,y_sim", comments="")
@@ -52,6 +56,10 @@ def diagnose(
     without: Annotated[
         list[str] | None, typer.Option(help="leave an effect out of the catalogue; may be given several times")
     ] = None,
+    t: T = None,
+    u: U = None,
+    y: Y = None,
+    r: R = None,
 ) -> None:
     """Find where and why recordings differ from the simulation: numbers, missing physics, or something else."""
     from rich.console import Console
@@ -62,11 +70,10 @@ def diagnose(
     from autotune.diagnosis.diagnose import diagnose as find
     from autotune.diagnosis.simulation import entry_of
     from autotune.models import read_model, write_model
-    from autotune.recording import read_recording
     from autotune.report.diagnosis_page import write_diagnosis_page
 
     nominal = read_model(model)
-    data = [read_recording(path) for path in recordings]
+    data = read_all(recordings, signal_names(t, u, y, r))
     law = None if controller is None else read_controller(controller)
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
     # many short products: waiting for each other costs linear algebra's threads more than they save

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from autotune.cli import app, identify
+from autotune.cli.recordings import R, T, U, Y, read_all, signal_names
 
 if TYPE_CHECKING:
     from autotune.identification.reduction import ReducedModel
@@ -18,25 +19,29 @@ if TYPE_CHECKING:
 
 @identify.command("frequency")
 def frequency(
-    recordings: Annotated[list[Path], typer.Argument(help="recordings, CSV with columns t,u,y and r where it moved")],
+    recordings: Annotated[list[Path], typer.Argument(help="recordings; with r where it moved")],
     out: Annotated[Path, typer.Option(help="points file to write (JSON)")],
     largest_sd: Annotated[
         float,
         typer.Option(min=0.001, max=1.0, help="leave out points whose standard deviation is above this part of gain"),
     ] = 0.5,
+    t: T = None,
+    u: U = None,
+    y: Y = None,
+    r: R = None,
 ) -> None:
     """Estimate Bode points from recordings: relay, multisine, random binary or steps, open or closed loop."""
     from rich.progress import track
 
     from autotune.identification.frequency.recorded import combine, frequency_points
     from autotune.points import points_to_json
-    from autotune.recording import read_recording
 
     estimates = []
-    for path in track(recordings, description="recordings", transient=True, disable=len(recordings) < 2):
-        estimates.append(frequency_points(read_recording(path), largest_relative_sd=largest_sd))
-    for path, estimate in zip(recordings, estimates, strict=True):
-        typer.echo(f"{path}: {estimate.excitation}, {len(estimate.points)} point(s)")
+    data = read_all(recordings, signal_names(t, u, y, r))
+    for one in track(data, description="recordings", transient=True, disable=len(data) < 2):
+        estimates.append(frequency_points(one, largest_relative_sd=largest_sd))
+    for one, estimate in zip(data, estimates, strict=True):
+        typer.echo(f"{one.name}: {estimate.excitation}, {len(estimate.points)} point(s)")
     combined = combine(estimates)
     for point in combined.points:
         typer.echo(f"  {_line(point)}")

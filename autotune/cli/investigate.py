@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from autotune.cli import app
+from autotune.cli.recordings import R, T, U, Y, read_all, signal_names
 
 if TYPE_CHECKING:
     from autotune.diagnosis.investigate import Investigation
@@ -37,17 +38,20 @@ def investigate(
         list[str] | None, typer.Option(help="leave an effect out of the catalogue; may be given several times")
     ] = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="run the rig's simulated twin instead of the rig")] = False,
+    t: T = None,
+    u: U = None,
+    y: Y = None,
+    r: R = None,
 ) -> None:
     """Run the experiments that tell apart what a model may leave out, until one hypothesis is left."""
     from autotune.cli.common import ProgressBar, new_folder, rig_of
     from autotune.config import load_config
     from autotune.diagnosis.investigate import investigate as find_out
     from autotune.models import read_model
-    from autotune.recording import read_recording
 
     content = load_config(config)
     nominal = read_model(model)
-    given = [read_recording(path) for path in recordings or []]
+    given = read_all(recordings or [], signal_names(t, u, y, r))
     rig = rig_of(content, dry_run)
     new_folder(out, ROUNDS)
     with ProgressBar() as bar:

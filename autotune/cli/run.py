@@ -12,6 +12,7 @@ from rich.console import Console
 from autotune.cli import app
 from autotune.cli.common import ProgressBar, new_folder, rig_of
 from autotune.cli.live import LISTEN, PORT, TOKEN
+from autotune.cli.recordings import R, T, U, Y, read_all, signal_names
 from autotune.errors import ExperimentStopped, InputError
 
 if TYPE_CHECKING:
@@ -137,7 +138,7 @@ def _diagnosed(config: Config, tuning: Tuning, folder: Path, console: Console) -
 def tune(
     out: _OUT,
     recordings: Annotated[
-        list[Path] | None, typer.Argument(metavar="[REC.csv ...]", help="recordings of the plant, t,u,y")
+        list[Path] | None, typer.Argument(metavar="[REC.csv ...]", help="recordings of the plant")
     ] = None,
     points: Annotated[
         list[Path] | None,
@@ -155,6 +156,10 @@ def tune(
     noise_gain: Annotated[float, typer.Option(help="largest amplification of noise to command [u unit/y unit]")] = 0.1,
     kind: Annotated[Literal["pi", "pid"], typer.Option(help="structure of the controller")] = "pi",
     source: Annotated[Literal["reduced model", "points"], typer.Option(help="what to design on")] = "reduced model",
+    t: T = None,
+    u: U = None,
+    y: Y = None,
+    r: R = None,
 ) -> None:
     """Design a controller from recordings and points, without a rig: Bode points, reduced model, controller, report."""
     import json
@@ -163,14 +168,13 @@ def tune(
     from autotune.identification.frequency.recorded import combine, frequency_points
     from autotune.pipeline import RESULT, analyse, analysis_json
     from autotune.points import read_points
-    from autotune.recording import read_recording
     from autotune.report.page import write_page
     from autotune.report.run_page import analysis_page
 
     recordings, files = recordings or [], points or []
     if not recordings and not files:
         raise InputError("give recordings or --points", where="autotune tune")
-    read = [read_recording(path) for path in recordings]
+    read = read_all(recordings, signal_names(t, u, y, r))
     given = [point for path in files for point in read_points(path)]
     new_folder(out, RESULT)
     combined = combine([frequency_points(recording) for recording in read]) if read else None

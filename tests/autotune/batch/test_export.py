@@ -7,7 +7,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from autotune.batch.export import columns_of, read_export, seconds, to_parquet
+from autotune.batch.export import columns_of, read_export, to_parquet
 from autotune.batch.settings import ExportSettings, LoopSettings
 from autotune.errors import InputError
 
@@ -27,27 +27,6 @@ def german_loop(tmp_path, **keys):
     path = tmp_path / "export.csv"
     path.write_text(GERMAN, encoding="utf-8")
     return LoopSettings(name="TIC1", file=str(path), u="TIC1.OP", y="TIC1.PV", **keys)
-
-
-@pytest.mark.parametrize(
-    ("stamps", "settings"),
-    [
-        (["1970-01-02T00:00:00", "1970-01-02 00:00:00.250"], {}),
-        (["1970-01-02T00:00:00Z", "1970-01-02T02:00:00.250+02:00"], {}),
-        (["02.01.1970 00:00:00.000", "02.01.1970 00:00:00.250"], {"time_format": "%d.%m.%Y %H:%M:%S.%f"}),
-        (["86400000", "86400250"], {"time_unit_s": 1e-3}),
-        (pa.array([86_400_000, 86_400_250], pa.timestamp("ms")), {}),
-        (pa.array([1.0, 1.0 + 0.25 / 86400]), {"time_unit_s": 86400.0}),
-    ],
-)
-def test_stamps_of_every_form_are_the_same_seconds(stamps, settings):
-    column = pa.chunked_array([stamps])
-    assert seconds(column, ExportSettings(**settings), "file") == pytest.approx([86400.0, 86400.25], abs=1e-6)
-
-
-def test_a_stamp_that_is_none_is_shown():
-    with pytest.raises(InputError, match=r"yesterday.*time_format"):
-        seconds(pa.chunked_array([["yesterday"]]), ExportSettings(), "file")
 
 
 def test_words_and_bad_quality_are_missing_samples(tmp_path):
@@ -101,3 +80,11 @@ def test_a_tag_that_is_not_there_names_the_nearest(tmp_path):
     loop = german_loop(tmp_path).model_copy(update={"y": "TIC1.PW"})
     with pytest.raises(InputError, match=r"'TIC1\.PW'; did you mean 'TIC1\.PV'"):
         read_export(loop, AS_GERMAN)
+
+
+def test_nothing_need_be_said_of_a_historians_export(tmp_path):
+    said, _ = read_export(german_loop(tmp_path), AS_GERMAN)
+    found, flagged = read_export(german_loop(tmp_path), ExportSettings())
+    for name, values in said.items():
+        np.testing.assert_array_equal(found[name], values)
+    assert flagged.sum() == 1
