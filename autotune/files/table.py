@@ -10,7 +10,7 @@ from autotune.errors import InputError
 from autotune.files.cells import Cells
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@dataclass(frozen=True, kw_only=True)
 class FileForm:
     """What is known, or to be found out (None), of how a file is written.
 

@@ -256,3 +256,11 @@ def test_what_is_no_table_is_refused(tmp_path, content):
     path.write_text(content)
     with pytest.raises(InputError, match="no rows of numbers"):
         read_recordings(path)
+
+
+def test_a_recording_of_the_projects_own_form_stays_as_it_is(tmp_path):
+    path = tmp_path / "a.csv"
+    path.write_text("t,u,y,r\n5,1,2,3\n6,1,2,3\n900,1,2,3\n")
+    reading = read_recordings(path)
+    assert reading.recordings[0].t.tolist() == [5.0, 6.0, 900.0]
+    assert not reading.said
