@@ -60,6 +60,10 @@ class LinkError(ExperimentStopped, ConnectionError):
     """The link to the rig failed, or answered something that is not a sample."""
 
 
+class NotTaken(LinkError):  # noqa: N818 - a verdict, as its base
+    """The rig was not taken: nothing was written to it, and it is as it was before."""
+
+
 class OperatorStop(ExperimentStopped):
     """Ctrl-C or SIGTERM ended the experiment; the rig was left at its safe output."""
 

@@ -65,7 +65,13 @@ def open_rig(
 
             kind = RegisterRig if settings.registers.K is None else GainRegisterRig
             return kind(
-                ModbusLink(settings), settings.registers, u_range=u_range, u_safe=u_safe, feed_s=settings.feed_s
+                ModbusLink(settings),
+                settings.registers,
+                u_range=u_range,
+                u_safe=u_safe,
+                feed_s=settings.feed_s,
+                scan_time_s=settings.scan_time_s,
+                permissives=settings.permissives,
             )
 
 

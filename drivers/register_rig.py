@@ -3,18 +3,26 @@
 from __future__ import annotations
 
 import math
-import random
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Protocol
 
 from autotune.config.registers import RegisterMap
+from autotune.config.rig import PermissiveSettings
 from autotune.controller import PIDController
-from autotune.errors import InputError, LinkError
-from autotune.experiment.rig import Clock, Reading
+from autotune.errors import ExperimentStopped, InputError, LinkError, NotTaken
+from autotune.experiment.rig import Clock, Former, Reading
 from drivers.clock import MonotonicClock
+from drivers.heartbeat import Heartbeat
 from drivers.registers import Block, Codec, blocks, codecs
 
 _SAMPLE = ("y", "u_applied", "device_time", "heartbeat_echo", "in_command")
+#: cycle of the device's program where it is not known [s], and how many of them its status is late at most: three, the
+#: part of one that has passed when the host writes, and the one for which it is shown
+_SCAN_S, _SCANS_LATE = 0.02, 5
+#: time that a device gets at least to say that the host commands [s]
+_TAKE_S = 0.25
+#: how long another master's heartbeat is looked for, in times between two of our own
+_WATCH_FEEDS = 3
 
 
 class RegisterLink(Protocol):
@@ -61,6 +69,10 @@ class RegisterRig:
         Command that ``make_safe`` leaves [u unit].
     feed_s : float
         Longest time between two heartbeats while the host commands [s].
+    scan_time_s : float, optional
+        Cycle of the device's program [s]; 20 ms where it is not known.
+    permissives : sequence of PermissiveSettings
+        Conditions that are read with every sample, and without which the rig is not moved.
 
     Raises
     ------
@@ -69,6 +81,9 @@ class RegisterRig:
 
     Notes
     -----
+    A device whose program runs in cycles shows the state of an earlier one: who commands and the echo of the heartbeat
+    are up to three cycles late, and that is waited for and tolerated.
+
     A sample's time stamp is the middle between request and answer. The wait of one request is bounded by the link's
     time-outs and retries.
     """
@@ -81,24 +96,33 @@ class RegisterRig:
         u_range: tuple[float, float],
         u_safe: float,
         feed_s: float = 0.1,
+        scan_time_s: float | None = None,
+        permissives: Sequence[PermissiveSettings] = (),
     ) -> None:
         self._link = link
         self._codecs = codecs(registers.mapped())
+        self._permissives = {f"permissive {one.name!r}": one for one in permissives}
+        conditions = codecs(self._permissives)
         self._clock = MonotonicClock()
         self._u_range = u_range
         self._u_safe = u_safe
         self._feed_s = feed_s
         for u in (*u_range, u_safe):
             self._codecs["u"].encode(u)
-        self._sample_blocks = blocks([self._codecs[name] for name in _SAMPLE if name in self._codecs])
+        sample = [self._codecs[name] for name in _SAMPLE if name in self._codecs]
+        self._sample_blocks = blocks([*sample, *conditions.values()])
         self._command_blocks = blocks([self._codecs[name] for name in ("u", "heartbeat") if name in self._codecs])
+        first = [self._codecs[name] for name in ("u", "heartbeat", "safe") if name in self._codecs]
+        self._first_blocks = blocks(first)
         self._checks_echo = "heartbeat_echo" in self._codecs
-        self._beats = int(self._codecs["heartbeat"].span[1]) + 1 if "heartbeat" in self._codecs else 1
-        # a device that was left with an old heartbeat must not seem to echo the first one
-        self._beat = random.randrange(self._beats)
-        self._fed_s = -math.inf
+        self._scan_s = scan_time_s if scan_time_s is not None else _SCAN_S
+        self._late_s = _SCANS_LATE * self._scan_s
+        beats = int(self._codecs["heartbeat"].span[1]) + 1 if "heartbeat" in self._codecs else 1
+        self._heart = Heartbeat(beats, late_s=self._late_s)
         self._u = u_safe
+        self._former: Former | None = None
         self._is_open = False
+        self._is_taken = False  # whether anything was written in this session
         self._is_commanding = False
 
     @property
@@ -106,20 +130,57 @@ class RegisterRig:
         """The monotonic clock."""
         return self._clock
 
+    @property
+    def shows_output(self) -> bool:
+        """Whether the device says which output it applies."""
+        return "u_applied" in self._codecs
+
+    @property
+    def former(self) -> Former | None:
+        """Mode and set-point that the device's own controller had before the host took command, where it ran."""
+        return self._former
+
     def open(self) -> None:
-        """Connect and take command without a bump where the device says what it applies, else at the safe output."""
-        self._link.connect()
-        self._is_open = True
-        self._fed_s = -math.inf  # nothing to be echoed yet
-        taken = self._sample()[0].u_applied
-        if "safe" in self._codecs:
-            self._put("safe", self._u_safe)
+        """Connect, look before anything is written, and take command.
+
+        Without a bump where the device says what it applies, else at the safe output.
+
+        Raises
+        ------
+        NotTaken
+            Nobody answers, another master commands, or a permissive is missing; nothing was written.
+        LinkError
+            The device does not let the host command.
+        """
+        try:
+            self._link.connect()
+            self._is_open = True
+            self._heart.begin()
+            reading, values = self._sample()
+            self._check_permissives(values)
+            held = self._read(("enable", "automatic"))
+            self._refuse_other_master(held | values)
+            runs = held.get("automatic") == 1.0
+            setpoint = self._read(("setpoint",)).get("setpoint", math.nan) if runs else math.nan
+        except LinkError as error:
+            self.close()
+            raise NotTaken(error.what, where=error.where, remedy=error.remedy) from None
+        self._former = Former(setpoint=setpoint) if runs else None
+        self._is_taken = True
+        if held.get("enable", 0.0) != 0.0:  # a session that was killed left it; a device's trip clears on its edge
+            self._put("enable", 0.0)
+            self._clock.sleep_until(self._clock.now() + 2.0 * self._scan_s)
+            reading, _ = self._sample()
+        taken = reading.u_applied
         low, high = self._u_range
         self._u = taken if low <= taken <= high else self._u_safe  # NaN compares false
         self._is_commanding = True
-        self._command()
+        self._write(self._first_blocks)
         if "enable" in self._codecs:
             self._put("enable", 1.0)
+        elif runs:
+            self._put("automatic", 0.0)
+        self._await_command(1.0)
 
     def read(self) -> Reading:
         """Take one sample; feeds the dead-man when that is due.
@@ -127,13 +188,15 @@ class RegisterRig:
         Raises
         ------
         LinkError
-            No answer, or one that does not carry the last heartbeat, also after the link was flushed; or the device
+            No answer, or one that does not carry a recent heartbeat, also after the link was flushed; or the device
             says that it no longer lets the host command.
+        ExperimentStopped
+            A permissive is lost.
         """
         self._require(self._is_open, "the rig is not open", "open it before the first sample")
-        if self._is_commanding and self._clock.now() - self._fed_s > self._feed_s:
-            self._feed()
+        self.feed()
         reading, values = self._sample()
+        self._check_permissives(values)
         if self._is_commanding and values.get("in_command") == 0.0:
             self._is_commanding = False
             raise LinkError(
@@ -157,15 +220,22 @@ class RegisterRig:
         self._u = u
         self._command()
 
+    def feed(self) -> None:
+        """Feed the device's dead-man where that is due; nothing where the host does not command."""
+        if self._is_commanding and self._clock.now() - self._heart.fed_s > self._feed_s:
+            self._feed()
+
     def make_safe(self) -> None:
         """Command the safe output, stop the device's own controller and give the actuator back.
+
+        Nothing where this session has taken nothing: the rig is somebody else's then.
 
         Raises
         ------
         LinkError
             The device could not be reached, also over a new connection; its dead-man sets the safe output.
         """
-        if not self._is_open:
+        if not self._is_taken:
             return
         try:
             self._go_safe()
@@ -174,9 +244,29 @@ class RegisterRig:
             self._link.connect()
             self._go_safe()
 
+    def hand_back(self) -> None:
+        """Give the actuator back to the device's own controller, in the mode and at the set-point it had, bumplessly.
+
+        Raises
+        ------
+        LinkError
+            The device could not be reached, or does not hold what was written; it is not known who commands.
+        """
+        self._require(self._is_commanding and self._former is not None, "no controller had the actuator", "")
+        former = self._former
+        if former is not None and math.isfinite(former.setpoint):
+            self._put("setpoint", former.setpoint)
+        self._put("automatic", 1.0)
+        if "enable" in self._codecs:
+            self._put("enable", 0.0)
+        self._await_command(0.0)
+        self._is_commanding = False
+        held = self._read(("automatic",))
+        self._require(held["automatic"] == 1.0, "the device's controller is not in automatic", "set it at the rig")
+
     def close(self) -> None:
         """Disconnect."""
-        self._is_open = self._is_commanding = False
+        self._is_open = self._is_commanding = self._is_taken = False
         self._link.disconnect()
 
     def _go_safe(self) -> None:
@@ -187,19 +277,75 @@ class RegisterRig:
             if name in self._codecs:
                 self._put(name, 0.0)
 
+    def _refuse_other_master(self, shown: Mapping[str, float]) -> None:
+        """Watch for a moving heartbeat where the device says, or may not say, that somebody commands it."""
+        told = [shown[name] for name in ("enable", "in_command") if name in shown]
+        if "heartbeat" not in self._codecs or (told and not any(told)):
+            return
+        start_s = self._clock.now()
+        patience_s = max(_WATCH_FEEDS * self._feed_s, self._late_s)
+        before = self._read(("heartbeat",))["heartbeat"]
+        while self._clock.now() - start_s < patience_s:
+            self._clock.sleep_until(self._clock.now() + self._scan_s)
+            beat = self._read(("heartbeat",))["heartbeat"]
+            self._require(
+                beat == before,
+                f"another master commands the rig: its heartbeat went from {before:g} to {beat:g}",
+                "end the other session; only one master may command",
+            )
+
+    def _check_permissives(self, values: Mapping[str, float]) -> None:
+        for name, condition in self._permissives.items():
+            if not condition.holds(values[name]):
+                raise (ExperimentStopped if self._is_taken else NotTaken)(
+                    f"{name} is {'lost' if self._is_taken else 'missing'}: it reads {values[name]:g}",
+                    where=self._link.where,
+                    remedy="look at the rig why, and start again when it is there",
+                )
+
+    def _await_command(self, wanted: float) -> None:
+        """Wait until the device says who commands, and echoes this session: its status is some program cycles late."""
+        start_s = self._clock.now()
+        while True:
+            asked_s = self._clock.now()
+            values = self._ask()[1]
+            echoes = not self._checks_echo or self._heart.is_own(values["heartbeat_echo"], asked_s)
+            if echoes and values.get("in_command", wanted) == wanted:
+                return
+            waited_s = self._clock.now() - start_s
+            self._require(
+                waited_s < max(_TAKE_S, self._late_s),
+                f"in_command is not {wanted:g} after {waited_s:.2g} s"
+                if echoes
+                else f"the device does not echo the heartbeat after {waited_s:.2g} s",
+                "look at the device's mode switch and trips, and whether its program runs; give rig.scan_time_s",
+            )
+            self.feed()
+            self._clock.sleep_until(self._clock.now() + 0.25 * self._scan_s)
+
+    def _read(self, names: Sequence[str]) -> dict[str, float]:
+        """Return the values of those of the signals that are mapped."""
+        values: dict[str, float] = {}
+        for block in blocks([self._codecs[name] for name in names if name in self._codecs]):
+            values |= block.decode(self._link.read(block)[0])
+        return values
+
     def _sample(self) -> tuple[Reading, dict[str, float]]:
-        """Return a sample that carries the last heartbeat, asking a second time over a flushed link."""
-        for _ in range(2):
-            reading, values = self._ask()
-            echo = values.get("heartbeat_echo", math.nan)
-            if not self._checks_echo or echo == self._beat or self._fed_s < 0:
-                return reading, values
+        """Return a sample that carries a recent heartbeat, asking again over a flushed line while it does not."""
+        start_s = asked_s = self._clock.now()
+        reading, values = self._ask()
+        while self._checks_echo and not self._heart.allows(values["heartbeat_echo"], asked_s):
+            self._require(
+                asked_s - start_s <= self._late_s,
+                f"the device echoes heartbeat {values['heartbeat_echo']:g}, not {self._heart.value}",
+                "it restarted, another master writes to it, or heartbeat_echo is mapped wrongly;"
+                " of a slow program give rig.scan_time_s",
+            )
             self._link.distrust()
-        raise LinkError(
-            f"the device echoes heartbeat {echo:g}, not {self._beat}",
-            where=self._link.where,
-            remedy="it restarted, another master writes to it, or heartbeat_echo is mapped wrongly",
-        )
+            self._clock.sleep_until(asked_s + 0.5 * self._scan_s)
+            asked_s = self._clock.now()
+            reading, values = self._ask()
+        return reading, values
 
     def _ask(self) -> tuple[Reading, dict[str, float]]:
         start_s = middle_s = self._clock.now()
@@ -223,9 +369,11 @@ class RegisterRig:
 
     def _command(self) -> None:
         """Write command and heartbeat; the heartbeat only once the command is in."""
-        beat = (self._beat + 1) % self._beats
-        values = {"u": self._u, "heartbeat": float(beat)}
-        for block in self._command_blocks:
+        self._write(self._command_blocks)
+
+    def _write(self, parts: Sequence[Block]) -> None:
+        values = {"u": self._u, "heartbeat": float(self._heart.next), "safe": self._u_safe}
+        for block in parts:
             words = [word for codec, _ in block.parts for word in codec.encode(values[codec.name])]
             suspect = self._link.write(block.table, block.address, words)
             if suspect and list(self._link.read(block)[0]) != words:
@@ -234,16 +382,13 @@ class RegisterRig:
                     where=self._link.where,
                     remedy="let only one master write to the device, or raise timeout_s",
                 )
-        self._beat = beat
-        self._fed_s = self._clock.now()
+        self._heart.written(self._clock.now())
 
     def _feed(self) -> None:
         if "heartbeat" not in self._codecs:
             return
-        beat = (self._beat + 1) % self._beats
-        self._put("heartbeat", float(beat))
-        self._beat = beat
-        self._fed_s = self._clock.now()
+        self._put("heartbeat", float(self._heart.next))
+        self._heart.written(self._clock.now())
 
     def _put(self, name: str, value: float) -> None:
         codec = self._codecs[name]

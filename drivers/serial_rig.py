@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 
 from autotune.config.rig import SerialSettings
 from autotune.controller import PIDController
-from autotune.errors import InputError, LinkError
-from autotune.experiment.rig import Clock, Reading
+from autotune.errors import InputError, LinkError, NotTaken
+from autotune.experiment.rig import Clock, Former, Reading
 from drivers.clock import MonotonicClock
 from drivers.line_protocol import PAYLOAD, Command, Frame, Kind
 from drivers.serial_line import NOT_IN_COMMAND, DeviceRefused, Port, SerialLink, open_port
@@ -20,6 +20,8 @@ from drivers.serial_line import NOT_IN_COMMAND, DeviceRefused, Port, SerialLink,
 COMMAND, _DEADMAN, _LIMIT, _TIME, _OVERRUN = 0x03, 0x04, 0x08, 0x10, 0x20
 _GAINS = PAYLOAD[Kind.SET_GAINS]
 _WRAP_S = 2**32 * 1e-6
+#: part of the dead-man time after which it is fed
+_FEED = 0.25
 #: how far the device's clock may be from the host's: a ceramic resonator and its temperature, and a tick or two [s]
 _CLOCK_ERROR, _CLOCK_SLACK_S = 0.02, 0.003
 
@@ -101,6 +103,7 @@ class SerialLineRig:
         self._starts = -1
         self._device_time_s = 0.0
         self._received_s, self._latency_s = 0.0, 0.0  # of the sample whose device time that is, on the host's clock
+        self._former: Former | None = None
         self._is_open = False
         self._is_commanding = False
 
@@ -114,9 +117,33 @@ class SerialLineRig:
         """Period of the device's own loop [s]; known once the rig has been opened."""
         return self._tick_s
 
+    @property
+    def shows_output(self) -> bool:
+        """The device says which output it applies."""
+        return True
+
+    @property
+    def former(self) -> Former | None:
+        """Whether the device's own PI ran before the host took command; its set-point cannot be read."""
+        return self._former
+
     def open(self) -> None:
-        """Connect and take command; the output stays until the first command."""
-        self._connect()
+        """Connect and take command; the output stays until the first command.
+
+        Raises
+        ------
+        NotTaken
+            Nobody answers; nothing was written.
+        LinkError
+            The device does not let the host command.
+        """
+        try:
+            self._connect()
+            self._starts = -1
+            frame, *_ = self._link.ask(Kind.READ)
+        except LinkError as error:
+            raise NotTaken(error.what, where=error.where, remedy=error.remedy) from None
+        self._former = Former() if self._state(frame) & COMMAND == Command.REGULATOR else None
         self._is_open = True
         self._take()
 
@@ -147,6 +174,21 @@ class SerialLineRig:
         """
         self._require(self._is_commanding, "the host is not in command", "open the rig again")
         return self._exchange(Kind.EXCHANGE, self._u.count(u, "u"))
+
+    def feed(self) -> None:
+        """Feed the device's dead-man where that is due; nothing where the host does not command."""
+        if self._is_commanding and self._clock.now() - self._received_s > _FEED * self._settings.deadman_s:
+            self._exchange(Kind.READ)
+
+    def hand_back(self) -> None:
+        """Refuse: the protocol does not say which set-point the device's own PI had.
+
+        Raises
+        ------
+        LinkError
+            Always.
+        """
+        raise LinkError("the set-point it had cannot be read", where=self._link.where, remedy="start it at the rig")
 
     def make_safe(self) -> None:
         """Have the device set the safe output and give the actuator back.

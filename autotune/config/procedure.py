@@ -39,6 +39,10 @@ class LimitSettings(Section):
     y_max: Annotated[float, Field(description="highest measurement the experiment may see once it floats [y unit]")]
     swing: Annotated[float, Field(gt=0, description="largest departure of y from the operating point [y unit]")]
     time_s: Annotated[float, Field(gt=0, description="longest time on the rig [s]")] = 600.0
+    late_s: Annotated[
+        float,
+        Field(gt=0, le=60, description="longest time the loop may be behind its schedule [s]; two samples always are"),
+    ] = 0.1
 
     @model_validator(mode="after")
     def _ordered(self) -> LimitSettings:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Literal, TypeAlias, get_args
 
 from pydantic import Field
 
 from autotune.config.procedure import Section
-from autotune.config.registers import RegisterMap
+from autotune.config.registers import RegisterMap, RegisterSettings
 
 
 class PlantSettings(Section):
@@ -50,6 +51,22 @@ class TwinSettings(PlantSettings):
     key_file: Annotated[str | None, Field(description="private key of the served twin, PEM (TLS)")] = None
 
 
+class PermissiveSettings(RegisterSettings):
+    """A condition of the plant that is read with every sample: a door, a drive that is ready, a mode switch."""
+
+    name: Annotated[str, Field(min_length=1, description="what it is, as people at the rig call it")]
+    at_least: Annotated[float | None, Field(description="holds from this value on; absent: where it is not 0")] = None
+    at_most: Annotated[float | None, Field(description="holds up to this value")] = None
+
+    def holds(self, value: float) -> bool:
+        """Return whether the rig may be moved at this value; never where it is not a number."""
+        if self.at_least is None and self.at_most is None:
+            return not math.isnan(value) and value != 0.0
+        low = self.at_least if self.at_least is not None else -math.inf
+        high = self.at_most if self.at_most is not None else math.inf
+        return low <= value <= high
+
+
 class ModbusSettings(Section):
     """What the Modbus transports have in common."""
 
@@ -64,7 +81,19 @@ class ModbusSettings(Section):
     feed_s: Annotated[
         float, Field(gt=0, le=60, description="longest time between two heartbeats while the host commands [s]")
     ] = 0.1
+    scan_time_s: Annotated[
+        float | None,
+        Field(
+            gt=0,
+            le=60,
+            description="cycle of the device's program [s]: its status may be three late; absent: not known, 0.02",
+        ),
+    ] = None
     registers: RegisterMap
+    permissives: Annotated[
+        tuple[PermissiveSettings, ...],
+        Field(description="conditions without which the rig is not moved; losing one is a safe stop with its name"),
+    ] = ()
     twin: TwinSettings | None = None
 
 

@@ -17,9 +17,10 @@ import numpy as np
 
 from autotune.arrays import FloatArray
 from autotune.errors import AutotuneError, ExperimentStopped, LinkError, OperatorStop
+from autotune.experiment.leaving import leave, say, verdict_on
 from autotune.experiment.limits import Envelope, Watch
 from autotune.experiment.monitor import ReadingMonitor
-from autotune.experiment.rig import Exchanges, Reading, Rig, Row
+from autotune.experiment.rig import Exchanges, Feeds, Reading, Rig, Row
 from autotune.experiment.rows import KEPT_ROWS, RecentRows
 from autotune.experiment.warm import warm_up
 from autotune.recording import RecordingWriter
@@ -28,11 +29,10 @@ from autotune.recording import RecordingWriter
 SLICE_S = 0.1
 #: what an onlooker's Abort arrives as; Ctrl-C itself where the system has no signal to spare
 ABORT = getattr(signal, "SIGUSR1", signal.SIGINT)
-#: samples behind the schedule at which the loop gives up: a command that late belongs to another plant state
-LATE_SAMPLES = 10
+#: sample times that the loop may always be behind its schedule, however short limits.late_s is
+LATE_SAMPLES = 2
 #: what lies at least between two rows [s], where a virtual clock stands still
 SHORTLY_S = 1e-6
-SAFE, UNSAFE = "safe output", "not confirmed: the link failed, the device's own dead-man timer has to act"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,6 +51,8 @@ class Tick:
         Whether ``y`` is this sample's own; an unusable one is NaN in the recording.
     u : float
         Command held until now [u unit].
+    slots : int
+        Sample times since the tick before: 1, or more where samples were missed between the two.
     """
 
     k: int
@@ -58,6 +60,7 @@ class Tick:
     y: float
     usable: bool
     u: float
+    slots: int = 1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -150,7 +153,8 @@ class ControlLoop:
         self._latency: deque[float] = deque(maxlen=KEPT_ROWS)
         self._lateness: deque[float] = deque(maxlen=KEPT_ROWS)
         self._exchange = rig.exchange if isinstance(rig, Exchanges) else None
-        self._missed = 0
+        self._feed = rig.feed if isinstance(rig, Feeds) else None
+        self._missed, self._slots = 0, 1
         self._stop_signal = ""
         self._start_s = self._device_start_s = 0.0
         self._deadline_s = 0.0
@@ -187,24 +191,20 @@ class ControlLoop:
             if self._exchange is not None:
                 self._write_row(held, {})
         except BaseException as error:
-            self._leave(error)
-            if isinstance(error, KeyboardInterrupt):
-                raise OperatorStop("stopped by Ctrl-C", remedy="run it again when ready") from error
-            raise
+            verdict = verdict_on(error)
+            self._leave(verdict or error)
+            if verdict is None:
+                raise
+            raise verdict from error
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._leave(error)
-        if isinstance(error, KeyboardInterrupt):  # a Ctrl-C that no handler of ours caught (not the main thread)
-            raise OperatorStop("stopped by Ctrl-C", remedy="run it again when ready") from error
-        if error is None and self.metadata["ended"]["output"] != SAFE:
-            raise LinkError(
-                "the safe output could not be confirmed",
-                where="hand back",
-                remedy="look at the rig: its dead-man timer has to act",
-            )
+        verdict = verdict_on(error)
+        self._leave(verdict or error)
+        if verdict is not None:
+            raise verdict from error
 
     def nearest(self, u: float) -> float:
         """Return the allowed command nearest to ``u``: range, rate, resolution [u unit]."""
@@ -309,20 +309,24 @@ class ControlLoop:
         """Wait for the next absolute deadline; a missed one is counted and left out, the grid stays."""
         clock, step = self.rig.clock, self.sample_time_s
         self._deadline_s += step
-        behind = (clock.now() - self._deadline_s) / step
-        if behind > LATE_SAMPLES:
+        self._slots = 1
+        behind_s = clock.now() - self._deadline_s
+        if behind_s > max(self.envelope.settings.late_s, LATE_SAMPLES * step):
             raise LinkError(
-                f"link too slow: {behind:.0f} samples of {step:g} s behind the schedule",
-                remedy="raise signals.sample_time_s, or unload the computer or the link",
+                f"link too slow: {behind_s:.3g} s behind the schedule of a sample every {step:g} s",
+                remedy="raise signals.sample_time_s, or unload the computer or the link; autotune doctor measures it",
             )
-        if behind > 1.0:
-            self._missed += int(behind)
-            self._deadline_s += step * int(behind)
+        if behind_s > step:
+            self._slots += int(behind_s / step)
+            self._missed += int(behind_s / step)
+            self._deadline_s += step * int(behind_s / step)
         while True:
             self._look_for_stop()
             clock.sleep_until(min(self._deadline_s, clock.now() + SLICE_S))
             if clock.now() >= self._deadline_s - 1e-9:
                 break
+            if self._feed is not None:
+                self._feed()
         self._lateness.append(max(0.0, clock.now() - self._deadline_s))
 
     def _look_for_stop(self) -> None:
@@ -339,7 +343,7 @@ class ControlLoop:
             self._latency.append(reading.latency_s)
         t_s = self._time_of(reading)
         y, usable = self.monitor.judge(reading, u)
-        tick = Tick(k=self.tick.k + 1, t_s=t_s, y=y, usable=usable, u=u)
+        tick = Tick(k=self.tick.k + 1, t_s=t_s, y=y, usable=usable, u=u, slots=self._slots)
         if self.monitor.recent:
             self.envelope.check_measurement(self.monitor.recent, self.watch, self.monitor.noise)
         self.envelope.check_time(t_s)
@@ -355,21 +359,29 @@ class ControlLoop:
         self._stop_signal = name
 
     def _leave(self, error: BaseException | None) -> None:
-        output = SAFE
-        try:
-            self.rig.make_safe()
-        except AutotuneError:
-            output = UNSAFE
-        with contextlib.suppress(AutotuneError):
-            self.rig.close()
+        """Leave the rig, and write down how and why; raises only where the end itself has to be one."""
+        farewell = leave(self.rig, error)
+        unconfirmed = None
+        if error is None and not farewell.is_confirmed:
+            error = unconfirmed = LinkError(
+                f"the safe output could not be confirmed ({farewell.error})",
+                where="hand back",
+                remedy="its dead-man timer has to act",
+            )
+        if error is not None:
+            say(error, farewell.note)
         if self.tick.k >= 0:
             with contextlib.suppress(OSError):
                 self._write_last_row()
-        self.metadata["ended"] = _reason(error) | {"output": output}
+        self.metadata["ended"] = _reason(error) | {"output": farewell.output}
+        if farewell.note:
+            self.metadata["ended"]["note"] = farewell.note
         self.metadata["timing"] = self.timing.to_table()
         with contextlib.suppress(OSError):  # a full disk must not hide why the loop ended
             self._writer.finish(self.metadata)
         self._exits.close()
+        if unconfirmed is not None:
+            raise unconfirmed
 
     def _write_last_row(self) -> None:
         """Write the last sample, which only the safe command followed; NaN where the link broke first."""
@@ -385,8 +397,6 @@ def _reason(error: BaseException | None) -> dict[str, Any]:
         return {"reason": "completed", "exit_status": 0}
     if isinstance(error, AutotuneError):
         return {"reason": str(error), "verdict": type(error).__name__, "exit_status": error.exit_status}
-    if isinstance(error, KeyboardInterrupt):
-        return {"reason": "stopped by Ctrl-C", "verdict": OperatorStop.__name__, "exit_status": 130}
     return {"reason": f"{type(error).__name__}: {error}", "verdict": type(error).__name__, "exit_status": 1}
 
 

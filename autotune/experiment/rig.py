@@ -84,6 +84,56 @@ class Rig(Protocol):
 
 
 @runtime_checkable
+class Feeds(Rig, Protocol):
+    """A rig whose dead-man can be fed without a command: while the host waits for its next sample."""
+
+    def feed(self) -> None:
+        """Feed the dead-man where that is due."""
+        ...
+
+
+@runtime_checkable
+class ShowsOutput(Rig, Protocol):
+    """A rig that can say whether its readings carry the output that the device applies."""
+
+    @property
+    def shows_output(self) -> bool:
+        """Whether :attr:`Reading.u_applied` is a number."""
+        ...
+
+
+@dataclass(frozen=True, kw_only=True)
+class Former:
+    """How the rig's own controller ran before the host took command.
+
+    Attributes
+    ----------
+    setpoint : float
+        Its set-point [y unit]; NaN where the rig does not say.
+    """
+
+    setpoint: float = math.nan
+
+    def __str__(self) -> str:
+        at = f" at set-point {self.setpoint:.6g}" if math.isfinite(self.setpoint) else ""
+        return f"automatic{at}"
+
+
+@runtime_checkable
+class HandsBack(Rig, Protocol):
+    """A rig whose own controller may have run before, and can be given the actuator back without a bump."""
+
+    @property
+    def former(self) -> Former | None:
+        """How it ran when the rig was opened; None where it did not."""
+        ...
+
+    def hand_back(self) -> None:
+        """Give it the actuator, its mode and its set-point back; raises LinkError where that is not certain."""
+        ...
+
+
+@runtime_checkable
 class Exchanges(Rig, Protocol):
     """A rig that takes a command and answers with the sample of the very instant from which the command acts.
 

@@ -11,7 +11,7 @@ from nicegui import Client, ui
 from nicegui.events import KeyEventArguments
 
 from autotune.controller import PIDController
-from autotune.experiment.loop import SAFE
+from autotune.experiment.leaving import sentence
 from autotune.live.charts import Pictures
 from autotune.live.controls import Controls
 from autotune.live.story import Story
@@ -224,8 +224,7 @@ class Screen:
     def _state_text(self) -> str:
         story = self._story
         if story.ended is not None:
-            left = "the rig has its safe output" if story.output == SAFE else f"safe output {story.output or 'unknown'}"
-            return f"Ended: {story.ended}; {left}."
+            return f"Ended: {story.ended}; {sentence(story.output)}."
         if self._controls.run_is_gone:
             return "The run is gone without a word: it was killed. The device's own dead-man timer has to act."
         if story.waiting_s:

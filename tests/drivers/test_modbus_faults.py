@@ -98,7 +98,7 @@ def test_a_late_answer_on_a_serial_line_never_becomes_a_sample(registers: Regist
     cable = Cable(seed=3, refuses=refuses)
     with counting_rtu(cable, registers) as (rig, plant):
         good = 0
-        while cable.harmed < (12 if refuses else 5):
+        while cable.harmed < (12 if refuses else 9):
             try:
                 if not good:
                     rig.open()
