@@ -9,17 +9,19 @@ from __future__ import annotations
 
 import math
 import os
-import tomllib
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, Literal, TypeAlias
+from typing import Annotated, Any, Literal, TypeAlias
 
 import numpy as np
 import tomli_w
+from pydantic import Field, model_validator
 
 from autotune.arrays import ComplexArray, FloatArray
 from autotune.errors import InputError
 from autotune.models import TransferFunction
+from autotune.outputs import write_whole
+from autotune.schema import LONGEST_S, SHORTEST_S, Number, Section, Time, shortened, validated
+from autotune.text_files import read_toml
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,6 +88,70 @@ class DiscreteController:
 Controller: TypeAlias = PIDController | TransferFunction | DiscreteController
 
 
+#: Below this size a gain commands nothing, in whatever units.
+SMALLEST_GAIN = 1e-15
+
+
+class _PID(Section):
+    """Keys of a PI or PID, in a controller file or a design."""
+
+    kind: Literal["pi", "pid"] | None = None
+    K: Annotated[Number, Field(strict=True, description="proportional gain with its sign, a number other than 0")]
+    Ti_s: Annotated[
+        float | None,
+        Field(strict=True, allow_inf_nan=True, description="integral time [s], a positive number; inf for none"),
+    ]
+    Td_s: Annotated[Number, Field(ge=0, strict=True, description="derivative time [s], 0 or more")] = 0.0
+    Tf_s: Annotated[Number, Field(ge=0, strict=True, description="time constant of the filter [s], 0 or more")] = 0.0
+    setpoint_weight: Annotated[
+        float, Field(ge=0, le=1, strict=True, description="share of the set-point in the proportional part, 0 to 1")
+    ] = 1.0
+
+    @model_validator(mode="after")
+    def _acts(self) -> _PID:
+        if abs(self.K) < SMALLEST_GAIN:
+            raise ValueError(f"K = {self.K:g} commands nothing: that is no controller")
+        times = {"Ti_s": self.Ti_s, "Td_s": self.Td_s or SHORTEST_S, "Tf_s": self.Tf_s or SHORTEST_S}
+        for key, value in times.items():
+            endless = value is None or (key == "Ti_s" and value == math.inf)
+            if value is not None and not endless and not SHORTEST_S <= value <= LONGEST_S:
+                raise ValueError(f"{key} = {value!r} is no time from {SHORTEST_S:g} to {LONGEST_S:g} s")
+        if self.kind == "pi" and (self.Td_s or self.Tf_s):
+            raise ValueError('kind = "pi" has neither Td_s nor Tf_s; write kind = "pid"')
+        return self
+
+
+class _DesignedPID(_PID):
+    """Keys of a design: the controller's, and what was found beside it, which is not read."""
+
+    h2: Any = None
+    h2_lower_bound: Any = None
+    binding: Any = None
+    margins: Any = None
+    certificate: Any = None
+
+
+_Coefficients = Annotated[tuple[Annotated[Number, Field(strict=True)], ...], Field(min_length=1, max_length=100)]
+
+
+class _Rational(Section):
+    """Keys of a controller as a transfer function."""
+
+    num: Annotated[_Coefficients, Field(strict=False, description="list of numbers")]
+    den: Annotated[_Coefficients, Field(strict=False, description="list of numbers, not all 0")]
+    sample_time_s: Annotated[Time | None, Field(strict=True, description="sample time [s], 1e-6 to 1e9")] = None
+
+    @model_validator(mode="after")
+    def _divides(self) -> _Rational:
+        if self.sample_time_s is not None and self.den[0] == 0.0:
+            raise ValueError("den must begin with a value other than 0")
+        if not any(self.den):
+            raise ValueError("den is zero")
+        if not any(self.num):
+            raise ValueError("num is zero: that is no controller")
+        return self
+
+
 def read_controller(path: str | os.PathLike[str]) -> Controller:
     """Read a controller file.
 
@@ -95,56 +161,50 @@ def read_controller(path: str | os.PathLike[str]) -> Controller:
         No such file, not TOML, or keys that make no controller; names the key.
     """
     where = str(path)
-    try:
-        content = tomllib.loads(Path(path).read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", where=where, remedy="check the path") from None
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"not TOML: {error}", where=where) from None
-    if "num" in content:
+    content = read_toml(path)
+    if isinstance(content.get("kind"), str):
+        content["kind"] = content["kind"].lower()
+    if "num" in content or "den" in content:
         return _rational(content, where)
-    kind = str(content.get("kind", "")).lower()
-    if kind not in ("pi", "pid"):
+    if content.get("kind") not in ("pi", "pid"):
+        kind = shortened(repr(content.get("kind")))
+        raise InputError(f"kind = {kind}", where=where, remedy='write kind = "pi" or "pid", or num and den')
+    return _pid(validated(_PID, content, where))
+
+
+def pid_from_table(table: Any, where: str) -> PIDController:
+    """Return the PI or PID of a design's or a result's JSON; ``where`` is for messages.
+
+    Raises
+    ------
+    InputError
+        No gains, or gains that no controller has; names the key.
+    """
+    if not isinstance(table, dict) or "K" not in table or "Ti_s" not in table:
         raise InputError(
-            f"kind = {content.get('kind')!r}", where=where, remedy='write kind = "pi" or "pid", or num and den'
+            "holds no K and Ti_s", where=where, remedy="give a design.json or the folder of a completed run"
         )
-    number = {
-        key: _number(content, key, where, default)
-        for key, default in (
-            ("K", None),
-            ("Ti_s", None),
-            ("Td_s", 0.0),
-            ("Tf_s", 0.0),
-            ("setpoint_weight", 1.0),
-        )
-    }
-    if not number["Ti_s"] > 0:
-        raise InputError(f"Ti_s = {number['Ti_s']:g}", where=where, remedy="the integral time is a positive time in s")
-    if number["Td_s"] < 0 or number["Tf_s"] < 0:
-        raise InputError("Td_s and Tf_s", where=where, remedy="times are not negative")
-    return PIDController(**number)
+    return _pid(validated(_DesignedPID, table, where))
 
 
-def _number(content: dict[str, Any], key: str, where: str, default: float | None) -> float:
-    value = content.get(key, default)
-    if isinstance(value, bool) or not isinstance(value, int | float) or math.isnan(value):
-        raise InputError(f"{key} = {value!r}", where=where, remedy=f"write {key} as a number")
-    return float(value)
+def _pid(given: _PID) -> PIDController:
+    return PIDController(
+        K=given.K,
+        Ti_s=math.inf if given.Ti_s is None else given.Ti_s,
+        Td_s=given.Td_s,
+        Tf_s=given.Tf_s,
+        setpoint_weight=given.setpoint_weight,
+    )
 
 
 def _rational(content: dict[str, Any], where: str) -> Controller:
-    try:
-        num = tuple(float(value) for value in content["num"])
-        den = tuple(float(value) for value in content["den"])
-    except (KeyError, TypeError, ValueError):
-        raise InputError("num and den must be lists of numbers", where=where) from None
-    if "sample_time_s" not in content:
-        return TransferFunction(num=num, den=den)
-    sample_time_s = _number(content, "sample_time_s", where, None)
-    if not sample_time_s > 0 or not den or den[0] == 0.0:
-        raise InputError("sample_time_s must be positive and den begin with a value other than 0", where=where)
+    given = validated(_Rational, content, where)
+    if given.sample_time_s is None:
+        return TransferFunction(num=given.num, den=given.den)
     return DiscreteController(
-        num=tuple(b / den[0] for b in num), den=tuple(a / den[0] for a in den), sample_time_s=sample_time_s
+        num=tuple(b / given.den[0] for b in given.num),
+        den=tuple(a / given.den[0] for a in given.den),
+        sample_time_s=given.sample_time_s,
     )
 
 
@@ -166,4 +226,4 @@ def write_controller(controller: Controller, path: str | os.PathLike[str]) -> No
             }
         case TransferFunction():
             content = {"num": list(controller.num), "den": list(controller.den)}
-    Path(path).write_bytes(tomli_w.dumps(content).encode())
+    write_whole(path, tomli_w.dumps(content))

@@ -68,3 +68,11 @@ class OperatorStop(ExperimentStopped):
     """Ctrl-C or SIGTERM ended the experiment; the rig was left at its safe output."""
 
     exit_status = 130
+
+
+class Unforeseen(AutotuneError):  # noqa: N818 - a verdict as well
+    """A defect of the tool that the command line caught; its traceback is in a file."""
+
+
+class UnforeseenAtRig(ExperimentStopped):
+    """A defect of the tool while it had a rig in command; every exit of the control loop makes the rig safe."""

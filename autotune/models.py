@@ -7,7 +7,6 @@ where a diagnosis added physics. ``y = last block's output + output.offset``, dr
 from __future__ import annotations
 
 import os
-import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,9 +18,16 @@ import tomli_w
 
 from autotune.arrays import ComplexArray, FloatArray
 from autotune.errors import InputError
+from autotune.outputs import write_whole
+from autotune.text_files import read_toml
 
 Place: TypeAlias = Literal["actuator", "plant", "sensor"]
 Hold: TypeAlias = Literal["zero", "linear"]
+
+#: Most blocks of a chain and most coefficients of a polynomial: far beyond any plant, far before work becomes a wait.
+MOST_BLOCKS, MOST_COEFFICIENTS = 50, 40
+#: Largest size of a number in a model file; where arithmetic overflows, a result would be none.
+LARGEST = 1e30
 
 
 def _trimmed(coefficients: Sequence[float]) -> tuple[float, ...]:
@@ -198,36 +204,52 @@ def read_model(path: str | os.PathLike[str]) -> Model:
         No such file, not TOML, an unknown key or place, or a block that is not proper; names the table and the key.
     """
     where = str(path)
-    try:
-        content = tomllib.loads(Path(path).read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", where=where, remedy="check the path") from None
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"not TOML: {error}", where=where) from None
+    content = read_toml(path)
     _known(content, {"name", "input", "output", "block", "effect"}, where)
-    blocks = content.get("block", [])
-    if not isinstance(blocks, list) or not blocks:
+    blocks, effects = _tables(content, "block", where), _tables(content, "effect", where)
+    if not blocks:
         raise InputError("no [[block]]", where=where, remedy="a model needs at least one block")
     return Model(
-        name=str(content.get("name", Path(path).stem)),
+        name=_text(content, "name", Path(path).stem, where),
         input=_port(content.get("input", {}), f"{where} [input]"),
         output=_port(content.get("output", {}), f"{where} [output]"),
         blocks=tuple(_block(table, f"{where} [[block]] {i + 1}") for i, table in enumerate(blocks)),
-        effects=tuple(
-            effect_of(table, f"{where} [[effect]] {i + 1}") for i, table in enumerate(content.get("effect", []))
-        ),
+        effects=tuple(effect_of(table, f"{where} [[effect]] {i + 1}") for i, table in enumerate(effects)),
     )
 
 
-def _known(table: Mapping[str, Any], keys: set[str], where: str) -> None:
+def _tables(content: Mapping[str, Any], key: str, where: str) -> list[Any]:
+    tables = content.get(key, [])
+    if not isinstance(tables, list):
+        raise InputError(f"{key} = {_shown(tables)}", where=where, remedy=f"write tables [[{key}]]")
+    if len(tables) > MOST_BLOCKS:
+        raise InputError(f"{len(tables)} [[{key}]]", where=where, remedy=f"give at most {MOST_BLOCKS}")
+    return tables
+
+
+def _text(table: Mapping[str, Any], key: str, default: str, where: str) -> str:
+    value = table.get(key, default)
+    if not isinstance(value, str) or len(value) > 200:
+        raise InputError(f"{key} = {_shown(value)}", where=where, remedy="write a text of at most 200 characters")
+    return value
+
+
+def _shown(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def _known(table: Any, keys: set[str], where: str) -> None:
+    if not isinstance(table, Mapping):
+        raise InputError(f"{_shown(table)} is no table", where=where, remedy=f"write keys: {', '.join(sorted(keys))}")
     for key in table:
         if key not in keys:
-            raise InputError(f"unknown key {key!r}", where=where, remedy=f"known are {', '.join(sorted(keys))}")
+            raise InputError(f"unknown key {_shown(key)}", where=where, remedy=f"known are {', '.join(sorted(keys))}")
 
 
 def _real(value: Any, key: str, where: str) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
-        raise InputError(f"{key} = {value!r}", where=where, remedy="write a finite number")
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= LARGEST:
+        raise InputError(f"{key} = {_shown(value)}", where=where, remedy=f"write a number within +-{LARGEST:g}")
     return float(value)
 
 
@@ -235,20 +257,26 @@ def _port(table: Mapping[str, Any], where: str) -> Port:
     _known(table, {"unit", "offset", "hold"}, where)
     hold = table.get("hold", "zero")
     if hold not in get_args(Hold):
-        raise InputError(f"hold = {hold!r}", where=where, remedy='write "zero" (held command) or "linear"')
-    return Port(unit=str(table.get("unit", "")), offset=_real(table.get("offset", 0.0), "offset", where), hold=hold)
+        raise InputError(f"hold = {_shown(hold)}", where=where, remedy='write "zero" (held command) or "linear"')
+    return Port(
+        unit=_text(table, "unit", "", where), offset=_real(table.get("offset", 0.0), "offset", where), hold=hold
+    )
 
 
 def _block(table: Mapping[str, Any], where: str) -> Block:
     _known(table, {"name", "place", "num", "den", "delay", "output", "unit"}, where)
     place = table.get("place", "plant")
     if place not in get_args(Place):
-        raise InputError(f"place = {place!r}", where=where, remedy=f"write one of {', '.join(get_args(Place))}")
+        raise InputError(f"place = {_shown(place)}", where=where, remedy=f"write one of {', '.join(get_args(Place))}")
     coefficients = {}
     for key in ("num", "den"):
         values = table.get(key, [1.0])
-        if not isinstance(values, list) or not values:
-            raise InputError(f"{key} = {values!r}", where=where, remedy="write a list in descending powers of s")
+        if not isinstance(values, list) or not 0 < len(values) <= MOST_COEFFICIENTS:
+            raise InputError(
+                f"{key} = {_shown(values)}",
+                where=where,
+                remedy=f"write a list of 1 to {MOST_COEFFICIENTS} numbers in descending powers of s",
+            )
         coefficients[key] = tuple(_real(value, key, where) for value in values)
     try:
         dynamics = TransferFunction(**coefficients, delay_s=_real(table.get("delay", 0.0), "delay", where))
@@ -257,11 +285,11 @@ def _block(table: Mapping[str, Any], where: str) -> Block:
     if not dynamics.is_proper:
         raise InputError("num has a higher degree than den", where=where, remedy="a block must be proper")
     return Block(
-        name=str(table.get("name", place)),
+        name=_text(table, "name", place, where),
         place=place,
         dynamics=dynamics,
-        output=str(table.get("output", "")),
-        unit=str(table.get("unit", "")),
+        output=_text(table, "output", "", where),
+        unit=_text(table, "unit", "", where),
     )
 
 
@@ -269,17 +297,21 @@ def effect_of(table: Mapping[str, Any], where: str) -> Effect:
     """Return the effect that an ``[[effect]]`` table states; ``where`` names it in messages."""
     acts = ("at", "state", "input", "port", "column")
     _known(table, {"name", "parameters", "equation", *acts}, where)
-    if "." not in str(table.get("name", "")):
-        raise InputError(f"name = {table.get('name')!r}", where=where, remedy="write PLACE.EFFECT of the catalogue")
+    name = _text(table, "name", "", where)
+    if "." not in name:
+        raise InputError(f"name = {_shown(name)}", where=where, remedy="write PLACE.EFFECT of the catalogue")
     parameters = {}
-    for key, entry in table.get("parameters", {}).items():
+    written = table.get("parameters", {})
+    if not isinstance(written, dict):
+        raise InputError(f"parameters = {_shown(written)}", where=where, remedy="write a table of parameters")
+    for key, entry in written.items():
         given = entry if isinstance(entry, dict) else {"value": entry}
-        sd = given.get("sd", float("nan"))
+        sd = _real(given["sd"], f"{key}.sd", where) if "sd" in given else float("nan")
         parameters[key] = Parameter(
-            value=_real(given.get("value"), key, where), unit=str(given.get("unit", "")), sd=float(sd)
+            value=_real(given.get("value"), key, where), unit=_text(given, "unit", "", where), sd=sd
         )
-    places = {key: str(table[key]) for key in acts if key in table}
-    return Effect(name=str(table["name"]), parameters=MappingProxyType(parameters), **places)
+    places = {key: _text(table, key, "", where) for key in acts if key in table}
+    return Effect(name=name, parameters=MappingProxyType(parameters), **places)
 
 
 def write_model(model: Model, path: str | os.PathLike[str], equations: Mapping[str, str] | None = None) -> None:
@@ -302,7 +334,7 @@ def write_model(model: Model, path: str | os.PathLike[str], equations: Mapping[s
     }
     if model.effects:
         content["effect"] = [effect_table(effect, (equations or {}).get(effect.name)) for effect in model.effects]
-    Path(path).write_bytes(tomli_w.dumps(content).encode())
+    write_whole(path, tomli_w.dumps(content))
 
 
 def _port_table(port: Port) -> dict[str, Any]:

@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
-import json
 import math
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from autotune.arrays import ComplexArray, FloatArray
 from autotune.errors import InputError
+from autotune.text_files import read_json
+
+#: Most points of a file; they are thinned before a design, see identification.frequency.thinning.
+MOST_POINTS = 200_000
+#: Range of frequencies [rad/s] and gains, far beyond every unit and far from where arithmetic overflows.
+SMALLEST, LARGEST = 1e-30, 1e30
+LARGEST_PHASE_DEG = 1e6
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,17 +104,20 @@ def read_points(path: str | os.PathLike[str]) -> tuple[FrequencyPoint, ...]:
         No such file, not JSON, or an entry without frequency, gain, phase or covariance; names the entry.
     """
     where = str(path)
-    try:
-        content = json.loads(Path(path).read_text(encoding="utf-8"))
-        entries = content["points"]
-    except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", where=where, remedy="check the path") from None
-    except (ValueError, KeyError, TypeError):
+    content = read_json(path)
+    entries = content.get("points") if isinstance(content, dict) else None
+    if not isinstance(entries, list):
         raise InputError(
             'is not a points file {"points": [...]}',
             where=where,
             remedy="write it with autotune identify frequency",
-        ) from None
+        )
+    if not entries:
+        raise InputError("holds no point", where=where, remedy="write it with autotune identify frequency")
+    if len(entries) > MOST_POINTS:
+        raise InputError(
+            f"{len(entries)} points", where=where, remedy=f"give at most {MOST_POINTS}, those around the crossover"
+        )
     return points_from_json(entries, where)
 
 
@@ -128,13 +136,18 @@ def _point(entry: Any, where: str) -> FrequencyPoint:
     try:
         omega, gain, phase_deg = (float(entry[key]) for key in ("omega_rad_s", "gain", "phase_deg"))
         covariance = np.array(entry["cov"], dtype=np.float64)
-    except (KeyError, TypeError, ValueError):
+    except (KeyError, TypeError, ValueError, OverflowError):
         raise InputError("needs omega_rad_s, gain, phase_deg, cov [[,],[,]]", where=where) from None
-    eigenvalues = np.linalg.eigvalsh(covariance) if covariance.shape == (2, 2) else np.array([-1.0])
-    if not (math.isfinite(gain) and math.isfinite(phase_deg) and omega > 0 and gain > 0):
-        raise InputError("omega_rad_s and gain must be positive numbers", where=where)
-    if not np.all(np.isfinite(covariance)) or eigenvalues.min() < -1e-9 * max(eigenvalues.max(), 1e-300):
-        raise InputError("cov must be a 2x2 positive semi-definite matrix", where=where)
+    for name, value in (("omega_rad_s", omega), ("gain", gain)):
+        if not SMALLEST <= value <= LARGEST:
+            raise InputError(f"{name} = {value:g}", where=where, remedy=f"it is from {SMALLEST:g} to {LARGEST:g}")
+    if not abs(phase_deg) <= LARGEST_PHASE_DEG:
+        raise InputError(f"phase_deg = {phase_deg:g}", where=where, remedy="write it in degrees, within +-1e6")
+    if covariance.shape != (2, 2) or not np.all(np.abs(covariance) <= LARGEST**2):
+        raise InputError("cov must be a 2x2 matrix of finite numbers", where=where)
+    eigenvalues = np.linalg.eigvalsh(covariance)
+    if eigenvalues.min() < -1e-9 * max(eigenvalues.max(), 1e-300) or not np.allclose(covariance, covariance.T):
+        raise InputError("cov must be symmetric and positive semi-definite", where=where)
     return FrequencyPoint(
         omega_rad_s=omega,
         response=complex(gain * np.exp(1j * math.radians(phase_deg))),
@@ -142,5 +155,5 @@ def _point(entry: Any, where: str) -> FrequencyPoint:
             (float(covariance[0, 0]), float(covariance[0, 1])),
             (float(covariance[1, 0]), float(covariance[1, 1])),
         ),
-        source=str(entry.get("source", "file")),
+        source=str(entry.get("source", "file"))[:80],
     )

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import io
 import os
-import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -21,6 +20,8 @@ import tomli_w
 
 from autotune.arrays import FloatArray
 from autotune.errors import InputError
+from autotune.outputs import append_whole, write_whole
+from autotune.text_files import printable, read_toml
 
 _REQUIRED = ("t", "u", "y")
 
@@ -57,6 +58,13 @@ class Recording:
     name: str = "recording"
 
     def __post_init__(self) -> None:
+        odd = next((column for column in self.extra if not column.isprintable() or len(column) > 200), None)
+        if odd is not None:
+            raise InputError(
+                f"the column name {printable(odd[:40])!r}",
+                where=self.name,
+                remedy="give names of at most 200 characters, none of them a control character",
+            )
         for column, values in {"u": self.u, "y": self.y, **self.extra}.items():
             if values.shape != self.t.shape:
                 raise InputError(
@@ -210,10 +218,17 @@ def _parse_slowly(body: Sequence[str], header_at: int, width: int, path: Path) -
         try:
             if len(cells) != width:
                 raise ValueError(f"{len(cells)} cells where the header has {width}")
-            rows.append([float(cell) if cell.strip() else np.nan for cell in cells])
+            rows.append([_number(cell) for cell in cells])
         except ValueError as error:
             raise InputError(str(error), where=f"{path} line {number}", remedy="correct or delete the line") from None
     return np.array(rows, dtype=np.float64).reshape(-1, width)
+
+
+def _number(cell: str) -> float:
+    """Return a cell as a number, NaN for an empty one; ``1_000``, which Python takes for 1000, is none."""
+    if "_" in cell:
+        raise ValueError(f"could not convert {cell.strip()!r} to a number")
+    return float(cell) if cell.strip() else np.nan
 
 
 def is_own_form(path: str | os.PathLike[str]) -> bool:
@@ -239,10 +254,7 @@ def read_sidecar(path: Path) -> Mapping[str, Any]:
     sidecar = path.with_suffix(".toml")
     if not sidecar.is_file():
         return MappingProxyType({})
-    try:
-        return MappingProxyType(tomllib.loads(sidecar.read_text(encoding="utf-8")))
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"not TOML: {error}", where=str(sidecar), remedy="correct the line or move the file") from None
+    return MappingProxyType(read_toml(sidecar))
 
 
 class RecordingWriter:
@@ -274,18 +286,23 @@ class RecordingWriter:
             raise InputError(
                 "a recording is already there", where=str(self.path), remedy="choose another --out"
             ) from None
-        self._file.write((",".join(columns) + "\n").encode())
-        self._write_sidecar()
+        try:
+            append_whole(self._file, (",".join(columns) + "\n").encode())
+            self._write_sidecar()
+        except BaseException:
+            self._file.close()
+            self.path.unlink(missing_ok=True)
+            raise
 
     def append(self, row: Sequence[float]) -> None:
         """Write one row, NaN for what is not known."""
         if len(row) != self._width:
             raise ValueError(f"{len(row)} values for {self._width} columns")
-        self._file.write((",".join(format(value, ".12g") for value in row) + "\n").encode())
+        append_whole(self._file, (",".join(format(value, ".12g") for value in row) + "\n").encode())
 
     def comment(self, text: str) -> None:
         """Write a comment line, for a person who reads the file."""
-        self._file.write(f"# {text}\n".replace("\r", " ").encode())
+        append_whole(self._file, f"# {text}\n".replace("\r", " ").encode())
 
     def note(self, metadata: Mapping[str, Any]) -> None:
         """Add what is known so far to the sidecar; a process killed later leaves it there."""
@@ -306,10 +323,7 @@ class RecordingWriter:
                 self._file.close()
 
     def _write_sidecar(self) -> None:
-        sidecar = self.path.with_suffix(".toml")
-        part = sidecar.with_suffix(".toml.part")
-        part.write_bytes(tomli_w.dumps(self._metadata).encode())
-        part.replace(sidecar)
+        write_whole(self.path.with_suffix(".toml"), tomli_w.dumps(self._metadata))
 
     def __enter__(self) -> RecordingWriter:
         return self
@@ -333,4 +347,4 @@ def write_recording(recording: Recording, path: str | os.PathLike[str]) -> None:
         comments="",
     )
     if recording.metadata:
-        path.with_suffix(".toml").write_bytes(tomli_w.dumps(dict(recording.metadata)).encode())
+        write_whole(path.with_suffix(".toml"), tomli_w.dumps(dict(recording.metadata)))

@@ -34,6 +34,7 @@ from autotune.errors import AutotuneError, ExperimentStopped, OperatorStop
 from autotune.experiment.result import Progress
 from autotune.experiment.verify import Verification, smoothed
 from autotune.models import TransferFunction
+from autotune.outputs import append_whole
 from autotune.points import FrequencyPoint, points_to_json
 
 #: rows of a step response that are kept for a picture
@@ -129,7 +130,7 @@ class RunLog:
     def _write(self, event: str, **content: Any) -> None:
         line = json.dumps(jsonable({"event": event, **content}), allow_nan=False)
         with contextlib.suppress(OSError):  # a full disk ends the run at its next row, not at what is told of it
-            self._file.write(line.encode() + b"\n")
+            append_whole(self._file, line.encode() + b"\n")
 
     def __enter__(self) -> Self:
         return self

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 from collections.abc import Callable, Iterable
@@ -17,6 +18,7 @@ import autotune
 from autotune.batch.export import to_parquet
 from autotune.batch.loop import Finding, Row, Work
 from autotune.batch.settings import CampaignSettings, LoopSettings, matches
+from autotune.outputs import Output, write_whole
 
 RESULTS = "results.parquet"
 
@@ -43,7 +45,10 @@ class Campaign:
 
     def file(self, loop: str) -> Path:
         """Return where the result of a loop lies."""
-        return self.out / "loops" / f"{quote(loop, safe=' ()[]+,')}.json"
+        name = quote(loop, safe=" ()[]+,")
+        if len(name) > 200:  # a file's name has at most 255 bytes
+            name = f"{name[:160]}-{hashlib.sha256(loop.encode()).hexdigest()[:16]}"
+        return self.out / "loops" / f"{name}.json"
 
     def done(self) -> dict[str, Row]:
         """Return the rows that lie there and still answer what the campaign asks, by loop."""
@@ -53,8 +58,9 @@ class Campaign:
                 content = json.loads(self.file(loop.name).read_text(encoding="utf-8"))
             except (OSError, ValueError):
                 continue
-            if content.get("asked") == self._digest(loop):
-                rows[loop.name] = Row(**content["row"])
+            with contextlib.suppress(AttributeError, KeyError, TypeError):  # not a file of this tool
+                if content["asked"] == self._digest(loop):
+                    rows[loop.name] = Row(**content["row"])
         return rows
 
     def works(self, done: Iterable[str], advance: Callable[[str, float], None]) -> dict[str, Work]:
@@ -84,10 +90,8 @@ class Campaign:
         """Write the result of a loop, whole or not at all; return its row as it will be read again."""
         path = self.file(loop.name)
         path.parent.mkdir(parents=True, exist_ok=True)
-        part = path.with_suffix(".part")
         content: dict[str, Any] = {"asked": self._digest(loop)} | finding.to_json()
-        part.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
-        part.replace(path)
+        write_whole(path, json.dumps(content, indent=1, allow_nan=False) + "\n")
         return Row(**content["row"])
 
     def _is_shared(self, file: str) -> bool:
@@ -156,7 +160,5 @@ def write_results(rows: Iterable[Row], path: Path) -> tuple[Row, ...]:
     ordered = tuple(sorted(rows, key=lambda row: row.order))
     schema = pa.schema([(f.name, _ARROW[str(f.type).removesuffix(" | None")]) for f in fields(Row)])
     table = pa.table({name: [getattr(row, name) for row in ordered] for name in schema.names}, schema=schema)
-    part = path.with_suffix(".part")
-    pyarrow.parquet.write_table(table, part)
-    part.replace(path)
+    Output(path, overwrite=True).by(lambda part: pyarrow.parquet.write_table(table, part))
     return ordered

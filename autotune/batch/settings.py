@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import os
-import tomllib
 from collections import Counter
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -12,10 +11,12 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, model_validator
 
 from autotune.config import validated
-from autotune.config.procedure import DesignSettings, Section
+from autotune.config.procedure import DesignSettings
 from autotune.errors import InputError
 from autotune.files.cells import GOOD
 from autotune.files.table import FileForm
+from autotune.schema import Number, Section, Text, Time
+from autotune.text_files import read_text, read_toml
 
 _FILE = "recording of the loop, or the export that holds its tags; * for several files that follow in time"
 
@@ -23,23 +24,23 @@ _FILE = "recording of the loop, or the export that holds its tags; * for several
 class LoopSettings(Section):
     """One loop: its signals in a file, their units, and what is known of it."""
 
-    name: Annotated[str, Field(min_length=1, description="name of the loop, each only once")]
+    name: Annotated[Text, Field(min_length=1, description="name of the loop, each only once")]
     file: Annotated[str, Field(min_length=1, description=_FILE)]
     u: Annotated[str, Field(description="column or tag of the command")] = "u"
     y: Annotated[str, Field(description="column or tag of the measurement")] = "y"
     r: Annotated[str, Field(description="column or tag of the set-point; default r where the file has it")] = ""
-    u_unit: Annotated[str, Field(description="unit of the command")] = ""
-    y_unit: Annotated[str, Field(description="unit of measurement and set-point")] = ""
-    u_scale: Annotated[float, Field(description="u is the file's value times this [u unit]")] = 1.0
-    u_offset: Annotated[float, Field(description="and plus this [u unit]")] = 0.0
-    y_scale: Annotated[float, Field(description="y and r are the file's values times this [y unit]")] = 1.0
-    y_offset: Annotated[float, Field(description="and plus this [y unit]")] = 0.0
+    u_unit: Annotated[Text, Field(description="unit of the command")] = ""
+    y_unit: Annotated[Text, Field(description="unit of measurement and set-point")] = ""
+    u_scale: Annotated[Number, Field(description="u is the file's value times this [u unit]")] = 1.0
+    u_offset: Annotated[Number, Field(description="and plus this [u unit]")] = 0.0
+    y_scale: Annotated[Number, Field(description="y and r are the file's values times this [y unit]")] = 1.0
+    y_offset: Annotated[Number, Field(description="and plus this [y unit]")] = 0.0
     start: Annotated[str, Field(description="first stamp to use, written as in the file; default the first")] = ""
     end: Annotated[str, Field(description="stamp before which to stop, written as in the file; default the end")] = ""
     model: Annotated[str, Field(description="nominal model to diagnose (TOML)")] = ""
     controller: Annotated[str, Field(description="controller the loop runs with (TOML)")] = ""
-    K: Annotated[float | None, Field(description="gain the loop runs with, with its sign [u unit/y unit]")] = None
-    Ti_s: Annotated[float | None, Field(gt=0, description="integral time the loop runs with [s]")] = None
+    K: Annotated[Number | None, Field(description="gain the loop runs with, with its sign [u unit/y unit]")] = None
+    Ti_s: Annotated[Time | None, Field(description="integral time the loop runs with [s]")] = None
 
     @model_validator(mode="after")
     def _one_controller(self) -> LoopSettings:
@@ -100,7 +101,7 @@ class ExportSettings(Section):
 class CampaignSettings(Section):
     """What is asked of every loop, and how their files are read."""
 
-    name: Annotated[str, Field(description="title of the campaign")]
+    name: Annotated[Text, Field(description="title of the campaign")]
     task: Annotated[
         Literal["identify", "design", "diagnose"],
         Field(description="identify: points; design: points, reduced model, controller; diagnose: missing physics"),
@@ -110,8 +111,8 @@ class CampaignSettings(Section):
         Field(description="how points are identified: from spectra, or by subspace from a loop under control"),
     ] = "frequency"
     longest_gap_s: Annotated[
-        float | None,
-        Field(gt=0, description="a longer gap cuts the record in two [s]; default ten times the usual step"),
+        Time | None,
+        Field(description="a longer gap cuts the record in two [s]; default ten times the usual step"),
     ] = None
     export: ExportSettings | None = None
     design: DesignSettings = DesignSettings()
@@ -153,7 +154,7 @@ def read_campaign(path: str | os.PathLike[str]) -> tuple[CampaignSettings, tuple
         A file that cannot be read, a key that is refused, a name given twice, or no loop; names the row.
     """
     path = Path(path).absolute()
-    file = validated(_CampaignFile, _toml(path), str(path))
+    file = validated(_CampaignFile, read_toml(path), str(path))
     settings = CampaignSettings(**{key: getattr(file, key) for key in CampaignSettings.model_fields})
     rows = [
         (where, {key: value for key, value in (file.defaults | row).items() if value != ""})
@@ -174,15 +175,6 @@ def read_campaign(path: str | os.PathLike[str]) -> tuple[CampaignSettings, tuple
     return settings, tuple(_absolute(loop, path.parent) for loop in loops)
 
 
-def _toml(path: Path) -> dict[str, Any]:
-    try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", where=str(path), remedy="check the path") from None
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"not TOML: {error}", where=str(path), remedy="correct the line") from None
-
-
 def _rows(file: _CampaignFile, path: Path) -> list[tuple[str, dict[str, Any]]]:
     """Return the keys of every loop with the place they come from."""
     if file.loop:
@@ -190,12 +182,11 @@ def _rows(file: _CampaignFile, path: Path) -> list[tuple[str, dict[str, Any]]]:
     if file.folder:
         return [(str(found), {"name": found.stem, "file": str(found)}) for found in matches(path.parent / file.folder)]
     table = path.parent / file.loops
+    reader = csv.DictReader(read_text(table).splitlines(), restkey="more cells than the header", restval="")
     try:
-        with table.open(encoding="utf-8-sig", newline="") as lines:
-            reader = csv.DictReader(lines, restkey="more cells than the header", restval="")
-            return [(f"{table} line {reader.line_num}", row) for row in reader]
-    except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", where=str(table), remedy="check the key loops") from None
+        return [(f"{table} line {reader.line_num}", row) for row in reader]
+    except csv.Error as error:
+        raise InputError(str(error), where=str(table), remedy="correct the line") from None
 
 
 def matches(pattern: Path) -> list[Path]:

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import _thread
+import contextlib
+import errno
+import signal
 import sys
 from typing import Any, NoReturn
 
 import typer
 from rich.console import Console
 
+from autotune.cli.guard import GuardedCommand, without_stdout
 from autotune.errors import AutotuneError, InputError, OperatorStop
+from autotune.text_files import printable
 
 # typer brings click under a name that differs between its versions; its exported exception leads to the base classes
 UsageError: type[Any] = typer.BadParameter.__mro__[1]
@@ -77,22 +83,63 @@ def _arrange() -> None:
 _arrange()
 
 
+def _guard() -> None:
+    """Let every command end in one place."""
+    for one in (*app.registered_commands, *identify.registered_commands):
+        one.cls = GuardedCommand
+
+
+_guard()
+
+
 def main() -> None:
-    """Run the command line; an error of the tool is one line on stderr and its exit status."""
+    """Run the command line; whatever ends it is one line on stderr and its exit status."""
+    if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+    sys.unraisablehook = _unraisable
     try:
         status = app(standalone_mode=False)
+        sys.stdout.flush()
     except AutotuneError as error:
-        _leave(str(error), error.exit_status)
+        _leave(printable(str(error)), error.exit_status)
     except ClickException as error:
         _leave(_usage(error), InputError.exit_status)
     except (typer.Abort, KeyboardInterrupt):
         _leave("stopped by the operator", OperatorStop.exit_status)
+    except OSError as error:
+        without_stdout()
+        said = "" if error.errno == errno.EPIPE else f"the screen cannot be written ({error.strerror or error})"
+        _leave(said, InputError.exit_status)
+    except RecursionError:
+        _leave("the input is nested too deep", InputError.exit_status)
+    _hear_no_more()
     sys.exit(status or 0)
 
 
+def _unraisable(unraisable: Any) -> None:
+    """Raise a Ctrl-C again that came where Python can raise nothing, such as in a finaliser."""
+    if isinstance(unraisable.exc_value, KeyboardInterrupt):
+        _thread.interrupt_main()
+        return
+    sys.__unraisablehook__(unraisable)
+
+
+def _hear_no_more() -> None:
+    """Ignore Ctrl-C from here on: what ends now has been said, and the interpreter's own end is no place for it."""
+    with contextlib.suppress(ValueError):  # a test that calls from another thread
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
 def _leave(line: str, status: int) -> NoReturn:
+    _hear_no_more()
     if line:
-        Console(stderr=True, highlight=False, soft_wrap=True).print(f"autotune: {line}", markup=False)
+        console = Console(stderr=True, highlight=False, soft_wrap=True)
+        with contextlib.suppress(OSError):
+            console.print(f"autotune: {line}", markup=False)
+    try:
+        sys.stdout.flush()
+    except (OSError, ValueError):
+        without_stdout()
     sys.exit(status)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import asdict
 from pathlib import Path
@@ -12,7 +11,9 @@ import typer
 from rich.console import Console
 
 from autotune.cli import app, identify
+from autotune.cli.common import OVERWRITE
 from autotune.cli.recordings import R, T, U, Y, read_one, signal_names
+from autotune.outputs import Output
 
 if TYPE_CHECKING:
     from autotune.identification.closed_loop.dither_proposal import DitherLimits
@@ -42,12 +43,14 @@ def closed_loop(
     u: U = None,
     y: Y = None,
     r: R = None,
+    overwrite: OVERWRITE = False,
 ) -> None:
     """Identify the plant from r, u and y recorded while its loop is closed."""
     from autotune.controller import read_controller
     from autotune.identification.closed_loop.identify import identify_closed_loop
 
     console = Console(stderr=True, highlight=False)
+    place = Output(out, inputs=(recording, controller, config), overwrite=overwrite)
     data = read_one(recording, signal_names(t, u, y, r))
     law = None if controller is None else read_controller(controller)
     with console.status("reading the loop") as status:
@@ -60,7 +63,7 @@ def closed_loop(
             limits=None if config is None else _limits(config),
             progress=lambda text: status.update(f"fitting {text}"),
         )
-    out.write_text(json.dumps(closed_loop_json(result), indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    place.json(closed_loop_json(result))
     for warning in result.warnings:
         console.print(f"warning: {warning}", markup=False, soft_wrap=True)
     typer.echo(summary(result))

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
+import typer
 from rich.console import Console
+
+from autotune.errors import InputError
+from autotune.outputs import claim
 
 if TYPE_CHECKING:
     from autotune.config import Config
@@ -27,16 +32,32 @@ def rig_of(config: Config, dry_run: bool = False) -> Rig:
     )
 
 
-def new_folder(out: Path, holds: str) -> None:
-    """Make the folder of a run; refuse one in which the file ``holds`` is already."""
-    from autotune.errors import InputError
+OVERWRITE = Annotated[bool, typer.Option("--overwrite", help="replace what is at --out; an input never is")]
 
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"cannot be made ({error.strerror})", where=str(out), remedy="choose another --out") from None
-    if (out / holds).exists():
-        raise InputError("holds a run already", where=str(out), remedy="choose another --out; nothing is overwritten")
+
+def new_folder(out: Path, names: str | Sequence[str], inputs: Sequence[Path | None] = ()) -> None:
+    """Make the folder of a run whose files grow while it goes; refuse one in which there is one of its files.
+
+    Parameters
+    ----------
+    out : Path
+        The folder.
+    names : str or sequence of str
+        What will be written into it.
+    inputs : sequence of Path or None
+        What the command reads.
+
+    Raises
+    ------
+    InputError
+        There is a file of the name, or none can be written there.
+    """
+    for name in (names,) if isinstance(names, str) else names:
+        if (out / name).exists():
+            raise InputError(
+                f"holds {name} already", where=str(out), remedy="choose another --out; nothing is overwritten"
+            )
+        claim(out / name, inputs=inputs)
 
 
 class ProgressBar:

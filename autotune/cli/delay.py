@@ -11,7 +11,9 @@ from typing import TYPE_CHECKING, Annotated, Literal, TextIO
 import typer
 
 from autotune.cli import app, identify
+from autotune.cli.common import OVERWRITE
 from autotune.cli.recordings import R, T, U, Y, read_one, signal_names
+from autotune.outputs import Output, claim
 
 if TYPE_CHECKING:
     from autotune.config.loader import Config
@@ -61,6 +63,7 @@ def identify_delay_command(
     u: U = None,
     y: Y = None,
     r: R = None,
+    overwrite: OVERWRITE = False,
 ) -> None:
     """Identify x^(n) = sum a_i x^(i) + b u(t - h) from a recording; no starting value is needed."""
     from rich.console import Console
@@ -68,6 +71,7 @@ def identify_delay_command(
     from autotune.identification.delay.identify import identify_delay
     from autotune.identification.delay.model import write_delay_model
 
+    place = Output(out, inputs=(recording,), overwrite=overwrite)
     record = read_one(recording, signal_names(t, u, y, r))
     with Console(stderr=True).status("searching the delay") as status:
         model = identify_delay(
@@ -82,7 +86,7 @@ def identify_delay_command(
             coloured=coloured,
             progress=lambda stage: status.update(stage),
         )
-    write_delay_model(model, out)
+    place.by(lambda part: write_delay_model(model, part))
     typer.echo(f"{describe(model)}; wrote {out}")
 
 
@@ -145,6 +149,7 @@ def watch(
     u: U = None,
     y: Y = None,
     r: R = None,
+    overwrite: OVERWRITE = False,
 ) -> None:
     """Track gain, time constants and dead time, and say when the controller wants retuning.
 
@@ -167,6 +172,7 @@ def watch(
         names=signal_names(t, u, y, r),
     )
     if source.suffix.lower() != ".toml":
+        claim(out, inputs=(source, controller), overwrite=overwrite)
         _follow(source, out, settings, follow)
         return
     from autotune.config import load_config
@@ -212,7 +218,7 @@ def _follow(recording: Path, out: Path, settings: _Tracking, quiet_s: float) -> 
         time.sleep(0.1)
     done, retune_at, rows, size = -math.inf, None, -1, -1
     quiet_since = time.monotonic()
-    with out.open("w", encoding="utf-8") as table:
+    with out.open("x", encoding="utf-8") as table:
         while True:
             if recording.stat().st_size > size:  # it may grow for long before the loop is in operation
                 size, quiet_since = recording.stat().st_size, time.monotonic()

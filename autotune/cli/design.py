@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from enum import StrEnum
 from pathlib import Path
@@ -11,8 +10,10 @@ from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias
 import typer
 
 from autotune.cli import app
+from autotune.cli.common import OVERWRITE
 from autotune.controller_forms import FORMS, to_form
 from autotune.errors import InputError
+from autotune.outputs import Output
 
 if TYPE_CHECKING:
     from autotune.design.specification import Design
@@ -53,6 +54,7 @@ def design_command(
     kind: Annotated[Kind, typer.Option(help="structure of the controller")] = Kind.PI,
     controller: Annotated[Path | None, typer.Option(help="also write the controller file (TOML) here")] = None,
     certificate: Annotated[bool, typer.Option(help="prove a lower bound on the H2 norm (PI on a model)")] = True,
+    overwrite: OVERWRITE = False,
 ) -> None:
     """Design the PI or PID with the smallest H2 norm under margins, on a model or straight on measured points."""
     from autotune.controller import write_controller
@@ -69,6 +71,8 @@ def design_command(
     )
     if (model is None) == (points is None):
         raise InputError("give one of --model and --points", where="autotune design")
+    place = Output(out, inputs=(model, points), overwrite=overwrite)
+    law = None if controller is None else Output(controller, inputs=(model, points, out), overwrite=overwrite)
     if model is not None:
         from autotune.design.synthesis import design
         from autotune.models import read_model
@@ -80,9 +84,9 @@ def design_command(
 
         assert points is not None
         designed = design_on_points(read_points(points), specification, kind.value)
-    out.write_text(json.dumps(designed.to_json(), indent=2) + "\n", encoding="utf-8")
-    if controller is not None:
-        write_controller(designed.controller, controller)
+    place.json(designed.to_json())
+    if law is not None:
+        law.by(lambda part: write_controller(designed.controller, part))
     typer.echo(_sentence(designed))
     typer.echo(f"wrote {out}" + (f" and {controller}" if controller is not None else ""))
 
@@ -110,14 +114,16 @@ def margins_command(
     noise_frequency: Annotated[
         float | None, typer.Option(help="lowest frequency of the noise [rad/s]; default the crossover")
     ] = None,
+    overwrite: OVERWRITE = False,
 ) -> None:
     """Compute the margins of a controller with a model; a sampled controller is taken with its hold."""
     from autotune.controller import read_controller
     from autotune.design.margins import margins
     from autotune.models import read_model
 
+    place = Output(out, inputs=(model, controller), overwrite=overwrite)
     m = margins(read_model(model), read_controller(controller), noise_frequency_rad_s=noise_frequency)
-    out.write_text(json.dumps(m.to_json(), indent=2) + "\n", encoding="utf-8")
+    place.json(m.to_json())
     state = "stable" if m.stable else "UNSTABLE: the figures describe the Nyquist curve, not margins"
     typer.echo(
         f"{state}; modulus margin {m.modulus:.4f}, phase margin {math.degrees(m.phase_rad):.2f} deg, "
@@ -144,10 +150,12 @@ def controller_command(
     u_max: Annotated[float | None, typer.Option(help="highest command, for c and st [u unit]; default none")] = None,
     u_rate: Annotated[float | None, typer.Option(help="fastest change, for c and st [u unit/s]; default none")] = None,
     out: Annotated[Path | None, typer.Option(help="file to write code to; default the screen")] = None,
+    overwrite: OVERWRITE = False,
 ) -> None:
     """Show a controller's gains as a maker's block takes them, or write its law as C or Structured Text."""
     from autotune.controller import PIDController, read_controller
 
+    place = None if out is None else Output(out, inputs=(controller,), overwrite=overwrite)
     c = read_controller(controller)
     if not isinstance(c, PIDController):
         raise InputError(
@@ -168,8 +176,8 @@ def controller_command(
     else:
         found = to_form(c, form, u_span=u_span, y_span=y_span, sample_time_s=sample_time)
         text = "".join(f"{name} = {value:.6g}\n" for name, value in found.values.items())
-    if out is None:
+    if place is None:
         typer.echo(text, nl=False)
     else:
-        out.write_text(text, encoding="utf-8")
+        place.text(text)
         typer.echo(f"wrote {out}")

@@ -8,7 +8,9 @@ from typing import Annotated
 import typer
 
 from autotune.cli import app
+from autotune.cli.common import OVERWRITE
 from autotune.cli.recordings import R, T, U, Y, read_all, read_one, signal_names
+from autotune.outputs import Output, OutputFolder
 
 
 @app.command()
@@ -24,6 +26,7 @@ def simulate(
     u: U = None,
     y: Y = None,
     r: R = None,
+    overwrite: OVERWRITE = False,
 ) -> None:
     """Simulate a model with a recording's u; with --horizon as a forecast, window after window."""
     import numpy as np
@@ -31,10 +34,11 @@ def simulate(
     from autotune.diagnosis.forecast import forecast
     from autotune.models import read_model
 
+    place = Output(out, inputs=(recording, model), overwrite=overwrite)
     data = read_one(recording, signal_names(t, u, y, r))
     y_sim = forecast(read_model(model), data, horizon)
-    out.parent.mkdir(parents=True, exist_ok=True)
-    np.savetxt(out, np.column_stack([data.t, y_sim]), fmt="%.10g", delimiter=",", header="t,y_sim", comments="")
+    rows = np.column_stack([data.t, y_sim])
+    place.by(lambda part: np.savetxt(part, rows, fmt="%.10g", delimiter=",", header="t,y_sim", comments=""))
     known = np.isfinite(data.y)
     error = float(np.sqrt(np.mean((data.y - y_sim)[known] ** 2)) / max(float(np.std(data.y[known])), 1e-300))
     typer.echo(f"simulated {len(data)} rows, error {error:.4g} of the spread of y, in {out}")
@@ -60,6 +64,7 @@ def diagnose(
     u: U = None,
     y: Y = None,
     r: R = None,
+    overwrite: OVERWRITE = False,
 ) -> None:
     """Find where and why recordings differ from the simulation: numbers, missing physics, or something else."""
     from rich.console import Console
@@ -72,6 +77,8 @@ def diagnose(
     from autotune.models import read_model, write_model
     from autotune.report.diagnosis_page import write_diagnosis_page
 
+    files = ("diagnosis.json", "extended_model.toml", "report.html")
+    place = OutputFolder(out, files, inputs=(model, controller, *recordings), overwrite=overwrite)
     nominal = read_model(model)
     data = read_all(recordings, signal_names(t, u, y, r))
     law = None if controller is None else read_controller(controller)
@@ -86,11 +93,11 @@ def diagnose(
             without or (),
             lambda what, share: progress.update(task, description=what, completed=share),
         )
-    out.mkdir(parents=True, exist_ok=True)
-    found.write(out / "diagnosis.json")
     equations = {effect.name: entry_of(effect.name).equation for effect in found.extended_model.effects}
-    write_model(found.extended_model, out / "extended_model.toml", equations)
-    write_diagnosis_page(found, out / "report.html", law)
+    with place.filled() as folder:
+        found.write(folder / "diagnosis.json")
+        write_model(found.extended_model, folder / "extended_model.toml", equations)
+        write_diagnosis_page(found, folder / "report.html", law)
     for sentence in found.sentences:
         typer.echo(sentence)
     if found.description is not None:

@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from autotune.cli import app
+from autotune.cli.common import OVERWRITE
+from autotune.outputs import Output
 
 
 @app.command()
-def schema(out: Annotated[Path, typer.Option(help="file to write the JSON Schema of the config to")]) -> None:
+def schema(
+    out: Annotated[Path, typer.Option(help="file to write the JSON Schema of the config to")],
+    overwrite: OVERWRITE = False,
+) -> None:
     """Write the JSON Schema of the configuration, so that editors complete its keys."""
     from autotune.config import json_schema
 
-    out.write_text(json.dumps(json_schema(), indent=2) + "\n", encoding="utf-8")
+    place = Output(out, overwrite=overwrite)
+    place.json(json_schema())
     typer.echo(f"wrote {out}")

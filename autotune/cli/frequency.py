@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -10,7 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from autotune.cli import app, identify
+from autotune.cli.common import OVERWRITE
 from autotune.cli.recordings import R, T, U, Y, read_all, signal_names
+from autotune.outputs import Output
 
 if TYPE_CHECKING:
     from autotune.identification.reduction import ReducedModel
@@ -29,6 +30,7 @@ def frequency(
     u: U = None,
     y: Y = None,
     r: R = None,
+    overwrite: OVERWRITE = False,
 ) -> None:
     """Estimate Bode points from recordings: relay, multisine, random binary or steps, open or closed loop."""
     from rich.progress import track
@@ -36,6 +38,7 @@ def frequency(
     from autotune.identification.frequency.recorded import combine, frequency_points
     from autotune.points import points_to_json
 
+    place = Output(out, inputs=recordings, overwrite=overwrite)
     estimates = []
     data = read_all(recordings, signal_names(t, u, y, r))
     for one in track(data, description="recordings", transient=True, disable=len(data) < 2):
@@ -47,7 +50,7 @@ def frequency(
         typer.echo(f"  {_line(point)}")
     for note in combined.notes:
         typer.echo(f"note: {note}")
-    out.write_text(json.dumps({"points": points_to_json(combined.points)}, indent=2) + "\n", encoding="utf-8")
+    place.json({"points": points_to_json(combined.points)})
     typer.echo(f"{len(combined.points)} frequency point(s) written to {out}")
 
 
@@ -79,18 +82,20 @@ def reduce(
     static_gain_sd: Annotated[
         float | None, typer.Option(min=0.0, help="its standard deviation; 1 % of it when absent")
     ] = None,
+    overwrite: OVERWRITE = False,
 ) -> None:
     """Reduce measured points to the cautious low-order model that a robust PI is designed on."""
     from autotune.identification.reduction import reduce_points
     from autotune.points import read_points
 
+    place = Output(out, inputs=(points,), overwrite=overwrite)
     known = None
     if static_gain is not None:
         known = (static_gain, static_gain_sd if static_gain_sd is not None else 0.01 * abs(static_gain))
     reduced = reduce_points(
         read_points(points), kind=None if kind == "auto" else kind, conditions=conditions, static_gain=known
     )
-    _write(reduced, out)
+    place.by(lambda part: _write(reduced, part))
     lag = "" if reduced.omega_0r_rad_s is None else f", omega_0r = {reduced.omega_0r_rad_s:.4g} rad/s"
     name = "integrating (24)" if reduced.integrating else "self-regulating (8)"
     typer.echo(f"{name}: {reduced.evidence}")

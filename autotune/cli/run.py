@@ -10,10 +10,12 @@ import typer
 from rich.console import Console
 
 from autotune.cli import app
-from autotune.cli.common import ProgressBar, new_folder, rig_of
+from autotune.cli.common import OVERWRITE, ProgressBar, new_folder, rig_of
+from autotune.cli.guard import rig_in_command
 from autotune.cli.live import LISTEN, PORT, TOKEN
 from autotune.cli.recordings import R, T, U, Y, read_all, signal_names
 from autotune.errors import ExperimentStopped, InputError
+from autotune.outputs import OutputFolder, write_json
 
 if TYPE_CHECKING:
     from autotune.config import Config
@@ -50,7 +52,8 @@ def run(
 ) -> None:
     """Commission a rig: relay sweep, Bode points, reduced model, controller, verification, report."""
     from autotune.live.session import LivePage
-    from autotune.pipeline import RECORDING, tune
+    from autotune.pipeline import tune
+    from autotune.pipeline.folder import FILES_OF_A_RUN, may_store
     from autotune.recording import read_recording
     from autotune.report.page import write_page
     from autotune.report.run_page import run_page
@@ -58,10 +61,12 @@ def run(
     content = _configuration(config, out, resume, dry_run)
     rig = rig_of(content)
     if out is not None:
-        new_folder(out, RECORDING)
+        new_folder(out, FILES_OF_A_RUN)
+        may_store(content, out)
     folder = out or resume or Path()
     console = Console(highlight=False, soft_wrap=True)
-    with LivePage(folder, listen, port, token) if live else nullcontext() as onlooker:
+    page_of_run = LivePage(folder, listen, port, token) if live else nullcontext()
+    with rig_in_command(), page_of_run as onlooker:
         keep = onlooker.keep if onlooker is not None else None
         with ProgressBar() as bar:
             tuning = tune(
@@ -160,10 +165,9 @@ def tune(
     u: U = None,
     y: Y = None,
     r: R = None,
+    overwrite: OVERWRITE = False,
 ) -> None:
     """Design a controller from recordings and points, without a rig: Bode points, reduced model, controller, report."""
-    import json
-
     from autotune.config.procedure import DesignSettings, SignalSettings
     from autotune.identification.frequency.recorded import combine, frequency_points
     from autotune.pipeline import RESULT, analyse, analysis_json
@@ -174,9 +178,9 @@ def tune(
     recordings, files = recordings or [], points or []
     if not recordings and not files:
         raise InputError("give recordings or --points", where="autotune tune")
+    place = OutputFolder(out, (RESULT, "report.html"), inputs=(*recordings, *files), overwrite=overwrite)
     read = read_all(recordings, signal_names(t, u, y, r))
     given = [point for path in files for point in read_points(path)]
-    new_folder(out, RESULT)
     combined = combine([frequency_points(recording) for recording in read]) if read else None
     notes = combined.notes if combined else ()
     settings = DesignSettings(
@@ -194,9 +198,10 @@ def tune(
         u_unit=str(units.get("u", "")),
         y_unit=str(units.get("y", "")),
     )
-    (out / RESULT).write_text(json.dumps(analysis_json(analysis), indent=2) + "\n", encoding="utf-8")
     page = analysis_page(", ".join(path.stem for path in (*recordings, *files)), signals, read, analysis, notes)
-    write_page(page, out / "report.html")
+    with place.filled() as folder:
+        write_json(folder / RESULT, analysis_json(analysis))
+        write_page(page, folder / "report.html")
     console = Console(highlight=False, soft_wrap=True)
     for note in (*notes, *analysis.warnings):
         console.print(f"note: {note}", markup=False)

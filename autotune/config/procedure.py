@@ -5,40 +5,33 @@ from __future__ import annotations
 import math
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
-
-class Section(BaseModel):
-    """A table of the configuration: frozen, and a key it does not know is refused."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
-
-Positive = Annotated[float, Field(gt=0)]
+from autotune.schema import LARGEST, SHORTEST_S, Number, Section, Text, Time
 
 
 class SignalSettings(Section):
     """Units and sample time."""
 
-    sample_time_s: Annotated[float, Field(gt=0, le=3600, description="control period [s], above 0 up to 3600")]
-    u_unit: Annotated[str, Field(description="unit of the command, as people say it")] = ""
-    y_unit: Annotated[str, Field(description="unit of the measurement, as people say it")] = ""
+    sample_time_s: Annotated[float, Field(ge=SHORTEST_S, le=3600, description="control period [s], 1e-6 up to 3600")]
+    u_unit: Annotated[Text, Field(description="unit of the command, as people say it")] = ""
+    y_unit: Annotated[Text, Field(description="unit of the measurement, as people say it")] = ""
     u_step: Annotated[
-        float, Field(ge=0, description="resolution of the command, whose multiples are sent [u unit]; 0 for any value")
+        Number, Field(ge=0, description="resolution of the command, whose multiples are sent [u unit]; 0 for any value")
     ] = 0.0
 
 
 class LimitSettings(Section):
     """Safety envelope: applied to every command, in every state."""
 
-    u_min: Annotated[float, Field(description="lowest command [u unit]")]
-    u_max: Annotated[float, Field(description="highest command [u unit]")]
-    u_safe: Annotated[float, Field(description="command the rig is left with [u unit], within u_min..u_max")]
-    u_rate: Annotated[float, Field(gt=0, description="largest change of the command per second [u unit/s]")] = 1e9
-    y_min: Annotated[float, Field(description="lowest measurement the experiment may see once it floats [y unit]")]
-    y_max: Annotated[float, Field(description="highest measurement the experiment may see once it floats [y unit]")]
-    swing: Annotated[float, Field(gt=0, description="largest departure of y from the operating point [y unit]")]
-    time_s: Annotated[float, Field(gt=0, description="longest time on the rig [s]")] = 600.0
+    u_min: Annotated[Number, Field(description="lowest command [u unit]")]
+    u_max: Annotated[Number, Field(description="highest command [u unit]")]
+    u_safe: Annotated[Number, Field(description="command the rig is left with [u unit], within u_min..u_max")]
+    u_rate: Annotated[Number, Field(gt=0, description="largest change of the command per second [u unit/s]")] = 1e9
+    y_min: Annotated[Number, Field(description="lowest measurement the experiment may see once it floats [y unit]")]
+    y_max: Annotated[Number, Field(description="highest measurement the experiment may see once it floats [y unit]")]
+    swing: Annotated[Number, Field(gt=0, description="largest departure of y from the operating point [y unit]")]
+    time_s: Annotated[Time, Field(description="longest time on the rig [s]")] = 600.0
     late_s: Annotated[
         float,
         Field(gt=0, le=60, description="longest time the loop may be behind its schedule [s]; two samples always are"),
@@ -58,9 +51,9 @@ class LimitSettings(Section):
 class OperatingPointSettings(Section):
     """Where the loop is commissioned, and how to get there."""
 
-    y: Annotated[float, Field(description="measurement to oscillate around [y unit]")]
-    u_guess: Annotated[float, Field(description="nominal command that holds it [u unit]")]
-    u_uncertainty: Annotated[float, Field(gt=0, description="how far the true one may be from u_guess [u unit]")]
+    y: Annotated[Number, Field(description="measurement to oscillate around [y unit]")]
+    u_guess: Annotated[Number, Field(description="nominal command that holds it [u unit]")]
+    u_uncertainty: Annotated[Number, Field(gt=0, description="how far the true one may be from u_guess [u unit]")]
     approach: Annotated[
         Literal["ramp", "hold"],
         Field(description="ramp the command until y moves, or start where the rig is"),
@@ -70,6 +63,7 @@ class OperatingPointSettings(Section):
         float | None,
         Field(
             gt=0,
+            le=LARGEST,
             description="change of the command per second on a ramp [u unit/s]; default u_uncertainty / 600 a sample",
         ),
     ] = None
@@ -85,12 +79,12 @@ class ExperimentSettings(Section):
     points: Annotated[int, Field(ge=3, le=20, description="number of points, 3 to 20")] = 5
     relay_amplitude: Annotated[
         float | None,
-        Field(gt=0, description="half-amplitude of the relay [u unit]; chosen by the tool when absent"),
+        Field(gt=0, le=LARGEST, description="half-amplitude of the relay [u unit]; chosen by the tool when absent"),
     ] = None
     gain_sd: Annotated[
         float, Field(gt=0, lt=0.5, description="relative standard deviation at which a point is good enough")
     ] = 0.004
-    budget_s: Annotated[float, Field(gt=0, description="rig time for the sweep [s]")] = 60.0
+    budget_s: Annotated[Time, Field(description="rig time for the sweep [s]")] = 60.0
 
 
 SPECIFICATIONS = {"Spec1": (0.5, 45.0), "Spec2": (0.8, 60.0)}
@@ -108,7 +102,7 @@ class DesignSettings(Section):
     phase_margin_deg: Annotated[float | None, Field(gt=0, lt=90, description="replaces the named one [deg]")] = None
     noise_gain: Annotated[
         float,
-        Field(gt=0, description="largest amplification of measurement noise to command, N_max [u/y unit]"),
+        Field(gt=0, le=LARGEST, description="largest amplification of measurement noise to command, N_max [u/y unit]"),
     ] = 0.1
     source: Annotated[
         Literal["reduced model", "points"],
@@ -127,20 +121,20 @@ class DesignSettings(Section):
 class ControllerSettings(Section):
     """The gains the loop has now: restored when the new ones do not verify."""
 
-    K: Annotated[float, Field(description="proportional gain with its sign [u unit/y unit]")]
-    Ti_s: Annotated[float, Field(gt=0, description="integral time [s]")]
+    K: Annotated[Number, Field(description="proportional gain with its sign [u unit/y unit]")]
+    Ti_s: Annotated[Time, Field(description="integral time [s]")]
 
 
 class VerificationSettings(Section):
     """Set-point step and input-disturbance step on the rig with the new gains, compared with the prediction."""
 
-    setpoint_step: Annotated[float | None, Field(description="step of the set-point [y unit]; default swing / 3")] = (
+    setpoint_step: Annotated[Number | None, Field(description="step of the set-point [y unit]; default swing / 3")] = (
         None
     )
     disturbance_step: Annotated[
-        float | None,
+        Number | None,
         Field(description="step added to the command [u unit]; chosen from the design when absent"),
     ] = None
-    duration_s: Annotated[
-        float | None, Field(gt=0, description="time per step [s]; chosen from the design when absent")
-    ] = None
+    duration_s: Annotated[Time | None, Field(description="time per step [s]; chosen from the design when absent")] = (
+        None
+    )

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
-from autotune.config.procedure import Section
+from autotune.schema import Number, Section
 
 RegisterType = Literal["int16", "uint16", "int32", "uint32", "float32", "bit"]
 
@@ -28,8 +28,8 @@ class RegisterSettings(Section):
     ] = "int16"
     byte_order: Annotated[Literal["big", "little"], Field(description="order of the bytes within a word")] = "big"
     word_order: Annotated[Literal["big", "little"], Field(description="order of the words of a 32-bit value")] = "big"
-    scale: Annotated[float, Field(description="engineering units per count, not 0")] = 1.0
-    offset: Annotated[float, Field(description="engineering value at count 0")] = 0.0
+    scale: Annotated[Number, Field(description="engineering units per count, not 0")] = 1.0
+    offset: Annotated[Number, Field(description="engineering value at count 0")] = 0.0
     not_a_value: Annotated[
         int | None, Field(description="raw count by which the device says that it has no measurement")
     ] = None

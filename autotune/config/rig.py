@@ -7,8 +7,8 @@ from typing import Annotated, Literal, TypeAlias, get_args
 
 from pydantic import Field
 
-from autotune.config.procedure import Section
 from autotune.config.registers import RegisterMap, RegisterSettings
+from autotune.schema import Number, Section
 
 
 class PlantSettings(Section):
@@ -148,8 +148,8 @@ class SerialSettings(Section):
     deadman_s: Annotated[
         float, Field(ge=0.002, le=60, description="silence of the host after which the device is safe [s], 0.002..60")
     ] = 0.5
-    y_span: Annotated[tuple[float, float], Field(description="y at count 0 and at full scale [y unit]")]
-    u_span: Annotated[tuple[float, float], Field(description="u at count 0 and at full scale [u unit]")]
+    y_span: Annotated[tuple[Number, Number], Field(description="y at count 0 and at full scale [y unit]")]
+    u_span: Annotated[tuple[Number, Number], Field(description="u at count 0 and at full scale [u unit]")]
     relay: Annotated[
         Literal["host", "device"],
         Field(description="who computes the relay and the verified PI: the host, or the device by itself at its tick"),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, get_args
@@ -25,6 +24,7 @@ from autotune.equations.model import (
 from autotune.equations.units import check_units
 from autotune.errors import InputError
 from autotune.models import Hold, effect_of, effect_table
+from autotune.text_files import read_toml
 
 _TOP = {"name", "input", "output", "state", "parameters", "define", "port", "horizon_s", "effect"}
 
@@ -58,12 +58,7 @@ def table_of(path: str | os.PathLike[str]) -> dict[str, Any]:
     InputError
         No such file, or not TOML.
     """
-    try:
-        return tomllib.loads(Path(path).read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", where=str(path), remedy="check the path") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"not TOML: {error}", where=str(path)) from None
+    return read_toml(path)
 
 
 def equations_of(content: Mapping[str, Any], where: str) -> EquationModel:

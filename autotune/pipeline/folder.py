@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from itertools import count, takewhile
@@ -13,13 +11,18 @@ from typing import Any
 import tomli_w
 
 from autotune.config import Config, load_config
-from autotune.controller import PIDController
+from autotune.controller import PIDController, pid_from_table
 from autotune.errors import InputError
 from autotune.experiment.cycles import Earlier, read_earlier
+from autotune.outputs import write_whole
 from autotune.points import FrequencyPoint, read_points
+from autotune.text_files import read_json
 
 RECORDING, VERIFICATION, RESULT, JOURNAL = "recording.csv", "verification.csv", "result.json", "journal.jsonl"
-PROGRESS, CONFIG = "progress.jsonl", "config.toml"
+PROGRESS, CONFIG, REPORT = "progress.jsonl", "config.toml", "report.html"
+
+#: what a new run writes, its configuration apart, which may be the one that it was given
+FILES_OF_A_RUN = (RECORDING, VERIFICATION, RESULT, JOURNAL, PROGRESS, REPORT)
 
 #: sections of the configuration that the measured points depend on
 EXPERIMENT_SECTIONS = ("rig", "signals", "limits", "operating_point", "experiment")
@@ -43,9 +46,36 @@ def recordings(folder: Path, name: str = RECORDING) -> tuple[Path, ...]:
 
 
 def store_config(config: Config, folder: Path) -> None:
-    """Keep the configuration that a run begins with beside its recordings."""
-    content = config.model_dump(mode="json", exclude_none=True)
-    (folder / CONFIG).write_text(tomli_w.dumps(content), encoding="utf-8")
+    """Keep the configuration that a run begins with beside its recordings.
+
+    One that says the same is left as it is, with the comments of whoever wrote it; one that differs where a resumed
+    run may differ is kept under the next free name.
+    """
+    place = folder / CONFIG
+    if place.is_file():
+        if _stores(config, place):
+            return
+        place.rename(next_free(place))
+    write_whole(place, tomli_w.dumps(config.model_dump(mode="json", exclude_none=True)))
+
+
+def may_store(config: Config, folder: Path) -> None:
+    """Refuse a folder for a new run that holds a configuration other than this one.
+
+    Raises
+    ------
+    InputError
+        It does; nothing is overwritten.
+    """
+    if (folder / CONFIG).exists() and not _stores(config, folder / CONFIG):
+        raise InputError(f"holds a {CONFIG} that says something else", where=str(folder), remedy="choose another --out")
+
+
+def _stores(config: Config, place: Path) -> bool:
+    try:
+        return load_config(place) == config
+    except InputError:
+        return False
 
 
 def stored_config(folder: Path) -> Config:
@@ -93,29 +123,14 @@ def read_designed(path: Path) -> PIDController:
     Raises
     ------
     InputError
-        No such file, or no PI or PID in it.
+        No such file, or no PI or PID in it that could run a loop; names the key.
     """
     content = _read_json(path)
-    design = content.get("controller", content)
-    try:
-        gains = {key: float(design[key] or 0.0) for key in ("K", "Td_s", "Tf_s")}
-        Ti_s = math.inf if design["Ti_s"] is None else float(design["Ti_s"])
-    except (KeyError, TypeError, ValueError):
-        raise InputError(
-            "holds no K, Ti_s, Td_s, Tf_s",
-            where=str(path),
-            remedy="give a design.json or the folder of a completed run",
-        ) from None
-    return PIDController(**gains, Ti_s=Ti_s, setpoint_weight=float(design.get("setpoint_weight", 1.0)))
+    return pid_from_table(content.get("controller", content), str(path))
 
 
 def _read_json(path: Path) -> dict[str, Any]:
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", where=str(path), remedy="check the path") from None
-    except ValueError as error:
-        raise InputError(f"not JSON: {error}", where=str(path)) from None
+    content = read_json(path)
     if not isinstance(content, dict):
         raise InputError("not a result", where=str(path), remedy="give a file that autotune wrote")
     return content
@@ -143,10 +158,18 @@ def read_interrupted(folder: Path, config: Config) -> Earlier:
             where=str(folder),
             remedy=f"go on with {folder / CONFIG}, or begin a new run",
         )
-    result = _read_json(folder / RESULT) if (folder / RESULT).exists() else {}  # a killed run leaves none
-    if result.get("experiment", {}).get("reason") == "completed":
+    if _is_complete(folder / RESULT):
         raise InputError("the run is complete", where=str(folder), remedy="autotune verify tries its controller again")
     return read_earlier(recordings(folder), config.signals.sample_time_s)
+
+
+def _is_complete(result: Path) -> bool:
+    """Return whether a run says that it came to its end; a killed one leaves no result, a full disk perhaps half."""
+    try:
+        experiment = _read_json(result).get("experiment")
+    except InputError:
+        return False
+    return isinstance(experiment, dict) and experiment.get("reason") == "completed"
 
 
 def differences(stored: Config, given: Config) -> tuple[str, ...]:

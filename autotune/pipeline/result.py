@@ -11,6 +11,7 @@ from autotune.design.nugap import Validation
 from autotune.diagnosis.result import Diagnosis
 from autotune.experiment.result import ExperimentResult
 from autotune.experiment.verify import Verification
+from autotune.outputs import write_whole
 from autotune.pipeline.analysis import Analysis
 from autotune.points import points_to_json
 from autotune.run_log import jsonable
@@ -51,7 +52,7 @@ def append_diagnosis(path: Path, found: Diagnosis) -> None:
 
 def write_json(content: dict[str, Any], path: Path) -> None:
     """Write a result file; what JSON has no number for becomes null."""
-    path.write_text(json.dumps(jsonable(content), indent=2, allow_nan=False) + "\n", encoding="utf-8")
+    write_whole(path, json.dumps(jsonable(content), indent=2, allow_nan=False) + "\n")
 
 
 def analysis_json(analysis: Analysis) -> dict[str, Any]:

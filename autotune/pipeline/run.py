@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 from autotune.config import Config
 from autotune.controller import PIDController
-from autotune.errors import AutotuneError
+from autotune.errors import AutotuneError, ExperimentStopped
 from autotune.experiment.cycles import Earlier
 from autotune.experiment.result import ExperimentResult
 from autotune.experiment.rig import HoldsGains, Rig
 from autotune.experiment.run import OnProgress, run_experiment
 from autotune.experiment.sweep import missing_phases
 from autotune.experiment.verify import Verification, run_verification
+from autotune.outputs import unwritable
 from autotune.pipeline.analysis import Analysis, analyse
 from autotune.pipeline.deployment import hand_over
 from autotune.pipeline.folder import (
@@ -105,8 +107,12 @@ def tune(
         The points give no model or no controller; they are in ``out``.
     """
     earlier = read_interrupted(out, config) if resume else Earlier()
-    store_config(config, out)
-    with RunLog(out / PROGRESS) as log:
+    try:
+        store_config(config, out)
+        log_of_run = RunLog(out / PROGRESS)
+    except OSError as error:
+        raise unwritable(error, out) from None
+    with log_of_run as log:
         log.begin(config)
         return _tune(
             rig, config, out, earlier, log, verify=verify, deploy=deploy, on_progress=log.also(on_progress), keep=keep
@@ -161,9 +167,18 @@ def _tune(
                 deployed = False
             log.gains(old, analysis.controller, deployed=deployed)
     except AutotuneError as error:
-        write_result(out / RESULT, experiment, analysis, None, reason=str(error))
+        with contextlib.suppress(OSError):  # a full disk must not hide why the run ended
+            write_result(out / RESULT, experiment, analysis, None, reason=str(error))
         raise
-    write_result(out / RESULT, experiment, analysis, verification, reason="completed")
+    try:
+        write_result(out / RESULT, experiment, analysis, verification, reason="completed")
+    except OSError as error:
+        refused, gains = unwritable(error, out / RESULT), "new" if deployed else "old"
+        raise ExperimentStopped(
+            f"{refused.what}; the run is complete and the rig's controller holds the {gains} gains",
+            where=refused.where,
+            remedy=f"free space, then autotune run --resume {out}",
+        ) from None
     return Tuning(
         experiment=experiment, analysis=analysis, verification=verification, old_controller=old, deployed=deployed
     )

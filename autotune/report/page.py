@@ -5,7 +5,6 @@ from __future__ import annotations
 import html
 import os
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
@@ -13,6 +12,7 @@ import plotly.graph_objects as go
 from plotly.offline import get_plotlyjs
 
 from autotune.arrays import FloatArray
+from autotune.outputs import write_whole
 
 Tone: TypeAlias = Literal["good", "warn", "bad"]
 
@@ -142,11 +142,11 @@ def write_page(page: Page, path: str | os.PathLike[str]) -> None:
         body.append(f'<nav aria-label="Contents">{"".join(links)}</nav>')
     for i, section in enumerate(page.sections):
         body.append(_section(section, i))
-    Path(path).write_text(
+    write_whole(
+        path,
         _SHELL.replace("@TITLE@", _text(page.title))
         .replace("@BODY@", "\n".join(body))
         .replace("@PLOTLY@", get_plotlyjs() if any(section.figures for section in page.sections) else ""),
-        encoding="utf-8",
     )
 
 

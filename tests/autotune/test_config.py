@@ -61,7 +61,7 @@ def test_margins_replace_those_of_the_named_specification(tmp_path: Path) -> Non
         (
             "sample_time_s = 0.01",
             "sample_time_s = 0",
-            r"signals\.sample_time_s = 0.*greater than 0.*control period \[s\]",
+            r"signals\.sample_time_s = 0.*greater than or equal to 0.000001.*control period \[s\]",
         ),
         ("swing = 3.0", "", r"'limits\.swing' is missing.*\[y unit\]"),
         ("u_safe = 0.0", "u_safe = 11.0", r"u_safe = 11 must lie within u_min\.\.u_max"),

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import numpy as np
@@ -7,7 +8,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from autotune.controller import Controller, DiscreteController, PIDController, read_controller, write_controller
+from autotune.controller import (
+    Controller,
+    DiscreteController,
+    PIDController,
+    pid_from_table,
+    read_controller,
+    write_controller,
+)
 from autotune.errors import InputError
 from autotune.models import TransferFunction
 
@@ -39,12 +47,24 @@ def test_a_written_controller_reads_back_equal(tmp_path: Path, controller: Contr
 @pytest.mark.parametrize(
     ("content", "says"),
     [
-        ('kind = "pi"\nK = 1.0\n', "Ti_s = None"),
+        ('kind = "pi"\nK = 1.0\n', "'Ti_s' is missing"),
         ('kind = "pi"\nK = 1.0\nTi_s = -3\n', "Ti_s = -3"),
         ('kind = "fuzzy"\n', "kind = 'fuzzy'"),
-        ("num = [1.0]\n", "num and den"),
-        ("num = [1.0]\nden = [0.0, 1.0]\nsample_time_s = 1.0\n", "den begin"),
+        ("num = [1.0]\n", "'den' is missing"),
+        ("num = [1.0]\nden = [0.0, 1.0]\nsample_time_s = 1.0\n", "den must begin"),
         ("K = \n", "not TOML"),
+        ('kind = "pi"\nK = inf\nTi_s = 1.0\n', "K = inf"),
+        ('kind = "pi"\nK = nan\nTi_s = 1.0\n', "K = nan"),
+        ('kind = "pi"\nK = 0.0\nTi_s = 1.0\n', "commands nothing"),
+        ('kind = "pi"\nK = 1e-300\nTi_s = 1.0\n', "commands nothing"),
+        ('kind = "pi"\nK = "1"\nTi_s = 1.0\n', "K = '1'"),
+        ('kind = "pi"\nK = true\nTi_s = 1.0\n', "K = True"),
+        ('kind = "pi"\nK = 1.0\nTi_s = 1e-308\n', "Ti_s = 1e-308"),
+        ('kind = "pi"\nK = 1.0\nTi_s = 1.0\nTd = 0.5\n', "unknown key 'Td'; did you mean 'Td_s'"),
+        ('kind = "pi"\nK = 1.0\nTi_s = 1.0\nTd_s = 0.5\n', "neither Td_s nor Tf_s"),
+        ("num = [true]\nden = [1.0]\n", r"num\.0 = True"),
+        ('num = [1.0]\nden = ["1"]\n', r"den\.0 = '1'"),
+        ("num = [0.0]\nden = [1.0]\n", "num is zero"),
     ],
 )
 def test_a_wrong_controller_is_refused_with_its_key(tmp_path: Path, content: str, says: str) -> None:
@@ -52,3 +72,23 @@ def test_a_wrong_controller_is_refused_with_its_key(tmp_path: Path, content: str
     path.write_text(content)
     with pytest.raises(InputError, match=says):
         read_controller(path)
+
+
+@pytest.mark.parametrize(
+    "table",
+    [
+        {"K": None, "Ti_s": 1.0}, {"K": "", "Ti_s": 1.0}, {"K": [], "Ti_s": 1.0}, {"K": math.nan, "Ti_s": 1.0},
+        {"K": math.inf, "Ti_s": 1.0}, {"K": True, "Ti_s": 1.0}, {"K": 0.0, "Ti_s": 1.0}, {"K": 1.0, "Ti_s": 0},
+        {"K": 1.0, "Ti_s": -1}, {"K": 1.0, "Ti_s": []}, {"K": 1.0, "Ti_s": ""}, {"K": 1.0}, {"Ti_s": 1.0}, {}, [], 5,
+        {"K": 1.0, "Ti_s": 1.0, "Td": 0.1}, {"K": 1.0, "Ti_s": 1.0, "Td_s": -0.1}, {"K": 1e300, "Ti_s": 1.0},
+    ],
+)  # fmt: skip
+def test_no_design_that_is_none_reaches_a_rig(table: object) -> None:
+    with pytest.raises(InputError, match=r"^design\.json"):
+        pid_from_table(table, "design.json")
+
+
+def test_a_design_of_this_tool_is_read_with_what_stands_beside_its_gains() -> None:
+    table = {"kind": "pi", "K": -0.02, "Ti_s": 3, "Td_s": 0.0, "Tf_s": 0.0, "h2": 0.1, "binding": [], "margins": {}}
+    assert pid_from_table(table, "design.json") == PIDController(K=-0.02, Ti_s=3.0)
+    assert pid_from_table({"K": 1.0, "Ti_s": None}, "design.json").Ti_s == math.inf

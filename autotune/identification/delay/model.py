@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import math
 import os
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,6 +12,8 @@ import numpy as np
 from autotune.arrays import ComplexArray, FloatArray
 from autotune.errors import InputError
 from autotune.models import TransferFunction
+from autotune.outputs import write_json
+from autotune.text_files import read_json
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -101,7 +101,7 @@ class DelayModel:
 
 def write_delay_model(model: DelayModel, path: str | os.PathLike[str]) -> None:
     """Write ``delay.json``."""
-    Path(path).write_text(json.dumps(model.to_json(), indent=2) + "\n", encoding="utf-8")
+    write_json(path, model.to_json())
 
 
 def read_delay_model(path: str | os.PathLike[str]) -> DelayModel:
@@ -113,8 +113,8 @@ def read_delay_model(path: str | os.PathLike[str]) -> DelayModel:
         No such file, not JSON, or a missing key.
     """
     where = str(path)
+    content = read_json(path)
     try:
-        content = json.loads(Path(path).read_text(encoding="utf-8"))
         a = tuple(float(value) for value in content["a"])
         b = float(content["b"][0])
         delay_s = float(content["delay_s"])
@@ -122,9 +122,11 @@ def read_delay_model(path: str | os.PathLike[str]) -> DelayModel:
         initial_state = tuple(float(value) for value in content.get("initial_state", [0.0] * len(a)))
         diagonal = np.array([*sd, *[0.0] * (1 + len(a))], dtype=np.float64) ** 2
         covariance = np.array(content.get("covariance", np.diag(diagonal)), dtype=np.float64)
-    except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", where=where, remedy="check the path") from None
-    except (ValueError, KeyError, TypeError, IndexError):
+        noise = content.get("noise", {})
+        rest = {key: float(content.get(key, 0.0)) for key in ("constant", "initial_time_s")}
+        noise_sd, noise_ar = float(noise.get("sd") or math.nan), tuple(float(value) for value in noise.get("ar", ()))
+        rows = int(content.get("rows", 0))
+    except (ValueError, KeyError, TypeError, IndexError, AttributeError, OverflowError):
         raise InputError(
             "is not a delay file with order, a, b, delay_s, initial_state, sd",
             where=where,
@@ -132,16 +134,15 @@ def read_delay_model(path: str | os.PathLike[str]) -> DelayModel:
         ) from None
     if not a or covariance.shape != (2 * len(a) + 3,) * 2 or not np.all(np.isfinite((*a, b, delay_s))):
         raise InputError("a, b, delay_s and sd do not belong together", where=where)
-    noise = content.get("noise", {})
     return DelayModel(
         a=a,
         b=b,
         delay_s=delay_s,
-        constant=float(content.get("constant", 0.0)),
-        initial_time_s=float(content.get("initial_time_s", 0.0)),
+        constant=rest["constant"],
+        initial_time_s=rest["initial_time_s"],
         initial_state=initial_state,
         covariance=covariance,
-        noise_sd=float(noise.get("sd", math.nan)),
-        noise_ar=tuple(float(value) for value in noise.get("ar", ())),
-        rows=int(content.get("rows", 0)),
+        noise_sd=noise_sd,
+        noise_ar=noise_ar,
+        rows=rows,
     )

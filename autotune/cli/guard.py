@@ -1,0 +1,141 @@
+"""The one place where whatever a command ends with becomes one line and an exit status, what nobody foresaw included.
+
+A command that fails on purpose raises one of the project's errors. Everything else arrives here: Ctrl-C at any moment,
+errors of the operating system, memory that ran out, and defects, whose traceback goes to a file beside the output.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import sys
+import tempfile
+import time
+import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NoReturn
+
+import typer
+from typer.core import TyperCommand
+
+from autotune.errors import AutotuneError, ExperimentStopped, InputError, OperatorStop, Unforeseen, UnforeseenAtRig
+from autotune.outputs import unwritable
+from autotune.text_files import printable, reason
+
+#: parameters of the commands that name where results go, the most telling first
+_PLACES = ("out", "resume", "folder", "run")
+#: most files that a message names
+_MOST_NAMES = 6
+_CLICK_EXCEPTION: type[Exception] = typer.BadParameter.__mro__[2]  # typer brings click under changing names
+
+
+class GuardedCommand(TyperCommand):
+    """A command whose every end is one of the project's errors, or click's own."""
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run the command."""
+        began_s = time.time()
+        try:
+            return super().invoke(ctx)
+        except (AutotuneError, _CLICK_EXCEPTION, typer.Exit) as error:
+            if isinstance(error, UnforeseenAtRig):
+                cause = error.__cause__ or error
+                error.remedy = f"the traceback is in {_keep_traceback(cause, _place(ctx))}; please report it"
+            raise
+        except (KeyboardInterrupt, typer.Abort):
+            _say_stopped(_place(ctx), began_s)
+        except OSError as error:
+            if error.errno == errno.EPIPE and error.filename is None:  # whoever read the output has gone
+                without_stdout()
+                raise typer.Exit(InputError.exit_status) from None
+            raise _refusal(error) from None
+        except (MemoryError, RecursionError) as error:
+            raise _too_large(error) from None
+        except Exception as error:
+            what = f"a defect of the tool: {_named(error)}"
+            kept = _keep_traceback(error, _place(ctx))
+            raise Unforeseen(
+                what, where=ctx.command_path, remedy=f"the traceback is in {kept}; please report it"
+            ) from error
+
+
+@contextmanager
+def rig_in_command() -> Iterator[None]:
+    """Say of an error that nobody foresaw that a rig was in command, so that it ends with the status of a stop.
+
+    Raises
+    ------
+    ExperimentStopped
+        An error of the operating system, or a defect.
+    """
+    try:
+        yield
+    except (AutotuneError, _CLICK_EXCEPTION, typer.Exit, typer.Abort):
+        raise
+    except OSError as error:
+        refusal = _refusal(error)
+        raise ExperimentStopped(refusal.what, where=refusal.where, remedy=refusal.remedy) from error
+    except Exception as error:
+        raise UnforeseenAtRig(f"a defect of the tool: {_named(error)}", where="rig in command") from error
+
+
+def without_stdout() -> None:
+    """Send what is left in standard output nowhere, so that the interpreter's own flush has nothing to say."""
+    with contextlib.suppress(OSError, ValueError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def _named(error: BaseException) -> str:
+    text = str(error).strip().splitlines()
+    return printable(f"{type(error).__name__}: {text[0][:200]}" if text else type(error).__name__)
+
+
+def _refusal(error: OSError) -> InputError:
+    if error.errno in (errno.ENOENT, errno.ENOTDIR, errno.EISDIR) and error.filename is not None:
+        return InputError(f"cannot be read ({reason(error)})", where=str(error.filename), remedy="check the path")
+    where = Path(str(error.filename)) if error.filename is not None else Path("a file")
+    return unwritable(error, where)
+
+
+def _too_large(error: BaseException) -> InputError:
+    if isinstance(error, RecursionError):
+        return InputError("the input is nested too deep", remedy="write it flat")
+    return InputError("the memory is not enough for this input", remedy="give fewer rows or points, or more memory")
+
+
+def _place(ctx: Any) -> Path | None:
+    """Return where the command puts its results, None where it has no such place."""
+    given = (ctx.params.get(name) for name in _PLACES)
+    return next((place for place in given if isinstance(place, Path)), None)
+
+
+def _say_stopped(place: Path | None, began_s: float) -> NoReturn:
+    names = _since(place, began_s) if place is not None else []
+    if not names:
+        raise OperatorStop("stopped by the operator; nothing was written") from None
+    shown = ", ".join(names[:_MOST_NAMES]) + (f" and {len(names) - _MOST_NAMES} more" * (len(names) > _MOST_NAMES))
+    raise OperatorStop("stopped by the operator", where=str(place), remedy=f"kept so far: {shown}") from None
+
+
+def _since(place: Path, began_s: float) -> list[str]:
+    """Return the names of the files there that were written since the command began."""
+    with contextlib.suppress(OSError):
+        files = [file for file in place.rglob("*") if ".part-" not in str(file)] if place.is_dir() else [place]
+        new = [file for file in files if file.is_file() and file.stat().st_mtime >= began_s - 1.0]
+        return sorted(file.name if file == place else str(file.relative_to(place)) for file in new)
+    return []
+
+
+def _keep_traceback(error: BaseException, place: Path | None) -> Path | str:
+    """Write the traceback beside the output, or where that cannot be written, and return its file."""
+    text = "".join(traceback.format_exception(error))
+    folders = [place if place.is_dir() else place.parent] if place is not None else []
+    for folder in (*folders, Path(), Path(tempfile.gettempdir())):
+        file = folder / f"autotune-defect-{time.strftime('%Y%m%d-%H%M%S')}-{os.getpid()}.txt"
+        with contextlib.suppress(OSError, ValueError), file.open("x", encoding="utf-8", errors="replace") as handle:
+            handle.write(text)
+            return file
+    return "no file, since none can be written"

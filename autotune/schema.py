@@ -1,0 +1,131 @@
+"""Tables of keys to validated settings: a refused key is named by its path, its range and its nearest known name.
+
+Every file that can reach a rig goes through here: configurations, campaigns, controllers, designs.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Mapping
+from typing import Annotated, Any, TypeVar
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic_core import ErrorDetails
+
+from autotune.errors import InputError
+from autotune.text_files import printable
+
+Root = TypeVar("Root", bound=BaseModel)
+
+#: Largest size of a gain or signal value, far beyond every unit and far below where arithmetic overflows.
+LARGEST = 1e15
+#: Shortest and longest time [s]: a microsecond, thirty years.
+SHORTEST_S, LONGEST_S = 1e-6, 1e9
+
+
+class Section(BaseModel):
+    """A table of settings: frozen, a key it does not know is refused, and so are NaN and infinity."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+#: A signal's value or a gain, finite and of a size that arithmetic can hold.
+Number = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
+#: A length of time [s].
+Time = Annotated[float, Field(ge=SHORTEST_S, le=LONGEST_S)]
+#: What people read: at most 200 characters.
+Text = Annotated[str, Field(max_length=200)]
+
+
+def validated(root: type[Root], content: Mapping[str, Any], where: str) -> Root:
+    """Return the settings that a table of keys holds.
+
+    Parameters
+    ----------
+    root : type
+        The settings asked for.
+    content : mapping
+        Keys and values, as TOML gives them.
+    where : str
+        The file, for messages.
+
+    Raises
+    ------
+    InputError
+        The first key that was refused: its path, the allowed range, the nearest known key.
+    """
+    try:
+        return root.model_validate(content)
+    except ValidationError as error:
+        raise _refusal(error, root, where) from None
+
+
+def _refusal(error: ValidationError, root: type[BaseModel], where: str) -> InputError:
+    details = error.errors(include_url=False)
+    first = next((d for d in details if d["type"] == "extra_forbidden"), details[0])
+    at = _key_path(first, root)
+    path = shortened(".".join(str(part) for part in at))
+    more = f" (and {len(details) - 1} more)" if len(details) > 1 else ""
+    if first["type"] == "extra_forbidden":
+        key = str(first["loc"][-1])
+        known = _known_keys(root, at[:-1])
+        near = difflib.get_close_matches(key, known, n=1, cutoff=0.5)
+        remedy = f"did you mean {near[0]!r}?" if near else f"known keys here: {', '.join(known)}"
+        return InputError(f"unknown key {path!r}{more}", where=where, remedy=remedy)
+    if first["type"] == "missing":
+        return InputError(f"{path!r} is missing{more}", where=where, remedy=_describe(root, at))
+    value = first.get("input")
+    shown = f" = {shortened(repr(value))}" if isinstance(value, str | int | float | bool) else ""
+    reason = first["msg"].removeprefix("Value error, ")
+    key = f"{path}{shown}: " if path else ""  # what holds between keys of the whole file has no path
+    return InputError(f"{key}{reason}{more}", where=where, remedy=_describe(root, at))
+
+
+def shortened(text: str) -> str:
+    """Return a text for a message: printable, and at most 80 characters of it."""
+    text = printable(text)
+    return text if len(text) <= 80 else f"{text[:77]}..."
+
+
+def _key_path(detail: ErrorDetails, root: type[BaseModel]) -> tuple[str | int, ...]:
+    """Drop the tags that pydantic puts into a path for the kinds of a union."""
+    path: list[str | int] = []
+    for i, part in enumerate(detail["loc"]):
+        known = {key for model in _section(root, tuple(path)) for key in model.model_fields}
+        last = i == len(detail["loc"]) - 1
+        if isinstance(part, int) or part in known or not known or (last and detail["type"] == "extra_forbidden"):
+            path.append(part)
+    return tuple(path)
+
+
+def _section(root: type[BaseModel], path: tuple[str | int, ...]) -> list[type[BaseModel]]:
+    """Return the models that a path can lead to: one, or the kinds of a union."""
+    models: list[type[BaseModel]] = [root]
+    for part in path:
+        if isinstance(part, int):
+            continue
+        found = []
+        for model in models:
+            field = model.model_fields.get(part)
+            if field is not None:
+                found += _models_in(field.annotation)
+        models = found
+    return models
+
+
+def _models_in(annotation: Any) -> list[type[BaseModel]]:
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [annotation]
+    return [model for part in getattr(annotation, "__args__", ()) for model in _models_in(part)]
+
+
+def _known_keys(root: type[BaseModel], path: tuple[str | int, ...]) -> list[str]:
+    return sorted({key for model in _section(root, path) for key in model.model_fields})
+
+
+def _describe(root: type[BaseModel], path: tuple[str | int, ...]) -> str:
+    for model in _section(root, path[:-1]) if path else []:
+        field = model.model_fields.get(str(path[-1]))
+        if field is not None and field.description:
+            return field.description
+    return ""
