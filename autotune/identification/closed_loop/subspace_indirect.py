@@ -23,6 +23,8 @@ from autotune.identification.closed_loop.state_space import InnovationModel
 Instrument: TypeAlias = Literal["r", "r and y", "u and y"]
 #: Singular values below this share of the largest are rounding in noise-free data.
 _RANK = 1e-9
+#: The same of the controller's Hankel matrix: Markov parameters estimated from data are known to about 1e-8.
+_CONTROLLER_RANK = 1e-7
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -87,8 +89,9 @@ def indirect_subspace(
     f, p : int
         Future and past window, p = f when absent; both above the loop's order.
     loop_order : int, optional
-        Minimal order n_cl of the loop; when absent the number of singular values (8) above rounding if the data are
-        noise-free, else the larger of ``order`` and the position of the largest gap.
+        Order n_cl of the loop; when absent n + n_c with the controller's order n_c from its Markov parameters
+        (:func:`controller_order`), or the number of singular values (8) above rounding where there is no noise. Fewer
+        than the minimal order make the estimate inconsistent, more only cost precision.
     instrument : {"r", "r and y", "u and y"}
         Psi = R_p, or [R_p; Y_p]; ``"u and y"`` only for an open loop, where R_p = U_p.
     sample_time_s : float
@@ -101,11 +104,12 @@ def indirect_subspace(
     Raises
     ------
     IdentificationError
-        Record too short, windows too short for the orders, or r not persistently exciting of order f.
+        Record too short, windows too short for the orders, too few Markov parameters to tell the controller's order, or
+        r not persistently exciting of order f.
 
     Notes
     -----
-    Consistent; exact without noise. Far from efficient in B and D with noise: on the paper's own example 22 of 100
+    Consistent, if n_cl is not below the loop's minimal order; exact without noise. Far from efficient in B and D with noise: on the paper's own example 22 of 100
     models are not stabilised by the true controller. Equations (7) to (11) of the paper.
     """
     p = f if p is None else p
@@ -122,7 +126,7 @@ def indirect_subspace(
         )
     # steps 1 and 2: first projection O_cl = M32 N2', its SVD (8)
     U_1, s_cl, V_1t = np.linalg.svd(M.block(2, 1), full_matrices=True)
-    n_cl = _loop_order(s_cl, order) if loop_order is None else loop_order
+    n_cl = _loop_order(s_cl, order, controller_markov) if loop_order is None else loop_order
     if n_cl >= f * n_y or order > n_cl:
         raise IdentificationError(f"loop order {n_cl} needs f n_y above it, and order {order} at most it, f = {f}")
     free = U_1[:, n_cl:].T  # annihilates Gamma_cl
@@ -162,12 +166,39 @@ class _Blocks:
         return self.R[at[column] : at[column + 1], at[row] : at[row + 1]].T
 
 
-def _loop_order(s: FloatArray, order: int) -> int:
+def _loop_order(s: FloatArray, order: int, controller_markov: FloatArray) -> int:
     noise_free = int(np.sum(s > _RANK * s[0]))
-    if noise_free < len(s):
-        return noise_free
-    gaps = np.log(s[order - 1 : -1]) - np.log(s[order:])
-    return order + int(np.argmax(gaps))
+    return noise_free if noise_free < len(s) else order + controller_order(controller_markov)
+
+
+def controller_order(markov: FloatArray) -> int:
+    """Return the order n_c of a controller, the rank of the Hankel matrix of its Markov parameters.
+
+    Parameters
+    ----------
+    markov : (count, n_u, n_y) array
+        D_c, C_c B_c, C_c A_c B_c ...
+
+    Raises
+    ------
+    IdentificationError
+        The rank is full: with so few parameters the order may be higher still.
+    """
+    terms = markov[1:]
+    high = (len(terms) + 1) // 2
+    wide = len(terms) + 1 - high
+    if not high or not np.any(terms):
+        return 0
+    hankel = np.block([[terms[i + k] for k in range(wide)] for i in range(high)])
+    s = np.linalg.svd(hankel, compute_uv=False)
+    rank = int(np.sum(s > _CONTROLLER_RANK * s[0]))
+    if rank == len(s):
+        raise IdentificationError(
+            f"{len(markov)} Markov parameters do not show the controller's order",
+            where="controller_markov",
+            mend="give twice as many as its order and more, or the loop's order",
+        )
+    return rank
 
 
 def markov_from_null_space(free: FloatArray, right: FloatArray, M11: FloatArray, *, n_u: int, n_y: int) -> FloatArray:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from threadpoolctl import threadpool_limits
 
 from autotune.errors import IdentificationError
 from autotune.identification.closed_loop.refit import refit_inputs
@@ -11,6 +12,7 @@ from autotune.identification.closed_loop.state_space import difference, feedback
 from autotune.identification.closed_loop.subspace_direct import pbsid_opt, ssarx
 from autotune.identification.closed_loop.subspace_indirect import (
     controller_markov_parameters,
+    controller_order,
     estimated_states,
     indirect_subspace,
 )
@@ -37,6 +39,39 @@ def test_paper_method_is_exact_without_noise(instrument: str) -> None:
     assert found.loop_order == 9  # n + n_c: the singular values fall by ten decades behind it
     np.testing.assert_allclose(den, PLANT_DEN, atol=1e-10)
     np.testing.assert_allclose(num, PLANT_NUM, atol=1e-10)
+
+
+@pytest.mark.parametrize("from_data", [False, True])
+def test_the_loops_order_is_the_plants_and_the_controllers(from_data: bool) -> None:
+    """With noise the gap of the singular values shows the plant alone: n_cl = n is not consistent."""
+    d = example_set(3, rows=4000)
+    markov = controller_markov_parameters(d.r, d.u, d.y, 15)[0] if from_data else MARKOV
+    assert controller_order(markov) == 4
+    assert indirect_subspace(d.r, d.u, d.y, 5, controller_markov=markov, f=15).loop_order == 9
+
+
+def test_too_few_markov_parameters_leave_the_controllers_order_open() -> None:
+    with pytest.raises(IdentificationError, match="do not show the controller's order"):
+        controller_order(MARKOV[:7])
+    assert controller_order(np.zeros((15, 1, 1))) == 0
+
+
+def test_the_default_tends_to_the_plant_with_the_record() -> None:
+    """Root mean square errors of the poles fall with the root of the rows; with n_cl = n they stay where they are."""
+    errors = {}
+    for rows in (10_000, 160_000):
+        found = []
+        with threadpool_limits(1):
+            for seed in range(6):
+                d = example_set(seed, rows=rows)
+                for loop_order in (None, 5):
+                    model = indirect_subspace(
+                        d.r, d.u, d.y, 5, controller_markov=MARKOV, f=15, loop_order=loop_order
+                    ).model
+                    found.append(np.abs(PLANT.poles[:, None] - model.poles).min(axis=1))
+        errors[rows] = np.sqrt(np.mean(np.reshape(found, (6, 2, 5)) ** 2, axis=(0, 2)))
+    assert errors[160_000][0] < 0.5 * errors[10_000][0]  # a quarter is what independent noise gives
+    assert errors[160_000][1] > 2.0 * errors[160_000][0]
 
 
 def test_states_of_remark_2_follow_the_state_equation_without_noise() -> None:
