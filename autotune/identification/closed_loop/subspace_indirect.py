@@ -109,7 +109,8 @@ def indirect_subspace(
 
     Notes
     -----
-    Consistent, if n_cl is not below the loop's minimal order; exact without noise. Far from efficient in B and D with noise: on the paper's own example 22 of 100
+    Consistent, if n_cl is not below the loop's minimal order; exact without noise.
+    Far from efficient in B and D with noise: on the paper's own example 22 of 100
     models are not stabilised by the true controller. Equations (7) to (11) of the paper.
     """
     p = f if p is None else p
@@ -196,7 +197,7 @@ def controller_order(markov: FloatArray) -> int:
         raise IdentificationError(
             f"{len(markov)} Markov parameters do not show the controller's order",
             where="controller_markov",
-            mend="give twice as many as its order and more, or the loop's order",
+            remedy="give twice as many as its order and more, or the loop's order",
         )
     return rank
 

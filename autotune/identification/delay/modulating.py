@@ -29,28 +29,28 @@ class SinePower:
 
     def derivative(self, i: int, s: FloatArray) -> FloatArray:
         """Return f^(i)(s), same shape as s."""
-        # sin^m(theta) = (2j)^-m sum_q C(m, q) (-1)^q exp(j (m - 2q) theta)
-        total = np.zeros(s.shape, dtype=np.complex128)
-        for q in range(self.m + 1):
-            frequency = (self.m - 2 * q) * np.pi
-            total += math.comb(self.m, q) * (-1) ** q * (1j * frequency) ** i * np.exp(1j * frequency * s)
-        return np.asarray((total / (2j) ** self.m).real, dtype=np.float64)
+        total = np.zeros(s.shape)
+        for c, omega in self.fourier():
+            total += np.real(c * (1j * omega) ** i * np.exp(1j * omega * s))
+        return total
 
-    def fourier(self) -> tuple[tuple[float, float], ...]:
-        """Return (c_q, omega_q), f(s) = sum c_q cos(omega_q s), for even m.
+    def fourier(self) -> tuple[tuple[complex, float], ...]:
+        """Return (c_q, omega_q), f(s) = sum Re c_q exp(j omega_q s), the lowest frequency first.
 
-        Raises
-        ------
-        InputError
-            m is odd: the family of its shifts is not the cosines' and sines' of whole periods.
+        Even powers are cosines of whole periods and a constant, odd powers sines of half periods (1, 3, ..).
         """
-        if self.m % 2:
-            raise InputError(f"sin^{self.m}", where="window", remedy="the exact shift needs an even power")
-        half = self.m // 2
-        terms = [(math.comb(self.m, half) / 2.0**self.m, 0.0)]
-        for q in range(1, half + 1):
-            terms.append(((-1) ** q * 2.0 * math.comb(self.m, half - q) / 2.0**self.m, 2.0 * np.pi * q))
+        terms: list[tuple[complex, float]] = []
+        if self.m % 2 == 0:
+            terms.append((math.comb(self.m, self.m // 2) / 2.0**self.m + 0j, 0.0))
+        for frequency in range(2 - self.m % 2, self.m + 1, 2):
+            q = (self.m - frequency) // 2  # sin^m = (2j)^-m sum_q C(m, q) (-1)^q exp(j (m - 2q) theta)
+            terms.append((2.0 * math.comb(self.m, q) * (-1) ** q / (2j) ** self.m, math.pi * frequency))
         return tuple(terms)
+
+    @property
+    def shifts(self) -> int:
+        """Dimension of the family that all shifts of f span."""
+        return self.m + 1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,6 +69,11 @@ class PolynomialWindow:
         """Return f^(i)(s), same shape as s."""
         f = np.polynomial.Polynomial([0.0, 1.0]) ** self.m * np.polynomial.Polynomial([1.0, -1.0]) ** self.m
         return np.asarray(f.deriv(i)(s) if i else f(s), dtype=np.float64)
+
+    @property
+    def shifts(self) -> int:
+        """Dimension of the family that all shifts of f span."""
+        return 2 * self.m + 1
 
 
 Window = SinePower | PolynomialWindow

@@ -16,12 +16,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
 from autotune.arrays import FloatArray
 from autotune.errors import IdentificationError, InputError
-from autotune.identification.delay.compiled import cholesky_solve
+from autotune.identification.delay import online_chain as chain
 from autotune.recording import Recording
+
+#: Rows of u's past that are made room for at once.
+_ROOM = 4096
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,11 +38,14 @@ class DelayTracking:
         T_0: time from the first row until which the delay is held at its start [s].
     rate : float
         lambda_h: share of the correction b_1/b_0 taken per second [1/s].
+    longest_s : float
+        Longest delay that u's past is kept for [s]; all of it by default.
     """
 
     start_s: float = 0.0
     after_s: float
     rate: float
+    longest_s: float = np.inf
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -57,6 +62,9 @@ class OnlineEstimate:
         Input gain and delay [s].
     state : (N, n) array
         x, x', .. at each row; NaN until the kernels have filled.
+    covariance : (N, n + 2, n + 2) array
+        Of (a_0.., b, delay); NaN until the equations have been averaged for two times memory, and with the paper's
+        scalar gain; zero for a delay that is not followed.
     """
 
     t: FloatArray
@@ -64,6 +72,162 @@ class OnlineEstimate:
     b: FloatArray
     delay_s: FloatArray
     state: FloatArray
+    covariance: FloatArray
+
+    @property
+    def standard_deviations(self) -> FloatArray:
+        """Of (a_0.., b, delay), shape (N, n + 2)."""
+        return np.sqrt(np.maximum(np.diagonal(self.covariance, axis1=1, axis2=2), 0.0))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class OnlineSample:
+    """Estimates after one row; as in :class:`OnlineEstimate`."""
+
+    t: float
+    a: FloatArray
+    b: float
+    delay_s: float
+    state: FloatArray
+    covariance: FloatArray
+
+
+class OnlineEstimator:
+    """The estimator as a live rig calls it: one row in, the estimates after it out.
+
+    Parameters
+    ----------
+    order : int
+        Order n.
+    forgetting : float
+        lambda [1/s]; the kernels of the parameters look back (n+2)/lambda.
+    memory_s : float, optional
+        Time over which equations are averaged [s]; (4 n + 8)/lambda where neither it nor a gain is given. The gain
+        matrix is the averaged equations' inverse over this time: a unit of t, u or y changes nothing.
+    gain : float, optional
+        The paper's scalar Lambda instead, whose effect depends on the units of u and y.
+    delay : DelayTracking, optional
+        How the delay is followed; the plant has none where not given.
+    linear : bool
+        Whether u runs linearly between rows; held otherwise.
+
+    Raises
+    ------
+    InputError
+        Settings that are not positive.
+
+    Notes
+    -----
+    Only u's past that the delay may reach is kept: memory is bounded by ``DelayTracking.longest_s``. The covariance is
+    that of least squares with forgetting under noise of any colour; it does not hold the bias that noise on y brings
+    into the regressors, nor the lag behind a parameter that moves. Where these matter, fit windows by output error
+    (:mod:`autotune.identification.delay.tracking`).
+    """
+
+    def __init__(
+        self,
+        order: int,
+        *,
+        forgetting: float,
+        memory_s: float | None = None,
+        gain: float | None = None,
+        delay: DelayTracking | None = None,
+        linear: bool = True,
+    ) -> None:
+        memory_s = (4.0 * order + 8.0) / forgetting if memory_s is None and forgetting > 0.0 else memory_s
+        if not (forgetting > 0 and (gain is None or gain > 0) and (memory_s or 0.0) > 0 and order >= 1):
+            raise InputError("forgetting, memory, gain and order must be positive", where="follow")
+        self._n, self._delay, self._linear = order, delay, linear
+        self._forgetting, self._memory_s, self._gain = float(forgetting), float(memory_s or 0.0), float(gain or 0.0)
+        kernels, unknowns = 2 * order + 2, order + (2 if delay else 1)
+        self._chains = np.zeros(kernels), np.zeros(kernels)
+        self._averages = np.zeros(unknowns), np.zeros((unknowns,) * 2), np.zeros(unknowns), np.zeros((unknowns,) * 2)
+        self._t, self._u, self._past = np.empty(_ROOM), np.empty(_ROOM), np.zeros((_ROOM, kernels))
+        self._rows = self._taken = 0
+        self._first_t = 0.0
+        self._scalars = np.zeros(8)
+        self._scalars[chain.H] = delay.start_s if delay else 0.0
+
+    def step(self, t: float, u: float, y: float) -> OnlineSample:
+        """Take a row and return the estimates after it.
+
+        Parameters
+        ----------
+        t, u, y : float
+            Time stamp [s], later than the last one's, command and measurement; u acts from t on.
+
+        Returns
+        -------
+        OnlineSample
+
+        Raises
+        ------
+        InputError
+            A value that is not a number, or a stamp that is not later.
+        IdentificationError
+            The delay ran out of the record: lock was lost.
+        """
+        if not (np.isfinite(t) and np.isfinite(u) and np.isfinite(y)):
+            raise InputError(f"t = {t}, u = {u}, y = {y}", where="step", remedy="leave out rows that are not numbers")
+        if self._rows and not t > self._scalars[chain.LAST_T]:
+            raise InputError(f"t = {t:g} s is not later than the last row", where="step", remedy="call it once a row")
+        self._make_room()
+        k, n = self._rows, self._n
+        self._t[k], self._u[k] = t, u
+        self._rows += 1
+        self._taken += 1
+        if self._taken == 1:
+            self._first_t = t
+            for place, value in ((chain.LAST_T, t), (chain.LAST_U, u), (chain.LAST_Y, y), (chain.FIRST_T, t)):
+                self._scalars[place] = value
+            return self._sample(t, np.full(n, np.nan), np.full((len(self._averages[0]),) * 2, np.nan))
+        state, covariance, locked = chain.step_row(
+            k, self._t, self._u, self._past, y, *self._chains, *self._averages, self._scalars, n, self._forgetting,
+            self._gain, self._memory_s, self._linear, self._delay is not None,
+            self._delay.after_s if self._delay else np.inf, self._delay.rate if self._delay else 0.0,
+        )  # fmt: skip
+        if not locked:
+            raise IdentificationError(
+                f"the delay estimate left the record at t = {t:g} s: lock was lost",
+                remedy="start nearer to the delay, later, or with a lower rate; identify_delay finds a start",
+            )
+        age = t - self._first_t
+        filled = age > (n + 2) / self._forgetting + 10.0 * age / (self._taken - 1)
+        return self._sample(t, state if filled else np.full(n, np.nan), covariance)
+
+    def _make_room(self) -> None:
+        """Forget rows that no delay reaches any more, or make the store larger."""
+        k = self._rows
+        if k < len(self._t):
+            return
+        longest = self._delay.longest_s if self._delay else 0.0
+        first = int(np.searchsorted(self._t[:k], self._t[k - 1] - longest)) - 1 if np.isfinite(longest) else 0
+        first = min(max(first, 0), k - 1)
+        room = max(_ROOM, 2 * (k - first))
+        for name in ("_t", "_u", "_past"):
+            old = getattr(self, name)
+            fresh = np.zeros((room, *old.shape[1:]))
+            fresh[: k - first] = old[first:k]
+            setattr(self, name, fresh)
+        self._rows = k - first
+        self._scalars[chain.ROW] = max(self._scalars[chain.ROW] - first, 0)
+
+    def _sample(self, t: float, state: FloatArray, covariance: FloatArray) -> OnlineSample:
+        n, A = self._n, self._averages[0]
+        jacobian = np.zeros((n + 2, A.size))
+        jacobian[: n + 1, : n + 1] = np.eye(n + 1)
+        if self._delay:  # h = h_hat + b_1 / b_0
+            jacobian[n + 1, n + 1] = 1.0 / A[n] if A[n] != 0.0 else np.nan
+        if self._gain:
+            covariance = np.full_like(covariance, np.nan)
+        return OnlineSample(
+            t=float(t),
+            a=A[:n].copy(),
+            b=float(A[n]),
+            delay_s=float(self._scalars[chain.H]),
+            state=state,
+            covariance=jacobian @ covariance @ jacobian.T,
+        )
 
 
 def follow(
@@ -71,26 +235,19 @@ def follow(
     order: int,
     *,
     forgetting: float,
-    gain: float,
+    memory_s: float | None = None,
+    gain: float | None = None,
     delay: DelayTracking | None = None,
     linear: bool = True,
 ) -> OnlineEstimate:
-    """Follow the parameters, the state and, where asked for, the delay, row by row.
+    """Follow the parameters, the state and, where asked for, the delay over a recording, row by row.
 
     Parameters
     ----------
     recording : Recording
         Rows of t, u, y.
-    order : int
-        Order n.
-    forgetting : float
-        lambda [1/s]; the kernels of the parameters look back (n+2)/lambda.
-    gain : float
-        Lambda of the gradient flow: large follows faster and lets more noise through.
-    delay : DelayTracking, optional
-        How the delay is followed; the plant has none where not given.
-    linear : bool
-        Whether u runs linearly between rows; held otherwise.
+    order, forgetting, memory_s, gain, delay, linear
+        As of :class:`OnlineEstimator`, whose steps these are.
 
     Returns
     -------
@@ -104,165 +261,19 @@ def follow(
     IdentificationError
         The delay ran out of the record: lock was lost.
 
-    Notes
-    -----
-    The estimate carries no covariance, and noise on y stands in its regressors; where bands are needed, fit windows
-    by output error (:mod:`autotune.identification.delay.tracking`).
-
     References
     ----------
     Section 2, Example 1; section 4, Examples 4 and 5.
     """
     recording.require_finite()
-    if not (forgetting > 0 and gain > 0 and order >= 1):
-        raise InputError("forgetting, gain and order must be positive", where="follow")
-    start, after, rate = (delay.start_s, delay.after_s, delay.rate) if delay else (0.0, np.inf, 0.0)
-    a, b, h, state, lost = _follow(
-        recording.t, recording.u, recording.y, order, forgetting, gain, linear, delay is not None, start, after, rate
+    estimator = OnlineEstimator(order, forgetting=forgetting, memory_s=memory_s, gain=gain, delay=delay, linear=linear)
+    rows = zip(recording.t.tolist(), recording.u.tolist(), recording.y.tolist(), strict=True)
+    samples = [estimator.step(t, u, y) for t, u, y in rows]
+    return OnlineEstimate(
+        t=recording.t,
+        a=np.array([sample.a for sample in samples]),
+        b=np.array([sample.b for sample in samples]),
+        delay_s=np.array([sample.delay_s for sample in samples]),
+        state=np.array([sample.state for sample in samples]),
+        covariance=np.array([sample.covariance for sample in samples]),
     )
-    if lost >= 0:
-        raise IdentificationError(
-            f"the delay estimate left the record at t = {recording.t[lost]:g} s: lock was lost",
-            where=recording.name,
-            remedy="start nearer to the delay, later, or with a lower rate; identify_delay finds a start",
-        )
-    filled = recording.t - recording.t[0] > (order + 2) / forgetting + 10.0 * recording.sample_time_s
-    state[~filled] = np.nan
-    return OnlineEstimate(t=recording.t, a=a, b=b, delay_s=h, state=state)
-
-
-@njit(cache=True)
-def _advance(J: FloatArray, step: float, first: float, last: float, lam: float, new: FloatArray) -> None:
-    """Carry the chain over a step during which the signal runs linearly from first to last, exactly."""
-    decay = np.exp(-lam * step)
-    for j in range(J.size):
-        total = 0.0
-        binomial = 1.0  # C(j, i) step^i
-        for i in range(j + 1):
-            total += binomial * J[j - i]
-            binomial *= step * (j - i) / (i + 1.0)
-        new[j] = decay * total
-    # int_0^step v(step - s) s^j exp(-lam s) ds by four Gauss points, exact to (lam step)^8
-    for node, weight in (
-        (0.06943184420297371, 0.17392742256872692),
-        (0.33000947820757187, 0.32607257743127307),
-        (0.6699905217924281, 0.32607257743127307),
-        (0.9305681557970262, 0.17392742256872692),
-    ):
-        s = node * step
-        value = (last + (first - last) * node) * weight * step * np.exp(-lam * s)
-        for j in range(J.size):
-            new[j] += value
-            value *= s
-    for j in range(J.size):
-        J[j] = new[j]
-
-
-@njit(cache=True)
-def _derivatives(J: FloatArray, n: int, lam: float) -> FloatArray:
-    """Return I_{x, g_j^(i)} for i = 0..n, shape (n+1, kernels)."""
-    result = np.empty((n + 1, J.size))
-    result[0] = J
-    for i in range(1, n + 1):
-        for j in range(J.size):
-            result[i, j] = lam * result[i - 1, j] - (j * result[i - 1, j - 1] if j > 0 else 0.0)
-    return result
-
-
-@njit(cache=True)
-def _delayed(
-    t: FloatArray, u: FloatArray, past: FloatArray, k: int, at: float, row: int, lam: float, linear: bool
-) -> tuple[FloatArray, int]:
-    """Return the chain of u at a time in the past, and the row it was carried on from."""
-    J = np.zeros(past.shape[1])
-    if at <= t[0]:
-        return J, 0
-    while row < k and t[row + 1] <= at:
-        row += 1
-    while row > 0 and t[row] > at:
-        row -= 1
-    J[:] = past[row]
-    if row < t.size - 1 and at > t[row]:
-        share = (at - t[row]) / (t[row + 1] - t[row])
-        last = u[row] + share * (u[row + 1] - u[row]) if linear else u[row]
-        _advance(J, at - t[row], u[row], last, lam, np.empty(J.size))
-    return J, row
-
-
-@njit(cache=True)
-def _follow(
-    t: FloatArray,
-    u: FloatArray,
-    y: FloatArray,
-    n: int,
-    lam: float,
-    gain: float,
-    linear: bool,
-    delayed: bool,
-    h: float,
-    after: float,
-    rate: float,
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, int]:
-    N = t.size
-    kernels = 2 * n + 2
-    unknowns = n + 2 if delayed else n + 1
-    Jy = np.zeros(kernels)
-    Ju = np.zeros(kernels)
-    new = np.empty(kernels)
-    past = np.zeros((N if delayed else 1, kernels))
-    A = np.zeros(unknowns)
-    a = np.zeros((N, n))
-    b = np.zeros(N)
-    delay = np.full(N, h)
-    state = np.zeros((N, n))
-    row = 0
-    for k in range(1, N):
-        step = t[k] - t[k - 1]
-        _advance(Jy, step, y[k - 1], y[k], lam, new)
-        _advance(Ju, step, u[k - 1], u[k] if linear else u[k - 1], lam, new)
-        Jh = Ju
-        if delayed:
-            past[k] = Ju
-            Jh, row = _delayed(t, u, past, k, t[k] - h, row, lam, linear)
-        Y = _derivatives(Jy, n, lam)
-        U = _derivatives(Jh, 1, lam)
-        C = np.empty((kernels - n, unknowns))
-        D = np.empty(kernels - n)
-        for j in range(n, kernels):
-            for i in range(n):
-                C[j - n, i] = (-1.0) ** i * Y[i, j]
-            C[j - n, n] = U[0, j]
-            if delayed:
-                C[j - n, n + 1] = U[1, j]
-            D[j - n] = (-1.0) ** n * Y[n, j]
-        # the implicit step (I + dt Lambda C^T C) A_new = A + dt Lambda C^T D; its matrix is positive definite
-        A = cholesky_solve(np.eye(unknowns) + step * gain * (C.T @ C), A + step * gain * (C.T @ D), 0.0)[0]
-        if delayed and t[k] - t[0] > after and A[n] != 0.0:
-            h += step * rate * A[n + 1] / A[n]
-            if not 0.0 <= h <= t[k] - t[0]:
-                return a, b, delay, state, k
-        a[k] = A[:n]
-        b[k] = A[n]
-        delay[k] = h
-        state[k] = _state(A, Y, U, n, lam)
-    return a, b, delay, state, -1
-
-
-@njit(cache=True)
-def _state(A: FloatArray, Y: FloatArray, U: FloatArray, n: int, lam: float) -> FloatArray:
-    """Solve the equations of the kernels j < n, whose end terms carry x..x^(n-1)(T)."""
-    ends = np.zeros((n + 1, n))  # g_j^(k)(T)
-    ends[0, 0] = 1.0
-    for k in range(1, n + 1):
-        for j in range(n):
-            ends[k, j] = lam * ends[k - 1, j] - (j * ends[k - 1, j - 1] if j > 0 else 0.0)
-    M = np.zeros((n, n))
-    r = np.zeros(n)
-    for j in range(n):
-        r[j] = -A[n] * U[0, j]
-        for i in range(n + 1):
-            coefficient = -1.0 if i == n else A[i]
-            r[j] -= coefficient * (-1.0) ** i * Y[i, j]
-            for order in range(i):
-                M[j, order] += coefficient * (-1.0) ** (i - order - 1) * ends[i - order - 1, j]
-    return np.asarray(np.linalg.solve(M, r), dtype=np.float64)

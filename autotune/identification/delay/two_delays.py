@@ -17,7 +17,7 @@ import numpy as np
 
 from autotune.arrays import FloatArray
 from autotune.errors import IdentificationError, InputError
-from autotune.identification.delay.modulated_delay import Interval
+from autotune.identification.delay.modulated_integrals import Interval
 from autotune.recording import Recording
 
 
