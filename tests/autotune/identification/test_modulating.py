@@ -89,7 +89,7 @@ def test_the_papers_step_takes_about_five_iterations():
 
 
 @given(delay_s=st.floats(0.0, 12.0), family=st.sampled_from([SinePower, PolynomialWindow]), m=st.integers(2, 4))
-@settings(max_examples=12)
+@settings(max_examples=8)
 def test_what_has_converged_is_the_delay_whatever_the_window(delay_s, family, m):
     """Of the windows' fixed points at other delays none is called converged."""
     found = modulated_delay(shifted_example_2(delay_s), 2, MORE_INTERVALS, window=family(m=m))
