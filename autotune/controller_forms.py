@@ -168,6 +168,8 @@ def _series(c: PIDController, spans: Spans) -> Values:
 
 
 def _of_series(v: Values, spans: Spans) -> PIDController:
+    if v["Ti_s"] == 0.0:  # as delivered
+        return PIDController(K=v["K"], Ti_s=math.inf, Tf_s=v["Tf_s"])
     total = v["Ti_s"] + v["Td_s"]
     return PIDController(K=v["K"] * total / v["Ti_s"], Ti_s=total, Td_s=v["Ti_s"] * v["Td_s"] / total, Tf_s=v["Tf_s"])
 
@@ -189,10 +191,12 @@ def _of_velocity(v: Values, spans: Spans) -> PIDController:
 
 
 def _band(c: PIDController, spans: Spans) -> Values:
-    if c.K == 0.0:
-        raise DesignError("a gain of 0 has no proportional band", where="proportional-band")
-    band = 100.0 * spans.ratio / c.K
-    return {"PB_percent": band, "reset_min": c.Ti_s / 60.0, "rate_min": c.Td_s / 60.0, "pv_filter_s": c.Tf_s}
+    return {
+        "PB_percent": _over(100.0 * spans.ratio, c.K),
+        "reset_min": c.Ti_s / 60.0,
+        "rate_min": c.Td_s / 60.0,
+        "pv_filter_s": c.Tf_s,
+    }
 
 
 def _of_band(v: Values, spans: Spans) -> PIDController:
@@ -244,7 +248,7 @@ def _schneider_mixed(c: PIDController, spans: Spans) -> Values:
 
 
 def _of_schneider_mixed(v: Values, spans: Spans) -> PIDController:
-    filter_s = v["td"] / v["kd"] if v["td"] else 0.0
+    filter_s = _over(v["td"], v["kd"])
     return _measurement_filtered(v["kp"], v["ti"] or math.inf, v["td"], filter_s)
 
 
@@ -256,7 +260,7 @@ def _schneider_parallel(c: PIDController, spans: Spans) -> Values:
 
 
 def _of_schneider_parallel(v: Values, spans: Spans) -> PIDController:
-    filter_s = v["td"] / v["kd"] if v["td"] else 0.0
+    filter_s = _over(v["td"], v["kd"])
     Ti, Td = v["ti"] * v["kp"] / spans.ratio or math.inf, _over(v["td"] * spans.ratio, v["kp"])
     return _measurement_filtered(v["kp"], Ti, Td, filter_s)
 

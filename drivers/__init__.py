@@ -60,10 +60,11 @@ def open_rig(
             on_line = DeviceLawRig if settings.relay == "device" else SerialLineRig
             return on_line(settings, u_range=u_range, u_safe=u_safe)
         case ModbusTcpSettings() | ModbusTlsSettings() | ModbusRtuSettings():
+            from drivers.gain_rig import GainRegisterRig
             from drivers.modbus import ModbusLink
-            from drivers.register_rig import GainRegisterRig, RegisterRig
+            from drivers.register_rig import RegisterRig
 
-            kind = RegisterRig if settings.registers.K is None else GainRegisterRig
+            kind = RegisterRig if settings.registers.held_gains is None else GainRegisterRig
             return kind(
                 ModbusLink(settings),
                 settings.registers,

@@ -199,7 +199,7 @@ def implausible(codec: Codec, words: Sequence[int], expected: tuple[float, float
     others = [
         other
         for other in _alternatives(codec)
-        if (expected is not None or other.register.type == "float32")
+        if (expected is not None or other.register.type.startswith("float"))
         and _plausible(other.decode(words), other, expected)
     ]
     for other in others[:2]:
@@ -221,20 +221,20 @@ def _plausible(value: float, codec: Codec, expected: tuple[float, float] | None)
         low, high = expected
         return low <= value <= high and not _is_denormal(value, codec)
     return not _is_denormal(value, codec) and (
-        codec.register.type != "float32" or value == 0.0 or abs(value) <= _FLOAT_PLAUSIBLE[1]
+        not codec.register.type.startswith("float") or value == 0.0 or abs(value) <= _FLOAT_PLAUSIBLE[1]
     )
 
 
 def _is_denormal(value: float, codec: Codec) -> bool:
     """Return whether a float is so small that swapped words are its likelier reading."""
-    return codec.register.type == "float32" and 0.0 < abs(value) < _FLOAT_PLAUSIBLE[0]
+    return codec.register.type.startswith("float") and 0.0 < abs(value) < _FLOAT_PLAUSIBLE[0]
 
 
 def _alternatives(codec: Codec) -> list[Codec]:
     register = codec.register
-    if register.type == "bit":
+    if register.type == "bit" or register.is_coded:
         return []
-    words: tuple[Order, ...] = get_args(Order) if register.words == 2 else (register.word_order,)
+    words: tuple[Order, ...] = get_args(Order) if register.words > 1 else (register.word_order,)
     forms: list[tuple[RegisterType, Order, Order]] = [
         (register.type, byte, word) for word in words for byte in get_args(Order)
     ]
@@ -251,5 +251,9 @@ def _alternatives(codec: Codec) -> list[Codec]:
 
 
 def _same_size(register: RegisterSettings) -> tuple[RegisterType, ...]:
-    sizes: tuple[RegisterType, ...] = ("float32", "int32", "uint32") if register.words == 2 else ("int16", "uint16")
-    return tuple(other for other in sizes if other != register.type)
+    sizes: dict[int, tuple[RegisterType, ...]] = {
+        1: ("int16", "uint16"),
+        2: ("float32", "int32", "uint32"),
+        4: ("float64", "int64", "uint64"),
+    }
+    return tuple(other for other in sizes[register.words] if other != register.type)

@@ -8,8 +8,7 @@ from typing import Protocol
 
 from autotune.config.registers import RegisterMap
 from autotune.config.rig import PermissiveSettings
-from autotune.controller import PIDController
-from autotune.errors import ExperimentStopped, InputError, LinkError, NotTaken
+from autotune.errors import ExperimentStopped, LinkError, NotTaken
 from autotune.experiment.rig import Clock, Former, Reading
 from drivers.clock import MonotonicClock
 from drivers.heartbeat import Heartbeat
@@ -77,7 +76,8 @@ class RegisterRig:
     Raises
     ------
     InputError
-        The register of the command cannot hold the whole range of commands.
+        The register of the command cannot hold the whole range of commands; or a limit lies between its counts and no
+        count within the range is near it.
 
     Notes
     -----
@@ -108,7 +108,7 @@ class RegisterRig:
         self._u_safe = u_safe
         self._feed_s = feed_s
         for u in (*u_range, u_safe):
-            self._codecs["u"].encode(u)
+            self._codecs["u"].encode_within(u, *u_range)
         sample = [self._codecs[name] for name in _SAMPLE if name in self._codecs]
         self._sample_blocks = blocks([*sample, *conditions.values()])
         self._command_blocks = blocks([self._codecs[name] for name in ("u", "heartbeat") if name in self._codecs])
@@ -212,7 +212,7 @@ class RegisterRig:
         Raises
         ------
         InputError
-            The register cannot hold the value.
+            The register cannot hold the value, or it is out of range.
         LinkError
             The device did not acknowledge it, or after a retry holds another value.
         """
@@ -374,7 +374,7 @@ class RegisterRig:
     def _write(self, parts: Sequence[Block]) -> None:
         values = {"u": self._u, "heartbeat": float(self._heart.next), "safe": self._u_safe}
         for block in parts:
-            words = [word for codec, _ in block.parts for word in codec.encode(values[codec.name])]
+            words = [word for codec, _ in block.parts for word in self._words(codec, values[codec.name])]
             suspect = self._link.write(block.table, block.address, words)
             if suspect and list(self._link.read(block)[0]) != words:
                 raise LinkError(
@@ -392,86 +392,16 @@ class RegisterRig:
 
     def _put(self, name: str, value: float) -> None:
         codec = self._codecs[name]
-        self._link.write(codec.register.table, codec.register.address, codec.encode(value))
+        self._link.write(codec.register.table, codec.register.address, self._words(codec, value))
+
+    def _words(self, codec: Codec, value: float) -> Sequence[int]:
+        """Return what is written of a signal: outputs within their range to the last count, a bit within its word."""
+        if codec.name in ("u", "safe"):
+            return codec.encode_within(value, *self._u_range)
+        if codec.register.bit is None:
+            return codec.encode(value)
+        return codec.encode(value, self._link.read(blocks([codec])[0])[0])
 
     def _require(self, holds: bool, what: str, remedy: str) -> None:
         if not holds:
             raise LinkError(what, where=self._link.where, remedy=remedy)
-
-
-class GainRegisterRig(RegisterRig):
-    """A device whose own PI is in the register map as well."""
-
-    def read_gains(self) -> PIDController:
-        """Return the gains the device's controller holds now."""
-        values: dict[str, float] = {}
-        self._link.connect()
-        for block in self._gain_blocks():
-            values |= block.decode(self._link.read(block)[0])
-        return PIDController(K=values["K"], Ti_s=values["Ti"])
-
-    def write_gains(self, controller: PIDController) -> None:
-        """Write gains and read them back; where that fails the old ones are written again.
-
-        Raises
-        ------
-        InputError
-            The controller is no PI, or a gain does not fit its register; nothing was written.
-        LinkError
-            What is read back differs, or the link broke; says what the device holds, as far as it is known.
-        """
-        if controller.kind != "pi":
-            raise InputError("the device holds a PI", where=self._link.where, remedy="design one with --kind pi")
-        self._link.connect()
-        gains = {"K": controller.K, "Ti": controller.Ti_s}
-        parts = self._gain_blocks()
-        new = [[word for codec, _ in block.parts for word in codec.encode(gains[codec.name])] for block in parts]
-        old = [list(self._link.read(block)[0]) for block in parts]
-        try:
-            self._write_checked(parts, new)
-        except LinkError as error:
-            raise self._restored(parts, old, error) from None
-
-    def start_controller(self, setpoint: float) -> None:
-        """Give the actuator to the device's own controller, at a set-point [y unit].
-
-        Raises
-        ------
-        InputError
-            The register map has no ``automatic`` or no ``setpoint``; nothing was done.
-        """
-        for name in ("automatic", "setpoint"):
-            if name not in self._codecs:
-                raise InputError(f"{name} is not mapped", where=self._link.where, remedy=f"map rig.registers.{name}")
-        self._link.connect()
-        self._put("setpoint", setpoint)
-        self._put("automatic", 1.0)
-        if "enable" in self._codecs:
-            self._put("enable", 0.0)
-        self._is_commanding = False
-
-    def _gain_blocks(self) -> tuple[Block, ...]:
-        return blocks(self._gain_codecs())
-
-    def _gain_codecs(self) -> list[Codec]:
-        return [self._codecs["K"], self._codecs["Ti"]]
-
-    def _write_checked(self, parts: Sequence[Block], words: Sequence[list[int]]) -> None:
-        for block, wanted in zip(parts, words, strict=True):
-            self._link.write(block.table, block.address, wanted)
-        for block, wanted in zip(parts, words, strict=True):
-            held = list(self._link.read(block)[0])
-            if held != wanted:
-                raise LinkError(f"read back {held} where {wanted} was written", where=self._link.where)
-
-    def _restored(self, parts: Sequence[Block], old: Sequence[list[int]], cause: LinkError) -> LinkError:
-        """Write the old gains again and return the error that says how it ended."""
-        try:
-            self._link.disconnect()
-            self._link.connect()
-            self._write_checked(parts, old)
-        except LinkError:
-            state, remedy = "the device may hold old, new or mixed gains", "stop it and check its gains before it runs"
-        else:
-            state, remedy = "the device holds its old gains again", cause.remedy
-        return LinkError(f"the gains were not taken ({cause.what}); {state}", where=self._link.where, remedy=remedy)

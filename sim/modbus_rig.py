@@ -17,7 +17,7 @@ from pymodbus.exceptions import NoSuchIdException
 from pymodbus.server import ModbusSerialServer, ModbusTcpServer, ModbusTlsServer
 from pymodbus.simulator import DataType, SimData, SimDevice
 
-from sim.register_device import IllegalAddress, RegisterDevice
+from sim.register_device import IllegalAddress, IllegalValue, RegisterDevice
 from sim.registers import RegisterSpec, Table
 
 _TABLE: dict[int, Table] = {
@@ -204,6 +204,8 @@ class ModbusRig:
                 memory[address - start : address - start + count] = self.device.read(table, address, count, now_s)
         except IllegalAddress:
             return ExcCodes.ILLEGAL_ADDRESS
+        except IllegalValue:  # refused before anything was taken: the plant goes on
+            return ExcCodes.ILLEGAL_VALUE
         return None
 
     def _show_bits(self, table: Table, start: int, memory: list[int], now_s: float) -> None:

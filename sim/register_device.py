@@ -20,6 +20,11 @@ from sim.registers import RegisterSpec, Table, from_words, to_words
 
 _TICK_S = 0.01
 _KEPT = 100_000
+_GAINS = ("K", "Ti", "Td", "Tf")
+
+
+class IllegalValue(ValueError):  # noqa: N818 - Modbus calls it so
+    """A request writes what is not a finite number."""
 
 
 class IllegalAddress(LookupError):  # noqa: N818 - Modbus calls it so
@@ -54,7 +59,8 @@ class RegisterDevice:
         What it moves and measures.
     registers : mapping of str to RegisterSpec
         Signals ``y``, ``u`` and any of ``u_applied``, ``device_time``, ``heartbeat``, ``heartbeat_echo``, ``enable``,
-        ``in_command``, ``safe``, ``automatic``, ``setpoint``, ``K``, ``Ti``.
+        ``in_command``, ``safe``, ``automatic``, ``setpoint``, ``K``, ``Ti``, ``Td``, ``Tf``, ``unlock``; others are
+        held as they are written.
     u_safe : float
         Safe output until the host writes another [u unit].
     u_range : (float, float)
@@ -62,7 +68,13 @@ class RegisterDevice:
     deadman_s : float
         Time without a new heartbeat (where none is mapped: without a command) until the output is safe [s].
     gains : (float, float)
-        K and Ti that the device's PI is delivered with.
+        K and Ti that the device's controller is delivered with.
+    held : mapping of str to float
+        What further registers hold when it is delivered.
+    law : callable, optional
+        From all that the registers hold to K, Ti, Td, Tf of the controller, where it has its gains in another form.
+    unlock_code : float, optional
+        Without it in ``unlock`` the device refuses new gains, with Modbus's illegal value.
     """
 
     def __init__(
@@ -74,15 +86,22 @@ class RegisterDevice:
         u_range: tuple[float, float],
         deadman_s: float = 0.5,
         gains: tuple[float, float] = (0.0, 1.0),
+        held: Mapping[str, float] | None = None,
+        law: Callable[[Mapping[str, float]], tuple[float, float, float, float]] | None = None,
+        unlock_code: float | None = None,
     ) -> None:
         self.plant = plant
         self.registers = dict(registers)
         self.history: deque[OutputChange] = deque(maxlen=_KEPT)
         self.on_change: Callable[[OutputChange], None] | None = None
-        self._at: dict[tuple[Table, int], tuple[str, int]] = {}
+        self._at: dict[tuple[Table, int], list[tuple[str, int]]] = {}
         for name, spec in self.registers.items():
-            for i in range(spec.size):  # an echo may be mapped onto the very register that it echoes
-                self._at.setdefault((spec.table, spec.address + i), (name, i))
+            for i in range(spec.size):
+                there = self._at.setdefault((spec.table, spec.address + i), [])
+                # an echo may be mapped onto the very register that it echoes; bits share their word
+                if not there or spec.bit is not None:
+                    there.append((name, i))
+        self._words: dict[tuple[Table, int], int] = {}
         self._values = {
             "u": plant.u_applied,
             "safe": u_safe,
@@ -92,7 +111,12 @@ class RegisterDevice:
             "setpoint": 0.0,
             "K": gains[0],
             "Ti": gains[1],
-        }
+            "Td": 0.0,
+            "Tf": 0.0,
+            "unlock": 0.0,
+        } | dict(held or {})
+        self._law = law if law is not None else _isa
+        self._unlock_code = unlock_code
         self._u_range = u_range
         self.deadman_s = deadman_s
         self._output = plant.u_applied
@@ -101,6 +125,7 @@ class RegisterDevice:
         self._now_s = 0.0
         self._tick_s = 0.0
         self._error = 0.0
+        self._y_filtered = self._y_rate = 0.0
 
     @property
     def output(self) -> float:
@@ -142,11 +167,12 @@ class RegisterDevice:
         IllegalAddress
             One of them does not exist.
         """
-        parts = self._parts(table, address, count)
+        places = self._places(table, address, count)
         self.live(now_s)
-        names = dict.fromkeys(name for name, _ in parts)  # each once: a measurement must not change between its words
+        # each once: a measurement must not change between its words
+        names = dict.fromkeys(name for place in places for name, _ in self._at[place])
         shown = {name: to_words(self._shown(name), self.registers[name]) for name in names}
-        return [shown[name][i] for name, i in parts]
+        return [self._word(place, shown) for place in places]
 
     def write(self, table: Table, address: int, words: Sequence[int], now_s: float) -> None:
         """Take registers from the host at the device time ``now_s`` [s].
@@ -155,26 +181,48 @@ class RegisterDevice:
         ------
         IllegalAddress
             One of them does not exist, or is half of a value whose other half is not written.
+        IllegalValue
+            One of them is not a finite number, or the device is locked; nothing was taken.
         """
-        parts = self._parts(table, address, len(words))
+        places = self._places(table, address, len(words))
         self.live(now_s)
         written: dict[str, list[int]] = {}
-        for (name, _), word in zip(parts, words, strict=True):
-            written.setdefault(name, []).append(word)
+        for place, word in zip(places, words, strict=True):
+            for name, _ in self._at[place]:
+                written.setdefault(name, []).append(word)
         if any(len(value) != self.registers[name].size for name, value in written.items()):
             raise IllegalAddress(f"{table} {address}: half a value")
-        for name, value in written.items():
-            self._take(name, from_words(value, self.registers[name]))
+        values = {name: from_words(value, self.registers[name]) for name, value in written.items()}
+        if not all(math.isfinite(value) for value in values.values()):
+            raise IllegalValue(f"{table} {address}: not a number")
+        is_locked = self._unlock_code not in (None, self._values["unlock"])
+        if is_locked and any(name in _GAINS or name.startswith("gains.") for name in values):
+            raise IllegalValue(f"{table} {address}: locked")
+        self._words |= dict(zip(places, words, strict=True))
+        for name, taken in values.items():
+            if self.registers[name].bit is None or taken != self._shown(name):  # a word's other bits came along
+                self._take(name, taken)
 
     @property
     def _is_automatic(self) -> bool:
         return not self._by_host and self._values["automatic"] == 1.0
 
-    def _parts(self, table: Table, address: int, count: int) -> list[tuple[str, int]]:
+    def _places(self, table: Table, address: int, count: int) -> list[tuple[Table, int]]:
         wanted = [(table, address + i) for i in range(count)]
         if not all(place in self._at for place in wanted):
             raise IllegalAddress(f"{table} {address}..{address + count - 1}")
-        return [self._at[place] for place in wanted]
+        return wanted
+
+    def _word(self, place: tuple[Table, int], shown: Mapping[str, list[int]]) -> int:
+        """Return a register as it is shown; of a word of bits those that have no name stay as they were written."""
+        word, known = 0, 0
+        for name, i in self._at[place]:
+            spec = self.registers[name]
+            word |= shown[name][i]
+            known |= (
+                0xFFFF if spec.bit is None else sum(to_words(1.0, spec)[i : i + 1] + to_words(0.0, spec)[i : i + 1])
+            )
+        return word | self._words.get(place, 0) & ~known
 
     def _shown(self, name: str) -> float:
         match name:
@@ -218,17 +266,22 @@ class RegisterDevice:
         if cause == "dead-man":
             self._values["automatic"] = 0.0
         if self._values["automatic"] == 1.0:
-            self._error = self._values["setpoint"] - self.plant.measure()
+            self._y_filtered, self._y_rate = self.plant.measure(), 0.0
+            self._error = self._values["setpoint"] - self._y_filtered
             self._tick_s = self._now_s + _TICK_S
         else:
             self._set(self._values["safe"], cause)
 
     def _control(self) -> None:
-        """One tick of the PI in velocity form, held within the actuator's range."""
-        error = self._values["setpoint"] - self.plant.measure()
-        K, Ti = self._values["K"], self._values["Ti"]
+        """One tick of the controller in velocity form, held within the actuator's range; no derivative of r."""
+        K, Ti, Td, Tf = self._law(self._values)
+        before, rate = self._y_filtered, self._y_rate
+        self._y_filtered += _TICK_S / (Tf + _TICK_S) * (self.plant.measure() - before)
+        self._y_rate = (self._y_filtered - before) / _TICK_S
+        error = self._values["setpoint"] - self._y_filtered
         low, high = self._u_range
         u = self._output + K * (error - self._error) + (K * _TICK_S / Ti * error if Ti > 0 else 0.0)
+        u -= K * Td * (self._y_rate - rate)
         self._error = error
         self._tick_s += _TICK_S
         self._set(min(max(u, low), high), "controller")
@@ -239,3 +292,7 @@ class RegisterDevice:
         self.history.append(change)
         if self.on_change is not None:
             self.on_change(change)
+
+
+def _isa(held: Mapping[str, float]) -> tuple[float, float, float, float]:
+    return held["K"], held["Ti"], held["Td"], held["Tf"]

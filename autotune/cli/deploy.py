@@ -64,6 +64,7 @@ def deploy(
     from autotune.experiment.verify import expected_margins
     from autotune.pipeline.deployment import deploy as hand_over
     from autotune.pipeline.folder import JOURNAL
+    from autotune.pipeline.held_gains import held_by
     from autotune.pipeline.result import verification_json, write_json
     from autotune.report.page import write_page
     from autotune.report.run_page import deployment_page
@@ -71,13 +72,14 @@ def deploy(
     content = load_config(config)
     new = _gains(controller, design, run)
     measured, fit = _plant(run, points) if verify else (None, None)
+    rig = _with_gains(rig_of(content))
+    new = held_by(rig, new, content.design, fit=fit)
     if fit is not None:
         expected_margins(fit, new)
     if not yes and not sys.stdin.isatty():
         raise InputError(
             "nobody can be asked here", where="autotune deploy", remedy="look at the gains, then give --yes"
         )
-    rig = _with_gains(rig_of(content))
     folder = _folder(config, run, out)
     console = Console(highlight=False, soft_wrap=True)
     _restore_interrupted(rig, folder / JOURNAL, console, yes)

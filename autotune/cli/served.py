@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import math
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from autotune.config import Config
-from autotune.config.registers import RegisterSettings
+from autotune.config.registers import RegisterMap, RegisterSettings
 from autotune.config.rig import (
     AnyModbusSettings,
     ModbusRtuSettings,
@@ -17,7 +19,9 @@ from autotune.config.rig import (
     SimulatedRigSettings,
     TwinSettings,
 )
+from autotune.controller import PIDController
 from autotune.errors import InputError
+from drivers.gain_settings import controller_of, settings_of
 from sim.modbus_rig import ModbusRig, Refusal, RtuTransport, TcpTransport
 from sim.plant import Plant, make_plant
 from sim.register_device import RegisterDevice
@@ -53,6 +57,9 @@ def spec_of(register: RegisterSettings) -> RegisterSpec:
         word_order=register.word_order,
         scale=register.scale,
         offset=register.offset,
+        bit=register.bit,
+        on=register.on,
+        off=register.off,
     )
 
 
@@ -79,15 +86,35 @@ def device_of(config: Config, plant: Plant | None = None) -> RegisterDevice:
             where="rig.twin.deadman_s",
             remedy="give it several sample times",
         )
-    controller = config.controller
+    controller, registers = config.controller, settings.registers
+    specs = {name: spec_of(register) for name, register in registers.mapped().items()}
+    if registers.unlock is not None:
+        specs["unlock"] = spec_of(registers.unlock)
     return RegisterDevice(
         plant or make_plant(twin.plant, seed=twin.seed, noise=twin.noise, start=twin.start),
-        {name: spec_of(register) for name, register in settings.registers.mapped().items()},
+        specs,
         u_safe=config.limits.u_safe,
         u_range=(config.limits.u_min, config.limits.u_max),
         deadman_s=twin.deadman_s,
         gains=(controller.K, controller.Ti_s) if controller else (0.0, 1.0),
+        unlock_code=registers.unlock.code if registers.unlock is not None else None,
+        **_form_of(config, registers),
     )
+
+
+def _form_of(config: Config, registers: RegisterMap) -> dict[str, Any]:
+    """Return what a device with gains in its maker's form is delivered with, and how it reads them."""
+    gains = registers.gains
+    if gains is None:
+        return {}
+    given = config.controller
+    delivered = PIDController(K=given.K if given else 0.0, Ti_s=given.Ti_s if given else 1.0)
+
+    def law(held: Mapping[str, float]) -> tuple[float, float, float, float]:
+        c = controller_of(gains, {name: held[f"gains.{name}"] for name in gains.settings})
+        return c.K, 0.0 if math.isinf(c.Ti_s) else c.Ti_s, c.Td_s, c.Tf_s
+
+    return {"held": {f"gains.{name}": value for name, value in settings_of(gains, delivered).items()}, "law": law}
 
 
 @contextmanager

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import os
 from typing import Any
+
+from pydantic import model_validator
 
 from autotune.config.procedure import (
     ControllerSettings,
@@ -14,6 +17,7 @@ from autotune.config.procedure import (
     SignalSettings,
     VerificationSettings,
 )
+from autotune.config.registers import RegisterMap, RegisterSettings
 from autotune.config.rig import RigSettings
 from autotune.schema import Section, Text, validated
 from autotune.text_files import read_toml
@@ -33,6 +37,41 @@ class Config(Section):
     design: DesignSettings = DesignSettings()
     controller: ControllerSettings | None = None
     verification: VerificationSettings = VerificationSettings()
+
+    @model_validator(mode="after")
+    def _on_the_grid(self) -> Config:
+        """Cut the limits inwards to what the command's register can hold, and command in its steps."""
+        registers = getattr(self.rig, "registers", None)
+        if isinstance(registers, RegisterMap):
+            cut = _held(self.limits, registers.u)
+            step = registers.u.step
+            is_multiple = step and math.isclose(registers.u.offset / step, round(registers.u.offset / step))
+            signals = self.signals
+            if not signals.u_step and is_multiple:
+                signals = signals.model_copy(update={"u_step": step})
+            for name, value in (("limits", cut), ("signals", signals)):
+                object.__setattr__(self, name, value)  # frozen, and not handed out yet
+        return self
+
+
+def _held(limits: LimitSettings, register: RegisterSettings) -> LimitSettings:
+    try:
+        u_min, u_max = register.inwards(limits.u_min, limits.u_max)
+    except ValueError as error:
+        raise ValueError(f"limits.u_min..u_max: {error}") from None
+    u_safe = min(max(limits.u_safe, u_min), u_max)
+    if register.step:
+        count = round((u_safe - register.offset) / register.scale)
+        at = (register.scale * (count + by) + register.offset for by in (0, -1, 1))
+        u_safe = min((u for u in at if u_min <= u <= u_max), key=lambda u: abs(u - limits.u_safe), default=u_safe)
+    if abs(u_safe - limits.u_safe) > 0.01 * (limits.u_max - limits.u_min):
+        raise ValueError(
+            f"limits.u_safe = {limits.u_safe:g}: in the register's steps of {register.step:g} the nearest value within"
+            f" the limits is {u_safe:g}; give that if the rig may be left with it, or a register with a finer scale"
+        )
+    if abs(u_safe - limits.u_safe) <= 1e-6 * register.step:
+        u_safe = limits.u_safe
+    return limits.model_copy(update={"u_min": u_min, "u_max": u_max, "u_safe": u_safe})
 
 
 def load_config(path: str | os.PathLike[str]) -> Config:

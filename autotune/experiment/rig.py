@@ -215,3 +215,16 @@ class HoldsGains(Rig, Protocol):
     def write_gains(self, controller: PIDController) -> None:
         """Write gains and read them back; raises LinkError if what is read back differs."""
         ...
+
+
+@runtime_checkable
+class RoundsGains(HoldsGains, Protocol):
+    """A rig whose registers hold gains in steps: what they can hold is the controller."""
+
+    def holdable(self, controller: PIDController) -> PIDController:
+        """Return the controller that the rig would hold after these gains were written; nothing is written."""
+        ...
+
+    def coarse(self, controller: PIDController) -> tuple[str, ...]:
+        """Return which settings are held too coarsely, each with the resolution that would do."""
+        ...

@@ -10,10 +10,12 @@ from dataclasses import asdict, dataclass
 from enum import StrEnum
 from pathlib import Path
 
+from autotune.config.procedure import DesignSettings
 from autotune.controller import PIDController
 from autotune.errors import AutotuneError, ExperimentStopped, InputError
 from autotune.experiment.rig import HoldsGains
 from autotune.experiment.verify import Verification
+from autotune.pipeline.held_gains import held_by
 from autotune.run_log import jsonable
 
 
@@ -239,7 +241,14 @@ def restore(rig: HoldsGains, old: PIDController, journal: Path) -> None:
 
 
 def _write(rig: HoldsGains, new: PIDController, old: PIDController, notes: Journal, done: Step) -> PIDController:
-    """Write the new gains, or the old ones where that fails; return the new ones as the rig holds them."""
+    """Write the new gains, or the old ones where that fails; return the new ones as the rig holds them.
+
+    Raises
+    ------
+    InputError
+        The rig's registers cannot hold them, or only far from what they are; nothing was written.
+    """
+    new = held_by(rig, new, DesignSettings())
     notes.note(Step.WRITING, new)
     try:
         try:

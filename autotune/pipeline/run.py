@@ -29,6 +29,7 @@ from autotune.pipeline.folder import (
     read_interrupted,
     store_config,
 )
+from autotune.pipeline.held_gains import held_by, on_registers
 from autotune.pipeline.result import write_result
 from autotune.run_log import RunLog
 
@@ -103,6 +104,8 @@ def tune(
         There is nothing to resume, or not with this configuration; nothing was done.
     ExperimentStopped, LinkError, OperatorStop
         The rig was left safe; what was recorded and the result so far are in ``out``.
+    InputError
+        The rig's registers are too coarse for the gains; the points are in ``out``.
     IdentificationError, DesignError
         The points give no model or no controller; they are in ``out``.
     """
@@ -139,6 +142,9 @@ def _tune(
             log.recording(recording)
         experiment = run_experiment(rig, config, recording, earlier=earlier, on_progress=on_progress)
         analysis = analyse(experiment.points, config.design)
+        if deploy:  # what the rig can hold is what is verified, reported and handed over
+            held = held_by(rig, analysis.controller, config.design, fit=analysis.fit)
+            analysis = on_registers(analysis, held)
         plant, reduced = analysis.fit.plant, analysis.reduced.transfer_function()
         log.analysed(analysis.points, plant, reduced, analysis.controller)
         verification = None

@@ -4,12 +4,14 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from autotune.config import json_schema, load_config
+from autotune.config import Config, json_schema, load_config
 from autotune.errors import InputError
 
+CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 COMPLETE = """
 name = "ball"
 [rig]
@@ -111,3 +113,27 @@ def test_the_schema_command_writes_what_editors_read(tmp_path: Path) -> None:
     out = tmp_path / "schema.json"
     subprocess.run([sys.executable, "-m", "autotune.cli", "schema", "--out", str(out)], check=True, capture_output=True)
     assert json.loads(out.read_text()) == json_schema()
+
+
+def _on_register(limits: dict[str, float], **register: Any) -> Config:
+    given = load_config(CONFIGS / "servo_sim.toml").model_dump()
+    rig = {"kind": "modbus_tcp", "registers": {"y": {"address": 0, "table": "input"}, "u": {"address": 0, **register}}}
+    return Config.model_validate(given | {"rig": rig, "limits": given["limits"] | limits})
+
+
+def test_limits_are_cut_inwards_to_what_the_commands_register_can_hold() -> None:
+    config = _on_register({"u_min": -9.6, "u_max": 9.6, "u_safe": 0.0})
+    assert (config.limits.u_min, config.limits.u_max, config.signals.u_step) == (-9.0, 9.0, 1.0)
+    assert Config.model_validate(config.model_dump()) == config  # and once only
+    for kept in ({"type": "float32"}, {"scale": 0.1}, {"scale": -1e-3}, {"scale": 1e-3, "offset": 2.0}):
+        limits = _on_register({"u_min": -9.6, "u_max": 9.6, "u_safe": 0.0}, **kept).limits
+        assert (limits.u_min, limits.u_max, limits.u_safe) == (-9.6, 9.6, 0.0)
+
+
+def test_a_safe_output_that_its_register_cannot_hold_is_refused_with_what_it_can() -> None:
+    for u_safe, u_min in ((0.4, -9.6), (0.4, 0.4)):
+        with pytest.raises(ValueError, match=r"limits.u_safe = 0.4: .* is [01];"):
+            _on_register({"u_min": u_min, "u_max": 9.6, "u_safe": u_safe})
+    with pytest.raises(ValueError, match=r"limits.u_min..u_max: .*has not two values"):
+        _on_register({"u_min": 0.2, "u_max": 0.9, "u_safe": 0.4})
+    assert _on_register({"u_min": 0.0, "u_max": 9.6, "u_safe": 0.04}, scale=0.1).limits.u_safe == 0.0

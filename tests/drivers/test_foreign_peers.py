@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import math
 import shutil
 import struct
 import subprocess
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Literal
 
 import minimalmodbus
 import modbus_tk.defines
 import pytest
 import serial
 from modbus_tk.modbus_rtu import RtuServer
+from pyModbusTCP.client import ModbusClient
 from pyModbusTCP.server import DataBank, ModbusServer
 
 from autotune.config.registers import RegisterMap
@@ -21,6 +25,7 @@ from autotune.controller import PIDController
 from autotune.errors import LinkError
 from drivers.modbus import DeviceRefused
 from sim.modbus_rig import ModbusRig, RtuTransport, TcpTransport
+from sim.plant import make_plant
 from sim.serial_line import SerialLine
 from tests.drivers.bench import U_SAFE, register_device, rig_of, rtu_settings, tcp_settings
 
@@ -209,3 +214,30 @@ def test_a_python_master_moves_and_reads_the_served_rig_on_a_serial_line() -> No
         with pytest.raises(minimalmodbus.IllegalRequestError):
             master.read_register(99)
         master.serial.close()
+
+
+@pytest.mark.parametrize("plant", ["ball", "servo", "two_tank", "thermal"])
+def test_the_served_rig_refuses_what_is_no_number_and_goes_on(
+    plant: Literal["ball", "servo", "two_tank", "thermal"],
+) -> None:
+    floats = {
+        name: {"address": 2 * i, "type": "float32"} for i, name in enumerate(("u", "safe", "K", "Ti", "setpoint"))
+    }
+    given = floats | {"y": {"address": 100, "type": "float32"}, "enable": {"table": "coil", "address": 0}}
+    device = register_device(RegisterMap.model_validate(given), make_plant(plant, seed=0))
+    with ModbusRig(device, TcpTransport()) as server:
+        master = ModbusClient(port=server.port, timeout=5.0)
+        for wrong in (math.nan, math.inf, -math.inf):
+            words = list(struct.unpack(">HH", struct.pack(">f", wrong)))
+            for address in (0, 2, 4, 6, 8):
+                assert not master.write_multiple_registers(address, words)
+                assert master.last_except == 3
+        assert master.write_multiple_registers(0, list(struct.unpack(">HH", struct.pack(">f", 3e38))))
+        assert master.write_single_coil(0, True)
+        assert device.by_host
+        released = threading.Event()
+        device.on_change = lambda change: released.set() if change.cause == "dead-man" else None
+        assert released.wait(20.0)  # its time goes on
+        assert master.read_holding_registers(100, 2) is not None
+        assert master.write_multiple_registers(0, [0, 0])
+        master.close()

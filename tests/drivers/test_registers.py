@@ -14,14 +14,14 @@ from drivers.registers import MAX_WORDS, Codec, blocks
 from sim.registers import from_words, to_words
 
 ORDERS = st.sampled_from(["big", "little"])
-NUMERIC = st.sampled_from(["int16", "uint16", "int32", "uint32", "float32"])
+NUMERIC = st.sampled_from(["int16", "uint16", "int32", "uint32", "int64", "uint64", "float32", "float64"])
 SCALES = st.sampled_from([1.0, 0.1, 1e-3, -0.5, 2.5, 10.0 / 4095.0])
 
 
 @st.composite
 def numeric_codecs(draw: st.DrawFn) -> Codec:
     register = RegisterSettings(
-        address=draw(st.integers(0, 65534)),
+        address=draw(st.integers(0, 65532)),
         type=draw(NUMERIC),
         byte_order=draw(ORDERS),
         word_order=draw(ORDERS),
@@ -29,6 +29,15 @@ def numeric_codecs(draw: st.DrawFn) -> Codec:
         offset=draw(st.sampled_from([0.0, -40.0, 5.0])),
     )
     return Codec(name="x", register=register)
+
+
+def room(codec: Codec) -> tuple[float, float]:
+    """Return between which values a register is tried."""
+    if codec.register.type.startswith("float"):
+        return -1e6, 1e6
+    low, high = codec.span  # of 64 bits a float cannot say the last
+    middle, half = 0.5 * (low + high), 0.5 * (high - low)
+    return (middle - 0.999 * half, middle + 0.999 * half) if codec.register.words == 4 else (low, high)
 
 
 @pytest.mark.parametrize(
@@ -57,16 +66,16 @@ def test_the_example_of_the_modbus_specification() -> None:
 
 @given(codec=numeric_codecs(), fraction=st.floats(0.0, 1.0))
 def test_what_is_written_reads_back_within_half_a_count(codec: Codec, fraction: float) -> None:
-    low, high = (-1e6, 1e6) if codec.register.type == "float32" else codec.span
+    low, high = room(codec)
     value = low + fraction * (high - low)
     back = codec.decode(codec.encode(value))
     half_a_count = 0.5 * codec.resolution if codec.resolution else 1e-6 * (abs(value) + 50.0)
-    assert abs(back - value) <= half_a_count * (1.0 + 1e-6)
+    assert abs(back - value) <= half_a_count * (1.0 + 1e-6) + 1e-15 * abs(value)
 
 
 @given(codec=numeric_codecs(), fraction=st.floats(0.0, 1.0))
 def test_two_codings_written_apart_agree(codec: Codec, fraction: float) -> None:
-    low, high = (-1e6, 1e6) if codec.register.type == "float32" else codec.span
+    low, high = room(codec)
     value = low + fraction * (high - low)
     words = codec.encode(value)
     spec = spec_of(codec.register)
@@ -81,8 +90,10 @@ def test_two_codings_written_apart_agree(codec: Codec, fraction: float) -> None:
 def test_a_value_that_does_not_fit_is_refused_and_never_clipped(codec: Codec, beyond: float) -> None:
     low, high = codec.span
     step = codec.resolution or 1e34  # beyond the largest float32
+    if codec.register.type.endswith("64"):  # where a float counts in steps of 2048 and more
+        step = codec.resolution * 1e4 or math.inf
     for value in (low - beyond * step, high + beyond * step):
-        with pytest.raises(InputError, match="does not fit"):
+        with pytest.raises(InputError, match=r"does not fit|is not a value"):
             codec.encode(value)
 
 
@@ -93,6 +104,119 @@ def test_what_is_no_number_is_never_written(kind: str, value: float) -> None:
     codec = Codec(name="u", register=RegisterSettings.model_validate({"address": 0, "type": kind, "table": table}))
     with pytest.raises(InputError, match="is not a value"):
         codec.encode(value)
+
+
+@pytest.mark.parametrize(
+    ("kind", "words", "value"),
+    [
+        ("float64", (0x4009, 0x21FB, 0x5444, 0x2D18), math.pi),
+        ("int64", (0xFFFF, 0xFFFF, 0xFFFF, 0xFFFE), -2.0),
+        ("uint64", (0x0001, 0x0000, 0x0000, 0x0000), 2.0**48),
+    ],
+)
+def test_values_of_four_words(kind: str, words: tuple[int, ...], value: float) -> None:
+    for order, shown in (("big", words), ("little", words[::-1])):
+        register = RegisterSettings.model_validate({"address": 0, "type": kind, "word_order": order})
+        codec = Codec(name="x", register=register)
+        assert codec.decode(shown) == value
+        assert codec.encode(value) == shown
+
+
+def test_a_bit_is_written_into_its_word_and_leaves_the_others() -> None:
+    codec = Codec(name="enable", register=RegisterSettings.model_validate({"address": 4, "bit": 3}))
+    assert codec.encode(1.0, [0xA005]) == (0xA00D,)
+    assert codec.encode(0.0, [0xA00D]) == (0xA005,)
+    assert [codec.decode([word]) for word in (0xA00D, 0xA005)] == [1.0, 0.0]
+    with pytest.raises(InputError, match="read the word first"):
+        codec.encode(1.0)
+
+
+@given(
+    bit=st.integers(0, 63),
+    held=st.lists(st.integers(0, 0xFFFF), min_size=4, max_size=4),
+    orders=st.tuples(ORDERS, ORDERS),
+)
+def test_any_bit_of_any_word_agrees_with_a_coding_written_apart(
+    bit: int, held: list[int], orders: tuple[str, str]
+) -> None:
+    given_as = {"address": 0, "type": "uint64", "bit": bit, "byte_order": orders[0], "word_order": orders[1]}
+    codec = Codec(name="enable", register=RegisterSettings.model_validate(given_as))
+    for value in (0.0, 1.0):
+        words = codec.encode(value, held)
+        assert codec.decode(words) == from_words(list(words), spec_of(codec.register)) == value
+        assert sum((a ^ b).bit_count() for a, b in zip(words, held, strict=True)) <= 1
+
+
+@pytest.mark.parametrize(
+    ("given_as", "yes", "no", "unknown"),
+    [
+        ({"on": 0x047F, "off": 0x0006, "type": "uint16"}, 0x047F, 0x0006, 0x0001),  # a drive's control word
+        ({"on": 0}, 0, None, 5),
+        ({"table": "coil", "on": 0, "off": 1}, 0, 1, None),  # an inverted coil
+        ({"bit": 0, "on": 0, "off": 1}, 0, 1, None),
+    ],
+)
+def test_codes_and_inverted_bits(given_as: dict[str, object], yes: int, no: int | None, unknown: int | None) -> None:
+    if no is None:
+        with pytest.raises(ValueError, match="cannot be told apart"):
+            RegisterSettings.model_validate({"address": 0} | given_as)
+        return
+    codec = Codec(name="enable", register=RegisterSettings.model_validate({"address": 0} | given_as))
+    assert codec.encode(1.0, [0]) == (yes,)
+    assert codec.encode(0.0, [0]) == (no,)
+    assert (codec.decode([yes]), codec.decode([no])) == (1.0, 0.0)
+    if unknown is not None:
+        assert codec.decode([unknown]) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("given_as", "reason"),
+    [
+        ({"bit": 16}, "bit 16"),
+        ({"bit": 3, "type": "int16"}, "one of a uint16"),
+        ({"bit": 3, "on": 2}, "a bit is 0 or 1"),
+        ({"on": 3, "scale": 0.1}, "no scale"),
+        ({"on": 3, "type": "float32"}, "no float"),
+    ],
+)
+def test_bits_and_codes_that_cannot_be_are_refused(given_as: dict[str, object], reason: str) -> None:
+    with pytest.raises(ValueError, match=reason):
+        RegisterSettings.model_validate({"address": 0} | given_as)
+
+
+def test_two_bits_share_a_word_and_nothing_else_does() -> None:
+    y_and_u = {"y": {"table": "input", "address": 0}, "u": {"address": 0}}
+    word = {"enable": {"address": 1, "bit": 0}, "automatic": {"address": 1, "bit": 1}}
+    assert set(RegisterMap.model_validate(y_and_u | word).mapped()) == {"y", "u", "enable", "automatic"}
+    for wrong in ({"automatic": {"address": 1, "bit": 0}}, {"automatic": {"address": 1}}, {"K": {"address": 1}}):
+        with pytest.raises(ValueError, match=r"overlap|together"):
+            RegisterMap.model_validate(y_and_u | word | wrong)
+
+
+@given(codec=numeric_codecs(), ends=st.tuples(st.floats(0.0, 1.0), st.floats(0.0, 1.0)), at=st.floats(0.0, 1.0))
+def test_what_is_written_of_a_command_is_never_beyond_its_limits(
+    codec: Codec, ends: tuple[float, float], at: float
+) -> None:
+    span = codec.span if codec.resolution else (-1e6, 1e6)
+    low, high = (span[0] + share * (span[1] - span[0]) * 1e-3 for share in sorted(ends))
+    value = min(max(low + at * (high - low), low), high)
+    try:
+        words = codec.encode_within(value, low, high)
+    except InputError:  # no count between the limits, near the value
+        assert high - low < 2.0 * codec.resolution or (codec.resolution == 0.0 and high - low <= 1e-5 * abs(high))
+        return
+    tolerance = 1e-6 * codec.resolution + 1e-12 * max(abs(low), abs(high))
+    assert low - tolerance <= codec.decode(words) <= high + tolerance
+
+
+def test_a_limit_between_two_counts_is_kept() -> None:
+    codec = Codec(name="u", register=RegisterSettings(address=0))
+    assert codec.encode(9.6) == (10,)
+    assert codec.encode_within(9.6, 0.0, 9.6) == (9,)
+    assert codec.encode_within(0.4, 0.4, 9.6) == (1,)
+    for wrong in (9.7, -0.1):
+        with pytest.raises(InputError, match="cannot be held within"):
+            codec.encode_within(wrong, 0.0, 9.6)
 
 
 def test_the_count_for_no_measurement_is_no_measurement() -> None:

@@ -1,0 +1,154 @@
+"""A rig behind a register map whose own controller's gains are in the map too, in whatever form its maker has."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+from autotune.config.registers import GainSettings, RegisterMap, UnlockSettings
+from autotune.controller import PIDController
+from autotune.errors import InputError, LinkError
+from drivers.gain_settings import controller_of, settings_of
+from drivers.register_rig import RegisterLink, RegisterRig
+from drivers.registers import Codec, blocks
+
+#: steps of a register, relative to what it holds, that are fine enough for a gain
+_FINE = 0.01
+
+
+class GainRegisterRig(RegisterRig):
+    """A device whose own PI or PID is in the register map as well; parameters as of :class:`RegisterRig`.
+
+    Raises
+    ------
+    InputError
+        No gains are mapped.
+    """
+
+    def __init__(self, link: RegisterLink, registers: RegisterMap, **settings: Any) -> None:
+        super().__init__(link, registers, **settings)
+        held = registers.held_gains
+        if held is None:
+            raise InputError("no gains are mapped", where="rig.registers", remedy="map K and Ti, or gains")
+        self._gains: GainSettings = held
+        self._unlock: UnlockSettings | None = registers.unlock
+        self._gain_names = registers.gain_names
+        self._parts = blocks([self._codecs[name] for name in self._gain_names.values()])
+
+    def read_gains(self) -> PIDController:
+        """Return the gains the device's controller holds now."""
+        self._link.connect()
+        return self._decoded([list(self._link.read(block)[0]) for block in self._parts])
+
+    def holdable(self, controller: PIDController) -> PIDController:
+        """Return the controller that the device would hold after these gains were written: rounded to its registers.
+
+        Raises
+        ------
+        InputError
+            A gain does not fit its register, or the device has no setting for what the controller needs.
+        DesignError
+            The device's form cannot express the controller.
+        """
+        held = self._decoded(self._encoded(controller))
+        if "PWeighting" not in self._gains.settings:  # a weight of the set-point leaves feedback and margins alone
+            held = replace(held, setpoint_weight=controller.setpoint_weight)
+        return held
+
+    def coarse(self, controller: PIDController) -> tuple[str, ...]:
+        """Return which registers move a setting by more than half a percent, each with a scale that would not."""
+        told = []
+        for name, value in settings_of(self._gains, controller).items():
+            codec = self._codecs[self._gain_names[name]]
+            held = codec.decode(codec.encode(value))
+            if codec.resolution > 0.0 and abs(held - value) > 0.5 * _FINE * abs(value):
+                told.append(
+                    f"rig.registers.{codec.name} holds {held:.4g} for {value:.4g}: scale = {_round(_FINE * value):g}"
+                    f" in place of {abs(codec.register.scale):g} would do"
+                )
+        return tuple(told)
+
+    def write_gains(self, controller: PIDController) -> None:
+        """Write gains and read them back; where that fails the old ones are written again.
+
+        Raises
+        ------
+        InputError
+            The device's form has no place for the controller, or a gain does not fit its register; nothing was written.
+        LinkError
+            What is read back differs, or the link broke; says what the device holds, as far as it is known.
+        """
+        new = self._encoded(controller)
+        self._link.connect()
+        old = [list(self._link.read(block)[0]) for block in self._parts]
+        try:
+            self._write_checked(new)
+        except LinkError as error:
+            raise self._restored(old, error) from None
+
+    def start_controller(self, setpoint: float) -> None:
+        """Give the actuator to the device's own controller, at a set-point [y unit].
+
+        Raises
+        ------
+        InputError
+            The register map has no ``automatic`` or no ``setpoint``; nothing was done.
+        """
+        for name in ("automatic", "setpoint"):
+            if name not in self._codecs:
+                raise InputError(f"{name} is not mapped", where=self._link.where, remedy=f"map rig.registers.{name}")
+        self._link.connect()
+        self._put("setpoint", setpoint)
+        self._put("automatic", 1.0)
+        if "enable" in self._codecs:
+            self._put("enable", 0.0)
+        self._is_commanding = False
+
+    def _encoded(self, controller: PIDController) -> list[list[int]]:
+        """Return the words of every block of gains."""
+        values = {self._gain_names[name]: value for name, value in settings_of(self._gains, controller).items()}
+        return [
+            [word for codec, _ in block.parts for word in codec.encode(values[codec.name])] for block in self._parts
+        ]
+
+    def _decoded(self, words: Sequence[list[int]]) -> PIDController:
+        shown: dict[str, float] = {}
+        for block, held in zip(self._parts, words, strict=True):
+            shown |= block.decode(held)
+        return controller_of(self._gains, {name: shown[mapped] for name, mapped in self._gain_names.items()})
+
+    def _write_checked(self, words: Sequence[list[int]]) -> None:
+        self._key(self._unlock.code if self._unlock is not None else None)
+        for block, wanted in zip(self._parts, words, strict=True):
+            self._link.write(block.table, block.address, wanted)
+        for block, wanted in zip(self._parts, words, strict=True):
+            held = list(self._link.read(block)[0])
+            if held != wanted:
+                raise LinkError(f"read back {held} where {wanted} was written", where=self._link.where)
+        self._key(self._unlock.lock if self._unlock is not None else None)
+
+    def _key(self, code: int | None) -> None:
+        """Write a code into the register that locks and unlocks the device, where there is one."""
+        if self._unlock is not None and code is not None:
+            words = Codec(name="unlock", register=self._unlock).encode(float(code))
+            self._link.write(self._unlock.table, self._unlock.address, words)
+
+    def _restored(self, old: Sequence[list[int]], cause: LinkError) -> LinkError:
+        """Write the old gains again and return the error that says how it ended."""
+        try:
+            self._link.disconnect()
+            self._link.connect()
+            self._write_checked(old)
+        except LinkError:
+            state, remedy = "the device may hold old, new or mixed gains", "stop it and check its gains before it runs"
+        else:
+            state, remedy = "the device holds its old gains again", cause.remedy
+        return LinkError(f"the gains were not taken ({cause.what}); {state}", where=self._link.where, remedy=remedy)
+
+
+def _round(value: float) -> float:
+    """Return the largest 1, 2 or 5 times a power of ten that is not above the magnitude."""
+    power = 10.0 ** math.floor(math.log10(abs(value)))
+    return max(step * power for step in (1.0, 2.0, 5.0) if step * power <= abs(value))
