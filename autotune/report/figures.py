@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
-import plotly.graph_objects as go
-from plotly.subplots import make_subplots
 
 from autotune.arrays import ComplexArray, FloatArray
 from autotune.points import FrequencyPoint
 from autotune.recording import Recording
+from autotune.report import chart as go
+from autotune.report.chart import make_subplots
 from autotune.report.page import BLUE, GREY, ORANGE, RED, add_line, thinned
 
 
@@ -34,7 +34,9 @@ class Curve:
     dash: str = "solid"
 
 
-def recording_figure(recording: Recording, u_unit: str, y_unit: str, *, marks: Sequence[tuple[float, str]] = ()) -> Any:
+def recording_figure(
+    recording: Recording, u_unit: str, y_unit: str, *, marks: Sequence[tuple[float, str]] = ()
+) -> go.Chart:
     """Draw y over u against time, with instants marked by their names.
 
     Parameters
@@ -75,7 +77,7 @@ def bode_figure(
     omega: FloatArray,
     sign: int,
     gain_unit: str,
-) -> Any:
+) -> go.Chart:
     """Draw gain and phase as in figure 6 of Le & Mendes: points with their 95 % bars, and curves.
 
     Parameters
@@ -127,7 +129,7 @@ def nyquist_figure(
     controller: Responds,
     omega: FloatArray,
     modulus_margin: float,
-) -> Any:
+) -> go.Chart:
     """Draw loops L = H C with the circle of the modulus margin, and the measured points times C with their regions.
 
     Parameters
@@ -143,7 +145,7 @@ def nyquist_figure(
     modulus_margin : float
         Radius of the circle around -1 that the loops must not enter.
     """
-    figure = go.Figure()
+    figure = go.Chart()
     angle = np.linspace(0, 2 * np.pi, 181)
     circle = -1 + modulus_margin * np.exp(1j * angle)
     add_line(figure, circle.real, circle.imag, f"modulus margin {modulus_margin:g}", RED, dash="dot")
@@ -174,9 +176,11 @@ def nyquist_figure(
     return figure
 
 
-def nichols_figure(loops: Sequence[Curve], omega: FloatArray, modulus_margin: float, phase_margin_rad: float) -> Any:
+def nichols_figure(
+    loops: Sequence[Curve], omega: FloatArray, modulus_margin: float, phase_margin_rad: float
+) -> go.Chart:
     """Draw loops in the Black-Nichols plane as in figures 7 and 8: gain in dB over phase, with the required margins."""
-    figure = go.Figure()
+    figure = go.Chart()
     circle = -1 + modulus_margin * np.exp(1j * np.linspace(0, 2 * np.pi, 181))
     phase_deg = np.degrees(np.angle(circle)) % 360 - 360
     add_line(figure, phase_deg, 20 * np.log10(np.abs(circle)), f"modulus margin {modulus_margin:g}", RED, dash="dot")
@@ -198,9 +202,9 @@ def nichols_figure(loops: Sequence[Curve], omega: FloatArray, modulus_margin: fl
     return figure
 
 
-def sensitivity_figure(loops: Sequence[Curve], omega: FloatArray, modulus_margin: float) -> Any:
+def sensitivity_figure(loops: Sequence[Curve], omega: FloatArray, modulus_margin: float) -> go.Chart:
     """Draw abs(S) in dB with the bound 1/M_m of (12)."""
-    figure = go.Figure()
+    figure = go.Chart()
     for curve in loops:
         S = 1.0 / (1.0 + curve.system.response(omega))
         add_line(figure, omega, 20 * np.log10(np.abs(S)), curve.name, curve.colour, dash=curve.dash)

@@ -1,18 +1,22 @@
-"""One self-contained HTML page: sections of sentences, tables and plotly figures; no request leaves the browser."""
+"""One self-contained HTML page: sections of sentences, tables and charts; no request leaves the browser."""
 
 from __future__ import annotations
 
+import base64
+import functools
+import gzip
 import html
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass
+from importlib.resources import files
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
-import plotly.graph_objects as go
-from plotly.offline import get_plotlyjs
 
 from autotune.arrays import FloatArray
 from autotune.outputs import write_whole
+from autotune.report.chart import Chart, Scatter
 
 Tone: TypeAlias = Literal["good", "warn", "bad"]
 
@@ -31,9 +35,9 @@ class Table:
 
 @dataclass(frozen=True, kw_only=True)
 class Figure:
-    """A plotly figure with the sentence that says what is to be seen in it."""
+    """A chart with the sentence that says what is to be seen in it."""
 
-    figure: Any
+    figure: Chart
     caption: str
     height_px: int = 420
 
@@ -97,16 +101,16 @@ def thinned(t: FloatArray, y: FloatArray, points: int = 3000) -> tuple[FloatArra
     return t[keep], y[keep]
 
 
-def lines_figure(x_title: str, y_title: str, *, log_x: bool = False, log_y: bool = False) -> Any:
-    """Return an empty figure with titled axes, for traces to be added."""
-    figure = go.Figure()
+def lines_figure(x_title: str, y_title: str, *, log_x: bool = False, log_y: bool = False) -> Chart:
+    """Return an empty chart with titled axes, for traces to be added."""
+    figure = Chart()
     figure.update_xaxes(title=x_title, type="log" if log_x else "linear")
     figure.update_yaxes(title=y_title, type="log" if log_y else "linear")
     return figure
 
 
 def add_line(
-    figure: Any,
+    figure: Chart,
     x: FloatArray,
     y: FloatArray,
     name: str,
@@ -118,7 +122,7 @@ def add_line(
 ) -> None:
     """Add a curve; ``place`` takes plotly's ``row`` and ``col`` and trace settings such as ``showlegend``."""
     at = {key: place.pop(key) for key in ("row", "col") if key in place}
-    trace = go.Scatter(x=x, y=y, name=name, mode="lines", line={"color": colour, "dash": dash, "width": width}, **place)
+    trace = Scatter(x=x, y=y, name=name, mode="lines", line={"color": colour, "dash": dash, "width": width}, **place)
     figure.add_trace(trace, **at)
 
 
@@ -142,12 +146,16 @@ def write_page(page: Page, path: str | os.PathLike[str]) -> None:
         body.append(f'<nav aria-label="Contents">{"".join(links)}</nav>')
     for i, section in enumerate(page.sections):
         body.append(_section(section, i))
-    write_whole(
-        path,
-        _SHELL.replace("@TITLE@", _text(page.title))
-        .replace("@BODY@", "\n".join(body))
-        .replace("@PLOTLY@", get_plotlyjs() if any(section.figures for section in page.sections) else ""),
-    )
+    shell = _SHELL.replace("@TITLE@", _text(page.title)).replace("@BODY@", "\n".join(body))
+    drawn = any(section.figures for section in page.sections)
+    write_whole(path, shell.replace("@CHARTS@", _CHARTS if drawn else "").replace("@PLOTLY@", _plotly()))
+
+
+@functools.cache
+def _plotly() -> str:
+    """Return the drawing library, packed: it is three quarters of a page otherwise."""
+    script = files("autotune.report").joinpath("vendored/plotly-basic.min.js").read_bytes()
+    return base64.b64encode(gzip.compress(script, 9, mtime=0)).decode("ascii")
 
 
 def _text(text: str) -> str:
@@ -172,25 +180,61 @@ def _table(table: Table) -> str:
 
 def _figure(figure: Figure, identity: str) -> str:
     drawn = figure.figure
+    grid = "rgba(128,128,128,0.25)"
     drawn.update_layout(
-        margin={"l": 60, "r": 14, "t": 30, "b": 50},
+        margin={"l": 8, "r": 12, "t": 22, "b": 8},
         paper_bgcolor="rgba(0,0,0,0)",
         plot_bgcolor="rgba(0,0,0,0)",
-        font={"size": 13},
-        legend={"orientation": "h", "y": 1.02, "yanchor": "bottom", "x": 0},
+        hoverlabel={"font": {"color": "#fff"}},
+        showlegend=False,
         autosize=True,
         height=figure.height_px,
-        template="none",
     )
-    drawn.update_xaxes(gridcolor="rgba(128,128,128,0.25)", zerolinecolor="rgba(128,128,128,0.4)", automargin=True)
-    drawn.update_yaxes(gridcolor="rgba(128,128,128,0.25)", zerolinecolor="rgba(128,128,128,0.4)", automargin=True)
-    plot = drawn.to_html(
-        full_html=False,
-        include_plotlyjs=False,
-        div_id=identity,
-        config={"responsive": True, "displaylogo": False, "displayModeBar": False},
+    axis: dict[str, Any] = {
+        "gridcolor": grid,
+        "zerolinecolor": "rgba(128,128,128,0.45)",
+        "automargin": True,
+        "tickangle": 0,
+    }
+    drawn.update_xaxes(**axis)
+    drawn.update_yaxes(**axis)
+    content = drawn.to_json().replace("</", "<\\/")
+    return (
+        f"<figure>{_legend(drawn, identity)}"
+        f'<div class="chart" id="{identity}" style="height:{figure.height_px}px"></div>'
+        f'<script type="application/json" data-chart="{identity}">{content}</script>'
+        f"<figcaption>{_text(figure.caption)}</figcaption></figure>"
     )
-    return f"<figure>{plot}<figcaption>{_text(figure.caption)}</figcaption></figure>"
+
+
+def _legend(drawn: Chart, identity: str) -> str:
+    """Return the names of the curves above the chart, where they hide nothing; pressing one hides its curves."""
+    keys: dict[str, tuple[str, list[int]]] = {}
+    for i, trace in enumerate(drawn.data):
+        name = str(trace.get("name", ""))
+        if name and (name in keys or trace.get("showlegend", True)):
+            keys.setdefault(name, (_swatch(trace), []))[1].append(i)
+    if len(keys) < 2:
+        return ""
+    buttons = (
+        f'<button type="button" aria-pressed="true" data-of="{identity}" data-traces="{",".join(map(str, at))}">'
+        f"{swatch}{_text(name)}</button>"
+        for name, (swatch, at) in keys.items()
+    )
+    return f'<div class="legend">{"".join(buttons)}</div>'
+
+
+def _swatch(trace: Mapping[str, Any]) -> str:
+    line, marker = trace.get("line", {}), trace.get("marker", {})
+    if trace.get("fill") and "fillcolor" in trace:
+        return f'<svg viewBox="0 0 26 10"><rect width="26" height="10" fill="{trace["fillcolor"]}"/></svg>'
+    if trace["type"] == "bar" or "markers" in str(trace.get("mode")):
+        colour = marker.get("color") or line.get("color", GREY)
+        return f'<svg viewBox="0 0 26 10"><circle cx="13" cy="5" r="4" fill="{colour}"/></svg>'
+    dash = {"dash": "6 3", "dot": "2 3", "dashdot": "6 3 2 3"}.get(line.get("dash", ""), "")
+    colour = line.get("color", GREY)
+    stroke = f'stroke="{colour}" stroke-width="2.4" stroke-dasharray="{dash}"'
+    return f'<svg viewBox="0 0 26 10"><path d="M0 5H26" {stroke}/></svg>'
 
 
 _SHELL = """<!doctype html>
@@ -215,21 +259,58 @@ table { border-collapse: collapse; font-variant-numeric: tabular-nums; font-size
 .caption { color: var(--faint); font-size: 0.93rem; margin-top: 1.2rem; }
 th, td { text-align: left; padding: 0.3rem 0.9rem 0.3rem 0; border-bottom: 1px solid var(--line); vertical-align: top; }
 th { font-weight: 600; }
+.legend { display: flex; flex-wrap: wrap; gap: 0.1rem 0.4rem; }
+.legend button { all: unset; cursor: pointer; font-size: 0.86rem; padding: 0.1rem 0.4rem; border-radius: 4px; }
+.legend button:focus-visible { outline: 2px solid var(--faint); } .legend button[aria-pressed="false"] { opacity: 0.4; }
+.legend svg { width: 26px; height: 10px; margin-right: 0.4rem; fill: none; }
 figure { margin: 1.1rem 0 1.6rem; } figcaption { color: var(--faint); font-size: 0.9rem; max-width: 84ch; }
 @media (max-width: 520px) { body { font-size: 15px; } h1 { font-size: 1.35rem; } td, th { padding-right: 0.6rem; } }
 </style>
-<script>@PLOTLY@</script></head>
+</head>
 <body><main>
 @BODY@
 </main>
+@CHARTS@</body></html>
+"""
+
+_CHARTS = """<noscript><p>The charts need JavaScript, all of which is in this file; no request is sent.</p></noscript>
+<script type="text/plain" id="plotly">@PLOTLY@</script>
 <script>
-function ink() {
-  if (typeof Plotly === "undefined") return;
-  const colour = getComputedStyle(document.body).color;
-  document.querySelectorAll(".js-plotly-plot").forEach(plot => Plotly.relayout(plot, {"font.color": colour}));
+const own = id => JSON.parse(document.querySelector(`[data-chart="${id}"]`).textContent);
+const ink = () => ({"font.color": getComputedStyle(document.body).color, "font.family": "inherit"});
+async function unpacked(id) {
+  const bytes = Uint8Array.from(atob(document.getElementById(id).textContent), one => one.charCodeAt(0));
+  return new Response(new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"))).text();
 }
-ink();
-matchMedia("(prefers-color-scheme: dark)").addEventListener("change", ink);
+function narrow(layout, width) {
+  if (width > 520) return;
+  for (const key of Object.keys(layout).filter(key => /^[xy]axis/.test(key))) {
+    const axis = layout[key], part = axis.domain ? axis.domain[1] - axis.domain[0] : 1;
+    if (key[0] === "x" && axis.dtick === undefined) axis.nticks = Math.max(2, Math.floor(6 * part));
+    if (axis.title) axis.title.font = {size: 11};
+  }
+  layout.font.size = 11;
+}
+function draw(div) {
+  const {data, layout} = own(div.id);
+  layout.font = {size: 13, color: getComputedStyle(document.body).color};
+  narrow(layout, div.clientWidth);
+  return Plotly.newPlot(div, data, layout, {responsive: true, displaylogo: false, displayModeBar: false});
+}
+async function drawAll() {
+  const script = document.createElement("script");
+  script.textContent = await unpacked("plotly");
+  document.head.append(script);
+  for (const div of document.querySelectorAll(".chart")) await draw(div);
+  document.body.dataset.drawn = "yes";
+}
+drawAll();
+matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () =>
+  document.querySelectorAll(".chart").forEach(div => Plotly.relayout(div, ink())));
+document.querySelectorAll(".legend button").forEach(button => button.addEventListener("click", () => {
+  const shown = button.getAttribute("aria-pressed") !== "true";
+  button.setAttribute("aria-pressed", shown);
+  Plotly.restyle(button.dataset.of, {visible: shown}, button.dataset.traces.split(",").map(Number));
+}));
 </script>
-</body></html>
 """

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
-from plotly.subplots import make_subplots
 
 from autotune.config.procedure import SignalSettings
 from autotune.controller import PIDController
@@ -18,6 +16,7 @@ from autotune.pipeline import Analysis, Tuning
 from autotune.pipeline.deployment import Deployment
 from autotune.recording import Recording
 from autotune.report.analysis_sections import analysis_sections, gains_text, margins_sentence
+from autotune.report.chart import Chart, make_subplots
 from autotune.report.figures import recording_figure
 from autotune.report.page import BLUE, GREEN, GREY, ORANGE, RED, Figure, Page, Section, Table, add_line, thinned
 
@@ -252,7 +251,7 @@ def _milliseconds(values: tuple[float, float, float]) -> str:
     return " / ".join(f"{1e3 * value:.2g}" for value in values) + " ms"
 
 
-def _cycles_figure(recordings: Sequence[Recording], segments: Sequence[Segment], signals: SignalSettings) -> Any:
+def _cycles_figure(recordings: Sequence[Recording], segments: Sequence[Segment], signals: SignalSettings) -> Chart:
     ordered = sorted(segments, key=lambda segment: segment.point.omega_rad_s)
     titles = [f"{segment.point.omega_rad_s:.2g}" for segment in ordered]
     figure = make_subplots(rows=2, cols=len(ordered), shared_xaxes=True, subplot_titles=titles, vertical_spacing=0.08)
@@ -335,7 +334,7 @@ def _sentence(text: str) -> str:
     return f"{text[0].upper()}{text[1:]}."
 
 
-def _step_figure(verification: Verification, signals: SignalSettings) -> Any:
+def _step_figure(verification: Verification, signals: SignalSettings) -> Chart:
     test, prediction = verification.test, verification.prediction
     figure = make_subplots(rows=2, cols=1, shared_xaxes=True, vertical_spacing=0.06, row_heights=[0.65, 0.35])
     edge = slice(None, None, max(1, test.t.size // 600))

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-import plotly.graph_objects as go
 
 from autotune.arrays import FloatArray
 from autotune.controller import Controller
@@ -26,6 +23,7 @@ from autotune.diagnosis.screens import (
     value_screen,
     window_screen,
 )
+from autotune.report import chart as go
 from autotune.report.page import BLUE, GREEN, GREY, ORANGE, Figure, Section, Table, add_line, lines_figure, thinned
 
 #: Height of one screen's picture [px]; periods of the recomputed law that are drawn.
@@ -64,7 +62,7 @@ def _samples(found: Diagnosis, controller: Controller | None) -> Section:
     return Section(title="What the samples alone show", text=text, figures=tuple(figures))
 
 
-def _histogram(values: FloatArray, title: str, least: tuple[float, float], *, log: bool = False) -> Any:
+def _histogram(values: FloatArray, title: str, least: tuple[float, float], *, log: bool = False) -> go.Chart:
     figure = lines_figure(title, "rows", log_y=log)
     edges = np.linspace(min(values.min(), least[0]), max(values.max(), least[1]), 161)
     counts = np.histogram(values, edges)[0]
@@ -73,7 +71,7 @@ def _histogram(values: FloatArray, title: str, least: tuple[float, float], *, lo
     return figure
 
 
-def _law(law: LawScreen, unit: str) -> Any:
+def _law(law: LawScreen, unit: str) -> go.Chart:
     figure = lines_figure("t [s]", f"u [{unit}]")
     near = slice(0, LAW_ROWS)
     add_line(figure, law.t[near], law.recorded[near], "recorded", GREY)
@@ -185,12 +183,12 @@ def _signals(found: Diagnosis) -> Section:
     return Section(title="Residual against every signal", text=(text,), tables=(table,), figures=tuple(figures))
 
 
-def _add_means(figure: Any, means: Means, name: str, colour: str) -> None:
+def _add_means(figure: go.Chart, means: Means, name: str, colour: str) -> None:
     _band(figure, means.x, means.mean, 1.96 * means.error, colour)
     add_line(figure, means.x, means.mean, name, colour)
 
 
-def _band(figure: Any, x: FloatArray, y: FloatArray, half: FloatArray, colour: str) -> None:
+def _band(figure: go.Chart, x: FloatArray, y: FloatArray, half: FloatArray, colour: str) -> None:
     red, green, blue = (int(colour[i : i + 2], 16) for i in (1, 3, 5))
     figure.add_trace(
         go.Scatter(
@@ -201,7 +199,7 @@ def _band(figure: Any, x: FloatArray, y: FloatArray, half: FloatArray, colour: s
     )  # fmt: skip
 
 
-def curve_figure(curve: Curve) -> Any:
+def curve_figure(curve: Curve) -> go.Chart:
     """Return the picture of a description's free curve with its 95 % band."""
     figure = lines_figure(curve.signal, f"missing [{curve.unit}]")
     _band(figure, curve.x, curve.value, 1.96 * curve.sd, GREEN)

@@ -59,7 +59,7 @@ def test_the_report_asks_nothing_of_the_network(finished: Path) -> None:
     page = (finished / "report.html").read_text()
     outside = re.findall(r"<(?:script|link|img|iframe)[^>]*(?:src|href)\s*=", page.split("</style>")[0])
     assert outside == []
-    assert page.count('class="plotly-graph-div"') >= 6
+    assert page.count('class="chart"') >= 6
 
 
 def test_a_second_run_does_not_overwrite_the_first(finished: Path) -> None:

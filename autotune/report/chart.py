@@ -1,0 +1,167 @@
+"""Charts as plotly.js takes them: traces on a grid of axes, in plain dictionaries; nothing is drawn here.
+
+The names are those of plotly's own Python package (``Scatter``, ``Bar``, ``make_subplots``, ``add_trace``,
+``update_xaxes``, ``add_vline``), of which a report needs these few, at a thousandth of its size.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, TypeAlias
+
+import numpy as np
+
+Trace: TypeAlias = dict[str, Any]
+
+#: What plotly writes with an underscore for a setting inside a group.
+_GROUPS = ("line", "marker", "title", "font")
+_DIGITS = 7
+
+
+def Scatter(**settings: Any) -> Trace:  # noqa: N802 - plotly's own name
+    """Return a trace of points or lines; the settings are plotly's, ``line_shape`` for ``line: {shape}``."""
+    return {"type": "scatter", **_nested(settings)}
+
+
+def Bar(**settings: Any) -> Trace:  # noqa: N802 - plotly's own name
+    """Return a trace of bars."""
+    return {"type": "bar", **_nested(settings)}
+
+
+def make_subplots(
+    *,
+    rows: int = 1,
+    cols: int = 1,
+    shared_xaxes: bool = False,
+    vertical_spacing: float = 0.08,
+    horizontal_spacing: float = 0.06,
+    row_heights: Sequence[float] | None = None,
+    subplot_titles: Sequence[str] = (),
+) -> Chart:
+    """Return a chart with a grid of axes, rows from the top; with shared x axes a column is zoomed together."""
+    chart = Chart(rows=rows, cols=cols)
+    heights = np.array(row_heights if row_heights is not None else np.ones(rows), dtype=np.float64)
+    heights *= (1.0 - vertical_spacing * (rows - 1)) / heights.sum()
+    width = (1.0 - horizontal_spacing * (cols - 1)) / cols
+    for row in range(rows):
+        top = 1.0 - float(heights[:row].sum()) - row * vertical_spacing
+        for col in range(cols):
+            name = _suffix(row * cols + col)
+            left = col * (width + horizontal_spacing)
+            x: dict[str, Any] = {"domain": [left, left + width], "anchor": f"y{name}"}
+            if shared_xaxes and row < rows - 1:
+                x |= {"matches": f"x{_suffix((rows - 1) * cols + col)}", "showticklabels": False}
+            chart.layout[f"xaxis{name}"] = x
+            chart.layout[f"yaxis{name}"] = {"domain": [max(top - heights[row], 0.0), top], "anchor": f"x{name}"}
+    for i, title in enumerate(subplot_titles):
+        name = _suffix(i)
+        chart.add_annotation(
+            x=0.5, xref=f"x{name} domain", y=1.0, yref=f"y{name} domain", yanchor="bottom", text=title, showarrow=False
+        )
+    return chart
+
+
+def _suffix(index: int) -> str:
+    return "" if index == 0 else str(index + 1)
+
+
+class Chart:
+    """Traces and layout of one chart, with the few methods of plotly's figures that the reports use.
+
+    Parameters
+    ----------
+    rows, cols : int
+        Grid of axes.
+    """
+
+    def __init__(self, *, rows: int = 1, cols: int = 1) -> None:
+        self.rows, self.cols = rows, cols
+        self.data: list[Trace] = []
+        self.layout: dict[str, Any] = {"xaxis": {}, "yaxis": {}, "shapes": [], "annotations": []}
+
+    def add_trace(self, trace: Trace, row: int = 1, col: int = 1) -> None:
+        """Add a trace to the axes in a row and a column, counted from 1."""
+        name = self._name(row, col)
+        self.data.append({**trace, "xaxis": f"x{name}", "yaxis": f"y{name}"})
+
+    def add_scatter(self, *, row: int = 1, col: int = 1, **settings: Any) -> None:
+        """Add a trace of points or lines."""
+        self.add_trace(Scatter(**settings), row, col)
+
+    def update_layout(self, **settings: Any) -> None:
+        """Set what holds for the whole chart."""
+        self.layout |= _nested(settings)
+
+    def update_xaxes(self, row: int | None = None, col: int | None = None, **settings: Any) -> None:
+        """Set horizontal axes: all, or those of a row or a column."""
+        self._update("xaxis", row, col, settings)
+
+    def update_yaxes(self, row: int | None = None, col: int | None = None, **settings: Any) -> None:
+        """Set vertical axes: all, or those of a row or a column."""
+        self._update("yaxis", row, col, settings)
+
+    def add_vline(self, x: float, **settings: Any) -> None:
+        """Draw a line over the whole height at an x of the first axis."""
+        self.add_shape(type="line", x0=x, x1=x, y0=0, y1=1, yref="paper", **settings)
+
+    def add_hline(self, y: float, **settings: Any) -> None:
+        """Draw a line over the whole width at a y of the first axis."""
+        self.add_shape(type="line", y0=y, y1=y, x0=0, x1=1, xref="paper", **settings)
+
+    def add_vrect(self, x0: float, x1: float, **settings: Any) -> None:
+        """Shade what lies between two x of the first axis."""
+        self.add_shape(type="rect", x0=x0, x1=x1, y0=0, y1=1, yref="paper", **settings)
+
+    def add_shape(self, **settings: Any) -> None:
+        """Draw a shape."""
+        self.layout["shapes"].append(_nested(settings))
+
+    def add_annotation(self, *, row: int | None = None, col: int | None = None, **settings: Any) -> None:
+        """Write a text at a place."""
+        if row is not None or col is not None:
+            name = self._name(row or 1, col or 1)
+            settings = {"xref": f"x{name}", "yref": f"y{name}", **settings}
+        self.layout["annotations"].append(_nested(settings))
+
+    def to_json(self) -> str:
+        """Return traces and layout as JSON, numbers to seven digits, no number as null."""
+        return json.dumps({"data": _plain(self.data), "layout": _plain(self.layout)}, separators=(",", ":"))
+
+    def _name(self, row: int, col: int) -> str:
+        return _suffix((row - 1) * self.cols + col - 1)
+
+    def _update(self, axis: str, row: int | None, col: int | None, settings: Mapping[str, Any]) -> None:
+        for i in range(self.rows * self.cols):
+            if row in (None, i // self.cols + 1) and col in (None, i % self.cols + 1):
+                own = self.layout.setdefault(f"{axis}{_suffix(i)}", {})
+                own |= _nested(settings)
+
+
+def _nested(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the settings with ``line_shape`` and the like inside their group, and a title as plotly.js wants it."""
+    nested: dict[str, Any] = {}
+    for key, value in settings.items():
+        group, mark, rest = key.partition("_")
+        if mark and group in _GROUPS:
+            nested[group] = {**nested.get(group, {}), rest: value}
+        elif key == "title" and isinstance(value, str):
+            nested["title"] = {**nested.get("title", {}), "text": value}
+        elif isinstance(value, Mapping) and isinstance(nested.get(key), Mapping):
+            nested[key] = {**nested[key], **value}
+        else:
+            nested[key] = value
+    return nested
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {key: _plain(inner) for key, inner in value.items()}
+    if isinstance(value, np.ndarray | list | tuple):
+        return [_plain(inner) for inner in value]
+    if isinstance(value, np.integer | np.bool_):
+        return value.item()
+    if isinstance(value, float | np.floating):
+        return float(f"{value:.{_DIGITS}g}") if math.isfinite(value) else None
+    return value
