@@ -39,7 +39,7 @@ figures: $(VENV)/.docs
 $(VENV)/.run: pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit("Python >= 3.11 is needed, this is " + sys.version.split()[0] if sys.version_info < (3, 11) else 0)'
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	@echo "Installing into $(VENV): about 1 GB, one to five minutes. The first run then compiles for about a minute."
+	@echo "Installing into $(VENV): about half a GB, one to five minutes. The first run then compiles for about a minute."
 	$(BIN)/python -m pip install --disable-pip-version-check -e .
 	touch $@
 

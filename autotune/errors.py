@@ -7,6 +7,7 @@ operator).
 
 from __future__ import annotations
 
+import importlib.util
 from typing import ClassVar
 
 
@@ -40,6 +41,27 @@ class InputError(AutotuneError, ValueError):
     """A file, a setting or an argument was refused; nothing was done."""
 
     exit_status = 2
+
+
+def require_extra(extra: str, *packages: str) -> None:
+    """Refuse where the packages of an extra are not installed.
+
+    Parameters
+    ----------
+    extra : str
+        As in ``pip install 'relay-autotune[extra]'``.
+    packages : str
+        What is imported of it.
+
+    Raises
+    ------
+    InputError
+        With the command that installs it.
+    """
+    missing = [package for package in packages if importlib.util.find_spec(package) is None]
+    if missing:
+        remedy = f"pip install 'relay-autotune[{extra}]'"
+        raise InputError(f"{' and '.join(missing)} not installed", where=f"this needs the extra {extra}", remedy=remedy)
 
 
 class IdentificationError(InputError):

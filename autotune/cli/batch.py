@@ -26,11 +26,13 @@ def batch(
     """Identify, design or diagnose every loop of a plant; results as a Parquet table and one page."""
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+    from autotune.errors import InputError, OperatorStop, require_extra
+
+    require_extra("batch", "distributed", "pyarrow")
     from autotune.batch.campaign import RESULTS, Campaign, failed, write_results
     from autotune.batch.engine import cluster, run_all
     from autotune.batch.loop import ATTENTION, analyse_loop
     from autotune.batch.settings import read_campaign
-    from autotune.errors import InputError, OperatorStop
     from autotune.report.campaign_page import campaign_page
     from autotune.report.page import write_page
 

@@ -30,10 +30,9 @@ def live(
     beside_run: Annotated[bool, typer.Option("--beside-run", hidden=True)] = False,
 ) -> None:
     """Show a run in the browser: while it goes, or when it has ended. Looks on only; run --live has the controls."""
-    from autotune.errors import InputError
-    from autotune.live.session import require_extra
+    from autotune.errors import InputError, require_extra
 
-    require_extra()
+    require_extra("live", "nicegui")
     from autotune.live.server import Run, listening, serve, token_for
     from autotune.pipeline import PROGRESS
 

@@ -16,7 +16,7 @@ from rich.progress import Progress, track
 from rich.table import Table
 
 from autotune.cli import app
-from autotune.errors import InputError
+from autotune.errors import InputError, require_extra
 
 if TYPE_CHECKING:
     from sim.proof import Campaign
@@ -42,6 +42,7 @@ def prove(
     ] = None,
 ) -> None:
     """Conceal effects in simulated recordings, diagnose them as a user would, reveal the answers and count."""
+    require_extra("batch", "distributed")
     from sim.proof import Campaign, conceal, keep_failures, mark_all, seal
     from sim.score import resolved, table
 

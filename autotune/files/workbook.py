@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from autotune.errors import InputError
+from autotune.errors import InputError, require_extra
 from autotune.files.cells import Cells
 from autotune.files.header import Header, read_header
 from autotune.files.long_form import one_column_per_tag
@@ -102,13 +102,10 @@ def parquet_table(paths: Sequence[Path]) -> Table:
     InputError
         A file that is none, or the package that reads them is not installed.
     """
-    try:
-        import pyarrow as pa
-        import pyarrow.dataset
-    except ImportError:
-        raise InputError(
-            "a Parquet file needs pyarrow", where=str(paths[0]), remedy="pip install 'relay-autotune[parquet]'"
-        ) from None
+    require_extra("parquet", "pyarrow")
+    import pyarrow as pa
+    import pyarrow.dataset
+
     try:
         data = pyarrow.dataset.dataset([str(path) for path in paths], format="parquet")
     except (pa.ArrowInvalid, OSError) as error:

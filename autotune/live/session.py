@@ -7,7 +7,6 @@ control loop. Only actions come back, each a line on a pipe: a thread that sleep
 from __future__ import annotations
 
 import _thread
-import importlib.util
 import queue
 import signal
 import subprocess
@@ -19,23 +18,11 @@ from typing import Self
 
 from rich.console import Console
 
-from autotune.errors import InputError
+from autotune.errors import InputError, require_extra
 from autotune.experiment.loop import ABORT
 
 #: what the page may ask; anything else on the pipe is no action
 ACTIONS = ("abort", "keep", "restore")
-
-
-def require_extra() -> None:
-    """Refuse where the page's library is not installed.
-
-    Raises
-    ------
-    InputError
-        With the command that installs it.
-    """
-    if importlib.util.find_spec("nicegui") is None:
-        raise InputError("needs nicegui", where="live page", remedy="pip install 'relay-autotune[live]'")
 
 
 class LivePage:
@@ -64,7 +51,7 @@ class LivePage:
     """
 
     def __init__(self, folder: Path, listen: str, port: int, token: str | None) -> None:
-        require_extra()
+        require_extra("live", "nicegui")
         self._command = [
             sys.executable, "-m", "autotune.cli", "live", str(folder), "--beside-run",
             "--listen", listen, "--port", str(port), *(["--token", token] if token else []),

@@ -13,12 +13,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import plotly.graph_objects as go
-from plotly.subplots import make_subplots
 
 from autotune.arrays import ComplexArray, FloatArray
 from autotune.errors import IdentificationError
 from autotune.identification.closed_loop.state_space import InnovationModel
+from autotune.report import chart as go
+from autotune.report.chart import make_subplots
 from autotune.report.page import BLUE, GREY, ORANGE, Figure, Page, Section, add_line, write_page
 from tests.benchmarks.closed_loop import METHODS
 from tests.loop_example import PLANT, example_set
@@ -79,7 +79,7 @@ def _marks(
 
 def noise_figure(models: Mapping[str, Sequence[InnovationModel]]) -> Any:
     """Draw sigma times the magnitude of H for each method's models, the true one on top."""
-    figure = make_subplots(rows=1, cols=len(models), shared_yaxes=True)
+    figure = make_subplots(rows=1, cols=len(models))
     for col, (title, found) in enumerate(models.items(), start=1):
         # one trace for all sets, NaN between them, keeps the page small
         x = np.concatenate([np.append(OMEGA, np.nan) for _ in found])

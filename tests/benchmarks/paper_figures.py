@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
-from plotly.subplots import make_subplots
 
 from autotune.arrays import FloatArray
 from autotune.config import Config, load_config
@@ -39,6 +38,7 @@ from autotune.identification.reduction import reduce_points
 from autotune.models import TransferFunction
 from autotune.points import FrequencyPoint
 from autotune.recording import RecordingWriter
+from autotune.report.chart import make_subplots
 from autotune.report.figures import Curve, nichols_figure, sensitivity_figure
 from autotune.report.page import BLUE, GREEN, GREY, ORANGE, PURPLE, Figure, Page, Section, Table, add_line, write_page
 from drivers.simulated import SimulatedRig

@@ -1,0 +1,82 @@
+"""Charts and the page that carries them: what plotly.js is given, what the page weighs, that it asks for nothing."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from autotune.report.chart import Chart, Scatter, make_subplots
+from autotune.report.page import Figure, Page, Section, add_line, lines_figure, write_page
+
+
+def test_a_trace_lands_on_the_axes_of_its_row_and_column():
+    chart = make_subplots(rows=2, cols=2, shared_xaxes=True)
+    chart.add_trace(Scatter(x=[1], y=[2], line_shape="hv"), row=2, col=1)
+    chart.update_yaxes(title="y [m]", row=2, col=1)
+    content = json.loads(chart.to_json())
+    (trace,) = content["data"]
+    assert (trace["xaxis"], trace["yaxis"]) == ("x3", "y3")
+    assert trace["line"] == {"shape": "hv"}
+    assert content["layout"]["yaxis3"]["title"]["text"] == "y [m]"
+    assert content["layout"]["xaxis"]["matches"] == "x3"
+
+
+def test_rows_of_axes_fill_the_height_and_do_not_overlap():
+    chart = make_subplots(rows=3, row_heights=[3, 1, 1], vertical_spacing=0.1)
+    domains = [chart.layout[f"yaxis{i}"]["domain"] for i in ("", "2", "3")]
+    assert domains[0][1] == pytest.approx(1.0)
+    assert domains[2][0] == pytest.approx(0.0)
+    assert all(above[0] - below[1] == pytest.approx(0.1) for above, below in pairwise(domains))
+
+
+def test_what_is_no_number_is_null():
+    chart = Chart()
+    chart.add_scatter(x=np.array([0.0, np.nan]), y=np.array([np.inf, 1 / 3]))
+    assert json.loads(chart.to_json())["data"][0]["y"] == [None, 0.3333333]
+
+
+def page_of(tmp_path, rows=3000):
+    t = np.linspace(0.0, 10.0, rows)
+    figures = []
+    for i in range(20):
+        figure = lines_figure("t [s]", "y [m]")
+        add_line(figure, t, np.sin(t + i), "measured", "#3b82c4")
+        add_line(figure, t, np.cos(t + i), "</script>", "#d98200")
+        figures.append(Figure(figure=figure, caption="<b>both</b>"))
+    path = tmp_path / "page.html"
+    write_page(
+        Page(title="<i>T</i>", verdict="v", tone="good", sections=(Section(title="s", figures=tuple(figures)),)), path
+    )
+    return path
+
+
+def test_a_page_of_twenty_charts_stays_within_what_a_mail_takes_and_names_nobody_else(tmp_path):
+    content = page_of(tmp_path, 600).read_text(encoding="utf-8")
+    assert len(content) < 1.5e6
+    assert not re.findall(r"""(?:src|href)\s*=\s*["']?(?:https?:)?//""", content)
+    assert content.count("</script>") == content.count("<script")
+
+
+@pytest.mark.system("chromium")
+def test_every_chart_is_drawn_without_a_request(tmp_path):
+    playwright = pytest.importorskip("playwright.sync_api")
+    path, asked, wrong = page_of(tmp_path, 200), [], []
+    with playwright.sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=shutil.which("chromium"), args=["--no-sandbox"])
+        opened = browser.new_page(viewport={"width": 400, "height": 800})
+        opened.on("request", lambda request: asked.append(request.url))
+        opened.on("pageerror", lambda error: wrong.append(str(error)))
+        opened.goto(path.as_uri())
+        opened.wait_for_selector("body[data-drawn=yes]")
+        assert opened.locator(".chart .main-svg").count() >= 20
+        assert opened.evaluate("document.documentElement.scrollWidth <= document.documentElement.clientWidth")
+        opened.locator(".legend button").first.click()
+        assert opened.locator(".chart").first.evaluate("chart => chart.data[0].visible") is False
+        browser.close()
+    assert wrong == []
+    assert [url for url in asked if not url.startswith(("file:", "blob:", "data:"))] == []
