@@ -32,11 +32,14 @@ def simulate(
     import numpy as np
 
     from autotune.diagnosis.forecast import forecast
-    from autotune.models import read_model
+    from autotune.equations import forecast as of_equations
+    from autotune.equations.files import read_any_model
+    from autotune.models import Model
 
     place = Output(out, inputs=(recording, model), overwrite=overwrite)
     data = read_one(recording, signal_names(t, u, y, r))
-    y_sim = forecast(read_model(model), data, horizon)
+    nominal = read_any_model(model)
+    y_sim = forecast(nominal, data, horizon) if isinstance(nominal, Model) else of_equations(nominal, data, horizon)
     rows = np.column_stack([data.t, y_sim])
     place.by(lambda part: np.savetxt(part, rows, fmt="%.10g", delimiter=",", header="t,y_sim", comments=""))
     known = np.isfinite(data.y)

@@ -9,7 +9,13 @@ The way of a file through the room::
     tape.py          EquationModel + Extensions -> Program, a tape of elementary operations; a millisecond
     kernel.py        the one compiled integrator of all tapes: adaptive, switched terms located, friction sticks, stiff
     simulate.py      compile_model, drive_of, simulate: the interface below
-    effects.py       catalogue names -> Extension, by the kind of state, by port, input or output
+    effects.py       catalogue names -> Extension, by the kind of state, by port, input or output; equation_of
+    sensitivity.py   dy/dparameters and dy/dstart by differences along the same steps
+    starts.py        rest, and start states that fit the readings
+    fit.py           fit on given windows, retune from short windows to the free run; beliefs counted
+    identifiability  which combinations of parameters the recordings do not determine
+    forecast.py      what ``autotune simulate`` does, with and without --horizon
+    files.py         read_any_model: a chain of blocks, or equations
 
 The narrow interface that a diagnosis builds on::
 
@@ -45,7 +51,11 @@ within 1e-9 of the rows' distance; stiff models go on with an L-stable method. A
 there on with a reason in ``run.reasons``; :func:`~autotune.equations.simulate.require_complete` turns it into one line.
 """
 
+from autotune.equations.effects import apply
 from autotune.equations.expressions import parse, to_text
+from autotune.equations.fit import Fitted, fit, retune
+from autotune.equations.forecast import forecast
+from autotune.equations.identifiability import combinations, undetermined
 from autotune.equations.model import (
     EquationModel,
     Extension,
@@ -73,18 +83,25 @@ __all__ = [
     "Drive",
     "EquationModel",
     "Extension",
+    "Fitted",
     "InputColumn",
     "ModelParameter",
     "ModelPort",
     "Run",
     "State",
+    "apply",
+    "combinations",
     "compile_model",
     "derivatives",
     "drive_of",
+    "fit",
+    "forecast",
     "parse",
     "read_equations",
     "require_complete",
+    "retune",
     "simulate",
     "to_text",
+    "undetermined",
     "write_equations",
 ]

@@ -108,7 +108,7 @@ def _work(p: Tape, template: FloatArray, parameters: FloatArray) -> Work:
     r = template.copy()
     for i in range(parameters.size):
         r[1 + n + m + i] = parameters[i]
-    evaluate(p.code, 0, p.still, r)
+    evaluate(p.code, 0, p.still, r, False)
     return Work(
         r, np.zeros(r.size), np.zeros(m), np.zeros(m), np.zeros(1), np.zeros(s, dtype=np.int64),
         np.zeros(s, dtype=np.int64), np.zeros(s), np.zeros(s), np.zeros(s), np.zeros((s, s)), np.zeros(s),
@@ -119,7 +119,7 @@ def _work(p: Tape, template: FloatArray, parameters: FloatArray) -> Work:
 @njit(cache=True, error_model="numpy", nogil=True, inline="always")
 def _evaluate_slopes(p: Tape, w: Work, row: int) -> None:
     r, K, slopes = w.r, w.K, p.slopes
-    evaluate(p.code, p.still, p.dynamic, r)
+    evaluate(p.code, p.still, p.dynamic, r, 0 < row < 6)  # rows 0 and 6 of K are ends of steps, the others stages
     for i in range(p.n):
         K[row, i] = r[slopes[i]]
 
@@ -196,7 +196,7 @@ def _settle(p: Tape, w: Work, x: FloatArray, t: float) -> None:
     for _ in range(3):
         changed = False
         for k in range(p.switches.size):
-            _field(p, w, x, t, 0)
+            _field(p, w, x, t, 5)  # as a stage: just beyond the edge of a root its mode is not changed yet
             g, mode = w.r[p.switches[k]] - w.zero[k], w.r[p.modes[k]]
             w.largest[k] = max(w.largest[k], abs(g))
             near = abs(g) <= _NEAR * w.largest[k]
@@ -221,12 +221,12 @@ def _choose(p: Tape, w: Work, x: FloatArray, t: float, k: int, before: float, g:
     """Set the mode of a switch whose function is at zero by where the fields of both sides lead."""
     mode = p.modes[k]
     w.r[mode] = 1.0
-    _field(p, w, x, t, 0)
-    _speeds_of_switches(p, w, 0)
+    _field(p, w, x, t, 5)
+    _speeds_of_switches(p, w, 5)
     above = w.g_dot[k]
     w.r[mode] = -1.0
-    _field(p, w, x, t, 0)
-    _speeds_of_switches(p, w, 0)
+    _field(p, w, x, t, 5)
+    _speeds_of_switches(p, w, 5)
     below = w.g_dot[k]
     if above < 0.0 < below:
         w.sliding[k] = 1
@@ -383,14 +383,16 @@ def _advance(p: Tape, w: Work, x: FloatArray, t: float, end: float, span: float,
             return TOO_MANY_STEPS
         error = _trial(p, w, x, t, h, tolerance, new_point)
         new_point = False
-        if not error <= 1.0:
+        switched = p.switches.size > 0 and w.memory[_CROSSINGS] < MOST_CROSSINGS
+        crossed = switched and (error <= 1.0 or np.isnan(error)) and _crossing(p, w)
+        if not error <= 1.0 and not crossed:
             _next_step(w, error, h)
             locating = False
             if w.memory[_STEP] < 1e-13 * span:
                 return NOT_A_NUMBER
             continue
-        if p.switches.size > 0 and w.memory[_CROSSINGS] < MOST_CROSSINGS:
-            if _crossing(p, w):
+        if switched:
+            if crossed:
                 low, high, locating = (low if locating else 0.0), h, True
                 if high - low > _LOCATED * span:
                     continue
@@ -484,7 +486,7 @@ def run(
         _settle(p, w, x, t - times[0])
         status[window, 0], status[window, 1] = DONE, t
         for row in range(starts[window], stops[window]):
-            evaluate(p.code, p.dynamic, p.code.shape[0], w.r)
+            evaluate(p.code, p.dynamic, p.code.shape[0], w.r, False)
             for q in range(p.outputs.size):
                 out[q, row] = w.r[p.outputs[q]]
             if row + 1 >= times.size:
@@ -508,7 +510,7 @@ def look(
         w.sliding[:], w.crossed[:], w.zero[:], w.largest[:] = 0, 0, 0.0, 0.0
         w.base[:] = inputs[i]
         _settle(p, w, states[i], t)
-        evaluate(p.code, p.dynamic, p.code.shape[0], w.r)
+        evaluate(p.code, p.dynamic, p.code.shape[0], w.r, False)
         found[i] = w.K[0]
         for q in range(p.outputs.size):
             y[i, q] = w.r[p.outputs[q]]

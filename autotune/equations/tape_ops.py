@@ -35,8 +35,12 @@ from autotune.equations.opcodes import (
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def evaluate(code: IntArray, first: int, last: int, r: FloatArray) -> None:
-    """Run operations ``first`` to ``last`` on the registers; what is undefined becomes NaN."""
+def evaluate(code: IntArray, first: int, last: int, r: FloatArray, extended: bool) -> None:
+    """Run operations ``first`` to ``last`` on the registers.
+
+    What is undefined becomes NaN; ``extended``, roots and logarithms go on beyond their domain, so that a step over
+    the crossing of ``sqrt(max(h, 0))``, whose mode is held, can be tried and cut there.
+    """
     for k in range(first, last):
         o = code[k, 0]
         a = r[code[k, 2]]
@@ -65,13 +69,16 @@ def evaluate(code: IntArray, first: int, last: int, r: FloatArray) -> None:
         elif o == CHOOSE:
             v = a if r[code[k, 4]] >= 0.0 else b
         elif o == POW:
-            v = a**b if a >= 0.0 or b == np.floor(b) else np.nan
+            if a >= 0.0 or b == np.floor(b):
+                v = a**b
+            elif extended:
+                v = -((-a) ** b)
         elif o == EXP:
             v = math.exp(min(a, 709.0))
         elif o == LOG:
-            v = np.log(a)
+            v = np.log(max(a, 1e-300)) if extended else np.log(a)
         elif o == SQRT:
-            v = np.sqrt(a)
+            v = -np.sqrt(-a) if extended and a < 0.0 else np.sqrt(a)
         elif o == SIN:
             v = math.sin(a)
         elif o == COS:
@@ -130,7 +137,7 @@ def tangents(code: IntArray, first: int, last: int, r: FloatArray, d: FloatArray
         elif o == LOG:
             w = da / a
         elif o == SQRT:
-            w = 0.5 * da / v
+            w = 0.5 * da / abs(v)
         elif o == SIN:
             w = math.cos(a) * da
         elif o == COS:

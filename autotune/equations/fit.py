@@ -1,0 +1,370 @@
+"""Retuning: the parameters of a model, and of its extensions, that explain recordings best, beliefs counted.
+
+Gauss-Newton with Levenberg's damping on the readings' errors over the noise and on the parameters' distance from
+what is believed of them; the start states of all windows are eliminated by projection. A parameter with a nonzero
+value is sought on a logarithmic scale, so that it keeps its sign: ``p = value exp(spread z)`` with z standard normal.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from autotune.arrays import BoolArray, FloatArray, IntArray
+from autotune.equations.sensitivity import STEP, Sensitivities, Windows, sensitivities
+from autotune.equations.simulate import Compiled, Drive, drive_of, simulate
+from autotune.equations.starts import fitted_starts, given_starts, state_scales
+from autotune.errors import InputError
+from autotune.recording import Recording
+
+#: Relative decrease of the penalised sum of squares below which a fit has converged.
+_SMALL = 1e-5
+#: Windows that a recording is cut into, one fit after the other, each with this many rows at least.
+SHORT_TO_LONG, LEAST_ROWS = (32, 8, 2, 1), 24
+#: A longer window that leaves this many times the error of the shorter ones has lost its way.
+LOST = 30.0
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Fitted:
+    """What a fit found.
+
+    Attributes
+    ----------
+    compiled : Compiled
+        The model.
+    parameters, sd : (P,) arrays
+        Estimates, and their standard deviations with the beliefs counted; 0 for what is not retuned.
+    z : (P,) array
+        Distance from the nominal values in units of what is believed.
+    windows : tuple of Windows
+        Start states, one entry per recording.
+    simulated : tuple of (N,) array
+        y at every row.
+    residuals : tuple of (N,) array
+        Reading less simulation; NaN where the reading does not count.
+    noise_sd : float
+        Root mean square of the residuals [y unit].
+    jacobian : (rows, P) array
+        dy/dz over the noise, start states projected out; see :mod:`autotune.equations.identifiability`.
+    converged : bool
+        Whether the last step changed next to nothing.
+    """
+
+    compiled: Compiled
+    parameters: FloatArray
+    sd: FloatArray
+    z: FloatArray
+    windows: tuple[Windows, ...]
+    simulated: tuple[FloatArray, ...]
+    residuals: tuple[FloatArray, ...]
+    noise_sd: float
+    jacobian: FloatArray
+    converged: bool
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Data:
+    """A recording prepared for a fit."""
+
+    drive: Drive
+    y: FloatArray
+    good: BoolArray
+    windows: Windows
+
+
+def window_rows(t: FloatArray, horizon_s: float | None) -> tuple[IntArray, IntArray]:
+    """Return the first rows of windows of a length, and the rows before which they end; one window without it."""
+    if horizon_s is None:
+        return np.zeros(1, dtype=np.int64), np.array([t.size], dtype=np.int64)
+    count = max(int(np.floor((t[-1] - t[0]) / horizon_s + 1e-9)), 1)
+    edges = np.searchsorted(t, t[0] + horizon_s * np.arange(count) - 1e-9 * horizon_s).astype(np.int64)
+    edges = np.unique(edges)
+    return edges, np.append(edges[1:], t.size)
+
+
+def values_of(compiled: Compiled, z: FloatArray) -> FloatArray:
+    """Return the parameters at distances z from their nominal values, in units of what is believed of them."""
+    value, spread = compiled.parameter_vector, np.array([p.spread for p in compiled.parameters])
+    moved = np.where(value == 0.0, spread * z, value * np.exp(np.clip(spread * z, -50.0, 50.0)))
+    return np.asarray(np.where(spread > 0.0, moved, value), dtype=np.float64)
+
+
+def fit(
+    compiled: Compiled,
+    recordings: Sequence[Recording],
+    *,
+    windows: Sequence[Windows] | None = None,
+    horizon_s: float | None = None,
+    z: FloatArray | None = None,
+    free: BoolArray | None = None,
+    iterations: int = 30,
+    progress: Callable[[float], None] = lambda share: None,
+) -> Fitted:
+    """Fit a model's parameters on given windows.
+
+    Parameters
+    ----------
+    compiled : Compiled
+        The model with its extensions.
+    recordings : sequence of Recording
+        What was measured; rows whose y is no number do not count.
+    windows : sequence of Windows, optional
+        One per recording; by default windows of a length, with start states that fit them.
+    horizon_s : float, optional
+        That length [s]; by default the model's, or one free run per recording.
+    z : (P,) array, optional
+        Where to begin; the nominal values by default.
+    free : (P,) bool array, optional
+        Which parameters are retuned; by default all with a spread.
+    iterations : int
+        Gauss-Newton steps at most.
+    progress : callable
+        Is told the share of the steps that are done.
+
+    Returns
+    -------
+    Fitted
+        A local minimum. Standard deviations hold to first order and take the residual for white noise.
+
+    Raises
+    ------
+    InputError
+        A recording without readings or a missing column, or a nominal model that runs away.
+    """
+    z = np.zeros(len(compiled.parameters)) if z is None else np.array(z, dtype=np.float64)
+    spread = np.array([p.spread for p in compiled.parameters])
+    which = np.flatnonzero((spread > 0.0) & (np.ones(spread.size, dtype=bool) if free is None else free))
+    length = compiled.model.horizon_s if horizon_s is None else horizon_s
+    p = values_of(compiled, z)
+    data = [
+        _data(compiled, one, p, length, None if windows is None else windows[k]) for k, one in enumerate(recordings)
+    ]
+    state = _Descent(compiled, data, which, z)
+    converged = False
+    for k in range(iterations):
+        progress(k / iterations)
+        converged = state.step()
+        if converged:
+            break
+    progress(1.0)
+    return state.fitted(converged)
+
+
+def retune(
+    compiled: Compiled,
+    recordings: Sequence[Recording],
+    *,
+    free: BoolArray | None = None,
+    progress: Callable[[float], None] = lambda share: None,
+) -> Fitted:
+    """Retune a model on short windows first, then on longer ones up to the whole free run.
+
+    Parameters
+    ----------
+    compiled, recordings, free, progress
+        As for :func:`fit`.
+
+    Returns
+    -------
+    Fitted
+        On the longest windows that do not run away: free start states at many windows forgive wrong parameters
+        enough to lead to the right ones, from which a free run converges.
+
+    Raises
+    ------
+    InputError
+        As :func:`fit`.
+    """
+    whole = max(float(one.t[-1] - one.t[0]) for one in recordings)
+    longest = min(compiled.model.horizon_s or np.inf, whole)
+    rows = min(len(one) for one in recordings)
+    counts = [count for count in SHORT_TO_LONG if rows * longest / whole / count >= LEAST_ROWS]
+    lengths = [longest / count for count in counts or [1]]
+    found: Fitted | None = None
+    for k, length in enumerate(lengths):
+        z = None if found is None else found.z
+        last = length >= whole
+        try:
+            new = fit(
+                compiled, recordings, z=z, free=free, horizon_s=None if last else length,
+                iterations=30 if k == len(lengths) - 1 else 12,
+                progress=lambda share, k=k: progress((k + share) / len(lengths)),  # type: ignore[misc]
+            )  # fmt: skip
+        except InputError:
+            if found is None:
+                continue
+            break
+        if found is not None and new.noise_sd > LOST * found.noise_sd:
+            break
+        found = new
+    if found is None:
+        return fit(compiled, recordings, free=free)
+    return found
+
+
+def _data(
+    compiled: Compiled, recording: Recording, parameters: FloatArray, length_s: float | None, windows: Windows | None
+) -> _Data:
+    drive, good = drive_of(compiled.model, recording), np.isfinite(recording.y)
+    if good.sum() < 8:
+        raise InputError("fewer than 8 finite readings", where=recording.name, remedy="record longer")
+    if windows is None:
+        starts, stops = window_rows(recording.t, length_s)
+        windows = fitted_starts(compiled, parameters, drive, recording.y, good, starts, stops)
+    return _Data(drive=drive, y=recording.y, good=good, windows=windows)
+
+
+class _Descent:
+    """The iterate of one fit."""
+
+    def __init__(self, compiled: Compiled, data: Sequence[_Data], which: IntArray, z: FloatArray) -> None:
+        self._compiled, self._data, self._which, self._z = compiled, list(data), which, z
+        self._free_first = np.flatnonzero(~np.isfinite(given_starts(compiled)))
+        start = values_of(compiled, z)
+        scales = [state_scales(compiled, start, one.drive, one.windows.states[0]) for one in data]
+        self._scales = np.max(scales, axis=0)
+        self._damping = 1e-3
+        self._errors = self._simulated(z, [one.windows for one in data])
+        if self._errors is None:
+            raise InputError(
+                "the simulation runs away from every start", where=compiled.model.name,
+                remedy="check signs and units, or give horizon_s: an unstable plant is compared as forecasts",
+            )  # fmt: skip
+        self._sd = self._noise(self._errors)
+
+    def _simulated(self, z: FloatArray, windows: Sequence[Windows]) -> list[FloatArray] | None:
+        """Return reading less simulation at the rows that count, None where a run does not reach its end."""
+        found = []
+        for one, w in zip(self._data, windows, strict=True):
+            p = values_of(self._compiled, z)
+            run = simulate(self._compiled, p, one.drive, w.states, starts=w.starts, stops=w.stops)
+            error = (one.y - run.y)[one.good & _covered(one.y.size, w)]
+            if not np.all(np.isfinite(error)):
+                return None
+            found.append(error)
+        return found
+
+    @staticmethod
+    def _noise(errors: Sequence[FloatArray]) -> float:
+        return float(np.sqrt(np.mean(np.concatenate(list(errors)) ** 2))) + 1e-300
+
+    def _derivatives(self) -> list[tuple[FloatArray, list[tuple[FloatArray, IntArray, FloatArray]]]]:
+        """Return per recording J to z with the start states projected out, and per window what gives those back."""
+        z, compiled = self._z, self._compiled
+        p = values_of(compiled, z)
+        spread = np.array([q.spread for q in compiled.parameters])
+        per_z = np.where(compiled.parameter_vector == 0.0, spread, p * spread)
+        steps = STEP * np.maximum(np.abs(p), np.abs(per_z))
+        steps = np.where(steps > 0.0, steps, STEP)
+        found = []
+        for one in self._data:
+            s = sensitivities(
+                compiled, p, one.drive, one.windows, parameter_steps=steps, state_steps=STEP * self._scales,
+                which=self._which.tolist(),
+            )  # fmt: skip
+            found.append(self._projected(one, s, per_z))
+        return found
+
+    def _projected(
+        self, one: _Data, s: Sensitivities, per_z: FloatArray
+    ) -> tuple[FloatArray, list[tuple[FloatArray, IntArray, FloatArray]]]:
+        J = (s.to_parameters * per_z)[:, self._which]
+        X = s.to_states * self._scales
+        parts, back = [], []
+        for a, b in zip(one.windows.starts, one.windows.stops, strict=True):
+            rows = np.flatnonzero(one.good[a:b]) + a
+            free = self._free_first if a == 0 else np.arange(X.shape[1])
+            Q, R = np.linalg.qr(np.nan_to_num(X[rows][:, free]))
+            # a state that the window does not tell is left where it is
+            keep = np.abs(np.diag(R)) > 1e-6 * max(float(np.max(np.abs(np.diag(R)), initial=0.0)), 1e-300)
+            Q = Q[:, keep]
+            Jw = np.nan_to_num(J[rows])
+            parts.append(Jw - Q @ (Q.T @ Jw))
+            back.append((np.nan_to_num(X[rows][:, free]), free, Jw))
+        return np.vstack(parts), back
+
+    def step(self) -> bool:
+        """Take one step that lowers the penalised sum of squares; returns whether there was next to none to take."""
+        assert self._errors is not None
+        derivatives = self._derivatives()
+        J = np.vstack([part for part, _ in derivatives]) / self._sd
+        each = list(zip(self._data, (back for _, back in derivatives), self._errors, strict=True))
+        e = np.concatenate([_projected_error(back, error) for _, back, error in each])
+        z = self._z[self._which]
+        H, g = J.T @ J + np.eye(z.size), J.T @ (e / self._sd) - z
+        before = self._cost(self._errors, self._z)
+        for _ in range(12):
+            move = np.linalg.solve(H + self._damping * np.diag(np.diag(H)), g) if z.size else np.zeros(0)
+            new_z = self._z.copy()
+            new_z[self._which] += np.clip(move, -3.0, 3.0)
+            windows = [self._moved(one, back, error, new_z[self._which] - z) for one, back, error in each]
+            errors = self._simulated(new_z, windows)
+            after = np.inf if errors is None else self._cost(errors, new_z)
+            if errors is not None and after < before:
+                self._z, self._errors = new_z, errors
+                self._data = [replace(one, windows=w) for one, w in zip(self._data, windows, strict=True)]
+                self._damping = max(self._damping * 0.2, 1e-9)
+                self._sd = self._noise(errors)
+                return bool(before - after < _SMALL * before)
+            self._damping *= 10.0
+        return True
+
+    def _cost(self, errors: Sequence[FloatArray], z: FloatArray) -> float:
+        e = np.concatenate(list(errors)) / self._sd
+        return float(e @ e + z[self._which] @ z[self._which])
+
+    def _moved(
+        self, one: _Data, back: list[tuple[FloatArray, IntArray, FloatArray]], error: FloatArray, move: FloatArray
+    ) -> Windows:
+        """Return windows whose start states take up what the parameters' move leaves."""
+        states, at = one.windows.states.copy(), 0
+        for k, (X, free, J) in enumerate(back):
+            wanted = error[at : at + X.shape[0]] - J @ move
+            at += X.shape[0]
+            # a weak belief that the state is where it was keeps what the readings do not tell
+            H = X.T @ X + 1e-9 * np.eye(free.size) * max(float(np.trace(X.T @ X)), 1e-300)
+            H += self._damping * np.diag(np.diag(H))
+            states[k, free] += self._scales[free] * np.linalg.solve(H, X.T @ wanted)
+        return replace(one.windows, states=states)
+
+    def fitted(self, converged: bool) -> Fitted:
+        """Return what was found."""
+        compiled, p = self._compiled, values_of(self._compiled, self._z)
+        J = np.vstack([part for part, _ in self._derivatives()]) / self._sd
+        covariance = np.linalg.inv(J.T @ J + np.eye(self._which.size))
+        spread = np.array([q.spread for q in compiled.parameters])
+        per_z = np.where(compiled.parameter_vector == 0.0, spread, np.abs(p) * spread)
+        sd, whole = np.zeros(p.size), np.zeros((J.shape[0], p.size))
+        sd[self._which] = np.sqrt(np.diag(covariance)) * per_z[self._which]
+        whole[:, self._which] = J
+        simulated = tuple(
+            simulate(compiled, p, one.drive, one.windows.states, starts=one.windows.starts, stops=one.windows.stops).y
+            for one in self._data
+        )
+        residuals = tuple(np.where(one.good, one.y - y, np.nan) for one, y in zip(self._data, simulated, strict=True))
+        return Fitted(
+            compiled=compiled, parameters=p, sd=sd, z=self._z, windows=tuple(one.windows for one in self._data),
+            simulated=simulated, residuals=residuals, noise_sd=self._sd, jacobian=whole, converged=converged,
+        )  # fmt: skip
+
+
+def _covered(rows: int, windows: Windows) -> BoolArray:
+    covered = np.zeros(rows, dtype=bool)
+    for a, b in zip(windows.starts, windows.stops, strict=True):
+        covered[a:b] = True
+    return covered
+
+
+def _projected_error(back: list[tuple[FloatArray, IntArray, FloatArray]], error: FloatArray) -> FloatArray:
+    """Return the errors without what start states explain."""
+    parts, at = [], 0
+    for X, _, _ in back:
+        e = error[at : at + X.shape[0]]
+        at += X.shape[0]
+        Q, R = np.linalg.qr(X)
+        keep = np.abs(np.diag(R)) > 1e-6 * max(float(np.max(np.abs(np.diag(R)), initial=0.0)), 1e-300)
+        parts.append(e - Q[:, keep] @ (Q[:, keep].T @ e))
+    return np.concatenate(parts)

@@ -1,0 +1,80 @@
+"""Which combinations of parameters recordings determine, and which they do not: before anything is blamed.
+
+The sensitivity of the readings to the parameters, in units of the noise and of what is believed, start states
+projected out, has singular values s: along its right singular vector a recording narrows the belief from 1 to
+1/sqrt(1 + s^2). Where s is below 1, the recording says less than what was believed before.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from autotune.arrays import FloatArray
+from autotune.equations.fit import Fitted
+
+#: A parameter belongs to a combination where its share of the direction's length is at least this.
+_SHARE = 0.2
+
+
+@dataclass(frozen=True, kw_only=True)
+class Combination:
+    """A direction in the space of parameters.
+
+    Attributes
+    ----------
+    parameters : tuple of str
+        Those that move along it, the most first.
+    changes : tuple of float
+        Relative change of each while the first changes by 1 (absolute where a nominal value is 0).
+    narrowed : float
+        Standard deviation that is left along it, of what was believed: 1 where the recordings say nothing.
+    """
+
+    parameters: tuple[str, ...]
+    changes: tuple[float, ...]
+    narrowed: float
+
+    @property
+    def sentence(self) -> str:
+        """What it says to a reader."""
+        if len(self.parameters) == 1:
+            return f"the recordings do not determine {self.parameters[0]}"
+        moves = ", ".join(
+            f"{name} {100 * 0.1 * change:+.2g} %" for name, change in zip(self.parameters, self.changes, strict=True)
+        )
+        names = ", ".join(self.parameters)
+        return f"the recordings do not determine {names} apart: {moves} leaves the simulation as it is"
+
+
+def combinations(fitted: Fitted) -> list[Combination]:
+    """Return all directions of the parameters that were retuned, the least determined first."""
+    which = np.flatnonzero(np.any(fitted.jacobian != 0.0, axis=0) | _retuned(fitted))
+    if which.size == 0:
+        return []
+    J = fitted.jacobian[:, which]
+    values, vectors = np.linalg.eigh(J.T @ J)
+    parameters = [fitted.compiled.parameters[i] for i in which]
+    spread = np.array([p.spread for p in parameters])
+    found = []
+    for value, vector in zip(values, vectors.T, strict=True):
+        order = [i for i in np.argsort(-np.abs(vector)) if abs(vector[i]) >= _SHARE]
+        changes = (vector * spread)[order]
+        found.append(
+            Combination(
+                parameters=tuple(parameters[i].name for i in order),
+                changes=tuple(float(c) for c in changes / changes[0]),
+                narrowed=float(1.0 / np.sqrt(1.0 + max(value, 0.0))),
+            )
+        )
+    return found
+
+
+def undetermined(fitted: Fitted, narrowed: float = 0.5) -> list[Combination]:
+    """Return the combinations along which the recordings narrow the belief to no less than a share of it."""
+    return [one for one in combinations(fitted) if one.narrowed >= narrowed]
+
+
+def _retuned(fitted: Fitted) -> FloatArray:
+    return np.array([p.spread > 0.0 for p in fitted.compiled.parameters])

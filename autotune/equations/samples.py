@@ -1,0 +1,50 @@
+"""Effects on samples: what a held command becomes on its way, what a converter makes of readings."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+import numpy as np
+from numba import njit
+
+from autotune.arrays import FloatArray
+
+
+@njit(cache=True)
+def backlash(t: FloatArray, u: FloatArray, width: float) -> FloatArray:
+    """Return what follows u with a play of a width."""
+    w = np.empty_like(u)
+    now = u[0]
+    for k in range(u.size):
+        now = min(max(now, u[k] - 0.5 * width), u[k] + 0.5 * width)
+        w[k] = now
+    return w
+
+
+@njit(cache=True)
+def stiction(t: FloatArray, u: FloatArray, band: float) -> FloatArray:
+    """Return what stays until u is further away than a band, and then jumps to u."""
+    w = np.empty_like(u)
+    now = u[0]
+    for k in range(u.size):
+        if abs(u[k] - now) > band:
+            now = u[k]
+        w[k] = now
+    return w
+
+
+def quantised(values: FloatArray, step: float, origin: float = 0.0) -> FloatArray:
+    """Return values on a converter's steps; a step of 0 leaves them."""
+    return origin + step * np.floor((values - origin) / step + 0.5) if step > 0.0 else values
+
+
+def _converter(t: FloatArray, u: FloatArray, step: float) -> FloatArray:
+    return quantised(u, step)
+
+
+#: Effects on the held samples of an input: their parameters, and what they do.
+BEFORE: Mapping[str, tuple[tuple[str, ...], Callable[..., FloatArray]]] = {
+    "actuator.backlash": (("width",), backlash),
+    "actuator.stiction": (("band",), stiction),
+    "actuator.quantisation": (("step",), _converter),
+}

@@ -1,0 +1,177 @@
+"""Start states: rest under the first command at the first reading, then what fits a window's readings best."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from autotune.arrays import BoolArray, FloatArray, IntArray
+from autotune.equations.sensitivity import STEP, Windows, sensitivities
+from autotune.equations.simulate import Compiled, Drive, derivatives, simulate
+
+#: Rows that a start state is fitted to at least.
+LEAST = 30
+
+
+def given_starts(compiled: Compiled) -> FloatArray:
+    """Return the start value that the file states for each state, NaN where it is to be estimated, shape (n,)."""
+    known = {one.name: one.start for one in compiled.model.states}
+    values = [known.get(name) for name in compiled.states]
+    return np.array([np.nan if value is None else value for value in values], dtype=np.float64)
+
+
+def rest_state(compiled: Compiled, parameters: FloatArray, inputs: FloatArray, y: float) -> FloatArray:
+    """Return the state nearest to rest that reads y under inputs.
+
+    Parameters
+    ----------
+    compiled, parameters
+        The model.
+    inputs : (m,) array
+        What drives it.
+    y : float
+        The reading; NaN leaves it out.
+
+    Returns
+    -------
+    (n,) array
+        States that the file gives a start are left there.
+
+    Notes
+    -----
+    Least squares from a few starts; of several rests (a pendulum hangs or stands) the one nearest to zero is found.
+    """
+    given = given_starts(compiled)
+    free = np.flatnonzero(~np.isfinite(given))
+    base = np.where(np.isfinite(given), given, 0.0)
+    if free.size == 0:
+        return base
+    u = inputs[None, :]
+
+    def point(z: FloatArray) -> FloatArray:
+        x = base.copy()
+        x[free] = z
+        return x
+
+    def misses(z: FloatArray) -> FloatArray:
+        x = point(z)
+        slopes, outputs = derivatives(compiled, parameters, x[None, :], u)
+        off = outputs[0, 0] - y if np.isfinite(y) else 0.0
+        found = np.append(slopes[0], 1e3 * off)
+        return np.where(np.isfinite(found), np.clip(found, -1e12, 1e12), 1e12)
+
+    tries = [base[free], base[free] + (y if np.isfinite(y) else 1.0), base[free] + 1.0]
+    results = [least_squares(misses, z, x_scale=np.maximum(np.abs(z), 1.0), max_nfev=60) for z in tries]
+    best = min(results, key=lambda result: (round(float(np.log10(result.cost + 1e-12)), 1), float(result.x @ result.x)))
+    return point(np.asarray(best.x, dtype=np.float64))
+
+
+def state_scales(compiled: Compiled, parameters: FloatArray, drive: Drive, start: FloatArray) -> FloatArray:
+    """Return how large each state typically is, (n,): what a change of it is measured by."""
+    probe = np.linspace(0, drive.t.size - 1, min(drive.t.size, 400)).astype(np.int64)[:-1]
+    states = np.repeat(start[None, :], probe.size, axis=0)
+    run = simulate(compiled, parameters, drive, states, starts=probe, stops=probe + 1)
+    ends = run.ends[np.all(np.isfinite(run.ends), axis=1)]
+    whole = simulate(compiled, parameters, drive, start[None, :])
+    sizes = [np.abs(start), np.abs(whole.ends[0]) if whole.is_complete else np.zeros(start.size)]
+    if ends.size:
+        slopes = np.max(np.abs(ends - start), axis=0) / float(np.median(np.diff(drive.t)))
+        sizes.append(np.minimum(slopes, 1e6))
+    size = np.nanmax(np.array(sizes), axis=0)
+    return np.where(size > 1e-9, size, 1.0)
+
+
+def fitted_starts(
+    compiled: Compiled,
+    parameters: FloatArray,
+    drive: Drive,
+    y: FloatArray,
+    good: BoolArray,
+    starts: IntArray,
+    stops: IntArray,
+    *,
+    guess: FloatArray | None = None,
+    iterations: int = 8,
+    share: float = 0.1,
+) -> Windows:
+    """Find each window's start state: the previous window's end, then what fits its readings.
+
+    Parameters
+    ----------
+    compiled, parameters, drive
+        The model and what drives it.
+    y, good : (N,) arrays
+        Readings, and which of them count.
+    starts, stops : (W,) int arrays
+        The windows.
+    guess : (n,) array, optional
+        State to begin the first window from; rest by default.
+    iterations : int
+        Gauss-Newton steps per window.
+    share : float
+        Share of a window's rows that its start is fitted to, at least ``LEAST`` rows: wrong parameters lead the rest
+        astray.
+
+    Returns
+    -------
+    Windows
+        With their states.
+    """
+    given = given_starts(compiled)
+    first = int(starts[0])
+    reading = float(y[first:][good[first:]][0]) if good[first:].any() else float("nan")
+    x = rest_state(compiled, parameters, drive.inputs[max(first - 1, 0)], reading) if guess is None else guess
+    scales = state_scales(compiled, parameters, drive, x)
+    found = []
+    for k, (a, b) in enumerate(zip(starts, stops, strict=True)):
+        free = np.flatnonzero(~np.isfinite(given)) if a == 0 else np.arange(x.size)
+        until = min(max(int(a + share * (b - a)), a + LEAST), b)
+        window = Windows(starts=np.array([a]), stops=np.array([until]), states=x[None, :])
+        window = _fitted(compiled, parameters, drive, y, good, window, scales, free, iterations)
+        found.append(window.states[0])
+        if k + 1 < starts.size:
+            run = simulate(compiled, parameters, drive, window.states, starts=np.array([a]), stops=np.array([b]))
+            x = run.ends[0] if np.all(np.isfinite(run.ends)) else x
+    return Windows(starts=starts, stops=stops, states=np.array(found))
+
+
+def _fitted(
+    compiled: Compiled, parameters: FloatArray, drive: Drive, y: FloatArray, good: BoolArray, window: Windows,
+    scales: FloatArray, free: IntArray, iterations: int,
+) -> Windows:  # fmt: skip
+    """Return one window with the start state that fits its readings; what they do not tell stays as it was."""
+    if free.size == 0:
+        return window
+    a, b = int(window.starts[0]), int(window.stops[0])
+    rows = np.flatnonzero(good[a:b]) + a
+    no_steps = np.ones(parameters.size)
+    damping = 1e-6
+
+    def left(states: FloatArray) -> FloatArray:
+        run = simulate(compiled, parameters, drive, states, starts=window.starts, stops=window.stops)
+        return np.asarray(y[rows] - run.y[rows])
+
+    r = left(window.states)
+    for _ in range(iterations):
+        s = sensitivities(
+            compiled, parameters, drive, window, parameter_steps=no_steps, state_steps=STEP * scales, which=(),
+            which_states=free.tolist(),
+        )  # fmt: skip
+        J = s.to_states[rows][:, free] * scales[free]
+        if not np.all(np.isfinite(J)) or not np.all(np.isfinite(r)):
+            return window
+        H = J.T @ J
+        H += np.diag(damping * np.diag(H) + 1e-9 * float(np.trace(H)) + 1e-300)
+        states = window.states.copy()
+        states[0, free] += scales[free] * np.linalg.solve(H, J.T @ r)
+        new = left(states)
+        if not np.all(np.isfinite(new)) or new @ new > r @ r:
+            damping = max(damping, 1e-6) * 100.0
+            if damping > 1e6:
+                break
+            continue
+        small = r @ r - new @ new < 1e-6 * (r @ r)
+        window, r = Windows(starts=window.starts, stops=window.stops, states=states), new
+        if small:
+            break
+    return window

@@ -1,0 +1,99 @@
+"""Retuning of equations: the truth is found within its stated deviation, and what cannot be known is told."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from autotune.equations import Drive, EquationModel, combinations, compile_model, retune, simulate, undetermined
+from autotune.equations.forecast import forecast
+from autotune.equations.starts import rest_state
+from autotune.errors import InputError
+from autotune.recording import Recording
+from tests.autotune.equations.models import model, one_state
+
+
+def recorded(truth: EquationModel, seed: int, rows: int = 800, dt: float = 0.02, size: float = 0.6) -> Recording:
+    """Return a recording of a model with other parameters, from a start that nobody was told."""
+    rng = np.random.default_rng(seed)
+    t, u = np.arange(rows) * dt, np.repeat(rng.normal(0.0, size, -(-rows // 25)), 25)[:rows]
+    compiled = compile_model(truth)
+    start = 0.1 * rng.normal(size=(1, len(truth.states)))
+    y = simulate(compiled, compiled.parameter_vector, Drive(t=t, inputs=u[:, None]), start).y
+    return Recording(t=t, u=u, y=y + rng.normal(0.0, 0.003, rows), name=f"rec{seed}.csv")
+
+
+@pytest.fixture(scope="module")
+def pair() -> list[Recording]:
+    truth = model().with_parameters({"J": 0.06, "c": 0.03, "m": 0.55, "l": 0.29})
+    return [recorded(truth, 1), recorded(truth, 2)]
+
+
+def test_what_the_recordings_tell_is_found_within_its_deviation(pair: list[Recording]) -> None:
+    found = retune(compile_model(model()), pair)
+    J, c, m, length, g = found.parameters
+    # J, c and the product m l follow from the torque's scale; m and l apart do not
+    np.testing.assert_allclose([J, c, m * length], [0.06, 0.03, 0.55 * 0.29], rtol=0.01)
+    assert found.noise_sd == pytest.approx(0.003, rel=0.1)
+    assert g == 9.81
+    deviation = np.abs(found.parameters - [0.06, 0.03, 0.55, 0.29, 9.81]) / np.maximum(found.sd, 1e-12)
+    assert np.all(deviation < 4.0)
+
+
+def test_a_combination_that_is_not_determined_is_told(pair: list[Recording]) -> None:
+    found = retune(compile_model(model()), pair)
+    least = undetermined(found)
+    assert len(least) == 1
+    assert set(least[0].parameters) == {"m", "l"}
+    assert least[0].changes[0] * least[0].changes[1] < 0.0
+    assert all(one.narrowed < 0.1 for one in combinations(found)[1:])
+
+
+def test_a_fixed_parameter_stays_and_a_given_start_holds() -> None:
+    fixed = one_state("(K*u - x)/T", {"K": {"value": 2.0, "fixed": True}, "T": {"value": 1.0}})
+    truth = fixed.with_parameters({"T": 1.4})
+    found = retune(compile_model(fixed), [recorded(truth, 3)])
+    assert found.parameters[0] == 2.0
+    assert found.parameters[1] == pytest.approx(1.4, abs=4.0 * found.sd[1])
+
+
+def test_rest_is_where_nothing_moves_and_the_reading_fits() -> None:
+    compiled = compile_model(model())
+    rest = rest_state(compiled, compiled.parameter_vector, np.array([0.5]), float("nan"))
+    np.testing.assert_allclose(rest, [np.arcsin(0.5 / (0.5 * 9.81 * 0.3)), 0.0], atol=1e-5)
+
+
+def test_a_forecast_of_an_unstable_plant_stays_near_its_readings() -> None:
+    truth = one_state("x + u - x^3")
+    rec = recorded(truth, 4)
+    # its own states are known to the noise (0.003) in every window; a pole that is wrong by 0.1 adds 0.1 s of growth
+    for growth, error in (("x", 0.006), ("1.1*x", 0.04)):
+        windows = forecast(one_state(f"{growth} + u - x^3"), rec, 0.3)
+        assert np.sqrt(np.mean((windows - rec.y)[40:] ** 2)) < error
+
+
+def test_a_model_that_runs_away_from_every_start_is_refused() -> None:
+    rec = recorded(one_state("u - x"), 5)
+    with pytest.raises(InputError, match="runs away"):
+        forecast(one_state("x^3 + 1"), rec)
+
+
+def test_simulate_takes_equations(tmp_path: Path) -> None:
+    from typer.testing import CliRunner
+
+    from autotune.cli import app
+    from autotune.equations import write_equations
+    from autotune.recording import write_recording
+
+    write_equations(model(), tmp_path / "m.toml")
+    write_recording(recorded(model(), 6, rows=200), tmp_path / "rec.csv")
+    run = CliRunner().invoke(
+        app,
+        ["simulate", "--model", str(tmp_path / "m.toml"), str(tmp_path / "rec.csv"), "--out", str(tmp_path / "s.csv")],
+    )
+    assert run.exit_code == 0, run.output
+    y_sim = np.loadtxt(tmp_path / "s.csv", delimiter=",", skiprows=1)[:, 1]
+    y = np.loadtxt(tmp_path / "rec.csv", delimiter=",", skiprows=1)[:, 2]
+    assert np.std(y - y_sim) < 0.05
