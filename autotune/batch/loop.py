@@ -19,6 +19,7 @@ from autotune.design.margins import Margins, margins
 from autotune.diagnosis.diagnose import diagnose
 from autotune.diagnosis.result import Diagnosis
 from autotune.errors import AutotuneError, IdentificationError
+from autotune.experiment_design.next_experiment import with_next_experiment
 from autotune.identification.closed_loop.identify import identify_closed_loop
 from autotune.identification.frequency.recorded import FrequencyEstimate, combine, frequency_points
 from autotune.models import read_model
@@ -212,7 +213,7 @@ def _finding(work: Work, row: Row) -> Finding:
         notes="; ".join(record.notes),
     )
     if settings.task == "diagnose":
-        found = diagnose(read_model(loop.model), record.pieces, present)
+        found = with_next_experiment(diagnose(read_model(loop.model), record.pieces, present))
         return Finding(row=_diagnosed(row, found), result=found.as_json())
     points, notes = _points(record, settings, present)
     row = _with_notes(row, notes)

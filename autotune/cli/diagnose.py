@@ -31,7 +31,7 @@ def simulate(
     """Simulate a model with a recording's u; with --horizon as a forecast, window after window."""
     import numpy as np
 
-    from autotune.diagnosis.forecast import forecast
+    from autotune.diagnosis.simulation.forecast import forecast
     from autotune.equations import forecast as of_equations
     from autotune.equations.files import read_any_model
     from autotune.models import Model
@@ -76,7 +76,8 @@ def diagnose(
 
     from autotune.controller import read_controller
     from autotune.diagnosis.diagnose import diagnose as find
-    from autotune.diagnosis.simulation import entry_of
+    from autotune.diagnosis.effects import kind_of
+    from autotune.experiment_design.next_experiment import with_next_experiment
     from autotune.models import read_model, write_model
     from autotune.report.diagnosis_page import write_diagnosis_page
 
@@ -89,14 +90,16 @@ def diagnose(
     # many short products: waiting for each other costs linear algebra's threads more than they save
     with threadpool_limits(1), Progress(*columns, console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task("diagnosing", total=1.0)
-        found = find(
-            nominal,
-            data,
-            law,
-            without or (),
-            lambda what, share: progress.update(task, description=what, completed=share),
+        found = with_next_experiment(
+            find(
+                nominal,
+                data,
+                law,
+                without or (),
+                lambda what, share: progress.update(task, description=what, completed=share),
+            )
         )
-    equations = {effect.name: entry_of(effect.name).equation for effect in found.extended_model.effects}
+    equations = {effect.name: kind_of(effect.name).equation for effect in found.extended_model.effects}
     with place.filled() as folder:
         found.write(folder / "diagnosis.json")
         write_model(found.extended_model, folder / "extended_model.toml", equations)

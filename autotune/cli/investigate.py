@@ -12,7 +12,7 @@ from autotune.cli import app
 from autotune.cli.recordings import R, T, U, Y, read_all, signal_names
 
 if TYPE_CHECKING:
-    from autotune.diagnosis.investigate import Investigation
+    from autotune.pipeline.investigation import Investigation
 
 ROUNDS = "rounds.json"
 
@@ -46,8 +46,8 @@ def investigate(
     """Run the experiments that tell apart what a model may leave out, until one hypothesis is left."""
     from autotune.cli.common import ProgressBar, new_folder, rig_of
     from autotune.config import load_config
-    from autotune.diagnosis.investigate import investigate as find_out
     from autotune.models import read_model
+    from autotune.pipeline.investigation import investigate as find_out
 
     content = load_config(config)
     nominal = read_model(model)
@@ -73,7 +73,7 @@ def investigate(
 
 def _keep(known: Investigation, out: Path) -> None:
     """Write what is known so far; a later stop leaves it there."""
-    from autotune.diagnosis.simulation import entry_of
+    from autotune.diagnosis.effects import kind_of
     from autotune.models import write_model
     from autotune.report.investigation_page import write_investigation_page
 
@@ -82,6 +82,6 @@ def _keep(known: Investigation, out: Path) -> None:
     if found is None:
         return
     found.write(out / "diagnosis.json")
-    equations = {effect.name: entry_of(effect.name).equation for effect in found.extended_model.effects}
+    equations = {effect.name: kind_of(effect.name).equation for effect in found.extended_model.effects}
     write_model(found.extended_model, out / "extended_model.toml", equations)
     write_investigation_page(known, found, out / "report.html")

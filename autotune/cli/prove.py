@@ -114,8 +114,8 @@ def tie_resolved(out: Path, seed: int) -> dict[str, Any]:
         recording left nothing open, ``right_before`` and ``resolved``.
     """
     from autotune.config import load_config
-    from autotune.diagnosis.investigate import investigate
     from autotune.models import read_model
+    from autotune.pipeline.investigation import investigate
     from autotune.recording import read_recording
     from drivers.simulated import SimulatedRig
     from sim.ties import draw, write

@@ -114,7 +114,7 @@ def _configuration(config: Path | None, out: Path | None, resume: Path | None, d
 
 def _diagnosed(config: Config, tuning: Tuning, folder: Path, console: Console) -> Diagnosis | None:
     """Return what the fitted plant leaves out, its files written; None where the recordings do not allow it."""
-    from autotune.diagnosis.simulation import entry_of
+    from autotune.diagnosis.effects import kind_of
     from autotune.models import write_model
     from autotune.pipeline.folder import RESULT, VERIFICATION, recordings
     from autotune.pipeline.mismatch import diagnose_run
@@ -132,7 +132,7 @@ def _diagnosed(config: Config, tuning: Tuning, folder: Path, console: Console) -
     place = folder / "diagnosis"
     place.mkdir(exist_ok=True)
     found.write(place / "diagnosis.json")
-    equations = {effect.name: entry_of(effect.name).equation for effect in found.extended_model.effects}
+    equations = {effect.name: kind_of(effect.name).equation for effect in found.extended_model.effects}
     write_model(found.extended_model, place / "extended_model.toml", equations)
     write_diagnosis_page(found, place / "report.html")
     append_diagnosis(folder / RESULT, found)

@@ -10,9 +10,11 @@ from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
-from autotune.diagnosis.adequacy import Left
-from autotune.diagnosis.description import Description
-from autotune.diagnosis.selection import Search
+from autotune.diagnosis.evidence.adequacy import ResidualTests
+from autotune.diagnosis.evidence.description import Description
+from autotune.diagnosis.evidence.held_out import FitQuality
+from autotune.diagnosis.selection.probability import Candidate
+from autotune.diagnosis.selection.search import Search
 from autotune.models import Model, Parameter
 
 Verdict: TypeAlias = Literal["none", "parameters", "effect", "unexplained"]
@@ -28,6 +30,14 @@ class OperatingRange:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Offset:
+    """A shift of the operating point with its 1-sigma [u]."""
+
+    value: float
+    sd: float
+
+
+@dataclass(frozen=True, kw_only=True)
 class FoundEffect:
     """An effect that was added to the model."""
 
@@ -38,24 +48,6 @@ class FoundEffect:
     equation: str
     windows: tuple[tuple[int, float, float], ...]
     operating_range: OperatingRange | None = None
-
-
-@dataclass(frozen=True, kw_only=True)
-class Candidate:
-    """A rival with its probability."""
-
-    name: str
-    probability: float
-
-
-@dataclass(frozen=True, kw_only=True)
-class FitQuality:
-    """Errors on rows that were not fitted, divided by the spread of y."""
-
-    nominal: float
-    retuned: float
-    extended: float
-    noise_floor: float
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,7 +71,7 @@ class Diagnosis:
     effects : tuple of FoundEffect
         What was added to the model, the most important first.
     candidates : tuple of Candidate
-        Rivals.
+        Hypotheses with their probabilities.
     places : tuple of str
         Where the mismatch sits.
     fit : FitQuality
@@ -90,7 +82,7 @@ class Diagnosis:
         The model to go on with.
     sentences : tuple of str
         The finding in words.
-    left : Left
+    residual : ResidualTests
         What the chosen model leaves, and whether that is noise.
     description : Description, optional
         What is left of the residual as a function of the signals, where no effect of the catalogue explains it; not a
@@ -107,7 +99,7 @@ class Diagnosis:
     next_experiment: NextExperiment | None
     extended_model: Model
     sentences: tuple[str, ...]
-    left: Left
+    residual: ResidualTests
     description: Description | None
     search: Search
 
@@ -128,7 +120,7 @@ class Diagnosis:
                 "extended": self.fit.extended,
                 "noise_floor": self.fit.noise_floor,
             },
-            "left": self.left.as_json(),
+            "residual": self.residual.as_json(),
             "next_experiment": None
             if following is None
             else {

@@ -212,18 +212,14 @@ def run_test(
             loop.step(u_next)
         y, u = try_on_device(loop, loop.rig, law.controller, setpoint, load, tell)
         return (y - operating_y)[test.settle :], u[test.settle :]
-    y, u = np.full(count, np.nan), np.full(count, np.nan)
+    y, u = np.full(count, np.nan), np.empty(count)
     state = law.initial(u_hold, operating_y, operating_y)
-    start, k, before = loop.tick.slot, 0, -1
-    while (k := loop.tick.slot - start) < count:
+    for k in range(count):
         tick = loop.tick
         tell(k)
         y[k] = tick.y - operating_y if tick.usable else np.nan
-        for missed in range(before + 1, k + 1):  # the law's time goes on where samples were missed
-            u[missed], state = law.step(state, float(setpoint[k]), tick.y)
+        u[k], state = law.step(state, float(setpoint[k]), tick.y)
         loop.step(loop.nearest(u[k] + load[k]), extra={"r": float(setpoint[k])})
-        before = k
-    u[before + 1 :] = u[before]
     return y[test.settle :], u[test.settle :]
 
 

@@ -13,9 +13,10 @@ from scipy.signal import lfilter
 from autotune.config import Config
 from autotune.diagnosis.diagnose import diagnose
 from autotune.diagnosis.result import Diagnosis
-from autotune.diagnosis.selection import Report
+from autotune.diagnosis.selection.search import Progress
 from autotune.experiment.prediction import sampled
 from autotune.experiment.result import ExperimentResult
+from autotune.experiment_design.next_experiment import with_next_experiment
 from autotune.identification.parametric import PlantFit
 from autotune.models import Block, Model, Port, TransferFunction
 from autotune.recording import Recording, read_recording
@@ -86,7 +87,7 @@ def around_operating_point(recording: Recording) -> Recording | None:
 
 
 def diagnose_run(
-    config: Config, experiment: ExperimentResult, fit: PlantFit, files: Sequence[Path], report: Report
+    config: Config, experiment: ExperimentResult, fit: PlantFit, files: Sequence[Path], progress: Progress
 ) -> Diagnosis:
     """Find what the fitted plant leaves out of the run's recordings.
 
@@ -96,7 +97,7 @@ def diagnose_run(
         Of the run.
     files : sequence of Path
         Its recordings, sweep and verification.
-    report : callable
+    progress : callable
         Told what is being done and the share done, 0 to 1.
 
     Raises
@@ -107,4 +108,4 @@ def diagnose_run(
     read = [around_operating_point(read_recording(path)) for path in files]
     rows = [one for one in read if one is not None]
     u_rest = resting_command(rows[0], fit.plant, experiment.u_rest, config.operating_point.y)
-    return diagnose(fitted_model(config, fit, u_rest), rows, report=report)
+    return with_next_experiment(diagnose(fitted_model(config, fit, u_rest), rows, progress=progress))

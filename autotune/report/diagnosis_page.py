@@ -7,10 +7,9 @@ import os
 import numpy as np
 
 from autotune.controller import Controller
-from autotune.diagnosis.description import Curve, Description
+from autotune.diagnosis.evidence.description import Curve, Description
 from autotune.diagnosis.result import Diagnosis, FoundEffect
-from autotune.diagnosis.search import score
-from autotune.diagnosis.selection import merged
+from autotune.diagnosis.selection.hypothesis import merged, penalised
 from autotune.report.page import Figure, Page, Section, Table, Tone, write_page
 from autotune.report.screen_figures import curve_figure, screen_sections, trace_figures
 
@@ -131,12 +130,12 @@ def _fits(found: Diagnosis) -> Section:
 
 def _hypotheses(found: Diagnosis) -> Section:
     s = found.search
-    base = score(s.retuned)
+    base = penalised(s.retuned)
     # pruning and exchanging fit some combinations more than once
-    ranked = merged((*s.singles, *s.pairs, *s.triples), ())
+    ranked = merged((*s.singles, *s.pairs, *s.triples))
     table = Table(
         header=("hypothesis", "decrease of chi2, parameters paid for"),
-        rows=tuple((" + ".join(h.names), f"{base - score(h):.1f}") for h in ranked),
+        rows=tuple((" + ".join(h.names), f"{base - penalised(h):.1f}") for h in ranked),
     )
     odds = Table(
         header=("candidate", "probability"), rows=tuple((c.name, f"{c.probability:.3f}") for c in found.candidates)

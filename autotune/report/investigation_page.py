@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import os
 
-from autotune.diagnosis.investigate import Investigation
 from autotune.diagnosis.result import Diagnosis
+from autotune.pipeline.investigation import Investigation
 from autotune.report.diagnosis_page import write_diagnosis_page
 from autotune.report.page import Section, Table
 

@@ -6,9 +6,8 @@ import numpy as np
 
 from autotune.arrays import FloatArray
 from autotune.controller import Controller
-from autotune.diagnosis.description import Curve
-from autotune.diagnosis.result import Diagnosis
-from autotune.diagnosis.screens import (
+from autotune.diagnosis.evidence.description import Curve
+from autotune.diagnosis.evidence.screens import (
     LawScreen,
     Means,
     PeriodScreen,
@@ -23,6 +22,7 @@ from autotune.diagnosis.screens import (
     value_screen,
     window_screen,
 )
+from autotune.diagnosis.result import Diagnosis
 from autotune.report import chart as go
 from autotune.report.page import BLUE, GREEN, GREY, ORANGE, Figure, Section, Table, add_line, lines_figure, thinned
 

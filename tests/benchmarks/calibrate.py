@@ -23,11 +23,14 @@ from typing import Any
 
 import numpy as np
 
-from autotune.diagnosis import adequacy, judgement
-from autotune.diagnosis.adequacy import Left
-from autotune.diagnosis.constancy import Variation
-from autotune.diagnosis.diagnose import probability_of
-from autotune.diagnosis.result import Candidate, FitQuality
+from autotune.diagnosis import verdict
+from autotune.diagnosis.evidence import adequacy, held_out
+from autotune.diagnosis.evidence.adequacy import ResidualTests
+from autotune.diagnosis.evidence.constancy import Variation
+from autotune.diagnosis.evidence.held_out import FitQuality
+from autotune.diagnosis.findings import probability_of
+from autotune.diagnosis.selection import probability
+from autotune.diagnosis.selection.probability import Candidate
 from autotune.models import read_model
 from sim.proof import FIRST_PROOF_SEED, Campaign, conceal, diagnose
 from sim.score import calibration_error
@@ -83,7 +86,7 @@ class Shown:
     @property
     def excess(self) -> float:
         """Variance of what is left over the noise's, less what chance adds."""
-        return float(self.left["misfit"] - self.left["misfit_chance"])
+        return float(self.left["reduced_chi2"] - self.left["reduced_chi2_chance"])
 
     @property
     def slow(self) -> float:
@@ -103,7 +106,7 @@ def shown(campaign: Campaign, seed: int) -> Shown:
         nuisance=answer["nuisance"],
         verdict=said["verdict"],
         names=[e.name for e in read_model(folder / "extended_model.toml").effects if e.name not in known],
-        left=said["left"],
+        left=said["residual"],
         quality=FitQuality(**{key: said["fit"][key] for key in ("nominal", "retuned", "extended", "noise_floor")}),
         candidates=[(c["name"], c["probability"]) for c in said["candidates"]],
         stated=[(e["name"], e["probability"]) for e in said["effects"]],
@@ -118,10 +121,10 @@ def judged(row: Shown, constants: Mapping[str, float]) -> str:
     constant = varies < max(constants["INCONSTANT"], constants["OF_THE_GAINED"] * gained)
     adequate = white and constant and row.excess < bound
     if row.names:
-        most = judgement.dominates(row.quality, constants["DOMINANT"], constants["FAR_FROM_NOISE"])
+        most = held_out.dominates(row.quality, constants["DOMINANT"], constants["FAR_FROM_NOISE"])
         lesser = varies < constants["HALF_OF_THE_GAINED"] * gained
         return "named" if adequate or (most and lesser) else "abstained"
-    missing = not constant or (not adequate and row.left["misfit"] > constants["MISSING"])
+    missing = not constant or (not adequate and row.left["reduced_chi2"] > constants["MISSING"])
     return "abstained" if missing else "neither"
 
 
@@ -137,7 +140,7 @@ def counts(rows: Sequence[Shown], constants: Mapping[str, float]) -> tuple[int, 
 
 def at(row: Shown, temperature: float, unknown: float) -> list[tuple[str, float, bool]]:
     """Names put forward with their probabilities at another temperature and doubt, and whether each is right."""
-    power = judgement.TEMPERATURE / temperature
+    power = probability.TEMPERATURE / temperature
     known = {name: p**power for name, p in row.candidates if name != "unknown" and p > 0.0}
     total = sum(known.values()) * (1.0 + doubt(row, unknown))
     candidates = [Candidate(name=name, probability=w / total) for name, w in known.items()]
@@ -151,12 +154,12 @@ def at(row: Shown, temperature: float, unknown: float) -> list[tuple[str, float,
 
 
 def doubt(row: Shown, unknown: float) -> float:
-    """Weight of what is unknown, see :func:`autotune.diagnosis.judgement.doubt_of`."""
+    """Weight of what is unknown, see :func:`autotune.diagnosis.verdict.Evidence.unknown_odds`."""
     varies = Variation(gain=row.left["varies"]["chi2"], places=("plant",), what="", period_s=math.inf)
-    left = Left(varies=varies, **{key: value for key, value in row.left.items() if key != "varies"})
+    left = ResidualTests(varies=varies, **{key: value for key, value in row.left.items() if key != "varies"})
     if not left.is_noise:
-        return judgement.HALF_EXPLAINED if judgement.dominates(row.quality) and left.is_lesser else 1.0
-    return unknown + (1.0 - unknown) * (max(left.misfit - 1.0, 0.0) / (left.allowed - 1.0)) ** 4
+        return verdict.HALF_EXPLAINED if held_out.dominates(row.quality) and left.is_lesser else 1.0
+    return unknown + (1.0 - unknown) * (max(left.reduced_chi2 - 1.0, 0.0) / (left.allowed - 1.0)) ** 4
 
 
 def calibration(rows: Sequence[Shown], temperature: float, unknown: float) -> tuple[float, float, int, int, int]:
@@ -197,7 +200,9 @@ def main() -> None:
     kinds = ", ".join(f"{count} {kind}" for kind, count in sorted(Counter(r.kind for r in rows).items()))
     print(f"{len(rows)} cases diagnosed in {campaign.out}: {kinds}")
     chain = [r for r in rows if not OF_ROWS & {name for name, _ in r.stated if name not in r.nuisance}]
-    in_use = {name: float(getattr(judgement, name, None) or getattr(adequacy, name)) for name in GRIDS}
+    in_use = {
+        name: float(next(getattr(m, name) for m in (adequacy, held_out, verdict) if hasattr(m, name))) for name in GRIDS
+    }
     explained = sum(r.right and bool(r.names) for r in chain)
     print(f"{len(chain)} of them decided by adequacy, {explained} explained by the truth")
     print("  right refused / wrong accepted / clean alarmed, one constant moved at a time:")
@@ -206,7 +211,7 @@ def main() -> None:
         print(f"  {name:15s} {in_use[name]:g} in use;  {moved}")
     rows = [r for r in rows if r not in chain or judged(r, in_use) == "named"]
     print("  log loss / expected error / wrong of those at p >= 0.95, of what is named with the bounds in use:")
-    T, unknown = judgement.TEMPERATURE, judgement.UNKNOWN
+    T, unknown = probability.TEMPERATURE, verdict.UNKNOWN
     for name, value, tried in (
         ("TEMPERATURE", T, [(t, t, unknown) for t in TEMPERATURES]),
         ("UNKNOWN", unknown, [(d, T, d) for d in DOUBTS]),
@@ -223,7 +228,5 @@ def main() -> None:
     strict = in_use | {"DOMINANT": math.inf}
     half = [r for r in rows if r.verdict == "effect" and judged(r, strict) == "abstained"]
     halves = [ok for r in half for name, _, ok in at(r, T, unknown) if name not in OF_ROWS]
-    print(
-        f"  HALF_EXPLAINED  {judgement.HALF_EXPLAINED:g} in use; right of those named without being adequate:", end=" "
-    )
+    print(f"  HALF_EXPLAINED  {verdict.HALF_EXPLAINED:g} in use; right of those named without being adequate:", end=" ")
     print(f"{sum(halves)}/{len(halves)}")

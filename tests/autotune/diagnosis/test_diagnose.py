@@ -11,10 +11,11 @@ from typer.testing import CliRunner
 
 from autotune.cli import app
 from autotune.diagnosis.diagnose import diagnose
-from autotune.diagnosis.fitting import fit
-from autotune.diagnosis.forecast import forecast
-from autotune.diagnosis.retuning import prepare
-from autotune.diagnosis.samples import inspect
+from autotune.diagnosis.evidence.samples import inspect
+from autotune.diagnosis.fitting.fit import fit
+from autotune.diagnosis.fitting.retuning import prepare
+from autotune.diagnosis.simulation.forecast import forecast
+from autotune.experiment_design import with_next_experiment
 from autotune.models import Block, Model, Port, TransferFunction, read_model
 from autotune.recording import Recording, read_recording
 
@@ -117,7 +118,8 @@ def test_a_clean_practice_case_needs_nothing(shared: Path, tmp_path: Path) -> No
 
 def test_a_lag_is_named_with_all_the_places_it_may_sit(shared: Path) -> None:
     case = shared / "practice_cases" / "case_009"
-    found = diagnose(read_model(case / "model.toml"), [read_recording(case / f"rec{k}.csv") for k in (1, 2)])
+    recordings = [read_recording(case / f"rec{k}.csv") for k in (1, 2)]
+    found = with_next_experiment(diagnose(read_model(case / "model.toml"), recordings))
     assert found.effects[0].name in ("actuator.lag", "sensor.lag")
     assert {"actuator", "sensor"} <= set(found.places)
     assert found.next_experiment is not None

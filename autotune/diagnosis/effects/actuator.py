@@ -1,0 +1,326 @@
+"""Effects of the actuator, in the order in which a command passes them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from autotune.arrays import FloatArray
+from autotune.diagnosis.effects.base import (
+    ACTUATOR_LAG,
+    Blocks,
+    EffectKind,
+    Line,
+    LinearPart,
+    Memory,
+    Quantity,
+    Scan,
+    SignalSizes,
+    Values,
+)
+from autotune.models import Block, TransferFunction
+
+_LJUNG = "Ljung, System Identification, 2nd ed., sec. 5.1"
+_ASTROM = "Astrom and Hagglund, Advanced PID Control, 2006, ch. 9"
+#: A limit that nothing reaches.
+NEVER = 1e18
+#: Steps of a converter that are tried, as shares of the standard deviation of u; how closely, as a share of a line's
+#: width over u; lines that are looked at, and followed.
+_STEPS_TRIED, _LINE_SHARE, _LINES_TRIED, _LINES_KEPT = (0.02, 3.0), 0.3, 24, 2
+#: Bands of stiction that are tried: the smallest and the largest as a share of the command's size, count.
+_BANDS_TRIED = (0.002, 0.6, 75)
+
+
+def limit_starts(low: float, high: float, cuts: tuple[float, ...]) -> list[tuple[float, ...]]:
+    """Return starts for two limits: the upper alone, the lower alone, both; one that does not act lies far outside."""
+    span = high - low
+    far = (low - 10.0 * span, high + 10.0 * span)
+    starts: list[tuple[float, ...]] = []
+    for c in cuts:
+        inner = (low + c * span, high - c * span)
+        starts += [(far[0], inner[1]), (inner[0], far[1]), inner]
+    return starts
+
+
+def converted(u: float, step: float, origin: float) -> float:
+    """Return a converter's level for a command."""
+    return origin + step * math.floor((u - origin) / step + 0.5)
+
+
+def _steps_over_command(scan: Scan) -> list[tuple[float, ...]]:
+    """Return the best lattice of levels: lines of the residual over u, then around them.
+
+    A converter adds a saw-tooth of u, whose period is its step: its fundamental is a line of the influence's
+    periodogram over the command, as a periodic load's is one over time. The origin is the level nearest to the middle
+    of u, so that a small error of the step does not move the levels away.
+    """
+    u, influence = scan.influence()
+    middle, spread, span = float(np.median(u)), float(np.std(u)), float(np.ptp(u))
+    if spread == 0.0:
+        return []
+    smallest, largest = _STEPS_TRIED
+    per_step = np.arange(1.0 / (largest * spread), 1.0 / (smallest * spread), _LINE_SHARE / span)
+    values, where = np.unique(u - middle, return_inverse=True)
+    weights = np.bincount(where, influence)
+    lines = np.array([weights @ np.exp(2j * np.pi * f * values) for f in per_step])
+    power = np.abs(lines)
+    inner = np.flatnonzero((power >= np.append(power[1:], 0.0)) & (power >= np.append(0.0, power[:-1])))
+    best_lines = inner[np.argsort(-power[inner])][:_LINES_TRIED]
+
+    def tried(levels: list[tuple[float, float]]) -> list[tuple[float, tuple[float, ...]]]:
+        found = scan.predicted([(step, middle + step * phase) for step, phase in levels])
+        return sorted(found, key=lambda one: -one[0])
+
+    # round(x) - x = -sin(2 pi x)/pi + ...: where the line's phase puts the fall through zero there is a level
+    turns = (np.angle(lines) / (2.0 * np.pi) + 0.25 + 0.5) % 1.0 - 0.5
+    best = tried([(1.0 / per_step[i], turns[i]) for i in best_lines])[:_LINES_KEPT]
+    width, turn = _LINE_SHARE, 0.1
+    for _ in range(4):
+        near = []
+        for _, (step, origin) in best:
+            phase = (origin - middle) / step
+            beside = [step / (1.0 + i * width * step / span) for i in (-1, 0, 1)]
+            near += [(h, phase + turn * k) for i, h in enumerate(beside) for k in (-1, 0, 1) if i != 1 or k]
+        best = sorted((*best, *tried(near)), key=lambda one: -one[0])[:_LINES_KEPT]
+        width, turn = 0.5 * width, 0.5 * turn
+    return [best[0][1]] if best and best[0][0] > 0.0 else []
+
+
+def _levels_around(values: Values, span: float, wide: float, turn: float) -> list[Values]:
+    """Return a converter's steps and origins around; ``wide`` moves the last level within the span by that share."""
+    step, origin = values["step"], values["origin"]
+    return [
+        {"step": step * (1.0 + i * wide * step / max(span, step)), "origin": origin + k * turn * step}
+        for i in (-1, 0, 1)
+        for k in (-1, 0, 1)
+        if i or k
+    ]
+
+
+def followed(w: float, width: float, held: float) -> tuple[float, float]:
+    """Return the far side of a play, and where it stays."""
+    half = 0.5 * width
+    held = min(max(held, w - half), w + half)
+    return held, held
+
+
+def stuck(w: float, band: float, slip: float, held: float) -> tuple[float, float]:
+    """Return a sticking valve's position, and where it stays; it jumps to w, or to ``slip`` - ``band`` short of it."""
+    if abs(w - held) > band:
+        held = w - math.copysign(band - slip, w - held) if slip >= 0.0 else w
+    return held, held
+
+
+def _bands(scan: Scan) -> list[tuple[float, ...]]:
+    """Return the best bands of a valve that sticks: every band moves other jumps, so peaks are narrow."""
+
+    def tried(bands: FloatArray) -> list[tuple[float, tuple[float, ...]]]:
+        return sorted(scan.predicted([(float(band),) for band in bands]), key=lambda one: -one[0])
+
+    low, high, count = _BANDS_TRIED
+    best = tried(scan.sizes.w * np.geomspace(low, high, count))[:3]
+    ratio = (high / low) ** (1.0 / (count - 1))
+    for _ in range(2):
+        around = np.concatenate([band * ratio ** np.array([-0.6, -0.3, 0.3, 0.6]) for _, (band,) in best])
+        best = sorted((*best, *tried(around)), key=lambda one: -one[0])[:2]
+        ratio **= 0.3
+    return [values for decrease, values in best if decrease > 0.0]
+
+
+def without_zone(w: float, half_width: float) -> float:
+    """Return what a dead zone lets through."""
+    return w - min(max(w, -half_width), half_width)
+
+
+def curved(w: float, second_order: float, third_order: float) -> float:
+    """Return a command through a bent characteristic."""
+    w += second_order * w * w
+    w += third_order * w * w * w
+    return w
+
+
+def limited(w: float, offset: float, low: float, high: float) -> float:
+    """Return a command within absolute limits."""
+    return min(max(w, low - offset), high - offset)
+
+
+def slewed(w: float, dt: float, rate: float, before: float) -> tuple[float, float]:
+    """Return the mean of a rate-limited command over a sub-step, and its end."""
+    reach = rate * dt
+    end = before + min(max(w - before, -reach), reach)
+    return 0.5 * (before + end), end
+
+
+def drifted(w: float, t: float, rate: float) -> float:
+    """Return a command whose gain drifts."""
+    return w * (1.0 + rate * t)
+
+
+def with_lag(blocks: Blocks, values: Values) -> Blocks:
+    """Put a lag before the chain."""
+    lag = TransferFunction(num=(1.0,), den=(max(values["time_constant"], 1e-12), 1.0))
+    return (Block(name="added lag", place="actuator", dynamics=lag), *blocks)
+
+
+def _with_time_constant(blocks: Blocks, time_constant: float) -> Blocks:
+    """Give the first actuator lag a time constant, or put one in front."""
+    for i, block in enumerate(blocks):
+        if block.place == "actuator" and len(block.dynamics.den) == 2 and block.dynamics.den[1] != 0.0:
+            gain = block.dynamics.num[-1] / block.dynamics.den[1]
+            lag = TransferFunction(num=(gain,), den=(time_constant, 1.0), delay_s=block.dynamics.delay_s)
+            return (*blocks[:i], replace(block, dynamics=lag), *blocks[i + 1 :])
+    return with_lag(blocks, {"time_constant": time_constant})
+
+
+def _last_commands(u: FloatArray, y: FloatArray, values: Values) -> FloatArray:
+    """Return an added lag at rest with the command before each window."""
+    return u[:, None]
+
+
+def _asymmetric_starts(s: SignalSizes) -> list[tuple[float, ...]]:
+    return [(a * s.lag_s, b * s.lag_s) for a, b in ((0.05, 0.1), (0.1, 0.05), (0.15, 0.4), (0.4, 0.15))]
+
+
+ACTUATOR = (
+    EffectKind(
+        name="actuator.quantisation",
+        equation="w = origin + step round((u - origin) / step)",
+        parameters=(
+            Quantity(name="step", unit="{u}", role="threshold", nonzero=True),
+            Quantity(name="origin", unit="{u}", role="location", sign="real", neutral=0.0),
+        ),
+        lines=(Line(stage="converter", does=converted),),
+        search=_steps_over_command,
+        lasting=True,
+        moves=_levels_around,
+        nudge=0.06,
+        confusable=("actuator.stiction",),
+        reference=_ASTROM,
+    ),
+    EffectKind(
+        name="actuator.backlash",
+        equation="w follows u - u0 with a play of the given width",
+        parameters=(Quantity(name="width", unit="{u}", role="amplitude"),),
+        lines=(Line(stage="command", does=followed),),
+        memory=Memory(name="held", replayed=True),
+        starts=lambda s: [(c * s.w,) for c in (0.05, 0.2, 0.5)],
+        nudge=0.06,
+        confusable=("actuator.stiction", "timing.dead_time"),
+        reference="Nordin and Gutman, Automatica 38, 2002",
+    ),
+    EffectKind(
+        name="actuator.stiction",
+        equation="w stays until |u - w| > band, then jumps to u",
+        parameters=(
+            Quantity(name="band", unit="{u}", role="threshold"),
+            # where it is not negative the valve jumps that far instead of all the way
+            Quantity(name="slip", unit="{u}", role="shape", sign="real", neutral=-1.0),
+        ),
+        lines=(Line(stage="command", does=stuck),),
+        memory=Memory(name="held", replayed=True),
+        search=_bands,
+        lasting=True,
+        nudge=0.02,  # its local minima are narrow
+        confusable=("actuator.backlash", "actuator.quantisation"),
+        reference="Stenman, Gustafsson and Forsman, Int. J. Adapt. Control 17, 2003",
+    ),
+    EffectKind(
+        name="actuator.dead_zone",
+        equation="w = 0 for |u - u0| < half_width, else u - u0 -+ half_width",
+        parameters=(Quantity(name="half_width", unit="{u}", role="amplitude"),),
+        lines=(Line(stage="command", does=without_zone),),
+        starts=lambda s: [(c * s.w,) for c in (0.01, 0.04, 0.12, 0.3)],
+        nudge=0.06,
+        confusable=("plant.coulomb_friction", "actuator.nonlinear_gain"),
+        reference=_ASTROM,
+    ),
+    EffectKind(
+        name="actuator.nonlinear_gain",
+        equation="w = (u - u0) + second_order (u - u0)^2 + third_order (u - u0)^3",
+        parameters=(
+            Quantity(name="second_order", unit="1/{u}", role="amplitude", sign="real", neutral=0.0),
+            Quantity(name="third_order", unit="1/{u}^2", role="amplitude", sign="real", neutral=0.0),
+        ),
+        lines=(Line(stage="command", does=curved),),
+        starts=lambda s: [(0.05 / s.w, 1e-3 / s.w**2), (1e-3 / s.w, 0.05 / s.w**2)],
+        confusable=("actuator.saturation", "sensor.nonlinear_gain"),
+        reference=_LJUNG,
+    ),
+    EffectKind(
+        name="actuator.saturation",
+        equation="w = min(max(u, low), high)",
+        parameters=(
+            Quantity(name="low", unit="{u}", role="limit", sign="real", neutral=-NEVER),
+            Quantity(name="high", unit="{u}", role="limit", sign="real", neutral=NEVER),
+        ),
+        lines=(Line(stage="command", does=limited),),
+        starts=lambda s: limit_starts(s.w_low, s.w_high, (0.05, 0.15, 0.3)),
+        confusable=("actuator.nonlinear_gain", "actuator.rate_limit"),
+        reference=_ASTROM,
+    ),
+    EffectKind(
+        name="actuator.rate_limit",
+        equation="|dw/dt| <= rate",
+        parameters=(Quantity(name="rate", unit="{u}/s", role="threshold"),),
+        lines=(Line(stage="command", does=slewed),),
+        memory=Memory(name="before"),
+        sub_steps=4,
+        starts=lambda s: [(s.w / (c * s.lag_s),) for c in (0.03, 0.06, 0.1, 0.16, 0.25, 0.4, 0.6, 1.0, 1.5)],
+        confusable=("actuator.lag",),
+        reference=_ASTROM,
+    ),
+    EffectKind(
+        name="actuator.gain_drift",
+        equation="w = (u - u0) (1 + rate t)",
+        parameters=(Quantity(name="rate", unit="1/s", role="amplitude", sign="real"),),
+        lines=(Line(stage="command", does=drifted),),
+        starts=lambda s: [(0.01 / s.duration_s,)],
+        confusable=("environment.drifting_load", "sensor.drift"),
+        places=("actuator", "plant"),
+        reference=_LJUNG,
+    ),
+    EffectKind(
+        name="actuator.lag",
+        equation="time_constant dw/dt = u - w",
+        parameters=(Quantity(name="time_constant", unit="s", role="amplitude"),),
+        linear=LinearPart(blocks=with_lag, states=1, at="front", start=_last_commands),
+        starts=lambda s: [(c * s.lag_s,) for c in (0.05, 0.25)],
+        confusable=("timing.dead_time", "actuator.rate_limit"),
+        same=("sensor.lag",),
+        places=("actuator", "sensor", "plant"),
+        reference=_LJUNG,
+    ),
+    EffectKind(
+        name="actuator.asymmetric_lag",
+        equation="the actuator's lag is time_constant_up when rising, time_constant_down when falling",
+        parameters=(
+            Quantity(name="time_constant_up", unit="s", role="time"),
+            Quantity(name="time_constant_down", unit="s", role="time"),
+        ),
+        linear=LinearPart(
+            blocks=lambda blocks, values: _with_time_constant(blocks, values["time_constant_up"]),
+            falling=lambda blocks, values: _with_time_constant(blocks, values["time_constant_down"]),
+            states=1,
+            at="front",
+            unless_lagged=True,
+            start=_last_commands,
+        ),
+        sub_steps=2,
+        needs=ACTUATOR_LAG,
+        starts=_asymmetric_starts,
+        confusable=("actuator.lag", "actuator.nonlinear_gain"),
+        reference=_LJUNG,
+    ),
+    EffectKind(
+        name="actuator.offset",
+        equation="w = u - u0 + offset",
+        parameters=(Quantity(name="offset", unit="{u}", role="amplitude", sign="real"),),
+        linear=LinearPart(u_offset=lambda values: -values["offset"]),
+        sought="operating point",
+        same=("environment.step_load",),
+        places=("actuator", "environment", "plant"),
+        reference=_ASTROM,
+    ),
+)

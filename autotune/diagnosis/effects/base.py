@@ -1,0 +1,456 @@
+"""What is known of one effect, in one record: equation, parameters, compiled lines, linear part, searches, source.
+
+An effect acts in one or both of two ways. A *line* is a small plain function of scalars that is put into the compiled
+simulation at a stage (:data:`STAGES`); its arguments are taken by their names: signals of the stage, the effect's own
+parameters, its memory. A *linear part* changes the blocks of the chain. What is incomplete is
+refused when the package is imported, see :mod:`autotune.diagnosis.effects.checks`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, Protocol, TypeAlias
+
+from autotune.arrays import FloatArray
+from autotune.models import Block, Model, Parameter
+
+#: What a parameter is to a search.
+#: ``amplitude``: the effect is about proportional to it, so that a first-order look tells its size.
+#: ``limit``: acts where a signal reaches it; where none did it goes back to its neutral value.
+#: ``threshold``, ``time``, ``shape``: found by fits from several starts.
+#: ``location``: no derivative tells it; a direct search sets it, and it counts as a free number.
+#: ``mark``: says where the effect acts (a recording's number); set by a direct search, counts nothing, is not shown.
+#: ``observed``: read off the samples, never simulated.
+Role: TypeAlias = Literal["amplitude", "limit", "threshold", "time", "shape", "location", "mark", "observed"]
+Sign: TypeAlias = Literal["positive", "real"]
+#: Where an effect is looked for: among hypotheses that are fitted; as a structure that is fitted beside them and is no
+#: effect; in the operating point that every fit has; in the samples; in the residual; in the recomputed law.
+Sought: TypeAlias = Literal["hypothesis", "structure", "operating point", "samples", "residual", "law"]
+Values: TypeAlias = Mapping[str, float]
+Blocks: TypeAlias = tuple[Block, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Quantity:
+    """A parameter of an effect.
+
+    Attributes
+    ----------
+    name : str
+        Its name in files.
+    unit : str
+        Unit, with ``{u}``, ``{f}``, ``{v}``, ``{y}`` for the command's, the plant input's, the speed's and the
+        measurement's.
+    role : str
+        What it is to a search, see :data:`Role`.
+    sign : {"positive", "real"}
+        Whether it is searched on a logarithmic or a linear scale.
+    neutral : float, optional
+        Value with which it does nothing, taken where a model does not give it; without one it must be given.
+    nonzero : bool
+        Whether the effect's equation divides by it: a value that is not above zero is refused.
+    size_with : tuple of str
+        Parameters that have one size together, as the two parts of a sinusoid: one of them may be near zero.
+    turns : bool
+        Whether it acts by the angle that it adds up until a recording's end: the longer the recording, the smaller are
+        the steps in which it is searched.
+    """
+
+    name: str
+    unit: str
+    role: Role
+    sign: Sign = "positive"
+    neutral: float | None = None
+    nonzero: bool = False
+    size_with: tuple[str, ...] = ()
+    turns: bool = False
+
+    @property
+    def is_time_of_change(self) -> bool:
+        """Whether it is the time at which something changes."""
+        return self.role == "location" and self.unit == "s"
+
+    @property
+    def is_fitted(self) -> bool:
+        """Whether a fit moves it; else a direct search has set it."""
+        return self.role not in ("location", "mark", "observed")
+
+
+@dataclass(frozen=True, kw_only=True)
+class SignalSizes:
+    """Sizes of the signals in the recordings, from which starting values follow.
+
+    Attributes
+    ----------
+    w, f, v, x, y : float
+        Largest deviation of command, plant input, speed, position (or level) and reading from the operating point.
+    w_low, w_high, y_low, y_high, x_offset : float
+        Extremes of command and reading, and the reading at the operating point.
+    f_peak : float
+        Largest plant input.
+    gain : float
+        From plant input to speed or level.
+    lag_s, dt_s, duration_s : float
+        Dominant time constant, sample time, and length of the longest recording.
+    levels : int
+        Number of levels one above the other, 0 where the plant has a speed.
+    """
+
+    w: float
+    f: float
+    v: float
+    x: float
+    y: float
+    w_low: float
+    w_high: float
+    y_low: float
+    y_high: float
+    x_offset: float
+    f_peak: float
+    gain: float
+    lag_s: float
+    dt_s: float
+    duration_s: float
+    levels: int
+
+
+class Chain(Protocol):
+    """What an effect may ask of the linear chain that it is put into."""
+
+    @property
+    def is_mechanical(self) -> bool:
+        """Whether the plant has a speed and a position."""
+
+    @property
+    def is_integrating(self) -> bool:
+        """Whether the chain has a pole at the origin."""
+
+    @property
+    def has_actuator_lag(self) -> bool:
+        """Whether an actuator's first-order lag stands before the plant."""
+
+    @property
+    def has_position_state(self) -> bool:
+        """Whether the position or level is itself a state."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Structure:
+    """A property that a chain must have, with what is said where it has not."""
+
+    holds: Callable[[Chain], bool]
+    otherwise: str
+
+
+ANY = Structure(holds=lambda chain: True, otherwise="")
+MECHANICAL = Structure(
+    holds=lambda chain: chain.is_mechanical, otherwise="friction, drag and stiffness need a speed and a position"
+)
+LEVEL = Structure(
+    holds=lambda chain: not chain.is_mechanical and not chain.is_integrating,
+    otherwise="it needs a plant that settles at a level",
+)
+INTEGRATING = Structure(holds=lambda chain: chain.is_integrating, otherwise="it needs a plant that integrates")
+POSITION_STATE = Structure(
+    holds=lambda chain: chain.has_position_state, otherwise="a hard stop needs a position that is a state"
+)
+ACTUATOR_LAG = Structure(
+    holds=lambda chain: chain.has_actuator_lag, otherwise="an asymmetric lag needs an actuator of first order"
+)
+
+StageName: TypeAlias = Literal[
+    "clock", "converter", "command", "load", "force", "travel", "friction", "outflow", "stop", "sensor", "reading"
+]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stage:
+    """A place of the compiled simulation where lines act.
+
+    Attributes
+    ----------
+    value : tuple of str
+        What passes through and comes back changed; empty where contributions are added up.
+    signals : tuple of str
+        What a line may ask for besides.
+    is_force : bool
+        Whether it acts at the plant within a sub-step.
+    """
+
+    value: tuple[str, ...] = ()
+    signals: tuple[str, ...] = ()
+    is_force: bool = False
+
+
+#: The stages in the order in which a sample passes them. ``t`` counts from the recording's first row [s].
+STAGES: Mapping[StageName, Stage] = {
+    # when a command acts: time since the first row, in and out
+    "clock": Stage(value=("elapsed",)),
+    # the absolute command
+    "converter": Stage(value=("u",), signals=("t",)),
+    # the command from the operating point on; ``offset`` is the command there
+    "command": Stage(value=("w",), signals=("offset", "dt", "t")),
+    # forces at the plant's input that no state changes; ``number`` is the recording's
+    "load": Stage(signals=("t", "number"), is_force=True),
+    # forces that go with plant input w, speed v, position or level x, first level, gain from force to speed or level;
+    # ``kelvin`` is the absolute temperature at the operating point, were y one
+    "force": Stage(signals=("w", "v", "x", "level", "y_offset", "gain", "kelvin"), is_force=True),
+    # what is remembered of a travel dx of the position, after every sub-step's first trial
+    "travel": Stage(signals=("dx", "dt"), is_force=True),
+    # level of a dry friction, which at most stops the motion
+    "friction": Stage(signals=("v",), is_force=True),
+    # what is added at the input of the plant's last block, whose gain is ``gain_last``
+    "outflow": Stage(signals=("x", "level", "gain_last"), is_force=True),
+    # position and speed after a sub-step; ``y_offset`` is the reading at position 0
+    "stop": Stage(value=("x", "v"), signals=("y_offset",)),
+    # the last block's output
+    "sensor": Stage(value=("z",), signals=("t",)),
+    # the absolute reading
+    "reading": Stage(value=("y",), signals=("t",)),
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Line:
+    """A function of the compiled simulation: scalars in, the stage's value or contribution out.
+
+    Its source is copied into the generated simulation: it may use ``math`` and functions of its own file. Where the
+    effect has a memory the function may take it by its name; in a stage with a value it then returns value and memory,
+    in ``travel`` the memory alone.
+    """
+
+    stage: StageName
+    does: Callable[..., Any]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Memory:
+    """What an effect keeps from one sub-step to the next.
+
+    Attributes
+    ----------
+    name : str
+        The lines' argument.
+    start : {"command", "zero"}
+        What it is where a window begins that follows no other: the command in force there, or 0.
+    replayed : bool
+        Whether it remembers every command before the window, as a play does.
+    """
+
+    name: str
+    start: Literal["command", "zero"] = "command"
+    replayed: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class LinearPart:
+    """What an effect makes of the chain itself.
+
+    Attributes
+    ----------
+    blocks : callable
+        The chain's blocks with the effect in them.
+    falling : callable, optional
+        The blocks that act while the command falls; what rises follows ``blocks``.
+    u_offset : callable, optional
+        What is added to the command's operating point.
+    states : int
+        States that it adds, ``at`` the chain's front or back.
+    unless_lagged : bool
+        Whether it adds none where an actuator's lag is there already.
+    start : callable, optional
+        Start states of those, (W, states), for windows with commands before them and linear outputs, (W,) each.
+    """
+
+    blocks: Callable[[Blocks, Values], Blocks] | None = None
+    falling: Callable[[Blocks, Values], Blocks] | None = None
+    u_offset: Callable[[Values], float] | None = None
+    states: int = 0
+    at: Literal["front", "back"] = "back"
+    unless_lagged: bool = False
+    start: Callable[[FloatArray, FloatArray, Values], FloatArray] | None = None
+
+
+class Scan(Protocol):
+    """What a direct search for starting values may look at: the recordings under a fit without the effect."""
+
+    @property
+    def sizes(self) -> SignalSizes:
+        """Sizes of the signals."""
+
+    @property
+    def durations_s(self) -> Sequence[float]:
+        """Length of every recording [s]."""
+
+    @property
+    def slowest_lag_s(self) -> float:
+        """Slowest time constant of the nominal chain [s]."""
+
+    def predicted(self, values: Sequence[tuple[float, ...]]) -> list[tuple[float, tuple[float, ...]]]:
+        """Return the decrease of chi-square that the first order predicts for the effect with each set of values.
+
+        Beside it stand the values with their amplitudes made as small as the first order needs them.
+        """
+
+    def together(self, values: Sequence[tuple[float, ...]]) -> tuple[float, FloatArray]:
+        """Return the decrease that sets of values predict together, and the factor of each of them."""
+
+    def lines_over_time(self) -> tuple[FloatArray, FloatArray]:
+        """Return frequencies [Hz] and the residual's power there, all recordings in one phase."""
+
+    def influence(self) -> tuple[FloatArray, FloatArray]:
+        """Return the commands, and how chi-square would fall with more of each."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fitted:
+    """What a fit made of an effect, beside what the recordings resolve.
+
+    Attributes
+    ----------
+    values : mapping
+        Its parameters.
+    travelled : float
+        Span of the positions or levels.
+    noise_sd : float
+        Standard deviation of the measurement noise.
+    mechanical : bool
+        Whether the plant has a speed and a position.
+    """
+
+    values: Values
+    travelled: float
+    noise_sd: float
+    mechanical: bool
+
+
+Starts: TypeAlias = Callable[[SignalSizes], list[tuple[float, ...]]]
+
+
+def no_starts(sizes: SignalSizes) -> list[tuple[float, ...]]:
+    """Return no starting value: a direct search finds them, or nothing is fitted."""
+    return []
+
+
+@dataclass(frozen=True, kw_only=True)
+class EffectKind:
+    """An effect that may be missing in a model, with all that is known of it.
+
+    Attributes
+    ----------
+    name : str
+        PLACE.EFFECT.
+    equation : str
+        What it does, for people.
+    parameters : tuple of Quantity
+        Its parameters.
+    reference : str
+        Where the equation is from.
+    sought : str
+        Where it is looked for, see :data:`Sought`.
+    lines : tuple of Line
+        What it does in the compiled simulation. Kinds act in the order in which their place's file lists them.
+    memory : Memory, optional
+        What its lines keep from step to step.
+    linear : LinearPart, optional
+        What it makes of the chain.
+    sub_steps : int
+        Sub-steps per sample that it needs at least.
+    needs, suits : Structure
+        Chain that it can be simulated in, and that a search tries it on.
+    possible : callable, optional
+        Given values and model; returns what is wrong with them, or "".
+    starts : callable
+        Starting values for a fit, from the sizes of the signals.
+    search : callable, optional
+        Starting values by direct search, see :class:`Scan`.
+    lasting : bool
+        Whether that search is long and its result hardly depends on what else is fitted: it is made once.
+    moves : callable, optional
+        Given values, the span of the commands, and two shares; returns values around them that no derivative leads to.
+    nudge : float
+        Shift of the amplitudes' logarithm that brings a fit out of the local minima that thresholds make; 0 for a
+        smooth criterion.
+    impacts : bool
+        Whether it makes the plant hit something: after an impact no first order tells anything, the least change of any
+        number shows, and start states are found anew.
+    stand_in : callable, optional
+        Whether a fit came to where it is a simpler effect by this one's name.
+    acts_in : callable, optional
+        Recording (-1 for all) and time from which it acts; always and everywhere by default.
+    readable : callable, optional
+        Its parameters as people name them.
+    steps : bool
+        Whether it makes steps of the readings that no derivative of a start state leads through.
+    excludes : tuple of str
+        Effects that are not looked for where this one is seen in the samples.
+    confusable : tuple of str
+        Effects that can look alike.
+    same : tuple of str
+        Effects that cannot be told apart from it with command and measurement alone; itself not counted. Drifts of
+        load and sensor are the same on a chain that settles; on others one of them simply explains nothing.
+    places : tuple of str
+        Where it may sit, several where command and measurement cannot say; its own by default.
+    """
+
+    name: str
+    equation: str
+    parameters: tuple[Quantity, ...]
+    reference: str
+    sought: Sought = "hypothesis"
+    lines: tuple[Line, ...] = ()
+    memory: Memory | None = None
+    linear: LinearPart | None = None
+    sub_steps: int = 1
+    needs: Structure = ANY
+    suits: Structure = ANY
+    possible: Callable[[Values, Model], str] | None = None
+    starts: Starts = no_starts
+    search: Callable[[Scan], list[tuple[float, ...]]] | None = None
+    lasting: bool = False
+    moves: Callable[[Values, float, float, float], list[Values]] | None = None
+    nudge: float = 0.0
+    impacts: bool = False
+    stand_in: Callable[[Fitted], bool] | None = None
+    acts_in: Callable[[Values], tuple[int, float]] | None = None
+    readable: Callable[[Mapping[str, Parameter]], dict[str, Parameter]] | None = None
+    steps: bool = False
+    excludes: tuple[str, ...] = ()
+    confusable: tuple[str, ...] = ()
+    same: tuple[str, ...] = ()
+    places: tuple[str, ...] = ()
+
+    @property
+    def place(self) -> str:
+        """The place in the effect's name."""
+        return self.name.partition(".")[0]
+
+    @property
+    def may_sit(self) -> tuple[str, ...]:
+        """Places where it may sit."""
+        return self.places or (self.place,)
+
+    @property
+    def is_simulated(self) -> bool:
+        """Whether a simulation can have it."""
+        return bool(self.lines) or self.linear is not None
+
+    @property
+    def is_rough(self) -> bool:
+        """Whether thresholds make the criterion rough."""
+        return self.nudge > 0.0
+
+    @property
+    def is_signed(self) -> bool:
+        """Whether it may act in either direction: a number that is fitted has either sign."""
+        return any(q.sign == "real" for q in self.parameters if q.is_fitted)
+
+    @property
+    def amplitudes(self) -> frozenset[str]:
+        """Parameters that it is about proportional to."""
+        return frozenset(q.name for q in self.parameters if q.role == "amplitude")
+
+    def quantity(self, name: str) -> Quantity | None:
+        """Return a parameter by its name."""
+        return next((q for q in self.parameters if q.name == name), None)

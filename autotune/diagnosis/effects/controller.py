@@ -1,0 +1,19 @@
+"""The effect of the controller: a law other than the stated one."""
+
+from __future__ import annotations
+
+from autotune.diagnosis.effects.base import EffectKind, Quantity
+
+CONTROLLER = (
+    EffectKind(
+        name="controller.law",
+        equation="u recomputed from r and y by the stated law differs from the recorded u",
+        parameters=(
+            Quantity(name="gain_factor", unit="-", role="observed"),
+            Quantity(name="T_I_factor", unit="-", role="observed"),
+            Quantity(name="T_d_factor", unit="-", role="observed"),
+        ),
+        sought="law",
+        reference="Astrom and Hagglund, Advanced PID Control, 2006, ch. 3",
+    ),
+)

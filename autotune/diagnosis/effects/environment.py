@@ -1,0 +1,153 @@
+"""Effects of the environment: loads at the plant's input that no state of the rig changes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+
+from autotune.diagnosis.effects.actuator import NEVER
+from autotune.diagnosis.effects.base import EffectKind, Line, Quantity, Scan, Values
+from autotune.models import Parameter
+
+_ASTROM = "Astrom and Hagglund, Advanced PID Control, 2006, ch. 4"
+_PLACES = ("environment", "actuator", "plant")
+#: Size of a load that is tried, as a share of the plant's largest input.
+_TRIED = 0.02
+#: Candidate times of a step per recording.
+_STEP_TIMES = 16
+#: Lines of the residual at which a periodic load is tried; steps in which its frequency is searched around each, in
+#: units of one over the longest recording's duration.
+_LINES, _RESOLVED = 3, 0.1
+#: Highest frequency at which a load is looked for: as a share of the sampling rate, and times the slowest lag.
+_FASTEST_SAMPLED, _FASTEST_LAGGED = 0.2, 10.0
+
+
+def stepped(t: float, number: float, amplitude: float, time: float, end: float, recording: float) -> float:
+    """Return a load that stands from a time on, in one recording, or in all (-1)."""
+    return amplitude if (recording < 0.0 or number == recording) and time <= t < end else 0.0
+
+
+def swinging(t: float, in_phase: float, quadrature: float, frequency: float) -> float:
+    """Return a sinusoidal load."""
+    angle = 2.0 * math.pi * frequency * t
+    return in_phase * math.sin(angle) + quadrature * math.cos(angle)
+
+
+def growing(t: float, rate: float) -> float:
+    """Return a load that drifts."""
+    return rate * t
+
+
+def _step_times(scan: Scan) -> list[tuple[float, ...]]:
+    """Return the best step load: its time is searched on a grid, then around the best.
+
+    It comes in one of the recordings, or in all at the same time (number -1), as a test that is repeated brings it.
+    """
+    size = _TRIED * scan.sizes.f_peak or 1.0
+
+    def best_of(times: list[tuple[int, float]]) -> tuple[float, tuple[float, ...]]:
+        return max(scan.predicted([(size, t, NEVER, float(i)) for i, t in times]), key=lambda one: one[0])
+
+    grid, step = [], 0.0
+    for i, duration in enumerate(scan.durations_s):
+        step = duration / (_STEP_TIMES + 1)
+        grid += [(i, step * (k + 1)) for k in range(_STEP_TIMES)]
+    if len(scan.durations_s) > 1:
+        grid += [(-1, step * (k + 1)) for k in range(_STEP_TIMES)]
+    best = best_of(grid)
+    for _ in range(3):
+        _, at, _, number = best[1]
+        step /= 3.0
+        closer = best_of([(int(number), at + k * step) for k in (-2, -1, 1, 2)])
+        if closer[0] > best[0]:
+            best = closer
+    return [best[1]] if best[0] > 0.0 else []
+
+
+def _swings(scan: Scan) -> list[tuple[float, ...]]:
+    """Return periodic loads at the strongest lines of the residual; far above the plant's corner no load shows."""
+    duration = max(scan.durations_s)
+    frequencies, power = scan.lines_over_time()
+    highest = min(_FASTEST_SAMPLED / scan.sizes.dt_s, _FASTEST_LAGGED / scan.slowest_lag_s)
+    use = (frequencies >= 1.0 / duration) & (frequencies <= highest)
+    frequencies, power = frequencies[use], power[use]
+    if frequencies.size < 3:
+        return []
+    inner = np.flatnonzero((power[1:-1] >= power[:-2]) & (power[1:-1] >= power[2:])) + 1
+    lines = inner[np.argsort(-power[inner])][:_LINES]
+    size = _TRIED * scan.sizes.f_peak or 1.0
+
+    def sinusoid(frequency: float) -> tuple[float, tuple[float, ...]]:
+        decrease, parts = scan.together([(size, 0.0, frequency), (0.0, size, frequency)])
+        return decrease, (float(size * parts[0]), float(size * parts[1]), frequency)
+
+    # the load's own frequency lies beside the residual's line: within a tenth of what the recordings resolve
+    near = [[float(frequencies[line]) + k * _RESOLVED / duration for k in range(-2, 3)] for line in lines]
+    return [max((sinusoid(f) for f in group), key=lambda found: found[0])[1] for group in near]
+
+
+def _acts_in(values: Values) -> tuple[int, float]:
+    return int(values["recording"]), values["time"]
+
+
+def _as_amplitude(parameters: Mapping[str, Parameter]) -> dict[str, Parameter]:
+    """Return a sinusoid's two parts as amplitude and phase."""
+    shown = dict(parameters)
+    a, b = shown.pop("in_phase"), shown.pop("quadrature")
+    size = math.hypot(a.value, b.value)
+    sd = math.hypot(a.value * a.sd, b.value * b.sd) / size if size else math.nan
+    shown["amplitude"] = Parameter(value=size, sd=sd, unit=a.unit)
+    shown["phase"] = Parameter(value=math.atan2(b.value, a.value), unit="rad")
+    return shown
+
+
+ENVIRONMENT = (
+    EffectKind(
+        name="environment.step_load",
+        equation="force + amplitude from the time on",
+        parameters=(
+            Quantity(name="amplitude", unit="{f}", role="amplitude", sign="real"),
+            Quantity(name="time", unit="s", role="location", sign="real", neutral=0.0),
+            Quantity(name="end", unit="s", role="mark", sign="real", neutral=math.inf),
+            Quantity(name="recording", unit="", role="mark", sign="real", neutral=-1.0),
+        ),
+        lines=(Line(stage="load", does=stepped),),
+        search=_step_times,
+        acts_in=_acts_in,
+        confusable=("actuator.offset", "environment.drifting_load"),
+        places=_PLACES,
+        reference=_ASTROM,
+    ),
+    EffectKind(
+        name="environment.periodic_load",
+        equation="force + amplitude sin(2 pi frequency t + phase)",
+        parameters=(
+            Quantity(
+                name="in_phase", unit="{f}", role="amplitude", sign="real", neutral=0.0, size_with=("quadrature",)
+            ),
+            Quantity(
+                name="quadrature", unit="{f}", role="amplitude", sign="real", neutral=0.0, size_with=("in_phase",)
+            ),
+            Quantity(name="frequency", unit="Hz", role="time", turns=True),
+        ),
+        lines=(Line(stage="load", does=swinging),),
+        search=_swings,
+        readable=_as_amplitude,
+        confusable=("plant.sine_torque",),
+        places=_PLACES,
+        reference=_ASTROM,
+    ),
+    EffectKind(
+        name="environment.drifting_load",
+        equation="force + rate t",
+        parameters=(Quantity(name="rate", unit="{f}/s", role="amplitude", sign="real"),),
+        lines=(Line(stage="load", does=growing),),
+        starts=lambda s: [(0.01 * s.f / s.duration_s,)],
+        confusable=("actuator.gain_drift",),
+        same=("sensor.drift",),
+        places=_PLACES,
+        reference=_ASTROM,
+    ),
+)

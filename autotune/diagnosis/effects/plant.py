@@ -1,0 +1,326 @@
+"""Effects of the plant: forces at its input, dry friction, stops, and modes that its chain lacks."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from autotune.arrays import FloatArray
+from autotune.diagnosis.effects.actuator import NEVER, limit_starts
+from autotune.diagnosis.effects.base import (
+    INTEGRATING,
+    LEVEL,
+    MECHANICAL,
+    POSITION_STATE,
+    Blocks,
+    EffectKind,
+    Fitted,
+    Line,
+    LinearPart,
+    Memory,
+    Quantity,
+    SignalSizes,
+    Values,
+)
+from autotune.models import Block, Model, TransferFunction
+
+_OLSSON = "Olsson, Astrom, Canudas de Wit, Gafvert and Lischinsky, Eur. J. Control 4, 1998"
+_KHALIL = "Khalil, Nonlinear Systems, 3rd ed., ch. 1"
+#: 0 degrees Celsius [K].
+_ICE = 273.15
+
+
+def dry(v: float, level: float) -> float:
+    """Return the level of a friction that does not depend on speed."""
+    return level
+
+
+def dropping(v: float, level: float, breakaway: float, stribeck_speed: float) -> float:
+    """Return the level of a friction that falls from breakaway as the speed grows."""
+    ratio = v / stribeck_speed
+    return level + (breakaway - level) * math.exp(-ratio * ratio)
+
+
+def dragged(v: float, gain: float, coefficient: float) -> float:
+    """Return a drag as a force at the plant's input."""
+    return -(coefficient * v * abs(v) / gain)
+
+
+def hardened(x: float, coefficient: float) -> float:
+    """Return the force of a spring that grows with the cube of the travel."""
+    return -(coefficient * x * x * x)
+
+
+def weighed(w: float, x: float, slope: float) -> float:
+    """Return what a gain over position adds to the plant's input."""
+    return slope * x * w
+
+
+def cogging(x: float, y_offset: float, amplitude: float, period: float, phase: float) -> float:
+    """Return a force that is periodic in position."""
+    return -(amplitude * math.sin(2.0 * math.pi * (x + y_offset) / period + phase))
+
+
+def held_back(turned: float, amplitude: float) -> float:
+    """Return the force of a hysteresis."""
+    return -(amplitude * turned)
+
+
+def turn(dx: float, width: float, turned: float) -> float:
+    """Return how far a hysteresis has turned after a travel."""
+    travel = dx / width
+    return min(max(turned + travel - abs(travel) * turned, -1.0), 1.0)
+
+
+def radiated(x: float, gain: float, kelvin: float, coefficient: float) -> float:
+    """Return what the fourth power adds to the linear loss that the plant's own lag stands for."""
+    return -(coefficient * ((kelvin + x) ** 4 - kelvin**4 - 4.0 * kelvin**3 * x) / gain)
+
+
+def leaked(x: float, gain: float, rate: float) -> float:
+    """Return a leak as a force at the plant's input."""
+    return -(rate * x / gain)
+
+
+def _excess(x: float, level: float) -> float:
+    """Return x - q(x) for q(x) = 2 X0 (sqrt(1 + x/X0) - 1): what a square-root outflow lacks against a linear one."""
+    return x - 2.0 * level * (math.sqrt(max(1.0 + x / level, 0.0)) - 1.0)
+
+
+def outflow(level: float, gain: float, operating_level: float) -> float:
+    """Return what the first level's outflow lacks, as a force at the plant's input."""
+    return _excess(level, operating_level) / gain
+
+
+def lower_outflow(x: float, level: float, gain_last: float, operating_level: float, operating_level_2: float) -> float:
+    """Return the same for a lower tank: it gets the upper one's true outflow and gives a square-root one itself."""
+    if operating_level_2 <= 0.0:
+        return 0.0
+    return _excess(x, operating_level_2) / gain_last - _excess(level, operating_level)
+
+
+def stopped(x: float, v: float, y_offset: float, low: float, high: float) -> tuple[float, float]:
+    """Hold the position inside hard stops; an impact on a stop is inelastic."""
+    if x > high - y_offset:
+        x = high - y_offset
+        v = min(v, 0.0)
+    if x < low - y_offset:
+        x = low - y_offset
+        v = max(v, 0.0)
+    return x, v
+
+
+def _kelvin(values: Values, model: Model) -> str:
+    """Say what is wrong with an operating temperature."""
+    zero = model.output.offset + (_ICE if "c" in model.output.unit.lower() else 0.0)
+    return "" if zero > 0.0 else "radiation needs a positive absolute temperature"
+
+
+def _is_friction_or_spring(fitted: Fitted) -> bool:
+    """Whether a servo's hysteresis turns within the noise, as Coulomb friction does, or never, as a spring."""
+    width = fitted.values["width"]
+    return width > fitted.travelled or (fitted.mechanical and 0.0 < width < fitted.noise_sd)
+
+
+def _is_slope(fitted: Fitted) -> bool:
+    """Whether not one period of a load periodic in position was travelled."""
+    return fitted.values["period"] > fitted.travelled
+
+
+def _with_resonance(blocks: Blocks, values: Values) -> Blocks:
+    omega = 2.0 * math.pi * values["frequency"]
+    den = (1.0 / omega**2, 2.0 * values["damping"] / omega, 1.0)
+    mode = Block(name="resonance", place="sensor", dynamics=TransferFunction(num=(1.0,), den=den))
+    return (*blocks, mode)
+
+
+def _resting_mode(u: FloatArray, y: FloatArray, values: Values) -> FloatArray:
+    omega = 2.0 * np.pi * values["frequency"]
+    return np.column_stack([y / omega**2, 0.0 * y])
+
+
+def _with_slow_mode(blocks: Blocks, values: Values) -> Blocks:
+    T, share = values["time_constant"], values["share"]
+    lag = TransferFunction(num=((1.0 - share) * T, 1.0), den=(T, 1.0))
+    return (*blocks, Block(name="slow mode", place="sensor", dynamics=lag))
+
+
+def _peaks(s: SignalSizes) -> list[tuple[float, ...]]:
+    """Return frequencies so close that a narrow peak, which is found from near it alone, is found."""
+    spread = (1.3 * 1.3**i for i in range(12))
+    return [(c / (6.28 * s.lag_s), 0.08) for c in spread if c * s.dt_s < 1.5 * s.lag_s]
+
+
+PLANT = (
+    EffectKind(
+        name="plant.coulomb_friction",
+        equation="force = -level sign(speed), sticking at rest",
+        parameters=(Quantity(name="level", unit="{f}", role="amplitude"),),
+        lines=(Line(stage="friction", does=dry),),
+        sub_steps=2,
+        needs=MECHANICAL,
+        suits=MECHANICAL,
+        starts=lambda s: [(c * s.f,) for c in (0.003, 0.015, 0.06, 0.2)],
+        nudge=0.06,
+        confusable=("plant.stribeck_friction", "actuator.dead_zone", "plant.quadratic_drag"),
+        reference=_OLSSON,
+    ),
+    EffectKind(
+        name="plant.stribeck_friction",
+        equation="force = -(level + (breakaway - level) exp(-(v/stribeck_speed)^2)) sign(v)",
+        parameters=(
+            Quantity(name="level", unit="{f}", role="amplitude"),
+            Quantity(name="breakaway", unit="{f}", role="amplitude"),
+            Quantity(name="stribeck_speed", unit="{v}", role="shape", nonzero=True),
+        ),
+        lines=(Line(stage="friction", does=dropping),),
+        sub_steps=2,
+        needs=MECHANICAL,
+        suits=MECHANICAL,
+        starts=lambda s: [(c * s.f, 2.0 * c * s.f, d * s.v) for c in (0.02, 0.1) for d in (0.05, 0.2)],
+        nudge=0.06,
+        confusable=("plant.coulomb_friction",),
+        reference=_OLSSON,
+    ),
+    EffectKind(
+        name="plant.quadratic_drag",
+        equation="tau dv/dt = -v - coefficient v |v| + gain w",
+        parameters=(Quantity(name="coefficient", unit="1/({v})", role="amplitude"),),
+        lines=(Line(stage="force", does=dragged),),
+        needs=MECHANICAL,
+        suits=MECHANICAL,
+        starts=lambda s: [(0.05 / s.v,), (0.5 / s.v,)],
+        confusable=("plant.coulomb_friction", "actuator.nonlinear_gain"),
+        reference=_KHALIL,
+    ),
+    EffectKind(
+        name="plant.cubic_stiffness",
+        equation="force = -coefficient x^3",
+        parameters=(Quantity(name="coefficient", unit="{f}/{y}^3", role="amplitude", sign="real"),),
+        lines=(Line(stage="force", does=hardened),),
+        needs=MECHANICAL,
+        suits=MECHANICAL,
+        starts=lambda s: [(0.02 * s.f / s.x**3,), (0.3 * s.f / s.x**3,)],
+        confusable=("plant.leak", "plant.position_dependent_gain"),
+        reference="Wigren and Schoukens, Three free data sets, ECC 2013",
+    ),
+    EffectKind(
+        name="plant.position_dependent_gain",
+        equation="w -> w (1 + slope x)",
+        parameters=(Quantity(name="slope", unit="1/{y}", role="amplitude", sign="real"),),
+        lines=(Line(stage="force", does=weighed),),
+        starts=lambda s: [(0.02 / s.x,), (-0.02 / s.x,)],
+        confusable=("plant.leak", "actuator.nonlinear_gain", "sensor.nonlinear_gain"),
+        reference=_KHALIL,
+    ),
+    EffectKind(
+        name="plant.hard_stop",
+        equation="the position is held at a stop, impacts are inelastic",
+        parameters=(
+            Quantity(name="low", unit="{y}", role="limit", sign="real", neutral=-NEVER),
+            Quantity(name="high", unit="{y}", role="limit", sign="real", neutral=NEVER),
+        ),
+        lines=(Line(stage="stop", does=stopped),),
+        sub_steps=2,
+        needs=POSITION_STATE,
+        # readings at a stop lie around it: it is beyond all but the farthest
+        starts=lambda s: limit_starts(s.y_low, s.y_high, (-0.005, 0.02, 0.1)),
+        impacts=True,
+        confusable=("sensor.saturation",),
+        reference=_KHALIL,
+    ),
+    EffectKind(
+        name="plant.sqrt_outflow",
+        equation="outflow 2 X0 (sqrt(1 + x/X0) - 1) in place of x",
+        parameters=(
+            Quantity(name="operating_level", unit="{y}", role="shape", nonzero=True),
+            # of a lower tank, where there are two one above the other
+            Quantity(name="operating_level_2", unit="{y}", role="shape", neutral=0.0, nonzero=True),
+        ),
+        lines=(Line(stage="force", does=outflow), Line(stage="outflow", does=lower_outflow)),
+        suits=LEVEL,
+        starts=lambda s: [(c * s.x,) * (2 if s.levels == 2 else 1) for c in (1.5, 6.0)],
+        confusable=("actuator.nonlinear_gain", "sensor.nonlinear_gain", "plant.radiation_loss"),
+        reference="Torricelli; Wigren and Schoukens, Three free data sets, ECC 2013",
+    ),
+    EffectKind(
+        name="plant.resonance",
+        equation="times omega^2 / (s^2 + 2 damping omega s + omega^2)",
+        parameters=(
+            Quantity(name="frequency", unit="Hz", role="time"),
+            Quantity(name="damping", unit="", role="shape"),
+        ),
+        linear=LinearPart(blocks=_with_resonance, states=2, start=_resting_mode),
+        starts=_peaks,
+        confusable=("sensor.lag", "timing.dead_time"),
+        places=("plant", "sensor"),
+        reference=_KHALIL,
+    ),
+    EffectKind(
+        name="plant.hysteresis",
+        equation="force = -amplitude z, dz/dt = (dx/dt - |dx/dt| z)/width",
+        parameters=(
+            Quantity(name="amplitude", unit="{f}", role="amplitude"),
+            Quantity(name="width", unit="{y}", role="shape", nonzero=True),
+        ),
+        lines=(Line(stage="force", does=held_back), Line(stage="travel", does=turn)),
+        memory=Memory(name="turned", start="zero"),
+        starts=lambda s: [(0.05 * s.f, c * s.x) for c in (0.05, 0.3)],
+        nudge=0.06,
+        stand_in=_is_friction_or_spring,
+        confusable=("plant.coulomb_friction", "actuator.backlash"),
+        reference="Dahl, AIAA J. 14, 1976; Bouc and Wen with exponent 1",
+    ),
+    EffectKind(
+        name="plant.radiation_loss",
+        equation="tau dx/dt = -x - coefficient (T^4 - T0^4 - 4 T0^3 x) + gain w, T = T0 + x absolute",
+        parameters=(Quantity(name="coefficient", unit="1/K^3", role="amplitude"),),
+        lines=(Line(stage="force", does=radiated),),
+        suits=LEVEL,
+        possible=_kelvin,
+        starts=lambda s: [(c / (s.x_offset + _ICE) ** 3,) for c in (0.02, 0.3)],
+        confusable=("plant.sqrt_outflow", "actuator.nonlinear_gain", "sensor.nonlinear_gain"),
+        reference="Stefan and Boltzmann",
+    ),
+    EffectKind(
+        name="plant.leak",
+        equation="force = -rate x / gain: the plant loses what it has stored",
+        parameters=(Quantity(name="rate", unit="{v}/({y})", role="amplitude", sign="real"),),
+        lines=(Line(stage="force", does=leaked),),
+        suits=INTEGRATING,
+        starts=lambda s: [(0.02 * abs(s.f * s.gain) / s.x,)],
+        confusable=("plant.position_dependent_gain", "plant.cubic_stiffness"),
+        reference=_KHALIL,
+    ),
+    EffectKind(
+        name="plant.sine_torque",
+        equation="force = -amplitude sin(2 pi x / period + phase)",
+        parameters=(
+            Quantity(name="amplitude", unit="{f}", role="amplitude", sign="real"),
+            Quantity(name="period", unit="{y}", role="shape", nonzero=True),
+            Quantity(name="phase", unit="rad", role="shape", sign="real", neutral=0.0),
+        ),
+        lines=(Line(stage="force", does=cogging),),
+        suits=MECHANICAL,
+        starts=lambda s: [(0.05 * s.f, p, a) for p in (0.3 * 1.25**i * s.x for i in range(13)) for a in (0.0, 1.57)],
+        stand_in=_is_slope,
+        confusable=("plant.cubic_stiffness",),
+        reference=_KHALIL,
+    ),
+    EffectKind(
+        name="plant.slow_mode",
+        equation="times ((1 - share) time_constant s + 1) / (time_constant s + 1)",
+        parameters=(
+            Quantity(name="share", unit="", role="amplitude", sign="real"),
+            Quantity(name="time_constant", unit="s", role="time"),
+        ),
+        linear=LinearPart(blocks=_with_slow_mode, states=1, start=lambda u, y, values: (values["share"] * y)[:, None]),
+        sought="structure",
+        suits=LEVEL,
+        starts=lambda s: [(0.03, c * s.lag_s) for c in (2.5, 8.0)],
+        confusable=("plant.hysteresis", "environment.step_load", "environment.drifting_load"),
+        places=("plant", "sensor"),
+        reference="Ljung, System Identification, 2nd ed., sec. 16.4: the order of a linear model",
+    ),
+)

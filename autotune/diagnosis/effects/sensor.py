@@ -1,0 +1,138 @@
+"""Effects of the sensor, in the order in which a reading passes them; what single samples show last."""
+
+from __future__ import annotations
+
+import math
+
+from autotune.arrays import FloatArray
+from autotune.diagnosis.effects.actuator import NEVER, limit_starts
+from autotune.diagnosis.effects.base import Blocks, EffectKind, Line, LinearPart, Quantity, Values
+from autotune.models import Block, TransferFunction
+
+_LJUNG = "Ljung, System Identification, 2nd ed., sec. 5.1"
+
+
+def curved(z: float, second_order: float, third_order: float) -> float:
+    """Return a reading through a bent characteristic."""
+    z += second_order * z * z
+    z += third_order * z * z * z
+    return z
+
+
+def drifted(z: float, t: float, rate: float) -> float:
+    """Return a reading that drifts."""
+    return z + rate * t
+
+
+def folded(y: float, fold: float) -> float:
+    """Return a reading without its sign."""
+    return fold + abs(y - fold)
+
+
+def limited(y: float, low: float, high: float) -> float:
+    """Return a reading within the sensor's range."""
+    return min(max(y, low), high)
+
+
+def rounded(y: float, step: float) -> float:
+    """Return a converter's level for a reading."""
+    return step * math.floor(y / step + 0.5)
+
+
+def _with_lag(blocks: Blocks, values: Values) -> Blocks:
+    """Put a lag behind the chain."""
+    lag = TransferFunction(num=(1.0,), den=(max(values["time_constant"], 1e-12), 1.0))
+    return (*blocks, Block(name="added lag", place="sensor", dynamics=lag))
+
+
+def _last_outputs(u: FloatArray, y: FloatArray, values: Values) -> FloatArray:
+    """Return an added lag at rest with the chain's output."""
+    return y[:, None]
+
+
+SENSOR = (
+    EffectKind(
+        name="sensor.lag",
+        equation="time_constant dy/dt = z - y",
+        parameters=(Quantity(name="time_constant", unit="s", role="amplitude"),),
+        linear=LinearPart(blocks=_with_lag, states=1, start=_last_outputs),
+        starts=lambda s: [(c * s.lag_s,) for c in (0.05, 0.25)],
+        confusable=("timing.dead_time",),
+        same=("actuator.lag",),
+        places=("sensor", "actuator", "plant"),
+        reference=_LJUNG,
+    ),
+    EffectKind(
+        name="sensor.nonlinear_gain",
+        equation="y = y0 + z + second_order z^2 + third_order z^3",
+        parameters=(
+            Quantity(name="second_order", unit="1/{y}", role="amplitude", sign="real", neutral=0.0),
+            Quantity(name="third_order", unit="1/{y}^2", role="amplitude", sign="real", neutral=0.0),
+        ),
+        lines=(Line(stage="sensor", does=curved),),
+        starts=lambda s: [(0.05 / s.x, 1e-3 / s.x**2), (1e-3 / s.x, 0.05 / s.x**2)],
+        confusable=("actuator.nonlinear_gain", "plant.position_dependent_gain"),
+        reference=_LJUNG,
+    ),
+    EffectKind(
+        name="sensor.drift",
+        equation="y = z + rate t",
+        parameters=(Quantity(name="rate", unit="{y}/s", role="amplitude", sign="real"),),
+        lines=(Line(stage="sensor", does=drifted),),
+        starts=lambda s: [(0.01 * s.y / s.duration_s,)],
+        confusable=("actuator.gain_drift",),
+        same=("environment.drifting_load",),
+        reference=_LJUNG,
+    ),
+    EffectKind(
+        name="sensor.absolute_value",
+        equation="y = fold + |z - fold|, fold = 0 for a sensor that cannot tell the sign",
+        parameters=(Quantity(name="fold", unit="{y}", role="threshold", sign="real"),),
+        lines=(Line(stage="reading", does=folded),),
+        starts=lambda s: [(s.y_low + c * (s.y_high - s.y_low),) for c in (0.005, 0.03, 0.1)],
+        reference="a sensor that cannot tell the sign, as an encoder without direction",
+    ),
+    EffectKind(
+        name="sensor.saturation",
+        equation="y = min(max(z, low), high)",
+        parameters=(
+            Quantity(name="low", unit="{y}", role="limit", sign="real", neutral=-NEVER),
+            Quantity(name="high", unit="{y}", role="limit", sign="real", neutral=NEVER),
+        ),
+        lines=(Line(stage="reading", does=limited),),
+        starts=lambda s: limit_starts(s.y_low, s.y_high, (0.02, 0.1)),
+        confusable=("plant.hard_stop",),
+        reference=_LJUNG,
+    ),
+    EffectKind(
+        name="sensor.quantisation",
+        equation="y = step round(z / step)",
+        parameters=(Quantity(name="step", unit="{y}", role="threshold", nonzero=True),),
+        lines=(Line(stage="reading", does=rounded),),
+        sought="samples",
+        steps=True,
+        # a reading that was rounded is off by less where it stands still: that is no jitter
+        excludes=("timing.jitter",),
+        reference=_LJUNG,
+    ),
+    EffectKind(
+        name="sensor.dropout",
+        equation="y repeats its last value while a sample is missing",
+        parameters=(
+            Quantity(name="share", unit="-", role="observed"),
+            Quantity(name="rows", unit="-", role="observed"),
+        ),
+        sought="samples",
+        reference=_LJUNG,
+    ),
+    EffectKind(
+        name="sensor.outliers",
+        equation="y = z + spikes of either sign at single rows",
+        parameters=(
+            Quantity(name="share", unit="-", role="observed"),
+            Quantity(name="size", unit="{y}", role="observed"),
+        ),
+        sought="samples",
+        reference="Ljung, System Identification, 2nd ed., sec. 15.2",
+    ),
+)

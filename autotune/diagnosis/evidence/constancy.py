@@ -1,0 +1,175 @@
+"""Whether what a fitted model holds constant is: score tests against what swings, bends, or goes past its chain.
+
+A parameter that swings in time adds to the chain what it multiplies, times the swing: a gain the command, a stiffness
+the position, a lag or delay the rate of the reading. Each of these signals, times cos and sin of every frequency that
+the recordings resolve, is sent through the linear chain; what it would explain of the residual beyond start states and
+free numbers is chi-square of two degrees where the model is right (Rao's score test). No fit is needed, and nothing is
+assumed of the swing's shape: a switch or a sweep has parts at those frequencies too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+
+from autotune.arrays import FloatArray
+from autotune.diagnosis.evidence.residual import NEW, FreedResidual, Place, filled
+from autotune.diagnosis.fitting.data import Data
+from autotune.diagnosis.fitting.fit import Fit
+from autotune.diagnosis.fitting.windows import slowest_lag_s
+
+#: Fastest swing that is looked for, in cycles per slowest lag, and the most frequencies.
+FASTEST, MOST_FREQUENCIES = 0.3, 120
+#: Delays of an echo that is looked for, in slowest lags.
+ECHOES = (0.5, 0.75, 1.0, 1.35, 1.8, 2.4)
+#: A swing that explains this share of what the best one explains cannot be told from it: a slow one of the gain is the
+#: command's or the reading's.
+AS_MUCH = 0.9
+_LOAD, _GAIN = "a load", "the command, as a gain that changes would"
+_STIFFNESS = "the position or level, as a stiffness or leak that changes would"
+_LAG = "the rate of the reading, as a lag or delay that changes would"
+#: Where something may enter that one place of the chain cannot tell from another.
+_MAY_ENTER = {
+    _LOAD: ("environment", "actuator", "plant"),
+    _GAIN: ("actuator", "plant"),
+    _STIFFNESS: ("plant", "environment"),
+    _LAG: ("plant", "timing", "actuator", "sensor"),
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Variation:
+    """What explains most of a residual among what swings, bends, or is missing as a path.
+
+    Attributes
+    ----------
+    gain : float
+        Decrease of chi2 that it promises, in units of the residual's own variance.
+    places : tuple of str
+        Where it may enter, or what explains about as much.
+    what : str
+        The signal that is multiplied or added.
+    period_s : float
+        Of the swing [s]; infinite for what does not swing.
+    """
+
+    gain: float
+    places: tuple[str, ...]
+    what: str
+    period_s: float
+
+    @property
+    def sentence(self) -> str:
+        """What a reader is told."""
+        if np.isfinite(self.period_s):
+            return f"What is left swings with a period of about {self.period_s:.2g} s together with {self.what}."
+        return f"What is left goes with {self.what}."
+
+
+def largest_variation(result: Fit, data: Data) -> Variation:
+    """Return what explains most of a fit's residual among swings, bends and paths that its model does not have.
+
+    Parameters
+    ----------
+    result : Fit
+        A fit at its minimum.
+    data : Data
+        What it was fitted to.
+
+    Returns
+    -------
+    Variation
+        The largest of some two hundred chi-square values of two degrees of freedom: on recordings of a model that is
+        right it stays below 20 (about one in two hundred exceeds it).
+
+    Notes
+    -----
+    Linear in the effect and quasi-static in the swing: what is far from both is found with less power, and a model that
+    is right is not accused more often. No signal knows the noise of the row that is tested, so feedback brings no bias.
+    """
+    left = FreedResidual(result, data)
+    e = left.beyond_numbers(left.e)
+    variance = float(e @ e) / left.rows
+    lag, longest = slowest_lag_s(result.model), max(r.duration_s for r in data.recordings)
+    count = int(min(FASTEST * longest / max(lag, 1e-12), MOST_FREQUENCIES))
+    entries = [(*signal, k / longest) for signal in _multiplied(left) for k in range(count + 1)]
+    entries += [(*signal, 0.0) for signal in (*_bends(left), *_paths(left, lag))]
+
+    def gained(entry: tuple[Place, str, Sequence[FloatArray], float]) -> float:
+        place, _, signals, frequency = entry
+        waves = (np.cos, np.sin) if frequency else (np.cos,)
+        columns = [left.shown(place, _swinging(data, signals, wave, frequency)) for wave in waves]
+        return _explained(np.column_stack(columns), e, left) / variance
+
+    with ThreadPoolExecutor(2) as pool:
+        gains = list(pool.map(gained, entries))
+    ranked = sorted(zip(gains, entries, strict=True), key=lambda pair: -pair[0])
+    gain, (_, what, _, frequency) = ranked[0]
+    near = [entry for g, entry in ranked if entry[3] and g >= AS_MUCH * gain] if frequency else [ranked[0][1]]
+    places = dict.fromkeys(p for place, name, _, _ in near for p in _MAY_ENTER.get(name, (place,)))
+    return Variation(gain=gain, places=tuple(places), what=what, period_s=1.0 / frequency if frequency else np.inf)
+
+
+def _multiplied(left: FreedResidual) -> Iterator[tuple[Place, str, list[FloatArray]]]:
+    """Yield what a swing would multiply: place, name, and signal per recording."""
+    sim, recordings = left.result.sim, left.data.recordings
+    out = [filled(s) for s in left.result.signals]
+    yield "plant", _LOAD, [np.ones(len(r)) for r in recordings]
+    yield "actuator", _GAIN, [r.u - sim.u_offset for r in recordings]
+    yield "plant", _STIFFNESS, [s[:, 2] for s in out]
+    yield "sensor", "the reading, as a sensor's gain that changes would", [s[:, 0] - sim.y_offset for s in out]
+    # from the row before: the row after has felt the command that answers this row's noise
+    rates = [np.diff(s[:, 0], prepend=s[0, 0]) / np.gradient(r.t) for s, r in zip(out, recordings, strict=True)]
+    yield "sensor", _LAG, rates
+
+
+def _bends(left: FreedResidual) -> Iterator[tuple[Place, str, list[FloatArray]]]:
+    """Yield what a static curve would add: second and third powers of each signal, place, and a gain over position."""
+    sim, out = left.result.sim, [filled(s) for s in left.result.signals]
+    speed, position, force = ([s[:, column] for s in out] for column in (1, 2, 3))
+    curved: list[tuple[Place, str, list[FloatArray]]] = [
+        ("actuator", "the command", [r.u - sim.u_offset for r in left.data.recordings]),
+        ("plant", "the position or level", position),
+        ("sensor", "the reading", [s[:, 0] - sim.y_offset for s in out]),
+    ]
+    if sim.chain.is_mechanical:
+        curved.append(("plant", "the speed", speed))
+    for place, what, signals in curved:
+        yield place, f"the square of {what}", [s**2 for s in signals]
+        yield place, f"the cube of {what}", [s**3 for s in signals]
+    products = [x * f for x, f in zip(position, force, strict=True)]
+    yield "plant", "the position or level times the plant's input", products
+
+
+def _paths(left: FreedResidual, lag_s: float) -> Iterator[tuple[Place, str, list[FloatArray]]]:
+    """Yield what a path that the chain lacks would add to the reading: place, name, and signal per recording."""
+    sim, recordings = left.result.sim, left.data.recordings
+    # the command held until the row: the row's own already answers its noise
+    held = [np.concatenate([r.u[:1], r.u[:-1]]) - sim.u_offset for r in recordings]
+    yield "sensor", "the command itself, as cross-talk to the reading would", held
+    readings = [filled(s)[:, 0] - sim.y_offset for s in left.result.signals]
+    for delay in (d * lag_s for d in ECHOES):
+        past = [np.interp(r.t - delay, r.t, y) for y, r in zip(readings, recordings, strict=True)]
+        yield "sensor", f"the reading {delay:.2g} s before, as an echo would", past
+
+
+def _swinging(
+    data: Data, signals: Sequence[FloatArray], wave: Callable[[FloatArray], FloatArray], frequency_hz: float
+) -> list[FloatArray]:
+    """Return signals times a wave of every recording's own time."""
+    angles = [2.0 * np.pi * frequency_hz * (r.t - r.t[0]) for r in data.recordings]
+    return [s * wave(a) for s, a in zip(signals, angles, strict=True)]
+
+
+def _explained(X: FloatArray, e: FloatArray, left: FreedResidual) -> float:
+    """Return the decrease of |e|^2 by columns, as far as free numbers cannot imitate them."""
+    before = np.sum(X**2, axis=0)
+    X = left.beyond_numbers(X)
+    new = np.sum(X**2, axis=0) > NEW * before
+    if not new.any():
+        return 0.0
+    Q = np.linalg.qr(X[:, new] / np.sqrt(before[new]))[0]
+    return float(np.sum((Q.T @ e) ** 2))

@@ -1,0 +1,93 @@
+"""Errors on windows that were not fitted: the nominal, the retuned and the extended model."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from autotune.diagnosis.fitting.data import Data
+from autotune.diagnosis.fitting.fit import RUNAWAY, Fit, fit, states_of
+from autotune.diagnosis.fitting.noise import noise_from_differences
+
+#: Share of the retuned model's excess variance that effects must explain where nothing explains all of it, and how many
+#: times the noise's variance the retuned model's error must have: nearer to the noise adequacy is asked for.
+DOMINANT, FAR_FROM_NOISE = 0.35, 8.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class FitQuality:
+    """Errors on rows that were not fitted, divided by the spread of y."""
+
+    nominal: float
+    retuned: float
+    extended: float
+    noise_floor: float
+
+    @property
+    def is_better(self) -> bool:
+        """Whether the extended model is at least as good as the retuned one where neither was fitted."""
+        return self.extended <= self.retuned
+
+
+def dominates(quality: FitQuality, share: float = DOMINANT, far: float = FAR_FROM_NOISE) -> bool:
+    """Whether the chosen effects explain most of a residual that nothing explains whole.
+
+    On real rigs something always remains; an effect is named all the same when on rows that were not fitted it takes
+    away a share of the variance that retuning leaves above the noise, where that is ``far`` times the noise's.
+    """
+    retuned, noise = quality.retuned**2, quality.noise_floor**2
+    return retuned > far * noise and retuned - quality.extended**2 > share * (retuned - noise)
+
+
+def held_out(retuned: Fit, chosen: Fit, data: Data) -> FitQuality:
+    """Return errors on windows with numbers fitted to the others.
+
+    Every second window is left out, then the others: each half is tried with the numbers of the other one.
+
+    Parameters
+    ----------
+    retuned, chosen : Fit
+        The nominal structure and the extended model; the same object where nothing was added.
+    data : Data
+        What both were fitted to.
+    """
+    halves = _half(data, 0), _half(data, 1)
+    y = np.concatenate([r.y[g] for r, g in zip(data.recordings, data.good, strict=True)])
+    spread = float(np.std(y)) or 1.0
+
+    def error(result: Fit, tune: bool) -> float:
+        fits = [_tested(result, tune, *pair) for pair in (halves, halves[::-1])]
+        squares = sum(float(e @ e) for f in fits for e in f.residuals)
+        freedom = sum(f.rows - sum(Q.shape[1] for Q in f.states_explain) for f in fits)
+        return math.sqrt(squares / max(freedom, 1)) / spread
+
+    nominal, tuned = error(retuned, tune=False), error(retuned, tune=True)
+    extended = tuned if chosen is retuned else error(chosen, tune=True)
+    noise = noise_from_differences(chosen.residuals, data.good).total_sd / spread
+    return FitQuality(nominal=nominal, retuned=tuned, extended=extended, noise_floor=noise)
+
+
+def _tested(result: Fit, tune: bool, known: Data, unknown: Data) -> Fit:
+    """Return a fit's start states on windows that its numbers, tuned to others or nominal, were not fitted to."""
+    p, none = result.parametrisation, np.zeros(result.theta.size, dtype=bool)
+    theta = result.theta if tune else p.centre
+    try:
+        if tune:
+            theta = fit(p, known, theta, states_of(result, known), iterations=6, rounds=1).theta
+        return fit(p, unknown, theta, states_of(result, unknown), free=none, iterations=8)
+    except RUNAWAY:
+        # numbers from half the windows can run away on the other half: then those of all windows count
+        return result
+
+
+def _half(data: Data, which: int) -> Data:
+    """Return every second window of the data, or block of windows where there are few."""
+    chosen = []
+    for a in data.starts:
+        # few windows may go by direction one and one: then blocks of them are taken
+        block = 1 if len(a) >= 8 else max(1, len(a) // 2)
+        keep = (np.arange(len(a)) // block) % 2 == which % 2
+        chosen.append(keep if keep.any() else np.ones(len(a), dtype=bool))
+    return data.only(chosen)

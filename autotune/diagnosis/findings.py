@@ -1,0 +1,172 @@
+"""What is found, for people: effects with parameters, probabilities and windows, and the model that has them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from types import MappingProxyType
+
+import numpy as np
+
+from autotune.diagnosis.effects import kind_of
+from autotune.diagnosis.evidence.samples import SampleEffect
+from autotune.diagnosis.fitting.fit import Fit
+from autotune.diagnosis.result import FoundEffect, Offset, OperatingRange, Verdict
+from autotune.diagnosis.selection.hypothesis import Hypothesis
+from autotune.diagnosis.selection.probability import Candidate
+from autotune.diagnosis.selection.search import Search
+from autotune.diagnosis.verdict import UNKNOWN, Evidence
+from autotune.models import Effect, Model, Parameter
+
+#: An operating point that lies this many standard deviations from the nominal one is an offset.
+OFFSET_SIGMAS = 6.0
+#: Share of the squared error that a simulation with a converter's rounding may leave to be the better one.
+ROUNDING = 0.9
+#: Evidence from which on what single rows show is sure; probabilities stated of it then, and of less.
+SURE, SURELY, PROBABLY = 60.0, 1.0 / (1.0 + UNKNOWN), 0.85
+#: The effect that every fit has as a free number.
+OFFSET = "actuator.offset"
+Window = tuple[int, float, float]
+
+
+def offset_of(result: Fit) -> Offset | None:
+    """Return the operating point's shift where it is far outside its uncertainty."""
+    for i, free in enumerate(result.parametrisation.free):
+        if free.kind == "u_offset":
+            sd = math.sqrt(max(float(result.covariance[i, i]), 0.0)) * free.size
+            shift = result.theta[i] * free.size
+            if sd > 0.0 and abs(shift) > OFFSET_SIGMAS * sd and abs(shift) > 1e-3 * free.size:
+                return Offset(value=-shift, sd=sd)
+    return None
+
+
+def probability_of(name: str, candidates: Sequence[Candidate]) -> float:
+    """Return the probability that an effect, or one that cannot be told from it, is part of the truth."""
+    group = {name, *kind_of(name).same}
+    total = sum(c.probability for c in candidates if group & set(c.name.split("+")))
+    return min(max(total, 0.0), 0.99)
+
+
+def found_effects(evidence: Evidence) -> tuple[FoundEffect, ...]:
+    """Return the effects that are named, the most important first."""
+    search, chosen = evidence.search, evidence.search.chosen
+    everywhere = tuple((i, float(r.t[0]), float(r.t[-1])) for i, r in enumerate(search.data.recordings))
+    effects: list[tuple[float, FoundEffect]] = []
+    for effect in _with_uncertainty(chosen, chosen.fit.model.effects):
+        effects.append((_lost_without(search, effect.name), _found_effect(effect, evidence, everywhere)))
+    effects += [(s.evidence, _of_samples(s, everywhere)) for s in evidence.samples]
+    ranked = [e for _, e in sorted(effects, key=lambda pair: -pair[0])]
+    if evidence.offset is not None and not any(e.name in kind_of(OFFSET).same for e in ranked):
+        ranked.append(_of_offset(evidence.offset, evidence, everywhere))
+    return tuple(ranked)
+
+
+def _of_samples(s: SampleEffect, everywhere: tuple[Window, ...]) -> FoundEffect:
+    return FoundEffect(
+        name=s.name,
+        probability=SURELY if s.evidence > SURE else PROBABLY,
+        places=(kind_of(s.name).place,),
+        parameters=MappingProxyType(s.parameters),
+        equation=s.equation,
+        windows=s.windows or everywhere,
+    )
+
+
+def _of_offset(offset: Offset, evidence: Evidence, everywhere: tuple[Window, ...]) -> FoundEffect:
+    kind, unit = kind_of(OFFSET), evidence.search.chosen.fit.parametrisation.model.input.unit
+    return FoundEffect(
+        name=OFFSET,
+        probability=1.0 / (1.0 + evidence.unknown_odds),
+        places=kind.places,
+        parameters=MappingProxyType({"offset": Parameter(value=offset.value, sd=offset.sd, unit=unit)}),
+        equation=kind.equation,
+        windows=everywhere,
+    )
+
+
+def _lost_without(found: Search, name: str) -> float:
+    """Return the penalised chi-square that is lost without a chosen effect, as far as that was fitted."""
+    rest = frozenset(found.chosen.names) - {name}
+    known = {frozenset(h.names): h.penalised_chi2 for h in (found.retuned, *found.singles, *found.pairs)}
+    return known.get(rest, found.retuned.penalised_chi2) - found.chosen.penalised_chi2
+
+
+def _found_effect(effect: Effect, evidence: Evidence, everywhere: tuple[Window, ...]) -> FoundEffect:
+    kind, search, windows = kind_of(effect.name), evidence.search, everywhere
+    if kind.acts_in is not None:
+        number, after = kind.acts_in({key: q.value for key, q in effect.parameters.items()})
+        pairs = [(i, r) for i, r in enumerate(search.data.recordings) if number in (-1, i)]
+        windows = tuple((i, float(r.t[0] + after), float(r.t[-1])) for i, r in pairs)
+    return FoundEffect(
+        name=effect.name,
+        probability=probability_of(effect.name, evidence.candidates),
+        places=kind.may_sit,
+        parameters=MappingProxyType(_readable(effect)),
+        equation=kind.equation,
+        windows=windows,
+        operating_range=_range(search, kind.place),
+    )
+
+
+def _readable(effect: Effect) -> Mapping[str, Parameter]:
+    """Return an effect's parameters as people name them: limits that do not act are left out."""
+    kind = kind_of(effect.name)
+    parameters = dict(effect.parameters) if kind.readable is None else kind.readable(effect.parameters)
+    for q in kind.parameters:
+        unfelt = q.role == "limit" and q.name in parameters and not math.isfinite(parameters[q.name].sd)
+        if q.role == "mark" or unfelt:
+            parameters.pop(q.name, None)
+    return parameters
+
+
+def _with_uncertainty(h: Hypothesis, effects: tuple[Effect, ...]) -> tuple[Effect, ...]:
+    """Return the effects with the standard deviations of their fit; NaN for a number that the data did not feel.
+
+    A limit that was not felt is none: where it came to rest, further excitation would meet it.
+    """
+    result, p = [], h.fit.parametrisation
+    sd = np.sqrt(np.maximum(np.diag(h.fit.covariance), 0.0))
+    spans: dict[tuple[int, int], float] = {}
+    for i, f in enumerate(p.free):
+        if f.kind == "effect":
+            spans[f.index] = float(sd[i]) * (p.value(i, h.fit.theta) if f.positive else f.size)
+    for number, effect in enumerate(effects):
+        parameters = {
+            key: replace(q, sd=spans.get((number, j), math.nan) or math.nan)
+            for j, (key, q) in enumerate(effect.parameters.items())
+        }
+        for q in kind_of(effect.name).parameters:
+            given = parameters.get(q.name)
+            if q.role == "limit" and q.neutral is not None and given is not None and not math.isfinite(given.sd):
+                parameters[q.name] = replace(given, value=q.neutral)
+        result.append(replace(effect, parameters=MappingProxyType(parameters)))
+    return tuple(result)
+
+
+def _range(found: Search, place: str) -> OperatingRange:
+    column, name = {"plant": (2, "position"), "sensor": (0, "y")}.get(place, (3, "plant input"))
+    values = np.concatenate([s[:, column] for s in found.chosen.fit.signals])
+    return OperatingRange(signal=name, low=float(np.nanmin(values)), high=float(np.nanmax(values)))
+
+
+def extended_model(evidence: Evidence, verdict: Verdict, nominal: Model) -> Model:
+    """Return the model to go on with: the nominal one where nothing is missing, else what explains more."""
+    found = evidence.search
+    named = evidence.quality.is_better and verdict in ("effect", "unexplained")
+    use = found.chosen if named else found.retuned
+    extended = nominal if verdict == "none" else use.fit.model
+    ends = [Effect(name=s.name, parameters=s.parameters) for s in evidence.samples if _simulated(s, use.fit)]
+    return replace(extended, effects=(*_with_uncertainty(use, extended.effects), *ends))
+
+
+def _simulated(effect: SampleEffect, result: Fit) -> bool:
+    """Whether a simulation is nearer to the readings with what their samples show; beside much noise no rounding is."""
+    kind = kind_of(effect.name)
+    if not kind.steps:
+        return kind.is_simulated
+    step = effect.parameters["step"].value
+    y = [s[:, 0] + e for s, e in zip(result.signals, result.residuals, strict=True)]
+    rounded = [r - step * np.round(s[:, 0] / step) for r, s in zip(y, result.signals, strict=True)]
+    squares = [float(np.nansum(np.concatenate(e) ** 2)) for e in (rounded, result.residuals)]
+    return squares[0] < ROUNDING * squares[1]

@@ -1,0 +1,1 @@
+"""Models fitted to recordings: noise, windows, free numbers, Gauss-Newton, restarts."""

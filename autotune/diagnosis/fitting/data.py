@@ -1,0 +1,121 @@
+"""Recordings as a fit sees them: which rows count, where the state starts anew, what noise whitens the residuals."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numba import njit
+
+from autotune.arrays import BoolArray, FloatArray, IntArray
+from autotune.diagnosis.fitting.noise import Noise
+from autotune.diagnosis.simulation.simulator import Windows
+from autotune.recording import Recording
+
+#: Windows of a recording that thinning leaves: fewer would miss a direction or a level of the motion.
+LEAST_WINDOWS_KEPT = 6
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Data:
+    """Recordings with what a fit needs to know of them.
+
+    Attributes
+    ----------
+    recordings : tuple of Recording
+        What was measured.
+    good : tuple of (N,) bool array
+        Rows whose reading counts.
+    starts : tuple of (W,) int array
+        Rows where the state starts anew: the first row alone, or every window's.
+    stops : tuple of (W,) int array
+        Rows before which the windows end.
+    noise : Noise
+        Autoregressive noise model that whitens residuals.
+    numbers : tuple of int
+        The recordings' numbers in the order given by the user.
+    """
+
+    recordings: tuple[Recording, ...]
+    good: tuple[BoolArray, ...]
+    starts: tuple[IntArray, ...]
+    stops: tuple[IntArray, ...]
+    noise: Noise
+    numbers: tuple[int, ...] = ()
+
+    def thinned(self, rows: int, telling: Sequence[BoolArray] | None = None) -> Data:
+        """Return the data with windows left out evenly, until about as many rows count.
+
+        Windows in which u or y is largest or smallest stay, and those named as telling: a limit that is rarely reached
+        acts only there.
+        """
+        share = max(1.0, self.rows / rows)
+        if share < 1.5:
+            return self
+        if all(len(a) <= LEAST_WINDOWS_KEPT for a in self.starts):
+            return self
+        chosen = []
+        named = [np.zeros(len(a), dtype=bool) for a in self.starts] if telling is None else telling
+        for r, a, ok, tells in zip(self.recordings, self.starts, self.good, named, strict=True):
+            count = min(len(a), max(LEAST_WINDOWS_KEPT, round(len(a) / share)))
+            far = [extreme(np.where(ok, x, np.median(x[ok]))) for x in (r.u, r.y) for extreme in (np.argmin, np.argmax)]
+            extremes = np.clip(np.searchsorted(a, far, side="right") - 1, 0, len(a) - 1)
+            evenly = np.linspace(0, len(a) - 1, count).round().astype(np.int64)
+            chosen.append(np.unique(np.concatenate([evenly, extremes, np.flatnonzero(tells)])))
+        return self.only(chosen)
+
+    def only(self, chosen: Iterable[IntArray | BoolArray]) -> Data:
+        """Return the data with the chosen windows of every recording, by number or by mask; no other row counts."""
+        starts, stops, good = [], [], []
+        for keep, a, b, ok in zip(chosen, self.starts, self.stops, self.good, strict=True):
+            inside = np.zeros(ok.size, dtype=bool)
+            for first, last in zip(a[keep], b[keep], strict=True):
+                inside[first:last] = True
+            starts.append(a[keep])
+            stops.append(b[keep])
+            good.append(ok & inside)
+        return replace(self, starts=tuple(starts), stops=tuple(stops), good=tuple(good))
+
+    def joined(self, count: int) -> Data:
+        """Return the data with that many windows, one after the other, made into one; the last may be of fewer."""
+        pairs = zip(self.starts, self.stops, strict=True)
+        stops = tuple(np.append(a[count::count], b[-1]).astype(np.int64) for a, b in pairs)
+        return replace(self, starts=tuple(a[::count] for a in self.starts), stops=stops)
+
+    @property
+    def rows(self) -> int:
+        """Rows that count."""
+        return int(sum(g.sum() for g in self.good))
+
+    @cached_property
+    def windows(self) -> tuple[Windows, ...]:
+        """Every recording's windows, as a simulation takes them."""
+        return tuple(Windows(starts=a, stops=b) for a, b in zip(self.starts, self.stops, strict=True))
+
+    @cached_property
+    def sample_times(self) -> tuple[float, ...]:
+        """Sample time of every recording [s]."""
+        return tuple(r.sample_time_s for r in self.recordings)
+
+    def whitened(self, residuals: list[FloatArray]) -> list[FloatArray]:
+        """Return the residuals whitened by the noise model, zero where a row or one that it needs does not count."""
+        ar, sd = np.array(self.noise.ar), self.noise.sd
+        rows = zip(residuals, self.good, self.starts, strict=True)
+        return [_innovations(r, good, starts, ar, sd) for r, good, starts in rows]
+
+
+@njit(cache=True, nogil=True)
+def _innovations(r: FloatArray, good: BoolArray, starts: IntArray, ar: FloatArray, sd: float) -> FloatArray:
+    """Return e_k = (r_k - a1 r_{k-1} - ...) / sd, r before a start taken for zero."""
+    e = np.zeros(r.size)
+    for w in range(starts.size):
+        for k in range(starts[w], starts[w + 1] if w + 1 < starts.size else r.size):
+            counts, total = good[k], r[k]
+            for lag in range(1, min(k - starts[w], ar.size) + 1):
+                counts = counts and good[k - lag]
+                total -= ar[lag - 1] * r[k - lag]
+            if counts:
+                e[k] = total / sd
+    return e

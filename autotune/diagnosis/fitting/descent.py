@@ -1,0 +1,283 @@
+"""The descent of a fit: damped Gauss-Newton on whitened simulation errors, start states eliminated."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from autotune.arrays import BoolArray, FloatArray, IntArray
+from autotune.diagnosis.fitting.data import Data
+from autotune.diagnosis.fitting.parameters import Parametrisation
+from autotune.diagnosis.simulation.simulator import Simulator
+from autotune.errors import AutotuneError, IdentificationError
+
+#: Damping below which a small decrease means that the bottom is reached.
+SETTLED = 1e-7
+
+
+@dataclass(frozen=True, eq=False)
+class Spot:
+    """A point of the search with what its simulation left."""
+
+    theta: FloatArray
+    x0: list[FloatArray]
+    sim: Simulator
+    ends: list[FloatArray]
+    e: FloatArray
+
+
+Derivatives: TypeAlias = tuple[FloatArray, FloatArray]
+
+
+def simulate(
+    sim: Simulator, x0: list[FloatArray], data: Data, signals: int = 1
+) -> tuple[list[FloatArray], list[FloatArray]]:
+    """Return every recording's reading, or all its signals, and the states that its windows end with."""
+    result, ends = [], []
+    for i, (recording, x) in enumerate(zip(data.recordings, x0, strict=True)):
+        number = data.numbers[i] if data.numbers else i
+        dt = data.sample_times[i]
+        out, end = sim.run(recording, x, data.windows[i], number=number, sample_time_s=dt, signals=signals)
+        result.append(out)
+        ends.append(end)
+    return result, ends
+
+
+def whiten(signals: list[FloatArray], data: Data) -> FloatArray:
+    """Return the whitened residuals of all recordings, one after the other."""
+    return np.concatenate(data.whitened([r.y - out[:, 0] for r, out in zip(data.recordings, signals, strict=True)]))
+
+
+AnyArray: TypeAlias = NDArray[Any]
+
+
+class Problem:
+    """Residuals and their derivatives for one parametrisation on one set of data (a scratch pad, not an engine)."""
+
+    def __init__(self, parametrisation: Parametrisation, data: Data) -> None:
+        self.parametrisation = parametrisation
+        self.data = data
+        #: Largest step of every number in one iteration: a factor e for chain and effect sizes
+        self.reach = np.array([0.5 if f.kind in ("gain", "den", "num") else 1.0 for f in parametrisation.free])
+        self.reach[[f.kind == "effect" and not f.positive for f in parametrisation.free]] = 5.0
+        #: Steps of the derivatives
+        self.nudge = np.array([1e-2 if f.kind == "effect" else 1e-3 for f in parametrisation.free])
+        for i, f in enumerate(parametrisation.free):
+            if f.turns:
+                angle = 2.0 * np.pi * np.exp(parametrisation.centre[i]) * max(r.duration_s for r in data.recordings)
+                self.reach[i], self.nudge[i] = 1.0 / angle, 0.05 / angle
+        lengths = [len(r) for r in data.recordings]
+        edges = np.cumsum([0, *lengths])
+        #: First row of every window and the row after its last, in the concatenated residual
+        self.first = np.concatenate([e + a for e, a in zip(edges, data.starts, strict=False)])
+        self.last = np.concatenate([e + b for e, b in zip(edges, data.stops, strict=False)])
+        #: How many windows every recording has
+        self.counts = [len(a) for a in data.starts]
+
+    def spot(self, theta: FloatArray, x0: list[FloatArray]) -> Spot:
+        """Simulate at a point."""
+        sim = self.parametrisation.simulator(theta)
+        signals, ends = simulate(sim, x0, self.data)
+        return Spot(theta, x0, sim, ends, whiten(signals, self.data))
+
+    def per_recording(self, values: AnyArray) -> list[AnyArray]:
+        """Split what is known per window into recordings."""
+        return np.split(values, np.cumsum(self.counts)[:-1])
+
+    def chi2(self, e: FloatArray) -> FloatArray:
+        """Return every window's sum of squares."""
+        sums = np.concatenate([[0.0], np.cumsum(e**2)])
+        return np.asarray(sums[self.last] - sums[self.first])
+
+    def prior(self, e: FloatArray, may: BoolArray) -> FloatArray:
+        """Return what a unit of theta weighs against the data.
+
+        Where the structure is wrong its misfit counts as noise, else the fit would bend the chain out of all reason.
+        """
+        weight = max(1.0, float(np.sqrt(e @ e / max(self.data.rows, 1))))
+        return np.where(may, weight / self.parametrisation.spreads, 0.0)
+
+    def cost(self, e: FloatArray, theta: FloatArray, prior: FloatArray) -> float:
+        """Return chi2 and the prior's penalty."""
+        return float(e @ e + np.sum((prior * (theta - self.parametrisation.centre)) ** 2))
+
+    def jacobian(self, spot: Spot, may: BoolArray) -> Derivatives:
+        """Return de/dtheta (N, p) and de/dx0 (N, n), all windows' states moved at once."""
+        J = np.zeros((spot.e.size, spot.theta.size))
+        for i in np.flatnonzero(may):
+            J[:, i] = self._column(int(i), spot.theta, spot.x0, spot.e)
+        Jx = np.empty((spot.e.size, spot.sim.order))
+        for j in range(spot.sim.order):
+            h = 1e-3 * self.scales[j]
+            shifted = [x.copy() for x in spot.x0]
+            for x in shifted:
+                x[:, j] += h
+            moved = whiten(simulate(spot.sim, shifted, self.data)[0], self.data)
+            column = (moved - spot.e) * (self.scales[j] / h)
+            Jx[:, j] = column if bounded(column) else 0.0
+        return J, Jx
+
+    def inherited(self, theta: FloatArray, x0: list[FloatArray], e: FloatArray, smaller: Derivatives) -> Derivatives:
+        """Return derivatives that take a smaller model's for the numbers they share, new ones for the rest."""
+        J_old, Jx = smaller
+        J = np.empty((e.size, theta.size))
+        J[:, : J_old.shape[1]] = J_old
+        for i in range(J_old.shape[1], theta.size):
+            J[:, i] = self._column(i, theta, x0, e)
+        return J, Jx
+
+    def _column(self, i: int, theta: FloatArray, x0: list[FloatArray], e: FloatArray) -> FloatArray:
+        h = self.nudge[i]
+        moved = theta.copy()
+        moved[i] += h
+        column = (self.spot(moved, x0).e - e) / h
+        return column if bounded(column) else np.zeros_like(column)
+
+    scales: FloatArray
+    reach: FloatArray
+
+
+def eliminate(
+    problem: Problem, derivatives: Derivatives, e: FloatArray, damping: float = 0.0
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Project residual and Jacobian on what the start states cannot explain.
+
+    Damped, the start states explain less, and move less: a window that begins where dry friction holds the plant
+    tells nothing true of how far its state may go.
+
+    Returns
+    -------
+    e_left, J_left
+        (N,) and (N, p) array: what is left of residual and Jacobian.
+    gain_e, gain_J
+        (W, n) and (W, n, p) array: start states that explain the rest, in units of their scales.
+    """
+    J, Jx = derivatives
+    left = np.column_stack([e, J])
+    try:
+        gains = _freed(left, Jx, problem.first, problem.last, damping)
+    except np.linalg.LinAlgError as failure:
+        raise IdentificationError("the start states cannot be told from the data", where="fit") from failure
+    return left[:, 0], left[:, 1:], gains[:, :, 0], gains[:, :, 1:]
+
+
+@njit(cache=True, nogil=True)
+def _freed(left: FloatArray, Jx: FloatArray, first: IntArray, last: IntArray, damping: float) -> FloatArray:
+    """Free columns of what each window's start state explains, in place; return the states that do, (W, n, columns)."""
+    n = Jx.shape[1]
+    gains = np.empty((first.size, n, left.shape[1]))
+    for w in range(first.size):
+        X, Y = Jx[first[w] : last[w]], left[first[w] : last[w]]
+        G = X.T @ X
+        # a little of the prior that start states are of the signals' size keeps unfelt ones in place
+        least = 1e-2 + 1e-10 * np.trace(G)
+        for i in range(n):
+            G[i, i] += damping * G[i, i] + least
+        gains[w] = np.linalg.solve(G, X.T @ Y)
+        Y -= X @ gains[w]
+    return gains
+
+
+def descend(
+    problem: Problem, spot: Spot, derivatives: Derivatives | None, may: BoolArray, iterations: int, tolerance: float
+) -> tuple[Spot, Derivatives | None]:
+    """Damped Gauss-Newton steps; derivatives are kept as long as they predict the decrease (chord method)."""
+    damping, fresh = 1e-4, False
+    for _ in range(iterations):
+        prior = problem.prior(spot.e, may)
+        cost = problem.cost(spot.e, spot.theta, prior)
+        if derivatives is None:
+            derivatives, fresh = problem.jacobian(spot, may), True
+        e_left, J_left, gain_e, gain_J = eliminate(problem, derivatives, spot.e, damping)
+        if not (np.all(np.isfinite(J_left)) and np.all(np.isfinite(e_left))):
+            return spot, None  # a derivative ran out of the model's range: the last good point stands
+        step = _step(problem, spot, derivatives[0], e_left, J_left, prior, damping, may)
+        left = e_left + J_left @ step
+        promised = cost - problem.cost(left, spot.theta + step, prior)
+        moves = problem.per_recording(problem.scales * (gain_e + gain_J @ step))
+        trial = [x - move for x, move in zip(spot.x0, moves, strict=True)]
+        new = attempted(problem, spot.theta + step, trial)
+        decrease = -np.inf if new is None else cost - problem.cost(new.e, new.theta, prior)
+        if new is not None and decrease < 0.6 * promised:
+            # start states follow the step in theta to first order alone: they are put right before it is judged
+            settled = resettled(problem, new, derivatives[1], damping)
+            better = -np.inf if settled is None else cost - problem.cost(settled.e, settled.theta, prior)
+            if better > decrease:
+                new, decrease = settled, better
+        if new is not None and decrease > 0.0:
+            spot = new
+            damping = max(damping / 10.0, 1e-9)
+            small = decrease < tolerance + 1e-5 * cost and (fresh or decrease > 0.5 * promised)
+            if small and damping < SETTLED:  # damped, a step along a flat valley is small far from its end
+                break
+            if decrease < 0.6 * promised:
+                derivatives = None
+            fresh = False
+        elif fresh:
+            if promised < tolerance or damping > 1e4:
+                break
+            damping *= 30.0
+        else:
+            derivatives = None
+    return spot, derivatives
+
+
+def _step(
+    problem: Problem,
+    spot: Spot,
+    J: FloatArray,
+    e_left: FloatArray,
+    J_left: FloatArray,
+    prior: FloatArray,
+    damping: float,
+    may: BoolArray,
+) -> FloatArray:
+    """Return the step in theta."""
+    H = J.T @ J_left + np.diag(prior**2)
+    g = J.T @ e_left + prior**2 * (spot.theta - problem.parametrisation.centre)
+    step = np.linalg.lstsq(H + damping * np.diag(np.maximum(np.diag(H), 1e-12)), -g, rcond=1e-15)[0]
+    step[~may] = 0.0
+    step /= max(1.0, float(np.max(np.abs(step) / problem.reach, initial=0.0)))
+    return np.asarray(step)
+
+
+def resettled(problem: Problem, spot: Spot, Jx: FloatArray, damping: float) -> Spot | None:
+    """Return a point with the start states that fit its theta, one linear step from where they are."""
+    gain = eliminate(problem, (np.empty((spot.e.size, 0)), Jx), spot.e, damping)[2]
+    moves = problem.per_recording(problem.scales * gain)
+    return attempted(problem, spot.theta, [x - move for x, move in zip(spot.x0, moves, strict=True)])
+
+
+def continued(problem: Problem, spot: Spot) -> Spot:
+    """Start every window where the one before ended, where that fits better: a way out of stuck start states."""
+    if all(len(x) == 1 for x in spot.x0):
+        return spot
+    trial = [x.copy() for x in spot.x0]
+    for i, (x, ends) in enumerate(zip(trial, spot.ends, strict=True)):
+        follows = problem.data.stops[i][:-1] == problem.data.starts[i][1:]
+        x[1:][follows] = ends[:-1][follows]
+    new = attempted(problem, spot.theta, trial)
+    if new is None:
+        return spot
+    better = problem.per_recording(problem.chi2(new.e) < 0.9 * problem.chi2(spot.e) - 2.0)
+    trial = [np.where(b[:, None], x, old) for b, x, old in zip(better, trial, spot.x0, strict=True)]
+    mixed = attempted(problem, spot.theta, trial)
+    return spot if mixed is None or mixed.e @ mixed.e >= spot.e @ spot.e else mixed
+
+
+def bounded(values: FloatArray) -> bool:
+    """Whether a simulation stayed within bounds: one that runs away is finite for a while."""
+    return bool(np.max(np.abs(values), initial=0.0) < 1e15)  # NaN compares false
+
+
+def attempted(problem: Problem, theta: FloatArray, x0: list[FloatArray]) -> Spot | None:
+    """Return a trial point, None where the model there is refused or the simulation diverges."""
+    try:
+        spot = problem.spot(theta, x0)
+    except (AutotuneError, OverflowError):
+        return None
+    return spot if bounded(spot.e) else None

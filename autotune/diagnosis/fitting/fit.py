@@ -1,0 +1,272 @@
+"""Fits by free-run simulation error: whitened residuals, Gauss-Newton with damping, start states as nuisances.
+
+The simulated output is y_sim(theta, x0); r = y - y_sim; e_k = (r_k - a1 r_{k-1} - a2 r_{k-2}) / sd. The start states
+of all windows are free and eliminated by their Schur complement. In closed loop u depends on past noise; with e white
+at the true parameters the criterion stays consistent as soon as there is a sample of delay in the loop, which the
+zero-order hold provides.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from autotune.arrays import BoolArray, FloatArray, IntArray
+from autotune.diagnosis.fitting.data import Data
+from autotune.diagnosis.fitting.descent import (
+    Derivatives,
+    Problem,
+    Spot,
+    bounded,
+    continued,
+    descend,
+    eliminate,
+    simulate,
+)
+from autotune.diagnosis.fitting.parameters import Parametrisation
+from autotune.diagnosis.simulation.kernel import SIGNALS
+from autotune.diagnosis.simulation.simulator import Simulator
+from autotune.errors import AutotuneError, IdentificationError
+from autotune.models import Model
+
+#: What a fit raises where the simulation runs away: that start is no hypothesis.
+RUNAWAY = (AutotuneError, OverflowError, np.linalg.LinAlgError)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Fit:
+    """Outcome of a fit.
+
+    Attributes
+    ----------
+    parametrisation : Parametrisation
+        What was free.
+    theta : (p,) array
+        Estimate in units of the search.
+    x0 : tuple of (W, n) array
+        Start states per recording.
+    chi2 : float
+        Sum of squared whitened residuals.
+    penalty : float
+        Squared distance from the prior in its standard deviations.
+    covariance : (p, p) array
+        Of theta, scaled with the residual's variance where that exceeds the noise.
+    residuals, whitened : tuple of (N,) array
+        Per recording.
+    signals : tuple of (N, 4) array
+        Simulated reading, speed, position, plant input.
+    explained : (N, q) array
+        What moving the free numbers can explain of a residual beyond the start states: columns that are orthonormal
+        together with the rows of what is believed of the numbers.
+    states_explain : tuple of (L, m) array
+        The same for the start state of every window.
+    jacobian : (N, p) and (N, n) array
+        Derivatives of the whitened residual to the free numbers and to every window's start state.
+    windows : tuple of (first, last)
+        Rows of every window in the concatenated residual.
+    starts : tuple of (W,) int array
+        The windows' first rows in their recordings.
+    rows : int
+        Rows that count.
+    sim : Simulator
+        The fitted model, assembled.
+    """
+
+    parametrisation: Parametrisation
+    theta: FloatArray
+    x0: tuple[FloatArray, ...]
+    chi2: float
+    penalty: float
+    covariance: FloatArray
+    residuals: tuple[FloatArray, ...]
+    whitened: tuple[FloatArray, ...]
+    signals: tuple[FloatArray, ...]
+    explained: FloatArray = field(repr=False)
+    states_explain: tuple[FloatArray, ...] = field(repr=False)
+    windows: tuple[tuple[int, int], ...]
+    starts: tuple[IntArray, ...]
+    rows: int
+    sim: Simulator = field(repr=False)
+    jacobian: tuple[FloatArray, FloatArray] = field(repr=False)
+
+    @property
+    def e(self) -> FloatArray:
+        """All whitened residuals, one recording after the other."""
+        return np.concatenate(self.whitened)
+
+    @property
+    def model(self) -> Model:
+        """The fitted model."""
+        return self.parametrisation.with_values(self.theta)
+
+    def without_states(self, direction: FloatArray) -> FloatArray:
+        """Return what is left of a whitened direction when all start states may move against it."""
+        left = direction.copy()
+        for (a, b), Q in zip(self.windows, self.states_explain, strict=True):
+            left[a:b] -= Q @ (Q.T @ left[a:b])
+        return left
+
+    def without_numbers(self, direction: FloatArray) -> FloatArray:
+        """Return what is left of a direction freed of start states when the free numbers may move against it too.
+
+        They pay for how far they move from what is believed: what bends them far is not explained by them whole.
+        """
+        return np.asarray(direction - self.explained @ (self.explained.T @ direction))
+
+    @property
+    def cost(self) -> float:
+        """chi2 and penalty together."""
+        return self.chi2 + self.penalty
+
+
+def start_states(sim: Simulator, data: Data) -> list[FloatArray]:
+    """Return a first guess of every window's start state: rest at the row's command and reading."""
+    result = []
+    for recording, good, starts in zip(data.recordings, data.good, data.starts, strict=True):
+        states = []
+        for s in starts:
+            near = np.flatnonzero(good[s : s + 20])
+            y = recording.y[s + near[0]] if near.size else float(np.mean(recording.y[good]))
+            states.append(sim.rest_state(recording.u[max(s - 1, 0)], y))
+        result.append(np.array(states))
+    return result
+
+
+def states_of(result: Fit, data: Data) -> list[FloatArray]:
+    """Return a fit's start states of the windows that thinned data have."""
+    pairs = zip(result.x0, result.starts, data.starts, strict=True)
+    return [x0[np.searchsorted(known, starts)] for x0, known, starts in pairs]
+
+
+def fit(
+    parametrisation: Parametrisation,
+    data: Data,
+    theta: FloatArray | None = None,
+    x0: Sequence[FloatArray] | None = None,
+    iterations: int = 10,
+    rounds: int = 2,
+    tolerance: float = 0.05,
+    free: BoolArray | None = None,
+    inherit: Fit | None = None,
+) -> Fit:
+    """Fit by simulation error.
+
+    Parameters
+    ----------
+    parametrisation : Parametrisation
+        What is free, and where to start.
+    data : Data
+        What to fit to.
+    theta : (p,) array, optional
+        Start; the parametrisation's centre by default.
+    x0 : sequence of (W, n) array, optional
+        Start states to begin from; rest by default.
+    iterations : int
+        Most Gauss-Newton steps per round.
+    rounds : int
+        Most rounds; each begins with start states carried over from the window before where that fits better.
+    tolerance : float
+        Decrease of the cost at which to stop, in units of the noise variance.
+    free : (p,) bool array, optional
+        Numbers that may move; all by default.
+    inherit : Fit, optional
+        A fit of the same chain with fewer effects near the start, whose derivatives are used at first.
+
+    Returns
+    -------
+    Fit
+        Estimate with covariance, residuals and signals.
+
+    Raises
+    ------
+    IdentificationError
+        The simulation diverges at the starting point, or derivatives leave the range of numbers.
+
+    Notes
+    -----
+    A local search: effects with thresholds need several starts. The covariance is the linearised one.
+    """
+    point = parametrisation.centre.copy() if theta is None else theta.copy()
+    problem = Problem(parametrisation, data)
+    sim = parametrisation.simulator(point)
+    problem.scales = sim.state_sizes(
+        [r.u for r in data.recordings], [r.y[g] for r, g in zip(data.recordings, data.good, strict=True)]
+    )
+    fits_in = x0 is not None and x0[0].shape[1] == sim.order
+    states = [x.copy() for x in x0] if x0 is not None and fits_in else start_states(sim, data)
+    may = np.ones(point.size, dtype=bool) if free is None else free
+    spot = problem.spot(point, states)
+    if not bounded(spot.e):
+        raise IdentificationError("the simulation runs away at the starting point", where="fit")
+    derivatives = None
+    near = inherit is not None and float(spot.e @ spot.e) < 2.0 * inherit.chi2
+    if inherit is not None and near and inherit.jacobian[1].shape[1] == sim.order:
+        derivatives = problem.inherited(point, states, spot.e, inherit.jacobian)
+    for _ in range(rounds):
+        spot, derivatives = descend(problem, spot, derivatives, may, iterations, tolerance)
+        before = spot.e @ spot.e
+        spot = continued(problem, spot)
+        if before - spot.e @ spot.e < 2.0 + 1e-4 * before:
+            break
+        derivatives = None
+    if derivatives is None:
+        derivatives = problem.jacobian(spot, may)
+    return _finish(problem, spot, derivatives, may)
+
+
+def residual_at(
+    parametrisation: Parametrisation, data: Data, theta: FloatArray, x0: tuple[FloatArray, ...]
+) -> FloatArray:
+    """Return the whitened residual at a point, all recordings one after the other."""
+    return Problem(parametrisation, data).spot(theta, list(x0)).e
+
+
+def _finish(problem: Problem, spot: Spot, derivatives: Derivatives, may: BoolArray) -> Fit:
+    windows = [(int(a), int(b)) for a, b in zip(problem.first, problem.last, strict=True)]
+    _, J_left, _, _ = eliminate(problem, derivatives, spot.e)
+    chi2 = float(spot.e @ spot.e)
+    prior = problem.prior(spot.e, may)
+    believed = np.where(may, 1.0 / problem.parametrisation.spreads, 0.0)
+    excess = max(1.0, chi2 / max(problem.data.rows - spot.theta.size, 1))
+    with np.errstate(over="ignore", invalid="ignore"):
+        H = J_left.T @ J_left / excess + np.diag(believed**2)
+    if not np.all(np.isfinite(H)):
+        raise IdentificationError("derivatives leave the range of numbers", where="fit")
+    edges = np.cumsum([len(r) for r in problem.data.recordings])[:-1]
+    signals = simulate(spot.sim, spot.x0, problem.data, SIGNALS)[0]
+    rows = zip(problem.data.recordings, signals, problem.data.good, strict=True)
+    return Fit(
+        parametrisation=problem.parametrisation,
+        theta=spot.theta,
+        x0=tuple(spot.x0),
+        chi2=chi2,
+        penalty=float(np.sum((prior * (spot.theta - problem.parametrisation.centre)) ** 2)),
+        covariance=np.asarray(np.linalg.pinv(H, rcond=1e-14, hermitian=True)),
+        residuals=tuple(np.where(good, r.y - out[:, 0], 0.0) for r, out, good in rows),
+        whitened=tuple(np.split(spot.e, edges)),
+        signals=tuple(signals),
+        explained=_basis(J_left, prior),
+        jacobian=derivatives,
+        states_explain=tuple(_basis(derivatives[1][a:b]) for a, b in windows),
+        windows=tuple(windows),
+        starts=problem.data.starts,
+        rows=problem.data.rows,
+        sim=spot.sim,
+    )
+
+
+def _basis(J: FloatArray, prior: FloatArray | None = None) -> FloatArray:
+    """Return columns that span the well-determined part of J's columns: orthonormal with the rows of the prior."""
+    norms = np.linalg.norm(J, axis=0)
+    felt = norms > 1e-9
+    scaled = J[:, felt] / norms[felt]
+    if scaled.shape[1] == 0:
+        return np.zeros((J.shape[0], 0))
+    H = scaled.T @ scaled
+    if prior is not None:
+        H += np.diag((prior[felt] / norms[felt]) ** 2)
+    values, vectors = np.linalg.eigh(H)
+    keep = values > 1e-8 * values[-1]
+    return np.asarray(scaled @ (vectors[:, keep] / np.sqrt(values[keep])))

@@ -1,0 +1,247 @@
+"""What is free in a fit: the chain's own numbers, with what is believed of them, and the parameters of effects."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from types import MappingProxyType
+from typing import Literal, TypeAlias
+
+import numpy as np
+
+from autotune.arrays import FloatArray
+from autotune.diagnosis.effects import kind_of
+from autotune.diagnosis.simulation.simulator import Simulator, assemble
+from autotune.models import Block, Effect, Model, Parameter, TransferFunction
+
+Kind: TypeAlias = Literal["gain", "den", "num", "delay", "u_offset", "effect"]
+#: Standard deviation of a nominal number's logarithm: people's gains and lags are right to some tens of percent.
+NOMINAL_SPREAD = 0.2
+
+
+@dataclass(frozen=True, kw_only=True)
+class Free:
+    """One free number.
+
+    Attributes
+    ----------
+    name : str
+        For tables.
+    kind : str
+        What it changes.
+    index : tuple of int
+        Block and coefficient, or effect and parameter.
+    positive : bool
+        Searched as a logarithm.
+    size : float
+        Its natural size: unit of a step where it is searched linearly.
+    spread : float
+        Standard deviation of its prior, in units of the search; infinite where there is none.
+    turns : bool
+        Whether it acts by the angle that it adds up until a recording's end.
+    """
+
+    name: str
+    kind: Kind
+    index: tuple[int, int] = (0, 0)
+    positive: bool = True
+    size: float = 1.0
+    spread: float = math.inf
+    turns: bool = False
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Parametrisation:
+    """A model with numbers set free.
+
+    Attributes
+    ----------
+    model : Model
+        Nominal chain with the effects at their starting values.
+    free : tuple of Free
+        What is free.
+    centre : (p,) array
+        Nominal values in units of the search; also the prior's mean.
+    fixed : mapping
+        Effect parameters that are not searched, by (effect, parameter name).
+    """
+
+    model: Model
+    free: tuple[Free, ...]
+    centre: FloatArray
+    fixed: MappingProxyType[str, float] = field(default_factory=lambda: MappingProxyType({}))
+
+    @property
+    def spreads(self) -> FloatArray:
+        """Prior standard deviations in units of the search."""
+        return np.array([f.spread for f in self.free])
+
+    def value(self, i: int, theta: FloatArray) -> float:
+        """Return free number i in its own unit."""
+        f = self.free[i]
+        return math.exp(theta[i]) if f.positive else theta[i] * f.size
+
+    @property
+    def effect_numbers(self) -> int:
+        """Free numbers beyond those of the nominal structure, those that a direct search sets included."""
+        located = sum(
+            q.role == "location" and q.name in effect.parameters
+            for effect in self.model.effects
+            for q in kind_of(effect.name).parameters
+        )
+        return located + sum(f.kind == "effect" for f in self.free)
+
+    def simulator(self, theta: FloatArray) -> Simulator:
+        """Return the model at a point of the search, assembled."""
+        return assemble(self.with_values(theta))
+
+    def with_values(self, theta: FloatArray) -> Model:
+        """Return the model at a point of the search."""
+        gain, u_offset, delay = 1.0, self.model.input.offset, None
+        factors: dict[tuple[str, int, int], float] = {}
+        effects: dict[tuple[int, int], float] = {}
+        for i, f in enumerate(self.free):
+            value = self.value(i, theta)
+            if f.kind == "gain":
+                gain = value
+            elif f.kind == "u_offset":
+                u_offset = self.model.input.offset + value
+            elif f.kind == "delay":
+                delay = max(value, 0.0)
+            elif f.kind == "effect":
+                effects[f.index] = value
+            else:
+                factors[(f.kind, *f.index)] = value
+        blocks = _scaled(self.model.blocks, gain, factors, delay)
+        return replace(
+            self.model,
+            input=replace(self.model.input, offset=u_offset),
+            blocks=blocks,
+            effects=_set_effects(self.model.effects, effects),
+        )
+
+
+def _set_effects(effects: tuple[Effect, ...], values: dict[tuple[int, int], float]) -> tuple[Effect, ...]:
+    result = []
+    for number, effect in enumerate(effects):
+        parameters = {
+            key: replace(parameter, value=values.get((number, j), parameter.value))
+            for j, (key, parameter) in enumerate(effect.parameters.items())
+        }
+        result.append(replace(effect, parameters=MappingProxyType(parameters)))
+    return tuple(result)
+
+
+def _scaled(
+    blocks: tuple[Block, ...], gain: float, factors: dict[tuple[str, int, int], float], delay: float | None
+) -> tuple[Block, ...]:
+    """Return the blocks with their coefficients multiplied, the whole gain put on the gain's block."""
+    target = gain_block(blocks)
+    result = []
+    for i, block in enumerate(blocks):
+        dynamics = block.dynamics
+        num = [c * factors.get(("num", i, j), 1.0) for j, c in enumerate(dynamics.num)]
+        den = [c * factors.get(("den", i, j), 1.0) for j, c in enumerate(dynamics.den)]
+        if i == target:
+            num = [c * gain for c in num]
+        wait = dynamics.delay_s if delay is None else (delay if i == 0 else 0.0)
+        result.append(replace(block, dynamics=TransferFunction(num=tuple(num), den=tuple(den), delay_s=wait)))
+    return tuple(result)
+
+
+def gain_block(blocks: Sequence[Block]) -> int:
+    """Return the number of the block that carries the chain's uncertain gain: the first dynamic one of the plant."""
+    dynamic = [i for i, block in enumerate(blocks) if len(block.dynamics.den) > 1]
+    plant = [i for i in dynamic if blocks[i].place == "plant"]
+    return (plant or dynamic or [0])[0]
+
+
+def chain_parameters(model: Model, input_size: float, sample_time_s: float) -> tuple[list[Free], list[float]]:
+    """Return the chain's free numbers and their centres.
+
+    Parameters
+    ----------
+    model : Model
+        Nominal model.
+    input_size : float
+        Size of the command's deviations, the step of its offset.
+    sample_time_s : float
+        Sample time [s], the least uncertainty of a dead time.
+
+    Returns
+    -------
+    free, centre
+        Gain, every lag (coefficients of denominators above the constant), zeros, dead time where the model has one,
+        and the command's operating point.
+    """
+    free = [Free(name="gain", kind="gain", spread=NOMINAL_SPREAD)]
+    centre = [0.0]
+    for i, block in enumerate(model.blocks):
+        den, num = block.dynamics.den, block.dynamics.num
+        for j in range(len(den) - 1):
+            if den[j] != 0.0 and den[-1] != 0.0:
+                free.append(Free(name=f"{block.name} den[{j}]", kind="den", index=(i, j), spread=NOMINAL_SPREAD))
+                centre.append(0.0)
+        for j in range(len(num) - 1):
+            if num[j] != 0.0:
+                free.append(Free(name=f"{block.name} num[{j}]", kind="num", index=(i, j), spread=NOMINAL_SPREAD))
+                centre.append(0.0)
+    delay = sum(block.dynamics.delay_s for block in model.blocks)
+    if delay > 0.0:
+        # searched in units of the dead time itself: a logarithm would never reach zero
+        spread = max(NOMINAL_SPREAD, 0.5 * sample_time_s / delay)
+        free.append(Free(name="dead time", kind="delay", positive=False, size=delay, spread=spread))
+        centre.append(1.0)
+    free.append(Free(name="input offset", kind="u_offset", positive=False, size=input_size))
+    centre.append(0.0)
+    return free, centre
+
+
+def parametrise(
+    model: Model,
+    effects: Sequence[Effect],
+    input_size: float,
+    sample_time_s: float,
+) -> Parametrisation:
+    """Set a model's numbers and those of effects free.
+
+    Parameters
+    ----------
+    model : Model
+        Nominal model without effects.
+    effects : sequence of Effect
+        Effects at their starting values. Parameters that count or mark stay as they are.
+    input_size, sample_time_s : float
+        As in :func:`chain_parameters`.
+
+    Returns
+    -------
+    Parametrisation
+        Chain and effects, ready to be fitted.
+    """
+    free, centre = chain_parameters(model, input_size, sample_time_s)
+    for number, effect in enumerate(effects):
+        kind = kind_of(effect.name)
+        for j, (key, parameter) in enumerate(effect.parameters.items()):
+            q = kind.quantity(key)
+            if q is None or not q.is_fitted:
+                continue
+            positive = q.sign == "positive"
+            parts = [effect.parameters[k].value for k in (key, *q.size_with) if k in effect.parameters]
+            size = math.hypot(*parts) or 1.0
+            name = f"{effect.name}.{key}"
+            free.append(Free(name=name, kind="effect", index=(number, j), positive=positive, size=size, turns=q.turns))
+            centre.append(math.log(parameter.value) if positive else parameter.value / size)
+    return Parametrisation(model=replace(model, effects=tuple(effects)), free=tuple(free), centre=np.array(centre))
+
+
+def effect_with(name: str, values: Sequence[float], units: Sequence[str] = ()) -> Effect:
+    """Return an effect of the catalogue with values for its parameters, in their order; the last may be left out."""
+    quantities = kind_of(name).parameters[: len(values)]
+    given = list(units) or [""] * len(quantities)
+    parameters = {
+        q.name: Parameter(value=float(v), unit=unit)
+        for q, v, unit in zip(quantities, values, given[: len(quantities)], strict=True)
+    }
+    return Effect(name=name, parameters=MappingProxyType(parameters))

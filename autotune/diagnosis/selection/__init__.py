@@ -1,0 +1,1 @@
+"""Hypotheses: predicted, screened, fitted, compared."""

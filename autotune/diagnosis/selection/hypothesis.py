@@ -1,0 +1,77 @@
+"""A hypothesis: effects with the fit that has them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from autotune.diagnosis.effects import kind_of
+from autotune.diagnosis.effects.base import EffectKind, Fitted
+from autotune.diagnosis.fitting.data import Data
+from autotune.diagnosis.fitting.fit import Fit
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Hypothesis:
+    """Effects with the fit that has them; none for the retuned nominal structure."""
+
+    names: tuple[str, ...]
+    fit: Fit
+
+    @property
+    def parameters(self) -> int:
+        """Free numbers beyond those of the nominal structure, those that a direct search sets included."""
+        return self.fit.parametrisation.effect_numbers
+
+    @property
+    def kinds(self) -> tuple[EffectKind, ...]:
+        """What is known of its effects."""
+        return tuple(kind_of(name) for name in self.names)
+
+    @property
+    def penalised_chi2(self) -> float:
+        """The cost with what free numbers have to pay: ln N each of the effects', 1 each start state.
+
+        A block that an effect adds brings start states to every window, each of which takes 1 of chi2 from noise alone.
+        """
+        states = sum(Q.shape[1] for Q in self.fit.states_explain)
+        return float(self.fit.cost + self.parameters * np.log(self.fit.rows) + states)
+
+
+def hypothesis(fit: Fit) -> Hypothesis:
+    """Return a fit as a hypothesis, named after the effects of its model."""
+    return Hypothesis(names=tuple(e.name for e in fit.parametrisation.model.effects), fit=fit)
+
+
+def penalised(h: Hypothesis) -> float:
+    """Return a hypothesis's penalised chi-square, to sort by."""
+    return h.penalised_chi2
+
+
+def merged(first: Sequence[Hypothesis], second: Sequence[Hypothesis] = ()) -> list[Hypothesis]:
+    """Return the better fit of every combination of effects, best first."""
+    best: dict[frozenset[str], Hypothesis] = {}
+    for h in (*first, *second):
+        key = frozenset(h.names)
+        if key not in best or penalised(h) < penalised(best[key]):
+            best[key] = h
+    return sorted(best.values(), key=penalised)
+
+
+def is_stand_in(h: Hypothesis, data: Data) -> bool:
+    """Whether one of its effects came to where it is a simpler one by another name."""
+    able = [(e, kind_of(e.name)) for e in h.fit.model.effects if kind_of(e.name).stand_in is not None]
+    if not able:
+        return False
+    positions = np.concatenate([signals[:, 2] for signals in h.fit.signals])
+    travelled = float(np.nanmax(positions) - np.nanmin(positions))
+    for effect, kind in able:
+        values = {key: q.value for key, q in effect.parameters.items()}
+        fitted = Fitted(
+            values=values, travelled=travelled, noise_sd=data.noise.total_sd, mechanical=h.fit.sim.chain.is_mechanical
+        )
+        if kind.stand_in is not None and kind.stand_in(fitted):
+            return True
+    return False

@@ -1,0 +1,182 @@
+"""First order: what adding an effect to a fit would gain, without fitting it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from types import MappingProxyType
+
+import numpy as np
+
+from autotune.arrays import FloatArray
+from autotune.diagnosis.effects import kind_of
+from autotune.diagnosis.effects.base import EffectKind, SignalSizes
+from autotune.diagnosis.fitting.data import Data
+from autotune.diagnosis.fitting.descent import bounded
+from autotune.diagnosis.fitting.fit import RUNAWAY, Fit, residual_at
+from autotune.diagnosis.fitting.parameters import Parametrisation, effect_with, parametrise
+from autotune.errors import IdentificationError
+from autotune.models import Effect, Model
+
+#: Decrease that an effect's direction may have, as a share of chi2, before it is taken for too large to be linear.
+LINEAR_SHARE = 0.3
+#: Decrease that is predicted at least of an effect that makes impacts, where it acts at all.
+TOUCHED = 20.0
+#: Most simulations of one effect while it is shrunk, and the share of chi2 that a simulation counts that ran away.
+SHRINKINGS, RAN_AWAY = 4, 1e6
+#: Factors of an effect that are tried: of a signed one, of one that acts one way.
+SIGNED, ONE_WAY = (-20.0, 20.0), (0.0, 4.0)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Prediction:
+    """A starting point, the decrease of chi2 that the first order predicts from it, and the size it predicts it at."""
+
+    effect: Effect
+    decrease: float
+    scaled: Effect
+
+
+def signal_sizes(base: Fit, data: Data) -> SignalSizes:
+    """Return the sizes of the signals in the recordings under a fitted model."""
+    sim = base.sim
+    w = np.concatenate([r.u for r in data.recordings]) - sim.u_offset
+    y = np.concatenate([r.y[g] for r, g in zip(data.recordings, data.good, strict=True)])
+    signals = np.concatenate(base.signals)
+    rates = np.abs(np.linalg.eigvals(sim.chain.A))
+    rates = rates[rates > 1e-9 * max(float(rates.max()), 1e-12)]
+    tiny = 1e-12
+
+    def largest(values: FloatArray) -> float:
+        # the spikes that a differentiating controller puts into u say nothing of the sizes at work
+        return max(float(np.nanquantile(np.abs(values), 0.98)), tiny)
+
+    return SignalSizes(
+        w=largest(w),
+        f=largest(signals[:, 3]),
+        v=largest(signals[:, 1]),
+        x=largest(signals[:, 2]),
+        y=largest(y - sim.y_offset),
+        w_low=float(w.min() + sim.u_offset),
+        w_high=float(w.max() + sim.u_offset),
+        y_low=float(np.quantile(y, 0.001)),
+        y_high=float(np.quantile(y, 0.999)),
+        x_offset=sim.y_offset,
+        f_peak=max(float(np.nanmax(np.abs(s[:, 3]))) for s in base.signals),
+        gain=float(sim.chain.gains[0]),
+        lag_s=1.0 / float(rates.min()),
+        dt_s=data.recordings[0].sample_time_s,
+        duration_s=max(r.duration_s for r in data.recordings),
+        levels=sim.chain.levels,
+    )
+
+
+def units_of(kind: EffectKind, model: Model) -> list[str]:
+    """Return the units of an effect's parameters in a model."""
+    units = {"u": model.input.unit, "y": model.output.unit}
+    plant_in = next((b.unit for b in model.blocks if b.place == "actuator" and b.unit), units["u"])
+    units |= {"f": plant_in, "v": f"{units['y']}/s"}
+    return [q.unit.format(**units) for q in kind.parameters]
+
+
+def starting_effects(kind: EffectKind, base: Fit, sizes: SignalSizes) -> list[Effect]:
+    """Return the starting points of an effect for a fit on top of a base."""
+    units = units_of(kind, base.parametrisation.model)
+    return [effect_with(kind.name, values, units) for values in kind.starts(sizes)]
+
+
+def extended(base: Fit, effect: Effect, data: Data) -> tuple[Parametrisation, FloatArray, tuple[FloatArray, ...]]:
+    """Return parametrisation, starting point and start states of a fit with one more effect."""
+    old = base.parametrisation
+    effects = (*base.model.effects, effect)
+    size = float(np.std(np.concatenate([r.u for r in data.recordings]))) or 1.0
+    p = parametrise(replace(old.model, effects=()), effects, size, data.recordings[0].sample_time_s)
+    theta = p.centre.copy()
+    theta[: base.theta.size] = base.theta
+    # an effect's own centre is its starting value; those fitted already keep the scale of their search
+    free = (*old.free, *p.free[len(old.free) :])
+    p = replace(p, free=free, centre=np.concatenate([old.centre, p.centre[len(old.free) :]]))
+    return p, theta, carried_states(base, effect, data)
+
+
+def carried_states(base: Fit, effect: Effect, data: Data) -> tuple[FloatArray, ...]:
+    """Return a fit's start states with those of a block that the effect adds, at rest with its neighbour."""
+    part = kind_of(effect.name).linear
+    if part is None or part.start is None or (part.unless_lagged and base.sim.chain.has_actuator_lag):
+        return base.x0
+    values = {key: q.value for key, q in effect.parameters.items()}
+    states = []
+    for r, starts, x in zip(data.recordings, data.starts, base.x0, strict=True):
+        u, y = r.u[np.maximum(starts - 1, 0)] - base.sim.u_offset, x @ base.sim.chain.taps[3]
+        added = part.start(u, y, values)
+        states.append(np.column_stack([added, x] if part.at == "front" else [x, added]))
+    return tuple(states)
+
+
+def predictions(base: Fit, effect: Effect, data: Data) -> list[Prediction]:
+    """Return what the first order predicts when an effect is added to a fit: near zero, and at the size given.
+
+    An effect that moves the reading by more than a share of chi2 is shrunk: what far too large an effect does
+    tells nothing of its direction near zero. Dry friction that is as large as that is found from its own size alone.
+    """
+    tried = []
+    for _ in range(SHRINKINGS):
+        found, share = _predicted(base, effect, data)
+        tried.append(found)
+        if share <= LINEAR_SHARE or not kind_of(effect.name).amplitudes:
+            break
+        effect = _scaled(effect, float(np.sqrt(0.3 * LINEAR_SHARE / share)), least=1e-9)
+    return [tried[-1], *tried[:1]] if len(tried) > 1 else tried
+
+
+def direction(base: Fit, effect: Effect, data: Data) -> FloatArray:
+    """Return how an effect moves the whitened residual, freed of what the start states could explain.
+
+    Raises
+    ------
+    AutotuneError, OverflowError, LinAlgError
+        The simulation runs away with the effect.
+    """
+    p, theta, states = extended(base, effect, data)
+    moved = residual_at(p, data, theta, states) - base.e
+    if not bounded(moved):
+        raise IdentificationError("the simulation runs away", where=effect.name)
+    return base.without_states(moved)
+
+
+def _predicted(base: Fit, effect: Effect, data: Data) -> tuple[Prediction, float]:
+    """Return what is predicted, and how far the effect moves the reading as a share of chi2.
+
+    The direction d = e(with effect) - e(without) is freed of what the numbers already free could explain; the decrease
+    of |e + a d|^2 over 0 <= a <= 4 is predicted, over -20 <= a <= 20 for an effect of either sign. After an impact
+    everything goes another way, which no first order tells: a stop that is touched predicts a little always.
+    """
+    kind = kind_of(effect.name)
+    nothing = Prediction(effect=effect, decrease=0.0, scaled=effect)
+    try:
+        d = direction(base, effect, data)
+    except RUNAWAY:
+        return nothing, RAN_AWAY
+    # the fit is at rest: its numbers have nothing to gain by themselves, and their priors are weighed with chi2
+    slope, curvature = -float(d @ base.e), float(d @ base.without_numbers(d))
+    if curvature == 0.0:
+        return nothing, 0.0
+    low, high = SIGNED if kind.is_signed else ONE_WAY
+    if not kind.amplitudes:
+        low, high = 0.0, 1.0  # a limit or a step is not made larger by a factor
+    a = float(np.clip(slope / curvature, low, high))
+    scaled = _scaled(effect, a, 20.0 if kind.is_signed else 2.0)
+    least = min(TOUCHED, curvature) if kind.impacts else 0.0
+    decrease = max(2.0 * a * slope - a * a * curvature, least)
+    return Prediction(effect=effect, decrease=decrease, scaled=scaled), curvature / base.chi2
+
+
+def _scaled(effect: Effect, a: float, most: float = np.inf, least: float = 0.05) -> Effect:
+    """Return the effect with its amplitudes multiplied, where that is a step one can trust."""
+    if a == 0.0:
+        return effect
+    factor = float(np.sign(a) * np.clip(abs(a), least, most))
+    amplitudes = kind_of(effect.name).amplitudes
+    parameters = {
+        key: replace(q, value=q.value * factor) if key in amplitudes else q for key, q in effect.parameters.items()
+    }
+    return replace(effect, parameters=MappingProxyType(parameters))

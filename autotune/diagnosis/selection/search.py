@@ -1,0 +1,255 @@
+"""Which physics is missing: the nominal structure retuned, effects added in ones, twos and threes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from autotune.arrays import BoolArray
+from autotune.diagnosis.effects import CATALOGUE, STRUCTURES
+from autotune.diagnosis.fitting.data import Data
+from autotune.diagnosis.fitting.fit import RUNAWAY, Fit, fit, states_of
+from autotune.diagnosis.fitting.noise import Noise, noise_from_differences
+from autotune.diagnosis.fitting.restarts import standing_out
+from autotune.diagnosis.fitting.retuning import (
+    COARSE,
+    LONGER,
+    at_operating_point,
+    far_from_prior,
+    floored,
+    holds,
+    prepare,
+    reduced_chi2,
+)
+from autotune.diagnosis.selection.growth import exchanged, grown, larger, lasting_starts, polished, pruned
+from autotune.diagnosis.selection.hypothesis import Hypothesis, merged, penalised
+from autotune.diagnosis.selection.parsimony import (
+    MODEL_ERROR,
+    final_lead,
+    needed,
+    simplest,
+    simplicity_lead,
+    worth_adding,
+)
+from autotune.diagnosis.selection.screening import Bench, Width
+from autotune.models import Model
+from autotune.recording import Recording
+
+#: Rows on which hypotheses are screened; the best are fitted to all.
+SCREENING_ROWS = 4500
+Progress = Callable[[str, float], None]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Search:
+    """Everything that the search found.
+
+    Attributes
+    ----------
+    data : Data
+        Recordings with windows and noise.
+    nominal : Fit
+        Nominal numbers, start states fitted.
+    retuned : Hypothesis
+        Nominal structure, numbers fitted.
+    singles, pairs, triples : tuple of Hypothesis
+        Hypotheses fitted, best first.
+    chosen : Hypothesis
+        The one that the data ask for; the retuned model where no effect is needed.
+    """
+
+    data: Data
+    nominal: Fit
+    retuned: Hypothesis
+    singles: tuple[Hypothesis, ...] = ()
+    pairs: tuple[Hypothesis, ...] = ()
+    triples: tuple[Hypothesis, ...] = ()
+    chosen: Hypothesis
+
+    @property
+    def all(self) -> tuple[Hypothesis, ...]:
+        """Every hypothesis, the retuned model first."""
+        return (self.retuned, *self.singles, *self.pairs, *self.triples)
+
+    @property
+    def gained(self) -> float:
+        """Decrease of the penalised chi-square that the chosen effects bring."""
+        return self.retuned.penalised_chi2 - self.chosen.penalised_chi2
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Stage:
+    """What a search has at hand: all data, those it screens on, the retuned model, and what it works with."""
+
+    data: Data
+    few: Data
+    base: Fit
+    bench: Bench
+
+    def polished(self, ranked: Sequence[Hypothesis], count: int) -> list[Hypothesis]:
+        """Return the best hypotheses fitted to all data, best first."""
+        return polished(ranked, count, self.data, self.base, self.bench)
+
+
+def search(
+    model: Model,
+    recordings: Sequence[Recording],
+    good: Sequence[BoolArray],
+    without: Sequence[str] = (),
+    progress: Progress = lambda what, share: None,
+) -> Search:
+    """Search for the physics that is missing.
+
+    Parameters
+    ----------
+    model : Model
+        Nominal model.
+    recordings, good : sequences
+        What was measured, and which rows count.
+    without : sequence of str
+        Effects left out of the catalogue.
+    progress : callable
+        Told what is being done and the share done, 0 to 1.
+
+    Returns
+    -------
+    Search
+        All hypotheses with their fits.
+
+    Notes
+    -----
+    Forward search with a beam: pairs are built on the best four singles, whether or not these help alone, so that
+    partners that only help together are found as long as one of them is among the four. What brings the residual to
+    noise must do so on longer windows too; else everything is searched again on those.
+    """
+    kinds = tuple(kind for name, kind in (CATALOGUE | STRUCTURES).items() if name not in without)
+    with threadpool_limits(1), ThreadPoolExecutor(2) as pool:
+        bench = Bench(pool=pool, kinds=kinds)
+        progress("retuning", 0.0)
+        found = _searched(*prepare(model, recordings, good, 1), bench, progress)
+        if not holds(found.chosen.fit, found.data):
+            progress("once more, on longer windows", 0.0)
+            found = _searched(*prepare(model, recordings, good, LONGER), bench, progress)
+        return found
+
+
+def _searched(data: Data, base: Fit, bench: Bench, progress: Progress) -> Search:
+    """Search beside a retuned model."""
+    try:
+        nominal = fit(base.parametrisation, data, x0=base.x0, free=np.zeros(base.theta.size, dtype=bool))
+    except RUNAWAY:
+        nominal = base  # nominal numbers that run away have no error that could be told
+    try:
+        return _extended(data, base, nominal, bench, progress)
+    except RUNAWAY:
+        # what breaks off explains nothing: the retuned model stands, and is judged by its residual
+        retuned = Hypothesis(names=(), fit=base)
+        return Search(data=data, nominal=nominal, retuned=retuned, chosen=retuned)
+
+
+def _extended(data: Data, base: Fit, nominal: Fit, bench: Bench, progress: Progress) -> Search:
+    """Add effects in ones, twos and threes as far as the residual asks for them."""
+    progress("single effects", 0.1)
+    stage = _Stage(data=data, few=data.thinned(SCREENING_ROWS, standing_out(base)), base=base, bench=bench)
+    candidates = _screened(stage)
+    singles = stage.polished(candidates, 3)
+    if singles and reduced_chi2(base, data) > COARSE:
+        stage = _finer(singles[0], stage)
+        candidates = [_again(h, stage.few) for h in candidates[:3]]
+        singles = stage.polished(candidates, 3)
+    retuned = chosen = Hypothesis(names=(), fit=stage.base)
+    if not singles or not (worth_adding(retuned, singles[0]) or reduced_chi2(stage.base, stage.data) > 1.1):
+        return Search(data=stage.data, nominal=nominal, retuned=retuned, singles=tuple(singles), chosen=retuned)
+    if worth_adding(retuned, singles[0]):
+        chosen = singles[0]
+    progress("pairs of effects", 0.4)
+    chosen, pairs, triples = _combined(chosen, singles, candidates, stage, progress)
+    if len(chosen.names) > 1:
+        progress("dropping what is not needed", 0.85)
+        chosen, singles = pruned(chosen, singles, stage.data, stage.base, bench)
+    if len(chosen.names) > 1:
+        ranked = sorted((chosen, *exchanged(chosen, stage.data, stage.base, bench)), key=penalised)
+        pairs = [*pairs, *ranked]
+        chosen = simplest(ranked, simplicity_lead(stage.base, ranked[0], stage.data))
+    if reduced_chi2(chosen.fit, stage.data) > MODEL_ERROR:
+        fewer = [h for h in (*singles, *pairs) if h.parameters < chosen.parameters]
+        chosen = simplest([chosen, *fewer], final_lead(stage.base, chosen, stage.data))
+    return Search(
+        data=stage.data,
+        nominal=nominal,
+        retuned=retuned,
+        singles=tuple(singles),
+        pairs=tuple(pairs),
+        triples=tuple(triples),
+        chosen=retuned if STRUCTURES.keys() & set(chosen.names) else chosen,
+    )
+
+
+def _screened(stage: _Stage) -> list[Hypothesis]:
+    """Return single effects fitted to the rows that are screened on, best first.
+
+    Where retuning went far from the prior, effects are looked for beside the chain at its prior as well.
+    """
+    base, data, few, bench = stage.base, stage.data, stage.few, stage.bench
+    p = base.parametrisation
+    start = Hypothesis(names=(), fit=base if few is data else fit(p, few, base.theta, states_of(base, few)))
+    found = grown(start, few, bench, Width(effects=7), lasting_starts(start, few, bench, bench.names))
+    if not far_from_prior(base):
+        return found
+    at_prior = Hypothesis(names=(), fit=at_operating_point(p, few))
+    lasting = lasting_starts(at_prior, few, bench, bench.names)
+    return merged(found, grown(at_prior, few, bench, Width(effects=7, starts=2), lasting))
+
+
+def _combined(
+    chosen: Hypothesis,
+    singles: list[Hypothesis],
+    candidates: list[Hypothesis],
+    stage: _Stage,
+    progress: Progress,
+) -> tuple[Hypothesis, list[Hypothesis], list[Hypothesis]]:
+    """Return the choice among singles, pairs and triples, and the pairs and triples fitted."""
+    data, base, retuned = stage.data, stage.base, Hypothesis(names=(), fit=stage.base)
+    wider = _paired(singles, candidates, stage)
+    pairs, triples = stage.polished(wider, 2), list[Hypothesis]()
+    if not (pairs and worth_adding(retuned, pairs[0]) and needed(singles[0], pairs[0], data, base)):
+        return chosen, pairs, triples
+    chosen = pairs[0]
+    if reduced_chi2(chosen.fit, data) > 1.05:
+        progress("three effects", 0.8)
+        triples = stage.polished(larger(wider[:1], stage.few, stage.bench), 1)
+    if triples and needed(pairs[0], triples[0], data, base):
+        chosen = triples[0]
+    return chosen, pairs, triples
+
+
+def _paired(singles: list[Hypothesis], candidates: list[Hypothesis], stage: _Stage) -> list[Hypothesis]:
+    """Return pairs built on the best singles.
+
+    A single effect that leaves noise alone is given one chance to be half of a pair, a bad one three.
+    """
+    settled = reduced_chi2(singles[0].fit, stage.data) < 1.03
+    lead = [h for h in candidates if h.names == singles[0].names]
+    bases = [*lead, *(h for h in candidates[:3] if h not in lead)]
+    wider = larger(bases[: 1 if settled else 3], stage.few, stage.bench)
+    return [h for h in wider if penalised(lead[0]) - penalised(h) > 5.0]
+
+
+def _finer(best: Hypothesis, stage: _Stage) -> _Stage:
+    """Return data with the noise that the best hypothesis leaves, and the retuned model under it."""
+    data, base = stage.data, stage.base
+    noise = noise_from_differences(best.fit.residuals, data.good)
+    if reduced_chi2(best.fit, data) > COARSE:
+        noise = Noise(sd=float(np.sqrt(np.mean(np.concatenate(best.fit.residuals) ** 2))))
+    data = replace(data, noise=floored(noise, data.recordings))
+    base = fit(base.parametrisation, data, base.theta, base.x0, iterations=20)
+    return replace(stage, data=data, base=base, few=data.thinned(SCREENING_ROWS, standing_out(base)))
+
+
+def _again(h: Hypothesis, data: Data) -> Hypothesis:
+    """Fit a hypothesis again under another noise."""
+    return replace(h, fit=fit(h.fit.parametrisation, data, h.fit.theta, h.fit.x0, iterations=20))

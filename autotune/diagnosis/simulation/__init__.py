@@ -1,0 +1,1 @@
+"""A model with effects in it, compiled and driven by a recording."""

@@ -1,0 +1,222 @@
+"""The linear chain in state space, arranged so that physics can be put into it.
+
+Every first-order block's state is its output, so that speed, position and level are states; blocks of higher order
+are in controllable form. Forces enter at the input of the first plant block, in that input's unit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+
+import numpy as np
+
+from autotune.arrays import FloatArray, IntArray
+from autotune.diagnosis.simulation import kernel
+from autotune.errors import InputError
+from autotune.models import Block, Model
+
+#: Positions in a chain's ``where``.
+ACTUATOR, SPEED, POSITION = range(3)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Chain:
+    """State space of a chain with its signals.
+
+    Attributes
+    ----------
+    A : (n, n) array
+        Dynamics.
+    B : (n, 3) array
+        Columns: command, force at the first plant block's input, input of the last plant block.
+    taps : (5, n) array
+        Rows: plant input, speed, position (or level), output, first level.
+    gains : (4,) array
+        Gain of the first plant block from force to speed or level, of the last plant block, direct gain from command
+        to plant input and from command to output.
+    where : (3,) int array
+        State numbers of actuator lag, speed and position, -1 where there is none.
+    levels : int
+        Number of levels, one above the other; 0 where the plant has a speed.
+    delay_s : float
+        Dead time of all blocks together, which commutes with the linear chain.
+    plant : slice
+        The states of the plant's blocks.
+    """
+
+    A: FloatArray
+    B: FloatArray
+    taps: FloatArray
+    gains: FloatArray
+    where: IntArray
+    levels: int
+    delay_s: float
+    plant: slice
+
+    @property
+    def order(self) -> int:
+        """Number of states."""
+        return int(self.A.shape[0])
+
+    @cached_property
+    def fastest_of_plant(self) -> float:
+        """Largest rate of the plant's own poles [rad/s]."""
+        return float(np.max(np.abs(np.linalg.eigvals(self.A[self.plant, self.plant]))))
+
+    @property
+    def has_actuator_lag(self) -> bool:
+        """Whether an actuator's first-order lag stands before the plant."""
+        return bool(self.where[ACTUATOR] >= 0)
+
+    @property
+    def has_position_state(self) -> bool:
+        """Whether the position or level is itself a state."""
+        return bool(self.where[POSITION] >= 0)
+
+    @property
+    def is_mechanical(self) -> bool:
+        """Whether the plant has a speed and a position."""
+        return bool(self.taps[kernel.SPEED].any())
+
+    @property
+    def is_integrating(self) -> bool:
+        """Whether the chain has a pole at the origin."""
+        return bool(np.min(np.abs(np.linalg.eigvals(self.A))) < 1e-9) if self.order else False
+
+
+def _realise(block: Block) -> tuple[FloatArray, FloatArray, FloatArray, float]:
+    """Return A, b, c, d of one block."""
+    den = np.asarray(block.dynamics.den) / block.dynamics.den[0]
+    num = np.zeros(den.size)
+    num[den.size - len(block.dynamics.num) :] = np.asarray(block.dynamics.num) / block.dynamics.den[0]
+    n = den.size - 1
+    direct = float(num[0])
+    rest = num[1:] - direct * den[1:]
+    if n == 1:
+        if rest[0] == 0.0:
+            return np.array([[-den[1]]]), np.array([0.0]), np.array([1.0]), direct
+        return np.array([[-den[1]]]), np.array([rest[0]]), np.array([1.0]), direct
+    A = np.zeros((n, n))
+    b = np.zeros(n)
+    if n:
+        A[:-1, 1:] = np.eye(n - 1)
+        A[-1] = -den[:0:-1]
+        b[-1] = 1.0
+    return A, b, rest[::-1].copy(), direct
+
+
+def build_chain(model: Model) -> Chain:
+    """Arrange a model's blocks in state space, see :func:`chain_of`; its effects are not looked at."""
+    return chain_of(model.blocks, model.name)
+
+
+@lru_cache(maxsize=64)
+def chain_of(blocks: tuple[Block, ...], name: str) -> Chain:
+    """Arrange blocks in state space; a fit asks for the same ones again and again.
+
+    Parameters
+    ----------
+    blocks : tuple of Block
+        The chain.
+    name : str
+        The model's name, for errors.
+
+    Returns
+    -------
+    Chain
+        State space with taps.
+
+    Raises
+    ------
+    InputError
+        A chain without any dynamics, or of more than 12 states.
+    """
+    order = sum(len(block.dynamics.den) - 1 for block in blocks)
+    if not 1 <= order <= 12:
+        raise InputError(f"the chain has {order} states", where=name, remedy="diagnosis handles 1 to 12 states")
+    plant = _plant_blocks(blocks)
+    A, B = np.zeros((order, order)), np.zeros((order, kernel.INPUTS))
+    taps, gains = np.zeros((5, order)), np.ones(4)
+    gains[2:] = 0.0
+    signals = _Signals(taps=taps, gains=gains, where=np.full(3, -1, dtype=np.int64))
+    row, direct = np.zeros(order), np.array([1.0, 0.0, 0.0])
+    at = 0
+    edges = [order, 0]
+    for number, block in enumerate(blocks):
+        a, b, c, d = _realise(block)
+        n = b.size
+        if number == plant[0]:
+            taps[kernel.PLANT_IN], gains[2] = row, direct[0]
+            direct[1] = 1.0
+        if number == plant[-1] and number != plant[0]:
+            direct[2] = 1.0
+        states = slice(at, at + n)
+        A[states, states] = a
+        A[states] += np.outer(b, row)
+        B[states] += np.outer(b, direct)
+        row = d * row
+        row[states] += c
+        direct = d * direct
+        if number in plant:
+            _note_signals(signals, block, (number == plant[0], number == plant[-1]), at, c, row)
+        if block.place == "actuator" and n == 1 and number < plant[0] and signals.where[ACTUATOR] < 0:
+            signals.where[ACTUATOR] = at
+        if number in plant:
+            edges = [min(edges[0], at), at + n]
+        at += n
+    taps[kernel.OUTPUT], gains[3] = row, direct[0]
+    return Chain(
+        A=A, B=B, taps=taps, gains=gains, where=signals.where, levels=0 if taps[kernel.SPEED].any() else len(plant),
+        delay_s=sum(block.dynamics.delay_s for block in blocks), plant=slice(*edges),
+    )  # fmt: skip
+
+
+def _plant_blocks(blocks: Sequence[Block]) -> list[int]:
+    """Return the numbers of the plant's dynamic blocks; without any, of the slowest block."""
+    dynamic = [i for i, b in enumerate(blocks) if len(b.dynamics.den) > 1]
+    plant = [i for i in dynamic if blocks[i].place == "plant"]
+
+    def slowness(i: int) -> float:
+        den = blocks[i].dynamics.den
+        return float("inf") if den[-1] == 0.0 else abs(den[0] / den[-1]) ** (1.0 / (len(den) - 1))
+
+    return plant or [max(dynamic, key=slowness)]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Signals:
+    """Where signals are read, filled in block by block."""
+
+    taps: FloatArray
+    gains: FloatArray
+    where: IntArray
+
+
+def _note_signals(
+    signals: _Signals, block: Block, ends: tuple[bool, bool], at: int, c: FloatArray, row: FloatArray
+) -> None:
+    """Note which states of a plant's block are speed, position and level, and the gain from force to them.
+
+    ``ends`` says whether it is the plant's first block and its last one.
+    """
+    (first, last), (taps, gains, where) = ends, (signals.taps, signals.gains, signals.where)
+    den, n = block.dynamics.den, c.size
+    static = block.dynamics.num[-1] / den[-1] if den[-1] != 0.0 else block.dynamics.num[-1] / den[0]
+    if first:
+        gains[0] = static
+        taps[kernel.FIRST_LEVEL] = row
+        if n == 2 and last:
+            taps[kernel.SPEED, at + 1] = c[0]
+            where[SPEED] = at + 1
+            where[POSITION] = at
+            taps[kernel.POSITION, at] = c[0]
+            return
+    if last:
+        gains[1] = static
+        taps[kernel.POSITION] = row
+        where[POSITION] = at if n == 1 else -1
+        if not first and n == 1 and den[-1] == 0.0:
+            taps[kernel.SPEED] = taps[kernel.FIRST_LEVEL]
+            where[SPEED] = at - 1

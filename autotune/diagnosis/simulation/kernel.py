@@ -1,0 +1,290 @@
+"""The body of the compiled simulation; the stages it calls are written from the effects' records.
+
+Between events the linear chain is advanced exactly: a table holds exp(A h) and its integrals for the steps h = i d,
+i = 0..NODES, and a step that falls between two nodes blends them. Lags much shorter than the sample time are
+therefore stable and exact. Forces that depend on the state are held over a sub-step and averaged with their value at
+its end (Heun); dry friction is solved implicitly, so that sticking is exact.
+
+This file is read as text and compiled together with the stages, see :mod:`autotune.diagnosis.simulation.compiled`: the
+compiler's cache would not notice a change in another file.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from autotune.arrays import FloatArray, IntArray
+from autotune.diagnosis.simulation.stages import (
+    MEMORIES,
+    Effects,
+    begin,
+    clock,
+    command,
+    converter,
+    force,
+    friction,
+    inlined,
+    load,
+    outflow,
+    reading,
+    sensor,
+    stop,
+    travel,
+)
+
+#: Nodes of the table of transition matrices.
+NODES = 64
+#: Columns of B: command, force at the first plant block's input, force at the last plant block's input.
+INPUTS = 3
+#: Rows of the taps.
+PLANT_IN, SPEED, POSITION, OUTPUT, FIRST_LEVEL = range(5)
+#: Columns of the returned signals: reading, speed, position (or level), plant input.
+SIGNALS = 4
+
+#: Positions in the vector of numbers, before the effects' values.
+(
+    STEP, DELAY, U_OFFSET, Y_OFFSET, KELVIN, GAIN, GAIN_LAST, DIRECT_IN, DIRECT_OUT, NUMBERS
+) = range(10)  # fmt: skip
+#: Positions in the vector of integers, before those that say which effects act.
+(
+    NUMBER, SIGNALS_ASKED, LINEAR_HOLD, DIRECTIONAL, ACTUATOR, SPEED_STATE, POSITION_STATE, FORCED, SMOOTH, RUBBING,
+    DRAINING, STOPPED, SENSING, PLAIN, REPLAYED, FLAGS
+) = range(16)  # fmt: skip
+
+
+class _Linear(NamedTuple):
+    """The chain within a run: transition matrices by slot and the node each is for, taps, and how steps are split."""
+
+    M: FloatArray
+    known: FloatArray
+    taps: FloatArray
+    numbers: FloatArray
+    flags: IntArray
+
+
+class _Work(NamedTuple):
+    """Vectors of the state's length that every sub-step uses again."""
+
+    x: FloatArray
+    free: FloatArray
+    column: FloatArray
+    end: FloatArray
+
+
+@inlined
+def _blend(table: FloatArray, node: float, slot: int, linear: _Linear) -> None:
+    """Write a step's transition matrix into a slot, unless it is there from a step of the same length."""
+    M, known = linear.M, linear.known
+    if abs(node - known[slot]) < 1e-8:
+        return
+    known[slot] = node
+    i = int(node + 1e-6)
+    part = node - i if node - i > 1e-6 else 0.0
+    j = min(i + 1, NODES)
+    for row in range(M.shape[1]):
+        for k in range(M.shape[2]):
+            M[slot, row, k] = table[i, row, k] + part * (table[j, row, k] - table[i, row, k])
+
+
+@inlined
+def _advance(M: FloatArray, slot: int, x: FloatArray, w: float, out: FloatArray) -> None:
+    """Write the state after one step under the command alone."""
+    n = x.size
+    for row in range(n):
+        total = M[slot, row, n] * w
+        for k in range(n):
+            total += M[slot, row, k] * x[k]
+        out[row] = total
+
+
+@inlined
+def _tap(taps: FloatArray, row: int, x: FloatArray) -> float:
+    total = 0.0
+    for k in range(x.size):
+        total += taps[row, k] * x[k]
+    return total
+
+
+@inlined
+def _state_force(x: FloatArray, w: float, linear: _Linear, effects: Effects) -> float:
+    """Return the state-dependent force for a state."""
+    taps, numbers = linear.taps, linear.numbers
+    plant_in = _tap(taps, PLANT_IN, x) + numbers[DIRECT_IN] * w
+    v, position, level = _tap(taps, SPEED, x), _tap(taps, POSITION, x), _tap(taps, FIRST_LEVEL, x)
+    return float(force(plant_in, v, position, level, numbers[Y_OFFSET], numbers[GAIN], numbers[KELVIN], effects))
+
+
+@inlined
+def _rubbed(work: _Work, taps: FloatArray, effects: Effects) -> float:
+    """Return the dry friction that opposes motion: what stops the speed, at most the friction's level."""
+    level = friction(_tap(taps, SPEED, work.x), effects)
+    per_force = _tap(taps, SPEED, work.column)
+    if per_force == 0.0:
+        return 0.0
+    needed = -_tap(taps, SPEED, work.free) / per_force
+    return float(min(max(needed, -level), level))
+
+
+@inlined
+def _push(slot: int, w: float, push: float, dt: float, linear: _Linear, work: _Work, effects: Effects) -> None:
+    """Add to the force-free step what the forces do: Heun for smooth ones, implicit for dry friction."""
+    M, taps, flags = linear.M, linear.taps, linear.flags
+    x, free, column, end = work.x, work.free, work.column, work.end
+    n = x.size
+    total = push
+    for i in range(n):
+        column[i] = M[slot, i, n + 1]
+    if flags[SMOOTH]:
+        before = _state_force(x, w, linear, effects)
+        for i in range(n):
+            end[i] = free[i] + column[i] * (before + push)
+        travel(_tap(taps, POSITION, end) - _tap(taps, POSITION, x), dt, effects)
+        after = _state_force(end, w, linear, effects)
+        total += 0.5 * (before + after)
+    for i in range(n):
+        free[i] += column[i] * total
+    if flags[RUBBING]:
+        rubbed = _rubbed(work, taps, effects)
+        for i in range(n):
+            free[i] += column[i] * rubbed
+    if flags[DRAINING]:
+        added = outflow(_tap(taps, POSITION, x), _tap(taps, FIRST_LEVEL, x), linear.numbers[GAIN_LAST], effects)
+        for row in range(n):
+            free[row] += M[slot, row, n + 2] * added
+
+
+@inlined
+def _stop(x: FloatArray, linear: _Linear, effects: Effects) -> None:
+    """Hold the position where a stop holds it."""
+    p, v = linear.flags[POSITION_STATE], linear.flags[SPEED_STATE]
+    x[p], speed = stop(x[p], x[v] if v >= 0 else 0.0, linear.numbers[Y_OFFSET], effects)
+    if v >= 0:
+        x[v] = speed
+
+
+@inlined
+def _held(driven: FloatArray, j: int, begin_s: float, dt: float, linear: _Linear) -> float:
+    """Return the command in the middle of a sub-step: as held, or on the straight line to the next row's."""
+    value = driven[1, j]
+    if linear.flags[LINEAR_HOLD] and j + 1 < driven.shape[1]:
+        share = (begin_s + 0.5 * dt - linear.numbers[DELAY] - driven[0, j]) / (driven[0, j + 1] - driven[0, j])
+        value += min(max(share, 0.0), 1.0) * (driven[1, j + 1] - driven[1, j])
+    return float(value)
+
+
+@njit(cache=True, nogil=True)
+def run(
+    driven: FloatArray,
+    rows: IntArray,
+    states: FloatArray,
+    tables: FloatArray,
+    taps: FloatArray,
+    numbers: FloatArray,
+    flags: IntArray,
+) -> FloatArray:
+    """Simulate a recording's rows, the state restarted at given rows.
+
+    Parameters
+    ----------
+    driven : (2, N) array
+        Time stamps [s] and commands.
+    rows : (2, W) int array
+        Rows where windows start, increasing, and rows before which they end; rows outside all windows stay NaN.
+    states : (2, W, n) array
+        State at the first of those rows; receives the state at the last of them.
+    tables : (2, NODES+1, n, n+INPUTS) array
+        Transition tables for a step; two of them where the actuator's lag depends on its direction.
+    taps : (5, n) array
+        How signals are read from the state, see :mod:`autotune.diagnosis.simulation.chain`.
+    numbers, flags : arrays
+        See the positions above; then the effects' values, and which of them act.
+
+    Returns
+    -------
+    (signals, N) array
+        Reading, speed, position and plant input at each row, or the reading alone.
+    """
+    t, u = driven[0], driven[1]
+    N, n = t.size, states.shape[2]
+    out = np.full((flags[SIGNALS_ASKED], N), np.nan)
+    linear = _Linear(np.empty((4, n, n + INPUTS)), np.full(4, -1.0), taps, numbers, flags)
+    work = _Work(np.empty(n), np.empty(n), np.empty(n), np.empty(n))
+    M, x, free = linear.M, work.x, work.free
+    memory = np.zeros(MEMORIES + 1)
+    carried = np.full(MEMORIES + 1, u[0] - numbers[U_OFFSET])
+    effects = Effects(numbers[NUMBERS:], flags[FLAGS:], memory)
+    before = Effects(numbers[NUMBERS:], flags[FLAGS:], carried)
+    u_offset, y_offset, step = numbers[U_OFFSET], numbers[Y_OFFSET], numbers[STEP]
+    node_length = step / NODES
+    # when each command arrives at the chain
+    acts = np.empty(N)
+    for k in range(N):
+        acts[k] = t[0] + clock(t[k] - t[0], effects) + numbers[DELAY]
+    past = 0
+    for window in range(rows.shape[1]):
+        first, last = rows[0, window], rows[1, window]
+        x[:] = states[0, window]
+        # the command in force at the window's start, dead time counted
+        j = first
+        while j > 0 and acts[j] > t[first] + 1e-9:
+            j -= 1
+        while j + 1 < N and acts[j + 1] <= t[first] + 1e-9:
+            j += 1
+        w = u[j] - u_offset
+        # some effects remember all commands before the window
+        while flags[REPLAYED] and past <= j:
+            command(converter(u[past], 0.0, before) - u_offset, u_offset, 0.0, 0.0, before)
+            past += 1
+        begin(w, window > 0 and rows[1, window - 1] == first, carried, effects)
+        for k in range(first, last):
+            z = _tap(taps, OUTPUT, x) + numbers[DIRECT_OUT] * w
+            since = t[k] - t[0]
+            out[0, k] = (
+                reading(sensor(z, since, effects) + y_offset, since, effects) if flags[SENSING] else z + y_offset
+            )
+            if out.shape[0] > 1:
+                out[1, k] = _tap(taps, SPEED, x)
+                out[2, k] = _tap(taps, POSITION, x)
+                out[3, k] = _tap(taps, PLANT_IN, x) + numbers[DIRECT_IN] * w
+            if k + 1 >= N:
+                break
+            now = t[k]
+            while now < t[k + 1] - 1e-9 * step:
+                while j + 1 < N and acts[j + 1] <= now + 1e-6 * step:
+                    j += 1
+                until = t[k + 1]
+                if j + 1 < N and now < acts[j + 1] < until:
+                    until = acts[j + 1]
+                pieces = max(1, math.ceil((until - now) / step - 1e-6))
+                dt = (until - now) / pieces
+                node = min(dt / node_length, float(NODES))
+                slot = 0 if now == t[k] else 1
+                _blend(tables[0], node, slot, linear)
+                if flags[DIRECTIONAL]:
+                    _blend(tables[1], node, slot + 2, linear)
+                if flags[PLAIN]:
+                    w = u[j] - u_offset
+                    for _ in range(pieces):
+                        _advance(M, slot, x, w, free)
+                        x[:] = free
+                    now = until
+                    continue
+                for piece in range(pieces):
+                    begin_s = now + piece * dt
+                    absolute = converter(_held(driven, j, begin_s, dt, linear), begin_s - t[0], effects)
+                    w = command(absolute - u_offset, u_offset, dt, begin_s - t[0], effects)
+                    use = slot + 2 if flags[DIRECTIONAL] and w < x[flags[ACTUATOR]] else slot
+                    _advance(M, use, x, w, free)
+                    if flags[FORCED]:
+                        push = load(begin_s + 0.5 * dt - t[0], flags[NUMBER], effects)
+                        _push(use, w, push, dt, linear, work, effects)
+                    x[:] = free
+                    if flags[STOPPED]:
+                        _stop(x, linear, effects)
+                now = until
+        states[1, window] = x
+    return out

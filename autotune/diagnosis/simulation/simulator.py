@@ -1,0 +1,334 @@
+"""Free-run simulation of a model with its effects: the chain assembled once, then driven by recordings."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cache, lru_cache
+
+import numpy as np
+
+from autotune.arrays import FloatArray, IntArray
+from autotune.diagnosis.effects import ALL, KINDS, kind_of
+from autotune.diagnosis.effects.base import STAGES, EffectKind, StageName
+from autotune.diagnosis.simulation import kernel
+from autotune.diagnosis.simulation.chain import Chain, chain_of
+from autotune.diagnosis.simulation.compiled import Layout, compiled_run, layout_of
+from autotune.diagnosis.simulation.transitions import transition_table
+from autotune.errors import InputError
+from autotune.models import Effect, Model
+from autotune.recording import Recording
+
+#: Sub-steps of a sample at most, of one whose command runs straight between rows, and the largest sub-step of a forced
+#: plant in units of its fastest time constant.
+_MOST, _LINEAR, _FASTEST = 8, 4, 0.2
+#: 0 degrees Celsius [K].
+_ICE = 273.15
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Windows:
+    """Where a simulation starts anew and ends: rows, (W,) each, the last row excluded."""
+
+    starts: IntArray
+    stops: IntArray
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Simulator:
+    """An assembled model, ready to be driven.
+
+    Attributes
+    ----------
+    chain : Chain
+        Linear chain, blocks that effects add included.
+    falling : Chain
+        The chain while the actuator falls; the same object where its lag does not depend on the direction.
+    kinds : tuple of EffectKind
+        Effects that act beside the chain.
+    values, acts : array
+        Their parameters and flags, as the compiled simulation has them.
+    u_offset, y_offset : float
+        Operating point.
+    kelvin : float
+        Absolute temperature at the operating point, were y one.
+    linear_hold : bool
+        Whether u runs straight between rows.
+    """
+
+    chain: Chain
+    falling: Chain
+    kinds: tuple[EffectKind, ...]
+    values: FloatArray
+    acts: IntArray
+    u_offset: float
+    y_offset: float
+    kelvin: float
+    linear_hold: bool
+
+    @property
+    def order(self) -> int:
+        """Number of states."""
+        return self.chain.order
+
+    @property
+    def is_linear(self) -> bool:
+        """Whether it is the chain alone."""
+        return not any(kind.lines for kind in self.kinds) and self.falling is self.chain
+
+    def linear(self) -> Simulator:
+        """Return the chain alone."""
+        return replace(self, kinds=(), acts=np.zeros_like(self.acts), falling=self.chain)
+
+    def without_steps(self) -> Simulator:
+        """Return the simulator without what makes steps of the readings."""
+        kept = tuple(kind for kind in self.kinds if not kind.steps)
+        acts = self.acts.copy()
+        for kind in set(self.kinds) - set(kept):
+            acts[_layout().flag(kind.name)] = 0
+        return replace(self, kinds=kept, acts=acts)
+
+    def stepped(self, y: FloatArray) -> FloatArray:
+        """Return what effects that make steps of readings make of them."""
+        for kind in (kind for kind in self.kinds if kind.steps):
+            values = {q.name: float(self.values[_layout().slots[kind.name, q.name]]) for q in kind.parameters}
+            y = np.array([kind.lines[0].does(one, **values) for one in y])
+        return y
+
+    def step_s(self, dt_s: float) -> float:
+        """Return the longest sub-step [s] for a sample time: shorter where forces change within a sample."""
+        pieces = _LINEAR if self.linear_hold else 1
+        if any(_acts_at(kind, *_FORCED) for kind in self.kinds):
+            pieces = max(pieces, math.ceil(self.chain.fastest_of_plant * dt_s / _FASTEST))
+        return dt_s / min(max(pieces, *(kind.sub_steps for kind in self.kinds), 1), _MOST)
+
+    def run(
+        self,
+        recording: Recording,
+        x0: FloatArray,
+        windows: Windows | None = None,
+        *,
+        number: int = 0,
+        sample_time_s: float | None = None,
+        signals: int = kernel.SIGNALS,
+    ) -> tuple[FloatArray, FloatArray]:
+        """Simulate a recording's rows.
+
+        Parameters
+        ----------
+        recording : Recording
+            Its t and u drive the chain.
+        x0 : (W, n) or (n,) array
+            State at each window's first row.
+        windows : Windows, optional
+            The whole recording by default.
+        number : int
+            The recording's number among those diagnosed.
+        sample_time_s : float, optional
+            The recording's, where it is known already.
+        signals : int
+            How many signals are asked for: all, or 1 for the reading alone.
+
+        Returns
+        -------
+        signals : (N, signals) array
+            Reading, speed, position (or level) and plant input at each row; NaN outside the windows.
+        ends : (W, n) array
+            The state that every window ends with.
+        """
+        step = self.step_s(recording.sample_time_s if sample_time_s is None else sample_time_s)
+        chain, rows = self.chain, _rows(windows, len(recording))
+        states = np.empty((2, rows.shape[1], chain.order))
+        states[0] = x0
+        numbers = np.concatenate([(step, chain.delay_s, self.u_offset, self.y_offset, self.kelvin), chain.gains,
+                                  self.values])  # fmt: skip
+        flags = np.concatenate([(number, signals, *self._flags), self.acts])
+        out = compiled_run()(
+            _driven(recording), rows, states, _tables(chain, self.falling, step), chain.taps, numbers, flags
+        )
+        return out.T, states[1]
+
+    @property
+    def _flags(self) -> tuple[int, ...]:
+        """Return what the compiled simulation may leave out, see the positions in its body."""
+        directional = self.falling is not self.chain
+        forced = any(_acts_at(kind, *_FORCED) for kind in self.kinds)
+        driven = any(_acts_at(kind, "converter", "command", "stop") for kind in self.kinds)
+        return (
+            int(self.linear_hold), int(directional), *self.chain.where, int(forced),
+            *(int(any(_acts_at(kind, stage) for kind in self.kinds)) for stage in _TOLD),
+            int(any(_acts_at(kind, "sensor", "reading") for kind in self.kinds)),
+            int(not (forced or driven or directional or self.linear_hold)),
+            int(any(kind.memory is not None and kind.memory.replayed for kind in self.kinds)),
+        )  # fmt: skip
+
+    def rest_state(self, u: float, y: float) -> FloatArray:
+        """Return the state nearest to rest under a command that gives a reading.
+
+        Parameters
+        ----------
+        u, y : float
+            Command and reading, absolute.
+
+        Returns
+        -------
+        (n,) array
+            For an integrating chain at rest but for its reading; else the linear equilibrium, shifted to the reading.
+        """
+        chain = self.chain
+        aim = y - self.y_offset
+        # least squares of: A x = -B w (weighted), output = aim
+        weight = 1e3
+        scale = np.maximum(np.abs(chain.A).max(axis=1), 1e-12)
+        lhs = np.vstack([chain.A / scale[:, None], weight * chain.taps[kernel.OUTPUT]])
+        rhs = np.append(-chain.B[:, 0] / scale * (u - self.u_offset), weight * aim)
+        return np.asarray(np.linalg.lstsq(lhs, rhs, rcond=1e-12)[0]).reshape(chain.order)
+
+    def state_sizes(self, commands: Sequence[FloatArray], readings: Sequence[FloatArray]) -> FloatArray:
+        """Return a size for every state: what the command's span makes of it, bounded by what the readings show.
+
+        Parameters
+        ----------
+        commands, readings : sequence of (N,) array
+            Of all recordings.
+        """
+        span = max(float(np.std(u)) for u in commands)
+        spread = max(float(np.std(y)) for y in readings)
+        A, b = self.chain.A, self.chain.B[:, 0]
+        damped = A - 1e-3 * np.eye(self.chain.order) * max(float(np.abs(A).max()), 1e-9)
+        states = np.abs(np.linalg.solve(damped, b)) * span
+        tap = np.abs(self.chain.taps[kernel.OUTPUT])
+        states = np.where(tap > 0, np.minimum(states, spread / np.maximum(tap, 1e-300)), states)
+        return np.asarray(np.maximum(states, 1e-9))
+
+
+_FORCED: tuple[StageName, ...] = tuple(name for name, stage in STAGES.items() if stage.is_force)
+#: Stages that the body asks for one by one.
+_TOLD: tuple[StageName, ...] = ("force", "friction", "outflow", "stop")
+
+
+def _acts_at(kind: EffectKind, *names: StageName) -> bool:
+    return any(line.stage in names for line in kind.lines)
+
+
+@cache
+def _layout() -> Layout:
+    return layout_of(ALL)
+
+
+@lru_cache(maxsize=16)
+def _driven(recording: Recording) -> FloatArray:
+    return np.stack((recording.t, recording.u))
+
+
+@lru_cache(maxsize=64)
+def _tables(chain: Chain, falling: Chain, step_s: float) -> FloatArray:
+    """Return chains' transitions for a step: the same for all recordings, and for all effects that add no block."""
+    return np.stack([transition_table(one.A, one.B, step_s) for one in (chain, falling)])
+
+
+def _rows(windows: Windows | None, count: int) -> IntArray:
+    if windows is None:
+        return np.array([[0], [count]], dtype=np.int64)
+    return np.stack((windows.starts, windows.stops)).astype(np.int64)
+
+
+def assemble(model: Model) -> Simulator:
+    """Assemble a model with its effects for simulation.
+
+    Parameters
+    ----------
+    model : Model
+        Chain and effects.
+
+    Returns
+    -------
+    Simulator
+        What runs it.
+
+    Raises
+    ------
+    InputError
+        An effect that is not in the catalogue, stands twice, lacks a parameter, or does not fit the chain.
+    """
+    layout = _layout()
+    values, acts = np.zeros(len(layout.slots)), np.zeros(len(layout.kinds), dtype=np.int64)
+    blocks, fall, u_offset = model.blocks, None, model.input.offset
+    kinds: list[EffectKind] = []
+    for effect in model.effects:
+        kind = kind_of(effect.name, model.name)
+        if not kind.is_simulated:
+            continue
+        if kind in kinds:
+            raise InputError(f"{kind.name} stands twice", where=model.name, remedy="leave one of the two out")
+        kinds.append(kind)
+        given = values_of(effect, kind, model)
+        if kind.lines:
+            acts[layout.flag(kind.name)] = 1
+            for q in kind.parameters:
+                values[layout.slots[kind.name, q.name]] = given[q.name]
+        if kind.linear is not None:
+            part = kind.linear
+            if part.falling is not None:
+                fall = part.falling(blocks, given)
+            elif fall is not None and part.blocks is not None:
+                fall = part.blocks(fall, given)
+            blocks = part.blocks(blocks, given) if part.blocks is not None else blocks
+            u_offset += part.u_offset(given) if part.u_offset is not None else 0.0
+    chain = chain_of(blocks, model.name)
+    for kind in kinds:
+        if not kind.needs.holds(chain):
+            raise InputError(kind.needs.otherwise, where=model.name, remedy=f"leave {kind.name} out")
+    return Simulator(
+        chain=chain,
+        falling=chain if fall is None else chain_of(fall, model.name),
+        kinds=tuple(kinds),
+        values=values,
+        acts=acts,
+        u_offset=u_offset,
+        y_offset=model.output.offset,
+        kelvin=model.output.offset + (_ICE if "c" in model.output.unit.lower() else 0.0),
+        linear_hold=model.input.hold == "linear",
+    )
+
+
+def values_of(effect: Effect, kind: EffectKind, model: Model) -> dict[str, float]:
+    """Return an effect's parameters, neutral ones where they are not given.
+
+    Raises
+    ------
+    InputError
+        A parameter that it does not have, lacks, or cannot take.
+    """
+    known = ", ".join(q.name for q in kind.parameters)
+    for key in effect.parameters:
+        if kind.quantity(key) is None:
+            raise InputError(f"{effect.name} has no parameter {key!r}", where=model.name, remedy=f"known: {known}")
+    if not effect.parameters and all(q.neutral is not None for q in kind.parameters):
+        raise InputError(f"{effect.name} has no parameters", where=model.name, remedy=f"known: {known}")
+    values: dict[str, float] = {}
+    for q in kind.parameters:
+        if q.name in effect.parameters:
+            values[q.name] = effect.parameters[q.name].value
+            if q.nonzero and not values[q.name] > 0.0:
+                what = f"{effect.name} has {q.name} = {values[q.name]:g}"
+                raise InputError(what, where=model.name, remedy="give it a value above zero")
+        elif q.neutral is None:
+            raise InputError(
+                f"{effect.name} lacks {q.name}", where=model.name, remedy=f"add {q.name} to its parameters"
+            )
+        else:
+            values[q.name] = q.neutral
+    wrong = kind.possible(values, model) if kind.possible is not None else ""
+    if wrong:
+        raise InputError(wrong, where=model.name, remedy=f"leave {effect.name} out")
+    return values
+
+
+def states_that_stay(name: str, order: int) -> slice:
+    """Return the states that stay when an effect is taken out of a chain of an order: all but those of its block."""
+    part = KINDS[name].linear
+    if part is None or part.unless_lagged:
+        return slice(0, order)
+    return slice(part.states, order) if part.at == "front" else slice(0, order - part.states)

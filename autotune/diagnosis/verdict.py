@@ -1,0 +1,157 @@
+"""From evidence to a verdict: one table, read from its first row to its last."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+from autotune.diagnosis.effects import STRUCTURES, kind_of
+from autotune.diagnosis.evidence.adequacy import ResidualTests
+from autotune.diagnosis.evidence.description import Description
+from autotune.diagnosis.evidence.held_out import FitQuality, dominates
+from autotune.diagnosis.evidence.samples import SampleEffect
+from autotune.diagnosis.result import FoundEffect, Offset, Verdict
+from autotune.diagnosis.selection.hypothesis import penalised
+from autotune.diagnosis.selection.parsimony import worth_adding
+from autotune.diagnosis.selection.probability import Candidate, candidates_of
+from autotune.diagnosis.selection.search import Search
+
+#: Decrease of chi2 that wrong numbers must bring before the verdict is "parameters".
+NUMBERS_DECREASE = 25.0
+#: Reduced chi-square of a model without effects from which on something must be missing, although no effect is worth
+#: adding; clean recordings leave up to 1.02.
+MISSING = 1.05
+#: Prior odds of a cause outside the catalogue, beside 1 of all hypotheses: where the best explains the recordings, and
+#: where it explains most of what retuning leaves but not all.
+UNKNOWN, HALF_EXPLAINED = 0.03, 0.25
+#: Held-out share of the residual from which on a description tells where it adds its terms.
+INFORMATIVE = 0.5
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Evidence:
+    """All that a verdict rests on.
+
+    Attributes
+    ----------
+    search : Search
+        Hypotheses with their fits.
+    samples : tuple of SampleEffect
+        What single samples, the residual's size over the slope, and the recomputed law show.
+    residual : ResidualTests
+        What the chosen model leaves.
+    quality : FitQuality
+        Errors on rows that were not fitted.
+    offset : Offset, optional
+        Shift of the operating point that is far outside its uncertainty.
+    """
+
+    search: Search
+    samples: tuple[SampleEffect, ...]
+    residual: ResidualTests
+    quality: FitQuality
+    offset: Offset | None
+
+    @cached_property
+    def explains_most(self) -> bool:
+        """Whether the chosen effects explain most of a residual that nothing explains whole.
+
+        A load of free timing explains a part of everything: that part is not enough.
+        """
+        loads = all(kind_of(name).place == "environment" for name in self.search.chosen.names)
+        return dominates(self.quality) and self.residual.is_lesser and not loads
+
+    @cached_property
+    def unknown_odds(self) -> float:
+        """Prior odds of a cause outside the catalogue, beside 1 of all hypotheses together.
+
+        Small where what is left is noise, and the larger the nearer its variance comes to the bound of adequacy; beyond
+        it the two weigh the same, but for effects that explain most of what retuning leaves.
+        """
+        if self.residual.is_noise:
+            excess = max(self.residual.reduced_chi2 - 1.0, 0.0) / (self.residual.allowed - 1.0)
+            return UNKNOWN + (1.0 - UNKNOWN) * excess**4
+        return HALF_EXPLAINED if self.explains_most else 1.0
+
+    @cached_property
+    def candidates(self) -> tuple[Candidate, ...]:
+        """Every hypothesis with its probability, best first."""
+        return candidates_of(self.search, self.unknown_odds)
+
+    @cached_property
+    def facts(self) -> frozenset[str]:
+        """What holds, in the words of the table."""
+        found = self.search
+        best = min(found.all, key=penalised)
+        retuned = found.retuned.fit
+        holds = {
+            "effects": bool(found.chosen.names),
+            "samples": bool(self.samples),
+            "adequate": self.residual.is_noise or self.explains_most,
+            "constant": self.residual.is_constant,
+            "another structure": bool(STRUCTURES.keys() & set(best.names)) and worth_adding(found.retuned, best),
+            "offset": self.offset is not None,
+            "missing": self.residual.reduced_chi2 > MISSING,
+            "wrong numbers": found.nominal.chi2 - retuned.chi2 - retuned.penalty > NUMBERS_DECREASE,
+        }
+        return frozenset(name for name, one in holds.items() if one)
+
+
+#: Each row: what must hold, what must not, and the verdict. The first row that fits decides.
+TABLE: tuple[tuple[set[str], set[str], Verdict], ...] = (
+    ({"effects", "adequate"}, {"samples"}, "effect"),
+    ({"effects"}, {"samples"}, "unexplained"),
+    ({"another structure"}, {"samples"}, "unexplained"),
+    (set(), {"samples", "constant"}, "unexplained"),
+    ({"samples"}, set(), "effect"),
+    ({"offset", "adequate"}, set(), "effect"),
+    ({"missing"}, {"adequate"}, "unexplained"),
+    ({"wrong numbers"}, set(), "parameters"),
+    (set(), set(), "none"),
+)
+
+
+def judged(evidence: Evidence) -> Verdict:
+    """Return the verdict of the first row of the table that fits."""
+    facts = evidence.facts
+    return next(verdict for holds, lacks, verdict in TABLE if holds <= facts and not lacks & facts)
+
+
+def places_of(evidence: Evidence, effects: Sequence[FoundEffect], description: Description | None) -> tuple[str, ...]:
+    """Return where the mismatch sits: where its effects may, else where what is missing shows."""
+    if description is None:
+        return tuple(dict.fromkeys(place for e in effects for place in e.places))
+    known: dict[str, None] = {description.place: None} if description.terms else {}
+    if not evidence.residual.is_constant:
+        informative = known if description.explained > INFORMATIVE else {}
+        return tuple(dict.fromkeys(evidence.residual.varies.places) | informative)
+    places: dict[str, None] = dict(known)
+    for h in sorted((*evidence.search.singles, *evidence.search.pairs), key=penalised)[:3]:
+        for kind in h.kinds:
+            places |= dict.fromkeys(kind.may_sit)
+    return tuple(places) or ("plant",)
+
+
+def sentences_of(
+    verdict: Verdict, effects: Sequence[FoundEffect], evidence: Evidence, places: Sequence[str]
+) -> tuple[str, ...]:
+    """Return the finding in words."""
+    q, residual = evidence.quality, evidence.residual
+    errors = (
+        f"Held-out error, as a share of the spread of y: nominal {q.nominal:.3g}, retuned {q.retuned:.3g}, "
+        f"extended {q.extended:.3g}, noise {q.noise_floor:.3g}."
+    )
+    match verdict:
+        case "none":
+            first = "The simulation explains the recordings to within noise."
+        case "parameters":
+            first = "The structure is right, its numbers are not: retuned, the simulation explains the recordings."
+        case "effect":
+            names = " and ".join(f"{e.name} (probability {e.probability:.2f})" for e in effects)
+            is_all = residual.is_noise or evidence.samples
+            rest = "" if is_all else " What is left is not noise: something smaller is missing as well."
+            first = f"Physics was left out: {names}.{rest}"
+        case _:
+            first = f"Something is missing that no candidate explains to within noise; it shows at {', '.join(places)}."
+    return (first, errors) if residual.is_constant else (first, residual.varies.sentence, errors)

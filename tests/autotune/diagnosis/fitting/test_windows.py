@@ -1,0 +1,58 @@
+"""Windows: how a recording is cut, how windows are joined, and what only free start states made possible."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from autotune.diagnosis.effects import CATALOGUE
+from autotune.diagnosis.evidence.samples import inspect
+from autotune.diagnosis.fitting.fit import fit
+from autotune.diagnosis.fitting.parameters import effect_with
+from autotune.diagnosis.fitting.retuning import LONGER, holds, prepare, reduced_chi2
+from autotune.diagnosis.fitting.windows import LEAST_ROWS, LEAST_WINDOWS, window_rows
+from autotune.diagnosis.selection.prediction import extended
+from autotune.diagnosis.selection.search import search
+from autotune.recording import Recording
+from tests.autotune.diagnosis.servo_rigs import GAIN, servo_model, servo_recording
+
+
+@pytest.mark.parametrize("length_s", [0.5, 3.0, 40.0, 1e4])
+def test_windows_cut_a_recording_without_gap_into_enough_parts(length_s: float) -> None:
+    rows = 2000
+    recording = Recording(t=0.02 * np.arange(rows), u=np.zeros(rows), y=np.zeros(rows))
+    starts, stops = window_rows(recording, length_s, 0.4)
+    assert starts[0] == 20
+    assert stops[-1] == rows
+    np.testing.assert_array_equal(stops[:-1], starts[1:])
+    assert len(starts) >= LEAST_WINDOWS
+    assert np.min(stops - starts) >= LEAST_ROWS - 1
+
+
+def test_joined_windows_count_the_same_rows() -> None:
+    data, _ = prepare(servo_model(), [servo_recording(3)], inspect([servo_recording(3)])[0])
+    joined = data.joined(LONGER)
+    assert joined.rows == data.rows
+    assert len(joined.starts[0]) == -(-len(data.starts[0]) // LONGER)
+    np.testing.assert_array_equal(joined.stops[0][:-1], joined.starts[0][1:])
+    assert joined.stops[0][-1] == data.stops[0][-1]
+
+
+def test_what_is_true_holds_on_longer_windows_and_what_start_states_made_possible_does_not() -> None:
+    # a spring so weak that within a window it is a constant force, which free start states stand for
+    r = [servo_recording(seed, lambda x, v: -0.001 * x, rows=3000) for seed in (1, 2)]
+    data, base = prepare(servo_model(), r, inspect(r)[0])
+    p, theta, states = extended(base, effect_with("plant.leak", (0.001 * GAIN,)), data)
+    true = fit(p, data, theta, states, iterations=30)
+    assert reduced_chi2(base, data) < 1.06
+    assert not holds(base, data)
+    assert holds(true, data)
+
+
+def test_a_spring_that_short_windows_forgive_is_found_on_longer_ones() -> None:
+    r = [servo_recording(seed, lambda x, v: -0.00032 * x, rows=3000) for seed in (1, 2)]
+    few = ("plant.leak", "sensor.lag", "plant.quadratic_drag", "environment.step_load")
+    found = search(servo_model(), r, inspect(r)[0], [name for name in CATALOGUE if name not in few])
+    assert found.chosen.names == ("plant.leak",)
+    assert found.chosen.fit.model.effects[0].parameters["rate"].value == pytest.approx(0.00032 * GAIN, rel=0.2)
+    assert len(found.data.starts[0]) < 12

@@ -1,0 +1,134 @@
+"""The compiled chain against closed forms: exact between samples, whatever the lags; sticking is exact."""
+
+from __future__ import annotations
+
+from types import MappingProxyType
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.linalg import expm
+
+from autotune.diagnosis.simulation.simulator import Windows, assemble
+from autotune.errors import InputError
+from autotune.models import Block, Effect, Model, Parameter, Port, TransferFunction
+from autotune.recording import Recording
+
+
+def servo(lag_s: float = 0.01, delay_s: float = 0.0, effects: tuple[Effect, ...] = ()) -> Model:
+    return Model(
+        name="servo",
+        input=Port(unit="V"),
+        output=Port(unit="rad"),
+        blocks=(
+            Block(
+                name="drive",
+                place="actuator",
+                dynamics=TransferFunction(num=(1.0,), den=(lag_s, 1.0), delay_s=delay_s),
+            ),
+            Block(name="speed", place="plant", dynamics=TransferFunction(num=(5.0,), den=(0.25, 1.0))),
+            Block(name="position", place="plant", dynamics=TransferFunction(num=(1.0,), den=(1.0, 0.0))),
+        ),
+        effects=effects,
+    )
+
+
+def effect(name: str, **values: float) -> Effect:
+    return Effect(name=name, parameters=MappingProxyType({key: Parameter(value=v) for key, v in values.items()}))
+
+
+def recording(u: np.ndarray, dt: float) -> Recording:
+    t = dt * np.arange(u.size)
+    return Recording(t=t, u=u, y=np.zeros(u.size))
+
+
+@settings(max_examples=20)
+@given(lag=st.floats(1e-4, 0.2), delay=st.floats(0.0, 0.05), dt=st.floats(0.002, 0.05), seed=st.integers(0, 1000))
+def test_a_linear_chain_with_a_fractional_dead_time_is_exact_whatever_its_lags(
+    lag: float, delay: float, dt: float, seed: int
+) -> None:
+    u = np.random.default_rng(seed).normal(size=40)
+    sim = assemble(servo(lag, delay))
+    got = sim.run(recording(u, dt), np.zeros(3))[0][:, 0]
+    # reference: superposition of delayed steps through the matrix exponential
+    A, b, c = sim.chain.A, sim.chain.B[:, 0], sim.chain.taps[3]
+    big = np.zeros((4, 4))
+    big[:3, :3], big[:3, 3] = A, b
+
+    def step_response(time: float) -> float:
+        return float(c @ expm(big * time)[:3, 3]) if time > 0.0 else 0.0
+
+    changes = np.diff(np.concatenate([[0.0], u]))
+    table = {k: step_response(k * dt - delay) for k in range(u.size + 1)}
+    # the command before the first row is taken to be the first row's: it acts without delay
+    want = [u[0] * step_response(k * dt) + sum(changes[j] * table[k - j] for j in range(1, k)) for k in range(u.size)]
+    # a dead time between two nodes of the table is blended: second order in a 64th of the sample time
+    tolerance = 2e-4 * float(np.max(np.abs(want))) + 1e-9
+    np.testing.assert_allclose(got, want, atol=tolerance)
+
+
+def test_dry_friction_stops_a_coasting_mass_where_the_closed_form_says_and_holds_it() -> None:
+    level, v0, tau, gain = 0.2, 3.0, 0.25, 5.0
+    sim = assemble(servo(effects=(effect("plant.coulomb_friction", level=level),)))
+    out, _ = sim.run(recording(np.zeros(600), 0.002), np.array([0.0, v0, 0.0]))
+    # tau dv/dt = -v - gain level: v reaches 0 at T = tau log(1 + v0/(gain level)), after v0 tau - gain level T
+    rest = tau * np.log(1.0 + v0 / (gain * level))
+    assert out[-1, 0] == pytest.approx(v0 * tau - gain * level * rest, rel=2e-3)
+    assert np.all(out[int(rest / 0.002) + 3 :, 1] == 0.0)
+
+
+def test_a_push_below_the_friction_level_moves_nothing() -> None:
+    sim = assemble(servo(effects=(effect("plant.coulomb_friction", level=0.2),)))
+    out, _ = sim.run(recording(np.full(500, 0.19), 0.002), np.zeros(3))
+    # what the drive still gains while the mass sticks leaves only rounding of the sub-steps
+    assert np.max(np.abs(out[:, 0])) < 1e-5
+
+
+@given(limit=st.floats(0.1, 2.0))
+@settings(max_examples=10)
+def test_a_position_never_passes_a_hard_stop(limit: float) -> None:
+    sim = assemble(servo(effects=(effect("plant.hard_stop", high=limit),)))
+    out, _ = sim.run(recording(np.ones(400), 0.01), np.zeros(3))
+    assert out[:, 0].max() == pytest.approx(limit, abs=1e-12)
+
+
+def test_windows_that_start_where_the_one_before_ended_are_one_free_run() -> None:
+    rng = np.random.default_rng(3)
+    r = recording(np.repeat(rng.normal(size=40), 20), 0.005)
+    sim = assemble(servo(effects=(effect("plant.quadratic_drag", coefficient=0.1),)))
+    whole, _ = sim.run(r, np.array([0.1, 0.2, 0.3]))
+    first, rest = (Windows(starts=np.array([a]), stops=np.array([b])) for a, b in ((0, 400), (400, 800)))
+    _, ends = sim.run(r, np.array([0.1, 0.2, 0.3]), first)
+    second, _ = sim.run(r, ends, rest)
+    np.testing.assert_allclose(second[400:], whole[400:], atol=1e-12)
+
+
+def test_an_effect_that_the_chain_has_no_place_for_is_refused() -> None:
+    tank = Model(
+        name="tank",
+        input=Port(),
+        output=Port(),
+        blocks=(Block(name="tank", place="plant", dynamics=TransferFunction(num=(1.0,), den=(30.0, 1.0))),),
+        effects=(effect("plant.coulomb_friction", level=0.1),),
+    )
+    with pytest.raises(InputError, match="speed and a position"):
+        assemble(tank)
+
+
+def test_an_unknown_effect_and_a_missing_parameter_are_refused_by_name() -> None:
+    with pytest.raises(InputError, match=r"plant\.gremlin"):
+        assemble(servo(effects=(effect("plant.gremlin", level=1.0),)))
+    with pytest.raises(InputError, match="time_constant"):
+        assemble(servo(effects=(effect("sensor.lag"),)))
+
+
+@settings(max_examples=20)
+@given(step=st.floats(0.05, 0.5), origin=st.floats(-1.0, 1.0), seed=st.integers(0, 1000))
+def test_a_converters_levels_pass_through_its_origin(step: float, origin: float, seed: int) -> None:
+    u = np.random.default_rng(seed).normal(size=60)
+    rounded = origin + step * np.floor((u - origin) / step + 0.5)
+    stepped = assemble(servo(effects=(effect("actuator.quantisation", step=step, origin=origin),)))
+    got, _ = stepped.run(recording(u, 0.01), np.zeros(3))
+    want, _ = assemble(servo()).run(recording(rounded, 0.01), np.zeros(3))
+    np.testing.assert_allclose(got, want, atol=1e-10)
