@@ -203,14 +203,17 @@ def read_model(path: str | os.PathLike[str]) -> Model:
     InputError
         No such file, not TOML, an unknown key or place, or a block that is not proper; names the table and the key.
     """
-    where = str(path)
-    content = read_toml(path)
+    return model_of(read_toml(path), str(path))
+
+
+def model_of(content: Mapping[str, Any], where: str) -> Model:
+    """Return the chain that a TOML content states; ``where`` names it in messages."""
     _known(content, {"name", "input", "output", "block", "effect"}, where)
     blocks, effects = _tables(content, "block", where), _tables(content, "effect", where)
     if not blocks:
         raise InputError("no [[block]]", where=where, remedy="a model needs at least one block")
     return Model(
-        name=_text(content, "name", Path(path).stem, where),
+        name=_text(content, "name", Path(where).stem, where),
         input=_port(content.get("input", {}), f"{where} [input]"),
         output=_port(content.get("output", {}), f"{where} [output]"),
         blocks=tuple(_block(table, f"{where} [[block]] {i + 1}") for i, table in enumerate(blocks)),

@@ -47,18 +47,7 @@ def read_equations(path: str | os.PathLike[str]) -> EquationModel:
     InputError
         What is wrong, in which table, and how to fix it.
     """
-    return equations_of(table_of(path), str(path))
-
-
-def table_of(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """Return the content of a TOML file.
-
-    Raises
-    ------
-    InputError
-        No such file, or not TOML.
-    """
-    return read_toml(path)
+    return equations_of(read_toml(path), str(path))
 
 
 def equations_of(content: Mapping[str, Any], where: str) -> EquationModel:

@@ -1,0 +1,233 @@
+"""Equations for other tools: readable text, LaTeX, Modelica and a Python function.
+
+Every export is of the flattened model: effects are written out, so that nothing of this project is needed to run it.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+
+from autotune.equations.expressions import Call, Expression, Name, Number, number_text, to_text
+from autotune.equations.flatten import flattened
+from autotune.equations.model import EquationModel
+
+_GREEK_NAMES = (
+    "alpha beta gamma delta epsilon zeta eta theta iota kappa lambda mu nu xi rho sigma tau phi chi psi omega Gamma "
+    "Delta Theta Lambda Xi Pi Sigma Phi Psi Omega "
+)
+_GREEK = frozenset(_GREEK_NAMES.split())
+
+
+def as_text(model: EquationModel) -> str:
+    """Return the equations as a person writes them on paper, with their numbers below."""
+    flat = flattened(model)
+    lines = [flat.name, ""]
+    lines += [f"{name} = {to_text(tree)}" for name, tree in flat.defines]
+    lines += [f"d{one.name}/dt = {to_text(one.derivative)}{_unit(one.unit)}" for one in flat.states]
+    lines += [f"y = {to_text(flat.output)}{_unit(flat.output_unit)}", ""]
+    for one in flat.inputs:
+        late = f", {one.delay_s:g} s late" if one.delay_s else ""
+        lines.append(f"{one.column}: {'command' if one == flat.inputs[0] else 'measured'}, "
+                     f"{'held' if one.hold == 'zero' else 'straight between rows'}{late}{_unit(one.unit)}")  # fmt: skip
+    lines += [f"{one.name} = {one.value:.6g}{f' {one.unit}' if one.unit else ''}" for one in flat.parameters]
+    return "\n".join(lines) + "\n"
+
+
+def _unit(unit: str) -> str:
+    return f"   [{unit}]" if unit else ""
+
+
+def as_latex(model: EquationModel) -> str:
+    """Return the equations as a LaTeX ``align`` environment."""
+    flat = flattened(model)
+    lines = [rf"{_symbol(name)} &= {_latex(tree)[0]}" for name, tree in flat.defines]
+    lines += [rf"\dot{{{_symbol(one.name)}}} &= {_latex(one.derivative)[0]}" for one in flat.states]
+    lines.append(rf"y &= {_latex(flat.output)[0]}")
+    return "\\begin{align}\n  " + " \\\\\n  ".join(lines) + "\n\\end{align}\n"
+
+
+def _symbol(name: str) -> str:
+    head, _, tail = name.partition("_")
+    match = re.fullmatch(r"([A-Za-z]+)(\d+)", head)
+    if match and not tail:
+        head, tail = match[1], match[2]
+    shown = rf"\{head}" if head in _GREEK else head if len(head) == 1 else rf"\mathrm{{{head}}}"
+    return shown if not tail else rf"{shown}_{{\mathrm{{{tail.replace('_', ',')}}}}}"
+
+
+_LATEX_FUNCTIONS = {
+    **{name: rf"\{name}" for name in ("sin", "cos", "tan", "sinh", "cosh", "tanh", "exp", "log", "min", "max")},
+    "asin": r"\arcsin", "acos": r"\arccos", "atan": r"\arctan", "atan2": r"\operatorname{atan2}",
+    "sign": r"\operatorname{sgn}",
+}  # fmt: skip
+_LATEX_SIGNS = {"<": "<", "<=": r"\le", ">": ">", ">=": r"\ge"}
+
+
+def _latex(tree: Expression) -> tuple[str, int]:
+    """Return LaTeX and how tightly the outermost operator binds."""
+    match tree:
+        case Number(value):
+            mantissa, _, exponent = number_text(value).partition("e")
+            return (mantissa, 5) if not exponent else (rf"{mantissa} \cdot 10^{{{int(exponent)}}}", 2)
+        case Name("pi"):
+            return r"\pi", 5
+        case Name(name):
+            return _symbol(name), 5
+        case Call("neg", (inner,)):
+            return f"-{_inside(inner, 2)}", 1
+        case Call("/", (above, below)):
+            return rf"\frac{{{_latex(above)[0]}}}{{{_latex(below)[0]}}}", 4
+        case Call("*", (left, right)):
+            a, b = _inside(left, 2), _inside(right, 2)
+            return rf"{a} \cdot {b}" if b[0].isdigit() else rf"{a} \, {b}", 2
+        case Call(("+" | "-") as sign, (left, right)):
+            return f"{_inside(left, 1)} {sign} {_inside(right, 1 if sign == '+' else 2)}", 1
+        case Call("^", (base, exponent)):
+            return f"{{{_inside(base, 5)}}}^{{{_latex(exponent)[0]}}}", 3
+        case Call("sqrt", (inner,)):
+            return rf"\sqrt{{{_latex(inner)[0]}}}", 5
+        case Call("abs", (inner,)):
+            return rf"\left|{_latex(inner)[0]}\right|", 5
+        case Call("if", (condition, then, otherwise)):
+            a, b, c = (_latex(one)[0] for one in (then, otherwise, condition))
+            return rf"\begin{{cases}} {a} & {c} \\ {b} & \text{{otherwise}} \end{{cases}}", 0
+        case Call(sign, (left, right)) if sign in _LATEX_SIGNS:
+            return f"{_latex(left)[0]} {_LATEX_SIGNS[sign]} {_latex(right)[0]}", 0
+    assert isinstance(tree, Call)
+    among = ", ".join(_latex(one)[0] for one in tree.arguments)
+    return rf"{_LATEX_FUNCTIONS[tree.function]}\left({among}\right)", 5
+
+
+def _inside(tree: Expression, at_least: int) -> str:
+    text, binding = _latex(tree)
+    return text if binding >= at_least else rf"\left({text}\right)"
+
+
+def as_modelica(model: EquationModel) -> str:
+    """Return a Modelica model with the inputs as ``RealInput``, y as ``RealOutput``, parameters with their values.
+
+    Switched terms stay as they are written: Modelica locates their events itself. Dead times become ``delay(u, d)``.
+    """
+    flat = flattened(model)
+    names = _safe_names(flat, _MODELICA_WORDS)
+    arrives = {one.column: f"{names[one.column]}_late" if one.delay_s else names[one.column] for one in flat.inputs}
+    said = names | arrives
+    title = re.sub(r"\W", "_", flat.name).strip("_") or "Rig"
+    title = title if title[0].isalpha() else f"Rig_{title}"
+    lines = [f"model {title}"]
+    lines += [f"  parameter Real {names[p.name]} = {p.value!r};{_comment(p.unit)}" for p in flat.parameters]
+    lines += [f"  input Real {names[one.column]};{_comment(one.unit)}" for one in flat.inputs]
+    lines += [f"  Real {names[one.column]}_late;" for one in flat.inputs if one.delay_s]
+    lines += [f"  Real {names[name]};" for name, _ in flat.defines]
+    lines += [
+        f"  Real {names[one.name]}(start = {one.start or 0.0!r}, fixed = true);{_comment(one.unit)}"
+        for one in flat.states
+    ]
+    lines += [f"  output Real y;{_comment(flat.output_unit)}", "equation"]
+    lines += [f"  {names[one.column]}_late = delay({names[one.column]}, {one.delay_s!r});"
+              for one in flat.inputs if one.delay_s]  # fmt: skip
+    lines += [f"  {names[name]} = {_modelica(tree, said)};" for name, tree in flat.defines]
+    lines += [f"  der({names[one.name]}) = {_modelica(one.derivative, said)};" for one in flat.states]
+    lines += [f"  y = {_modelica(flat.output, said)};", f"end {title};"]
+    return "\n".join(lines) + "\n"
+
+
+def _comment(unit: str) -> str:
+    return f"  // {unit}" if unit else ""
+
+
+_MODELICA_TAKEN = (
+    "algorithm and annotation block break class connect connector constant der discrete each else end equation final "
+    "for function if import in initial inner input loop model not or outer output package parameter record stream then "
+    "time true false type when while y Real Integer delay "
+)
+_MODELICA_WORDS = frozenset(_MODELICA_TAKEN.split())
+
+
+def _safe_names(model: EquationModel, taken: frozenset[str]) -> dict[str, str]:
+    """Return for every name one that the other language lets through."""
+    names = [*model.columns, *model.state_names, *model.parameter_names, *(name for name, _ in model.defines)]
+    found: dict[str, str] = {}
+    for name in names:
+        safe = name
+        while safe in taken or safe in found.values() or (safe != name and safe in names):
+            safe += "_"
+        found[name] = safe
+    return found
+
+
+def _modelica(tree: Expression, names: Mapping[str, str]) -> str:
+    match tree:
+        case Number(value):
+            return repr(value) if value >= 0.0 else f"({value!r})"
+        case Name(name):
+            return {"pi": repr(math.pi), "t": "time"}.get(name) or names[name]
+        case Call("neg", (inner,)):
+            return f"(-{_modelica(inner, names)})"
+        case Call("if", (condition, then, otherwise)):
+            a, b, c = (_modelica(one, names) for one in (condition, then, otherwise))
+            return f"(if {a} then {b} else {c})"
+        case Call(("+" | "-" | "*" | "/" | "^" | "<" | "<=" | ">" | ">=") as sign, (left, right)):
+            return f"({_modelica(left, names)} {sign} {_modelica(right, names)})"
+        case Call(("min" | "max") as function, (first, *rest)):
+            nested = _modelica(first, names)
+            for other in rest:
+                nested = f"{function}({nested}, {_modelica(other, names)})"
+            return nested
+    assert isinstance(tree, Call)
+    return f"{tree.function}({', '.join(_modelica(one, names) for one in tree.arguments)})"
+
+
+def as_python(model: EquationModel) -> str:
+    """Return a Python module with ``derivatives(t, x, inputs, p)``, ``output(t, x, inputs, p)`` and ``PARAMETERS``.
+
+    It needs the standard library alone. ``x`` is a sequence in the order of ``STATES``, ``inputs`` in the order of
+    ``INPUTS`` (those of ``DELAYS`` that many seconds ago), ``p`` a mapping, by default ``PARAMETERS``.
+    """
+    flat = flattened(model)
+    names = _safe_names(flat, _PYTHON_WORDS)
+    unpack = [f"    {', '.join(names[s] for s in flat.state_names)}, = x"]
+    unpack += [f"    {', '.join(names[c] for c in flat.columns)}, = inputs"]
+    unpack += [f"    {names[p]} = p[{p!r}]" for p in flat.parameter_names]
+    unpack += [f"    {names[name]} = {_python(tree, names)}" for name, tree in flat.defines]
+    slopes = [f"        {_python(one.derivative, names)}," for one in flat.states]
+    lines = [
+        f'"""{flat.name}: dx/dt = derivatives(t, x, inputs), y = output(t, x, inputs)."""', "", "import math", "",
+        f"STATES = {flat.state_names!r}", f"INPUTS = {flat.columns!r}",
+        f"DELAYS = {({one.column: one.delay_s for one in flat.inputs if one.delay_s})!r}",
+        f"PARAMETERS = {({p.name: p.value for p in flat.parameters})!r}", "", "",
+        "def _sign(value):", "    return (value > 0) - (value < 0)", "", "",
+        "def derivatives(t, x, inputs, p=PARAMETERS):", *unpack, "    return [", *slopes, "    ]", "", "",
+        "def output(t, x, inputs, p=PARAMETERS):", *unpack, f"    return {_python(flat.output, names)}",
+    ]  # fmt: skip
+    return "\n".join(lines) + "\n"
+
+
+_PYTHON_TAKEN = (
+    "False None True and as assert async await break class continue def del elif else except finally for from global "
+    "if import in is lambda nonlocal not or pass raise return try while with yield x p t inputs math derivatives output "
+    "min max abs _sign STATES INPUTS DELAYS PARAMETERS "
+)
+_PYTHON_WORDS = frozenset(_PYTHON_TAKEN.split())
+
+
+def _python(tree: Expression, names: Mapping[str, str]) -> str:
+    match tree:
+        case Number(value):
+            return repr(value) if value >= 0.0 else f"({value!r})"
+        case Name(name):
+            return {"pi": "math.pi", "t": "t"}.get(name) or names[name]
+        case Call("neg", (inner,)):
+            return f"(-{_python(inner, names)})"
+        case Call("if", (condition, then, otherwise)):
+            a, b, c = (_python(one, names) for one in (condition, then, otherwise))
+            return f"({b} if {a} else {c})"
+        case Call("^", (base, exponent)):
+            return f"({_python(base, names)} ** {_python(exponent, names)})"
+        case Call(("+" | "-" | "*" | "/" | "<" | "<=" | ">" | ">=") as sign, (left, right)):
+            return f"({_python(left, names)} {sign} {_python(right, names)})"
+    assert isinstance(tree, Call)
+    function = {"min": "min", "max": "max", "abs": "abs", "sign": "_sign"}.get(tree.function, f"math.{tree.function}")
+    return f"{function}({', '.join(_python(one, names) for one in tree.arguments)})"
