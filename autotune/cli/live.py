@@ -12,12 +12,11 @@ from rich.console import Console
 
 from autotune.cli import app
 
-LISTEN = Annotated[
-    str, typer.Option(metavar="ADDRESS", help="address of the live page; any but loopback needs a token")
-]
+LISTEN = Annotated[str, typer.Option(metavar="ADDRESS", help="address of the live page")]
 PORT = Annotated[int, typer.Option(min=0, max=65535, help="port of the live page; 0 takes a free one")]
 TOKEN = Annotated[
-    str | None, typer.Option(help="what visitors need; made up where absent and the address is not loopback")
+    str | None,
+    typer.Option(envvar="AUTOTUNE_LIVE_TOKEN", help="what visitors need; made up where absent"),
 ]
 
 
@@ -38,10 +37,10 @@ def live(
 
     if not beside_run and not (folder / PROGRESS).is_file():
         raise InputError(f"holds no {PROGRESS}", where=str(folder), remedy="give the --out folder of autotune run")
-    token = token_for(listen, token)
+    token = token_for(token)
     bound = listening(listen, port)
     host = socket.gethostname() if listen in ("0.0.0.0", "::") else f"[{listen}]" if ":" in listen else listen
-    url = f"http://{host}:{bound.getsockname()[1]}/" + (f"?token={token}" if token else "")
+    url = f"http://{host}:{bound.getsockname()[1]}/?token={token}"
     if beside_run:
         if os.name == "posix":
             os.nice(10)  # the control loop first

@@ -24,6 +24,8 @@ class Controls:
         Whether Abort was pressed.
     run_is_gone : bool
         Whether the run has gone without saying why.
+    refused : int
+        Requests and messages that were not of an open page of this run.
     """
 
     def __init__(self, act: Callable[[str], None] | None) -> None:
@@ -31,6 +33,7 @@ class Controls:
         self.holder: str | None = None
         self.aborted = False
         self.run_is_gone = False
+        self.refused = 0
         self._first = True
 
     def arrive(self, tab: str | None) -> None:

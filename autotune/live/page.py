@@ -8,6 +8,7 @@ from collections.abc import Callable
 from typing import Any
 
 from nicegui import Client, ui
+from nicegui.elements.mixins.text_element import TextElement
 from nicegui.events import KeyEventArguments
 
 from autotune.controller import PIDController
@@ -115,7 +116,7 @@ class Screen:
             self._abort = ui.button("Abort (Esc)", on_click=self._on_abort, color=None).classes("abort")
             self._abort.props('aria-label="Abort: safe output now. Key: Escape"')
             with ui.element("div").classes("state"):
-                self._title = ui.html(tag="h1")
+                self._title = Heading()
                 self._state = ui.label().props("role=status")
                 self._left = ui.label().classes("left")
             self._role = ui.label().classes("note")
@@ -206,7 +207,7 @@ class Screen:
 
     def _show_words(self) -> None:
         story, controls = self._story, self._controls
-        self._title.content = story.config.get("name", "waiting for a run")
+        self._title.text = story.config.name if story.config is not None else "waiting for a run"
         self._state.text, self._left.text = self._state_text(), self._left_text()
         self._relay.text, self._limits.text = story.relay_text(), story.limits_text()
         warnings = [*story.warnings(), *self._silence()]
@@ -245,6 +246,11 @@ class Screen:
         return f"{story.now_s:.1f} s on the rig, {left}"
 
     def _role_text(self, acts: bool, over: bool) -> str:
+        refused = self._controls.refused
+        said = f"; {refused} request{'s' * (refused > 1)} of others refused" if refused else ""
+        return f"{self._role_words(acts, over)}{said}"
+
+    def _role_words(self, acts: bool, over: bool) -> str:
         if over or not acts:
             return "Replay" if over else "This page looks on"
         if self._controls.aborted:
@@ -316,6 +322,13 @@ class Screen:
         """Note which browser tab this is, once it has connected."""
         self.tab = self._client.tab_id
         self._controls.arrive(self.tab)
+
+
+class Heading(TextElement):
+    """A heading whose text is text whatever it says: the name of a run comes from a file."""
+
+    def __init__(self) -> None:
+        super().__init__(tag="h1", text="")
 
 
 def _decision(story: Story) -> str:

@@ -1,14 +1,16 @@
-"""Serves the page from local files: on loopback, or on another address to whoever has the token."""
+"""Serves the page from local files to whoever has the token, on loopback as well: other users reach that too."""
 
 from __future__ import annotations
 
+import logging
 import os
+import re
 import secrets
 import socket
 import sys
 import threading
 import time
-from http.cookies import SimpleCookie
+from http.cookies import CookieError, SimpleCookie
 from pathlib import Path
 from urllib.parse import parse_qs, urlsplit
 
@@ -37,21 +39,30 @@ POLICY = (
 
 
 class Guard:
-    """Lets requests through that come from the page itself, and where there is a token, from whoever has it.
+    """Lets requests through that come from the page itself and from whoever has the token.
 
-    On loopback the name that was asked for must be a loopback name: a foreign page that has its own name resolved to
-    this machine is refused. A request of a foreign origin is refused everywhere.
+    Other users of the machine reach a loopback address as well as its owner does, so there is a token everywhere. On
+    loopback the name that was asked for must also be a loopback name: a foreign page that has its own name resolved to
+    this machine is refused. A request of a foreign origin is refused everywhere, and so is one that cannot be read.
 
     Parameters
     ----------
     inner : ASGI application
         What is guarded.
-    token : str or None
-        What must be in the address once; it is kept in a cookie then. None on loopback.
+    token : str
+        What must be in the address once; it is kept in a cookie then.
+    loopback : bool
+        Whether the page is served on loopback only.
+
+    Attributes
+    ----------
+    refused : int
+        Requests that were refused.
     """
 
-    def __init__(self, inner: ASGIApp, token: str | None) -> None:
-        self._inner, self._token = inner, token
+    def __init__(self, inner: ASGIApp, token: str, *, loopback: bool) -> None:
+        self._inner, self._token, self._loopback = inner, token, loopback
+        self.refused = 0
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer a request, or refuse it with 403."""
@@ -59,29 +70,57 @@ class Guard:
             await self._inner(scope, receive, send)
             return
         headers = {name.decode("latin-1"): value.decode("latin-1") for name, value in scope["headers"]}
-        host = headers.get("host", "")
-        origin = headers.get("origin")
-        given = parse_qs(scope["query_string"].decode("latin-1")).get("token", [""])[0]
-        cookie = SimpleCookie(headers.get("cookie", "")).get(_cookie(host))
-        foreign = origin is not None and urlsplit(origin).netloc != host
-        named = self._token is not None or urlsplit(f"//{host}").hostname in LOOPBACK
-        known = self._token is None or any(
-            secrets.compare_digest(word.encode(), self._token.encode())
-            for word in (given, cookie.value if cookie is not None else "")
-        )
-        if foreign or not named or not known:
+        given = ""
+        try:
+            given = parse_qs(scope["query_string"].decode("latin-1"), max_num_fields=100).get("token", [""])[0]
+            allowed = self._is_allowed(headers, given)
+        except (ValueError, CookieError):  # a host, an origin, a cookie or a query that is none
+            allowed = False
+        if not allowed:
+            self.refused += 1
             await PlainTextResponse("refused: open the address that the command has printed", 403)(scope, receive, send)
             return
 
         async def answered(message: Message) -> None:
             if message["type"] == "http.response.start":
                 message["headers"] = [*message.get("headers", []), (b"content-security-policy", POLICY.encode())]
-                if self._token is not None and given:
-                    kept = f"{_cookie(host)}={self._token}; HttpOnly; SameSite=Strict; Path=/"
+                if given:
+                    kept = f"{_cookie(headers['host'])}={self._token}; HttpOnly; SameSite=Strict; Path=/"
                     message["headers"].append((b"set-cookie", kept.encode()))
             await send(message)
 
         await self._inner(scope, receive, answered)
+
+    def _is_allowed(self, headers: dict[str, str], given: str) -> bool:
+        host, origin = headers.get("host", ""), headers.get("origin")
+        hostname = urlsplit(f"//{host}").hostname
+        if not hostname or (self._loopback and hostname not in LOOPBACK):
+            return False
+        if origin is not None and urlsplit(origin).netloc != host:
+            return False
+        cookie = SimpleCookie(headers.get("cookie", "")).get(_cookie(host))
+        return any(
+            secrets.compare_digest(word.encode(), self._token.encode())
+            for word in (given, cookie.value if cookie is not None else "")
+        )
+
+
+class Refusals(logging.Handler):
+    """Counts what the server's libraries say of malformed requests and messages, in place of their tracebacks."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.count = 0
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Count it."""
+        self.count += record.levelno >= logging.WARNING
+
+    def attach(self) -> None:
+        """Take over from the libraries that speak of connections."""
+        for name in ("uvicorn", "uvicorn.error", "uvicorn.asgi", "asyncio", "engineio", "socketio", "websockets"):
+            logger = logging.getLogger(name)
+            logger.handlers, logger.propagate = [self], False
 
 
 def _cookie(host: str) -> str:
@@ -89,9 +128,19 @@ def _cookie(host: str) -> str:
     return f"autotune_live_{urlsplit(f'//{host}').port or 80}"
 
 
-def token_for(host: str, given: str | None) -> str | None:
-    """Return the token that visitors need: the given one, a new one on another address than loopback, else none."""
-    return given or (None if host in LOOPBACK else secrets.token_urlsafe(12))
+def token_for(given: str | None) -> str:
+    """Return the token that visitors need: the given one, else a new one.
+
+    Raises
+    ------
+    InputError
+        One that an address or a cookie cannot hold, or that is guessed soon.
+    """
+    if given is None:
+        return secrets.token_urlsafe(16)
+    if not re.fullmatch(r"[A-Za-z0-9_-]{8,200}", given):
+        raise InputError("cannot be used", where="--token", remedy="give 8 to 200 letters, digits, - and _")
+    return given
 
 
 def listening(host: str, port: int) -> socket.socket:
@@ -113,7 +162,7 @@ def listening(host: str, port: int) -> socket.socket:
         ) from None
 
 
-def serve(folder: Path, bound: socket.socket, token: str | None, run: Run | None = None) -> None:
+def serve(folder: Path, bound: socket.socket, token: str, run: Run | None = None) -> None:
     """Serve the page of a run's folder until Ctrl-C, or with a ``run`` until that is over and no page is open.
 
     Parameters
@@ -122,8 +171,8 @@ def serve(folder: Path, bound: socket.socket, token: str | None, run: Run | None
         Of a run that goes on, or has ended.
     bound : socket
         From :func:`listening`.
-    token : str or None
-        None on loopback only.
+    token : str
+        From :func:`token_for`.
     run : Run, optional
         The run that listens to the page.
     """
@@ -135,9 +184,9 @@ def serve(folder: Path, bound: socket.socket, token: str | None, run: Run | None
     ui.run_with(
         shell, dark=None, tailwind=False, show_welcome_message=False, message_history_length=50, language="en-US"
     )
-    settings = uvicorn.Config(
-        Guard(shell, token), log_level="warning", ws_per_message_deflate=False, timeout_graceful_shutdown=1
-    )
+    guard, refusals = Guard(shell, token, loopback=bound.getsockname()[0] in LOOPBACK), Refusals()
+    settings = uvicorn.Config(guard, log_config=None, ws_per_message_deflate=False, timeout_graceful_shutdown=1)
+    refusals.attach()
     server = uvicorn.Server(settings)
     looked_s = time.monotonic()
 
@@ -146,6 +195,7 @@ def serve(folder: Path, bound: socket.socket, token: str | None, run: Run | None
         story.poll()
         tabs = {screen.tab for screen in screens if screen.tab is not None}
         controls.present(tabs)
+        controls.refused = guard.refused + refusals.count
         for screen in list(screens):
             screen.update()
         over = run is not None and run.is_over

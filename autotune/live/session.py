@@ -7,6 +7,7 @@ control loop. Only actions come back, each a line on a pipe: a thread that sleep
 from __future__ import annotations
 
 import _thread
+import os
 import queue
 import signal
 import subprocess
@@ -35,7 +36,7 @@ class LivePage:
     listen, port : str, int
         Address and port; port 0 takes a free one.
     token : str or None
-        What visitors need; made up where None and the address is not loopback.
+        What visitors need; made up where None.
 
     Attributes
     ----------
@@ -54,8 +55,10 @@ class LivePage:
         require_extra("live", "nicegui")
         self._command = [
             sys.executable, "-m", "autotune.cli", "live", str(folder), "--beside-run",
-            "--listen", listen, "--port", str(port), *(["--token", token] if token else []),
+            "--listen", listen, "--port", str(port),
         ]  # fmt: skip
+        # not among the arguments, which every user of the machine can read
+        self._environment = os.environ | ({"AUTOTUNE_LIVE_TOKEN": token} if token else {})
         self._console = Console(highlight=False, soft_wrap=True)
         self._answers: queue.SimpleQueue[str] = queue.SimpleQueue()
         self.url = ""
@@ -63,6 +66,7 @@ class LivePage:
     def __enter__(self) -> Self:
         self.process = subprocess.Popen(
             self._command,
+            env=self._environment,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,

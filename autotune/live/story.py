@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import json
 import math
 import time
-import tomllib
 from array import array
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -19,9 +16,24 @@ from autotune.controller import PIDController
 from autotune.errors import InputError
 from autotune.experiment.monitor import RECENT
 from autotune.experiment.result import State
+from autotune.live.events import (
+    Analysed,
+    Ended,
+    Event,
+    GainsKnown,
+    InProgress,
+    RecordingBegins,
+    Relay,
+    RunBegins,
+    Told,
+    Verified,
+    Waiting,
+    read_event,
+)
 from autotune.models import TransferFunction
 from autotune.pipeline import PROGRESS
-from autotune.points import FrequencyPoint, points_from_json
+from autotune.points import LARGEST, FrequencyPoint
+from autotune.text_files import read_toml
 
 #: part of limits.swing from which on y counts as near the limit
 NEAR_SHARE = 0.95
@@ -98,10 +110,8 @@ class Story:
     output : str
         How the rig was left, once that is known.
 
-    Raises
-    ------
-    InputError
-        The folder holds no run that tells of itself.
+    unread : int
+        Lines that were no events or rows.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -112,9 +122,10 @@ class Story:
         self._sidecar: Path | None = None
         self._start_s = 0.0
         self._remaining_s, self._told_s = math.nan, 0.0
-        self._relay: dict[str, Any] | None = None
+        self._relay: Relay | None = None
         self.rows = Rows()
-        self.config: dict[str, Any] = {}
+        self.config: Told | None = None
+        self.unread = 0
         self.marks: list[tuple[float, str]] = []
         self.news = 0
         self.state, self.message = "connect", "waiting for the run to begin"
@@ -134,69 +145,77 @@ class Story:
 
     def poll(self) -> bool:
         """Read what is new, and say whether there was anything."""
-        events = self._events.lines()
-        for line in events:
-            try:
-                event = json.loads(line)
-            except ValueError:
-                raise InputError(
-                    "holds a line that is not JSON", where=str(self._folder / PROGRESS), remedy="give another folder"
-                ) from None
-            self._take(event)
-        self.news += len(events)
-        return self._read_rows() or bool(events)
+        lines = self._events.lines()
+        for line in lines:
+            event = read_event(line)
+            if event is None:
+                self.unread += 1
+            else:
+                self._take(event)
+        self.news += len(lines)
+        return self._read_rows() or bool(lines)
 
-    def _take(self, event: dict[str, Any]) -> None:
-        match event.pop("event"):
-            case "run":
-                self.config, self.ended = event["config"], None
-            case "recording":
-                self._read_rows()  # the one before is complete
-                self._start_s = self.now_s
-                path = self._folder / event["file"]
-                self._recording, self._columns, self._sidecar = Tail(path), [], path.with_suffix(".toml")
-                if self.controller is not None:
-                    self._enter(State.VERIFY.value, self._start_s)
-                    self.message = "bringing the rig to its operating point under the new gains"
-                    self._remaining_s = math.nan
-            case "progress":
+    def _take(self, event: Event) -> None:
+        match event:
+            case RunBegins():
+                self.config, self.ended = event.config, None
+            case RecordingBegins():
+                self._begin_recording(event.file)
+            case InProgress():
                 self._progress(event)
-            case "analysis":
-                self.points = points_from_json(event["points"], PROGRESS)
-                self.plant, self.reduced = _transfer_function(event["plant"]), _transfer_function(event["reduced"])
-                self.controller = _controller(event["controller"])
+            case Analysed():
+                self.points = event.points
+                self.plant, self.reduced = event.plant.transfer_function(), event.reduced.transfer_function()
+                self.controller = event.controller.controller()
                 self.sign = 1 if self.controller.K > 0 else -1
                 self.message = "controller designed"
-            case "verification":
-                self.steps, self.accepted, self.verdict = event["steps"], event["accepted"], event["reason"]
-            case "gains":
-                old = _controller(event["old"]) if event["old"] else None
-                self.gains = Gains(old=old, new=_controller(event["new"]), deployed=event["deployed"])
+            case Verified():
+                self.steps = {str(n): [math.nan if v is None else v for v in c] for n, c in event.steps.items()}
+                self.accepted, self.verdict = event.accepted, event.reason
+            case GainsKnown():
+                old = event.old.controller() if event.old is not None else None
+                self.gains = Gains(old=old, new=event.new.controller(), deployed=event.deployed)
                 self.waiting_s = 0.0
-            case "waiting":
-                self.waiting_s, self._asked_s = event["patience_s"], time.monotonic()
-            case "ended":
-                self.ended, self.waiting_s = event["reason"], 0.0
+            case Waiting():
+                self.waiting_s, self._asked_s = event.patience_s, time.monotonic()
+            case Ended():
+                self.ended, self.waiting_s = event.reason, 0.0
                 self.output = self._output()
+
+    def _begin_recording(self, name: str) -> None:
+        self._read_rows()  # the one before is complete
+        self._start_s = self.now_s
+        path = self._folder / name
+        if path.is_symlink():  # a run makes none, and what it leads to is not of this run
+            self.unread += 1
+            return
+        self._recording, self._columns, self._sidecar = Tail(path), [], path.with_suffix(".toml")
+        if self.controller is not None:
+            self._enter(State.VERIFY.value, self._start_s)
+            self.message = "bringing the rig to its operating point under the new gains"
+            self._remaining_s = math.nan
 
     def _output(self) -> str:
         """Return how the last recording says the rig was left."""
         if self._sidecar is None or not self._sidecar.is_file():
             return ""
-        ended = tomllib.loads(self._sidecar.read_text(encoding="utf-8")).get("ended", {})
-        return str(ended.get("output", ""))
+        try:
+            ended = read_toml(self._sidecar).get("ended")
+        except InputError:
+            return ""
+        return str(ended.get("output", ""))[:80] if isinstance(ended, dict) else ""
 
-    def _progress(self, event: dict[str, Any]) -> None:
-        at_s = self._start_s + event["elapsed_s"]
-        self._enter(event["state"], at_s)
-        self.message = event["message"]
-        self._remaining_s = math.nan if event["remaining_s"] is None else event["remaining_s"]
+    def _progress(self, event: InProgress) -> None:
+        at_s = self._start_s + event.elapsed_s
+        self._enter(event.state, at_s)
+        self.message = event.message
+        self._remaining_s = math.nan if event.remaining_s is None else event.remaining_s
         self._told_s = at_s
-        self._relay = event["relay"]
-        self.sign = int(self._relay["plant_sign"]) if self._relay is not None else self.sign
-        self._told = event["warnings"] or self._told
-        if event["points"]:
-            self.points = points_from_json(event["points"], PROGRESS)
+        self._relay = event.relay
+        self.sign = self._relay.plant_sign if self._relay is not None else self.sign
+        self._told = list(event.warnings) or self._told
+        if event.points:
+            self.points = event.points
 
     def _enter(self, state: str, at_s: float) -> None:
         if state != self.state:
@@ -210,13 +229,23 @@ class Story:
                 continue
             if not self._columns:
                 self._columns = line.split(",")
-                continue
-            row = dict(zip(self._columns, map(float, line.split(",")), strict=False))
-            self.rows.t.append(self._start_s + row["t"])
-            self.rows.u.append(row["u"])
-            self.rows.y.append(row["y"])
-            self.rows.r.append(row.get("r", self.centre))
+            elif not self._add_row(line.split(",")):
+                self.unread += 1
         return bool(lines)
+
+    def _add_row(self, cells: list[str]) -> bool:
+        """Take a row, and say whether it is one: numbers in every column, at a time that goes on."""
+        try:
+            row = dict(zip(self._columns, map(float, cells), strict=True))
+            t, u, y = self._start_s + row["t"], row["u"], row["y"]
+        except (ValueError, KeyError):
+            return False
+        if not (abs(t) <= LARGEST and t >= self.now_s):
+            return False
+        for column, value in ((self.rows.t, t), (self.rows.u, u), (self.rows.y, y)):
+            column.append(value)
+        self.rows.r.append(row.get("r", self.centre))
+        return True
 
     @property
     def now_s(self) -> float:
@@ -226,18 +255,17 @@ class Story:
     @property
     def centre(self) -> float:
         """Operating point [y unit]; NaN while unknown."""
-        return float(self.config["operating_point"]["y"]) if self.config else math.nan
+        return self.config.operating_point.y if self.config is not None else math.nan
 
     @property
     def limits(self) -> dict[str, float]:
         """The configuration's limits; empty while unknown."""
-        return dict(self.config.get("limits", {}))
+        return self.config.limits.model_dump() if self.config is not None else {}
 
     @property
     def units(self) -> tuple[str, str]:
         """Units of u and y."""
-        signals = self.config.get("signals", {})
-        return signals.get("u_unit", ""), signals.get("y_unit", "")
+        return (self.config.signals.u_unit, self.config.signals.y_unit) if self.config is not None else ("", "")
 
     @property
     def remaining_s(self) -> float:
@@ -251,15 +279,15 @@ class Story:
 
     def relay_text(self) -> str:
         """Return what the relay does now, in words; nothing while none runs."""
-        if self._relay is None or self.state != State.SWEEP.value or not self.rows.u:
+        if self.config is None or self._relay is None or self.state != State.SWEEP.value or not self.rows.u:
             return ""
         u_unit, y_unit = self.units
         relay = self._relay
-        delay_s = (relay["delay_samples"] + 0.5 * (relay["smoothing"] - 1)) * self.config["signals"]["sample_time_s"]
-        side = "high" if self.rows.u[-1] > relay["midpoint"] else "low"
+        delay_s = (relay.delay_samples + 0.5 * (relay.smoothing - 1)) * self.config.signals.sample_time_s
+        side = "high" if self.rows.u[-1] > relay.midpoint else "low"
         return (
-            f"Relay {side}: {relay['midpoint']:.4g} ± {relay['amplitude']:.3g} {u_unit}, inserted delay"
-            f" {delay_s:.3g} s, hysteresis {relay['hysteresis']:.2g} {y_unit}"
+            f"Relay {side}: {relay.midpoint:.4g} ± {relay.amplitude:.3g} {u_unit}, inserted delay"
+            f" {delay_s:.3g} s, hysteresis {relay.hysteresis:.2g} {y_unit}"
         )
 
     def limits_text(self) -> str:
@@ -276,6 +304,8 @@ class Story:
     def warnings(self) -> list[str]:
         """Return what an onlooker should know, in words."""
         found = list(self._told)
+        if self.unread:
+            found.append(f"{self.unread} damaged lines of the run's files are left out: this page may lack something")
         swing = self.limits.get("swing", math.inf)
         floats = self.state == State.SWEEP.value and self.ended is None
         y = self.rows.since(self.now_s - RECENT_S)[2] if floats else np.empty(0)
@@ -286,12 +316,3 @@ class Story:
                 share = 100 * departure / swing
                 found.append(f"y comes near its limit: {share:.0f} % of the allowed swing of {swing:g} {self.units[1]}")
         return found
-
-
-def _transfer_function(content: dict[str, Any]) -> TransferFunction:
-    return TransferFunction(num=tuple(content["num"]), den=tuple(content["den"]), delay_s=content["delay_s"])
-
-
-def _controller(content: dict[str, Any]) -> PIDController:
-    Ti_s = content["Ti_s"]
-    return PIDController(**content | {"Ti_s": math.inf if Ti_s is None else Ti_s})

@@ -139,3 +139,53 @@ def test_one_page_holds_the_controls_and_leaves_them_to_whoever_takes_them() -> 
     assert controls.holder is None
     controls.take("second")
     assert controls.holder == "second"
+
+
+def test_no_line_can_name_a_file_outside_the_run(tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    run.mkdir()
+    (tmp_path / "secret.csv").write_text("t,u,y\n0,1,2\n")
+    (run / "recording.csv").symlink_to(tmp_path / "secret.csv")
+    names = ["../secret.csv", str(tmp_path / "secret.csv"), "recording.csv", "progress.jsonl", "", "a/../recording.csv"]
+    lines = [json.dumps({"event": "recording", "file": name}) for name in names]
+    (run / "progress.jsonl").write_text("\n".join(lines) + "\n")
+    story = Story(run)
+    story.poll()
+    assert list(story.rows.t) == []
+    assert story.unread == len(names)
+    assert "damaged" in story.warnings()[0]
+
+
+BROKEN = [
+    "", "nonsense", "{}", "[]", "5", "null", '{"event": "unknown"}', '{"event": "run"}',
+    '{"event": "run", "config": 5}',
+    '{"event": "progress", "state": 5}', '{"event": "gains", "old": {}, "new": {"K": "x"}}', "[" * 100_000,
+    '{"event": "verification", "accepted": true, "reason": "x", "steps": {"t": [1]}}',
+    '{"event": "analysis", "points": 5, "plant": null}', '{"event": "waiting", "patience_s": -1}',
+    '{"event": "ended", "reason": "\\u001b[2J"}', '{"event": "waiting", "patience_s": NaN}',
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("line", BROKEN)
+def test_a_damaged_line_is_counted_and_the_rest_is_shown(tmp_path: Path, line: str) -> None:
+    with RunLog(tmp_path / "progress.jsonl") as log:
+        log.begin(ball_config())
+        with (tmp_path / "progress.jsonl").open("a") as file:
+            file.write(line + "\n")
+        log.waiting(30.0)
+    story = Story(tmp_path)
+    story.poll()
+    assert story.config is not None
+    assert story.ended == "completed"
+    assert story.unread == 1
+
+
+def test_a_damaged_row_is_left_out(tmp_path: Path) -> None:
+    with RunLog(tmp_path / "progress.jsonl") as log:
+        log.begin(ball_config())
+        log.recording(tmp_path / "recording.csv")
+    (tmp_path / "recording.csv").write_text("t,u,y\n0,1,2\nx,y,z\n1,2\n-5,1,1\n1e300,1,1\n2,1,2\n")
+    story = Story(tmp_path)
+    story.poll()
+    assert list(story.rows.t) == [0.0, 2.0]
+    assert story.unread == 4
