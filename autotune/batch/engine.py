@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import logging
 import signal
+import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import TypeVar
+from multiprocessing import resource_tracker
+from typing import Any, TypeVar
 
 import dask
 from dask.system import CPU_COUNT
 from distributed import Client, KilledWorker, LocalCluster, Worker, as_completed
+from distributed.security import Security
 
 import autotune
 from autotune.errors import InputError
@@ -52,24 +55,14 @@ def cluster(workers: int | None = None, scheduler: str | None = None, *, process
 
     Notes
     -----
-    The embedded cluster listens on 127.0.0.1 only, has no dashboard, and replaces a worker that dies.
+    A Dask scheduler runs any code for whoever reaches it, and every user of a machine reaches its loopback. So the
+    embedded cluster speaks TLS with a certificate that is made for this campaign, held in memory only, and asked of
+    both sides; with threads it stays within this process and listens nowhere. It has no dashboard, and replaces a
+    worker that dies. An existing scheduler is as open as whoever runs it has made it.
     """
     if scheduler is None:
         tasks = workers or CPU_COUNT
-        with (
-            dask.config.set(_EMBEDDED),
-            LocalCluster(
-                n_workers=tasks if processes else 1,
-                threads_per_worker=1 if processes else tasks,
-                processes=processes,
-                host="tcp://127.0.0.1",
-                dashboard_address=None,
-                scheduler_kwargs={"dashboard_address": "127.0.0.1:0"},  # it serves its health there, on any free port
-                silence_logs=logging.CRITICAL,
-                preload=[__name__] if processes else [],
-            ) as local,
-            Client(local) as client,
-        ):
+        with dask.config.set(_EMBEDDED), _embedded(tasks, processes) as local, Client(local) as client:
             yield client
         return
     try:
@@ -79,6 +72,50 @@ def cluster(workers: int | None = None, scheduler: str | None = None, *, process
     with client:
         _check(client, scheduler)
         yield client
+
+
+def _embedded(tasks: int, processes: bool) -> LocalCluster:
+    """Start the embedded cluster; a Ctrl-C meanwhile waits until it stands, and its processes never hear one.
+
+    A terminal sends Ctrl-C to every process of the command. A signal that is blocked where a process is started is
+    blocked in the new one from its first instruction, long before :func:`dask_setup` is reached.
+    """
+    with _interrupt_held():
+        return LocalCluster(
+            n_workers=tasks if processes else 1,
+            threads_per_worker=1 if processes else tasks,
+            processes=processes,
+            **_transport(processes),
+            dashboard_address=None,
+            scheduler_kwargs={"dashboard_address": "127.0.0.1:0"},  # it serves its health there, on any free port
+            silence_logs=logging.CRITICAL,
+            preload=[__name__] if processes else [],
+        )
+
+
+@contextmanager
+def _interrupt_held() -> Iterator[None]:
+    if not hasattr(signal, "pthread_sigmask") or threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    came: list[int] = []
+    handler = signal.signal(signal.SIGINT, lambda number, _: came.append(number))  # another thread may hear it
+    resource_tracker.ensure_running()  # whoever starts it first has SIGINT unblocked in its thread
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        signal.signal(signal.SIGINT, handler)
+    if came:
+        raise KeyboardInterrupt
+
+
+def _transport(processes: bool) -> dict[str, Any]:
+    """Return how the parts of the embedded cluster speak to each other: nobody else can."""
+    if not processes:
+        return {"protocol": "inproc://"}
+    return {"host": "127.0.0.1", "protocol": "tls://", "security": Security.temporary()}
 
 
 def dask_setup(_worker: Worker) -> None:

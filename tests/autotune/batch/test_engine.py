@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
+import sys
+import textwrap
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -122,3 +125,41 @@ def test_a_scheduler_without_workers_is_said(monkeypatch):
         cluster(scheduler=empty.scheduler_address),
     ):
         pass
+
+
+@pytest.mark.parametrize("protocol", ["tls", "tcp"])
+def test_another_user_of_the_machine_cannot_have_the_scheduler_run_code(two_workers, tmp_path, protocol):
+    from distributed import Client
+    from distributed.security import Security
+
+    address = urlsplit(two_workers.scheduler.address)
+    assert (address.scheme, address.hostname) == ("tls", "127.0.0.1")
+    stranger = Security.temporary() if protocol == "tls" else None  # a certificate of his own
+    with pytest.raises(OSError, match=r"Timed out|does not match|handshake|refused|closed"):
+        Client(f"{protocol}://{address.netloc}", security=stranger, timeout=2.0)
+
+
+def test_a_cluster_of_threads_listens_nowhere():
+    with cluster(workers=1, processes=False) as client:
+        assert client.scheduler.address.startswith("inproc://")
+
+
+INTERRUPTED = """
+import os, signal, sys, threading, time
+from autotune.batch.engine import cluster
+try:
+    threading.Timer(float(sys.argv[1]), os.killpg, (os.getpid(), signal.SIGINT)).start()
+    with cluster(workers=2) as client:
+        client.submit(time.sleep, 600).result()
+except KeyboardInterrupt:
+    print("stopped", file=sys.stderr)
+"""
+
+
+@pytest.mark.parametrize("after_s", [0.0, 0.2, 1.0, 4.0])
+def test_ctrl_c_while_workers_start_is_one_line(tmp_path, after_s):
+    path = tmp_path / "interrupted.py"
+    path.write_text(f"if __name__ == '__main__':\n{textwrap.indent(INTERRUPTED, '    ')}")
+    command = [sys.executable, str(path), str(after_s)]
+    done = subprocess.run(command, capture_output=True, text=True, start_new_session=True, check=False)
+    assert done.stderr == "stopped\n"
