@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import logging
 import signal
-import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from multiprocessing import resource_tracker
 from typing import Any, TypeVar
 
 import dask
@@ -17,6 +15,7 @@ from distributed.security import Security
 
 import autotune
 from autotune.errors import InputError
+from autotune.interrupts import interrupt_held
 
 Given = TypeVar("Given")
 Answer = TypeVar("Answer")
@@ -80,7 +79,7 @@ def _embedded(tasks: int, processes: bool) -> LocalCluster:
     A terminal sends Ctrl-C to every process of the command. A signal that is blocked where a process is started is
     blocked in the new one from its first instruction, long before :func:`dask_setup` is reached.
     """
-    with _interrupt_held():
+    with interrupt_held():
         return LocalCluster(
             n_workers=tasks if processes else 1,
             threads_per_worker=1 if processes else tasks,
@@ -91,24 +90,6 @@ def _embedded(tasks: int, processes: bool) -> LocalCluster:
             silence_logs=logging.CRITICAL,
             preload=[__name__] if processes else [],
         )
-
-
-@contextmanager
-def _interrupt_held() -> Iterator[None]:
-    if not hasattr(signal, "pthread_sigmask") or threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    came: list[int] = []
-    handler = signal.signal(signal.SIGINT, lambda number, _: came.append(number))  # another thread may hear it
-    resource_tracker.ensure_running()  # whoever starts it first has SIGINT unblocked in its thread
-    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
-        signal.signal(signal.SIGINT, handler)
-    if came:
-        raise KeyboardInterrupt
 
 
 def _transport(processes: bool) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from rich.console import Console
 from autotune.cli import app, identify
 from autotune.cli.common import OVERWRITE
 from autotune.cli.recordings import R, T, U, Y, read_one, signal_names
-from autotune.outputs import Output
+from autotune.outputs import Output, claim
 
 if TYPE_CHECKING:
     from autotune.identification.closed_loop.dither_proposal import DitherLimits
@@ -172,6 +172,9 @@ def dither(
             remedy="give the recording another name",
         )
     rig = rig_of(content)
+    claim(out, inputs=(config,))
+    if out.with_suffix(".toml").exists():
+        raise InputError("exists already", where=str(out.with_suffix(".toml")), remedy="give --out another name")
     with ProgressBar() as bar:
         done = run_dither(
             rig, content, out, duration_s=duration, amplitude=amplitude, dwell_s=dwell, seed=seed, on_progress=bar.show

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.console import Console
 
+from autotune.cli.guard import mark_rig_in_command
 from autotune.errors import InputError
 from autotune.outputs import claim
 
@@ -24,6 +25,7 @@ def rig_of(config: Config, dry_run: bool = False) -> Rig:
     from drivers import open_rig, twin_of
 
     given = config.controller
+    mark_rig_in_command()
     return open_rig(
         twin_of(config.rig) if dry_run else config.rig,
         u_range=(config.limits.u_min, config.limits.u_max),

@@ -191,15 +191,17 @@ def _watch_rig(config: Config, out: Path, settings: _Tracking, duration_s: float
     from autotune.cli.common import new_folder, rig_of
     from autotune.experiment.dither import run_dither
     from autotune.experiment.warm import warm_up
+    from autotune.interrupts import interrupt_held
 
-    new_folder(out, "recording.csv")
+    new_folder(out, ("recording.csv", "recording.toml", "watch.csv"))
     warm_up()  # a first compilation may take longer than a recording may be quiet
     recording = out / "recording.csv"
     quiet_s = max(5.0, 20.0 * config.signals.sample_time_s)
     fits = multiprocessing.get_context("spawn").Process(
         target=_follow, args=(recording, out / "watch.csv", settings, quiet_s)
     )
-    fits.start()
+    with interrupt_held():  # Ctrl-C is for this process, which ends the recording, which ends the fits
+        fits.start()
     try:
         run_dither(rig_of(config), config, recording, duration_s=duration_s, amplitude=dither)
     finally:

@@ -274,7 +274,7 @@ def _comparison(
         return rows
 
     before, after = shown(old), shown(new)
-    table = Table(form, "the rig holds", "new", title=config.name)
+    table = Table(form, "the rig holds", "new", title=escape(config.name))
     for name in dict.fromkeys((*before, *after)):
         table.add_row(escape(name), before.get(name, "-"), after.get(name, "-"))
     return table

@@ -13,8 +13,7 @@ import sys
 import tempfile
 import time
 import traceback
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextvars import ContextVar
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -26,10 +25,13 @@ from autotune.outputs import unwritable
 from autotune.text_files import printable, reason
 
 #: parameters of the commands that name where results go, the most telling first
-_PLACES = ("out", "resume", "folder", "run")
+_PLACES = ("out", "resume")
 #: most files that a message names
 _MOST_NAMES = 6
 _CLICK_EXCEPTION: type[Exception] = typer.BadParameter.__mro__[2]  # typer brings click under changing names
+
+
+_RIG_IN_COMMAND: ContextVar[bool] = ContextVar("rig in command", default=False)
 
 
 class GuardedCommand(TyperCommand):
@@ -37,13 +39,10 @@ class GuardedCommand(TyperCommand):
 
     def invoke(self, ctx: Any) -> Any:
         """Run the command."""
-        began_s = time.time()
+        began_s, before = time.time(), _RIG_IN_COMMAND.set(False)
         try:
             return super().invoke(ctx)
-        except (AutotuneError, _CLICK_EXCEPTION, typer.Exit) as error:
-            if isinstance(error, UnforeseenAtRig):
-                cause = error.__cause__ or error
-                error.remedy = f"the traceback is in {_keep_traceback(cause, _place(ctx))}; please report it"
+        except (AutotuneError, _CLICK_EXCEPTION, typer.Exit):
             raise
         except (KeyboardInterrupt, typer.Abort):
             _say_stopped(_place(ctx), began_s)
@@ -55,31 +54,14 @@ class GuardedCommand(TyperCommand):
         except (MemoryError, RecursionError) as error:
             raise _too_large(error) from None
         except Exception as error:
-            what = f"a defect of the tool: {_named(error)}"
-            kept = _keep_traceback(error, _place(ctx))
-            raise Unforeseen(
-                what, where=ctx.command_path, remedy=f"the traceback is in {kept}; please report it"
-            ) from error
+            raise _unforeseen(error, ctx) from error
+        finally:
+            _RIG_IN_COMMAND.reset(before)
 
 
-@contextmanager
-def rig_in_command() -> Iterator[None]:
-    """Say of an error that nobody foresaw that a rig was in command, so that it ends with the status of a stop.
-
-    Raises
-    ------
-    ExperimentStopped
-        An error of the operating system, or a defect.
-    """
-    try:
-        yield
-    except (AutotuneError, _CLICK_EXCEPTION, typer.Exit, typer.Abort):
-        raise
-    except OSError as error:
-        refusal = _refusal(error)
-        raise ExperimentStopped(refusal.what, where=refusal.where, remedy=refusal.remedy) from error
-    except Exception as error:
-        raise UnforeseenAtRig(f"a defect of the tool: {_named(error)}", where="rig in command") from error
+def mark_rig_in_command() -> None:
+    """Say that from here on the running command may have a rig in command: what fails then is a stop, not a refusal."""
+    _RIG_IN_COMMAND.set(True)
 
 
 def without_stdout() -> None:
@@ -93,11 +75,24 @@ def _named(error: BaseException) -> str:
     return printable(f"{type(error).__name__}: {text[0][:200]}" if text else type(error).__name__)
 
 
-def _refusal(error: OSError) -> InputError:
+def _refusal(error: OSError) -> AutotuneError:
     if error.errno in (errno.ENOENT, errno.ENOTDIR, errno.EISDIR) and error.filename is not None:
-        return InputError(f"cannot be read ({reason(error)})", where=str(error.filename), remedy="check the path")
-    where = Path(str(error.filename)) if error.filename is not None else Path("a file")
-    return unwritable(error, where)
+        said = InputError(f"cannot be read ({reason(error)})", where=str(error.filename), remedy="check the path")
+    else:
+        said = unwritable(error, Path(str(error.filename)) if error.filename is not None else Path("a file"))
+    if _RIG_IN_COMMAND.get():
+        return ExperimentStopped(said.what, where=said.where, remedy=said.remedy)
+    return said
+
+
+def _unforeseen(error: Exception, ctx: Any) -> AutotuneError:
+    kept = _keep_traceback(error, _place(ctx))
+    kind = UnforeseenAtRig if _RIG_IN_COMMAND.get() else Unforeseen
+    return kind(
+        f"a defect of the tool: {_named(error)}",
+        where=ctx.command_path,
+        remedy=f"the traceback is in {kept}; please report it",
+    )
 
 
 def _too_large(error: BaseException) -> InputError:
@@ -124,7 +119,7 @@ def _since(place: Path, began_s: float) -> list[str]:
     """Return the names of the files there that were written since the command began."""
     with contextlib.suppress(OSError):
         files = [file for file in place.rglob("*") if ".part-" not in str(file)] if place.is_dir() else [place]
-        new = [file for file in files if file.is_file() and file.stat().st_mtime >= began_s - 1.0]
+        new = [file for file in files if file.is_file() and file.stat().st_mtime >= began_s - 0.02]
         return sorted(file.name if file == place else str(file.relative_to(place)) for file in new)
     return []
 

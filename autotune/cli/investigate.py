@@ -10,6 +10,7 @@ import typer
 
 from autotune.cli import app
 from autotune.cli.recordings import R, T, U, Y, read_all, signal_names
+from autotune.outputs import write_whole
 
 if TYPE_CHECKING:
     from autotune.pipeline.investigation import Investigation
@@ -53,7 +54,7 @@ def investigate(
     nominal = read_model(model)
     given = read_all(recordings or [], signal_names(t, u, y, r))
     rig = rig_of(content, dry_run)
-    new_folder(out, ROUNDS)
+    new_folder(out, (ROUNDS, "diagnosis.json", "extended_model.toml", "report.html"), (config, model))
     with ProgressBar() as bar:
         known = find_out(
             rig, content, nominal, given, out, rounds=rounds, duration_s=duration, rig_time_s=rig_time,
@@ -77,7 +78,7 @@ def _keep(known: Investigation, out: Path) -> None:
     from autotune.models import write_model
     from autotune.report.investigation_page import write_investigation_page
 
-    (out / ROUNDS).write_text(json.dumps(known.as_json(), indent=2) + "\n", encoding="utf-8")
+    write_whole(out / ROUNDS, json.dumps(known.as_json(), indent=2) + "\n")
     found = known.diagnosis
     if found is None:
         return

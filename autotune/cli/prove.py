@@ -17,6 +17,7 @@ from rich.table import Table
 
 from autotune.cli import app
 from autotune.errors import InputError, require_extra
+from autotune.outputs import write_whole
 
 if TYPE_CHECKING:
     from sim.proof import Campaign
@@ -72,7 +73,7 @@ def prove(
         "marks": [asdict(m) for m in marks],
         "ties": tried,
     }
-    (out / "proof.json").write_text(json.dumps(result, indent=1), encoding="utf-8")
+    write_whole(out / "proof.json", json.dumps(result, indent=1))
     _print_confusion(console, marks)
     _print_table(console, rows)
     failures = keep_failures(campaign, marks)
@@ -141,7 +142,7 @@ def tie_resolved(out: Path, seed: int) -> dict[str, Any]:
         "right_before": bool(tie.names & set(old.split("+"))),
         "resolved": bool(tie.names & set(new.split("+"))),
     }
-    kept.write_text(json.dumps(answer), encoding="utf-8")
+    write_whole(kept, json.dumps(answer))
     return answer
 
 
@@ -149,7 +150,7 @@ def _publish(path: Path, digest: str) -> None:
     """Write the seal before anything is diagnosed; a continued campaign must have the same one."""
     if path.exists() and path.read_text(encoding="utf-8").strip() != digest:
         raise InputError(f"{path}: these answers are not the ones that were sealed; use another --out")
-    path.write_text(digest + "\n", encoding="utf-8")
+    write_whole(path, digest + "\n")
 
 
 def _ablate(console: Console, campaign: Campaign, without: str, most: int, workers: int, scheduler: str | None) -> None:

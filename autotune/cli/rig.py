@@ -10,9 +10,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from autotune.cli import app
+from autotune.errors import LinkError
 
 if TYPE_CHECKING:
     from autotune.config import Config
@@ -36,17 +38,19 @@ def rig(config: _CONFIG) -> None:
         signal.signal(number, lambda *_: stop.set())
     if isinstance(content.rig, SerialSettings):
         with served_on_line(content, content.rig):
-            console.print(f"serving a microcontroller on {content.rig.device}; Ctrl-C ends it")
+            console.print(f"serving a microcontroller on {content.rig.device}; Ctrl-C ends it", markup=False)
             stop.wait()
         console.print("stopped")
         return
     settings = modbus_settings(content)
     with served(content, device_of(content)) as server:
-        table = Table("signal", "table", "address", "type", "order", "scale", "offset", title=f"{content.name}")
+        table = Table("signal", "table", "address", "type", "order", "scale", "offset", title=escape(content.name))
         for name, register in settings.registers.mapped().items():
             table.add_row(name, *_row(register))
         console.print(table)
-        console.print(f"serving {_address(settings, server.port)}, unit {settings.unit_id}; Ctrl-C ends it")
+        console.print(
+            f"serving {_address(settings, server.port)}, unit {settings.unit_id}; Ctrl-C ends it", markup=False
+        )
         stop.wait()
     console.print("stopped")
 
@@ -65,16 +69,22 @@ def probe(config: _CONFIG) -> None:
         return
     found = probe_registers(modbus_settings(content), expected=_expected(content))
     units = _units(content)
-    table = Table("signal", "register", "type", "raw", "value", "unit", title=content.name)
+    table = Table("signal", "register", "type", "raw", "value", "unit", title=escape(content.name))
     for one in found:
         register = one.register
         raw = " ".join(f"{word:04X}" for word in one.words) or "-"
         value = f"{one.value:.6g}" if one.words else "-"
         place = f"{register.table} {register.address}"
-        table.add_row(one.name, place, register.type, raw, value, units.get(one.name, ""))
+        table.add_row(one.name, place, register.type, raw, value, escape(units.get(one.name, "")))
     console = Console(highlight=False, soft_wrap=True)
     console.print(table)
-    _print_verdict(console, f"{len(found)} registers", {one.name: one.warnings for one in found})
+    read = sum(bool(one.words) for one in found)
+    what = f"{read} registers" if read == len(found) else f"{read} of {len(found)} registers"
+    _print_verdict(console, what, {one.name: one.warnings for one in found})
+    if not read:
+        raise LinkError(
+            "no register could be read", where=content.name, remedy="check address, unit id and the register map"
+        )
 
 
 def _probe_line(config: Config, settings: SerialSettings) -> None:
@@ -82,9 +92,9 @@ def _probe_line(config: Config, settings: SerialSettings) -> None:
 
     found = probe_line(settings, expected=_expected(config))
     units = _units(config)
-    table = Table("signal", "raw", "value", "unit", title=config.name)
+    table = Table("signal", "raw", "value", "unit", title=escape(config.name))
     for one in found.signals:
-        table.add_row(one.name, one.raw, f"{one.value:.6g}", units.get(one.name, ""))
+        table.add_row(one.name, one.raw, f"{one.value:.6g}", escape(units.get(one.name, "")))
     console = Console(highlight=False, soft_wrap=True)
     console.print(found.description, markup=False)
     console.print(table)
@@ -97,7 +107,7 @@ def _print_verdict(console: Console, what: str, warnings: Mapping[str, Sequence[
             console.print(f"{name}: {warning}", markup=False)
     doubtful = [name for name, said in warnings.items() if said]
     verdict = f"{', '.join(doubtful)} look implausible" if doubtful else "all values are plausible"
-    console.print(f"{what} read, nothing written: {verdict}")
+    console.print(f"{what} read, nothing written: {verdict}", markup=False)
 
 
 @app.command()

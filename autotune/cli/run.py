@@ -11,7 +11,6 @@ from rich.console import Console
 
 from autotune.cli import app
 from autotune.cli.common import OVERWRITE, ProgressBar, new_folder, rig_of
-from autotune.cli.guard import rig_in_command
 from autotune.cli.live import LISTEN, PORT, TOKEN
 from autotune.cli.recordings import R, T, U, Y, read_all, signal_names
 from autotune.errors import ExperimentStopped, InputError
@@ -65,8 +64,7 @@ def run(
         may_store(content, out)
     folder = out or resume or Path()
     console = Console(highlight=False, soft_wrap=True)
-    page_of_run = LivePage(folder, listen, port, token) if live else nullcontext()
-    with rig_in_command(), page_of_run as onlooker:
+    with LivePage(folder, listen, port, token) if live else nullcontext() as onlooker:
         keep = onlooker.keep if onlooker is not None else None
         with ProgressBar() as bar:
             tuning = tune(
