@@ -2,18 +2,11 @@
 
 from __future__ import annotations
 
-from autotune.config.rig import (
-    ModbusRtuSettings,
-    ModbusTcpSettings,
-    ModbusTlsSettings,
-    ReplaySettings,
-    RigSettings,
-    SerialSettings,
-    SimulatedRigSettings,
-)
+from autotune.config.rig import RigSettings, SimulatedRigSettings, TwinSettings
 from autotune.controller import PIDController
 from autotune.errors import InputError
 from autotune.experiment.rig import Rig
+from drivers.kinds import Session, kind_of
 
 __all__ = ["open_rig", "twin_of"]
 
@@ -43,37 +36,8 @@ def open_rig(
     InputError
         A register cannot hold the commands, a certificate or a recording cannot be read.
     """
-    # imported here so that a simulated run does not pay for the Modbus library, nor a real one for the plants
-    match settings:
-        case SimulatedRigSettings():
-            from drivers.simulated import open_simulated
-
-            return open_simulated(settings, u_safe=u_safe, controller=controller)
-        case ReplaySettings():
-            from drivers.replay import open_replay
-
-            return open_replay(settings)
-        case SerialSettings():
-            from drivers.device_rig import DeviceLawRig
-            from drivers.serial_rig import SerialLineRig
-
-            on_line = DeviceLawRig if settings.relay == "device" else SerialLineRig
-            return on_line(settings, u_range=u_range, u_safe=u_safe)
-        case ModbusTcpSettings() | ModbusTlsSettings() | ModbusRtuSettings():
-            from drivers.gain_rig import GainRegisterRig
-            from drivers.modbus import ModbusLink
-            from drivers.register_rig import RegisterRig
-
-            kind = RegisterRig if settings.registers.held_gains is None else GainRegisterRig
-            return kind(
-                ModbusLink(settings),
-                settings.registers,
-                u_range=u_range,
-                u_safe=u_safe,
-                feed_s=settings.feed_s,
-                scan_time_s=settings.scan_time_s,
-                permissives=settings.permissives,
-            )
+    session = Session(u_range=u_range, u_safe=u_safe, controller=controller)
+    return kind_of(settings).open(settings, session)
 
 
 def twin_of(settings: RigSettings) -> SimulatedRigSettings:
@@ -84,18 +48,13 @@ def twin_of(settings: RigSettings) -> SimulatedRigSettings:
     InputError
         The configuration names none.
     """
-    match settings:
-        case SimulatedRigSettings():
-            return settings
-        case (
-            ModbusTcpSettings(twin=twin)
-            | ModbusTlsSettings(twin=twin)
-            | ModbusRtuSettings(twin=twin)
-            | SerialSettings(twin=twin)
-        ) if twin:
-            return SimulatedRigSettings(
-                kind="simulated", plant=twin.plant, seed=twin.seed, noise=twin.noise, start=twin.start
-            )
+    if isinstance(settings, SimulatedRigSettings):
+        return settings
+    twin = getattr(settings, "twin", None)
+    if isinstance(twin, TwinSettings):
+        return SimulatedRigSettings(
+            kind="simulated", plant=twin.plant, seed=twin.seed, noise=twin.noise, start=twin.start
+        )
     raise InputError(
         "the rig has no simulated twin", where="rig.twin", remedy='name its plant: [rig.twin] plant = "ball"'
     )

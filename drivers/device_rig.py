@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import replace
 
+from autotune.config.rig import SerialSettings
 from autotune.controller import PIDController
 from autotune.errors import InputError, LinkError
 from autotune.experiment.relay import RelaySettings
 from autotune.experiment.rig import Reading, Row
+from drivers.kinds import Reach, Session
 from drivers.line_protocol import Command, Frame, Kind
+from drivers.probe import ProbedDevice, probe_line
 from drivers.serial_rig import COMMAND, SerialLineRig
 
 _LONGEST_TICKS = 2**32 - 1
@@ -193,3 +197,19 @@ class DeviceLawRig(SerialLineRig):
         self._received_s, self._latency_s = self._clock.now(), self._row_s
         reading = replace(self._reading(frame, at_s, self._received_s, 0.0), latency_s=math.nan)
         return Row(reading=reading, u_mean=self._u.value(mean))
+
+
+def open_kind(settings: SerialSettings, session: Session) -> SerialLineRig:
+    """Return the rig that ``[rig] kind = "serial"`` describes, its laws run by the host or by the device."""
+    on_line = DeviceLawRig if settings.relay == "device" else SerialLineRig
+    return on_line(settings, u_range=session.u_range, u_safe=session.u_safe)
+
+
+def reached_by(settings: SerialSettings) -> Reach:
+    """Return the serial device."""
+    return Reach(device=settings.device)
+
+
+def probe_kind(settings: SerialSettings, expected: Mapping[str, tuple[float, float]]) -> ProbedDevice:
+    """Return who the microcontroller is, a sample and its gains."""
+    return probe_line(settings, expected=expected)

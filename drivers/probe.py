@@ -61,11 +61,13 @@ def probe(settings: AnyModbusSettings, *, expected: Mapping[str, tuple[float, fl
     LinkError
         No connection. A register that the device refuses is a warning of its own.
     """
-    link = ModbusLink(settings)
+    link = ModbusLink(settings, exclusive=False)
     link.connect()
+    named = {f"permissive {one.name!r}": one for one in settings.permissives}
     try:
         return tuple(
-            _probe_one(link, codec, expected.get(codec.name)) for codec in codecs(settings.registers.mapped()).values()
+            _probe_one(link, codec, expected.get(codec.name))
+            for codec in codecs(settings.registers.mapped() | named).values()
         )
     finally:
         link.disconnect()

@@ -11,6 +11,7 @@ from autotune.config.rig import ReplaySettings
 from autotune.errors import LinkError
 from autotune.experiment.rig import Reading
 from autotune.recording import Recording, read_recording
+from drivers.kinds import Reach, Session
 
 
 class ReplayClock:
@@ -134,8 +135,13 @@ class ExchangeReplayRig(ReplayRig):
         return reading
 
 
-def open_replay(settings: ReplaySettings) -> ReplayRig:
+def open_kind(settings: ReplaySettings, session: Session) -> ReplayRig:
     """Return the rig that ``[rig] kind = "replay"`` describes."""
     recording = read_recording(settings.recording)
     kind = ExchangeReplayRig if recording.metadata.get("rig") == "serial" else ReplayRig
     return kind(recording, tolerance=settings.tolerance)
+
+
+def reached_by(settings: ReplaySettings) -> Reach:
+    """Return the recording."""
+    return Reach(files=(settings.recording,))

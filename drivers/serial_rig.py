@@ -118,11 +118,6 @@ class SerialLineRig:
         return self._tick_s
 
     @property
-    def shows_output(self) -> bool:
-        """The device says which output it applies."""
-        return True
-
-    @property
     def former(self) -> Former | None:
         """Whether the device's own PI ran before the host took command; its set-point cannot be read."""
         return self._former

@@ -8,6 +8,7 @@ from autotune.config.rig import SimulatedRigSettings
 from autotune.controller import PIDController
 from autotune.errors import LinkError
 from autotune.experiment.rig import Reading
+from drivers.kinds import Session
 from sim.imperfections import FaultyPlant
 from sim.plant import Plant, make_plant
 
@@ -117,9 +118,7 @@ class SimulatedRig:
                 raise LinkError(str(error), where="simulated rig", remedy="check the cable and the device") from error
 
 
-def open_simulated(
-    settings: SimulatedRigSettings, *, u_safe: float, controller: PIDController | None = None
-) -> SimulatedRig:
+def open_kind(settings: SimulatedRigSettings, session: Session) -> SimulatedRig:
     """Return the rig that ``[rig] kind = "simulated"`` describes, not yet opened."""
     plant = make_plant(settings.plant, seed=settings.seed, noise=settings.noise, start=settings.start)
-    return SimulatedRig(plant, u_safe=u_safe, controller=controller)
+    return SimulatedRig(plant, u_safe=session.u_safe, controller=session.controller)

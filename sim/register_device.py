@@ -142,6 +142,10 @@ class RegisterDevice:
         """The values the host has written, by signal."""
         return self._values
 
+    def show(self, name: str, value: float) -> None:
+        """Have the device show a value of a signal of its own: a door, a switch."""
+        self._values[name] = value
+
     def live(self, now_s: float) -> None:
         """Let the plant live until the device time ``now_s`` [s], through dead-man and controller ticks on the way."""
         while self._now_s < now_s:

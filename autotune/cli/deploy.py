@@ -63,7 +63,7 @@ def deploy(
     from autotune.config import load_config
     from autotune.experiment.verify import expected_margins
     from autotune.pipeline.deployment import deploy as hand_over
-    from autotune.pipeline.folder import JOURNAL
+    from autotune.pipeline.folder import JOURNAL, next_free
     from autotune.pipeline.held_gains import held_by
     from autotune.pipeline.result import verification_json, write_json
     from autotune.report.page import write_page
@@ -96,6 +96,7 @@ def deploy(
 
     done = hand_over(rig, new, folder / JOURNAL, agree=agree, try_out=try_out if verify else None)
     verification = done.verification
+    result = next_free(folder / "deploy.json")
     write_json(
         {
             "old": asdict(done.old),
@@ -103,12 +104,12 @@ def deploy(
             "kept": done.kept,
             "verification": verification_json(verification) if verification is not None else None,
         },
-        folder / "deploy.json",
+        result,
     )
     page = deployment_page(content.name, content.signals, done)
-    write_page(page, folder / "deploy.html")
+    write_page(page, result.with_suffix(".html"))
     console.print(page.verdict, markup=False)
-    console.print(f"report: {folder / 'deploy.html'}", markup=False)
+    console.print(f"report: {result.with_suffix('.html')}", markup=False)
     if not done.kept:
         raise typer.Exit(ExperimentStopped.exit_status)
 
@@ -121,6 +122,7 @@ def verify(
     from autotune.config import load_config
     from autotune.experiment.rig import HoldsGains
     from autotune.pipeline.deployment import read_gains
+    from autotune.pipeline.folder import next_free
     from autotune.pipeline.result import verification_json, write_json
     from autotune.report.page import write_page
     from autotune.report.run_page import verification_page
@@ -131,12 +133,13 @@ def verify(
     gains = read_gains(rig) if isinstance(rig, HoldsGains) and controller is None else _gains(controller, None, run)
     folder = _folder(config, run, out)
     verification = _verify(rig, content, gains, fit, measured, folder)
-    write_json({"controller": asdict(gains), "verification": verification_json(verification)}, folder / "verify.json")
+    result = next_free(folder / "verify.json")
+    write_json({"controller": asdict(gains), "verification": verification_json(verification)}, result)
     page = verification_page(content.name, content.signals, gains, verification)
-    write_page(page, folder / "verify.html")
+    write_page(page, result.with_suffix(".html"))
     console = Console(highlight=False, soft_wrap=True)
     console.print(page.verdict, markup=False)
-    console.print(f"report: {folder / 'verify.html'}", markup=False)
+    console.print(f"report: {result.with_suffix('.html')}", markup=False)
     if not verification.accepted:
         raise typer.Exit(ExperimentStopped.exit_status)
 

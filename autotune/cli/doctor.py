@@ -236,27 +236,17 @@ def _group(device: str) -> str:
 
 def _rig(content: Config) -> Iterator[Check]:
     """Look for the rig of a configuration: its device, its address, its files. Nothing is sent to it."""
-    from autotune.config.rig import (
-        ModbusRtuSettings,
-        ModbusTcpSettings,
-        ModbusTlsSettings,
-        ReplaySettings,
-        SerialSettings,
-    )
+    from drivers.kinds import Reach, kind_of
 
-    match content.rig:
-        case ModbusTcpSettings() | ModbusTlsSettings():
-            if isinstance(content.rig, ModbusTlsSettings):
-                files = (content.rig.ca_file, content.rig.cert_file, content.rig.key_file)
-                yield from (_file(name) for name in files)
-            yield _address(content.rig.host, content.rig.port, content.rig.timeout_s)
-        case ModbusRtuSettings() | SerialSettings():
-            check = _permission("the rig's port", content.rig.device)
-            yield replace(check, verdict="wrong") if check.remedy else check  # this port is needed, others are not
-        case ReplaySettings():
-            yield _file(content.rig.recording)
-        case _:
-            yield Check(subject="the rig", found="simulated, in this process")
+    reach = kind_of(content.rig).reached_by(content.rig)
+    yield from (_file(name) for name in reach.files)
+    if reach.address is not None:
+        yield _address(*reach.address, reach.timeout_s)
+    if reach.device:
+        check = _permission("the rig's port", reach.device)
+        yield replace(check, verdict="wrong") if check.remedy else check  # this port is needed, others are not
+    if reach == Reach():
+        yield Check(subject="the rig", found=f'kind = "{content.rig.kind}", in this process')
 
 
 def _file(name: str) -> Check:

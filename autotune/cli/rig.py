@@ -19,7 +19,8 @@ from autotune.errors import LinkError
 if TYPE_CHECKING:
     from autotune.config import Config
     from autotune.config.registers import RegisterSettings
-    from autotune.config.rig import AnyModbusSettings, SerialSettings
+    from autotune.config.rig import AnyModbusSettings
+    from drivers.probe import ProbedDevice
 
 _CONFIG = Annotated[Path, typer.Argument(metavar="CONFIG.toml", help="configuration of the rig")]
 
@@ -58,17 +59,16 @@ def rig(config: _CONFIG) -> None:
 @app.command()
 def probe(config: _CONFIG) -> None:
     """Read every mapped register, or all a microcontroller says, once; nothing is written."""
-    from autotune.cli.served import modbus_settings
     from autotune.config import load_config
-    from autotune.config.rig import SerialSettings
-    from drivers.probe import probe as probe_registers
+    from drivers.kinds import kind_of
+    from drivers.probe import ProbedDevice
 
     content = load_config(config)
-    if isinstance(content.rig, SerialSettings):
-        _probe_line(content, content.rig)
-        return
-    found = probe_registers(modbus_settings(content), expected=_expected(content))
+    found = kind_of(content.rig).probe(content.rig, _expected(content))
     units = _units(content)
+    if isinstance(found, ProbedDevice):
+        _print_device(content.name, found, units)
+        return
     table = Table("signal", "register", "type", "raw", "value", "unit", title=escape(content.name))
     for one in found:
         register = one.register
@@ -87,12 +87,8 @@ def probe(config: _CONFIG) -> None:
         )
 
 
-def _probe_line(config: Config, settings: SerialSettings) -> None:
-    from drivers.probe import probe_line
-
-    found = probe_line(settings, expected=_expected(config))
-    units = _units(config)
-    table = Table("signal", "raw", "value", "unit", title=escape(config.name))
+def _print_device(name: str, found: ProbedDevice, units: Mapping[str, str]) -> None:
+    table = Table("signal", "raw", "value", "unit", title=escape(name))
     for one in found.signals:
         table.add_row(one.name, one.raw, f"{one.value:.6g}", escape(units.get(one.name, "")))
     console = Console(highlight=False, soft_wrap=True)

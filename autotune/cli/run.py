@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from contextlib import nullcontext
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -66,7 +67,7 @@ def run(
     console = Console(highlight=False, soft_wrap=True)
     with LivePage(folder, listen, port, token) if live else nullcontext() as onlooker:
         keep = onlooker.keep if onlooker is not None else None
-        with ProgressBar() as bar:
+        with _page_where_stopped(content, folder), ProgressBar() as bar:
             tuning = tune(
                 rig,
                 content,
@@ -90,6 +91,24 @@ def run(
         console.print(f"report: {folder / 'report.html'}", markup=False)
     if missed:
         raise typer.Exit(ExperimentStopped.exit_status)
+
+
+@contextmanager
+def _page_where_stopped(config: Config, folder: Path) -> Iterator[None]:
+    """Write a page also where the run is stopped: it says why, and how the rig was left."""
+    from autotune.pipeline.folder import RECORDING, VERIFICATION, recordings
+    from autotune.recording import read_recording
+    from autotune.report.page import write_page
+    from autotune.report.run_page import stopped_page
+
+    try:
+        yield
+    except ExperimentStopped as error:
+        with suppress(InputError, OSError):  # a recording of no rows, a full disk: the line says it all
+            files = (*recordings(folder, RECORDING), *recordings(folder, VERIFICATION))
+            page = stopped_page(config.name, config.signals, [read_recording(file) for file in files], str(error))
+            write_page(page, folder / "report.html")
+        raise
 
 
 def _configuration(config: Path | None, out: Path | None, resume: Path | None, dry_run: bool) -> Config:

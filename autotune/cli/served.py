@@ -13,10 +13,9 @@ from autotune.config.registers import RegisterMap, RegisterSettings
 from autotune.config.rig import (
     AnyModbusSettings,
     ModbusRtuSettings,
+    ModbusTcpSettings,
     ModbusTlsSettings,
-    ReplaySettings,
     SerialSettings,
-    SimulatedRigSettings,
     TwinSettings,
 )
 from autotune.controller import PIDController
@@ -38,7 +37,7 @@ def modbus_settings(config: Config) -> AnyModbusSettings:
     InputError
         It is another kind.
     """
-    if isinstance(config.rig, SimulatedRigSettings | ReplaySettings | SerialSettings):
+    if not isinstance(config.rig, ModbusTcpSettings | ModbusTlsSettings | ModbusRtuSettings):
         raise InputError(
             f'kind = "{config.rig.kind}" has no registers',
             where="rig",
@@ -90,7 +89,9 @@ def device_of(config: Config, plant: Plant | None = None) -> RegisterDevice:
     specs = {name: spec_of(register) for name, register in registers.mapped().items()}
     if registers.unlock is not None:
         specs["unlock"] = spec_of(registers.unlock)
-    return RegisterDevice(
+    permissives = {f"permissive {one.name!r}": one for one in settings.permissives}
+    specs |= {name: spec_of(register) for name, register in permissives.items()}
+    device = RegisterDevice(
         plant or make_plant(twin.plant, seed=twin.seed, noise=twin.noise, start=twin.start),
         specs,
         u_safe=config.limits.u_safe,
@@ -100,6 +101,9 @@ def device_of(config: Config, plant: Plant | None = None) -> RegisterDevice:
         unlock_code=registers.unlock.code if registers.unlock is not None else None,
         **_form_of(config, registers),
     )
+    for name, condition in permissives.items():
+        device.show(name, condition.held_at)
+    return device
 
 
 def _form_of(config: Config, registers: RegisterMap) -> dict[str, Any]:

@@ -53,6 +53,16 @@ class Config(Section):
                 object.__setattr__(self, name, value)  # frozen, and not handed out yet
         return self
 
+    @model_validator(mode="after")
+    def _no_faster_than_the_program(self) -> Config:
+        scan_s, sample_s = getattr(self.rig, "scan_time_s", None), self.signals.sample_time_s
+        if scan_s is not None and sample_s < scan_s:
+            raise ValueError(
+                f"signals.sample_time_s = {sample_s:g} is below rig.scan_time_s = {scan_s:g}: the device's program"
+                " would pass over commands and show a measurement twice; sample no faster than it runs"
+            )
+        return self
+
 
 def _held(limits: LimitSettings, register: RegisterSettings) -> LimitSettings:
     try:

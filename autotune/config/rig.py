@@ -58,6 +58,13 @@ class PermissiveSettings(RegisterSettings):
     at_least: Annotated[float | None, Field(description="holds from this value on; absent: where it is not 0")] = None
     at_most: Annotated[float | None, Field(description="holds up to this value")] = None
 
+    @property
+    def held_at(self) -> float:
+        """A value at which it holds: what a simulated rig shows."""
+        if self.at_least is not None:
+            return self.at_least
+        return self.at_most if self.at_most is not None else 1.0
+
     def holds(self, value: float) -> bool:
         """Return whether the rig may be moved at this value; never where it is not a number."""
         if self.at_least is None and self.at_most is None:
@@ -157,15 +164,6 @@ class SerialSettings(Section):
     twin: TwinSettings | None = None
 
 
-_KINDS = (
-    SimulatedRigSettings,
-    ReplaySettings,
-    ModbusTcpSettings,
-    ModbusTlsSettings,
-    ModbusRtuSettings,
-    SerialSettings,
-)
-
 AnyModbusSettings: TypeAlias = ModbusTcpSettings | ModbusTlsSettings | ModbusRtuSettings
 
 RigSettings: TypeAlias = Annotated[
@@ -173,4 +171,5 @@ RigSettings: TypeAlias = Annotated[
     Field(discriminator="kind", description="how the rig is reached"),
 ]
 
-RIG_KINDS = frozenset(get_args(model.model_fields["kind"].annotation)[0] for model in _KINDS)
+RIG_SETTINGS: tuple[type[Section], ...] = get_args(get_args(RigSettings)[0])
+RIG_KINDS = frozenset(get_args(model.model_fields["kind"].annotation)[0] for model in RIG_SETTINGS)

@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass, fields
 from enum import StrEnum
 from typing import Any
 
+from autotune.experiment.leaving import SAFE
 from autotune.experiment.loop import Timing
 from autotune.experiment.relay import RelaySettings
 from autotune.identification.frequency.describing import DescribingFunctionEstimate
@@ -185,6 +186,8 @@ class ExperimentResult:
         Why it ended.
     warnings : tuple of str
         What the reader should know.
+    output : str
+        Who moves the actuator since, as the rig confirmed it.
     """
 
     segments: tuple[Segment, ...]
@@ -200,3 +203,4 @@ class ExperimentResult:
     parts: tuple[Part, ...]
     reason: str
     warnings: tuple[str, ...]
+    output: str = SAFE

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from autotune.experiment.limits import Envelope, Watch
 from autotune.experiment.loop import ControlLoop, Timing
 from autotune.experiment.relay import RelaySettings
 from autotune.experiment.result import ExperimentResult, Part, Progress, Segment, State
-from autotune.experiment.rig import Rig, RunsLaws
+from autotune.experiment.rig import Rig, RunsLaws, ShowsOutput
 from autotune.experiment.sweep import doubts, missing_phases, sweep
 from autotune.recording import RecordingWriter
 
@@ -33,6 +34,11 @@ OnProgress = Callable[[Progress], None]
 def envelope_of(config: Config) -> Envelope:
     """Return the safety envelope that the configuration asks for."""
     return Envelope(settings=config.limits, sample_time_s=config.signals.sample_time_s, u_step=config.signals.u_step)
+
+
+def further_columns(rig: Rig) -> tuple[str, ...]:
+    """Return the columns that the rig's own words fill: what it says it applies, where it says so."""
+    return ("u_applied",) if isinstance(rig, ShowsOutput) and rig.shows_output else ()
 
 
 def recording_metadata(config: Config) -> dict[str, Any]:
@@ -81,9 +87,11 @@ def run_experiment(
         last = earlier.recordings[-1].metadata
         known = Known(first_move_s=math.nan, link_rad_s=last.get("link_rad_s", math.inf))
         return _result(final, config, earlier.parts, Timing.from_table(last.get("timing", {})), known)
-    writer = RecordingWriter(recording, ("t", "u", "y"), recording_metadata(config))
-    with ControlLoop(rig=rig, envelope=envelope_of(config), writer=writer) as loop:
-        return experiment_on(loop, config, earlier=earlier, on_progress=on_progress)
+    extra = further_columns(rig)
+    writer = RecordingWriter(recording, ("t", "u", "y", *extra), recording_metadata(config))
+    with ControlLoop(rig=rig, envelope=envelope_of(config), writer=writer, extra=extra) as loop:
+        result = experiment_on(loop, config, earlier=earlier, on_progress=on_progress)
+    return replace(result, output=loop.metadata["ended"]["output"])
 
 
 def experiment_on(

@@ -24,7 +24,14 @@ from autotune.experiment.loop import ControlLoop
 from autotune.experiment.prediction import Prediction, predict
 from autotune.experiment.result import Progress, State
 from autotune.experiment.rig import Exchanges, Rig, RunsLaws
-from autotune.experiment.run import OnProgress, envelope_of, float_on, recording_metadata, wait_for_rest
+from autotune.experiment.run import (
+    OnProgress,
+    envelope_of,
+    float_on,
+    further_columns,
+    recording_metadata,
+    wait_for_rest,
+)
 from autotune.identification.parametric import PlantFit
 from autotune.recording import RecordingWriter
 
@@ -285,8 +292,9 @@ def run_verification(
         fit = _delayed(fit, config.signals.sample_time_s)  # its commands act one sample after what they come from
     test = plan_test(config, law, fit, crossover_rad_s)
     law = law_for(controller, config.limits, config.signals.sample_time_s, float(test.disturbance[-1]))
-    writer = RecordingWriter(recording, ("t", "u", "y", "r"), recording_metadata(config))
-    with ControlLoop(rig=rig, envelope=envelope_of(config), writer=writer, extra=("r",)) as loop:
+    extra = ("r", *further_columns(rig))
+    writer = RecordingWriter(recording, ("t", "u", "y", *extra), recording_metadata(config))
+    with ControlLoop(rig=rig, envelope=envelope_of(config), writer=writer, extra=extra) as loop:
         loop.metadata["controller"] = {"kind": controller.kind, "K": controller.K, "Ti_s": controller.Ti_s}
         if config.operating_point.approach == "ramp":
             wait_for_rest(loop, config)

@@ -7,6 +7,7 @@ import json
 import os
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
 from enum import StrEnum
 from pathlib import Path
 
@@ -36,7 +37,7 @@ OPEN_ENDS = (Step.WRITING, Step.ON_TRIAL, Step.RESTORING)
 
 
 class Journal:
-    """``journal.jsonl``: one JSON object per step, with the gains it is about, appended before the step is taken.
+    """``journal.jsonl``: one JSON object per step, with its gains and its time, appended before the step is taken.
 
     Parameters
     ----------
@@ -55,7 +56,8 @@ class Journal:
         ExperimentStopped
             The file cannot be written.
         """
-        line = json.dumps(jsonable({"gains": step.value, **asdict(controller)}))
+        at = datetime.now(UTC).isoformat(timespec="milliseconds")
+        line = json.dumps(jsonable({"gains": step.value, "at": at, **asdict(controller)}))
         try:
             with self.path.open("a", encoding="utf-8") as file:
                 file.write(line + "\n")
@@ -94,7 +96,7 @@ class Journal:
 
 
 def _gains(note: dict[str, float | None]) -> PIDController:
-    numbers = {key: value for key, value in note.items() if key != "gains"}
+    numbers = {key: value for key, value in note.items() if key not in ("gains", "at")}
     Ti_s = numbers.pop("Ti_s")
     return PIDController(**{key: float(value or 0.0) for key, value in numbers.items()}, Ti_s=Ti_s or float("inf"))
 

@@ -93,6 +93,7 @@ def _experiment_json(experiment: ExperimentResult | None, reason: str) -> dict[s
         "sweep_time_s": experiment.sweep_time_s,
         "parts": [asdict(part) for part in experiment.parts],
         "reason": reason,
+        "output": experiment.output,
         "warnings": list(experiment.warnings),
         "u_rest": experiment.u_rest,
         "u_rest_sd": experiment.u_rest_sd,

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from autotune.config import Config
 from autotune.controller import PIDController
-from autotune.errors import AutotuneError, ExperimentStopped
+from autotune.errors import AutotuneError, ExperimentStopped, OperatorStop
 from autotune.experiment.cycles import Earlier
 from autotune.experiment.result import ExperimentResult
 from autotune.experiment.rig import HoldsGains, Rig
@@ -173,6 +173,8 @@ def _tune(
                 deployed = False
             log.gains(old, analysis.controller, deployed=deployed)
     except AutotuneError as error:
+        if isinstance(error, OperatorStop):
+            error.remedy = f"autotune run --resume {out} goes on with what is missing"
         with contextlib.suppress(OSError):  # a full disk must not hide why the run ended
             write_result(out / RESULT, experiment, analysis, None, reason=str(error))
         raise

@@ -10,6 +10,7 @@ import numpy as np
 from autotune.config.procedure import SignalSettings
 from autotune.controller import PIDController
 from autotune.diagnosis.result import Diagnosis
+from autotune.experiment.leaving import sentence
 from autotune.experiment.result import ExperimentResult, Segment
 from autotune.experiment.verify import Verification, smoothed
 from autotune.pipeline import Analysis, Tuning
@@ -93,6 +94,35 @@ def analysis_page(
         tone="warn",
         summary=(margins_sentence(analysis), "Next: verify it on the rig before it is left alone with it."),
         sections=sections,
+    )
+
+
+def stopped_page(name: str, signals: SignalSettings, recordings: Sequence[Recording], line: str) -> Page:
+    """Return the page of a run that a limit, a fault or the operator stopped: why, and how the rig was left.
+
+    Parameters
+    ----------
+    name : str
+        Of the rig.
+    signals : SignalSettings
+        Units.
+    recordings : sequence of Recording
+        What was recorded, the last one last.
+    line : str
+        The one line that the run ended with.
+    """
+    figures = tuple(
+        Figure(figure=recording_figure(recording, signals.u_unit, signals.y_unit), caption=recording.name)
+        for recording in recordings
+    )
+    output = recordings[-1].metadata.get("ended", {}).get("output", "") if recordings else None
+    left = f"When it was left: {sentence(output)}." if output is not None else "Nothing was recorded."
+    return Page(
+        title=f"Stopped: {name}",
+        verdict=f"Stopped: {line}",
+        tone="bad",
+        summary=(left, "Nothing that was measured is lost: autotune run --resume goes on with what is missing."),
+        sections=(Section(title="What was recorded", figures=figures),) if figures else (),
     )
 
 
@@ -231,9 +261,9 @@ def _experiment_section(
     return Section(
         title="The experiment",
         text=(
-            f"It ended because: {experiment.reason}. Link latency {_milliseconds(timing.latency_s)}, lateness of the"
-            f" loop {_milliseconds(timing.lateness_s)} (median, 99 %, worst);"
-            f" {timing.missed} sample(s) missed, {timing.unusable} unusable.",
+            f"It ended because: {experiment.reason}; {sentence(experiment.output)}.",
+            f"Link latency {_milliseconds(timing.latency_s)}, lateness of the loop {_milliseconds(timing.lateness_s)}"
+            f" (median, 99 %, worst); {timing.missed} sample(s) missed, {timing.unusable} unusable.",
         ),
         tables=(sittings,) if len(parts) > 1 else (),
         figures=(

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 from autotune.config import Config, json_schema, load_config
+from autotune.config.rig import ModbusTcpSettings
 from autotune.errors import InputError
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
@@ -137,3 +138,19 @@ def test_a_safe_output_that_its_register_cannot_hold_is_refused_with_what_it_can
     with pytest.raises(ValueError, match=r"limits.u_min..u_max: .*has not two values"):
         _on_register({"u_min": 0.2, "u_max": 0.9, "u_safe": 0.4})
     assert _on_register({"u_min": 0.0, "u_max": 9.6, "u_safe": 0.04}, scale=0.1).limits.u_safe == 0.0
+
+
+def test_a_sample_time_below_the_programs_cycle_is_refused_with_the_reason(tmp_path: Path) -> None:
+    given = (CONFIGS / "ball_modbus_tcp.toml").read_text().replace("[rig]", "[rig]\nscan_time_s = 0.02", 1)
+    (tmp_path / "slow.toml").write_text(given)
+    with pytest.raises(InputError, match=r"sample_time_s = 0.01 is below rig.scan_time_s = 0.02: the device's program"):
+        load_config(tmp_path / "slow.toml")
+
+
+def test_a_permissive_is_part_of_the_rigs_table(tmp_path: Path) -> None:
+    door = '\n[[rig.permissives]]\nname = "door"\ntable = "discrete"\naddress = 3\n'
+    given = (CONFIGS / "ball_modbus_tcp.toml").read_text() + door
+    (tmp_path / "door.toml").write_text(given)
+    rig = load_config(tmp_path / "door.toml").rig
+    assert isinstance(rig, ModbusTcpSettings)
+    assert [(one.name, one.type, one.holds(1.0)) for one in rig.permissives] == [("door", "bit", True)]

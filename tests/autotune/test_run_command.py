@@ -5,6 +5,7 @@ import re
 import signal
 import subprocess
 import sys
+from datetime import datetime
 from pathlib import Path
 
 import numpy as np
@@ -53,6 +54,28 @@ def test_the_new_gains_are_in_the_journal_before_and_after_they_are_written(fini
     notes = [json.loads(line) for line in (finished / "journal.jsonl").read_text().splitlines()]
     assert [note["gains"] for note in notes][:3] == ["read", "writing", "written and read back"]
     assert notes[0]["K"] == -0.01
+    times = [datetime.fromisoformat(note["at"]) for note in notes]
+    assert times == sorted(times)
+    assert all(time.tzinfo is not None for time in times)
+
+
+def test_every_verification_keeps_its_files(finished: Path) -> None:
+    for number in ("", "-2"):
+        done = autotune("verify", CONFIGS / "ball_sim.toml", "--run", finished)
+        assert done.returncode == 0, done.stderr
+        assert f"verify{number}.html" in done.stdout
+        assert json.loads((finished / f"verify{number}.json").read_text())["verification"]["accepted"]
+
+
+def test_a_run_that_is_stopped_leaves_a_page_that_says_why_and_how_the_rig_was_left(tmp_path: Path) -> None:
+    hurried = (CONFIGS / "ball_sim.toml").read_text().replace("time_s = 180.0", "time_s = 30.0")
+    (tmp_path / "hurried.toml").write_text(hurried)
+    done = autotune("run", tmp_path / "hurried.toml", "--out", tmp_path / "out")
+    assert done.returncode == 3
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert "time over" in page
+    assert "the rig has its safe output" in page
+    assert "the rig has its safe output" not in done.stderr  # the one line speaks of it where it is not so
 
 
 def test_the_report_asks_nothing_of_the_network(finished: Path) -> None:
@@ -103,6 +126,7 @@ def test_every_signal_leaves_a_readable_recording_and_says_why(
     else:
         assert errors.strip().count("\n") == 0
         assert "stopped by" in errors
+        assert f"autotune run --resume {out}" in errors
         assert "stopped by" in ended
         assert rows.metadata["ended"]["output"] == "safe output"
 

@@ -17,11 +17,12 @@ from autotune.errors import ExperimentStopped, LinkError, NotTaken, OperatorStop
 from autotune.experiment.limits import Envelope
 from autotune.experiment.loop import ControlLoop, Tick
 from autotune.experiment.rig import HandsBack
+from autotune.experiment.run import further_columns
 from autotune.recording import RecordingWriter, read_recording
 from drivers.register_rig import RegisterRig
-from tests.drivers.bench import LIMIT_S, rig_of
+from tests.drivers.bench import LIMIT_S, rig_of, tcp_settings
 from tests.drivers.lines import LIMITS
-from tests.drivers.scanning_plc import DOOR, ScanningPlc, plc_settings
+from tests.drivers.scanning_plc import DOOR, REGISTERS, ScanningPlc, plc_settings
 
 GO = "Go to the rig: its safe output was not confirmed"
 
@@ -360,3 +361,10 @@ def test_the_deadman_is_fed_while_the_host_waits_for_a_slow_sample(recording: Pa
             loop.step(0.2)
             loop.step(0.1)
             assert not plc.tripped
+
+
+def test_what_the_device_says_it_applies_is_a_column_of_the_recording_where_it_is_mapped() -> None:
+    with ScanningPlc() as plc:
+        assert further_columns(rig_on(plc)) == ("u_applied",)
+        bare = REGISTERS.model_copy(update={"u_applied": None})
+        assert further_columns(rig_of(tcp_settings(plc.port, bare))) == ()

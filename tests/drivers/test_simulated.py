@@ -8,7 +8,8 @@ from autotune.config.rig import SimulatedRigSettings
 from autotune.controller import PIDController
 from autotune.errors import LinkError
 from autotune.experiment.rig import HoldsGains, Rig
-from drivers.simulated import SimulatedRig, open_simulated
+from drivers.kinds import Session
+from drivers.simulated import SimulatedRig, open_kind
 from sim.ball import make_ball
 from sim.imperfections import Fault, FaultyPlant
 
@@ -68,7 +69,7 @@ def test_a_cut_link_is_a_link_error_never_a_sample() -> None:
 def test_gains_are_handed_over_and_read_back() -> None:
     delivered = PIDController(K=-0.01, Ti_s=6.0)
     settings = SimulatedRigSettings(kind="simulated", plant="ball", seed=3)
-    rig = open_simulated(settings, u_safe=0.0, controller=delivered)
+    rig = open_kind(settings, Session(u_range=(0.0, 10.0), u_safe=0.0, controller=delivered))
     assert isinstance(rig, HoldsGains)
     assert rig.read_gains() == delivered
     new = PIDController(K=-0.025, Ti_s=3.6)

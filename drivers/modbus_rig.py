@@ -1,0 +1,46 @@
+"""Rigs on Modbus, whatever the transport: how they are opened, what has to be there, what can be read first."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import assert_never
+
+from autotune.config.rig import AnyModbusSettings, ModbusRtuSettings, ModbusTcpSettings, ModbusTlsSettings
+from autotune.experiment.rig import Rig
+from drivers.gain_rig import GainRegisterRig
+from drivers.kinds import Reach, Session
+from drivers.modbus import ModbusLink
+from drivers.probe import ProbedRegister, probe
+from drivers.register_rig import RegisterRig
+
+
+def open_kind(settings: AnyModbusSettings, session: Session) -> Rig:
+    """Return the rig, with its own controller's gains where they are mapped."""
+    kind = RegisterRig if settings.registers.held_gains is None else GainRegisterRig
+    return kind(
+        ModbusLink(settings),
+        settings.registers,
+        u_range=session.u_range,
+        u_safe=session.u_safe,
+        feed_s=settings.feed_s,
+        scan_time_s=settings.scan_time_s,
+        permissives=settings.permissives,
+    )
+
+
+def reached_by(settings: AnyModbusSettings) -> Reach:
+    """Return address or serial device, and the certificates."""
+    match settings:
+        case ModbusTcpSettings():
+            return Reach(address=(settings.host, settings.port), timeout_s=settings.timeout_s)
+        case ModbusTlsSettings():
+            files = (settings.ca_file, settings.cert_file, settings.key_file)
+            return Reach(files=files, address=(settings.host, settings.port), timeout_s=settings.timeout_s)
+        case ModbusRtuSettings():
+            return Reach(device=settings.device)
+    assert_never(settings)
+
+
+def probe_kind(settings: AnyModbusSettings, expected: Mapping[str, tuple[float, float]]) -> tuple[ProbedRegister, ...]:
+    """Return every mapped register and permissive, read once."""
+    return probe(settings, expected=expected)
