@@ -257,6 +257,15 @@ def read_sidecar(path: Path) -> Mapping[str, Any]:
     return MappingProxyType(read_toml(sidecar))
 
 
+def as_written(value: float) -> float:
+    """Return a value as it is read back from a recording."""
+    return float(_text(value))
+
+
+def _text(value: float) -> str:
+    return format(value, ".12g")
+
+
 class RecordingWriter:
     """Append-only writer: each row is with the operating system before :meth:`append` returns.
 
@@ -298,7 +307,7 @@ class RecordingWriter:
         """Write one row, NaN for what is not known."""
         if len(row) != self._width:
             raise ValueError(f"{len(row)} values for {self._width} columns")
-        append_whole(self._file, (",".join(format(value, ".12g") for value in row) + "\n").encode())
+        append_whole(self._file, (",".join(map(_text, row)) + "\n").encode())
 
     def comment(self, text: str) -> None:
         """Write a comment line, for a person who reads the file."""

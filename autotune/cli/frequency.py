@@ -35,16 +35,16 @@ def frequency(
     """Estimate Bode points from recordings: relay, multisine, random binary or steps, open or closed loop."""
     from rich.progress import track
 
-    from autotune.identification.frequency.recorded import combine, frequency_points
+    from autotune.identification.frequency.recorded import combine, session_points, sessions
     from autotune.points import points_to_json
 
     place = Output(out, inputs=recordings, overwrite=overwrite)
     estimates = []
-    data = read_all(recordings, signal_names(t, u, y, r))
+    data = sessions(read_all(recordings, signal_names(t, u, y, r)))
     for one in track(data, description="recordings", transient=True, disable=len(data) < 2):
-        estimates.append(frequency_points(one, largest_relative_sd=largest_sd))
+        estimates.append(session_points(one, largest_relative_sd=largest_sd))
     for one, estimate in zip(data, estimates, strict=True):
-        typer.echo(f"{one.name}: {estimate.excitation}, {len(estimate.points)} point(s)")
+        typer.echo(f"{', '.join(part.name for part in one)}: {estimate.excitation}, {len(estimate.points)} point(s)")
     combined = combine(estimates)
     for point in combined.points:
         typer.echo(f"  {_line(point)}")

@@ -186,7 +186,7 @@ def tune(
 ) -> None:
     """Design a controller from recordings and points, without a rig: Bode points, reduced model, controller, report."""
     from autotune.config.procedure import DesignSettings, SignalSettings
-    from autotune.identification.frequency.recorded import combine, frequency_points
+    from autotune.identification.frequency.recorded import combine, session_points, sessions
     from autotune.pipeline import RESULT, analyse, analysis_json
     from autotune.points import read_points
     from autotune.report.page import write_page
@@ -198,7 +198,7 @@ def tune(
     place = OutputFolder(out, (RESULT, "report.html"), inputs=(*recordings, *files), overwrite=overwrite)
     read = read_all(recordings, signal_names(t, u, y, r))
     given = [point for path in files for point in read_points(path)]
-    combined = combine([frequency_points(recording) for recording in read]) if read else None
+    combined = combine([session_points(one) for one in sessions(read)]) if read else None
     notes = combined.notes if combined else ()
     settings = DesignSettings(
         kind=kind,

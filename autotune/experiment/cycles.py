@@ -6,29 +6,20 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeAlias
 
 import numpy as np
 
-from autotune.arrays import FloatArray
 from autotune.errors import InputError
 from autotune.experiment.result import Cycle, Part, Segment
 from autotune.identification.frequency.describing import describing_function
 from autotune.identification.frequency.limit_cycle import WholePeriods
-from autotune.identification.frequency.limit_cycle_points import limit_cycle_points
+from autotune.identification.frequency.limit_cycle_points import LimitCycle
+from autotune.identification.frequency.windows import Rows, Windowed, windowed_cycles
 from autotune.points import FrequencyPoint
 from autotune.recording import Recording, read_recording
 
-#: harmonics while the rig waits; the estimate that is kept is made with all of them at the end
-FEW_HARMONICS = 7
-ALL_HARMONICS = 9
 
-Rows: TypeAlias = tuple[FloatArray, FloatArray, FloatArray]
-
-
-def measured(
-    cycle: Cycle, rows: Rows, sample_time_s: float, known: Sequence[FrequencyPoint], highest: int = FEW_HARMONICS
-) -> Segment:
+def measured(cycle: Cycle, rows: Rows, sample_time_s: float, known: Sequence[FrequencyPoint]) -> Segment:
     """Return the cycle with its point.
 
     Parameters
@@ -41,19 +32,21 @@ def measured(
         Control period [s].
     known : sequence of FrequencyPoint
         Points of other cycles: they make the rough model of the plant better, and enter the estimate no further.
-    highest : int
-        Highest harmonic that is fitted.
 
     Raises
     ------
     IdentificationError
         No response above the noise, or too few samples per period.
     """
-    t, u, y = rows
-    # a row later, the safe command may follow already
-    kept = (t >= cycle.start_s - 1e-9) & (t <= cycle.end_s + 0.5 * sample_time_s)
+    return _segment(cycle, _windowed(cycle, rows, sample_time_s).estimate(known), sample_time_s)
+
+
+def _windowed(cycle: Cycle, rows: Rows, sample_time_s: float) -> Windowed:
     window = WholePeriods(start_s=cycle.start_s, end_s=cycle.end_s, periods=cycle.periods)
-    found = limit_cycle_points(t[kept], u[kept], y[kept], window=window, known=known, highest_harmonic=highest)
+    return Windowed(rows=rows, window=window, sample_time_s=sample_time_s)
+
+
+def _segment(cycle: Cycle, found: LimitCycle, sample_time_s: float) -> Segment:
     relay = cycle.settings
     delay_s = (relay.delay_samples + 0.5 * (relay.smoothing - 1)) * sample_time_s
     return Segment(
@@ -74,7 +67,7 @@ def measured(
 
 
 def refined(segments: Sequence[Segment], rows: Callable[[int], Rows], sample_time_s: float) -> tuple[Segment, ...]:
-    """Return every cycle estimated once more, now that the others make a better rough model of the plant.
+    """Return every cycle estimated once more from the recorded rows, now that the others make a better rough model.
 
     Parameters
     ----------
@@ -85,12 +78,8 @@ def refined(segments: Sequence[Segment], rows: Callable[[int], Rows], sample_tim
     sample_time_s : float
         Control period [s].
     """
-    return tuple(
-        measured(
-            one, rows(one.part), sample_time_s, [other.point for other in segments if other is not one], ALL_HARMONICS
-        )
-        for one in segments
-    )
+    found = windowed_cycles([_windowed(one, rows(one.part), sample_time_s) for one in segments])
+    return tuple(_segment(one, cycle, sample_time_s) for one, cycle in zip(segments, found, strict=True))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -23,7 +23,7 @@ from autotune.experiment.monitor import ReadingMonitor
 from autotune.experiment.rig import Exchanges, Feeds, Reading, Rig, Row
 from autotune.experiment.rows import KEPT_ROWS, RecentRows
 from autotune.experiment.warm import warm_up
-from autotune.recording import RecordingWriter
+from autotune.recording import RecordingWriter, as_written
 
 #: longest wait without looking for a stop signal [s]
 SLICE_S = 0.1
@@ -387,7 +387,7 @@ class ControlLoop:
         """Write the last sample, which only the safe command followed; NaN where the link broke first."""
         t_s, y = self._time_of(self._reading), self._reading.y
         written_s = self._rows.last_s
-        if t_s <= written_s:
+        if as_written(t_s) <= written_s:
             t_s, y = max(t_s + self.rig.clock.now() - self._reading.t_s, written_s + SHORTLY_S), math.nan
         self._writer.append((t_s, self.envelope.settings.u_safe, y, *(math.nan for _ in self._extra)))
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from autotune.arrays import FloatArray
-from autotune.recording import read_recording
+from autotune.recording import as_written, read_recording
 
 #: rows that are kept in memory at least; up to twice as many are
 KEPT_ROWS = 100_000
@@ -17,6 +17,8 @@ KEPT_ROWS = 100_000
 
 class RecentRows:
     """Rows as estimates want them, in memory that does not grow with the time on the rig.
+
+    They are the values on the disk, to the last digit: what is computed from them is computed from the file again.
 
     Parameters
     ----------
@@ -34,7 +36,7 @@ class RecentRows:
         """Put a row; ``y`` is NaN where the sample was unusable."""
         self.unusable += math.isnan(y)
         for column, value in zip(self._columns, (t_s, u, y), strict=True):
-            column.append(value)
+            column.append(as_written(value))
         if len(self._columns[0]) >= 2 * KEPT_ROWS:
             self._first += KEPT_ROWS
             for column in self._columns:

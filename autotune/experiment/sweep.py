@@ -11,13 +11,14 @@ import numpy as np
 from autotune.config import Config
 from autotune.errors import ExperimentStopped, IdentificationError
 from autotune.experiment.approach import Known
-from autotune.experiment.cycles import Earlier, Rows, measured, refined
+from autotune.experiment.cycles import Earlier, measured, refined
 from autotune.experiment.loop import ControlLoop
 from autotune.experiment.oscillation import PATIENCE, Oscillation
 from autotune.experiment.plan import Choice, Goal, allot, choose, phase_targets, time_s
 from autotune.experiment.relay import RelaySettings
 from autotune.experiment.result import Cycle, Segment, State
 from autotune.identification.frequency.limit_cycle import WholePeriods
+from autotune.identification.frequency.windows import Rows
 
 #: part of limits.swing that a limit cycle is planned for: the rest is for a mid-point that is not quite right
 PEAK_SHARE = 0.87

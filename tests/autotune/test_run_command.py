@@ -173,6 +173,21 @@ def test_a_killed_run_is_gone_on_with_from_its_folder_alone(resumed: tuple[Path,
     assert "recording-2.csv" in (out / "report.html").read_text()
 
 
+@pytest.mark.parametrize("sittings", [1, 2])
+def test_a_runs_recordings_give_its_own_points_and_gains_to_the_last_digit(
+    request: pytest.FixtureRequest, sittings: int, tmp_path: Path
+) -> None:
+    out = request.getfixturevalue("finished") if sittings == 1 else request.getfixturevalue("resumed")[0]
+    recordings = [out / "recording.csv", *([out / "recording-2.csv"] if sittings == 2 else [])]
+    done = autotune("tune", *recordings, "--out", tmp_path / "again")
+    assert done.returncode == 0, done.stderr
+    run, again = (json.loads((folder / "result.json").read_text()) for folder in (out, tmp_path / "again"))
+    for part in ("points", "reduced_model", "controller", "margins", "validation"):
+        assert again[part] == run[part], part
+    assert autotune("identify", "frequency", *recordings, "--out", tmp_path / "p.json").returncode == 0
+    assert json.loads((tmp_path / "p.json").read_text())["points"] == run["points"]
+
+
 def test_what_cannot_be_gone_on_with_is_refused_with_the_remedy(resumed: tuple[Path, bytes], tmp_path: Path) -> None:
     out, _ = resumed
     calls = {

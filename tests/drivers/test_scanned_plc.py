@@ -39,7 +39,9 @@ def configuration(plc: ScannedPlc, folder: Path) -> Path:
         "limits": {
             "u_min": 0.0, "u_max": 10.0, "u_safe": 1.0, "y_min": 0.5, "y_max": 9.5, "swing": 3.0, "time_s": 300.0,
         },
-        "operating_point": {"y": 5.0, "u_guess": 5.0, "u_uncertainty": 0.5, "approach": "ramp", "ramp_rate": 2.0},
+        "operating_point": {
+            "y": 5.0, "u_guess": 5.0, "u_uncertainty": 0.5, "approach": "ramp", "ramp_rate": 0.04 / plc.scan_s,
+        },
         "experiment": {"budget_s": 1000.0 * T_s, "points": 3, "gain_sd": 0.02},
         "design": {"noise_gain": 20.0},
     }  # fmt: skip

@@ -16,6 +16,7 @@ from autotune.identification.frequency.limit_cycle_points import LimitCycle, lim
 from autotune.identification.frequency.local_polynomial import LocalEstimate, local_estimate
 from autotune.identification.frequency.reference_model import ReferenceModel, fit_reference, simulate_reference
 from autotune.identification.frequency.spectra import Spectra, clean_measurement, record_spectra
+from autotune.identification.frequency.windows import noted_windows, windowed_cycles
 from autotune.points import FrequencyPoint
 from autotune.recording import Recording
 
@@ -50,6 +51,25 @@ class FrequencyEstimate:
     excitation: Excitation
     cycles: tuple[LimitCycle, ...] = ()
     notes: tuple[str, ...] = ()
+
+
+def sessions(recordings: Sequence[Recording]) -> list[list[Recording]]:
+    """Return the recordings in groups: those with an experiment's noted limit cycles together, every other alone."""
+    noted = [one for one in recordings if noted_windows(one)]
+    return ([noted] if noted else []) + [[one] for one in recordings if not noted_windows(one)]
+
+
+def session_points(session: Sequence[Recording], *, largest_relative_sd: float = 0.5) -> FrequencyEstimate:
+    """Estimate the plant's frequency response from recordings that belong together, see :func:`sessions`.
+
+    Recordings whose sidecar notes limit cycles give the very points that the experiment ended with: the fundamentals,
+    each with the others in its rough model. Parameters and errors as of :func:`frequency_points`.
+    """
+    cycles = windowed_cycles([one for recording in session for one in noted_windows(recording)])
+    if not cycles:
+        return frequency_points(session[0], largest_relative_sd=largest_relative_sd)
+    points = sorted((cycle.points[0] for cycle in cycles), key=lambda point: point.omega_rad_s)
+    return FrequencyEstimate(points=tuple(points), excitation="relay", cycles=cycles)
 
 
 def frequency_points(recording: Recording, *, largest_relative_sd: float = 0.5) -> FrequencyEstimate:
