@@ -6,6 +6,8 @@ smallest distance from 0 are known exactly. Hence, for all controllers of a box 
 - ||.||_2^2 >= sum of weights/max abs(1/H + C)^2;
 - the modulus margin is violated where max abs(1/H + C) < M_m/abs(H) at any one frequency;
 - the phase or delay margin is violated where abs(L) passes 1 inside the forbidden sector for every member;
+- the noise gain is violated where min abs(C) abs(1/H)/max abs(1/H + C), or min abs(C), is too large beyond the
+  crossover of every member, or from omega_n on;
 - nobody is stable where 0 stays outside the rectangles at all frequencies and the centre is unstable.
 """
 
@@ -65,7 +67,7 @@ def lower_bound(
     points (refined around the crossover), and no point of 1/H between two of them further from the nearer one
     than three quarters of their distance.
     """
-    K_max = specification.largest_gain if specification.noise == "bound" else specification.noise_gain
+    K_max = specification.largest_gain
     h2 = m.h2
     omega = sampled.omega[::2]
     if math.isfinite(m.crossover_rad_s):
@@ -78,7 +80,7 @@ def lower_bound(
     plant = on_grid(H, omega, sampled.sign)
     k_max = _INTEGRAL_SPAN * abs(controller.K) / controller.Ti_s
     omega_n = specification.noise_frequency_rad_s
-    noise = specification.noise_gain if specification.noise == "true" and omega_n is not None else math.inf
+    allowed, by_bound = specification.noise_gain, specification.noise == "bound"
     bound, boxes = _branch_and_bound(
         plant.omega,
         1.0 / plant.h,
@@ -91,8 +93,9 @@ def lower_bound(
                 specification.modulus_margin * (1.0 - 1e-6),
                 specification.phase_margin_rad * (1.0 - 1e-6),
                 specification.delay_margin_s * (1.0 - 1e-6),
-                noise,
-                0.0 if omega_n is None else omega_n,
+                math.inf if by_bound else allowed * (1.0 + 1e-6),
+                specification.modulus_margin * allowed * (1.0 + 1e-6) if by_bound else math.inf,
+                -1.0 if omega_n is None else omega_n,
             ]
         ),
         h2 * h2,
@@ -119,7 +122,7 @@ def _bound(
 ) -> float:
     """Return a lower bound on the squared norm over the box, infinite where no member meets the specification."""
     K1, K2, k1, k2 = box
-    modulus, phase_margin, delay_margin, noise, omega_n = limits
+    modulus, phase_margin, delay_margin, noise, loudest, omega_n = limits
     total = 0.0
     above = below = False
     homogeneous = True
@@ -127,6 +130,13 @@ def _bound(
     crossings = 0
     size_before = 0.0
     first = before = 1.0 + 0.0j
+    if omega_n < 0.0:  # the noise begins at the crossover: every member's lies at or below the first such frequency
+        i = len(omega) - 1
+        while i >= 0 and K2 * K2 + (k2 / omega[i]) ** 2 < q[i].real ** 2 + q[i].imag ** 2:
+            omega_n = omega[i]
+            i -= 1
+        if omega_n < 0.0:
+            omega_n = math.inf
     for i in range(len(omega)):
         w = omega[i]
         qr, qi = q[i].real, q[i].imag
@@ -138,7 +148,7 @@ def _bound(
             return math.inf
         total += weights[i] / far
         smallest = K1 * K1 + (k1 / w) ** 2
-        if w >= omega_n and smallest * size > noise * noise * far:
+        if w >= omega_n and (smallest * size > noise * noise * far or smallest > loudest * loudest):
             return math.inf
         # forbidden sector around -180 degrees: all members in it, and abs(L) = 1 passed by all of them
         late = phase[i] + math.pi - (math.atan2(k2 / w, K1) if k2 > 0.0 or K1 > 0.0 else 0.5 * math.pi)

@@ -12,6 +12,7 @@ import numpy as np
 from numba import njit
 
 from autotune.arrays import ComplexArray, FloatArray
+from autotune.design.figures import Figures
 from autotune.design.loop import characteristic_frequencies
 from autotune.errors import DesignError
 from autotune.models import TransferFunction
@@ -150,23 +151,24 @@ def evaluate(
     Td: float,
     Tf: float,
     omega_n: float,
-) -> tuple[float, float, float, float, float]:
-    """Return squared norm (11), modulus margin, phase margin, delay margin and true noise gain (15) of one controller.
+) -> Figures:
+    """Return the figures of one controller, (K, T_I, T_d, T_f), on a sampled plant.
 
-    The modulus margin is returned with a minus sign where the closed loop is unstable. ``omega_n`` below 0 stands for
-    the highest crossover.
+    ``omega_n`` below 0 stands for the highest crossover, which is interpolated: the noise gain must not jump while the
+    crossover moves between two frequencies of the grid.
     """
     h2 = 0.0
     smallest = 1e300
     phase = math.pi
     delay = 1e300
-    noise = 0.0
+    noise = loudest = 0.0  # squares of (15) and (16)
     crossings = 0
     f0 = f1 = 1e300
     power0 = 0.0
     before = 1.0 + 0.0j
     first = 1.0 + 0.0j
     L_before = 0.0j
+    gain_before = 1.0
     for i in range(len(omega)):
         w = omega[i]
         C = complex(K, K * (Td * w - 1.0 / (Ti * w)))
@@ -199,16 +201,20 @@ def evaluate(
                     phase = angle
                 at = omega[i - 1] * (w / omega[i - 1]) ** share
                 delay = min(delay, (angle if angle > 0.0 else angle + 2.0 * math.pi) / at)
-                if omega_n < 0.0:
-                    noise = 0.0
+                if omega_n < 0.0:  # abs(1 + L) = 2 sin(abs(angle)/2) where abs(L) = 1
+                    before_C, now_C = power0 / gain_before, power / (h[i].real * h[i].real + h[i].imag * h[i].imag)
+                    loudest = before_C * (now_C / before_C) ** share
+                    noise = loudest / (4.0 * math.sin(0.5 * angle) ** 2)
+        gain_before = h[i].real * h[i].real + h[i].imag * h[i].imag
         if w >= omega_n:
-            noise = max(noise, (C.real * C.real + C.imag * C.imag) * inverse)
+            size = C.real * C.real + C.imag * C.imag
+            loudest, noise = max(loudest, size), max(noise, size * inverse)
         before, L_before, power0 = F, L, power
     end = math.atan2(before.imag, before.real) - math.atan2(first.imag, first.real)
     modulus = math.sqrt(smallest)
     if round((end + 2.0 * math.pi * crossings + turn) / math.pi) != 0:
         modulus = -modulus
-    return h2, modulus, phase, delay, math.sqrt(noise)
+    return Figures(h2, modulus, phase, delay, math.sqrt(noise), math.sqrt(loudest))
 
 
 @njit(cache=True)
@@ -220,9 +226,11 @@ def evaluate_grid(
     parameters: FloatArray,
     omega_n: float,
 ) -> FloatArray:
-    """Return :func:`evaluate` for every row (K, Ti, Td, Tf) of ``parameters``, (M, 5)."""
-    out = np.empty((len(parameters), 5))
+    """Return the figures of :func:`evaluate` for every row (K, Ti, Td, Tf) of ``parameters``, (M, 6)."""
+    out = np.empty((len(parameters), 6))
     for k in range(len(parameters)):
         K, Ti, Td, Tf = parameters[k]
-        out[k] = evaluate(omega, h, weights, turn, K, Ti, Td, Tf, omega_n)
+        figures = evaluate(omega, h, weights, turn, K, Ti, Td, Tf, omega_n)
+        for j in range(6):
+            out[k, j] = figures[j]
     return out

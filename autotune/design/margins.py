@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from autotune.arrays import ComplexArray, FloatArray
-from autotune.controller import Controller, PIDController
+from autotune.controller import Controller
+from autotune.design.figures import Figures
 from autotune.design.loop import ContinuousLoop, OpenLoop, Plant, open_loop
 from autotune.design.norms import disturbance_h2
 
@@ -43,7 +44,7 @@ class Margins:
     noise_gain : float
         True amplification (15): max of abs(C/(1 + L)) over omega >= omega_n.
     noise_gain_bound : float
-        Its bound by (16): largest abs(C) above the integral action, divided by M_m.
+        Its bound by (16): largest abs(C) at and above omega_n, divided by M_m.
     h2 : float
         Norm (11) of H/(1 + H C)/s; infinite without integral action or stability.
     """
@@ -59,6 +60,18 @@ class Margins:
     noise_gain: float
     noise_gain_bound: float
     h2: float
+
+    @property
+    def figures(self) -> Figures:
+        """What a specification is held against."""
+        return Figures(
+            squared_norm=self.h2**2,
+            modulus=self.modulus if self.stable else -self.modulus,
+            phase_rad=self.phase_rad,
+            delay_s=self.delay_s,
+            noise_gain=self.noise_gain,
+            controller_gain=self.noise_gain_bound * self.modulus,
+        )
 
     def to_json(self) -> dict[str, Any]:
         """Return the fixed form of ``margins.json``; what is infinite or does not exist is null."""
@@ -124,24 +137,21 @@ def margins(plant: Plant, controller: Controller, *, noise_frequency_rad_s: floa
         gain_reduction=reduction,
         crossover_rad_s=crossover,
         noise_gain=noise_amplification(loop, omega, start),
-        noise_gain_bound=high_frequency_gain(controller, loop, start) / M_m if M_m > 0.0 else math.inf,
+        noise_gain_bound=controller_gain(loop, start) / M_m if M_m > 0.0 else math.inf,
         h2=disturbance_h2(loop),
     )
 
 
-def high_frequency_gain(controller: Controller, loop: OpenLoop, start_rad_s: float) -> float:
-    """Return the gain of (16): abs(C) above its integral action.
-
-    For PI it is abs(K); for PID the larger of abs(K) and abs(K) T_d/T_f; for other controllers the largest abs(C) at
-    and above ``start_rad_s``.
-    """
-    if isinstance(controller, PIDController):
-        if controller.Td_s == 0.0:
-            return abs(controller.K)
-        derivative = controller.Td_s / controller.Tf_s if controller.Tf_s > 0.0 else math.inf
-        return abs(controller.K) * max(1.0, derivative)
+def controller_gain(loop: OpenLoop, start_rad_s: float) -> float:
+    """Return the largest abs(C) at and above ``start_rad_s``, left side of (16); infinite for an improper C."""
     omega = np.append(loop.grid[loop.grid > start_rad_s], start_rad_s)
-    return float(np.max(np.abs(loop.controller_response(omega))))
+    largest = float(np.max(np.abs(loop.controller_response(omega))))
+    if isinstance(loop, ContinuousLoop):
+        num, den = loop.controller.num, loop.controller.den
+        excess = len(den) - len(num)
+        limit = math.inf if excess < 0 else abs(num[0] / den[0]) if excess == 0 else 0.0
+        return max(largest, limit)
+    return largest
 
 
 def refined_minimum(

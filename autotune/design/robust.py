@@ -15,6 +15,7 @@ from scipy.optimize import minimize
 
 from autotune.arrays import FloatArray
 from autotune.controller import PIDController
+from autotune.design.figures import columns
 from autotune.design.kernels import evaluate, evaluate_grid
 from autotune.design.margins import Margins
 from autotune.design.specification import Design, Kind, Specification
@@ -68,28 +69,20 @@ def design_on_points(
 
 
 def _slacks(plant: UncertainPlant, specification: Specification, p: FloatArray) -> FloatArray:
-    """Return (4,) relative slacks of the guaranteed margins: modulus, phase, noise, delay."""
-    modulus, phase, delay, _, noise = guaranteed(plant.omega, plant.supports, p[0], p[1], p[2], p[3])
-    if specification.noise == "true":
-        noise_slack = 1.0 - noise / specification.noise_gain
-    else:
-        derivative = p[2] / p[3] if p[3] > 0.0 else 1.0
-        noise_slack = 1.0 - p[0] * max(1.0, derivative) / specification.largest_gain
-    asked = specification.delay_margin_s
-    return np.array(
-        [
-            modulus / specification.modulus_margin - 1.0,
-            phase / specification.phase_margin_rad - 1.0,
-            noise_slack,
-            delay / asked - 1.0 if asked > 0.0 else 10.0,
-        ]
-    )
+    """Return (4,) relative slacks that every plant of the set has."""
+    figures, _ = guaranteed(plant.omega, plant.supports, p[0], p[1], p[2], p[3], _omega_n(specification))
+    return np.minimum(specification.slacks(figures), 10.0)
+
+
+def _omega_n(specification: Specification) -> float:
+    asked = specification.noise_frequency_rad_s
+    return -1.0 if asked is None else asked
 
 
 def _norm(plant: UncertainPlant, p: FloatArray) -> float:
     n = plant.nominal
-    h2, modulus, *_ = evaluate(n.omega, n.h, n.weights, n.turn, p[0], p[1], p[2], p[3], -1.0)
-    return 0.5 * math.log(h2) if modulus > 0.0 else 1e3
+    figures = evaluate(n.omega, n.h, n.weights, n.turn, p[0], p[1], p[2], p[3], -1.0)
+    return 0.5 * math.log(figures.squared_norm) if figures.modulus > 0.0 else 1e3
 
 
 def _search(plant: UncertainPlant, specification: Specification, kind: Kind) -> FloatArray:
@@ -97,12 +90,9 @@ def _search(plant: UncertainPlant, specification: Specification, kind: Kind) -> 
     grid = _coarse_grid(plant, specification, kind)
     n = plant.nominal
     thin = n.thinned(4)
-    figures = evaluate_grid(thin.omega, thin.h, thin.weights, thin.turn, grid, -1.0)
-    promising = np.flatnonzero(
-        (figures[:, 1] >= 0.95 * specification.modulus_margin)
-        & (figures[:, 2] >= 0.95 * specification.phase_margin_rad)
-    )
-    order = promising[np.argsort(figures[promising, 0])]
+    figures = columns(evaluate_grid(thin.omega, thin.h, thin.weights, thin.turn, grid, _omega_n(specification)))
+    promising = np.flatnonzero(np.min(specification.slacks(figures)[:, :2], axis=1) >= -0.05)
+    order = promising[np.argsort(np.asarray(figures.squared_norm)[promising])]
     best, share = None, -math.inf
     for index in order:
         slack = float(np.min(_slacks(plant, specification, grid[index])))
@@ -143,8 +133,6 @@ def _coarse_grid(plant: UncertainPlant, specification: Specification, kind: Kind
     omega = float(np.clip(n.omega[at], plant.processes.omega_points[0], plant.processes.omega_points[-1]))
     gain = float(np.interp(omega, n.omega, np.abs(n.h)))
     K = min(specification.largest_gain, 3.0 / gain) * np.geomspace(2e-3, 1.0, 36)
-    if specification.noise == "true":
-        K = min(specification.noise_gain, 3.0 / gain) * np.geomspace(2e-3, 1.0, 36)
     Ti = np.geomspace(0.1, 100.0, 36) / omega
     if kind == "pi":
         return np.array([(k, t, 0.0, 0.0) for k in K for t in Ti])
@@ -162,25 +150,26 @@ def _coarse_grid(plant: UncertainPlant, specification: Specification, kind: Kind
 def _answer(
     plant: UncertainPlant, specification: Specification, kind: Kind, p: FloatArray, probability: float
 ) -> Design:
-    from autotune.design.synthesis import binding_constraints, weighted
+    from autotune.design.synthesis import weighted
 
     n = plant.nominal
     K, Ti, Td, Tf = (float(value) for value in p)
     controller = PIDController(K=n.sign * K, Ti_s=Ti, Td_s=Td, Tf_s=Tf)
-    modulus, phase, delay, gain, noise = guaranteed(plant.omega, plant.supports, K, Ti, Td, Tf)
+    kept, gain = guaranteed(plant.omega, plant.supports, K, Ti, Td, Tf, _omega_n(specification))
+    modulus = float(kept.modulus)
     L = n.h * controller.response(n.omega) * n.sign
     crossing = int(np.flatnonzero(np.abs(L) >= 1.0)[-1])
     m = Margins(
         stable=True,
         modulus=modulus,
         modulus_frequency_rad_s=float(n.omega[int(np.argmin(np.abs(1.0 + L)))]),
-        phase_rad=phase,
-        delay_s=delay,
+        phase_rad=float(kept.phase_rad),
+        delay_s=float(kept.delay_s),
         gain=gain,
         gain_reduction=0.0,
         crossover_rad_s=float(n.omega[crossing]),
-        noise_gain=noise,
-        noise_gain_bound=K * max(1.0, Td / Tf if Tf > 0.0 else 1.0) / modulus,
+        noise_gain=float(kept.noise_gain),
+        noise_gain_bound=float(kept.controller_gain) / modulus,
         h2=math.exp(_norm(plant, p)),
     )
     grown = plant.processes.inflation
@@ -191,7 +180,7 @@ def _answer(
         specification=specification,
         h2=m.h2,
         h2_lower_bound=None,
-        binding=binding_constraints(m, specification),
+        binding=specification.binding(m.figures),
         margins=m,
         certificate=(
             f"margins hold for every aperiodic process with dead time through the joint {100 * probability:g} % region "

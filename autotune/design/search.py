@@ -1,19 +1,21 @@
-"""Local search of the synthesis: sequential quadratic programming on the sampled plant, constraints made exact."""
+"""Local search of the synthesis: sequential quadratic programming on sampled plants, constraints made exact."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import minimize
 
 from autotune.arrays import FloatArray
 from autotune.controller import PIDController
+from autotune.design.figures import Figures, columns
 from autotune.design.kernels import SampledPlant, evaluate, evaluate_grid
 from autotune.design.loop import open_loop
 from autotune.design.margins import (
-    high_frequency_gain,
+    controller_gain,
     modulus_margin,
     noise_amplification,
     phase_and_delay_margin,
@@ -24,127 +26,151 @@ from autotune.models import TransferFunction
 
 _TOLERANCE = 1e-6
 _CORRECTIONS = 6
+_TIGHTER = (1e-4, 1e-3, 0.01, 0.03)
+_MOST_SLACK = 10.0  # what is not asked for has infinite slack, which has no derivative
 
 
-def slacks(modulus: float, phase: float, delay: float, noise: float, specification: Specification) -> FloatArray:
-    """Return (4,) relative slacks: modulus margin, phase margin, noise gain, delay margin; negative is violated.
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Problem:
+    """Plants on which one controller keeps one specification; the norm is the first one's.
 
-    ``noise`` is the true gain (15), or the gain of (16), as the specification asks.
+    Attributes
+    ----------
+    plants : tuple of TransferFunction
+        Exact.
+    sampled : tuple of SampledPlant
+        The same on their grids.
+    specification : Specification
+        Constraints (18), of every plant.
     """
-    allowed = specification.noise_gain if specification.noise == "true" else specification.largest_gain
-    asked = specification.delay_margin_s
-    return np.array(
-        [
-            modulus / specification.modulus_margin - 1.0,
-            phase / specification.phase_margin_rad - 1.0,
-            1.0 - noise / allowed,
-            delay / asked - 1.0 if asked > 0.0 else math.inf,
+
+    plants: tuple[TransferFunction, ...]
+    sampled: tuple[SampledPlant, ...]
+    specification: Specification
+
+    @property
+    def omega_n(self) -> float:
+        """Lowest frequency of the noise [rad/s] as the kernels take it: -1 for the crossover."""
+        asked = self.specification.noise_frequency_rad_s
+        return -1.0 if asked is None else asked
+
+    def norms_and_slacks(self, grid: FloatArray, thin: int = 1) -> tuple[FloatArray, FloatArray]:
+        """Return (M,) squared norms on the first plant and (M, S, 4) slacks on all plants of the (M, 4) controllers."""
+        found = []
+        for plant in self.sampled:
+            s = plant.thinned(thin) if thin > 1 else plant
+            found.append(columns(evaluate_grid(s.omega, s.h, s.weights, s.turn, grid, self.omega_n)))
+        slacks = np.stack([self.specification.slacks(figures) for figures in found], axis=1)
+        return np.asarray(found[0].squared_norm), slacks
+
+    def exact_slacks(self, parameters: FloatArray, coarse: FloatArray) -> FloatArray:
+        """Return (S, 4) slacks refined between the grid's frequencies, given ``coarse``, those on the grid.
+
+        Whether a loop is stable is taken from the grid's count: a negative modulus margin.
+        """
+        controller = self.controller(parameters)
+        found = [
+            _exact_figures(plant, controller, self.specification, stable=bool(slack > -1.0))
+            for plant, slack in zip(self.plants, coarse[:, 0], strict=True)
         ]
-    )
+        return np.array([self.specification.slacks(figures) for figures in found])
+
+    def kept(self, parameters: FloatArray) -> bool:
+        """Whether all plants keep the specification exactly."""
+        coarse = self.norms_and_slacks(parameters[None, :])[1][0]
+        return bool(np.min(self.exact_slacks(parameters, coarse)) >= -_TOLERANCE)
+
+    def controller(self, parameters: FloatArray) -> PIDController:
+        """Return the controller of (4,) parameters, with the plant's sign."""
+        K, Ti, Td, Tf = (float(value) for value in parameters)
+        return PIDController(K=self.sampled[0].sign * K, Ti_s=Ti, Td_s=Td, Tf_s=Tf)
 
 
-def _exact_slacks(
+def _exact_figures(
     H: TransferFunction, controller: PIDController, specification: Specification, *, stable: bool
-) -> FloatArray:
+) -> Figures:
     loop = open_loop(H, controller)
     omega = loop.grid
     L = loop.response(omega)
     modulus = modulus_margin(loop, omega, L)[0]
     phase, delay, crossover = phase_and_delay_margin(loop, omega, L)
-    noise = high_frequency_gain(controller, loop, 0.0)
-    if specification.noise == "true":
-        start = specification.noise_frequency_rad_s
-        noise = noise_amplification(
-            loop, omega, crossover if start is None and math.isfinite(crossover) else start or 0.0
-        )
-    return slacks(modulus if stable else -modulus, phase, delay, noise, specification)
-
-
-def evaluated_slacks(figures: FloatArray, parameters: FloatArray, specification: Specification) -> FloatArray:
-    """Return (M, 4) relative slacks of :func:`evaluate_grid`'s (M, 5) figures for the (M, 4) parameters."""
-    modulus, phase, delay, noise = figures[:, 1], figures[:, 2], figures[:, 3], figures[:, 4]
-    K, Td, Tf = parameters[:, 0], parameters[:, 2], parameters[:, 3]
-    if specification.noise == "true":
-        noise_slack = 1.0 - noise / specification.noise_gain
-    else:
-        with np.errstate(divide="ignore", invalid="ignore"):
-            derivative = np.where(Td > 0.0, Td / Tf, 0.0)
-        noise_slack = 1.0 - K * np.maximum(1.0, derivative) / specification.largest_gain
-    delay_slack = (
-        delay / specification.delay_margin_s - 1.0 if specification.delay_margin_s > 0.0 else np.full(len(K), np.inf)
-    )
-    return np.stack(
-        (
-            modulus / specification.modulus_margin - 1.0,
-            phase / specification.phase_margin_rad - 1.0,
-            noise_slack,
-            delay_slack,
-        ),
-        axis=1,
+    start = specification.noise_frequency_rad_s
+    if start is None:
+        start = crossover if math.isfinite(crossover) else float(omega[0])
+    return Figures(
+        squared_norm=math.nan,
+        modulus=modulus if stable else -modulus,
+        phase_rad=phase,
+        delay_s=delay,
+        noise_gain=noise_amplification(loop, omega, start),
+        controller_gain=controller_gain(loop, start),
     )
 
 
-def evaluate_on(sampled: SampledPlant, grid: FloatArray, specification: Specification) -> FloatArray:
-    """Return :func:`evaluate_grid` of the (M, 4) controllers on the sampled plant."""
-    omega_n = specification.noise_frequency_rad_s
-    return np.asarray(
-        evaluate_grid(
-            sampled.omega, sampled.h, sampled.weights, sampled.turn, grid, -1.0 if omega_n is None else omega_n
-        )
-    )
-
-
-def polished(
-    H: TransferFunction, sampled: SampledPlant, specification: Specification, starts: FloatArray
-) -> PIDController:
+def polished(problem: Problem, starts: FloatArray) -> PIDController:
     """Return the best controller reached from the (S, 4) starting values, its constraints corrected to the exact ones.
 
-    Parameters with value 0 stay 0.
+    Parameters with value 0 stay 0. Where the corrections do not settle on the feasible side, a little more is asked
+    for, and where no search ends there, the best of the starting values that is feasible exactly is returned.
+
+    Raises
+    ------
+    DesignError
+        Not even a starting value keeps the constraints between the frequencies of the grid.
     """
-    offset = np.zeros(4)
-    best: tuple[float, PIDController] | None = None
+    best = _corrected(problem, starts)
+    shape = (len(problem.plants), 4)
+    for more in _TIGHTER if best is None else ():
+        norm, parameters = _best_of(problem, starts, np.full(shape, more))
+        if math.isfinite(norm) and problem.kept(parameters):
+            best = parameters
+            break
+    if best is None:
+        best = next((start for start in starts if problem.kept(start)), None)
+    if best is None:
+        raise DesignError(
+            "no controller was found that keeps the constraints between the frequencies of the search",
+            where="synthesis",
+            remedy="relax the margins by a hundredth",
+        )
+    return problem.controller(best)
+
+
+def _corrected(problem: Problem, starts: FloatArray) -> FloatArray | None:
+    """Return the best parameters, the constraints on the grid shifted until they are the exact ones; None if none."""
+    offset = np.zeros((len(problem.plants), 4))
+    best: tuple[float, FloatArray] | None = None
     candidates = starts
     for _ in range(_CORRECTIONS):
-        found = [local_search(sampled, specification, start, offset) for start in candidates]
-        norm, parameters = min(found, key=lambda item: item[0])
+        norm, parameters = _best_of(problem, candidates, offset)
         if not math.isfinite(norm):
             break
-        controller = _controller(parameters, sampled.sign)
-        figures = evaluate_on(sampled, parameters[None, :], specification)
-        exact = _exact_slacks(H, controller, specification, stable=figures[0, 1] > 0.0)
+        coarse = problem.norms_and_slacks(parameters[None, :])[1][0]
+        exact = problem.exact_slacks(parameters, coarse)
         if float(np.min(exact)) >= -_TOLERANCE and (best is None or norm < best[0]):
-            best = (norm, controller)
-        coarse = evaluated_slacks(figures, parameters[None, :], specification)[0]
+            best = (norm, parameters)
         with np.errstate(invalid="ignore"):
             step = np.where(np.isfinite(coarse), coarse - exact, 0.0)
         if best is not None and np.max(np.abs(step - offset)) < 0.3 * _TOLERANCE:
             break
         offset = step + 0.3 * _TOLERANCE * (exact < 0.0)
         candidates = parameters[None, :]
-    if best is None:
-        raise DesignError(
-            "the search ended beside the constraints",
-            where="synthesis",
-            remedy="relax the margins by a thousandth, or report the plant",
-        )
-    return best[1]
+    return None if best is None else best[1]
 
 
-def _controller(parameters: FloatArray, sign: float) -> PIDController:
-    K, Ti, Td, Tf = (float(value) for value in parameters)
-    return PIDController(K=sign * K, Ti_s=Ti, Td_s=Td, Tf_s=Tf)
+def _best_of(problem: Problem, starts: FloatArray, offset: FloatArray) -> tuple[float, FloatArray]:
+    return min((local_search(problem, start, offset) for start in starts), key=lambda item: item[0])
 
 
-def local_search(
-    sampled: SampledPlant, specification: Specification, start: FloatArray, offset: FloatArray
-) -> tuple[float, FloatArray]:
+def local_search(problem: Problem, start: FloatArray, offset: FloatArray) -> tuple[float, FloatArray]:
     """Return the norm and the (4,) parameters at a local optimum: sequential quadratic programming in log gains.
 
-    ``offset`` (4,) is added to what the constraints ask for. The norm is infinite where no feasible point was found.
+    ``offset`` (S, 4) is added to what the constraints ask for. The norm is infinite where no feasible point was found.
     """
     free = start > 0.0
-    omega_n = -1.0 if specification.noise_frequency_rad_s is None else specification.noise_frequency_rad_s
-    data = (sampled.omega, sampled.h, sampled.weights, sampled.turn)
+    specification = problem.specification
+    data = [(plant.omega, plant.h, plant.weights, plant.turn) for plant in problem.sampled]
+    asked = [0, 1, 2, 3] if specification.delay_margin_s > 0.0 else [0, 1, 2]
     memory: dict[bytes, tuple[float, FloatArray]] = {}
     best: tuple[float, FloatArray] = (math.inf, start)
 
@@ -154,15 +180,15 @@ def local_search(
         if key not in memory:
             p = start.copy()
             p[free] = start[free] * np.exp(x)
-            figures = np.array(evaluate(*data, p[0], p[1], p[2], p[3], omega_n))
-            slack = evaluated_slacks(figures[None, :], p[None, :], specification)[0] - offset
-            slack = np.minimum(slack, 10.0)
-            memory[key] = (0.5 * math.log(figures[0]), slack)
-            if np.min(slack) >= -1e-9 and figures[0] < best[0]:
-                best = (float(figures[0]), p)
+            found = [evaluate(*plant, p[0], p[1], p[2], p[3], problem.omega_n) for plant in data]
+            slack = np.array([specification.slacks(figures) for figures in found]) - offset
+            slack = np.minimum(slack[:, asked], _MOST_SLACK).ravel()
+            squared = float(found[0].squared_norm)
+            memory[key] = (0.5 * math.log(squared), slack)
+            if np.min(slack) >= -1e-9 and squared < best[0]:
+                best = (squared, p)
         return memory[key]
 
-    active = 4 if specification.delay_margin_s > 0.0 else 3
     x = np.zeros(int(np.sum(free)))
     for span in (1.0, 0.05):
         # the stubs know no inequality constraint with its own gradient
@@ -172,8 +198,8 @@ def local_search(
             jac=lambda z: _gradient(lambda v: np.array([look(v)[0]]), z)[0],
             constraints={
                 "type": "ineq",
-                "fun": lambda z: look(z)[1][:active],
-                "jac": lambda z: _gradient(lambda v: look(v)[1][:active], z),
+                "fun": lambda z: look(z)[1],
+                "jac": lambda z: _gradient(lambda v: look(v)[1], z),
             },
             bounds=[(float(value) - span, float(value) + span) for value in x],
             method="SLSQP",
@@ -185,5 +211,17 @@ def local_search(
 
 def _gradient(f: Callable[[FloatArray], FloatArray], x: FloatArray) -> FloatArray:
     step = 1e-6
-    columns = [(f(x + step * e) - f(x - step * e)) / (2.0 * step) for e in np.eye(len(x))]
-    return np.stack(columns, axis=-1)
+    columns_ = [(f(x + step * e) - f(x - step * e)) / (2.0 * step) for e in np.eye(len(x))]
+    return np.stack(columns_, axis=-1)
+
+
+def separate(nodes: FloatArray, distance: float, most: int) -> FloatArray:
+    """Return the first of the (M, 4) controllers and those after it that are no neighbours: one start for each basin."""
+    kept: list[FloatArray] = []
+    for node in nodes:
+        free = node > 0.0
+        if all(np.max(np.abs(np.log(node[free] / other[free]))) > distance for other in kept):
+            kept.append(node)
+        if len(kept) == most:
+            break
+    return np.array(kept)

@@ -6,7 +6,11 @@ import math
 from dataclasses import dataclass
 from typing import Any, Literal, TypeAlias
 
+import numpy as np
+
+from autotune.arrays import FloatArray
 from autotune.controller import PIDController
+from autotune.design.figures import CONSTRAINTS, Figures
 from autotune.design.margins import Margins
 from autotune.errors import DesignError
 
@@ -25,11 +29,11 @@ class Specification:
         phi_d of (13) [rad], between 0 and pi/2.
     noise_gain : float
         N_max: largest amplification of measurement noise to command, input unit per output unit.
-    noise : {"bound", "true"}
-        ``bound`` keeps (16), abs(C) <= M_m N_max above the integral action (for PI abs(K) <= M_m N_max); ``true``
-        keeps (15) itself, abs(C/(1 + L)) <= N_max for omega >= omega_n, which never asks for more.
+    noise : {"true", "bound"}
+        ``true`` keeps (15) itself, abs(C/(1 + L)) <= N_max for omega >= omega_n; ``bound`` keeps (16), abs(C) <=
+        M_m N_max there, which implies (15) wherever the modulus margin is kept and so never asks for less.
     noise_frequency_rad_s : float, optional
-        omega_n of (15) [rad/s]; the crossover where absent. Used with ``true`` only.
+        omega_n of (15) and (16) [rad/s]; the crossover where absent.
     delay_margin_s : float
         Smallest delay margin [s]; 0 asks for none.
     setpoint_command : float
@@ -45,7 +49,7 @@ class Specification:
     modulus_margin: float = 0.5
     phase_margin_rad: float = math.pi / 4.0
     noise_gain: float = 0.1
-    noise: Literal["bound", "true"] = "bound"
+    noise: Literal["bound", "true"] = "true"
     noise_frequency_rad_s: float | None = None
     delay_margin_s: float = 0.0
     setpoint_command: float = math.inf
@@ -65,10 +69,42 @@ class Specification:
         if not self.setpoint_command > 0.0:
             refuse("set-point command", self.setpoint_command, "positive")
 
+        if self.noise_frequency_rad_s is not None and not 0.0 < self.noise_frequency_rad_s < math.inf:
+            refuse("noise frequency", self.noise_frequency_rad_s, "a positive frequency in rad/s")
+
     @property
     def largest_gain(self) -> float:
-        """M_m N_max of (16)."""
-        return self.modulus_margin * self.noise_gain
+        """Largest abs(K) of a PI on a strictly proper plant: M_m N_max by (16), N_max by (15), as L ends at 0."""
+        return self.modulus_margin * self.noise_gain if self.noise == "bound" else self.noise_gain
+
+    def slacks(self, figures: Figures) -> FloatArray:
+        """Return (..., 4) relative slacks in the order of CONSTRAINTS, negative where violated, infinite where not asked.
+
+        Parameters
+        ----------
+        figures : Figures
+            Of one loop, or of many in arrays of one shape.
+        """
+        noise = (
+            np.asarray(figures.noise_gain) / self.noise_gain
+            if self.noise == "true"
+            else np.asarray(figures.controller_gain) / (self.modulus_margin * self.noise_gain)
+        )
+        delay = np.asarray(figures.delay_s)
+        return np.stack(
+            (
+                np.asarray(figures.modulus) / self.modulus_margin - 1.0,
+                np.asarray(figures.phase_rad) / self.phase_margin_rad - 1.0,
+                1.0 - noise,
+                delay / self.delay_margin_s - 1.0 if self.delay_margin_s > 0.0 else np.full(delay.shape, np.inf),
+            ),
+            axis=-1,
+        )
+
+    def binding(self, figures: Figures) -> tuple[str, ...]:
+        """Return the names of the constraints that hold with equality (to within 1e-4)."""
+        slack = self.slacks(figures)
+        return tuple(name for name, value in zip(CONSTRAINTS, slack, strict=True) if abs(value) < 1e-4)
 
 
 def spec1(noise_gain: float) -> Specification:

@@ -7,6 +7,7 @@ until they hold for margins refined between the grid's frequencies.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -15,16 +16,24 @@ from autotune.arrays import FloatArray
 from autotune.controller import PIDController
 from autotune.design.kernels import SampledPlant, sampled_plant
 from autotune.design.loop import Plant, transfer_function_of
-from autotune.design.margins import Margins, margins
-from autotune.design.search import evaluate_on, evaluated_slacks, polished, slacks
+from autotune.design.margins import margins
+from autotune.design.search import Problem, polished, separate
 from autotune.design.specification import Design, Kind, Specification
 from autotune.errors import DesignError
-from autotune.models import TransferFunction
 
-_NAMES = ("modulus margin", "phase margin", "noise gain", "delay margin")
+_STARTS = 2
+#: margins between the grid's frequencies are exact to this; what is missed by more is never handed out
+_MISSED = 1e-3
 
 
-def design(plant: Plant, specification: Specification, kind: Kind = "pi", *, certificate: bool = True) -> Design:
+def design(
+    plant: Plant,
+    specification: Specification,
+    kind: Kind = "pi",
+    *,
+    also: Sequence[Plant] = (),
+    certificate: bool = True,
+) -> Design:
     """Return the controller with the smallest H2 norm (11) among those that meet the specification.
 
     Parameters
@@ -35,13 +44,15 @@ def design(plant: Plant, specification: Specification, kind: Kind = "pi", *, cer
         Constraints (18).
     kind : {"pi", "pid"}
         PI of (25), or PID with a first-order measurement filter.
+    also : sequence of TransferFunction or Model
+        Further plants that keep the constraints with the same controller: what a model may be besides its estimate.
     certificate : bool
         Whether to prove a lower bound on the norm (PI only; some tenths of a second).
 
     Returns
     -------
     Design
-        Frozen; its margins hold to within 1e-6 of what was asked.
+        Frozen; its margins, those of the worst plant, hold to within 1e-6 of what was asked. The norm is ``plant``'s.
 
     Raises
     ------
@@ -59,31 +70,43 @@ def design(plant: Plant, specification: Specification, kind: Kind = "pi", *, cer
     ----------
     Le & Mendes 2010, equations (11) to (18) and (25).
     """
-    H = transfer_function_of(plant)
-    most = specification.largest_gain if specification.noise == "bound" else specification.noise_gain
-    sampled = sampled_plant(H, most)
-    pi = _best_pi(H, sampled, specification)
+    plants = tuple(transfer_function_of(one) for one in (plant, *also))
+    H = plants[0]
+    problem = Problem(
+        plants=plants,
+        sampled=tuple(sampled_plant(one, specification.largest_gain) for one in plants),
+        specification=specification,
+    )
+    if len({one.sign for one in problem.sampled}) > 1:
+        raise DesignError("the plants' gains are of both signs", where="synthesis", remedy="measure the gain better")
+    controller = _best_pi(problem)
+    bound, statement = None, "no lower bound asked for"
     if kind == "pid":
         from autotune.design.pid import best_pid
 
-        controller = best_pid(H, sampled, specification, pi)
-        bound, statement = None, "no lower bound: four gains are searched locally from several starts"
-    else:
-        controller = pi
-        bound, statement = None, "no lower bound asked for"
-    m = margins(H, controller, noise_frequency_rad_s=specification.noise_frequency_rad_s)
+        controller = best_pid(problem, controller)
+        statement = "no lower bound: four gains are searched locally from several starts"
+    found = [margins(one, controller, noise_frequency_rad_s=specification.noise_frequency_rad_s) for one in plants]
+    worst = min(found, key=lambda m: float(np.min(specification.slacks(m.figures))))
+    if np.min(specification.slacks(worst.figures)) < -_MISSED:
+        raise DesignError(
+            f"the best controller found misses the constraints on closer look (M_m {worst.modulus:.3f},"
+            f" {math.degrees(worst.phase_rad):.1f} deg{'' if worst.stable else ', unstable'})",
+            where="synthesis",
+            remedy="relax the margins by a hundredth",
+        )
     if kind == "pi" and certificate:
         from autotune.design.certificate import lower_bound
 
-        bound, statement = lower_bound(H, sampled, specification, controller, m)
+        bound, statement = lower_bound(H, problem.sampled[0], specification, controller, found[0])
     return Design(
         kind=kind,
         controller=weighted(controller, specification),
         specification=specification,
-        h2=m.h2,
+        h2=found[0].h2,
         h2_lower_bound=bound,
-        binding=binding_constraints(m, specification),
-        margins=m,
+        binding=tuple(dict.fromkeys(name for m in found for name in specification.binding(m.figures))),
+        margins=worst,
         certificate=statement,
     )
 
@@ -94,13 +117,6 @@ def weighted(controller: PIDController, specification: Specification) -> PIDCont
     return replace(controller, setpoint_weight=weight)
 
 
-def binding_constraints(m: Margins, specification: Specification) -> tuple[str, ...]:
-    """Return the names of the constraints that hold with equality (to within 1e-4)."""
-    noise = m.noise_gain if specification.noise == "true" else m.noise_gain_bound * m.modulus
-    slack = slacks(m.modulus if m.stable else -m.modulus, m.phase_rad, m.delay_s, noise, specification)
-    return tuple(name for name, value in zip(_NAMES, slack, strict=True) if abs(value) < 1e-4)
-
-
 def gain_range(sampled: SampledPlant, specification: Specification) -> tuple[float, float, float]:
     """Return the largest gain worth looking at, and the frequency [rad/s] and phase limit that it comes from.
 
@@ -108,7 +124,7 @@ def gain_range(sampled: SampledPlant, specification: Specification) -> tuple[flo
     margin implies, as arg C < 0; a factor of 20 covers plants whose gain is not monotone.
     """
     phi = max(specification.phase_margin_rad, 2.0 * math.asin(0.5 * specification.modulus_margin))
-    most = specification.largest_gain if specification.noise == "bound" else specification.noise_gain * 20.0
+    most = specification.largest_gain
     gain = np.abs(sampled.h)
     beyond = np.flatnonzero(sampled.phase <= -math.pi + phi)
     audible = np.flatnonzero(gain * most >= 1.0)
@@ -118,29 +134,21 @@ def gain_range(sampled: SampledPlant, specification: Specification) -> tuple[flo
     return min(most, reachable), float(sampled.omega[at]), phi
 
 
-def _best_pi(H: TransferFunction, sampled: SampledPlant, specification: Specification) -> PIDController:
-    largest, omega_ref, _ = gain_range(sampled, specification)
+def _best_pi(problem: Problem) -> PIDController:
+    largest, omega_ref, _ = gain_range(problem.sampled[0], problem.specification)
     K = largest * np.geomspace(1e-4, 1.0, 33)
     Ti = np.geomspace(0.02, 400.0, 36) / omega_ref
     grid = np.array([(k, t, 0.0, 0.0) for k in K for t in Ti])
-    figures = evaluate_on(sampled.thinned(4), grid, specification)
-    slack = evaluated_slacks(figures, grid, specification)
+    norms, slacks = problem.norms_and_slacks(grid, thin=4)
+    slack = np.min(slacks, axis=1)
     feasible = np.min(slack, axis=1) >= -1e-12
     if not np.any(feasible):
-        raise _unreachable(H, sampled, specification, grid, slack)
-    starts = grid[feasible][np.argsort(figures[feasible, 0])]
-    return polished(H, sampled, specification, starts[_separate(starts)])
+        raise _unreachable(problem.specification, slack)
+    starts = grid[feasible][np.argsort(norms[feasible])]
+    return polished(problem, separate(starts, 0.8, _STARTS))
 
 
-def _separate(starts: FloatArray) -> list[int]:
-    """Return up to two of the best grid nodes that are not neighbours: one start for each of two basins."""
-    far = np.flatnonzero(np.max(np.abs(np.log(starts[:, :2] / starts[0, :2])), axis=1) > 0.8)
-    return [0, int(far[0])] if len(far) else [0]
-
-
-def _unreachable(
-    H: TransferFunction, sampled: SampledPlant, specification: Specification, grid: FloatArray, slack: FloatArray
-) -> DesignError:
+def _unreachable(specification: Specification, slack: FloatArray) -> DesignError:
     """Return the error that names the nearest specification: margins shrunk by one common factor, noise kept."""
     usable = slack[:, 2] >= 0.0
     share = np.where(usable, 1.0 + np.min(slack[:, [0, 1, 3]], axis=1), -np.inf)

@@ -10,6 +10,7 @@ import numpy as np
 from numba import njit
 
 from autotune.arrays import FloatArray
+from autotune.design.figures import Figures
 from autotune.design.kernels import SampledPlant
 from autotune.design.process_class import DIRECTIONS, ConsistentProcesses, consistent_processes
 from autotune.points import FrequencyPoint
@@ -136,12 +137,13 @@ def _nearest_to_critical(a: FloatArray, b: FloatArray, h: FloatArray) -> float:
 
 @njit(cache=True, error_model="numpy")
 def guaranteed(
-    omega: FloatArray, supports: FloatArray, K: float, Ti: float, Td: float, Tf: float
-) -> tuple[float, float, float, float, float]:
-    """Return modulus, phase [rad], delay [s] and gain margin and noise gain that every plant of the set has at least.
+    omega: FloatArray, supports: FloatArray, K: float, Ti: float, Td: float, Tf: float, omega_n: float
+) -> tuple[Figures, float]:
+    """Return the figures that every plant of the set keeps (no norm among them), and its gain margin.
 
     The modulus margin is negative where the set does not decide: abs(L) is not surely above 1 + itself at the lowest
-    frequency and below 1 - itself at the highest.
+    frequency and below 1 - itself at the highest. The noise begins at ``omega_n``, or where ``omega_n`` is below 0 at
+    the lowest crossover that a plant of the set can have.
     """
     directions = supports.shape[1]
     step = 2.0 * math.pi / directions
@@ -150,7 +152,7 @@ def guaranteed(
     phase = math.pi
     delay = 1e300
     growth = -1e300
-    noise = 0.0
+    noise = loudest = 0.0
     crossed = False
     h = np.empty(directions)  # support values of L at this frequency, and at the one before
     h_before = np.empty(directions)
@@ -170,7 +172,8 @@ def guaranteed(
         if smallest - 1.0 < modulus and 1.0 - largest < modulus:
             nearest = _nearest_to_critical(a, b, h)
             modulus = min(modulus, math.sqrt(nearest))
-        if crossed:
+        if w >= omega_n if omega_n >= 0.0 else crossed:
+            loudest = max(loudest, abs(C))
             noise = max(noise, abs(C) / math.sqrt(max(nearest, 1e-300)))
     C_low = complex(K, K * (Td * omega[0] - 1.0 / (Ti * omega[0]))) / complex(1.0, Tf * omega[0])
     C_high = complex(K, K * (Td * omega[-1] - 1.0 / (Ti * omega[-1]))) / complex(1.0, Tf * omega[-1])
@@ -179,4 +182,6 @@ def guaranteed(
     if at_least < 1.0 + modulus or at_most > 1.0 - modulus:
         modulus = min(modulus, at_least - 1.0, 1.0 - at_most)
     gain = math.exp(-max(growth, math.log(at_most)))
-    return modulus, phase, delay, gain, noise
+    beyond = abs(K) * max(1.0, Td / Tf if Tf > 0.0 else 1.0)  # above the highest frequency abs(1 + L) is near 1
+    loudest, noise = max(loudest, beyond), max(noise, beyond / max(1.0 - at_most, 1e-300))
+    return Figures(math.nan, modulus, phase, delay, noise, loudest), gain

@@ -29,7 +29,7 @@ def test_table_two_of_the_paper_recomputed() -> None:
     assert math.degrees(m.phase_rad) == pytest.approx(48.16, abs=5e-3)
     assert m.delay_s == pytest.approx(0.607, abs=5e-4)
     assert m.crossover_rad_s == pytest.approx(1.384, abs=5e-4)
-    assert m.noise_gain_bound == pytest.approx(0.0337, abs=5e-5)
+    assert m.noise_gain_bound == pytest.approx(0.0347, abs=5e-5)  # K/M_m = 0.0337 leaves the integral action out
     # recomputed with alpha = 0: 57.144; the paper prints 56.8, an independent recomputation 57.14
     assert m.h2 == pytest.approx(57.144, abs=1e-3)
 
