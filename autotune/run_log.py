@@ -89,7 +89,7 @@ class RunLog:
         self,
         points: tuple[FrequencyPoint, ...],
         plant: TransferFunction,
-        reduced: TransferFunction,
+        reduced: TransferFunction | None,
         controller: PIDController,
     ) -> None:
         """Say what follows from the points."""
@@ -97,7 +97,7 @@ class RunLog:
             "analysis",
             points=points_to_json(points),
             plant=asdict(plant),
-            reduced=asdict(reduced),
+            reduced=asdict(reduced) if reduced is not None else None,
             controller=asdict(controller),
         )
 

@@ -281,9 +281,9 @@ def _designed(row: Row, analysis: Analysis, present: Controller | None, settings
     reduced, c, m = analysis.reduced, analysis.controller, analysis.margins
     row = replace(
         _with_notes(row, analysis.warnings),
-        G_r=reduced.G_r,
-        omega_0r_rad_s=reduced.omega_0r_rad_s,
-        omega_d_rad_s=reduced.omega_d_rad_s,
+        G_r=None if reduced is None else reduced.G_r,
+        omega_0r_rad_s=None if reduced is None else reduced.omega_0r_rad_s,
+        omega_d_rad_s=None if reduced is None else reduced.omega_d_rad_s,
         K=c.K,
         Ti_s=c.Ti_s,
         Td_s=c.Td_s,
@@ -295,10 +295,6 @@ def _designed(row: Row, analysis: Analysis, present: Controller | None, settings
     )
     if present is not None:
         row = _compared(row, present, margins(analysis.fit.plant, present), settings)
-    doubts = analysis.reduced.warnings
-    if row.attention == "fine" and (doubts or not analysis.scaled.holds):
-        doubt = doubts[0] if doubts else "criterion (10) does not hold: measure more points"
-        return replace(row, attention="look", reason=doubt)
     return row
 
 

@@ -85,6 +85,8 @@ def run(
         write_page(page, folder / "report.html")
         for warning in (*tuning.experiment.warnings, *tuning.analysis.warnings):
             console.print(f"warning: {warning}", markup=False)
+        for note in tuning.analysis.notes:
+            console.print(f"note: {note}", markup=False)
         console.print(page.verdict, markup=False)
         for sentence in found.sentences if found is not None else ():
             console.print(sentence, markup=False)
@@ -175,19 +177,29 @@ def tune(
     ] = "Spec1",
     modulus_margin: Annotated[float | None, typer.Option(help="replaces the named one, 0 to 1")] = None,
     phase_margin: Annotated[float | None, typer.Option(help="replaces the named one [deg]")] = None,
-    noise_gain: Annotated[float, typer.Option(help="largest amplification of noise to command [u unit/y unit]")] = 0.1,
+    noise_gain: Annotated[
+        float | None,
+        typer.Option(
+            help="largest amplification of noise to command [u unit/y unit]; default from recorded noise and span of u"
+        ),
+    ] = None,
+    noise_frequency: Annotated[
+        float | None, typer.Option(help="lowest frequency of the noise [rad/s]; default the crossover")
+    ] = None,
     kind: Annotated[Literal["pi", "pid"], typer.Option(help="structure of the controller")] = "pi",
-    source: Annotated[Literal["reduced model", "points"], typer.Option(help="what to design on")] = "reduced model",
+    source: Annotated[
+        Literal["auto", "reduced model", "points", "fitted plant"],
+        typer.Option(help="what to design on; auto: the first that keeps its margins on everything measured"),
+    ] = "auto",
     t: T = None,
     u: U = None,
     y: Y = None,
     r: R = None,
     overwrite: OVERWRITE = False,
 ) -> None:
-    """Design a controller from recordings and points, without a rig: Bode points, reduced model, controller, report."""
+    """Design a controller from recordings and points, without a rig: model, controller, checks, report."""
     from autotune.config.procedure import DesignSettings, SignalSettings
-    from autotune.identification.frequency.recorded import combine, session_points, sessions
-    from autotune.pipeline import RESULT, analyse, analysis_json
+    from autotune.pipeline import RESULT, analyse, analysis_json, measured_of
     from autotune.points import read_points
     from autotune.report.page import write_page
     from autotune.report.run_page import analysis_page
@@ -198,17 +210,18 @@ def tune(
     place = OutputFolder(out, (RESULT, "report.html"), inputs=(*recordings, *files), overwrite=overwrite)
     read = read_all(recordings, signal_names(t, u, y, r))
     given = [point for path in files for point in read_points(path)]
-    combined = combine([session_points(one) for one in sessions(read)]) if read else None
-    notes = combined.notes if combined else ()
+    found = measured_of(read, given)
+    notes = found.notes
     settings = DesignSettings(
         kind=kind,
         specification=specification,
         modulus_margin=modulus_margin,
         phase_margin_deg=phase_margin,
         noise_gain=noise_gain,
+        noise_frequency_rad_s=noise_frequency,
         source=source,
     )
-    analysis = analyse([*(combined.points if combined else ()), *given], settings)
+    analysis = analyse(found.points, settings, fit=found.fit, facts=found.facts)
     units = read[0].metadata.get("units", {}) if read else {}
     signals = SignalSettings(
         sample_time_s=read[0].sample_time_s if read else 1.0,  # the page shows units only
@@ -220,7 +233,7 @@ def tune(
         write_json(folder / RESULT, analysis_json(analysis))
         write_page(page, folder / "report.html")
     console = Console(highlight=False, soft_wrap=True)
-    for note in (*notes, *analysis.warnings):
+    for note in (*notes, *analysis.warnings, *analysis.notes):
         console.print(f"note: {note}", markup=False)
     console.print(page.verdict, markup=False)
     console.print(f"report: {out / 'report.html'}", markup=False)

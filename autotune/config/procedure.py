@@ -101,13 +101,24 @@ class DesignSettings(Section):
     modulus_margin: Annotated[float | None, Field(gt=0, lt=1, description="replaces the named one, 0 to 1")] = None
     phase_margin_deg: Annotated[float | None, Field(gt=0, lt=90, description="replaces the named one [deg]")] = None
     noise_gain: Annotated[
-        float,
-        Field(gt=0, le=LARGEST, description="largest amplification of measurement noise to command, N_max [u/y unit]"),
-    ] = 0.1
+        float | None,
+        Field(
+            gt=0,
+            le=LARGEST,
+            description="largest amplification of measurement noise to command, N_max [u/y unit];"
+            " from the measured noise and the command's range when absent",
+        ),
+    ] = None
+    noise_frequency_rad_s: Annotated[
+        float | None, Field(gt=0, description="lowest frequency of the noise [rad/s]; the crossover when absent")
+    ] = None
     source: Annotated[
-        Literal["reduced model", "points"],
-        Field(description="design on the reduced model, or straight on the measured points and their regions"),
-    ] = "reduced model"
+        Literal["auto", "reduced model", "points", "fitted plant"],
+        Field(
+            description="what to design on: the reduced model (PI), the measured points and their regions, or the"
+            " fitted plant and its region; auto takes the first that keeps its margins on everything measured"
+        ),
+    ] = "auto"
 
     @property
     def margins(self) -> tuple[float, float]:

@@ -141,7 +141,8 @@ class ContinuousLoop:
                 around = np.concatenate((abs(root.imag) - offsets, [abs(root.imag)], abs(root.imag) + offsets))
                 parts.append(around[(around > low) & (around < high)])
         if L.delay_s > 0.0:
-            audible = parts[0][np.abs(self.response(parts[0])) > 0.04]
+            with np.errstate(divide="ignore", invalid="ignore"):  # a pole on the axis, at one of the frequencies
+                audible = parts[0][np.abs(self.response(parts[0])) > 0.04]
             end = min(audible[-1] if len(audible) else low, 2000.0 / L.delay_s)
             points = min(int(end * L.delay_s / 0.2) + 2, _MOST_DELAY_POINTS)
             parts.append(np.linspace(low, end, points)[1:] if end > low else parts[0][:0])

@@ -32,16 +32,17 @@ _MOST_SLACK = 10.0  # what is not asked for has infinite slack, which has no der
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Problem:
-    """Plants on which one controller keeps one specification; the norm is the first one's.
+    """Plants on which one controller keeps one specification; norm and noise gain are the first one's.
 
     Attributes
     ----------
     plants : tuple of TransferFunction
-        Exact.
+        Exact. The margins are kept on all of them; noise wears an actuator and does not endanger a loop, so that its
+        gain is kept on the first, the estimate.
     sampled : tuple of SampledPlant
         The same on their grids.
     specification : Specification
-        Constraints (18), of every plant.
+        Constraints (18).
     """
 
     plants: tuple[TransferFunction, ...]
@@ -60,8 +61,15 @@ class Problem:
         for plant in self.sampled:
             s = plant.thinned(thin) if thin > 1 else plant
             found.append(columns(evaluate_grid(s.omega, s.h, s.weights, s.turn, grid, self.omega_n)))
-        slacks = np.stack([self.specification.slacks(figures) for figures in found], axis=1)
+        slacks = np.stack([self.slacks_of(i, figures) for i, figures in enumerate(found)], axis=1)
         return np.asarray(found[0].squared_norm), slacks
+
+    def slacks_of(self, plant: int, figures: Figures) -> FloatArray:
+        """Return (..., 4) slacks of the figures on a plant."""
+        slacks = self.specification.slacks(figures)
+        if plant > 0:
+            slacks[..., 2] = np.inf
+        return slacks
 
     def exact_slacks(self, parameters: FloatArray, coarse: FloatArray) -> FloatArray:
         """Return (S, 4) slacks refined between the grid's frequencies, given ``coarse``, those on the grid.
@@ -73,7 +81,7 @@ class Problem:
             _exact_figures(plant, controller, self.specification, stable=bool(slack > -1.0))
             for plant, slack in zip(self.plants, coarse[:, 0], strict=True)
         ]
-        return np.array([self.specification.slacks(figures) for figures in found])
+        return np.array([self.slacks_of(i, figures) for i, figures in enumerate(found)])
 
     def kept(self, parameters: FloatArray) -> bool:
         """Whether all plants keep the specification exactly."""
@@ -181,7 +189,7 @@ def local_search(problem: Problem, start: FloatArray, offset: FloatArray) -> tup
             p = start.copy()
             p[free] = start[free] * np.exp(x)
             found = [evaluate(*plant, p[0], p[1], p[2], p[3], problem.omega_n) for plant in data]
-            slack = np.array([specification.slacks(figures) for figures in found]) - offset
+            slack = np.array([problem.slacks_of(i, figures) for i, figures in enumerate(found)]) - offset
             slack = np.minimum(slack[:, asked], _MOST_SLACK).ravel()
             squared = float(found[0].squared_norm)
             memory[key] = (0.5 * math.log(squared), slack)
@@ -216,7 +224,7 @@ def _gradient(f: Callable[[FloatArray], FloatArray], x: FloatArray) -> FloatArra
 
 
 def separate(nodes: FloatArray, distance: float, most: int) -> FloatArray:
-    """Return the first of the (M, 4) controllers and those after it that are no neighbours: one start for each basin."""
+    """Return the first of the (M, 4) controllers and those after it that are no neighbours: a start for each basin."""
     kept: list[FloatArray] = []
     for node in nodes:
         free = node > 0.0

@@ -78,7 +78,7 @@ class Specification:
         return self.modulus_margin * self.noise_gain if self.noise == "bound" else self.noise_gain
 
     def slacks(self, figures: Figures) -> FloatArray:
-        """Return (..., 4) relative slacks in the order of CONSTRAINTS, negative where violated, infinite where not asked.
+        """Return (..., 4) relative slacks in the order of CONSTRAINTS: negative where violated, infinite if not asked.
 
         Parameters
         ----------

@@ -45,7 +45,8 @@ def design(
     kind : {"pi", "pid"}
         PI of (25), or PID with a first-order measurement filter.
     also : sequence of TransferFunction or Model
-        Further plants that keep the constraints with the same controller: what a model may be besides its estimate.
+        Further plants that keep the margins with the same controller: what a model may be besides its estimate. The
+        noise gain is kept on ``plant``.
     certificate : bool
         Whether to prove a lower bound on the norm (PI only; some tenths of a second).
 
@@ -87,8 +88,9 @@ def design(
         controller = best_pid(problem, controller)
         statement = "no lower bound: four gains are searched locally from several starts"
     found = [margins(one, controller, noise_frequency_rad_s=specification.noise_frequency_rad_s) for one in plants]
-    worst = min(found, key=lambda m: float(np.min(specification.slacks(m.figures))))
-    if np.min(specification.slacks(worst.figures)) < -_MISSED:
+    slacks = [float(np.min(problem.slacks_of(i, m.figures))) for i, m in enumerate(found)]
+    worst = found[int(np.argmin(slacks))]
+    if min(slacks) < -_MISSED:
         raise DesignError(
             f"the best controller found misses the constraints on closer look (M_m {worst.modulus:.3f},"
             f" {math.degrees(worst.phase_rad):.1f} deg{'' if worst.stable else ', unstable'})",

@@ -8,9 +8,10 @@ that the points do not contradict is taken.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from itertools import combinations_with_replacement, product
+from typing import Literal
 
 import numpy as np
 from scipy.optimize import OptimizeResult, least_squares
@@ -23,6 +24,10 @@ from autotune.points import FrequencyPoint
 
 #: lags in the structures that are tried, beside the integrator and the dead time
 _MAX_LAGS = 2
+#: a structure whose Bayesian criterion is higher than the best one's by more is excluded by the data: odds of 20 to 1
+EXCLUDED = 2.0 * math.log(20.0)
+#: directions besides the principal ones in which the border of a parameter region is visited
+_DIRECTIONS = 48
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -36,7 +41,7 @@ class PlantFit:
     integrating : bool
         Whether it has a pole at s = 0.
     parameters : (P,) array
-        log|b|, log(tau_1), ..., log(tau_k), L [s].
+        log|b|, log(tau_1), ..., log(tau_k), L [s]; of a fit in time a_0, ..., a_(n-1), b, L of a differential equation.
     covariance : (P, P) array
         Covariance of ``parameters``, multiplied by chi^2 per degree of freedom where that exceeds 1.
     sign : int
@@ -45,6 +50,16 @@ class PlantFit:
         Weighted sum of squared residuals.
     degrees_of_freedom : int
         Number of real residuals less the number of parameters.
+    bounds : (2, P) array
+        Between which the parameters were searched; the region ends there.
+    build : callable
+        From (P,) parameters to the plant.
+    criterion : float
+        Bayesian information criterion, comparable between fits of the same data.
+    others : tuple of PlantFit
+        Structures that the same data do not exclude.
+    source : {"points", "recording"}
+        What was fitted.
     """
 
     plant: TransferFunction
@@ -54,6 +69,11 @@ class PlantFit:
     sign: int
     chi_square: float
     degrees_of_freedom: int
+    bounds: FloatArray
+    build: Callable[[FloatArray], TransferFunction] = field(repr=False)
+    criterion: float = 0.0
+    others: tuple[PlantFit, ...] = ()
+    source: Literal["points", "recording"] = "points"
 
     @property
     def p_value(self) -> float:
@@ -61,9 +81,45 @@ class PlantFit:
         return float(chi2.sf(self.chi_square, self.degrees_of_freedom)) if self.degrees_of_freedom else 1.0
 
     def draws(self, count: int, rng: np.random.Generator) -> tuple[TransferFunction, ...]:
-        """Return plants drawn from the parameters' normal distribution."""
+        """Return plants drawn from the parameters' normal distribution, cut at the bounds of the search."""
         samples = rng.multivariate_normal(self.parameters, self.covariance, count, method="eigh")
-        return tuple(_plant(sample, self.sign, self.integrating) for sample in samples)
+        return tuple(self.build(self._within(sample)) for sample in samples)
+
+    def _within(self, sample: FloatArray) -> FloatArray:
+        """Return a sample of the parameters, cut at the bounds of the search.
+
+        Above them the whole way from the estimate is shortened, as what the data leave open (a gain and the slowest
+        lag) moves together; below, where a lag or a dead time vanishes, each parameter ends by itself.
+        """
+        lower, upper = self.bounds
+        step = sample - self.parameters
+        share = min(
+            (room / way for room, way in zip(upper - self.parameters, step, strict=True) if way > 0.0), default=1.0
+        )
+        return np.asarray(np.maximum(self.parameters + min(max(share, 0.0), 1.0) * step, lower), dtype=np.float64)
+
+    def border(self, probability: float) -> tuple[TransferFunction, ...]:
+        """Return plants on the border of the joint region of all parameters, and of the other structures' likewise.
+
+        Parameters
+        ----------
+        probability : float
+            Of each structure's region, to first order.
+
+        Notes
+        -----
+        Both ends of every principal axis, and directions between them; what depends linearly on the parameters has its
+        extremes within a few per cent of the region's among them.
+        """
+        radius = math.sqrt(chi2.ppf(probability, self.parameters.size))
+        values, vectors = np.linalg.eigh(self.covariance)
+        axes = vectors * np.sqrt(np.maximum(values, 0.0))
+        between = np.random.default_rng(0).standard_normal((_DIRECTIONS, self.parameters.size))
+        between /= np.linalg.norm(between, axis=1, keepdims=True)
+        directions = np.vstack((np.eye(self.parameters.size), -np.eye(self.parameters.size), between, -between))
+        samples = self.parameters + radius * directions @ axes.T
+        members = [self.build(self._within(sample)) for sample in samples]
+        return (*members, *(plant for fit in self.others for plant in (fit.plant, *fit.border(probability))))
 
 
 def fit_plant(points: Sequence[FrequencyPoint]) -> PlantFit:
@@ -103,7 +159,15 @@ def fit_plant(points: Sequence[FrequencyPoint]) -> PlantFit:
         if (integrating or lags) and 2 * len(points) >= lags + 2
         for fit in [_fit_structure(omega, measured, whitener, integrating, lags)]
     ]
-    return min(fits, key=lambda fit: fit.chi_square + fit.parameters.size * math.log(2 * len(points)))
+    return not_excluded(fits)
+
+
+def not_excluded(fits: Sequence[PlantFit]) -> PlantFit:
+    """Return the fit with the smallest criterion, with the others that the data do not exclude beside it."""
+    best = min(fits, key=lambda fit: fit.criterion)
+    return replace(
+        best, others=tuple(fit for fit in fits if fit is not best and fit.criterion - best.criterion < EXCLUDED)
+    )
 
 
 def _whitener(point: FrequencyPoint) -> FloatArray:
@@ -140,8 +204,6 @@ def _fit_structure(
     def fit(sign: int, ratios: Sequence[float]) -> OptimizeResult:
         start = np.array([0.0, *(math.log(ratio / middle) for ratio in ratios), 0.1 / middle])
         start[0] = float(np.mean(np.log(np.abs(measured / _response(omega, start, sign, integrating)))))
-        lower = np.array([-np.inf, *[math.log(1e-3 / omega[-1])] * lags, 0.0])
-        upper = np.array([np.inf, *[math.log(1e3 / omega[0])] * lags, 2 * np.pi / omega[0]])
 
         def residuals(x: FloatArray) -> FloatArray:
             return whitened(_response(omega, x, sign, integrating) - measured)
@@ -158,19 +220,28 @@ def _fit_structure(
             max_nfev=60,
         )
 
+    lower = np.array([-np.inf, *[math.log(1e-3 / omega[-1])] * lags, 0.0])
+    upper = np.array([np.inf, *[math.log(1e3 / omega[0])] * lags, 2 * np.pi / omega[0]])
     starts = [(sign, ratios) for sign in (1, -1) for ratios in combinations_with_replacement((0.3, 3.0), lags)]
     sign, found = min(((sign, fit(sign, ratios)) for sign, ratios in starts), key=lambda pair: float(pair[1].cost))
     chi_square = 2 * float(found.cost)
     freedom = 2 * omega.size - found.x.size
     covariance = np.linalg.pinv(found.jac.T @ found.jac) * (max(1.0, chi_square / freedom) if freedom > 0 else 1.0)
+
+    def build(x: FloatArray) -> TransferFunction:
+        return _plant(x, sign, integrating)
+
     return PlantFit(
-        plant=_plant(found.x, sign, integrating),
+        plant=build(found.x),
         integrating=integrating,
         parameters=np.asarray(found.x, dtype=np.float64),
         covariance=np.asarray(covariance, dtype=np.float64),
         sign=sign,
         chi_square=chi_square,
         degrees_of_freedom=max(freedom, 0),
+        bounds=np.stack((lower, upper)),
+        build=build,
+        criterion=chi_square + found.x.size * math.log(2 * omega.size),
     )
 
 

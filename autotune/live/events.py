@@ -163,7 +163,7 @@ class Analysed(_WithPoints):
 
     event: Literal["analysis"]
     plant: Plant
-    reduced: Plant
+    reduced: Plant | None
     controller: Gains
 
 

@@ -165,7 +165,8 @@ class Story:
                 self._progress(event)
             case Analysed():
                 self.points = event.points
-                self.plant, self.reduced = event.plant.transfer_function(), event.reduced.transfer_function()
+                self.plant = event.plant.transfer_function()
+                self.reduced = event.reduced.transfer_function() if event.reduced is not None else None
                 self.controller = event.controller.controller()
                 self.sign = 1 if self.controller.K > 0 else -1
                 self.message = "controller designed"

@@ -3,6 +3,7 @@
 from autotune.pipeline.analysis import Analysis, analyse
 from autotune.pipeline.deployment import hand_over
 from autotune.pipeline.folder import JOURNAL, PROGRESS, RECORDING, RESULT, VERIFICATION, recordings
+from autotune.pipeline.measured import Measured, measured_of
 from autotune.pipeline.result import analysis_json, write_result
 from autotune.pipeline.run import DECISION_S, Tuning, tune
 
@@ -14,10 +15,12 @@ __all__ = [
     "RESULT",
     "VERIFICATION",
     "Analysis",
+    "Measured",
     "Tuning",
     "analyse",
     "analysis_json",
     "hand_over",
+    "measured_of",
     "recordings",
     "tune",
     "write_result",

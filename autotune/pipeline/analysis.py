@@ -1,62 +1,83 @@
-"""From frequency points to a checked controller, without a rig: fit, reduce, design, validate."""
+"""From frequency points or a fitted plant to a checked controller, without a rig: fit, reduce, design, check."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Literal, TypeAlias, TypeVar
 
 import numpy as np
 
 from autotune.config.procedure import DesignSettings
 from autotune.controller import PIDController
+from autotune.design.checks import Check, checks
 from autotune.design.margins import Margins, margins
+from autotune.design.noise import LoopFacts, default_noise_gain
 from autotune.design.nugap import Validation, loop_scaling, validate
+from autotune.design.on_fit import PROBABILITY, design_on_fit
 from autotune.design.robust import design_on_points
 from autotune.design.specification import Design, Specification
 from autotune.design.synthesis import design
-from autotune.errors import AutotuneError
+from autotune.errors import AutotuneError, DesignError
 from autotune.identification.parametric import PlantFit, fit_plant
 from autotune.identification.reduction import ReducedModel, reduce_points
 from autotune.points import FrequencyPoint
 
 #: Below this phase [deg] a PI has no use for a point, and another turn could not be told from a rise.
 LOWEST_PHASE_DEG = -270.0
+#: A loop whose delay margin is below so many samples is not the continuous one that was designed.
+_SAMPLES_OF_DELAY = 2.0
+
+_T = TypeVar("_T")
+Source: TypeAlias = Literal["reduced model", "points", "fitted plant"]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Analysis:
-    """What follows from the points alone, without a rig.
+    """What follows from the measurements alone, without a rig.
 
     Attributes
     ----------
     points : tuple of FrequencyPoint
-        What was measured.
+        What was measured; may be empty where the plant was fitted to a recording.
     fit : PlantFit
-        Transfer function through the points, for predictions.
-    reduced : ReducedModel
-        Model whose margins are a guarantee.
+        Transfer function through the points or the recording, for predictions and as a last check.
+    reduced : ReducedModel or None
+        Model whose margins are a guarantee; None where the points give none.
     design : Design
-        Controller, by default on the reduced model.
+        Controller.
+    source : {"reduced model", "points", "fitted plant"}
+        What the controller was designed on.
     alternatives : tuple of (str, Design or str)
-        What other bases of the design give: the reduced model, the points, the fitted plant held for true; or why not.
+        What other bases of the design give: the reduced model, the points, the fitted plant; or why not.
     margins : Margins
         Of the controller on the fitted plant.
-    unscaled, scaled : Validation
+    checks : tuple of Check
+        Of the controller on everything that was measured.
+    unscaled, scaled : Validation or None
         Criterion (10) in the units of the signals, and scaled as the loop itself weighs them at its crossover.
+    noise_source : str
+        Where the noise gain comes from.
     warnings : tuple of str
-        What the reader should know.
+        What the reader should know before relying on it.
+    notes : tuple of str
+        What limits the controller, in words for the terminal.
     """
 
     points: tuple[FrequencyPoint, ...]
     fit: PlantFit
-    reduced: ReducedModel
+    reduced: ReducedModel | None
     design: Design
+    source: Source
     alternatives: tuple[tuple[str, Design | str], ...]
     margins: Margins
-    unscaled: Validation
-    scaled: Validation
+    checks: tuple[Check, ...]
+    unscaled: Validation | None
+    scaled: Validation | None
+    noise_source: str
     warnings: tuple[str, ...]
+    notes: tuple[str, ...] = ()
 
     @property
     def controller(self) -> PIDController:
@@ -64,69 +85,200 @@ class Analysis:
         return self.design.controller
 
 
-def specification(settings: DesignSettings) -> Specification:
-    """Return the constraints that the configuration asks for."""
+def specification(
+    settings: DesignSettings, plant: PlantFit, facts: LoopFacts, highest_rad_s: float
+) -> tuple[Specification, str]:
+    """Return the constraints that the configuration asks for, and where the noise gain comes from."""
     modulus, phase_rad = settings.margins
-    return Specification(modulus_margin=modulus, phase_margin_rad=phase_rad, noise_gain=settings.noise_gain)
+    noise_gain, words = settings.noise_gain, "asked for"
+    if noise_gain is None:
+        noise_gain, words = default_noise_gain(plant.plant, facts, highest_rad_s)
+    asked = Specification(
+        modulus_margin=modulus,
+        phase_margin_rad=phase_rad,
+        noise_gain=noise_gain,
+        noise_frequency_rad_s=settings.noise_frequency_rad_s,
+        delay_margin_s=_SAMPLES_OF_DELAY * (facts.sample_time_s or 0.0),
+    )
+    return asked, words
 
 
-def analyse(points: Sequence[FrequencyPoint], settings: DesignSettings, *, compare: bool = True) -> Analysis:
-    """Fit, reduce, design and validate.
+def analyse(
+    points: Sequence[FrequencyPoint],
+    settings: DesignSettings,
+    *,
+    fit: PlantFit | None = None,
+    facts: LoopFacts | None = None,
+    compare: bool = True,
+) -> Analysis:
+    """Fit, reduce, design and check.
 
     Parameters
     ----------
     points : sequence of FrequencyPoint
-        At least three, spanning -135 degrees; those past -270 degrees are left out, with a warning.
+        At least three, or none where ``fit`` is given; those past -270 degrees are left out, with a warning.
     settings : DesignSettings
-        Structure, specification, and whether to design on the reduced model or straight on the points.
+        Structure, specification, and what to design on.
+    fit : PlantFit, optional
+        Plant fitted to a recording; fitted to the points where absent.
+    facts : LoopFacts, optional
+        Noise, range and sample time, for what the settings leave open.
     compare : bool
         Whether to design on the other bases too; the design on the points takes more than all the rest.
 
     Raises
     ------
     IdentificationError, DesignError
-        The points do not determine a model, or no controller meets the specification.
+        The measurements do not determine a model, or no controller keeps the specification on all of them.
     """
     measured = sorted(points, key=lambda point: point.omega_rad_s)
-    points = of_use(measured)
-    left_out = len(measured) - len(points)
+    usable = of_use(measured)
+    left_out = len(measured) - len(usable)
     beyond = (f"{left_out} points past {LOWEST_PHASE_DEG:g} deg were left out: a PI has no use for them",)
-    fit = fit_plant(points)
-    reduced = reduce_points(points)
-    H_r = reduced.transfer_function()
-    wanted, kind = specification(settings), settings.kind
-    bases: dict[str, Callable[[], Design]] = {
-        "reduced model": lambda: design(H_r, wanted, kind),
-        "points": lambda: design_on_points(points, wanted, kind),
-        "fitted plant": lambda: design(fit.plant, wanted, kind, certificate=False),
-    }
-    designed = bases.pop(settings.source)()
-    controller = designed.controller
-    achieved = margins(fit.plant, controller)
+    fit = fit_plant(usable) if fit is None else fit
+    asked, noise_source = specification(settings, fit, facts or LoopFacts(), _highest(usable, fit, facts))
+    reduced = _reduced(usable)
+    bases = _bases(usable, fit, reduced, asked, settings)
+    source, found, looked = _first_kept(bases, settings, usable, fit)
+    model = reduced if isinstance(reduced, ReducedModel) else None
+    H_r = None if model is None else model.transfer_function()
+    controller = found.controller
+    others = tuple((name, _or_reason(make)) for name, make in bases.items() if name != source) if compare else ()
     return Analysis(
         points=tuple(measured),
         fit=fit,
-        reduced=reduced,
-        design=designed,
-        alternatives=tuple((name, _or_reason(make)) for name, make in bases.items()) if compare else (),
-        margins=achieved,
-        unscaled=validate(fit.plant, H_r, controller),
-        scaled=validate(fit.plant, H_r, controller, scaling=loop_scaling(H_r, controller)),
-        warnings=(*(beyond if left_out else ()), *reduced.warnings),
+        reduced=model,
+        design=found,
+        source=source,
+        alternatives=others,
+        margins=margins(fit.plant, controller, noise_frequency_rad_s=asked.noise_frequency_rad_s),
+        checks=looked,
+        unscaled=None if H_r is None else validate(fit.plant, H_r, controller),
+        scaled=None if H_r is None else validate(fit.plant, H_r, controller, scaling=loop_scaling(H_r, controller)),
+        noise_source=noise_source,
+        warnings=(
+            *(beyond if left_out else ()),
+            *(model.warnings if source == "reduced model" and model is not None else ()),
+        ),
+        notes=_binding_words(found, noise_source),
     )
+
+
+def _highest(points: Sequence[FrequencyPoint], fit: PlantFit, facts: LoopFacts | None) -> float:
+    """Return the highest frequency [rad/s] at which something is known of the plant: a tenth of the sampling rate."""
+    if fit.source == "recording" and facts is not None and facts.sample_time_s:
+        return 0.2 * math.pi / facts.sample_time_s
+    return points[-1].omega_rad_s
+
+
+def _bases(
+    points: Sequence[FrequencyPoint],
+    fit: PlantFit,
+    reduced: ReducedModel | AutotuneError,
+    asked: Specification,
+    settings: DesignSettings,
+) -> dict[Source, Callable[[], Design]]:
+    """Return the ways to a controller, the one to try first before the others.
+
+    Points of a sweep bound every process of a wide class, which is the stronger guarantee; points of a plain recording
+    are few and wide, and the plant fitted to the whole of it knows far more.
+    """
+
+    def on_reduced() -> Design:
+        if isinstance(reduced, AutotuneError):
+            raise reduced
+        if settings.kind != "pi":
+            raise DesignError(
+                "a PID is not of class (2), so that margins on the reduced model are no guarantee",
+                where="reduced model",
+                remedy="design it on the points or on the fitted plant",
+            )
+        H_r = reduced.transfer_function()
+        found = design(H_r, asked, "pi", also=(fit.plant,))
+        return replace(found, margins=margins(H_r, found.controller))  # the fitted plant's own are beside them
+
+    ways: dict[Source, Callable[[], Design]] = {
+        "points": lambda: design_on_points(points, asked, settings.kind),
+        "fitted plant": lambda: design_on_fit(fit, asked, settings.kind),
+        "reduced model": on_reduced,
+    }
+    return {name: ways[name] for name in sorted(ways, key=lambda name: fit.source == "recording" and name == "points")}
+
+
+def _first_kept(
+    bases: dict[Source, Callable[[], Design]],
+    settings: DesignSettings,
+    points: Sequence[FrequencyPoint],
+    fit: PlantFit,
+) -> tuple[Source, Design, tuple[Check, ...]]:
+    """Return the first design whose margins are kept on everything measured; refuse where there is none."""
+    names = list(bases) if settings.source == "auto" else [settings.source]
+    reason: AutotuneError | None = None
+    for name in names:
+        try:
+            found = bases[name]()
+        except AutotuneError as error:
+            reason = reason or error
+            continue
+        looked = _checks(name, points, fit, found.controller, found.specification)
+        missed = [check for check in looked if not check.kept]
+        if not missed:
+            return name, found, looked
+        reason = reason or DesignError(
+            f"the controller designed on the {name} misses the margins: " + "; ".join(one.sentence for one in missed),
+            where="last check",
+            remedy="measure more points, or with smaller regions",
+        )
+    assert reason is not None
+    raise reason
+
+
+def _checks(
+    source: Source, points: Sequence[FrequencyPoint], fit: PlantFit, controller: PIDController, asked: Specification
+) -> tuple[Check, ...]:
+    region = PROBABILITY if source == "fitted plant" else None  # the others bound more than the fit's structure
+    return checks(points, fit, controller, asked, probability=region)
+
+
+def looked_at(analysis: Analysis, controller: PIDController) -> tuple[Check, ...]:
+    """Return the checks of another controller than the designed one, as of gains that a rig rounds."""
+    asked = analysis.design.specification
+    return _checks(analysis.source, of_use(analysis.points), analysis.fit, controller, asked)
+
+
+def _binding_words(design: Design, noise_source: str) -> tuple[str, ...]:
+    """Return what to say of the constraints that hold the controller back."""
+    if not design.binding:
+        return ()
+    words = f"what limits the controller: {', '.join(design.binding)}"
+    if "noise gain" in design.binding:
+        words += f" (at most {design.specification.noise_gain:.4g}: {noise_source}; --noise-gain sets another)"
+    if "delay margin" in design.binding:
+        words += f" ({_SAMPLES_OF_DELAY:g} samples: a faster sample time would allow more)"
+    return (words,)
 
 
 def of_use(points: Sequence[FrequencyPoint]) -> list[FrequencyPoint]:
     """Return the points up to the frequency where the plant's phase, unwrapped from the lowest, is below -270 deg."""
     ordered = sorted(points, key=lambda point: point.omega_rad_s)
+    if not ordered:
+        return []
     phase = np.degrees(np.unwrap([point.phase_rad for point in ordered]))
     of_positive_gain = phase - 180.0 * math.ceil((phase[0] - 30.0) / 180.0)
     beyond = np.flatnonzero(of_positive_gain < LOWEST_PHASE_DEG)
     return ordered[: int(beyond[0])] if beyond.size else ordered
 
 
-def _or_reason(make: Callable[[], Design]) -> Design | str:
-    """Return a design for comparison, or why there is none; only the one asked for may stop a run."""
+def _reduced(points: Sequence[FrequencyPoint]) -> ReducedModel | AutotuneError:
+    """Return the reduced model of the points, or why there is none."""
+    try:
+        return reduce_points(points)
+    except AutotuneError as error:
+        return error
+
+
+def _or_reason(make: Callable[[], _T]) -> _T | str:
+    """Return what is made, or why it cannot be; only what was asked for may stop a run."""
     try:
         return make()
     except AutotuneError as error:

@@ -12,7 +12,7 @@ from autotune.design.nugap import loop_scaling, validate
 from autotune.errors import InputError
 from autotune.experiment.rig import Rig, RoundsGains
 from autotune.identification.parametric import PlantFit
-from autotune.pipeline.analysis import Analysis
+from autotune.pipeline.analysis import Analysis, looked_at
 
 #: largest relative change of a gain by rounding; a fifth of the gain is a fifth of the disturbance's area
 MOVED = 0.2
@@ -64,21 +64,23 @@ def on_registers(analysis: Analysis, held: PIDController) -> Analysis:
     """Return the analysis with the gains as the rig holds them, and their margins in place of the exact gains'."""
     if held == analysis.controller:
         return analysis
-    plant, H_r = analysis.fit.plant, analysis.reduced.transfer_function()
-    with_reduced = margins(H_r, held)
+    plant = analysis.fit.plant
+    H_r = None if analysis.reduced is None else analysis.reduced.transfer_function()
+    rounded = margins(H_r if H_r is not None and analysis.source == "reduced model" else plant, held)
     said = "the norm and the margins are those of the gains as the rig's registers hold them"
     return replace(
         analysis,
         design=replace(
             analysis.design,
             controller=held,
-            margins=with_reduced,
-            h2=with_reduced.h2,
+            margins=rounded,
+            h2=rounded.h2,
             certificate="; ".join(part for part in (analysis.design.certificate, said) if part),
         ),
         margins=margins(plant, held),
-        unscaled=validate(plant, H_r, held),
-        scaled=validate(plant, H_r, held, scaling=loop_scaling(H_r, held)),
+        checks=looked_at(analysis, held),
+        unscaled=None if H_r is None else validate(plant, H_r, held),
+        scaled=None if H_r is None else validate(plant, H_r, held, scaling=loop_scaling(H_r, held)),
     )
 
 
@@ -105,6 +107,6 @@ def _lost(exact: PIDController, held: PIDController, settings: DesignSettings, f
     if after.phase_rad < min(wanted_phase_rad, KEPT * before.phase_rad):
         phases = [math.degrees(m.phase_rad) for m in (after, before)]
         return f"the rounded gains have a phase margin of {phases[0]:.1f} deg in place of {phases[1]:.1f} deg"
-    if after.noise_gain > max(settings.noise_gain, before.noise_gain / KEPT):
+    if after.noise_gain > max(settings.noise_gain or 0.0, before.noise_gain / KEPT):
         return f"the rounded gains amplify noise {after.noise_gain:.3g} times in place of {before.noise_gain:.3g}"
     return ""

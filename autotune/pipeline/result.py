@@ -57,10 +57,13 @@ def write_json(content: dict[str, Any], path: Path) -> None:
 
 def analysis_json(analysis: Analysis) -> dict[str, Any]:
     """Return the parts of ``result.json`` that follow from the points."""
-    reduced, scaled = analysis.reduced, analysis.scaled
+    reduced, scaled, unscaled = analysis.reduced, analysis.scaled, analysis.unscaled
     return {
         "points": points_to_json(analysis.points),
-        "reduced_model": {
+        "fitted_plant": asdict(analysis.fit.plant),
+        "reduced_model": None
+        if reduced is None
+        else {
             "kind": "integrating" if reduced.integrating else "self-regulating",
             "G_r": reduced.G_r,
             "omega_0r_rad_s": reduced.omega_0r_rad_s,
@@ -69,9 +72,13 @@ def analysis_json(analysis: Analysis) -> dict[str, Any]:
             "conditions": reduced.conditions,
             "evidence": reduced.evidence,
         },
-        "controller": analysis.design.to_json(),
+        "controller": analysis.design.to_json() | {"designed_on": analysis.source},
         "margins": analysis.margins.to_json(),
-        "validation": _validation_json(scaled) | {"unscaled": _validation_json(analysis.unscaled)},
+        "noise_gain": {"at_most": analysis.design.specification.noise_gain, "from": analysis.noise_source},
+        "checks": [check.to_json() for check in analysis.checks],
+        "validation": None
+        if scaled is None or unscaled is None
+        else _validation_json(scaled) | {"unscaled": _validation_json(unscaled)},
     }
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from autotune.config import Config
 from autotune.controller import PIDController
+from autotune.design.noise import LoopFacts
 from autotune.errors import AutotuneError, ExperimentStopped, OperatorStop
 from autotune.experiment.cycles import Earlier
 from autotune.experiment.result import ExperimentResult
@@ -141,12 +142,12 @@ def _tune(
         if missing_phases(config, earlier):
             log.recording(recording)
         experiment = run_experiment(rig, config, recording, earlier=earlier, on_progress=on_progress)
-        analysis = analyse(experiment.points, config.design)
+        analysis = analyse(experiment.points, config.design, facts=_facts(config, experiment))
         if deploy:  # what the rig can hold is what is verified, reported and handed over
             held = held_by(rig, analysis.controller, config.design, fit=analysis.fit)
             analysis = on_registers(analysis, held)
-        plant, reduced = analysis.fit.plant, analysis.reduced.transfer_function()
-        log.analysed(analysis.points, plant, reduced, analysis.controller)
+        reduced = None if analysis.reduced is None else analysis.reduced.transfer_function()
+        log.analysed(analysis.points, analysis.fit.plant, reduced, analysis.controller)
         verification = None
         if verify:
             verification = run_verification(
@@ -189,4 +190,12 @@ def _tune(
         ) from None
     return Tuning(
         experiment=experiment, analysis=analysis, verification=verification, old_controller=old, deployed=deployed
+    )
+
+
+def _facts(config: Config, experiment: ExperimentResult) -> LoopFacts:
+    return LoopFacts(
+        noise_sd=experiment.noise_sd,
+        u_range=config.limits.u_max - config.limits.u_min,
+        sample_time_s=config.signals.sample_time_s,
     )

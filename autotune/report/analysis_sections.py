@@ -15,6 +15,7 @@ from autotune.controller import PIDController
 from autotune.design.margins import margins
 from autotune.design.nugap import Validation
 from autotune.experiment.result import ExperimentResult
+from autotune.identification.parametric import PlantFit
 from autotune.pipeline import Analysis
 from autotune.points import FrequencyPoint
 from autotune.report.figures import Curve, bode_figure, frequencies, nichols_figure, nyquist_figure, sensitivity_figure
@@ -54,9 +55,17 @@ def analysis_sections(
     )
 
 
+def _grid(analysis: Analysis, decades: float) -> FloatArray:
+    """Return the frequencies of a figure [rad/s]: around the points, or around the crossover for a fit in time."""
+    if analysis.points and analysis.fit.source == "points":
+        return frequencies(analysis.points, decades)
+    crossover = analysis.margins.crossover_rad_s
+    return np.geomspace(crossover * 10 ** (-decades - 1.0), crossover * 10 ** (decades + 0.3), 400, dtype=np.float64)
+
+
 def _points_section(analysis: Analysis, signals: SignalSettings, experiment: ExperimentResult | None) -> Section:
     sign = analysis.fit.sign
-    omega = frequencies(analysis.points)
+    omega = _grid(analysis, 0.7)
     described = _described(experiment, sign) if experiment else ()
     estimates = _by_source(analysis.points)
     if described:
@@ -64,7 +73,7 @@ def _points_section(analysis: Analysis, signals: SignalSettings, experiment: Exp
     gain_unit = f"{signals.y_unit}/{signals.u_unit}" if signals.u_unit and signals.y_unit else ""
     curves = (
         Curve(name="fitted plant", system=analysis.fit.plant, colour=GREY, dash="dot"),
-        Curve(name="reduced model", system=analysis.reduced, colour=GREEN),
+        *([] if analysis.reduced is None else [Curve(name="reduced model", system=analysis.reduced, colour=GREEN)]),
     )
     return Section(
         title="Bode points",
@@ -165,6 +174,16 @@ def _wrapped(angle_rad: float) -> float:
 
 def _model_section(analysis: Analysis) -> Section:
     reduced, fit = analysis.reduced, analysis.fit
+    fitted = (
+        f"A transfer function was fitted through the {'points' if fit.source == 'points' else 'recording'}:"
+        f" {_transfer_text(fit)}; chi-square {fit.chi_square:.1f} with {fit.degrees_of_freedom} degrees of freedom."
+        + (f" {len(fit.others)} other structure(s) are not excluded by the data." if fit.others else "")
+    )
+    if reduced is None or analysis.unscaled is None or analysis.scaled is None:
+        why = dict(analysis.alternatives).get("reduced model", "")
+        return Section(
+            title="Model", text=(fitted, f"There is no reduced model: {why}." if isinstance(why, str) and why else "")
+        )
     lag = [] if reduced.omega_0r_rad_s is None else [("ω_0r [rad/s]", f"{reduced.omega_0r_rad_s:.4g}", "")]
     ball_paper = ("-65", "5.17") if reduced.integrating else ("", "")
     return Section(
@@ -172,8 +191,7 @@ def _model_section(analysis: Analysis) -> Section:
         text=(
             f"Structure: {'(24), integrating' if reduced.integrating else '(8), self-regulating'} ({reduced.evidence}),"
             f" under the conditions (5) on the {reduced.conditions}.",
-            f"For predictions, a transfer function was fitted through the points: {_transfer_text(fit)};"
-            f" chi-square {fit.chi_square:.1f} with {fit.degrees_of_freedom} degrees of freedom.",
+            fitted,
         ),
         tables=(
             Table(
@@ -209,22 +227,34 @@ def _validation_row(validation: Validation) -> tuple[str, str, str, str, str]:
     )
 
 
-def _transfer_text(fit: Any) -> str:
-    lags = ", ".join(f"{math.exp(value):.3g} s" for value in fit.parameters[1:-1])
-    kind = "integrator" if fit.integrating else "no integrator"
-    return (
-        f"gain {fit.sign * math.exp(fit.parameters[0]):.4g}, {kind}, lags {lags or 'none'},"
-        f" dead time {fit.plant.delay_s:.3g} s"
+def _transfer_text(fit: PlantFit) -> str:
+    plant = fit.plant
+    slow = [p for p in plant.poles if p != 0.0 and p.imag >= 0.0]
+    lags = ", ".join(
+        f"{-1.0 / p.real:.3g} s" if p.imag == 0.0 else f"{abs(p):.3g} rad/s with damping {-p.real / abs(p):.2g}"
+        for p in slow
     )
+    gain = plant.num[-1] / plant.den[-1 - plant.integrators]
+    kind = "integrator" if plant.integrators else "no integrator"
+    return f"gain {gain:.4g}, {kind}, lags {lags or 'none'}, dead time {plant.delay_s:.3g} s"
 
 
 def _loop_section(analysis: Analysis) -> Section:
     controller, spec = analysis.controller, analysis.design.specification
-    omega = frequencies(analysis.points, 1.3)
+    omega = _grid(analysis, 1.3)
     loops = (
         Curve(name="fitted plant", system=_Loop(plant=analysis.fit.plant, controller=controller), colour=BLUE),
-        Curve(
-            name="reduced model", system=_Loop(plant=analysis.reduced, controller=controller), colour=GREEN, dash="dash"
+        *(
+            []
+            if analysis.reduced is None
+            else [
+                Curve(
+                    name="reduced model",
+                    system=_Loop(plant=analysis.reduced, controller=controller),
+                    colour=GREEN,
+                    dash="dash",
+                )
+            ]
         ),
     )
     design, m, d = analysis.design, analysis.margins, analysis.design.margins
@@ -244,8 +274,11 @@ def _loop_section(analysis: Analysis) -> Section:
         title="Controller and margins",
         text=(
             f"Asked for: modulus margin {spec.modulus_margin:g}, phase margin"
-            f" {math.degrees(spec.phase_margin_rad):g} deg, noise gain at most {spec.noise_gain:g}."
-            f" Binding: {binding}.",
+            f" {math.degrees(spec.phase_margin_rad):g} deg, noise gain at most {spec.noise_gain:.4g}"
+            f" ({analysis.noise_source}). Binding: {binding}.",
+            "Checked: "
+            + "; ".join(f"{one.sentence}{'' if one.kept else ' (not kept)'}" for one in analysis.checks)
+            + ".",
             _certificate(analysis),
         ),
         tables=(
@@ -280,13 +313,13 @@ def _loop_section(analysis: Analysis) -> Section:
 _PROMISES = {
     "reduced model": "margins of every plant of class (1) that (5) bounds by the reduced model",
     "points": "margins of every aperiodic plant through the points' 95 % regions",
-    "fitted plant": "nothing beyond the fitted plant itself",
+    "fitted plant": "margins of every plant in the 95 % region of the fit, if its structure is right",
 }
 
 
 def _price_table(analysis: Analysis) -> Table:
     """Return what each guarantee costs: every design judged on the fitted plant."""
-    source = next(name for name in _PROMISES if name not in dict(analysis.alternatives))
+    source = analysis.source
     rows = []
     for name, found in ((source, analysis.design), *analysis.alternatives):
         if isinstance(found, str):

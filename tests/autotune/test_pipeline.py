@@ -75,7 +75,11 @@ class RefusesGains(SimulatedRig):
 
 
 def test_exact_points_of_the_ball_give_the_optimum_of_its_reduced_model() -> None:
-    analysis = analyse(points_of(BALL, np.array([0.9, 1.5, 2.4, 3.5, 5.0]), 1e-5), DesignSettings())
+    papers = DesignSettings(source="reduced model", noise_gain=0.1)
+    analysis = analyse(points_of(BALL, np.array([0.9, 1.5, 2.4, 3.5, 5.0]), 1e-5), papers)
+    assert analysis.reduced is not None
+    assert analysis.unscaled is not None
+    assert analysis.scaled is not None
     # FACTS: largest omega_d that C2 allows on (23) is 5.2138, smallest |G_r| 65.5
     assert analysis.reduced.G_r == pytest.approx(-65.5, rel=2e-3)
     assert analysis.reduced.omega_d_rad_s == pytest.approx(5.2138, rel=5e-3)
@@ -88,7 +92,7 @@ def test_exact_points_of_the_ball_give_the_optimum_of_its_reduced_model() -> Non
 
 def test_points_that_do_not_reach_135_degrees_are_refused_with_the_remedy() -> None:
     with pytest.raises(IdentificationError, match="higher frequency"):
-        analyse(points_of(BALL, np.array([0.1, 0.2, 0.3]), 1e-3), DesignSettings())
+        analyse(points_of(BALL, np.array([0.1, 0.2, 0.3]), 1e-3), DesignSettings(source="reduced model"))
 
 
 def test_a_plant_that_changed_is_noticed_and_the_old_gains_stay(tmp_path: Path) -> None:
@@ -181,6 +185,7 @@ def loaded() -> tuple[Config, Loaded]:
     config = sections(
         load_config(CONFIGS / "ball_sim.toml"),
         signals={"sample_time_s": 0.03}, experiment={"points": 3, "budget_s": 25.0}, verification={"duration_s": 8.0},
+        design={"source": "reduced model", "noise_gain": 0.1},  # a slow loop, whose test lasts beyond the load
     )  # fmt: skip
     return config, Loaded(make_plant("ball", seed=4, noise=0.1), u_safe=0.0, controller=OLD)
 

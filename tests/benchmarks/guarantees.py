@@ -59,7 +59,9 @@ def plants(kind: str, count: int) -> Iterator[TransferFunction]:
         yield TransferFunction(num=num, den=tuple(den), delay_s=delay * scale)
 
 
-def relay_points(plant: TransferFunction, rng: np.random.Generator, highest_deg: float = -160.0) -> list[FrequencyPoint]:
+def relay_points(
+    plant: TransferFunction, rng: np.random.Generator, highest_deg: float = -160.0
+) -> list[FrequencyPoint]:
     """Five points as a relay sweep gives them: phases -105 to -160 degrees, 0.4 % and 0.25 degrees."""
     corners = np.abs(np.concatenate((plant.poles, plant.zeros)))
     corners = np.append(corners[corners > 0.0], 1.0 / plant.delay_s if plant.delay_s > 0.0 else corners.max())

@@ -1,0 +1,103 @@
+"""Synthesis on a fitted plant and its region: margins for every plant on the border of what the data leave possible.
+
+The parameters of a fit are known to a joint region, and other structures may not be excluded by the data. The
+controller minimises the norm on the estimate while the plants on the border of those regions keep the margins too. It
+is visited in many directions, but only the few plants that bind become constraints (a cutting-plane method: what is
+violated is added until nothing is).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from autotune.arrays import FloatArray
+from autotune.controller import PIDController
+from autotune.design.figures import columns
+from autotune.design.kernels import SampledPlant, evaluate_grid, sampled_plant
+from autotune.design.specification import Design, Kind, Specification
+from autotune.design.synthesis import design
+from autotune.errors import DesignError
+from autotune.identification.parametric import PlantFit
+from autotune.models import TransferFunction
+
+PROBABILITY = 0.95
+_ROUNDS = 8
+#: a plant of the region that misses a constraint by less is not worth another round; the answer says what is kept
+_TOLERANCE = 2e-3
+
+
+def design_on_fit(
+    fit: PlantFit, specification: Specification, kind: Kind = "pi", *, probability: float = PROBABILITY
+) -> Design:
+    """Return the controller with the smallest norm on the estimate that keeps the constraints on the whole region.
+
+    Parameters
+    ----------
+    fit : PlantFit
+        Estimate, region, and the structures that the data do not exclude.
+    specification : Specification
+        Constraints (18).
+    kind : {"pi", "pid"}
+        Structure of the controller.
+    probability : float
+        Of the joint region of a structure's parameters.
+
+    Returns
+    -------
+    Design
+        Its margins are those of the worst plant of the region; its norm is the estimate's.
+
+    Raises
+    ------
+    DesignError
+        Nothing of this structure keeps the constraints on the region; names the nearest specification.
+
+    Notes
+    -----
+    The guarantee is that of the structures: a plant that none of them can follow is not covered, which
+    :func:`autotune.design.robust.design_on_points` is for.
+    """
+    members = fit.border(probability)
+    sampled = [sampled_plant(one, specification.largest_gain) for one in members]
+    chosen: list[int] = []
+    for _ in range(_ROUNDS):
+        found = design(fit.plant, specification, kind, also=[members[i] for i in chosen], certificate=False)
+        slack = _slacks(sampled, found.controller, specification)
+        worst = {int(i) for i in np.argmin(slack, axis=0) if np.min(slack[i]) < -_TOLERANCE}
+        if worst <= set(chosen):
+            break
+        chosen += sorted(worst - set(chosen))
+    if np.min(slack) < -2.0 * _TOLERANCE:
+        raise DesignError(
+            "no controller was found that keeps the margins on the whole region of the fitted plant",
+            where="synthesis",
+            remedy="record longer, or with larger steps of the command",
+        )
+    return replace(
+        found,
+        certificate=f"margins hold on the border of the {100 * probability:g} % region of the fitted plant; no lower "
+        "bound on the norm",
+    )
+
+
+def worst_of(
+    members: Sequence[TransferFunction], controller: PIDController, specification: Specification
+) -> tuple[TransferFunction, ...]:
+    """Return the members on which one margin or another is smallest with the controller, three at most."""
+    sampled = [sampled_plant(one, specification.largest_gain) for one in members]
+    slack = _slacks(sampled, controller, specification)
+    return tuple(members[i] for i in sorted({int(i) for i in np.argmin(slack, axis=0)}))
+
+
+def _slacks(sampled: Sequence[SampledPlant], controller: PIDController, specification: Specification) -> FloatArray:
+    """Return (S, 3) slacks of the margins (modulus, phase, delay) of one controller on sampled plants."""
+    c = controller
+    rows = []
+    for s in sampled:
+        grid = np.array([[c.K * s.sign, c.Ti_s, c.Td_s, c.Tf_s]])
+        figures = columns(evaluate_grid(s.omega, s.h, s.weights, s.turn, grid, -1.0))
+        rows.append(specification.slacks(figures)[0, [0, 1, 3]])
+    return np.array(rows)

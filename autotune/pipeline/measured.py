@@ -1,0 +1,91 @@
+"""What files say about a plant: frequency points, a fit of plain recordings, noise and range of the command."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from autotune.design.noise import LoopFacts, noise_of
+from autotune.errors import AutotuneError
+from autotune.identification.frequency.recorded import FrequencyEstimate, combine, session_points, sessions
+from autotune.identification.parametric import PlantFit
+from autotune.identification.recorded_plant import fit_recordings
+from autotune.points import FrequencyPoint
+from autotune.recording import Recording
+
+#: recordings whose points say less than a fit of the whole record does
+_PLAIN = ("random or steps", "repeated command")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Measured:
+    """What :func:`autotune.pipeline.analyse` is given.
+
+    Attributes
+    ----------
+    points : tuple of FrequencyPoint
+        Of all recordings and files.
+    fit : PlantFit or None
+        Of plain recordings; None where the points are to be fitted.
+    facts : LoopFacts
+        Noise, span of the command and sample time of the recordings.
+    notes : tuple of str
+        What was left out, and why.
+    """
+
+    points: tuple[FrequencyPoint, ...]
+    fit: PlantFit | None
+    facts: LoopFacts
+    notes: tuple[str, ...]
+
+
+def measured_of(recordings: Sequence[Recording], given: Sequence[FrequencyPoint] = ()) -> Measured:
+    """Return what recordings and given points say about their plant.
+
+    Parameters
+    ----------
+    recordings : sequence of Recording
+        Relay experiments, closed loops with a set-point that moves, or plain recordings with a command that moves.
+    given : sequence of FrequencyPoint
+        Points of other files.
+
+    Raises
+    ------
+    AutotuneError
+        Neither points nor a fit can be had of them.
+    """
+    estimates: list[FrequencyEstimate] = []
+    notes: list[str] = []
+    reason: AutotuneError | None = None
+    for session in sessions(recordings):
+        try:
+            estimates.append(session_points(session))
+        except AutotuneError as error:
+            reason = reason or error
+            notes.append(f"no frequency points: {error}")
+    combined = combine(estimates) if estimates else None
+    fit: PlantFit | None = None
+    if recordings and not given and all(one.excitation in _PLAIN for one in estimates):
+        try:
+            fit = fit_recordings(recordings)
+        except AutotuneError as error:
+            notes.append(str(error))
+            reason = reason or error
+    points = (*(combined.points if combined else ()), *given)
+    if fit is None and not points and reason is not None:
+        raise reason
+    return Measured(
+        points=points, fit=fit, facts=_facts(recordings), notes=(*notes, *(combined.notes if combined else ()))
+    )
+
+
+def _facts(recordings: Sequence[Recording]) -> LoopFacts:
+    if not recordings:
+        return LoopFacts()
+    return LoopFacts(
+        noise_sd=float(np.median([noise_of(one.y) for one in recordings])),
+        u_span=max(float(np.ptp(one.u)) for one in recordings),
+        sample_time_s=max(one.sample_time_s for one in recordings),
+    )
