@@ -37,8 +37,8 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_one_command_ends_with_a_verified_controller_and_every_file(finished: Path) -> None:
     result = json.loads((finished / "result.json").read_text())
     assert set(result) == {
-        "points", "fitted_plant", "reduced_model", "noise_gain", "checks", "controller", "margins", "validation",
-        "verification", "experiment",
+        "points", "designed_on", "fitted_plant", "reduced_model", "noise_gain", "checks", "controller", "margins",
+        "validation", "verification", "experiment",
     }  # fmt: skip
     assert len(result["points"]) == 5
     assert result["verification"]["accepted"]
@@ -48,7 +48,7 @@ def test_one_command_ends_with_a_verified_controller_and_every_file(finished: Pa
     assert result["reduced_model"]["G_r"] == pytest.approx(-66.0, rel=0.02)
     assert result["reduced_model"]["omega_d_rad_s"] == pytest.approx(5.15, rel=0.03)
     # straight on the points: between the -0.025 of the reduced model and the -0.0368 of the plant known exactly
-    assert result["controller"]["designed_on"] == "points"
+    assert result["designed_on"] == "points"
     assert -0.0368 < result["controller"]["K"] < -0.028
     assert all(check["kept"] for check in result["checks"])
     for name in ("recording.csv", "recording.toml", "verification.csv", "journal.jsonl", "report.html"):
