@@ -27,7 +27,7 @@ from autotune.text_files import reason
 _NO_LINKS = (errno.EPERM, errno.ENOTSUP, errno.EOPNOTSUPP, errno.EACCES, errno.EMLINK, errno.ENOSYS, errno.EXDEV)
 
 
-def write_whole(path: str | os.PathLike[str], content: str | bytes) -> None:
+def write_whole(path: str | os.PathLike[str], content: str | bytes, *, sync: bool = True) -> None:
     """Write a file whole or not at all: beside its place, brought to the disk, renamed; an existing one is replaced.
 
     Parameters
@@ -36,6 +36,9 @@ def write_whole(path: str | os.PathLike[str], content: str | bytes) -> None:
         Place of the file; commands claim theirs by :class:`Output` or :class:`OutputFolder` first.
     content : str or bytes
         A text is written as UTF-8.
+    sync : bool
+        Whether to wait until it is on the disk, which takes 10 to 100 ms; without, it outlives a killed process and not
+        a power failure. A control loop does not wait.
 
     Raises
     ------
@@ -53,7 +56,8 @@ def write_whole(path: str | os.PathLike[str], content: str | bytes) -> None:
             file.write(data)
             file.flush()
             os.fchmod(file.fileno(), 0o666 & ~_umask())
-            os.fsync(file.fileno())
+            if sync:
+                os.fsync(file.fileno())
         os.replace(part, place)
     except BaseException:
         with contextlib.suppress(OSError):

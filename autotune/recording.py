@@ -314,13 +314,14 @@ class RecordingWriter:
         append_whole(self._file, f"# {text}\n".replace("\r", " ").encode())
 
     def note(self, metadata: Mapping[str, Any]) -> None:
-        """Add what is known so far to the sidecar; a process killed later leaves it there."""
+        """Add what is known so far to the sidecar; a process killed later leaves it there; no disk is waited for."""
         self._metadata |= metadata
-        self._write_sidecar()
+        self._write_sidecar(sync=False)
 
     def finish(self, metadata: Mapping[str, Any]) -> None:
         """Add to the sidecar why the recording ended and what else is known, and close."""
-        self.note(metadata)
+        self._metadata |= metadata
+        self._write_sidecar()
         self.close()
 
     def close(self) -> None:
@@ -331,8 +332,8 @@ class RecordingWriter:
             finally:
                 self._file.close()
 
-    def _write_sidecar(self) -> None:
-        write_whole(self.path.with_suffix(".toml"), tomli_w.dumps(self._metadata))
+    def _write_sidecar(self, *, sync: bool = True) -> None:
+        write_whole(self.path.with_suffix(".toml"), tomli_w.dumps(self._metadata), sync=sync)
 
     def __enter__(self) -> RecordingWriter:
         return self

@@ -272,7 +272,7 @@ class RegisterRig:
     def _go_safe(self) -> None:
         self._is_commanding = False
         self._u = self._u_safe
-        self._command()
+        self._write(self._first_blocks)  # a device that restarted has forgotten its safe output
         for name in ("automatic", "enable"):
             if name in self._codecs:
                 self._put(name, 0.0)

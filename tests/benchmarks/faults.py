@@ -31,6 +31,8 @@ from sim.plant import make_plant
 from tests.drivers.bench import DEADMAN_S
 from tests.drivers.campaign import FAULTS, Outcome, run_fault
 from tests.drivers.ctrl_c import STATES, stop_in
+from tests.drivers.plant_campaign import PLANT_FAULTS as PLANT_CAMPAIGN
+from tests.drivers.plant_campaign import run_plant_fault
 from tests.drivers.signals import SIGNALS, is_right, strike_process
 
 CONFIG = Path(__file__).parents[2] / "configs" / "ball_sim.toml"
@@ -108,6 +110,8 @@ def main() -> None:
 
     for fault in FAULTS:
         add(fault.name, lambda seed, fault=fault: run_fault(fault, seed), _ends_as(fault.ends))  # type: ignore[misc]
+    for one in PLANT_CAMPAIGN:
+        add(one.name, lambda seed, one=one: run_plant_fault(one, seed), _ends_as(one.ends))  # type: ignore[misc]
     for number, _, _ in SIGNALS:
         add(
             f"process: {number.name if number else 'disk full'}",

@@ -8,8 +8,11 @@ applied, 2 heartbeat echo, 3 in command, 4 guard door; one count is 1e-3 of a un
 from __future__ import annotations
 
 import contextlib
+import itertools
+import json
 import socket
 import struct
+import sys
 import threading
 import time
 from collections import deque
@@ -49,6 +52,8 @@ class ScanningPlc:
         Time between two looks for a new connection [s].
     sockets : int
         Connections at a time; a further one is reset.
+    safe : float
+        Safe output that it starts with [u unit].
     deadman_s : float
         Time without a new heartbeat after which it trips, until it has seen enable at 0 in a scan [s].
     """
@@ -61,10 +66,12 @@ class ScanningPlc:
         accept_s: float = 0.0,
         sockets: int = 4,
         deadman_s: float = 1.0,
+        safe: float = 0.0,
         port: int = 0,
     ) -> None:
-        self.holding = [0] * 6
-        self.u, self.y, self.door = 0.0, 0.0, 1
+        self.holding = [0] * 5 + [round(1e3 * safe) & 0xFFFF]
+        self.history: list[tuple[float, float, str]] = []
+        self.u, self.y, self.door = safe, 0.0, 1
         self.mode = "nobody"
         self.tripped = False
         self.commands: list[float] = []
@@ -122,7 +129,8 @@ class ScanningPlc:
     def _scan(self) -> None:
         u, beat, enable, automatic, setpoint, safe = (self._signed(word) for word in self.holding)
         now_s = time.monotonic()
-        if beat != self._beat or not enable:
+        is_fed, before = beat != self._beat, (self.u, self.mode)
+        if is_fed or not enable:
             self._beat, self._beat_s = beat, now_s
         self.tripped = bool(enable) and (self.tripped or now_s - self._beat_s > self._deadman_s)
         if self.tripped or not (enable or automatic):
@@ -133,6 +141,8 @@ class ScanningPlc:
         else:  # its own controller: an integrator, bumpless from whatever was applied before
             self.mode = "controller"
             self.u += 0.5 * self._scan_s * (1e-3 * setpoint - self.y)
+        if (self.u, self.mode) != before or (is_fed and self.mode == "host"):
+            self.history.append((now_s, self.u, self.mode))
         self.y += self._scan_s / 0.2 * (self.u - self.y)
         status = [self.y * 1e3, self.u * 1e3, self.holding[1], self.mode == "host", self.door]
         self._status.append([round(value) & 0xFFFF for value in status])
@@ -213,3 +223,45 @@ def plc_settings(port: int, **changes: Any) -> Any:
     from tests.drivers.bench import tcp_settings
 
     return tcp_settings(port, REGISTERS, **({"feed_s": 0.05, "timeout_s": 1.0} | changes))
+
+
+def main() -> None:
+    """Serve one until killed, ``OPTIONS HISTORY``: its port is printed, what moves the actuator written into the file.
+
+    Lines on its standard input do to it what plants do: ``door 0``, ``reset MOMENT`` for good, ``once MOMENT``.
+    """
+    with open(sys.argv[2], "a", buffering=1) as file, ScanningPlc(**json.loads(sys.argv[1])) as plc:
+
+        def write_down(entries: list[tuple[float, float, str]]) -> None:
+            file.writelines(f"{t_s} {u} {mode}\n" for t_s, u, mode in entries)
+
+        plc.history = _Written(write_down)
+        sys.stdout.write(f"{plc.port}\n")
+        sys.stdout.flush()
+        for line in sys.stdin:
+            what, value = line.split()
+            if what == "door":
+                plc.door = int(value)
+                continue
+            left = [1] if what == "once" else itertools.repeat(1)
+            plc.reset_at = _resetting(value, left)
+
+
+class _Written(list[tuple[float, float, str]]):
+    """A history that is on the disk at once."""
+
+    def __init__(self, write: Callable[[list[tuple[float, float, str]]], None]) -> None:
+        super().__init__()
+        self._write = write
+
+    def append(self, entry: tuple[float, float, str]) -> None:
+        self._write([entry])
+
+
+def _resetting(moment: str, left: Any) -> Callable[[bytes], str]:
+    orders = iter(list(left) if isinstance(left, list) else left)
+    return lambda request: moment if next(orders, None) else ""
+
+
+if __name__ == "__main__":
+    main()

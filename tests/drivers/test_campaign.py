@@ -9,6 +9,7 @@ import pytest
 
 from tests.drivers.campaign import FAULTS, Fault, run_fault
 from tests.drivers.ctrl_c import STATES, stop_in
+from tests.drivers.plant_campaign import PLANT_FAULTS, PlantFault, run_plant_fault
 from tests.drivers.signals import SIGNALS, strike_process
 
 
@@ -17,6 +18,19 @@ def test_the_rig_is_safe_and_no_bad_sample_is_kept(fault: Fault) -> None:
     outcome = run_fault(fault, seed=5)
     assert outcome.is_good, outcome
     assert outcome.rows >= 5
+    assert any(re.search(end, outcome.ended) for end in fault.ends), outcome.ended
+    assert outcome.exit_status == (0 if outcome.ended == "completed" else 3)
+    assert "\n" not in outcome.ended
+
+
+#: those that need a process of the rig's own; the others are tests of their own
+OF_PROCESSES = tuple(fault for fault in PLANT_FAULTS if re.search("for good|process|second master", fault.name))
+
+
+@pytest.mark.parametrize("fault", OF_PROCESSES, ids=lambda fault: fault.name)
+def test_what_plants_do_leaves_the_rig_safe_and_is_said_in_one_line(fault: PlantFault) -> None:
+    outcome = run_plant_fault(fault, seed=5)
+    assert outcome.is_good, outcome
     assert any(re.search(end, outcome.ended) for end in fault.ends), outcome.ended
     assert outcome.exit_status == (0 if outcome.ended == "completed" else 3)
     assert "\n" not in outcome.ended
