@@ -16,9 +16,10 @@ from autotune.diagnosis.evidence.held_out import held_out
 from autotune.diagnosis.evidence.law import law_effect
 from autotune.diagnosis.evidence.samples import SampleEffect, inspect, jitter_effect
 from autotune.diagnosis.findings import extended_model, found_effects, offset_of
-from autotune.diagnosis.fitting.retuning import COARSE, reduced_chi2
+from autotune.diagnosis.fitting.retuning import reduced_chi2
 from autotune.diagnosis.result import Diagnosis
 from autotune.diagnosis.selection.search import Progress, Search, search
+from autotune.diagnosis.thresholds import IN_USE, Thresholds
 from autotune.diagnosis.verdict import Evidence, judged, places_of, sentences_of
 from autotune.errors import InputError
 from autotune.models import Model
@@ -26,10 +27,6 @@ from autotune.recording import Recording
 
 #: Rows that a diagnosis needs.
 LEAST_ROWS = 100
-#: Correlation of the noise from which on it is a disturbance of the plant's, not of single samples.
-SLOW_NOISE = 0.8
-#: Evidence from which on what single rows show is sure, and its share of what an effect of the chain gains.
-SURE, SAMPLE_SHARE = 60.0, 0.2
 
 
 def diagnose(
@@ -38,6 +35,7 @@ def diagnose(
     controller: Controller | None = None,
     without: Sequence[str] = (),
     progress: Progress = lambda what, share: None,
+    thresholds: Thresholds = IN_USE,
 ) -> Diagnosis:
     """Find where and why recordings differ from the simulation of a model.
 
@@ -53,6 +51,8 @@ def diagnose(
         Effects left out of the catalogue.
     progress : callable
         Told what is being done and the share done, 0 to 1.
+    thresholds : Thresholds
+        What decides between two findings.
 
     Returns
     -------
@@ -67,11 +67,11 @@ def diagnose(
     """
     _require_rows(recordings)
     progress("looking at the samples", 0.0)
-    good, seen = inspect(recordings, without)
-    found = search(model, recordings, good, [*without, *(effect.name for effect in seen)], progress)
+    good, seen = inspect(recordings, without, thresholds)
+    found = search(model, recordings, good, [*without, *(effect.name for effect in seen)], progress, thresholds)
     beside = [s for s in _beside(found, recordings, controller, seen) if s.name not in without]
     # where single rows are disturbed, what is left beside them must explain more to be named
-    if any(s.name == "timing.jitter" for s in beside) or (seen and found.gained < SURE):
+    if any(s.name == "timing.jitter" for s in beside) or (seen and found.gained < thresholds.samples_sure):
         found = replace(found, chosen=found.retuned)
     progress("checking on held-out rows", 0.9)
     samples = [*seen, *beside]
@@ -81,7 +81,7 @@ def diagnose(
         samples=tuple(samples),
         residual=residual_tests(found.chosen.fit, found.data, found.gained),
         quality=quality,
-        offset=offset_of(found.chosen.fit),
+        offset=offset_of(found.chosen.fit, thresholds.offset_sigmas),
     )
     verdict, candidates = judged(evidence), evidence.candidates
     effects = found_effects(evidence) if verdict == "effect" else ()
@@ -115,18 +115,21 @@ def _beside(
     found: Search, recordings: Sequence[Recording], controller: Controller | None, seen: Sequence[SampleEffect]
 ) -> list[SampleEffect]:
     """Return what is no effect of the chain and explains the residual better than one: jitter, another control law."""
+    limits = found.data.thresholds
     excluded = {name for s in seen for name in kind_of(s.name).excludes}
-    jitter = None if "timing.jitter" in excluded else jitter_effect(found.retuned.fit, recordings)
+    jitter = (
+        None if "timing.jitter" in excluded else jitter_effect(found.retuned.fit, recordings, limits.jitter_decrease)
+    )
     if jitter is not None and largest_variation(found.retuned.fit, found.data).gain > jitter.evidence:
         jitter = None  # what is left goes with a signal, and that grows with the slope too
-    both = [s for s in (jitter, law_effect(recordings, controller)) if s is not None]
-    quick = not found.data.noise.ar or found.data.noise.ar[0] < SLOW_NOISE
-    near = reduced_chi2(found.retuned.fit, found.data) < COARSE
+    both = [s for s in (jitter, law_effect(recordings, controller, limits)) if s is not None]
+    quick = not found.data.noise.ar or found.data.noise.ar[0] < limits.slow_noise
+    near = reduced_chi2(found.retuned.fit, found.data) < limits.coarse
     # a stamp that is wrong disturbs single rows: effects of the chain would leave something slow as well
     fast = is_white(found.retuned.fit, found.data) and quick and near
     return [
         s
         for s in both
-        if (s.evidence > max(SAMPLE_SHARE * found.gained, SURE) and fast)
+        if (s.evidence > max(limits.samples_share * found.gained, limits.samples_sure) and fast)
         or (s.evidence > found.gained and (s.name != "timing.jitter" or (quick and near)))
     ]

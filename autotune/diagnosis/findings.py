@@ -16,36 +16,31 @@ from autotune.diagnosis.result import FoundEffect, Offset, OperatingRange, Verdi
 from autotune.diagnosis.selection.hypothesis import Hypothesis
 from autotune.diagnosis.selection.probability import Candidate
 from autotune.diagnosis.selection.search import Search
-from autotune.diagnosis.verdict import UNKNOWN, Evidence
+from autotune.diagnosis.thresholds import Thresholds
+from autotune.diagnosis.verdict import Evidence
 from autotune.models import Effect, Model, Parameter
 
-#: An operating point that lies this many standard deviations from the nominal one is an offset.
-OFFSET_SIGMAS = 6.0
-#: Share of the squared error that a simulation with a converter's rounding may leave to be the better one.
-ROUNDING = 0.9
-#: Evidence from which on what single rows show is sure; probabilities stated of it then, and of less.
-SURE, SURELY, PROBABLY = 60.0, 1.0 / (1.0 + UNKNOWN), 0.85
 #: The effect that every fit has as a free number.
 OFFSET = "actuator.offset"
 Window = tuple[int, float, float]
 
 
-def offset_of(result: Fit) -> Offset | None:
+def offset_of(result: Fit, sigmas: float = Thresholds.offset_sigmas) -> Offset | None:
     """Return the operating point's shift where it is far outside its uncertainty."""
     for i, free in enumerate(result.parametrisation.free):
         if free.kind == "u_offset":
             sd = math.sqrt(max(float(result.covariance[i, i]), 0.0)) * free.size
             shift = result.theta[i] * free.size
-            if sd > 0.0 and abs(shift) > OFFSET_SIGMAS * sd and abs(shift) > 1e-3 * free.size:
+            if sd > 0.0 and abs(shift) > sigmas * sd and abs(shift) > 1e-3 * free.size:
                 return Offset(value=-shift, sd=sd)
     return None
 
 
-def probability_of(name: str, candidates: Sequence[Candidate]) -> float:
+def probability_of(name: str, candidates: Sequence[Candidate], most: float = Thresholds.most_probable) -> float:
     """Return the probability that an effect, or one that cannot be told from it, is part of the truth."""
     group = {name, *kind_of(name).same}
     total = sum(c.probability for c in candidates if group & set(c.name.split("+")))
-    return min(max(total, 0.0), 0.99)
+    return min(max(total, 0.0), most)
 
 
 def found_effects(evidence: Evidence) -> tuple[FoundEffect, ...]:
@@ -55,17 +50,18 @@ def found_effects(evidence: Evidence) -> tuple[FoundEffect, ...]:
     effects: list[tuple[float, FoundEffect]] = []
     for effect in _with_uncertainty(chosen, chosen.fit.model.effects):
         effects.append((_lost_without(search, effect.name), _found_effect(effect, evidence, everywhere)))
-    effects += [(s.evidence, _of_samples(s, everywhere)) for s in evidence.samples]
+    effects += [(s.evidence, _of_samples(s, everywhere, evidence.limits)) for s in evidence.samples]
     ranked = [e for _, e in sorted(effects, key=lambda pair: -pair[0])]
     if evidence.offset is not None and not any(e.name in kind_of(OFFSET).same for e in ranked):
         ranked.append(_of_offset(evidence.offset, evidence, everywhere))
     return tuple(ranked)
 
 
-def _of_samples(s: SampleEffect, everywhere: tuple[Window, ...]) -> FoundEffect:
+def _of_samples(s: SampleEffect, everywhere: tuple[Window, ...], limits: Thresholds) -> FoundEffect:
+    surely = 1.0 / (1.0 + limits.unknown_odds)
     return FoundEffect(
         name=s.name,
-        probability=SURELY if s.evidence > SURE else PROBABLY,
+        probability=surely if s.evidence > limits.samples_sure else limits.samples_probable,
         places=(kind_of(s.name).place,),
         parameters=MappingProxyType(s.parameters),
         equation=s.equation,
@@ -100,7 +96,7 @@ def _found_effect(effect: Effect, evidence: Evidence, everywhere: tuple[Window, 
         windows = tuple((i, float(r.t[0] + after), float(r.t[-1])) for i, r in pairs)
     return FoundEffect(
         name=effect.name,
-        probability=probability_of(effect.name, evidence.candidates),
+        probability=probability_of(effect.name, evidence.candidates, evidence.limits.most_probable),
         places=kind.may_sit,
         parameters=MappingProxyType(_readable(effect)),
         equation=kind.equation,
@@ -156,11 +152,15 @@ def extended_model(evidence: Evidence, verdict: Verdict, nominal: Model) -> Mode
     named = evidence.quality.is_better and verdict in ("effect", "unexplained")
     use = found.chosen if named else found.retuned
     extended = nominal if verdict == "none" else use.fit.model
-    ends = [Effect(name=s.name, parameters=s.parameters) for s in evidence.samples if _simulated(s, use.fit)]
+    ends = [
+        Effect(name=s.name, parameters=s.parameters)
+        for s in evidence.samples
+        if _simulated(s, use.fit, evidence.limits.rounding)
+    ]
     return replace(extended, effects=(*_with_uncertainty(use, extended.effects), *ends))
 
 
-def _simulated(effect: SampleEffect, result: Fit) -> bool:
+def _simulated(effect: SampleEffect, result: Fit, share: float) -> bool:
     """Whether a simulation is nearer to the readings with what their samples show; beside much noise no rounding is."""
     kind = kind_of(effect.name)
     if not kind.steps:
@@ -169,4 +169,4 @@ def _simulated(effect: SampleEffect, result: Fit) -> bool:
     y = [s[:, 0] + e for s, e in zip(result.signals, result.residuals, strict=True)]
     rounded = [r - step * np.round(s[:, 0] / step) for r, s in zip(y, result.signals, strict=True)]
     squares = [float(np.nansum(np.concatenate(e) ** 2)) for e in (rounded, result.residuals)]
-    return squares[0] < ROUNDING * squares[1]
+    return squares[0] < share * squares[1]

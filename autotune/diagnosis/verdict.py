@@ -16,17 +16,7 @@ from autotune.diagnosis.selection.hypothesis import penalised
 from autotune.diagnosis.selection.parsimony import worth_adding
 from autotune.diagnosis.selection.probability import Candidate, candidates_of
 from autotune.diagnosis.selection.search import Search
-
-#: Decrease of chi2 that wrong numbers must bring before the verdict is "parameters".
-NUMBERS_DECREASE = 25.0
-#: Reduced chi-square of a model without effects from which on something must be missing, although no effect is worth
-#: adding; clean recordings leave up to 1.02.
-MISSING = 1.05
-#: Prior odds of a cause outside the catalogue, beside 1 of all hypotheses: where the best explains the recordings, and
-#: where it explains most of what retuning leaves but not all.
-UNKNOWN, HALF_EXPLAINED = 0.03, 0.25
-#: Held-out share of the residual from which on a description tells where it adds its terms.
-INFORMATIVE = 0.5
+from autotune.diagnosis.thresholds import Thresholds
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -53,6 +43,11 @@ class Evidence:
     quality: FitQuality
     offset: Offset | None
 
+    @property
+    def limits(self) -> Thresholds:
+        """What decides between two findings."""
+        return self.search.data.thresholds
+
     @cached_property
     def explains_most(self) -> bool:
         """Whether the chosen effects explain most of a residual that nothing explains whole.
@@ -60,19 +55,12 @@ class Evidence:
         A load of free timing explains a part of everything: that part is not enough.
         """
         loads = all(kind_of(name).place == "environment" for name in self.search.chosen.names)
-        return dominates(self.quality) and self.residual.is_lesser and not loads
+        return dominates(self.quality, self.limits) and self.residual.is_lesser and not loads
 
     @cached_property
     def unknown_odds(self) -> float:
-        """Prior odds of a cause outside the catalogue, beside 1 of all hypotheses together.
-
-        Small where what is left is noise, and the larger the nearer its variance comes to the bound of adequacy; beyond
-        it the two weigh the same, but for effects that explain most of what retuning leaves.
-        """
-        if self.residual.is_noise:
-            excess = max(self.residual.reduced_chi2 - 1.0, 0.0) / (self.residual.allowed - 1.0)
-            return UNKNOWN + (1.0 - UNKNOWN) * excess**4
-        return HALF_EXPLAINED if self.explains_most else 1.0
+        """Prior odds of a cause outside the catalogue, beside 1 of all hypotheses together."""
+        return odds_of_unknown(self.residual, self.explains_most, self.limits)
 
     @cached_property
     def candidates(self) -> tuple[Candidate, ...]:
@@ -84,18 +72,31 @@ class Evidence:
         """What holds, in the words of the table."""
         found = self.search
         best = min(found.all, key=penalised)
-        retuned = found.retuned.fit
+        retuned, limits = found.retuned.fit, self.limits
         holds = {
             "effects": bool(found.chosen.names),
             "samples": bool(self.samples),
             "adequate": self.residual.is_noise or self.explains_most,
             "constant": self.residual.is_constant,
-            "another structure": bool(STRUCTURES.keys() & set(best.names)) and worth_adding(found.retuned, best),
+            "another structure": bool(STRUCTURES.keys() & set(best.names))
+            and worth_adding(found.retuned, best, limits),
             "offset": self.offset is not None,
-            "missing": self.residual.reduced_chi2 > MISSING,
-            "wrong numbers": found.nominal.chi2 - retuned.chi2 - retuned.penalty > NUMBERS_DECREASE,
+            "missing": self.residual.reduced_chi2 > limits.missing,
+            "wrong numbers": found.nominal.chi2 - retuned.chi2 - retuned.penalty > limits.numbers_decrease,
         }
         return frozenset(name for name, one in holds.items() if one)
+
+
+def odds_of_unknown(residual: ResidualTests, explains_most: bool, limits: Thresholds) -> float:
+    """Return the prior odds of a cause outside the catalogue, beside 1 of all hypotheses together.
+
+    Small where what is left is noise, and the larger the nearer its variance comes to the bound of adequacy; beyond it
+    the two weigh the same, but for effects that explain most of what retuning leaves.
+    """
+    if residual.is_noise:
+        excess = max(residual.reduced_chi2 - 1.0, 0.0) / (residual.allowed - 1.0)
+        return limits.unknown_odds + (1.0 - limits.unknown_odds) * excess**4
+    return limits.half_explained_odds if explains_most else 1.0
 
 
 #: Each row: what must hold, what must not, and the verdict. The first row that fits decides.
@@ -124,7 +125,7 @@ def places_of(evidence: Evidence, effects: Sequence[FoundEffect], description: D
         return tuple(dict.fromkeys(place for e in effects for place in e.places))
     known: dict[str, None] = {description.place: None} if description.terms else {}
     if not evidence.residual.is_constant:
-        informative = known if description.explained > INFORMATIVE else {}
+        informative = known if description.explained > evidence.limits.informative else {}
         return tuple(dict.fromkeys(evidence.residual.varies.places) | informative)
     places: dict[str, None] = dict(known)
     for h in sorted((*evidence.search.singles, *evidence.search.pairs), key=penalised)[:3]:

@@ -16,7 +16,7 @@ from autotune.diagnosis.result import Diagnosis, FoundEffect, NextExperiment
 from autotune.errors import InputError
 from autotune.experiment_design.conditions import as_recorded
 from autotune.experiment_design.open_hypotheses import open_hypotheses
-from autotune.experiment_design.plan import LEAST_DISCRIMINATION, plan_in
+from autotune.experiment_design.plan import plan_in
 
 #: Rows of a planned experiment: enough to rank the kinds.
 PLANNED_ROWS = 1000
@@ -55,7 +55,7 @@ def _planned(found: Diagnosis) -> NextExperiment | None:
         plan = plan_in(found, recorded, rows * recorded.sample_time_s)
     except InputError:  # an integrating plant without a stated law
         return None
-    if plan is None or plan.discrimination < LEAST_DISCRIMINATION:
+    if plan is None or plan.discrimination < found.search.data.thresholds.least_discrimination:
         return None
     return NextExperiment(
         purpose="tell " + " from ".join(plan.between),

@@ -6,9 +6,6 @@ from autotune.diagnosis.effects import kind_of
 from autotune.diagnosis.result import Diagnosis
 from autotune.diagnosis.selection.hypothesis import Hypothesis
 
-#: Least probability of a hypothesis that is open, most of them, and the probability from which on one is left.
-OPEN, MOST_OPEN, DECIDED = 0.02, 4, 0.9
-
 
 def open_hypotheses(found: Diagnosis) -> dict[str, tuple[Hypothesis, float]]:
     """Return the hypotheses still open with their probabilities, one of each class that u and y cannot tell apart.
@@ -19,7 +16,7 @@ def open_hypotheses(found: Diagnosis) -> dict[str, tuple[Hypothesis, float]]:
         With candidates and search; ``unknown`` is no hypothesis that predicts anything. The chosen hypothesis is
         always among those returned, however little is left for it; one whose extra parameters buy nothing is not.
     """
-    search = found.search
+    search, limits = found.search, found.search.data.thresholds
     least = frozenset(search.chosen.names)
     pool = {frozenset(h.names): h for h in search.all}
     stated = {candidate.name: candidate.probability for candidate in found.candidates}
@@ -34,9 +31,9 @@ def open_hypotheses(found: Diagnosis) -> dict[str, tuple[Hypothesis, float]]:
     total = sum(p for _, _, p in classes.values()) or 1.0
     kept = classes[_class(least)][0]
     ranked = sorted(((label, h, p / total) for label, h, p in classes.values()), key=lambda c: -c[2])
-    few = [one for one in ranked if one[2] >= OPEN][:MOST_OPEN]
+    few = [one for one in ranked if one[2] >= limits.still_open][: limits.most_open]
     few += [one for one in ranked if one[0] == kept and one not in few]
-    return {label: (h, max(p, OPEN)) for label, h, p in few}
+    return {label: (h, max(p, limits.still_open)) for label, h, p in few}
 
 
 def decided(found: Diagnosis) -> str:
@@ -44,7 +41,7 @@ def decided(found: Diagnosis) -> str:
     hypotheses = open_hypotheses(found)
     best, (h, p) = next(iter(hypotheses.items()))
     same = _class(frozenset(h.names)) == _class(frozenset(found.search.chosen.names))
-    return best if same and (len(hypotheses) == 1 or p >= DECIDED) else ""
+    return best if same and (len(hypotheses) == 1 or p >= found.search.data.thresholds.decided) else ""
 
 
 def _gains(h: Hypothesis, chosen: Hypothesis) -> bool:

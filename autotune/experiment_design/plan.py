@@ -18,7 +18,7 @@ from scipy.linalg import expm
 from autotune.arrays import FloatArray
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import RUNAWAY, Fit, fit
-from autotune.diagnosis.fitting.windows import LAGS_PER_WINDOW, slowest_lag_s, window_rows
+from autotune.diagnosis.fitting.windows import slowest_lag_s, window_rows
 from autotune.diagnosis.result import Diagnosis
 from autotune.diagnosis.selection.hypothesis import Hypothesis
 from autotune.diagnosis.selection.search import Progress
@@ -31,8 +31,6 @@ from autotune.experiment_design.conditions import Conditions
 from autotune.experiment_design.open_hypotheses import open_hypotheses
 from autotune.recording import Recording
 
-#: Expected discrimination below which nothing more can be learnt, and above which more is worth nothing.
-LEAST_DISCRIMINATION, CERTAIN = 20.0, 400.0
 #: Shares of the allowed swing and of the command's room that a planned excitation takes.
 SWING_SHARE, ROOM_SHARE = 0.5, 0.8
 #: Slowest feature of an excitation, in time constants of the loop.
@@ -217,11 +215,11 @@ def _told(
     found: Diagnosis, hypotheses: dict[str, tuple[Hypothesis, float]], one: Excitation, planned: Recording
 ) -> tuple[Plan, FloatArray]:
     """Return an excitation with its expected discrimination, and all readings that the hypotheses predict."""
-    model = found.search.retuned.fit.model
-    starts, stops = window_rows(planned, LAGS_PER_WINDOW * slowest_lag_s(model), float(planned.t[0]))
+    model, limits = found.search.retuned.fit.model, found.search.data.thresholds
+    starts, stops = window_rows(planned, limits.lags_per_window * slowest_lag_s(model), float(planned.t[0]), limits)
     data = Data(
         recordings=(planned,), good=(np.ones(len(planned), dtype=bool),), starts=(starts,), stops=(stops,),
-        noise=found.search.data.noise, numbers=(len(found.search.data.recordings),),
+        noise=found.search.data.noise, thresholds=limits, numbers=(len(found.search.data.recordings),),
     )  # fmt: skip
     predicted: dict[str, FloatArray] = {}
     for name, (h, _) in hypotheses.items():
@@ -232,9 +230,10 @@ def _told(
         (i, j): _least_chi2(hypotheses[j][0].fit, replace(data, recordings=(replace(planned, y=predicted[i]),)))
         for i, j in itertools.permutations(predicted, 2)
     }
+    certain = limits.certain_discrimination
     weights = {(i, j): hypotheses[i][1] * hypotheses[j][1] for i, j in T}
     total = sum(weights.values())
-    mean = sum(weights[pair] * min(T[pair], CERTAIN) for pair in T) / total if total > 0.0 else 0.0
+    mean = sum(weights[pair] * min(T[pair], certain) for pair in T) / total if total > 0.0 else 0.0
     plan = Plan(excitation=one, between=tuple(hypotheses), discrimination=mean)
     return plan, np.concatenate([planned.y, *predicted.values()])
 

@@ -19,7 +19,7 @@ from autotune.experiment.run import OnProgress
 from autotune.experiment_design.conditions import conditions_of
 from autotune.experiment_design.next_experiment import with_next_experiment
 from autotune.experiment_design.open_hypotheses import decided, open_hypotheses
-from autotune.experiment_design.plan import LEAST_DISCRIMINATION, Plan, general, plan_in
+from autotune.experiment_design.plan import Plan, general, plan_in
 from autotune.models import Model
 from autotune.recording import Recording, write_recording
 
@@ -202,7 +202,7 @@ def _next(
     if (done + 1) * duration_s > rig_time_s * (1.0 + 1e-9):
         return None, f"the rig time of {rig_time_s:g} s is used up, {len(hypotheses)} hypotheses are left"
     plan = plan_in(found, conditions_of(config), duration_s, seed=done + 1, progress=report)
-    if plan is None or plan.discrimination < LEAST_DISCRIMINATION:
+    if plan is None or plan.discrimination < found.search.data.thresholds.least_discrimination:
         told = 0.0 if plan is None else plan.discrimination
         names = ", ".join(hypotheses)
         return None, f"nothing more can be learnt within the limits (expected chi-square {told:.2g}): {names} are left"

@@ -1,11 +1,12 @@
-"""Constants of the diagnosis's judgement, counted on concealed cases that are none of the proof's.
+"""Thresholds of the diagnosis, counted on concealed cases that are none of the proof's.
 
 ``python -m tests.benchmarks calibrate`` reads the finished diagnoses of the campaign in AUTOTUNE_CALIBRATE_OUT, as
 ``autotune prove --seed 7000 --cases 200 --out DIR`` leaves them, whether or not all are finished; without it a campaign
 of AUTOTUNE_CALIBRATE_CASES (4) cases from seed AUTOTUNE_CALIBRATE_SEED (5000) on is made in a temporary folder.
 
-One bound of adequacy is tried at a time, the others as they are in use. Probabilities are those of diagnosis.json, at
-another temperature raised to a power: candidates below 1e-4 are not in it, which counts where the temperature doubles.
+It goes over every field of the table, one moved at a time, the others as they are in use. Probabilities are those of
+diagnosis.json, at another temperature raised to a power: candidates below 1e-4 are not in it, which counts where the
+temperature doubles.
 """
 
 from __future__ import annotations
@@ -16,47 +17,30 @@ import os
 import sys
 import tempfile
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from autotune.diagnosis import verdict
-from autotune.diagnosis.evidence import adequacy, held_out
+from autotune.diagnosis.effects import ALL
 from autotune.diagnosis.evidence.adequacy import ResidualTests
 from autotune.diagnosis.evidence.constancy import Variation
-from autotune.diagnosis.evidence.held_out import FitQuality
+from autotune.diagnosis.evidence.held_out import FitQuality, dominates
 from autotune.diagnosis.findings import probability_of
-from autotune.diagnosis.selection import probability
 from autotune.diagnosis.selection.probability import Candidate
+from autotune.diagnosis.thresholds import IN_USE, Thresholds, table
+from autotune.diagnosis.verdict import odds_of_unknown
 from autotune.models import read_model
 from sim.proof import FIRST_PROOF_SEED, Campaign, conceal, diagnose
 from sim.score import calibration_error
 
 Json = dict[str, Any]
 #: What single rows and the law show: no bound of adequacy decides on these.
-OF_ROWS = frozenset(
-    (
-        "sensor.quantisation", "sensor.dropout", "sensor.outliers", "sensor.saturation", "timing.jitter",
-        "controller.law",
-    )
-)  # fmt: skip
-GRIDS: Mapping[str, Sequence[float]] = {
-    "ADEQUATE": (1.0, 1.01, 1.02, 1.04, 1.06, 1.08, 1.12),
-    "ADEQUATE_QUICK": (1.04, 1.06, 1.08, 1.12, 1.16, 1.2, 1.3),
-    "QUICK": (0.8, 0.9, 1.0, 1.05, 1.1),
-    "WHITE": (0.9, 0.95, 1.0, 1.05, 1.08, 1.1, 1.12, 1.15, 1.2, 1.3),
-    "INCONSTANT": (12.0, 15.0, 18.0, 20.0, 25.0, 30.0, 40.0, 60.0),
-    "OF_THE_GAINED": (0.0, 0.02, 0.05, 0.1, 0.2, 0.4),
-    "HALF_OF_THE_GAINED": (0.1, 0.3, 0.5, 0.8),
-    "MISSING": (1.01, 1.02, 1.03, 1.05, 1.08, 1.12),
-    "DOMINANT": (0.35, 0.5, 0.7, 0.8, 0.9, 0.95),
-    "FAR_FROM_NOISE": (4.0, 6.0, 7.0, 8.0, 10.0, 15.0),
-}
-TEMPERATURES = (1.5, 2.0, 3.0, 4.0, 5.0, 6.0)
-DOUBTS = (0.01, 0.02, 0.03, 0.05, 0.07, 0.1, 0.15, 0.2)
+OF_ROWS = frozenset(k.name for k in ALL if k.sought in ("samples", "residual", "law")) | {"sensor.saturation"}
+#: Factors by which a threshold is moved; of one beside 1, such as a reduced chi-square, what is above 1 is.
+FACTORS = (0.0, 0.25, 0.5, 0.8, 1.0, 1.25, 1.5, 2.0, 3.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,16 +67,6 @@ class Shown:
         every = all(any(n in group for group in self.accept) for n in self.names)
         return self.kind != "outside" and every and all(set(group) & set(self.names) for group in self.accept)
 
-    @property
-    def excess(self) -> float:
-        """Variance of what is left over the noise's, less what chance adds."""
-        return float(self.left["reduced_chi2"] - self.left["reduced_chi2_chance"])
-
-    @property
-    def slow(self) -> float:
-        """Slow power of what is left over the noise's, less what chance adds."""
-        return float(self.left["slow"] - 2.0 * self.left["slow_chance"])
-
 
 def shown(campaign: Campaign, seed: int) -> Shown:
     """Read a case's diagnosis beside its answer."""
@@ -113,24 +87,34 @@ def shown(campaign: Campaign, seed: int) -> Shown:
     )
 
 
-def judged(row: Shown, constants: Mapping[str, float]) -> str:
-    """Verdict on a case by other constants: abstained, named or neither."""
-    white = row.slow < constants["WHITE"]
-    bound = constants["ADEQUATE_QUICK" if row.slow < constants["QUICK"] else "ADEQUATE"]
-    varies, gained = row.left["varies"]["chi2"], row.left["gained"]
-    constant = varies < max(constants["INCONSTANT"], constants["OF_THE_GAINED"] * gained)
-    adequate = white and constant and row.excess < bound
+def tests_of(row: Shown, limits: Thresholds) -> ResidualTests:
+    """What the extended model left, under other thresholds."""
+    varies = Variation(gain=row.left["varies"]["chi2"], places=("plant",), what="", period_s=math.inf)
+    numbers = {key: value for key, value in row.left.items() if key != "varies"}
+    return ResidualTests(varies=varies, limits=limits, **numbers)
+
+
+def judged(row: Shown, limits: Thresholds) -> str:
+    """Verdict on a case by other thresholds: abstained, named or neither."""
+    left = tests_of(row, limits)
     if row.names:
-        most = held_out.dominates(row.quality, constants["DOMINANT"], constants["FAR_FROM_NOISE"])
-        lesser = varies < constants["HALF_OF_THE_GAINED"] * gained
-        return "named" if adequate or (most and lesser) else "abstained"
-    missing = not constant or (not adequate and row.left["reduced_chi2"] > constants["MISSING"])
+        most = dominates(row.quality, limits) and left.is_lesser
+        return "named" if left.is_noise or most else "abstained"
+    missing = not left.is_constant or (not left.is_noise and left.reduced_chi2 > limits.missing)
     return "abstained" if missing else "neither"
 
 
-def counts(rows: Sequence[Shown], constants: Mapping[str, float]) -> tuple[int, int, int]:
+def moved(limits: Thresholds, name: str, factor: float) -> Thresholds:
+    """Return the table with one threshold moved."""
+    value = getattr(limits, name)
+    beside_one = next(unit for one, _, unit, _, _ in table(limits) if one == name) in ("reduced chi2", "slow power")
+    new = 1.0 + factor * (value - 1.0) if beside_one else factor * value
+    return replace(limits, **{name: type(value)(new)})
+
+
+def counts(rows: Sequence[Shown], limits: Thresholds) -> tuple[int, int, int]:
     """Count right hypotheses refused, wrong ones accepted, and clean cases in which something is missed."""
-    said = [(row, judged(row, constants)) for row in rows]
+    said = [(row, judged(row, limits)) for row in rows]
     return (
         sum(word == "abstained" for row, word in said if row.right and row.names),
         sum(word == "named" for row, word in said if not row.right),
@@ -138,11 +122,11 @@ def counts(rows: Sequence[Shown], constants: Mapping[str, float]) -> tuple[int, 
     )
 
 
-def at(row: Shown, temperature: float, unknown: float) -> list[tuple[str, float, bool]]:
-    """Names put forward with their probabilities at another temperature and doubt, and whether each is right."""
-    power = probability.TEMPERATURE / temperature
+def at(row: Shown, limits: Thresholds) -> list[tuple[str, float, bool]]:
+    """Names put forward with their probabilities at another temperature and other odds, and whether each is right."""
+    power = IN_USE.temperature / limits.temperature
     known = {name: p**power for name, p in row.candidates if name != "unknown" and p > 0.0}
-    total = sum(known.values()) * (1.0 + doubt(row, unknown))
+    total = sum(known.values()) * (1.0 + unknown_odds(row, limits))
     candidates = [Candidate(name=name, probability=w / total) for name, w in known.items()]
     own = {name for group in row.accept for name in group}
     spared = set(row.nuisance) - own
@@ -153,18 +137,15 @@ def at(row: Shown, temperature: float, unknown: float) -> list[tuple[str, float,
     ]
 
 
-def doubt(row: Shown, unknown: float) -> float:
-    """Weight of what is unknown, see :func:`autotune.diagnosis.verdict.Evidence.unknown_odds`."""
-    varies = Variation(gain=row.left["varies"]["chi2"], places=("plant",), what="", period_s=math.inf)
-    left = ResidualTests(varies=varies, **{key: value for key, value in row.left.items() if key != "varies"})
-    if not left.is_noise:
-        return verdict.HALF_EXPLAINED if held_out.dominates(row.quality) and left.is_lesser else 1.0
-    return unknown + (1.0 - unknown) * (max(left.reduced_chi2 - 1.0, 0.0) / (left.allowed - 1.0)) ** 4
+def unknown_odds(row: Shown, limits: Thresholds) -> float:
+    """Prior odds of what is unknown, see :func:`autotune.diagnosis.verdict.odds_of_unknown`."""
+    left = tests_of(row, IN_USE)
+    return odds_of_unknown(left, dominates(row.quality, IN_USE) and left.is_lesser, limits)
 
 
-def calibration(rows: Sequence[Shown], temperature: float, unknown: float) -> tuple[float, float, int, int, int]:
+def calibration(rows: Sequence[Shown], limits: Thresholds) -> tuple[float, float, int, int, int]:
     """Return log loss, expected error, and among statements with p >= 0.95 the wrong ones, all of them, and all."""
-    statements = [(p, ok) for row in rows for _, p, ok in at(row, temperature, unknown)]
+    statements = [(p, ok) for row in rows for _, p, ok in at(row, limits)]
     loss = -float(np.mean([math.log(min(max(p if ok else 1.0 - p, 1e-6), 1.0)) for p, ok in statements]))
     sure = [ok for p, ok in statements if p >= 0.95]
     return loss, calibration_error(statements), sure.count(False), len(sure), len(statements)
@@ -200,33 +181,29 @@ def main() -> None:
     kinds = ", ".join(f"{count} {kind}" for kind, count in sorted(Counter(r.kind for r in rows).items()))
     print(f"{len(rows)} cases diagnosed in {campaign.out}: {kinds}")
     chain = [r for r in rows if not OF_ROWS & {name for name, _ in r.stated if name not in r.nuisance}]
-    in_use = {
-        name: float(next(getattr(m, name) for m in (adequacy, held_out, verdict) if hasattr(m, name))) for name in GRIDS
-    }
     explained = sum(r.right and bool(r.names) for r in chain)
     print(f"{len(chain)} of them decided by adequacy, {explained} explained by the truth")
-    print("  right refused / wrong accepted / clean alarmed, one constant moved at a time:")
-    for name, grid in GRIDS.items():
-        moved = " ".join(f"{v:g}: {'/'.join(map(str, counts(chain, {**in_use, name: v})))}" for v in grid)
-        print(f"  {name:15s} {in_use[name]:g} in use;  {moved}")
-    rows = [r for r in rows if r not in chain or judged(r, in_use) == "named"]
-    print("  log loss / expected error / wrong of those at p >= 0.95, of what is named with the bounds in use:")
-    T, unknown = probability.TEMPERATURE, verdict.UNKNOWN
-    for name, value, tried in (
-        ("TEMPERATURE", T, [(t, t, unknown) for t in TEMPERATURES]),
-        ("UNKNOWN", unknown, [(d, T, d) for d in DOUBTS]),
-    ):
-        print(f"  {name:16s} {value:g} in use")
-        for at_value, t, d in tried:
-            loss, error, wrong, sure, count = calibration(rows, t, d)
-            print(f"    {at_value:5g}: {loss:.4f} / {error:.4f} / {wrong} of {sure}, {count} in all")
+    named = [r for r in rows if r not in chain or judged(r, IN_USE) == "named"]
+    print("  right refused / wrong accepted / clean alarmed, log loss / expected error / wrong of those at p >= 0.95,")
+    print("  one threshold moved at a time, where that changes anything:")
+    still = []
+    for name, value, unit, _, origin in table(IN_USE):
+        tried = {factor: moved(IN_USE, name, factor) for factor in FACTORS}
+        told = {f: (counts(chain, limits), calibration(named, limits)[:4]) for f, limits in tried.items()}
+        if len(set(told.values())) == 1:
+            still.append(name)
+            continue
+        print(f"  {name} {value:g} {unit} ({origin})")
+        for factor, (refused, (loss, error, wrong, sure)) in told.items():
+            at_value = getattr(tried[factor], name)
+            print(f"    {at_value:8.4g}: {'/'.join(map(str, refused))}  {loss:.4f} / {error:.4f} / {wrong} of {sure}")
+    print(f"  not told by diagnosis.json, they act before it is written: {', '.join(still)}")
     single: dict[str, list[bool]] = {}
-    for row in rows:
-        for name, _, ok in at(row, T, unknown):
+    for row in named:
+        for name, _, ok in at(row, IN_USE):
             single.setdefault(name if name in OF_ROWS else "of the chain", []).append(ok)
     print("  right of those named:", ", ".join(f"{n} {sum(oks)}/{len(oks)}" for n, oks in sorted(single.items())))
-    strict = in_use | {"DOMINANT": math.inf}
-    half = [r for r in rows if r.verdict == "effect" and judged(r, strict) == "abstained"]
-    halves = [ok for r in half for name, _, ok in at(r, T, unknown) if name not in OF_ROWS]
-    print(f"  HALF_EXPLAINED  {verdict.HALF_EXPLAINED:g} in use; right of those named without being adequate:", end=" ")
-    print(f"{sum(halves)}/{len(halves)}")
+    strict = replace(IN_USE, dominant=math.inf)
+    half = [r for r in named if r.verdict == "effect" and judged(r, strict) == "abstained"]
+    halves = [ok for r in half for name, _, ok in at(r, IN_USE) if name not in OF_ROWS]
+    print(f"  right of those named without being adequate: {sum(halves)}/{len(halves)}")

@@ -1,34 +1,20 @@
 """Adequacy: whether what the chosen model leaves of the recordings is noise.
 
 Three looks at the residual: its variance beside the noise that its own row-to-row jitter shows, its slow part, and what
-swings, bends or goes past the chain. The bounds were counted on concealed cases, none of them of the proof (``python -m
-tests.benchmarks calibrate``): they stand where nothing that is right is refused any more.
+swings, bends or goes past the chain. The bounds stand where nothing that is right is refused any more.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from autotune.diagnosis.evidence.constancy import Variation, largest_variation
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import Fit
 from autotune.diagnosis.fitting.retuning import BLOCKS, reduced_chi2, whiteness
-
-#: Reduced chi-square up to which a model is adequate, beside one standard deviation of it.
-ADEQUATE = 1.04
-#: The same for a residual without any slow part: then what is more is jitter that the differences of coloured noise did
-#: not show, and physics left out would have been slow.
-ADEQUATE_QUICK, QUICK = 1.12, 1.0
-#: The same for the slow part of the residual, after its own AR(2) has been taken out, beside two standard deviations.
-WHITE = 1.10
-#: Chi-square of the largest of some hundred score tests (:mod:`autotune.diagnosis.evidence.constancy`) from which on
-#: something swings or leads past the chain that the model does not have, and its least share of what effects gained:
-#: right models leave up to 15 (where thresholds make fits rough two hundredths of what they gain), wrong ones a third.
-INCONSTANT, OF_THE_GAINED = 25.0, 0.1
-#: Share of what effects gained from which on what they leave weighs as much as they do; real rigs leave a quarter.
-HALF_OF_THE_GAINED = 0.5
+from autotune.diagnosis.thresholds import Thresholds
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,6 +35,8 @@ class ResidualTests:
         What would explain most of it among what swings, bends and goes past the chain.
     gained : float
         Penalised chi-square that the effects gained beside the retuned model.
+    limits : Thresholds
+        What decides between two findings.
     """
 
     reduced_chi2: float
@@ -57,26 +45,28 @@ class ResidualTests:
     slow_chance: float
     varies: Variation
     gained: float
+    limits: Thresholds = field(default_factory=Thresholds)
 
     @property
     def allowed(self) -> float:
         """Largest reduced chi-square of noise."""
-        return (ADEQUATE_QUICK if self._is_white(QUICK) else ADEQUATE) + self.reduced_chi2_chance
+        limits = self.limits
+        return (limits.adequate_quick if self._is_white(limits.quick) else limits.adequate) + self.reduced_chi2_chance
 
     @property
     def is_noise(self) -> bool:
         """Whether it is noise: no more variance than its jitter shows, no slow part, and nothing that varies."""
-        return self.reduced_chi2 < self.allowed and self._is_white(WHITE) and self.is_constant
+        return self.reduced_chi2 < self.allowed and self._is_white(self.limits.white) and self.is_constant
 
     @property
     def is_constant(self) -> bool:
         """Whether nothing swings, bends or goes past the chain in it, beside what the effects gained."""
-        return self.varies.gain < max(INCONSTANT, OF_THE_GAINED * self.gained)
+        return self.varies.gain < max(self.limits.inconstant, self.limits.inconstant_share * self.gained)
 
     @property
     def is_lesser(self) -> bool:
         """Whether what varies in it is less than half of what the effects gained."""
-        return self.varies.gain < HALF_OF_THE_GAINED * self.gained
+        return self.varies.gain < self.limits.lesser_share * self.gained
 
     def _is_white(self, bound: float) -> bool:
         return self.slow < bound + 2.0 * self.slow_chance
@@ -115,6 +105,7 @@ def residual_tests(result: Fit, data: Data, gained: float) -> ResidualTests:
         slow_chance=_slow_chance(result),
         varies=largest_variation(result, data),
         gained=gained,
+        limits=data.thresholds,
     )
 
 
@@ -124,4 +115,4 @@ def _slow_chance(result: Fit) -> float:
 
 def is_white(result: Fit, data: Data) -> bool:
     """Whether a residual has no slow part beyond what chance brings."""
-    return whiteness(result, data) < WHITE + 2.0 * _slow_chance(result)
+    return whiteness(result, data) < data.thresholds.white + 2.0 * _slow_chance(result)

@@ -17,12 +17,10 @@ import numpy as np
 from scipy.interpolate import BSpline
 
 from autotune.arrays import FloatArray
-from autotune.diagnosis.evidence.residual import DIRECTION, LEAST_SHARE, FreedResidual, Place, ridge
+from autotune.diagnosis.evidence.residual import DIRECTION, FreedResidual, Place, ridge
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import Fit
 
-#: Decrease of chi2 that a term must bring.
-LEAST_DECREASE = 30.0
 #: Most terms that a person can still read as one equation.
 MOST_TERMS = 3
 #: Segments of a curve, and the smoothing weights that are tried, relative to the data's own curvature.
@@ -134,7 +132,7 @@ class Description:
         }
 
 
-def describe(result: Fit, data: Data, least_decrease: float = LEAST_DECREASE) -> Description:
+def describe(result: Fit, data: Data) -> Description:
     """Describe what a fit leaves as a function of its signals.
 
     Parameters
@@ -143,8 +141,6 @@ def describe(result: Fit, data: Data, least_decrease: float = LEAST_DECREASE) ->
         The retuned nominal structure.
     data : Data
         What it was fitted to.
-    least_decrease : float
-        Decrease of chi2 that a term must bring.
 
     Returns
     -------
@@ -166,7 +162,7 @@ def describe(result: Fit, data: Data, least_decrease: float = LEAST_DECREASE) ->
     """
     residual = FreedResidual(result, data)
     curves = sorted(_curves(residual), key=lambda c: -c.explained)
-    terms, place, explained = _equation(residual, least_decrease)
+    terms, place, explained = _equation(residual)
     shares = {f"{c.signal}, added to {_ADDS_TO[c.place]}": round(c.explained, 3) for c in curves}
     return Description(
         place=place if terms else curves[0].place,
@@ -243,13 +239,14 @@ def _memories(residual: FreedResidual) -> Iterator[_Candidate]:
         yield _Candidate(place="sensor", text=text, unit=unit, factor=1.0 / size, column=column)
 
 
-def _equation(residual: FreedResidual, least_decrease: float) -> tuple[tuple[Term, ...], Place, float]:
+def _equation(residual: FreedResidual) -> tuple[tuple[Term, ...], Place, float]:
     """Select up to three terms of one place and kind, as long as held-out windows ask for one more."""
     pool, memories = (
         [c for c in some if residual.is_new(c.column)] for some in (_candidates(residual), _memories(residual))
     )
     before = residual.cross_validated(np.zeros((residual.e.size, 0)))
-    least = max(LEAST_SHARE * (before - residual.floor), least_decrease)
+    limits = residual.data.thresholds
+    least = max(limits.term_share * (before - residual.floor), limits.least_decrease)
     chosen: list[_Candidate] = []
     error = before
     groups = [*([c for c in pool if c.place == place] for place in residual.signals), memories]

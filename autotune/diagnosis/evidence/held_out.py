@@ -10,10 +10,7 @@ import numpy as np
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import RUNAWAY, Fit, fit, states_of
 from autotune.diagnosis.fitting.noise import noise_from_differences
-
-#: Share of the retuned model's excess variance that effects must explain where nothing explains all of it, and how many
-#: times the noise's variance the retuned model's error must have: nearer to the noise adequacy is asked for.
-DOMINANT, FAR_FROM_NOISE = 0.35, 8.0
+from autotune.diagnosis.thresholds import Thresholds
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,14 +28,15 @@ class FitQuality:
         return self.extended <= self.retuned
 
 
-def dominates(quality: FitQuality, share: float = DOMINANT, far: float = FAR_FROM_NOISE) -> bool:
+def dominates(quality: FitQuality, limits: Thresholds) -> bool:
     """Whether the chosen effects explain most of a residual that nothing explains whole.
 
     On real rigs something always remains; an effect is named all the same when on rows that were not fitted it takes
-    away a share of the variance that retuning leaves above the noise, where that is ``far`` times the noise's.
+    away a share of the variance that retuning leaves above the noise, where that is many times the noise's.
     """
     retuned, noise = quality.retuned**2, quality.noise_floor**2
-    return retuned > far * noise and retuned - quality.extended**2 > share * (retuned - noise)
+    gained = retuned - quality.extended**2
+    return retuned > limits.far_from_noise * noise and gained > limits.dominant * (retuned - noise)
 
 
 def held_out(retuned: Fit, chosen: Fit, data: Data) -> FitQuality:
@@ -65,7 +63,7 @@ def held_out(retuned: Fit, chosen: Fit, data: Data) -> FitQuality:
 
     nominal, tuned = error(retuned, tune=False), error(retuned, tune=True)
     extended = tuned if chosen is retuned else error(chosen, tune=True)
-    noise = noise_from_differences(chosen.residuals, data.good).total_sd / spread
+    noise = noise_from_differences(chosen.residuals, data.good, data.thresholds.largest_correlation).total_sd / spread
     return FitQuality(nominal=nominal, retuned=tuned, extended=extended, noise_floor=noise)
 
 

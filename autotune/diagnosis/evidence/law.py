@@ -20,17 +20,10 @@ from scipy.signal import cont2discrete, lfilter
 from autotune.arrays import FloatArray
 from autotune.controller import Controller, DiscreteController, PIDController
 from autotune.diagnosis.evidence.samples import SampleEffect
+from autotune.diagnosis.thresholds import IN_USE, Thresholds
 from autotune.models import Parameter, TransferFunction
 from autotune.recording import Recording
 
-#: A gain or a time this far from the stated one, in standard deviations, is a broken law.
-SIGMAS = 6.0
-#: And this far as a share of it.
-LEAST_CHANGE = 0.04
-#: Where a derivative's filter is not stated: variance that the stated law must leave beside what other gains leave.
-CLEARLY_MORE = 2.0
-#: Share of the rows at the command's ends from which on limits made it, not the law.
-MOST_AT_LIMITS = 0.2
 #: Shortest filter of a derivative that is looked for where none is stated, in sample times; the longest is T_d.
 SHORTEST_FILTER = 0.05
 EQUATIONS = {
@@ -66,6 +59,8 @@ class ShownLaw:
         False where a derivative's filter that is not stated explains nearly as much as other gains do.
     filtered : bool
         Whether the filter is stated.
+    least_change : float
+        Share of a gain that counts as a change.
     """
 
     parts: tuple[str, ...]
@@ -74,12 +69,13 @@ class ShownLaw:
     recomputed: FloatArray
     clear: bool
     filtered: bool
+    least_change: float
 
     @property
     def off(self) -> FloatArray:
         """How far each gain is from the stated one in standard deviations; 0 where that is too little to count."""
         change = np.abs(self.ratio - 1.0)
-        return np.where(self.clear & (change > LEAST_CHANGE), change / np.maximum(self.sd, 1e-12), 0.0)
+        return np.where(self.clear & (change > self.least_change), change / np.maximum(self.sd, 1e-12), 0.0)
 
     @property
     def factors(self) -> dict[str, Parameter]:
@@ -109,7 +105,9 @@ class _Columns:
 Way: TypeAlias = Callable[[float], _Columns]
 
 
-def law_effect(recordings: Sequence[Recording], controller: Controller | None = None) -> SampleEffect | None:
+def law_effect(
+    recordings: Sequence[Recording], controller: Controller | None = None, limits: Thresholds = IN_USE
+) -> SampleEffect | None:
     """Return the mismatch of the control law where u recomputed from r and y differs from the recorded u.
 
     Parameters
@@ -118,6 +116,8 @@ def law_effect(recordings: Sequence[Recording], controller: Controller | None = 
         Those with a set-point column ``r`` are looked at.
     controller : Controller, optional
         The stated law; the sidecar's ``[controller]`` by default, see :func:`stated_law`.
+    limits : Thresholds
+        What decides between two findings.
 
     Returns
     -------
@@ -126,8 +126,8 @@ def law_effect(recordings: Sequence[Recording], controller: Controller | None = 
     """
     for r in recordings:
         stated = stated_law(r.metadata, controller)
-        shown = None if stated is None else shown_law(r, stated)
-        if shown is not None and np.max(shown.off) > SIGMAS:
+        shown = None if stated is None else shown_law(r, stated, limits)
+        if shown is not None and np.max(shown.off) > limits.law_sigmas:
             return SampleEffect(
                 name="controller.law",
                 equation=EQUATIONS[shown.parts],
@@ -163,7 +163,7 @@ def stated_law(metadata: Mapping[str, Any], controller: Controller | None) -> St
     return StatedLaw(controller=law, filtered=Tf is not None)
 
 
-def shown_law(r: Recording, stated: StatedLaw) -> ShownLaw | None:
+def shown_law(r: Recording, stated: StatedLaw, limits: Thresholds = IN_USE) -> ShownLaw | None:
     """Return what a recording shows of a stated law.
 
     Parameters
@@ -172,6 +172,8 @@ def shown_law(r: Recording, stated: StatedLaw) -> ShownLaw | None:
         With its set-point in the column ``r``.
     stated : StatedLaw
         What it is compared with.
+    limits : Thresholds
+        What decides between two findings.
 
     Returns
     -------
@@ -188,7 +190,7 @@ def shown_law(r: Recording, stated: StatedLaw) -> ShownLaw | None:
     of bias as far as the dither is white after its AR(8); T_d is known up to what the filter's form makes of it.
     """
     limited = float(np.mean((r.u == r.u.min()) | (r.u == r.u.max())))
-    if "r" not in r.extra or not np.all(np.isfinite(r["r"])) or limited > MOST_AT_LIMITS:
+    if "r" not in r.extra or not np.all(np.isfinite(r["r"])) or limited > limits.law_most_at_limits:
         return None
     ways = _ways(stated, r)
     if not ways:
@@ -204,8 +206,9 @@ def shown_law(r: Recording, stated: StatedLaw) -> ShownLaw | None:
         ratio=found.gains / columns.aims,
         sd=found.sd / np.abs(columns.aims),
         recomputed=_stated_commands(best, r.u),
-        clear=not sought or best.left > CLEARLY_MORE * found.left,
+        clear=not sought or best.left > limits.law_clearly_more * found.left,
         filtered=not sought,
+        least_change=limits.law_least_change,
     )
 
 

@@ -17,9 +17,6 @@ from autotune.diagnosis.fitting.noise import noise_from_differences
 from autotune.diagnosis.simulation.simulator import Simulator
 
 Place: TypeAlias = Literal["actuator", "plant", "sensor"]
-#: Least share of the held-out misfit above the noise that one more term must take away; a misfit that is less than
-#: this share of the noise has no shares.
-LEAST_SHARE = 0.1
 #: Least share of a function's power that the model's own numbers cannot imitate.
 NEW = 1e-3
 #: Ridge on unit columns while subsets are compared.
@@ -40,7 +37,10 @@ class FreedResidual:
         self._own = np.linalg.svd(self.J / np.maximum(np.linalg.norm(self.J, axis=0), 1e-300), full_matrices=False)[0]
         self.rows = data.rows
         # where the misfit is so large that it was taken for noise, the floor is what changes from row to row alone
-        jitter = noise_from_differences(result.residuals, data.good).total_sd / data.noise.total_sd
+        jitter = (
+            noise_from_differences(result.residuals, data.good, data.thresholds.largest_correlation).total_sd
+            / data.noise.total_sd
+        )
         self.floor = data.rows * min(1.0, jitter**2)
         number = np.zeros(result.e.size, dtype=np.int64)
         for i, (a, b) in enumerate(result.windows):
@@ -154,7 +154,9 @@ class FreedResidual:
 
     def explained(self, error: float, before: float) -> float:
         """Return the share of the held-out misfit above the noise that is gone."""
-        return float(np.clip((before - error) / max(before - self.floor, LEAST_SHARE * self.floor), 0.0, 1.0))
+        return float(
+            np.clip((before - error) / max(before - self.floor, self.data.thresholds.term_share * self.floor), 0.0, 1.0)
+        )
 
 
 def filled(signals: FloatArray) -> FloatArray:

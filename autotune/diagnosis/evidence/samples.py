@@ -13,13 +13,9 @@ import numpy as np
 
 from autotune.arrays import BoolArray, FloatArray
 from autotune.diagnosis.fitting.fit import Fit
+from autotune.diagnosis.thresholds import IN_USE, Thresholds
 from autotune.models import Parameter
 from autotune.recording import Recording
-
-#: A run of equal readings this long is no chance where readings are continuous.
-LEAST_RUN = 3
-#: A spike stands out of its neighbours' mean by this many robust standard deviations.
-SPIKE = 7.0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -45,11 +41,11 @@ class SampleEffect:
     windows: tuple[tuple[int, float, float], ...] = ()
 
 
-def lattice_step(y: FloatArray) -> float:
+def converter_step(y: FloatArray) -> float:
     """Return the step of the converter that all readings are multiples of, 0 where there is none.
 
-    Readings on a lattice take few different values whose distances are multiples of the smallest one; readings that
-    were only rounded when they were written take many.
+    Readings behind a converter take few different values whose distances are multiples of the smallest one; readings
+    that were only rounded when they were written take many.
     """
     values = np.unique(y[np.isfinite(y)])
     if values.size < 3:
@@ -68,19 +64,19 @@ def jitter_of(y: FloatArray) -> float:
     return float(np.sqrt(np.mean(np.minimum(d**2, np.quantile(d**2, 0.99))) / 6.0)) if d.size else 0.0
 
 
-def frozen_rows(y: FloatArray) -> BoolArray:
-    """Return the rows that repeat the reading before them in runs of at least three equal readings."""
+def frozen_rows(y: FloatArray, least_run: int = Thresholds.least_run) -> BoolArray:
+    """Return the rows that repeat the reading before them in runs of at least so many equal readings."""
     same = np.append([False], np.diff(y) == 0.0)
     edges = np.flatnonzero(np.diff(np.concatenate([[0], same.astype(np.int64), [0]])))
     frozen = np.zeros(y.size, dtype=bool)
     for first, last in zip(edges[::2], edges[1::2], strict=True):
-        if last - first >= LEAST_RUN - 1:
+        if last - first >= least_run - 1:
             frozen[first:last] = True
     return frozen
 
 
-def spikes(y: FloatArray, good: BoolArray) -> BoolArray:
-    """Return the rows that stand alone out of the mean of their neighbours."""
+def spikes(y: FloatArray, good: BoolArray, sds: float = Thresholds.spike) -> BoolArray:
+    """Return the rows that stand alone out of the mean of their neighbours by so many robust standard deviations."""
     found = np.zeros(y.size, dtype=bool)
     if y.size < 8:
         return found
@@ -92,14 +88,14 @@ def spikes(y: FloatArray, good: BoolArray) -> BoolArray:
         return found
     # the neighbours of a spike of height A show -A/2: a spike is the largest of the three
     size = np.abs(d)
-    peak = (size > SPIKE * spread) & (size >= np.roll(size, 1)) & (size >= np.roll(size, -1))
+    peak = (size > sds * spread) & (size >= np.roll(size, 1)) & (size >= np.roll(size, -1))
     opposed = np.minimum(-np.roll(d, 1) * np.sign(d), -np.roll(d, -1) * np.sign(d)) > 0.2 * size
     found[peak & opposed & good] = True
     return found
 
 
 def inspect(
-    recordings: Sequence[Recording], without: Collection[str] = ()
+    recordings: Sequence[Recording], without: Collection[str] = (), limits: Thresholds = IN_USE
 ) -> tuple[list[BoolArray], list[SampleEffect]]:
     """Look at the readings of all recordings.
 
@@ -109,6 +105,8 @@ def inspect(
         What was measured.
     without : collection of str
         Effects that are not looked for: their rows count like any other.
+    limits : Thresholds
+        What decides between two findings.
 
     Returns
     -------
@@ -120,23 +118,27 @@ def inspect(
     good = [np.isfinite(r.y) for r in recordings]
     unit = str(recordings[0].metadata.get("units", {}).get("y", ""))
     effects: list[SampleEffect] = []
-    step = lattice_step(np.concatenate([r.y for r in recordings]))
+    step = converter_step(np.concatenate([r.y for r in recordings]))
     if step > 0.0:
-        # on a lattice equal readings are no dropout, and a spike is measured in steps
-        return good, _quantisation(recordings, step, unit) if "sensor.quantisation" not in without else []
-    clipped, levels = _clipped(recordings)
+        # behind a converter equal readings are no dropout, and a spike is measured in steps
+        return good, _quantisation(recordings, step, unit, limits) if "sensor.quantisation" not in without else []
+    clipped, levels = _clipped(recordings, limits)
     if levels and "sensor.saturation" not in without:
         effects.append(_saturation(recordings, clipped, levels, unit))
         good = [g & ~c for g, c in zip(good, clipped, strict=True)]
-    frozen = [frozen_rows(r.y) & ~c for r, c in zip(recordings, clipped, strict=True)]
+    frozen = [frozen_rows(r.y, limits.least_run) & ~c for r, c in zip(recordings, clipped, strict=True)]
     count = sum(int(f.sum()) for f in frozen)
     total = sum(len(r) for r in recordings)
-    if count >= 6 and count > 1e-3 * total and "sensor.dropout" not in without:
+    if (
+        count >= limits.least_frozen_rows
+        and count > limits.least_frozen_share * total
+        and "sensor.dropout" not in without
+    ):
         effects.append(_dropout(recordings, frozen, count / total))
         good = [g & ~f for g, f in zip(good, frozen, strict=True)]
-    lone = [spikes(r.y, g) for r, g in zip(recordings, good, strict=True)]
+    lone = [spikes(r.y, g, limits.spike) for r, g in zip(recordings, good, strict=True)]
     count = sum(int(s.sum()) for s in lone)
-    if count >= 3 and "sensor.outliers" not in without:
+    if count >= limits.least_spikes and "sensor.outliers" not in without:
         heights = np.concatenate(
             [np.abs(r.y - _neighbours(r.y, g))[s] for r, g, s in zip(recordings, good, lone, strict=True)]
         )
@@ -145,7 +147,7 @@ def inspect(
     return good, effects
 
 
-def _clipped(recordings: Sequence[Recording]) -> tuple[list[BoolArray], dict[str, float]]:
+def _clipped(recordings: Sequence[Recording], limits: Thresholds) -> tuple[list[BoolArray], dict[str, float]]:
     """Return the rows that stand at the readings' largest or smallest value, where that value is an end stop.
 
     Continuous readings hardly ever take their extreme value twice; a converter's end takes it again and again, or once
@@ -153,13 +155,13 @@ def _clipped(recordings: Sequence[Recording]) -> tuple[list[BoolArray], dict[str
     """
     y = np.concatenate([r.y for r in recordings])
     ends = (float(np.nanmin(y)), float(np.nanmax(y)))
-    elsewhere = any(bool(np.any(frozen_rows(r.y) & ~np.isin(r.y, ends))) for r in recordings)
+    elsewhere = any(bool(np.any(frozen_rows(r.y, limits.least_run) & ~np.isin(r.y, ends))) for r in recordings)
     rows = [np.zeros(len(r), dtype=bool) for r in recordings]
     levels: dict[str, float] = {}
     for key, level in zip(("low", "high"), ends, strict=True):
         at = [r.y == level for r in recordings]
         runs = sum(int(np.sum(a[1:] & ~a[:-1]) + a[0]) for a in at)
-        if sum(int(a.sum()) for a in at) >= 5 and (runs >= 2 or not elsewhere):
+        if sum(int(a.sum()) for a in at) >= limits.least_clipped and (runs >= 2 or not elsewhere):
             levels[key] = level
             rows = [a | b for a, b in zip(rows, at, strict=True)]
     return rows, levels
@@ -182,11 +184,11 @@ def _neighbours(y: FloatArray, good: BoolArray) -> FloatArray:
     return np.asarray(0.5 * (np.roll(filled, 1) + np.roll(filled, -1)))
 
 
-def _quantisation(recordings: Sequence[Recording], step: float, unit: str) -> list[SampleEffect]:
+def _quantisation(recordings: Sequence[Recording], step: float, unit: str, limits: Thresholds) -> list[SampleEffect]:
     jitter = np.concatenate([np.diff(r.y) for r in recordings])
     share = float(np.mean(jitter == 0.0))
     noise = jitter_of(np.concatenate([r.y for r in recordings]))
-    if share < 0.02 or step**2 / 12.0 < 0.05 * noise**2:
+    if share < limits.least_equal_share or step**2 / 12.0 < limits.least_rounding * noise**2:
         return []  # too fine to matter beside the noise
     rows = sum(len(r) for r in recordings)
     return [
@@ -238,7 +240,9 @@ def _outliers(
     )
 
 
-def jitter_effect(result: Fit, recordings: Sequence[Recording]) -> SampleEffect | None:
+def jitter_effect(
+    result: Fit, recordings: Sequence[Recording], least_decrease: float = Thresholds.jitter_decrease
+) -> SampleEffect | None:
     """Return timing jitter where the residual's variance grows with the output's squared slope.
 
     A stamp that is wrong by d adds d dy/dt to the reading: Var e = s^2 + d_sd^2 (dy/dt)^2.
@@ -248,7 +252,7 @@ def jitter_effect(result: Fit, recordings: Sequence[Recording]) -> SampleEffect 
         slope = np.gradient(out[:, 0], r.t)
         use = (e != 0.0) & np.isfinite(slope)
         slopes.append(slope[use] ** 2)
-        # the fast part alone: slow misfit also grows with the slope
+        # the fast part alone: what is missing and slow grows with the slope
         fast = np.zeros_like(e)
         fast[1:-1] = (e[1:-1] - 0.5 * (e[:-2] + e[2:])) / np.sqrt(1.5)
         squares.append(fast[use] ** 2)
@@ -266,7 +270,7 @@ def jitter_effect(result: Fit, recordings: Sequence[Recording]) -> SampleEffect 
     fitted = np.maximum(X @ np.maximum(coefficients, [1e-6 * level, 0.0]), 1e-9 * level)
     constant = float(np.mean(z))
     gain = float(np.sum(np.log(constant) + z / constant - np.log(fitted) - z / fitted))
-    if coefficients[1] <= 0.0 or gain < 30.0:
+    if coefficients[1] <= 0.0 or gain < least_decrease:
         return None
     sd = float(np.sqrt(coefficients[1]))
     return SampleEffect(

@@ -15,7 +15,7 @@ from autotune.arrays import FloatArray
 from autotune.controller import Controller
 from autotune.diagnosis.evidence.law import shown_law, stated_law
 from autotune.diagnosis.evidence.residual import filled
-from autotune.diagnosis.evidence.samples import frozen_rows, lattice_step
+from autotune.diagnosis.evidence.samples import converter_step, frozen_rows
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import Fit
 from autotune.recording import Recording
@@ -151,7 +151,7 @@ def value_screen(recordings: Sequence[Recording]) -> ValueScreen:
     """Look at the values that the reading takes: converter steps, end stops, repeated readings."""
     y = np.concatenate([r.y for r in recordings])
     y = y[np.isfinite(y)]
-    step = lattice_step(y)
+    step = converter_step(y)
     frozen = sum(int(frozen_rows(r.y).sum()) for r in recordings)
     ends = max(int(np.sum(y == y.min())), int(np.sum(y == y.max())))
     parts = [f"{np.unique(y).size} different values in {y.size} readings"]

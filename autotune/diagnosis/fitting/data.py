@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -12,10 +12,8 @@ from numba import njit
 from autotune.arrays import BoolArray, FloatArray, IntArray
 from autotune.diagnosis.fitting.noise import Noise
 from autotune.diagnosis.simulation.simulator import Windows
+from autotune.diagnosis.thresholds import Thresholds
 from autotune.recording import Recording
-
-#: Windows of a recording that thinning leaves: fewer would miss a direction or a level of the motion.
-LEAST_WINDOWS_KEPT = 6
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -34,6 +32,8 @@ class Data:
         Rows before which the windows end.
     noise : Noise
         Autoregressive noise model that whitens residuals.
+    thresholds : Thresholds
+        What decides between two findings.
     numbers : tuple of int
         The recordings' numbers in the order given by the user.
     """
@@ -43,23 +43,24 @@ class Data:
     starts: tuple[IntArray, ...]
     stops: tuple[IntArray, ...]
     noise: Noise
+    thresholds: Thresholds = field(default_factory=Thresholds)
     numbers: tuple[int, ...] = ()
 
-    def thinned(self, rows: int, telling: Sequence[BoolArray] | None = None) -> Data:
+    def thinned(self, rows: int, informative: Sequence[BoolArray] | None = None) -> Data:
         """Return the data with windows left out evenly, until about as many rows count.
 
-        Windows in which u or y is largest or smallest stay, and those named as telling: a limit that is rarely reached
-        acts only there.
+        Windows in which u or y is largest or smallest stay, and those named as informative: a limit that is rarely
+        reached acts only there.
         """
         share = max(1.0, self.rows / rows)
         if share < 1.5:
             return self
-        if all(len(a) <= LEAST_WINDOWS_KEPT for a in self.starts):
+        if all(len(a) <= self.thresholds.least_windows for a in self.starts):
             return self
         chosen = []
-        named = [np.zeros(len(a), dtype=bool) for a in self.starts] if telling is None else telling
+        named = [np.zeros(len(a), dtype=bool) for a in self.starts] if informative is None else informative
         for r, a, ok, tells in zip(self.recordings, self.starts, self.good, named, strict=True):
-            count = min(len(a), max(LEAST_WINDOWS_KEPT, round(len(a) / share)))
+            count = min(len(a), max(self.thresholds.least_windows, round(len(a) / share)))
             far = [extreme(np.where(ok, x, np.median(x[ok]))) for x in (r.u, r.y) for extreme in (np.argmin, np.argmax)]
             extremes = np.clip(np.searchsorted(a, far, side="right") - 1, 0, len(a) - 1)
             evenly = np.linspace(0, len(a) - 1, count).round().astype(np.int64)

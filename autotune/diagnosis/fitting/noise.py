@@ -1,6 +1,6 @@
 """The measurement noise, estimated without believing any model's slow behaviour.
 
-Differences of a simulation residual keep the noise and lose what is slow: a misfit of structure moves over many
+Differences of a simulation residual keep the noise and lose what is slow: what a structure lacks moves over many
 samples. For AR(1) noise n_k = rho n_{k-1} + e_k the first difference has variance 2 s^2 (1 - rho) and lag-one
 covariance -s^2 (1 - rho)^2, which gives both numbers.
 """
@@ -13,9 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from autotune.arrays import BoolArray, FloatArray
-
-#: Correlation is held below this: beyond it a first difference cannot tell noise from slow misfit.
-LARGEST_RHO = 0.9
+from autotune.diagnosis.thresholds import Thresholds
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,7 +44,11 @@ class Noise:
         return float(self.sd * np.sqrt(response @ response))
 
 
-def noise_from_differences(residuals: Sequence[FloatArray], good: Sequence[BoolArray]) -> Noise:
+def noise_from_differences(
+    residuals: Sequence[FloatArray],
+    good: Sequence[BoolArray],
+    largest_correlation: float = Thresholds.largest_correlation,
+) -> Noise:
     """Estimate the measurement noise as AR(1).
 
     Parameters
@@ -55,6 +57,8 @@ def noise_from_differences(residuals: Sequence[FloatArray], good: Sequence[BoolA
         y - y_sim per recording, or y itself.
     good : sequence of (N,) bool array
         Rows that count.
+    largest_correlation : float
+        Bound of the correlation: beyond it a first difference cannot tell noise from a slow residual.
 
     Returns
     -------
@@ -64,7 +68,7 @@ def noise_from_differences(residuals: Sequence[FloatArray], good: Sequence[BoolA
     Notes
     -----
     Differences are winsorised at 4.5 robust standard deviations, so that single jumps (a relay's edge that the model
-    misses, an outlier) do not count as noise. Misfit faster than some samples is taken for noise.
+    misses, an outlier) do not count as noise. What is missing and faster than some samples is taken for noise.
     """
     c0 = c1 = n = 0.0
     for r, ok in zip(residuals, good, strict=True):
@@ -81,7 +85,7 @@ def noise_from_differences(residuals: Sequence[FloatArray], good: Sequence[BoolA
         n += float(use.sum())
     if n == 0.0 or c0 == 0.0:
         return Noise(sd=0.0)
-    rho = float(np.clip(1.0 + 2.0 * c1 / c0, 0.0, LARGEST_RHO))
+    rho = float(np.clip(1.0 + 2.0 * c1 / c0, 0.0, largest_correlation))
     return Noise(sd=float(np.sqrt(c0 / n * (1.0 + rho) / 2.0)), ar=(rho,))
 
 

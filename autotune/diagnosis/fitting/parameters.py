@@ -13,11 +13,10 @@ import numpy as np
 from autotune.arrays import FloatArray
 from autotune.diagnosis.effects import kind_of
 from autotune.diagnosis.simulation.simulator import Simulator, assemble
+from autotune.diagnosis.thresholds import Thresholds
 from autotune.models import Block, Effect, Model, Parameter, TransferFunction
 
 Kind: TypeAlias = Literal["gain", "den", "num", "delay", "u_offset", "effect"]
-#: Standard deviation of a nominal number's logarithm: people's gains and lags are right to some tens of percent.
-NOMINAL_SPREAD = 0.2
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -157,7 +156,9 @@ def gain_block(blocks: Sequence[Block]) -> int:
     return (plant or dynamic or [0])[0]
 
 
-def chain_parameters(model: Model, input_size: float, sample_time_s: float) -> tuple[list[Free], list[float]]:
+def chain_parameters(
+    model: Model, input_size: float, sample_time_s: float, prior_spread: float = Thresholds.prior_spread
+) -> tuple[list[Free], list[float]]:
     """Return the chain's free numbers and their centres.
 
     Parameters
@@ -168,6 +169,8 @@ def chain_parameters(model: Model, input_size: float, sample_time_s: float) -> t
         Size of the command's deviations, the step of its offset.
     sample_time_s : float
         Sample time [s], the least uncertainty of a dead time.
+    prior_spread : float
+        Standard deviation of a nominal number's logarithm.
 
     Returns
     -------
@@ -175,22 +178,22 @@ def chain_parameters(model: Model, input_size: float, sample_time_s: float) -> t
         Gain, every lag (coefficients of denominators above the constant), zeros, dead time where the model has one,
         and the command's operating point.
     """
-    free = [Free(name="gain", kind="gain", spread=NOMINAL_SPREAD)]
+    free = [Free(name="gain", kind="gain", spread=prior_spread)]
     centre = [0.0]
     for i, block in enumerate(model.blocks):
         den, num = block.dynamics.den, block.dynamics.num
         for j in range(len(den) - 1):
             if den[j] != 0.0 and den[-1] != 0.0:
-                free.append(Free(name=f"{block.name} den[{j}]", kind="den", index=(i, j), spread=NOMINAL_SPREAD))
+                free.append(Free(name=f"{block.name} den[{j}]", kind="den", index=(i, j), spread=prior_spread))
                 centre.append(0.0)
         for j in range(len(num) - 1):
             if num[j] != 0.0:
-                free.append(Free(name=f"{block.name} num[{j}]", kind="num", index=(i, j), spread=NOMINAL_SPREAD))
+                free.append(Free(name=f"{block.name} num[{j}]", kind="num", index=(i, j), spread=prior_spread))
                 centre.append(0.0)
     delay = sum(block.dynamics.delay_s for block in model.blocks)
     if delay > 0.0:
         # searched in units of the dead time itself: a logarithm would never reach zero
-        spread = max(NOMINAL_SPREAD, 0.5 * sample_time_s / delay)
+        spread = max(prior_spread, 0.5 * sample_time_s / delay)
         free.append(Free(name="dead time", kind="delay", positive=False, size=delay, spread=spread))
         centre.append(1.0)
     free.append(Free(name="input offset", kind="u_offset", positive=False, size=input_size))
@@ -203,6 +206,7 @@ def parametrise(
     effects: Sequence[Effect],
     input_size: float,
     sample_time_s: float,
+    prior_spread: float = Thresholds.prior_spread,
 ) -> Parametrisation:
     """Set a model's numbers and those of effects free.
 
@@ -212,7 +216,7 @@ def parametrise(
         Nominal model without effects.
     effects : sequence of Effect
         Effects at their starting values. Parameters that count or mark stay as they are.
-    input_size, sample_time_s : float
+    input_size, sample_time_s, prior_spread : float
         As in :func:`chain_parameters`.
 
     Returns
@@ -220,7 +224,7 @@ def parametrise(
     Parametrisation
         Chain and effects, ready to be fitted.
     """
-    free, centre = chain_parameters(model, input_size, sample_time_s)
+    free, centre = chain_parameters(model, input_size, sample_time_s, prior_spread)
     for number, effect in enumerate(effects):
         kind = kind_of(effect.name)
         for j, (key, parameter) in enumerate(effect.parameters.items()):

@@ -13,16 +13,13 @@ from autotune.diagnosis.effects.base import EffectKind, Values
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import Fit, fit, residual_at, start_states
 from autotune.diagnosis.fitting.parameters import Parametrisation
+from autotune.diagnosis.thresholds import Thresholds
 
-#: A window stands out whose misfit is this many times the median window's.
-STANDS_OUT = 1.5
 #: Share of a window on which a start state is found first: before a blow has carried its error far away.
 BEGINNING = 4
 #: How far effects are moved at first: for a converter its step as a share of what takes it a level off across u's span,
 #: its origin as a share of the step; how often these are halved.
 MOVES, HALVINGS = (0.5, 0.1), 5
-#: Decrease of the cost from which on moved effects or renewed start states are taken, and tried again from there.
-LEAST_GAIN = 10.0
 #: How often start states are found anew at most.
 RENEWALS = 3
 
@@ -47,8 +44,8 @@ def restarted(result: Fit, data: Data) -> Fit:
     Start states are fitted to the windows' beginnings alone, from rest; from there to whole windows, all else held.
     Those that then explain their window better replace the old ones, and everything is fitted again.
     """
-    before = _misfits(result)
-    out = np.concatenate(standing_out(result))
+    before = _mean_squares(result)
+    out = np.concatenate(standing_out(result, data.thresholds.stands_out))
     if not out.any():
         return result
     p, held = result.parametrisation, np.zeros(result.theta.size, dtype=bool)
@@ -59,7 +56,7 @@ def restarted(result: Fit, data: Data) -> Fit:
         return [np.where(w[:, None], a, b) for w, a, b in zip(np.split(which, cuts), new, result.x0, strict=True)]
 
     settled = fit(p, data, result.theta, chosen(out, begun.x0), free=held, rounds=1)
-    better = out & (_misfits(settled) < before)
+    better = out & (_mean_squares(settled) < before)
     if not better.any():
         return result
     again = fit(p, data, result.theta, chosen(better, settled.x0), iterations=30, inherit=result)
@@ -90,17 +87,17 @@ def renewed(result: Fit, data: Data) -> Fit:
     for _ in range(RENEWALS):
         begun = fit(p, data, result.theta, free=held, iterations=30)
         again = fit(p, data, begun.theta, begun.x0, iterations=30, rounds=4)
-        if again.cost > result.cost - LEAST_GAIN:
+        if again.cost > result.cost - data.thresholds.restart_decrease:
             break
         result = again
     return result
 
 
-def standing_out(result: Fit) -> list[BoolArray]:
+def standing_out(result: Fit, times: float = Thresholds.stands_out) -> list[BoolArray]:
     """Return which windows of every recording a fit explains far worse than the median window."""
-    misfits = _misfits(result)
+    sizes = _mean_squares(result)
     cuts = np.cumsum([len(starts) for starts in result.starts])[:-1]
-    return np.split(misfits > STANDS_OUT * np.median(misfits), cuts)
+    return np.split(sizes > times * np.median(sizes), cuts)
 
 
 def realigned(result: Fit, data: Data) -> Fit:
@@ -141,7 +138,7 @@ def realigned(result: Fit, data: Data) -> Fit:
     if best is before:
         return result
     again = fit(best.parametrisation, data, best.theta, result.x0, iterations=30, inherit=result)
-    return realigned(again, data) if again.cost < result.cost - LEAST_GAIN else result
+    return realigned(again, data) if again.cost < result.cost - data.thresholds.restart_decrease else result
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -174,7 +171,7 @@ def _moved(result: Fit, data: Data, kind: EffectKind, number: int, values: Value
     return _Moved(values=values, parametrisation=p, theta=theta, cost=float(left @ left))
 
 
-def _misfits(result: Fit) -> FloatArray:
+def _mean_squares(result: Fit) -> FloatArray:
     """Return every window's mean square of the whitened residual."""
     e = result.e
     return np.array([float(np.mean(e[a:b] ** 2)) for a, b in result.windows])

@@ -13,22 +13,21 @@ from autotune.diagnosis.fitting.fit import RUNAWAY, Fit, fit
 from autotune.diagnosis.fitting.noise import Noise, autoregressive, noise_from_differences
 from autotune.diagnosis.fitting.parameters import Parametrisation, parametrise
 from autotune.diagnosis.fitting.restarts import renewed
-from autotune.diagnosis.fitting.windows import LAGS_PER_WINDOW, known_from_s, slowest_lag_s, window_rows
+from autotune.diagnosis.fitting.windows import known_from_s, slowest_lag_s, window_rows
+from autotune.diagnosis.thresholds import IN_USE, Thresholds
 from autotune.models import Model
 from autotune.recording import Recording
 
-#: Residual variance over the noise's from which on the misfit itself is taken for white noise: the jitter of a clean
-#: recording says nothing of how well a model can do.
-COARSE = 25.0
-#: A residual of at most this misfit is near noise; joined in threes, windows may leave that much more of it. (Of 59
-#: right explanations of concealed cases none left more than 0.017.)
-NEAR_NOISE, LONGER, LEAVES_MORE = 1.15, 3, 0.03
 #: Blocks of a window whose means show slow power.
 BLOCKS = 24
 
 
 def prepare(
-    model: Model, recordings: Sequence[Recording], good: Sequence[BoolArray], times: int = 1
+    model: Model,
+    recordings: Sequence[Recording],
+    good: Sequence[BoolArray],
+    times: int = 1,
+    thresholds: Thresholds = IN_USE,
 ) -> tuple[Data, Fit]:
     """Retune the nominal structure, and estimate the noise from what it leaves.
 
@@ -42,33 +41,37 @@ def prepare(
         Rows whose reading counts.
     times : int
         How many times as long as usual windows are.
+    thresholds : Thresholds
+        What decides between two findings.
 
     Returns
     -------
     data, retuned
         Data with windows and noise, and the fit.
     """
-    length = times * LAGS_PER_WINDOW * slowest_lag_s(model)
-    noise = floored(noise_from_differences([r.y for r in recordings], good), recordings)
-    windows = [window_rows(r, length, known_from_s(model, r)) for r in recordings]
+    length = times * thresholds.lags_per_window * slowest_lag_s(model)
+    largest = thresholds.largest_correlation
+    noise = floored(noise_from_differences([r.y for r in recordings], good, largest), recordings)
+    windows = [window_rows(r, length, known_from_s(model, r, thresholds), thresholds) for r in recordings]
     data = Data(
         recordings=tuple(recordings),
         good=tuple(g & (np.arange(g.size) >= starts[0]) for g, (starts, _) in zip(good, windows, strict=True)),
         starts=tuple(starts for starts, _ in windows),
         stops=tuple(stops for _, stops in windows),
         noise=noise,
+        thresholds=thresholds,
     )
     size = float(np.std(np.concatenate([r.u for r in recordings]))) or 1.0
-    p = parametrise(model, [], size, recordings[0].sample_time_s)
+    p = parametrise(model, [], size, recordings[0].sample_time_s, thresholds.prior_spread)
     result = fit(p, data)
     for _ in range(2):
-        coarse = reduced_chi2(result, data) > COARSE
-        noise = noise_from_differences(result.residuals, data.good)
+        coarse = reduced_chi2(result, data) > thresholds.coarse
+        noise = noise_from_differences(result.residuals, data.good, largest)
         if coarse:
             noise = Noise(sd=float(np.sqrt(np.mean(np.concatenate(result.residuals) ** 2))))
         data = replace(data, noise=floored(noise, recordings))
         result = fit(p, data, result.theta, result.x0, iterations=20)
-    return data, _straightened(result, data) if far_from_prior(result) else result
+    return data, _straightened(result, data) if far_from_prior(result, thresholds.far_from_prior) else result
 
 
 def _straightened(result: Fit, data: Data) -> Fit:
@@ -86,25 +89,26 @@ def holds(result: Fit, data: Data) -> bool:
     windows that are joined. What is true leaves the same.
     """
     before = reduced_chi2(result, data)
-    if before > NEAR_NOISE:
+    limits = data.thresholds
+    if before > limits.near_noise:
         return True
-    joined, p = data.joined(LONGER), result.parametrisation
-    theta, x0 = result.theta, tuple(x[::LONGER] for x in result.x0)
+    joined, p = data.joined(limits.longer_windows), result.parametrisation
+    theta, x0 = result.theta, tuple(x[:: limits.longer_windows] for x in result.x0)
     for iterations, rounds in ((8, 1), (20, 2)):
         try:
             again = fit(p, joined, theta, x0, iterations=iterations, rounds=rounds)
         except RUNAWAY:
             return False
-        if reduced_chi2(again, joined) < before + LEAVES_MORE:
+        if reduced_chi2(again, joined) < before + limits.leaves_more:
             return True
         theta, x0 = again.theta, again.x0
     return False
 
 
-def far_from_prior(result: Fit, far: float = 2.0) -> bool:
-    """Whether retuning moved a gain or lag so far that it must stand for something else."""
+def far_from_prior(result: Fit, sds: float) -> bool:
+    """Whether retuning moved a gain or lag by more than some of its prior's standard deviations."""
     away = np.abs(result.theta - result.parametrisation.centre) / result.parametrisation.spreads
-    return bool(np.max(away, initial=0.0) > far)
+    return bool(np.max(away, initial=0.0) > sds)
 
 
 def at_operating_point(p: Parametrisation, data: Data) -> Fit:
@@ -122,7 +126,9 @@ def floored(noise: Noise, recordings: Sequence[Recording]) -> Noise:
 
 def reduced_chi2(result: Fit, data: Data) -> float:
     """Return the residual's variance in units of the noise that its own row-to-row jitter shows."""
-    noise = floored(noise_from_differences(result.residuals, data.good), data.recordings)
+    noise = floored(
+        noise_from_differences(result.residuals, data.good, data.thresholds.largest_correlation), data.recordings
+    )
     e = np.concatenate(replace(data, noise=noise).whitened(list(result.residuals)))
     states = sum(Q.shape[1] for Q in result.states_explain)
     freedom = max(data.rows - states - result.theta.size, 1)

@@ -6,16 +6,9 @@ import numpy as np
 
 from autotune.arrays import IntArray
 from autotune.diagnosis.simulation.chain import build_chain
+from autotune.diagnosis.thresholds import IN_USE, Thresholds
 from autotune.models import Model
 from autotune.recording import Recording
-
-#: Windows last this many of the slowest lag's time constants: long enough for structure to show.
-LAGS_PER_WINDOW = 10.0
-LEAST_ROWS = 60
-LEAST_WINDOWS = 6
-#: What was commanded before a recording begins is unknown: that many of the slowest lags after the dead time it acts no
-#: more (through a dead time, a rate limit); at most this share of the recording is left out.
-UNKNOWN_LAGS, MOST_LEFT_OUT = 1.0, 0.03
 
 
 def slowest_lag_s(model: Model) -> float:
@@ -26,14 +19,20 @@ def slowest_lag_s(model: Model) -> float:
     return float(1.0 / rates.min()) if rates.size else 0.0
 
 
-def known_from_s(model: Model, recording: Recording) -> float:
-    """Return the time from which on a recording's own commands tell what acts [s]."""
+def known_from_s(model: Model, recording: Recording, thresholds: Thresholds = IN_USE) -> float:
+    """Return the time from which on a recording's own commands tell what acts [s].
+
+    What was commanded before a recording begins is unknown: some of the slowest lags after the dead time it acts no
+    more (through a dead time, a rate limit).
+    """
     delay = sum(block.dynamics.delay_s for block in model.blocks)
-    unknown = delay + UNKNOWN_LAGS * slowest_lag_s(model)
-    return float(recording.t[0] + min(unknown, MOST_LEFT_OUT * recording.duration_s))
+    unknown = delay + thresholds.unknown_lags * slowest_lag_s(model)
+    return float(recording.t[0] + min(unknown, thresholds.most_left_out * recording.duration_s))
 
 
-def window_rows(recording: Recording, length_s: float, from_s: float) -> tuple[IntArray, IntArray]:
+def window_rows(
+    recording: Recording, length_s: float, from_s: float, thresholds: Thresholds = IN_USE
+) -> tuple[IntArray, IntArray]:
     """Return the rows where windows of about a length start, and those before which they end.
 
     Parameters
@@ -44,10 +43,13 @@ def window_rows(recording: Recording, length_s: float, from_s: float) -> tuple[I
         Length of a window [s].
     from_s : float
         Time before which no window starts [s].
+    thresholds : Thresholds
+        How few rows and windows there may be.
     """
     duration = recording.t[-1] - from_s
-    length = max(length_s, LEAST_ROWS * recording.sample_time_s)
-    count = max(1, round(duration / length), min(LEAST_WINDOWS, len(recording) // LEAST_ROWS))
+    least = thresholds.least_window_rows
+    length = max(length_s, least * recording.sample_time_s)
+    count = max(1, round(duration / length), min(thresholds.least_windows, len(recording) // least))
     edges = from_s + duration / count * np.arange(count)
     starts = np.unique(np.searchsorted(recording.t, edges - 1e-9)).astype(np.int64)
     return starts, np.append(starts[1:], len(recording))

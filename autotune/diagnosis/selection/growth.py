@@ -9,15 +9,13 @@ from autotune.diagnosis.effects import kind_of
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import RUNAWAY, Fit, fit
 from autotune.diagnosis.selection.hypothesis import Hypothesis, hypothesis, is_stand_in, merged, penalised
-from autotune.diagnosis.selection.parsimony import LEAST_DECREASE, needed, simplest, simplicity_lead
+from autotune.diagnosis.selection.parsimony import needed, simplest, simplicity_lead
 from autotune.diagnosis.selection.polishing import polish
 from autotune.diagnosis.selection.scan import searched
 from autotune.diagnosis.selection.screening import Bench, Width, extend
 from autotune.diagnosis.simulation.simulator import states_that_stay
+from autotune.diagnosis.thresholds import Thresholds
 from autotune.models import Effect
-
-#: A screened hypothesis this share of the best one's decrease behind, and this much, is not fitted to all rows.
-FAR_BEHIND = (0.3, 60.0)
 
 
 def lasting_starts(base: Hypothesis, data: Data, bench: Bench, names: Collection[str]) -> list[Effect]:
@@ -54,7 +52,8 @@ def grown(base: Hypothesis, data: Data, bench: Bench, width: Width, lasting: Seq
 
 def larger(bases: Sequence[Hypothesis], data: Data, bench: Bench) -> list[Hypothesis]:
     """Return fits with one effect more than bases have, best first."""
-    width = Width(effects=4, starts=1, least=0.5 * LEAST_DECREASE)
+    limits = data.thresholds
+    width = Width(effects=limits.further_effects, starts=1, least=0.5 * limits.least_decrease)
     return merged([h for base in bases for h in grown(base, data, bench, width)])
 
 
@@ -87,7 +86,7 @@ def exchanged(chosen: Hypothesis, data: Data, base: Fit, bench: Bench) -> list[H
         confusable = {*kind_of(name).confusable} - {*chosen.names, *kind_of(name).same}
         others = tuple(kind for kind in bench.kinds if kind.name in confusable)
         if smaller is not None and others:
-            width = Width(effects=len(others), starts=2)
+            width = Width(effects=len(others), starts=2, least=data.thresholds.least_predicted)
             found += grown(smaller, data, replace(bench, kinds=others), width)[:1]
     return [h for h in bench.pool.map(lambda h: polish(h, data, base), found) if h is not None]
 
@@ -112,7 +111,7 @@ def without(h: Hypothesis, index: int, data: Data) -> Hypothesis | None:
 
 def polished(ranked: Sequence[Hypothesis], count: int, data: Data, base: Fit, bench: Bench) -> list[Hypothesis]:
     """Return the best hypotheses fitted to all data, best first."""
-    few = [h for h in ranked[:count] if not _far_behind(h, ranked[0], base)]
+    few = [h for h in ranked[:count] if not _far_behind(h, ranked[0], base, data.thresholds)]
     fits = bench.pool.map(lambda h: polish(h, data, base), few)
     done = sorted((h for h in fits if h is not None), key=penalised)
     if done:
@@ -122,8 +121,8 @@ def polished(ranked: Sequence[Hypothesis], count: int, data: Data, base: Fit, be
     return done
 
 
-def _far_behind(h: Hypothesis, best: Hypothesis, base: Fit) -> bool:
+def _far_behind(h: Hypothesis, best: Hypothesis, base: Fit, limits: Thresholds) -> bool:
     """Whether a hypothesis is so far behind on the rows screened that all rows will not turn it."""
     share = h.fit.rows / base.rows
     behind, gained = penalised(h) - penalised(best), share * base.cost - best.fit.cost
-    return behind > max(FAR_BEHIND[0] * gained, FAR_BEHIND[1])
+    return behind > max(limits.far_behind_share * gained, limits.far_behind)

@@ -8,22 +8,7 @@ from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import Fit
 from autotune.diagnosis.fitting.retuning import far_from_prior, reduced_chi2
 from autotune.diagnosis.selection.hypothesis import Hypothesis, penalised
-
-#: Decrease of the score that an effect must bring: what chance brings among some two hundred starts, with a margin (on
-#: clean recordings nothing brought more than 15); weak effects that can be told bring a hundred and more, some 40.
-LEAST_DECREASE = 30.0
-#: The same where a number of the nominal structure lies beyond belief without the effect, by that many of its prior's
-#: standard deviations: a lag that has to be tripled is no wrong number.
-LEAST_BEYOND_BELIEF, BEYOND_BELIEF = 16.0, 4.0
-#: Score that a hypothesis with more free numbers must be ahead of one with fewer; a hundredth of what it explains where
-#: that is more and the misfit of the best is more than noise has.
-SIMPLER, NOISE_ALONE = 6.0, 1.02
-#: The same where the best leaves noise alone, and what a further effect has to bring, as a share of what is explained:
-#: no simulation of thresholds is more exact; after a blow against a stop the least change of any number shows.
-SIMULATED, AFTER_BLOWS = 2e-3, 5e-3
-#: Misfit from which on what is wrong with all of them rules, and not noise; the lead is then this share of what the
-#: best explains: a real rig's every imperfection is more than its noise, and little of it is worth a name.
-MODEL_ERROR, MODEL_ERROR_SHARE = 2.0, 0.12
+from autotune.diagnosis.thresholds import Thresholds
 
 
 def simplest(ranked: Sequence[Hypothesis], lead: float) -> Hypothesis:
@@ -33,27 +18,29 @@ def simplest(ranked: Sequence[Hypothesis], lead: float) -> Hypothesis:
 
 
 def simplicity_lead(base: Fit, best: Hypothesis, data: Data) -> float:
-    """Return by how much a richer hypothesis must beat a simpler one to be preferred, in units of the score.
+    """Return by how much a richer hypothesis must beat a simpler one to be preferred, in penalised chi-square.
 
-    Where even the best leaves more than noise, its score counts what is wrong with all of them, and more is asked.
+    Where even the best leaves more than noise, its chi-square counts what is wrong with all of them, and more is asked.
     """
-    if reduced_chi2(best.fit, data) < NOISE_ALONE:
-        return max(SIMPLER, _inexact(best) * (base.cost - best.fit.cost))
-    return max(SIMPLER, 0.01 * (base.cost - best.fit.cost))
+    limits, explained = data.thresholds, base.cost - best.fit.cost
+    if reduced_chi2(best.fit, data) < limits.noise_alone:
+        return max(limits.simpler_lead, _inexact(best, limits) * explained)
+    return max(limits.simpler_lead, limits.simpler_share * explained)
 
 
 def final_lead(base: Fit, best: Hypothesis, data: Data) -> float:
     """Return the same for the choice among all that were found, where the model's error may be what is left."""
     lead = simplicity_lead(base, best, data)
-    if reduced_chi2(best.fit, data) < MODEL_ERROR:
+    if reduced_chi2(best.fit, data) < data.thresholds.model_error:
         return lead
-    return max(lead, MODEL_ERROR_SHARE * (base.cost - best.fit.cost))
+    return max(lead, data.thresholds.model_error_share * (base.cost - best.fit.cost))
 
 
-def worth_adding(smaller: Hypothesis, larger: Hypothesis) -> bool:
-    """Whether a larger hypothesis explains enough more to be believed."""
+def worth_adding(smaller: Hypothesis, larger: Hypothesis, limits: Thresholds) -> bool:
+    """Whether a larger hypothesis explains enough more to be worth its numbers."""
     excess = max(1.0, larger.fit.chi2 / larger.fit.rows)
-    least = LEAST_BEYOND_BELIEF if far_from_prior(smaller.fit, BEYOND_BELIEF) else LEAST_DECREASE
+    beyond = far_from_prior(smaller.fit, limits.beyond_prior)
+    least = limits.least_decrease_beyond if beyond else limits.least_decrease
     return bool(penalised(smaller) - penalised(larger) > least * excess)
 
 
@@ -62,11 +49,13 @@ def needed(smaller: Hypothesis, larger: Hypothesis, data: Data, base: Fit) -> bo
 
     On a rig with disturbances of its own every further effect explains a little; that little is not physics.
     """
+    limits = data.thresholds
     before, after = reduced_chi2(smaller.fit, data) - 1.0, reduced_chi2(larger.fit, data) - 1.0
-    more = penalised(smaller) - penalised(larger) > _inexact(larger) * (base.cost - larger.fit.cost)
-    return more and worth_adding(smaller, larger) and (after < 0.08 or after < 0.5 * before)
+    more = penalised(smaller) - penalised(larger) > _inexact(larger, limits) * (base.cost - larger.fit.cost)
+    enough = after < limits.noise_left or after < limits.half_left * before
+    return more and worth_adding(smaller, larger, limits) and enough
 
 
-def _inexact(h: Hypothesis) -> float:
+def _inexact(h: Hypothesis, limits: Thresholds) -> float:
     """Return the share of what is explained that a hypothesis's simulation may be wrong by."""
-    return AFTER_BLOWS if any(kind.impacts for kind in h.kinds) else SIMULATED
+    return limits.impact_error if any(kind.impacts for kind in h.kinds) else limits.simulation_error

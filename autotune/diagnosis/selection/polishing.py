@@ -38,7 +38,7 @@ def _polish(h: Hypothesis, data: Data, base: Fit, rounds: int) -> Hypothesis:
     nudges = [kind.nudge for kind in h.kinds if kind.is_rough]
     if nudges or any(kind.impacts for kind in h.kinds):
         best = freed(best, data)
-    if nudges or far_from_prior(best):
+    if nudges or far_from_prior(best, data.thresholds.far_from_prior):
         best = renewed(best, data)
     positive = np.array([f.kind == "effect" and f.positive for f in p.free])
     for shift in (-min(nudges), min(nudges)) if nudges and positive.any() else ():

@@ -17,10 +17,6 @@ from autotune.diagnosis.fitting.parameters import Parametrisation, effect_with, 
 from autotune.errors import IdentificationError
 from autotune.models import Effect, Model
 
-#: Decrease that an effect's direction may have, as a share of chi2, before it is taken for too large to be linear.
-LINEAR_SHARE = 0.3
-#: Decrease that is predicted at least of an effect that makes impacts, where it acts at all.
-TOUCHED = 20.0
 #: Most simulations of one effect while it is shrunk, and the share of chi2 that a simulation counts that ran away.
 SHRINKINGS, RAN_AWAY = 4, 1e6
 #: Factors of an effect that are tried: of a signed one, of one that acts one way.
@@ -89,7 +85,9 @@ def extended(base: Fit, effect: Effect, data: Data) -> tuple[Parametrisation, Fl
     old = base.parametrisation
     effects = (*base.model.effects, effect)
     size = float(np.std(np.concatenate([r.u for r in data.recordings]))) or 1.0
-    p = parametrise(replace(old.model, effects=()), effects, size, data.recordings[0].sample_time_s)
+    p = parametrise(
+        replace(old.model, effects=()), effects, size, data.recordings[0].sample_time_s, data.thresholds.prior_spread
+    )
     theta = p.centre.copy()
     theta[: base.theta.size] = base.theta
     # an effect's own centre is its starting value; those fitted already keep the scale of their search
@@ -118,13 +116,13 @@ def predictions(base: Fit, effect: Effect, data: Data) -> list[Prediction]:
     An effect that moves the reading by more than a share of chi2 is shrunk: what far too large an effect does
     tells nothing of its direction near zero. Dry friction that is as large as that is found from its own size alone.
     """
-    tried = []
+    tried, linear = [], data.thresholds.linear_share
     for _ in range(SHRINKINGS):
         found, share = _predicted(base, effect, data)
         tried.append(found)
-        if share <= LINEAR_SHARE or not kind_of(effect.name).amplitudes:
+        if share <= linear or not kind_of(effect.name).amplitudes:
             break
-        effect = _scaled(effect, float(np.sqrt(0.3 * LINEAR_SHARE / share)), least=1e-9)
+        effect = _scaled(effect, float(np.sqrt(0.3 * linear / share)), least=1e-9)
     return [tried[-1], *tried[:1]] if len(tried) > 1 else tried
 
 
@@ -165,7 +163,7 @@ def _predicted(base: Fit, effect: Effect, data: Data) -> tuple[Prediction, float
         low, high = 0.0, 1.0  # a limit or a step is not made larger by a factor
     a = float(np.clip(slope / curvature, low, high))
     scaled = _scaled(effect, a, 20.0 if kind.is_signed else 2.0)
-    least = min(TOUCHED, curvature) if kind.impacts else 0.0
+    least = min(data.thresholds.impact_decrease, curvature) if kind.impacts else 0.0
     decrease = max(2.0 * a * slope - a * a * curvature, least)
     return Prediction(effect=effect, decrease=decrease, scaled=scaled), curvature / base.chi2
 

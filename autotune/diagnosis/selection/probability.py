@@ -10,9 +10,6 @@ from autotune.diagnosis.selection.hypothesis import penalised
 from autotune.diagnosis.selection.parsimony import final_lead, needed
 from autotune.diagnosis.selection.search import Search
 
-#: Scale of the log-odds: one unit of chi2 counts this much less than for ideal noise.
-TEMPERATURE = 3.0
-
 
 @dataclass(frozen=True, kw_only=True)
 class Candidate:
@@ -50,7 +47,8 @@ def candidates_of(found: Search, unknown_odds: float) -> tuple[Candidate, ...]:
                 pays = ahead + lead
         name = "+".join(h.names) if h.names else "none"
         scores[name] = min(scores.get(name, math.inf), penalised(h) + pays)
-    return weighed(scores, TEMPERATURE * max(1.0, chosen.fit.chi2 / chosen.fit.rows), unknown_odds)
+    temperature = found.data.thresholds.temperature
+    return weighed(scores, temperature * max(1.0, chosen.fit.chi2 / chosen.fit.rows), unknown_odds)
 
 
 def weighed(scores: Mapping[str, float], scale: float, unknown_odds: float) -> tuple[Candidate, ...]:

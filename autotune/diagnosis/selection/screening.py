@@ -21,14 +21,11 @@ from autotune.diagnosis.selection.prediction import (
     signal_sizes,
     starting_effects,
 )
+from autotune.diagnosis.thresholds import Thresholds
 from autotune.models import Effect
 
 #: Steps of a fit after which it is decided whether it goes on.
 FIRST_STEPS = 3
-#: Effects whose fits are finished, and fits of one effect.
-FINISHED, MOST_EACH = 4, 2
-#: Share of the best fit's decrease from which on any other is finished too, and of the best of the same effect.
-NEAR, SECOND = 0.8, 0.5
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,8 +64,8 @@ class Width:
     """
 
     effects: int
-    starts: int = 4
-    least: float = 3.0
+    starts: int
+    least: float
 
 
 def best_predictions(
@@ -156,7 +153,7 @@ def extend(
     starts = [e for group in tried if group[0].decrease > width.least for e in _distinct(group)[: width.starts]]
     begun = [h for h in bench.pool.map(lambda effect: _begun(base.fit, effect, data), starts) if h is not None]
     begun.sort(key=penalised)
-    finished = [h for k, h in enumerate(begun) if _goes_on(h, begun[:k], base)]
+    finished = [h for k, h in enumerate(begun) if _goes_on(h, begun[:k], base, data.thresholds)]
     fits: dict[str, Hypothesis] = {}
     for h in bench.pool.map(lambda h: _finished(h, data), finished):
         if is_stand_in(h, data):
@@ -167,12 +164,14 @@ def extend(
     return sorted(fits.values(), key=penalised)
 
 
-def _goes_on(h: Hypothesis, better: Sequence[Hypothesis], base: Hypothesis) -> bool:
+def _goes_on(h: Hypothesis, better: Sequence[Hypothesis], base: Hypothesis, limits: Thresholds) -> bool:
     """Whether a fit that has begun is worth finishing: among the best few, or near them, and not one name too often."""
     same = [other for other in better if other.names == h.names]
     gained = base.fit.cost - h.fit.cost
-    if len(same) >= MOST_EACH or (same and gained < SECOND * (base.fit.cost - same[0].fit.cost)):
+    if len(same) >= limits.finished_each or (
+        same and gained < limits.finished_second * (base.fit.cost - same[0].fit.cost)
+    ):
         return False
     lead = base.fit.cost - better[0].fit.cost if better else 0.0
     names = {other.names for other in better} | {h.names}
-    return len(names) <= FINISHED or gained > NEAR * lead
+    return len(names) <= limits.finished_effects or gained > limits.finished_near * lead

@@ -16,8 +16,6 @@ from autotune.diagnosis.fitting.fit import RUNAWAY, Fit, fit, states_of
 from autotune.diagnosis.fitting.noise import Noise, noise_from_differences
 from autotune.diagnosis.fitting.restarts import standing_out
 from autotune.diagnosis.fitting.retuning import (
-    COARSE,
-    LONGER,
     at_operating_point,
     far_from_prior,
     floored,
@@ -28,7 +26,6 @@ from autotune.diagnosis.fitting.retuning import (
 from autotune.diagnosis.selection.growth import exchanged, grown, larger, lasting_starts, polished, pruned
 from autotune.diagnosis.selection.hypothesis import Hypothesis, merged, penalised
 from autotune.diagnosis.selection.parsimony import (
-    MODEL_ERROR,
     final_lead,
     needed,
     simplest,
@@ -36,11 +33,10 @@ from autotune.diagnosis.selection.parsimony import (
     worth_adding,
 )
 from autotune.diagnosis.selection.screening import Bench, Width
+from autotune.diagnosis.thresholds import IN_USE, Thresholds
 from autotune.models import Model
 from autotune.recording import Recording
 
-#: Rows on which hypotheses are screened; the best are fitted to all.
-SCREENING_ROWS = 4500
 Progress = Callable[[str, float], None]
 
 
@@ -101,6 +97,7 @@ def search(
     good: Sequence[BoolArray],
     without: Sequence[str] = (),
     progress: Progress = lambda what, share: None,
+    thresholds: Thresholds = IN_USE,
 ) -> Search:
     """Search for the physics that is missing.
 
@@ -114,6 +111,8 @@ def search(
         Effects left out of the catalogue.
     progress : callable
         Told what is being done and the share done, 0 to 1.
+    thresholds : Thresholds
+        What decides between two findings.
 
     Returns
     -------
@@ -130,10 +129,11 @@ def search(
     with threadpool_limits(1), ThreadPoolExecutor(2) as pool:
         bench = Bench(pool=pool, kinds=kinds)
         progress("retuning", 0.0)
-        found = _searched(*prepare(model, recordings, good, 1), bench, progress)
+        found = _searched(*prepare(model, recordings, good, 1, thresholds), bench, progress)
         if not holds(found.chosen.fit, found.data):
             progress("once more, on longer windows", 0.0)
-            found = _searched(*prepare(model, recordings, good, LONGER), bench, progress)
+            longer = prepare(model, recordings, good, thresholds.longer_windows, thresholds)
+            found = _searched(*longer, bench, progress)
         return found
 
 
@@ -154,17 +154,19 @@ def _searched(data: Data, base: Fit, bench: Bench, progress: Progress) -> Search
 def _extended(data: Data, base: Fit, nominal: Fit, bench: Bench, progress: Progress) -> Search:
     """Add effects in ones, twos and threes as far as the residual asks for them."""
     progress("single effects", 0.1)
-    stage = _Stage(data=data, few=data.thinned(SCREENING_ROWS, standing_out(base)), base=base, bench=bench)
+    limits = data.thresholds
+    stage = _Stage(data=data, few=_few(data, base), base=base, bench=bench)
     candidates = _screened(stage)
     singles = stage.polished(candidates, 3)
-    if singles and reduced_chi2(base, data) > COARSE:
+    if singles and reduced_chi2(base, data) > limits.coarse:
         stage = _finer(singles[0], stage)
         candidates = [_again(h, stage.few) for h in candidates[:3]]
         singles = stage.polished(candidates, 3)
     retuned = chosen = Hypothesis(names=(), fit=stage.base)
-    if not singles or not (worth_adding(retuned, singles[0]) or reduced_chi2(stage.base, stage.data) > 1.1):
+    is_worth = bool(singles) and worth_adding(retuned, singles[0], limits)
+    if not singles or not (is_worth or reduced_chi2(stage.base, stage.data) > limits.search_on):
         return Search(data=stage.data, nominal=nominal, retuned=retuned, singles=tuple(singles), chosen=retuned)
-    if worth_adding(retuned, singles[0]):
+    if is_worth:
         chosen = singles[0]
     progress("pairs of effects", 0.4)
     chosen, pairs, triples = _combined(chosen, singles, candidates, stage, progress)
@@ -175,7 +177,7 @@ def _extended(data: Data, base: Fit, nominal: Fit, bench: Bench, progress: Progr
         ranked = sorted((chosen, *exchanged(chosen, stage.data, stage.base, bench)), key=penalised)
         pairs = [*pairs, *ranked]
         chosen = simplest(ranked, simplicity_lead(stage.base, ranked[0], stage.data))
-    if reduced_chi2(chosen.fit, stage.data) > MODEL_ERROR:
+    if reduced_chi2(chosen.fit, stage.data) > limits.model_error:
         fewer = [h for h in (*singles, *pairs) if h.parameters < chosen.parameters]
         chosen = simplest([chosen, *fewer], final_lead(stage.base, chosen, stage.data))
     return Search(
@@ -189,20 +191,26 @@ def _extended(data: Data, base: Fit, nominal: Fit, bench: Bench, progress: Progr
     )
 
 
+def _few(data: Data, base: Fit) -> Data:
+    """Return the rows on which hypotheses are screened; the best are fitted to all."""
+    return data.thinned(data.thresholds.screening_rows, standing_out(base, data.thresholds.stands_out))
+
+
 def _screened(stage: _Stage) -> list[Hypothesis]:
     """Return single effects fitted to the rows that are screened on, best first.
 
     Where retuning went far from the prior, effects are looked for beside the chain at its prior as well.
     """
     base, data, few, bench = stage.base, stage.data, stage.few, stage.bench
-    p = base.parametrisation
+    p, limits = base.parametrisation, data.thresholds
+    wide = Width(effects=limits.screened_effects, starts=4, least=limits.least_predicted)
     start = Hypothesis(names=(), fit=base if few is data else fit(p, few, base.theta, states_of(base, few)))
-    found = grown(start, few, bench, Width(effects=7), lasting_starts(start, few, bench, bench.names))
-    if not far_from_prior(base):
+    found = grown(start, few, bench, wide, lasting_starts(start, few, bench, bench.names))
+    if not far_from_prior(base, limits.far_from_prior):
         return found
     at_prior = Hypothesis(names=(), fit=at_operating_point(p, few))
     lasting = lasting_starts(at_prior, few, bench, bench.names)
-    return merged(found, grown(at_prior, few, bench, Width(effects=7, starts=2), lasting))
+    return merged(found, grown(at_prior, few, bench, replace(wide, starts=2), lasting))
 
 
 def _combined(
@@ -216,10 +224,10 @@ def _combined(
     data, base, retuned = stage.data, stage.base, Hypothesis(names=(), fit=stage.base)
     wider = _paired(singles, candidates, stage)
     pairs, triples = stage.polished(wider, 2), list[Hypothesis]()
-    if not (pairs and worth_adding(retuned, pairs[0]) and needed(singles[0], pairs[0], data, base)):
+    if not (pairs and worth_adding(retuned, pairs[0], data.thresholds) and needed(singles[0], pairs[0], data, base)):
         return chosen, pairs, triples
     chosen = pairs[0]
-    if reduced_chi2(chosen.fit, data) > 1.05:
+    if reduced_chi2(chosen.fit, data) > data.thresholds.three_effects:
         progress("three effects", 0.8)
         triples = stage.polished(larger(wider[:1], stage.few, stage.bench), 1)
     if triples and needed(pairs[0], triples[0], data, base):
@@ -232,22 +240,22 @@ def _paired(singles: list[Hypothesis], candidates: list[Hypothesis], stage: _Sta
 
     A single effect that leaves noise alone is given one chance to be half of a pair, a bad one three.
     """
-    settled = reduced_chi2(singles[0].fit, stage.data) < 1.03
+    settled = reduced_chi2(singles[0].fit, stage.data) < stage.data.thresholds.settled
     lead = [h for h in candidates if h.names == singles[0].names]
     bases = [*lead, *(h for h in candidates[:3] if h not in lead)]
     wider = larger(bases[: 1 if settled else 3], stage.few, stage.bench)
-    return [h for h in wider if penalised(lead[0]) - penalised(h) > 5.0]
+    return [h for h in wider if penalised(lead[0]) - penalised(h) > stage.data.thresholds.pair_decrease]
 
 
 def _finer(best: Hypothesis, stage: _Stage) -> _Stage:
     """Return data with the noise that the best hypothesis leaves, and the retuned model under it."""
     data, base = stage.data, stage.base
-    noise = noise_from_differences(best.fit.residuals, data.good)
-    if reduced_chi2(best.fit, data) > COARSE:
+    noise = noise_from_differences(best.fit.residuals, data.good, data.thresholds.largest_correlation)
+    if reduced_chi2(best.fit, data) > data.thresholds.coarse:
         noise = Noise(sd=float(np.sqrt(np.mean(np.concatenate(best.fit.residuals) ** 2))))
     data = replace(data, noise=floored(noise, data.recordings))
     base = fit(base.parametrisation, data, base.theta, base.x0, iterations=20)
-    return replace(stage, data=data, base=base, few=data.thinned(SCREENING_ROWS, standing_out(base)))
+    return replace(stage, data=data, base=base, few=_few(data, base))
 
 
 def _again(h: Hypothesis, data: Data) -> Hypothesis:

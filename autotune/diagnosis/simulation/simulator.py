@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cache, lru_cache
 
 import numpy as np
@@ -14,7 +14,7 @@ from autotune.diagnosis.effects import ALL, KINDS, kind_of
 from autotune.diagnosis.effects.base import STAGES, EffectKind, StageName
 from autotune.diagnosis.simulation import kernel
 from autotune.diagnosis.simulation.chain import Chain, chain_of
-from autotune.diagnosis.simulation.compiled import Layout, compiled_run, layout_of
+from autotune.diagnosis.simulation.compiled import Layout, Run, compiled_run, layout_of
 from autotune.diagnosis.simulation.transitions import transition_table
 from autotune.errors import InputError
 from autotune.models import Effect, Model
@@ -55,6 +55,8 @@ class Simulator:
         Absolute temperature at the operating point, were y one.
     linear_hold : bool
         Whether u runs straight between rows.
+    compiled : callable
+        The compiled simulation that ``values`` and ``acts`` are laid out for.
     """
 
     chain: Chain
@@ -66,6 +68,7 @@ class Simulator:
     y_offset: float
     kelvin: float
     linear_hold: bool
+    compiled: Run = field(default_factory=compiled_run, repr=False)
 
     @property
     def order(self) -> int:
@@ -144,7 +147,7 @@ class Simulator:
         numbers = np.concatenate([(step, chain.delay_s, self.u_offset, self.y_offset, self.kelvin), chain.gains,
                                   self.values])  # fmt: skip
         flags = np.concatenate([(number, signals, *self._flags), self.acts])
-        out = compiled_run()(
+        out = self.compiled(
             _driven(recording), rows, states, _tables(chain, self.falling, step), chain.taps, numbers, flags
         )
         return out.T, states[1]

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from autotune.diagnosis.evidence.samples import frozen_rows, inspect, lattice_step, spikes
+from autotune.diagnosis.evidence.samples import converter_step, frozen_rows, inspect, spikes
 from autotune.diagnosis.fitting.noise import autoregressive, noise_from_differences
 from autotune.recording import Recording
 
@@ -25,14 +25,14 @@ def signal(seed: int, rows: int = 3000) -> np.ndarray:
 @given(step=st.floats(0.02, 0.2), seed=st.integers(0, 100))
 def test_the_step_of_a_converter_is_found_from_the_values_that_occur(step: float, seed: int) -> None:
     y = rounded(step * np.round(signal(seed) / step))
-    assert lattice_step(y) == pytest.approx(step, rel=1e-3)
+    assert converter_step(y) == pytest.approx(step, rel=1e-3)
 
 
 @given(seed=st.integers(0, 100))
 @settings(max_examples=10)
 def test_readings_written_with_six_digits_have_no_step_no_run_and_no_spike(seed: int) -> None:
     y = rounded(signal(seed))
-    assert lattice_step(y) == 0.0
+    assert converter_step(y) == 0.0
     assert not frozen_rows(y).any()
     assert spikes(y, np.ones(y.size, dtype=bool)).sum() == 0
 

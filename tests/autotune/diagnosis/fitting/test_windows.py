@@ -9,10 +9,11 @@ from autotune.diagnosis.effects import CATALOGUE
 from autotune.diagnosis.evidence.samples import inspect
 from autotune.diagnosis.fitting.fit import fit
 from autotune.diagnosis.fitting.parameters import effect_with
-from autotune.diagnosis.fitting.retuning import LONGER, holds, prepare, reduced_chi2
-from autotune.diagnosis.fitting.windows import LEAST_ROWS, LEAST_WINDOWS, window_rows
+from autotune.diagnosis.fitting.retuning import holds, prepare, reduced_chi2
+from autotune.diagnosis.fitting.windows import window_rows
 from autotune.diagnosis.selection.prediction import extended
 from autotune.diagnosis.selection.search import search
+from autotune.diagnosis.thresholds import IN_USE
 from autotune.recording import Recording
 from tests.autotune.diagnosis.servo_rigs import GAIN, servo_model, servo_recording
 
@@ -25,15 +26,15 @@ def test_windows_cut_a_recording_without_gap_into_enough_parts(length_s: float) 
     assert starts[0] == 20
     assert stops[-1] == rows
     np.testing.assert_array_equal(stops[:-1], starts[1:])
-    assert len(starts) >= LEAST_WINDOWS
-    assert np.min(stops - starts) >= LEAST_ROWS - 1
+    assert len(starts) >= IN_USE.least_windows
+    assert np.min(stops - starts) >= IN_USE.least_window_rows - 1
 
 
 def test_joined_windows_count_the_same_rows() -> None:
     data, _ = prepare(servo_model(), [servo_recording(3)], inspect([servo_recording(3)])[0])
-    joined = data.joined(LONGER)
+    joined = data.joined(IN_USE.longer_windows)
     assert joined.rows == data.rows
-    assert len(joined.starts[0]) == -(-len(data.starts[0]) // LONGER)
+    assert len(joined.starts[0]) == -(-len(data.starts[0]) // IN_USE.longer_windows)
     np.testing.assert_array_equal(joined.stops[0][:-1], joined.starts[0][1:])
     assert joined.stops[0][-1] == data.stops[0][-1]
 

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from autotune.diagnosis.evidence.held_out import FAR_FROM_NOISE, FitQuality, dominates
+from autotune.diagnosis.evidence.held_out import FitQuality, dominates
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import fit
 from autotune.diagnosis.fitting.noise import Noise
@@ -17,6 +17,7 @@ from autotune.diagnosis.fitting.parameters import effect_with, parametrise
 from autotune.diagnosis.fitting.retuning import prepare
 from autotune.diagnosis.selection.prediction import extended
 from autotune.diagnosis.selection.probability import weighed
+from autotune.diagnosis.thresholds import IN_USE
 from autotune.models import Block, Model, Port, TransferFunction
 from autotune.recording import Recording
 
@@ -43,10 +44,10 @@ def test_most_of_a_residual_is_enough_only_far_from_the_noise(noise: float, far:
     retuned = far * noise**2
     extended = retuned - share * (retuned - noise**2)
     quality = FitQuality(nominal=1.0, retuned=retuned**0.5, extended=extended**0.5, noise_floor=noise)
-    if far < 0.99 * FAR_FROM_NOISE or share < 0.3:
-        assert not dominates(quality)
-    elif far > 1.01 * FAR_FROM_NOISE and share > 0.4:
-        assert dominates(quality)
+    if far < 0.99 * IN_USE.far_from_noise or share < 0.3:
+        assert not dominates(quality, IN_USE)
+    elif far > 1.01 * IN_USE.far_from_noise and share > 0.4:
+        assert dominates(quality, IN_USE)
 
 
 def test_thinned_data_keep_the_windows_where_a_limit_is_reached() -> None:

@@ -1,0 +1,135 @@
+"""The thresholds of the diagnosis: one table, passed in with the data, read from nowhere else.
+
+Every number that decides between two findings stands here with its unit, its meaning and where its value comes from;
+``python -m tests.benchmarks calibrate`` goes over those that were counted. Numbers that only say how a method computes
+(nodes of a table, damping of a step, frequencies of a scan) stay with the method.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+from typing import Any, Literal, TypeAlias, TypeVar
+
+#: Where a value comes from. ``counted``: on concealed cases, none of them of the proof, see ``calibrate``.
+#: ``real rigs``: on recordings of real rigs, where no model is adequate. ``chance``: a quantile of what noise alone brings.
+#: ``convention``: usual in the field. ``cost``: a compromise between time and what is found.
+Origin: TypeAlias = Literal["counted", "real rigs", "chance", "convention", "cost"]
+_T = TypeVar("_T", int, float)
+
+
+def _known(value: _T, unit: str, meaning: str, origin: Origin) -> _T:
+    entry: Any = field(default=value, metadata={"unit": unit, "meaning": meaning, "origin": origin})
+    return entry  # type: ignore[no-any-return]  # a field stands for its value until the class is made
+
+
+@dataclass(frozen=True, kw_only=True)
+class Thresholds:
+    """Every number that decides between two findings; units are those of :func:`table`."""
+
+    # fmt: off
+    # windows
+    lags_per_window: float = _known(10.0, "slowest lags", "length of a window: long enough for structure to show", "cost")
+    least_window_rows: int = _known(60, "rows", "shortest window", "convention")
+    least_windows: int = _known(6, "windows", "of a recording, where it has the rows; as many stay when data are thinned", "counted")
+    unknown_lags: float = _known(1.0, "slowest lags", "after the dead time, commands before the recording act no more", "convention")
+    most_left_out: float = _known(0.03, "of a recording", "that is left out at its beginning at most", "convention")
+    longer_windows: int = _known(3, "times", "windows on which what brings the residual to noise must do so too", "cost")
+    near_noise: float = _known(1.15, "reduced chi2", "up to which longer windows are asked", "counted")
+    leaves_more: float = _known(0.03, "reduced chi2", "that longer windows may leave more; right explanations left up to 0.017", "counted")
+    # noise
+    largest_correlation: float = _known(0.9, "1", "of the noise from row to row: beyond it differences cannot tell it from a slow residual", "convention")
+    slow_noise: float = _known(0.8, "1", "correlation of the noise from which on it is no matter of single samples", "counted")
+    coarse: float = _known(25.0, "reduced chi2", "from which on the residual itself is taken for noise", "real rigs")
+    # what samples show
+    least_run: int = _known(3, "rows", "equal readings that are no chance where readings are continuous", "chance")
+    least_frozen_rows: int = _known(6, "rows", "that repeat a reading before a dropout is named", "chance")
+    least_frozen_share: float = _known(1e-3, "of the rows", "that repeat a reading before a dropout is named", "convention")
+    spike: float = _known(7.0, "robust sd", "out of its neighbours' mean that make a spike", "chance")
+    least_spikes: int = _known(3, "rows", "before outliers are named", "chance")
+    least_clipped: int = _known(5, "rows", "at an extreme reading before a saturation is named", "chance")
+    least_equal_share: float = _known(0.02, "of the rows", "that equal the one before, before rounding is named", "counted")
+    least_rounding: float = _known(0.05, "of the noise", "variance of a converter's rounding that matters", "convention")
+    jitter_decrease: float = _known(30.0, "chi2", "that the slope explains of the residual's size before jitter is named", "chance")
+    samples_sure: float = _known(60.0, "chi2", "from which on what samples show is sure", "counted")
+    samples_share: float = _known(0.2, "of the gained", "that evidence of jitter or law must reach beside effects of the chain", "counted")
+    samples_probable: float = _known(0.85, "probability", "stated of what samples show with less", "counted")
+    rounding: float = _known(0.9, "of the squared error", "that a simulation with a converter's rounding may leave to be better", "convention")
+    # the control law
+    law_sigmas: float = _known(6.0, "sd", "that a gain or a time is off its stated value in a broken law", "chance")
+    law_least_change: float = _known(0.04, "of the value", "that it is off at least", "convention")
+    law_clearly_more: float = _known(2.0, "times", "variance that a law must leave whose derivative's filter is not stated", "counted")
+    law_most_at_limits: float = _known(0.2, "of the rows", "at the command's ends from which on limits made it", "convention")
+    # fits
+    prior_spread: float = _known(0.2, "of the value", "sd of a nominal number: people's gains and lags are right to tens of percent", "convention")
+    far_from_prior: float = _known(2.0, "prior sd", "of a number that must stand for something else", "convention")
+    beyond_prior: float = _known(4.0, "prior sd", "of a number that is no wrong number: a lag that has to be tripled", "convention")
+    stands_out: float = _known(1.5, "times the median", "chi2 of a window that stands out", "counted")
+    restart_decrease: float = _known(10.0, "chi2", "from which on a restart is taken", "cost")
+    # predictions and screening
+    linear_share: float = _known(0.3, "of chi2", "that an effect's direction may have before it is too large to be linear", "convention")
+    impact_decrease: float = _known(20.0, "chi2", "predicted at least of an effect that makes impacts and acts", "counted")
+    least_predicted: float = _known(3.0, "chi2", "predicted of an effect before it is fitted", "cost")
+    screening_rows: int = _known(4500, "rows", "on which hypotheses are screened", "cost")
+    screened_effects: int = _known(7, "effects", "fitted of those that predict most", "cost")
+    further_effects: int = _known(4, "effects", "the same beside other effects", "cost")
+    finished_effects: int = _known(4, "effects", "whose fits are finished", "cost")
+    finished_each: int = _known(2, "fits", "of one effect that are finished", "cost")
+    finished_near: float = _known(0.8, "of the best decrease", "from which on any other fit is finished too", "cost")
+    finished_second: float = _known(0.5, "of the best decrease", "from which on a second fit of one effect is finished", "cost")
+    far_behind: float = _known(60.0, "chi2", "behind the best with which a hypothesis is not fitted to all rows", "cost")
+    far_behind_share: float = _known(0.3, "of the best decrease", "the same", "cost")
+    # parsimony
+    least_decrease: float = _known(30.0, "chi2", "that an effect must bring: chance among two hundred starts brought up to 15", "chance")
+    least_decrease_beyond: float = _known(16.0, "chi2", "the same where a number lies beyond its prior without the effect", "counted")
+    simpler_lead: float = _known(6.0, "chi2", "that a hypothesis with more numbers must be ahead", "counted")
+    simpler_share: float = _known(0.01, "of the explained", "the same where more than noise is left", "counted")
+    noise_alone: float = _known(1.02, "reduced chi2", "up to which a residual is noise alone", "counted")
+    simulation_error: float = _known(2e-3, "of the explained", "that a simulation may be wrong by", "counted")
+    impact_error: float = _known(5e-3, "of the explained", "the same after impacts", "counted")
+    model_error: float = _known(2.0, "reduced chi2", "from which on the model's error rules, not noise", "real rigs")
+    model_error_share: float = _known(0.12, "of the explained", "that a richer hypothesis must be ahead then", "real rigs")
+    search_on: float = _known(1.1, "reduced chi2", "of the retuned model from which on pairs are tried although no single is worth it", "counted")
+    settled: float = _known(1.03, "reduced chi2", "of a single up to which one chance for a partner is enough", "cost")
+    pair_decrease: float = _known(5.0, "chi2", "that a pair must bring to be fitted to all rows", "cost")
+    three_effects: float = _known(1.05, "reduced chi2", "of a pair from which on a third effect is looked for", "cost")
+    noise_left: float = _known(0.08, "reduced chi2 - 1", "that an effect may leave to be needed", "counted")
+    half_left: float = _known(0.5, "of reduced chi2 - 1", "that an effect may leave to be needed", "counted")
+    # adequacy
+    adequate: float = _known(1.04, "reduced chi2", "up to which a model is adequate, beside one sd of chance", "counted")
+    adequate_quick: float = _known(1.12, "reduced chi2", "the same of a residual without slow part: physics left out would be slow", "counted")
+    quick: float = _known(1.0, "slow power", "of the residual over the noise's up to which it has no slow part", "counted")
+    white: float = _known(1.10, "slow power", "up to which a residual is white, beside two sd of chance", "counted")
+    inconstant: float = _known(25.0, "chi2", "of the largest of some hundred score tests; right models leave up to 15", "counted")
+    inconstant_share: float = _known(0.1, "of the gained", "the same beside effects: right ones leave two hundredths, wrong ones a third", "counted")
+    lesser_share: float = _known(0.5, "of the gained", "from which on what varies weighs as much as the effects; real rigs leave a quarter", "real rigs")
+    dominant: float = _known(0.35, "of the excess variance", "held out, that effects must explain where nothing explains all", "real rigs")
+    far_from_noise: float = _known(8.0, "times the noise", "variance of the retuned model: nearer to the noise adequacy is asked for", "real rigs")
+    # verdict and probabilities
+    numbers_decrease: float = _known(25.0, "chi2", "that wrong numbers must bring to be called wrong", "chance")
+    missing: float = _known(1.05, "reduced chi2", "of a model without effects from which on something is missing; clean ones leave 1.02", "counted")
+    offset_sigmas: float = _known(6.0, "sd", "that an operating point must be off to be an offset", "chance")
+    temperature: float = _known(3.0, "chi2", "that counts as one: noise is never ideal", "counted")
+    unknown_odds: float = _known(0.03, "odds", "prior, of a cause outside the catalogue where the best explains the recordings", "counted")
+    half_explained_odds: float = _known(0.25, "odds", "the same where the best explains most, not all", "real rigs")
+    most_probable: float = _known(0.99, "probability", "stated at most", "convention")
+    informative: float = _known(0.5, "of the residual", "held out, from which on a description tells the place", "counted")
+    term_share: float = _known(0.1, "of the residual", "held out, that one more term of a description must take away", "counted")
+    # what to record next
+    still_open: float = _known(0.02, "probability", "of a hypothesis that is still open", "convention")
+    most_open: int = _known(4, "hypotheses", "that an experiment is planned between", "cost")
+    decided: float = _known(0.9, "probability", "from which on one is left", "convention")
+    least_discrimination: float = _known(20.0, "chi2", "expected, below which nothing more can be learnt", "chance")
+    certain_discrimination: float = _known(400.0, "chi2", "expected, above which more is worth nothing", "convention")
+    # fmt: on
+
+
+#: The table in use.
+IN_USE = Thresholds()
+
+
+def table(thresholds: Thresholds) -> list[tuple[str, float, str, str, str]]:
+    """Return the table's rows: name, value, unit, meaning, origin."""
+    return [
+        (f.name, float(getattr(thresholds, f.name)), f.metadata["unit"], f.metadata["meaning"], f.metadata["origin"])
+        for f in fields(thresholds)
+    ]
