@@ -81,7 +81,7 @@ def run(
         missed = tuning.verification is not None and not tuning.verification.accepted
         found = _diagnosed(content, tuning, folder, console) if missed or diagnose else None
         recordings = [read_recording(folder / part.recording) for part in tuning.experiment.parts]
-        page = run_page(content.name, content.signals, recordings, tuning, found)
+        page = run_page(content.name, content.signals, recordings, tuning, found, dry_run=dry_run)
         write_page(page, folder / "report.html")
         for warning in (*tuning.experiment.warnings, *tuning.analysis.warnings):
             console.print(f"warning: {warning}", markup=False)

@@ -133,11 +133,14 @@ def doubts(segments: Sequence[Segment], config: Config, link_rad_s: float) -> tu
         for omega in (one.point.omega_rad_s for one in segments)
         if omega > link_rad_s
     )
-    return beyond + tuple(
-        f"point at {one.point.omega_rad_s:.3g} rad/s is known to {100 * sd:.2g} % only,"
-        f" {100 * wanted:.2g} % was wanted: raise experiment.budget_s"
-        for one, sd in zip(segments, sds, strict=True)
-        if sd > 1.1 * wanted
+    coarse = [sd for sd in sds if sd > 1.1 * wanted]
+    if not coarse:
+        return beyond
+    enough_s = config.experiment.budget_s * (max(coarse) / wanted) ** 2  # a variance falls as the time grows
+    return (
+        *beyond,
+        f"{len(coarse)} of {len(sds)} points are known to {100 * max(coarse):.2g} % at worst, {100 * wanted:.2g} % was"
+        f" wanted: set experiment.budget_s = {enough_s:.2g}",
     )
 
 

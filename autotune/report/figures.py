@@ -54,8 +54,8 @@ def recording_figure(
         add_line(figure, *thinned(recording.t, recording["r"]), "r", GREY, dash="dash", row=1, col=1)
     held_t, held_u = thinned(recording.t, recording.u)
     add_line(figure, held_t, held_u, "u", ORANGE, width=1.0, row=2, col=1, line_shape="hv")
-    figure.update_yaxes(title=_axis("y", y_unit), row=1, col=1)
-    figure.update_yaxes(title=_axis("u", u_unit), range=usual_range(recording.u), row=2, col=1)
+    figure.update_yaxes(title=axis_title("y", y_unit), row=1, col=1)
+    figure.update_yaxes(title=axis_title("u", u_unit), range=usual_range(recording.u), row=2, col=1)
     figure.update_xaxes(title="time [s]", row=2, col=1)
     for time_s, name in marks:
         figure.add_vline(x=time_s, line={"color": GREY, "width": 1, "dash": "dot"})
@@ -78,7 +78,7 @@ def bode_figure(
     sign: int,
     gain_unit: str,
 ) -> go.Chart:
-    """Draw gain and phase as in figure 6 of Le & Mendes: points with their 95 % bars, and curves.
+    """Draw gain and phase: points with their 95 % bars, and curves.
 
     Parameters
     ----------
@@ -94,14 +94,18 @@ def bode_figure(
         Unit of the gain.
     """
     figure = make_subplots(rows=2, cols=1, shared_xaxes=True, vertical_spacing=0.05)
+    drawn = []
     for curve in curves:
         gain, phase_deg = gain_phase(sign * curve.system.response(omega))
+        drawn.append(phase_deg)
         add_line(figure, omega, gain, curve.name, curve.colour, dash=curve.dash, row=1, col=1)
         add_line(figure, omega, phase_deg, curve.name, curve.colour, dash=curve.dash, row=2, col=1, showlegend=False)
+    measured: list[FloatArray] = []
     for name, points, colour in estimates:
         at = np.array([point.omega_rad_s for point in points])
         gain, phase_deg = gain_phase(np.array([sign * point.response for point in points]))
         bars = np.array([gain_phase_bars(point) for point in points]).reshape(-1, 2)
+        measured.append(phase_deg)
         for row, values, bar in ((1, gain, bars[:, 0]), (2, phase_deg, np.degrees(bars[:, 1]))):
             figure.add_trace(
                 go.Scatter(
@@ -118,9 +122,34 @@ def bode_figure(
             )
     figure.update_xaxes(type="log")
     figure.update_xaxes(title="angular frequency [rad/s]", row=2, col=1)
-    figure.update_yaxes(type="log", title=_axis("gain", gain_unit), row=1, col=1)
-    figure.update_yaxes(title="phase [deg]", dtick=45, row=2, col=1)
+    figure.update_yaxes(type="log", title=axis_title("gain", gain_unit), row=1, col=1)
+    low, high, step = phase_axis(measured, drawn)
+    figure.update_yaxes(title="phase [deg]", dtick=step, range=[low, high], row=2, col=1)
     return figure
+
+
+def phase_axis(measured: Sequence[FloatArray], drawn: Sequence[FloatArray]) -> tuple[float, float, float]:
+    """Return a phase axis that stays readable where dead time turns the phase without end.
+
+    Parameters
+    ----------
+    measured, drawn : sequence of (N,) array
+        Phases of the points and of the curves [deg].
+
+    Returns
+    -------
+    low, high, step : float
+        Limits and the distance of the ticks [deg]: a quarter turn below the lowest point, or a turn and a half below
+        the highest where there is none; at most nine ticks.
+    """
+    curves = np.concatenate([*drawn, *measured])
+    curves = curves[np.isfinite(curves)]
+    points = np.concatenate([*measured, np.empty(0)])
+    top = float(curves.max()) if curves.size else 0.0
+    floor = float(points.min()) - 90.0 if points.size else top - 540.0
+    bottom = max(float(curves.min()) if curves.size else -180.0, floor)
+    step = next((step for step in (15.0, 30.0, 45.0, 90.0, 180.0) if (top - bottom) / step <= 7.0), 360.0)
+    return float(step * np.floor(bottom / step + 1e-6)), float(step * np.ceil(top / step - 1e-6)), step
 
 
 def nyquist_figure(
@@ -171,15 +200,17 @@ def nyquist_figure(
     figure.add_trace(
         go.Scatter(x=[-1], y=[0], mode="markers", marker={"symbol": "cross", "color": RED, "size": 10}, name="-1")
     )
-    figure.update_xaxes(title="real part of L", range=[-2.6, 1.2])
-    figure.update_yaxes(title="imaginary part of L", range=[-2.2, 1.2], scaleanchor="x", scaleratio=1)
+    figure.update_xaxes(title="real part of L", range=[-2.4, 1.2], dtick=0.5, constrain="domain")
+    figure.update_yaxes(
+        title="imaginary part of L", range=[-2.4, 1.2], dtick=0.5, scaleanchor="x", scaleratio=1, constrain="domain"
+    )
     return figure
 
 
 def nichols_figure(
     loops: Sequence[Curve], omega: FloatArray, modulus_margin: float, phase_margin_rad: float
 ) -> go.Chart:
-    """Draw loops in the Black-Nichols plane as in figures 7 and 8: gain in dB over phase, with the required margins."""
+    """Draw loops in the Black-Nichols plane: gain in dB over phase, with the required margins."""
     figure = go.Chart()
     circle = -1 + modulus_margin * np.exp(1j * np.linspace(0, 2 * np.pi, 181))
     phase_deg = np.degrees(np.angle(circle)) % 360 - 360
@@ -197,19 +228,19 @@ def nichols_figure(
             name=f"phase margin {margin_deg:.0f} deg",
         )
     )
-    figure.update_xaxes(title="phase of L [deg]", range=[-270, -80], dtick=45)
-    figure.update_yaxes(title="gain of L [dB]", range=[-30, 30])
+    figure.update_xaxes(title="phase of L [deg]", range=[-275, -80], dtick=45)
+    figure.update_yaxes(title="gain of L [dB]", range=[-33, 33], dtick=10)
     return figure
 
 
 def sensitivity_figure(loops: Sequence[Curve], omega: FloatArray, modulus_margin: float) -> go.Chart:
-    """Draw abs(S) in dB with the bound 1/M_m of (12)."""
+    """Draw abs(S) in dB with the bound that the modulus margin sets, the inverse of it."""
     figure = go.Chart()
     for curve in loops:
         S = 1.0 / (1.0 + curve.system.response(omega))
         add_line(figure, omega, 20 * np.log10(np.abs(S)), curve.name, curve.colour, dash=curve.dash)
     bound = np.full(2, -20 * np.log10(modulus_margin))
-    add_line(figure, omega[[0, -1]], bound, f"1/M_m for M_m = {modulus_margin:g}", RED, dash="dot")
+    add_line(figure, omega[[0, -1]], bound, f"bound of modulus margin {modulus_margin:g}", RED, dash="dot")
     figure.update_xaxes(title="angular frequency [rad/s]", type="log")
     figure.update_yaxes(title="sensitivity |S| [dB]")
     return figure
@@ -222,8 +253,9 @@ def usual_range(values: FloatArray) -> list[float]:
     return [float(low - room), float(high + room)]
 
 
-def _axis(name: str, unit: str) -> str:
-    return f"{name} [{unit}]" if unit else name
+def axis_title(name: str, unit: str) -> str:
+    """Return the title of an axis."""
+    return f"{name} [{unit or 'unit not given'}]"
 
 
 def gain_phase(response: ComplexArray) -> tuple[FloatArray, FloatArray]:

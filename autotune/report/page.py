@@ -25,32 +25,54 @@ BLUE, ORANGE, GREEN, RED, GREY, PURPLE = "#3b82c4", "#d98200", "#0d9a72", "#d149
 
 
 @dataclass(frozen=True, kw_only=True)
+class Picture:
+    """A curve as small as a word, for a cell of a table.
+
+    Attributes
+    ----------
+    values : (N,) array
+        The curve, evenly spaced; scaled to the cell.
+    says : str
+        The same in words, for those who do not see it.
+    """
+
+    values: FloatArray
+    says: str
+
+
+@dataclass(frozen=True, kw_only=True)
 class Table:
     """Rows of cells under a header; numbers are formatted by the caller, with their units in the header."""
 
     header: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
+    rows: tuple[tuple[str | Picture, ...], ...]
     caption: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Figure:
-    """A chart with the sentence that says what is to be seen in it."""
+    """A chart with the sentence that says what is to be seen in it; a square one for axes of equal scale."""
 
     figure: Chart
     caption: str
     height_px: int = 420
+    square: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
 class Section:
-    """A heading with paragraphs, links (what they say, and where they lead), then tables, then figures."""
+    """A heading with paragraphs, links (what they say, and where they lead), then figures and tables, then the method.
+
+    ``details`` and ``detail_tables`` are for those who want to check the method; they are folded away.
+    """
 
     title: str
     text: tuple[str, ...] = ()
     links: tuple[tuple[str, str], ...] = ()
     tables: tuple[Table, ...] = ()
     figures: tuple[Figure, ...] = ()
+    details: tuple[str, ...] = ()
+    detail_tables: tuple[Table, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,8 +87,10 @@ class Page:
         The result in one sentence.
     tone : {"good", "warn", "bad"}
         Colour of the verdict; the sentence says the same without it.
+    answers : tuple of (str, str)
+        What was found, how sure it is, what to do: a heading of a word or three, and a sentence or two.
     summary : tuple of str
-        What the reader needs to know or do next.
+        What else the reader needs to know.
     sections : tuple of Section
         The evidence, in the order of the data's way.
     """
@@ -74,6 +98,7 @@ class Page:
     title: str
     verdict: str
     tone: Tone
+    answers: tuple[tuple[str, str], ...] = ()
     summary: tuple[str, ...] = ()
     sections: tuple[Section, ...] = ()
 
@@ -139,6 +164,7 @@ def write_page(page: Page, path: str | os.PathLike[str]) -> None:
     body = [
         f"<h1>{_text(page.title)}</h1>",
         f'<p class="verdict {page.tone}">{_text(page.verdict)}</p>',
+        _answers(page.answers),
         *(f"<p>{_text(line)}</p>" for line in page.summary),
     ]
     if len(page.sections) > 3:
@@ -158,6 +184,11 @@ def _plotly() -> str:
     return base64.b64encode(gzip.compress(script, 9, mtime=0)).decode("ascii")
 
 
+def _answers(answers: tuple[tuple[str, str], ...]) -> str:
+    cards = (f"<div><dt>{_text(head)}</dt><dd>{_text(said)}</dd></div>" for head, said in answers)
+    return f'<dl class="answers">{"".join(cards)}</dl>' if answers else ""
+
+
 def _text(text: str) -> str:
     return html.escape(text, quote=False)
 
@@ -166,16 +197,30 @@ def _section(section: Section, number: int) -> str:
     parts = [f'<section id="s{number}"><h2>{_text(section.title)}</h2>']
     parts += [f"<p>{_text(line)}</p>" for line in section.text]
     parts += [f'<p><a href="{html.escape(target)}">{_text(label)}</a></p>' for label, target in section.links]
-    parts += [_table(table) for table in section.tables]
     parts += [_figure(figure, f"f{number}_{i}") for i, figure in enumerate(section.figures)]
+    parts += [_table(table) for table in section.tables]
+    if section.details or section.detail_tables:
+        inside = [f"<p>{_text(line)}</p>" for line in section.details] + [_table(t) for t in section.detail_tables]
+        parts.append(f"<details><summary>Method details</summary>{''.join(inside)}</details>")
     return "\n".join([*parts, "</section>"])
 
 
 def _table(table: Table) -> str:
     head = "".join(f'<th scope="col">{_text(cell)}</th>' for cell in table.header)
-    rows = "".join("<tr>" + "".join(f"<td>{_text(cell)}</td>" for cell in row) + "</tr>" for row in table.rows)
+    rows = "".join("<tr>" + "".join(f"<td>{_cell(cell)}</td>" for cell in row) + "</tr>" for row in table.rows)
     caption = f'<p class="caption">{_text(table.caption)}</p>' if table.caption else ""
     return f'{caption}<div class="wide"><table><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table></div>'
+
+
+def _cell(cell: str | Picture) -> str:
+    if isinstance(cell, str):
+        return _text(cell)
+    low, high = float(np.min(cell.values)), float(np.max(cell.values))
+    x = np.linspace(1.0, 99.0, cell.values.size)
+    y = 27.0 - 25.0 * (cell.values - low) / ((high - low) or 1.0)
+    path = " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(x, y, strict=True))
+    drawn = f'<polyline points="{path}" fill="none" stroke="{BLUE}" stroke-width="1.6"/>'
+    return f'<svg class="small" viewBox="0 0 100 28" role="img" aria-label="{html.escape(cell.says)}">{drawn}</svg>'
 
 
 def _figure(figure: Figure, identity: str) -> str:
@@ -188,7 +233,7 @@ def _figure(figure: Figure, identity: str) -> str:
         hoverlabel={"font": {"color": "#fff"}},
         showlegend=False,
         autosize=True,
-        height=figure.height_px,
+        **({} if figure.square else {"height": figure.height_px}),
     )
     axis: dict[str, Any] = {
         "gridcolor": grid,
@@ -201,10 +246,14 @@ def _figure(figure: Figure, identity: str) -> str:
     content = drawn.to_json().replace("</", "<\\/")
     return (
         f"<figure>{_legend(drawn, identity)}"
-        f'<div class="chart" id="{identity}" style="height:{figure.height_px}px"></div>'
+        f'<div class="chart{" square" * figure.square}" id="{identity}"{_height(figure)}></div>'
         f'<script type="application/json" data-chart="{identity}">{content}</script>'
         f"<figcaption>{_text(figure.caption)}</figcaption></figure>"
     )
+
+
+def _height(figure: Figure) -> str:
+    return "" if figure.square else f' style="height:{figure.height_px}px"'
 
 
 def _legend(drawn: Chart, identity: str) -> str:
@@ -259,6 +308,12 @@ table { border-collapse: collapse; font-variant-numeric: tabular-nums; font-size
 .caption { color: var(--faint); font-size: 0.93rem; margin-top: 1.2rem; }
 th, td { text-align: left; padding: 0.3rem 0.9rem 0.3rem 0; border-bottom: 1px solid var(--line); vertical-align: top; }
 th { font-weight: 600; }
+.answers { display: grid; gap: 0.8rem; margin: 1rem 0; }
+.answers { grid-template-columns: repeat(auto-fit, minmax(min(17rem, 100%), 1fr)); }
+.answers div { background: var(--card); padding: 0.6rem 0.9rem; border-radius: 6px; }
+.answers dt { color: var(--faint); font-size: 0.86rem; } .answers dd { margin: 0.15rem 0 0; }
+.square { width: min(100%, 560px); aspect-ratio: 1; } .small { width: 100px; height: 28px; }
+details { margin: 0.8rem 0; } summary { cursor: pointer; color: var(--faint); font-size: 0.93rem; }
 .legend { display: flex; flex-wrap: wrap; gap: 0.1rem 0.4rem; }
 .legend button { all: unset; cursor: pointer; font-size: 0.86rem; padding: 0.1rem 0.4rem; border-radius: 4px; }
 .legend button:focus-visible { outline: 2px solid var(--faint); } .legend button[aria-pressed="false"] { opacity: 0.4; }

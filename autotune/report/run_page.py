@@ -18,8 +18,8 @@ from autotune.pipeline.deployment import Deployment
 from autotune.recording import Recording
 from autotune.report.analysis_sections import analysis_sections, gains_text, margins_sentence
 from autotune.report.chart import Chart, make_subplots
-from autotune.report.figures import recording_figure
-from autotune.report.page import BLUE, GREEN, GREY, ORANGE, RED, Figure, Page, Section, Table, add_line, thinned
+from autotune.report.figures import axis_title, recording_figure
+from autotune.report.page import BLUE, GREEN, GREY, ORANGE, PURPLE, RED, Figure, Page, Section, Table, add_line, thinned
 
 
 def run_page(
@@ -28,6 +28,8 @@ def run_page(
     recordings: Sequence[Recording],
     tuning: Tuning,
     diagnosis: Diagnosis | None = None,
+    *,
+    dry_run: bool = False,
 ) -> Page:
     """Return the page of a whole run on a rig.
 
@@ -43,23 +45,22 @@ def run_page(
         What the run ended with.
     diagnosis : Diagnosis, optional
         What the fitted plant leaves out; its own page is in ``diagnosis/report.html`` beside this one.
+    dry_run : bool
+        Whether the rig's simulated twin took its place.
     """
     experiment, verification = tuning.experiment, tuning.verification
-    sections = [
-        _experiment_section(recordings, experiment, signals),
-        *analysis_sections(tuning.analysis, signals, experiment),
-    ]
-    if verification is not None:
-        sections.append(_verification_section(verification, signals))
+    sections = [] if verification is None else [_verification_section(verification, signals)]
     if diagnosis is not None:
         sections.append(_diagnosis_section(diagnosis))
-    sections.append(_warnings_section((*experiment.warnings, *tuning.analysis.warnings)))
-    verdict, good = _verdict(tuning, signals)
+    sections += reversed(analysis_sections(tuning.analysis, signals, experiment))
+    sections.append(_experiment_section(recordings, experiment, signals))
+    sections += _warnings_sections((*experiment.warnings, *tuning.analysis.warnings))
+    verdict, good = _verdict(tuning, signals, dry_run)
     return Page(
-        title=f"Commissioning: {name}",
+        title=f"Rehearsal: {name}" if dry_run else f"Commissioning: {name}",
         verdict=verdict,
         tone="good" if good else "bad" if verification is not None else "warn",
-        summary=_summary(tuning, signals, diagnosis),
+        answers=_answers(tuning, signals, diagnosis),
         sections=tuple(sections),
     )
 
@@ -87,12 +88,23 @@ def analysis_page(
         for recording in recordings
     )
     first = (Section(title="Recordings", figures=figures),) if figures else ()
-    sections = (*first, *analysis_sections(analysis, signals, None), _warnings_section((*notes, *analysis.warnings)))
+    sections = (
+        *reversed(analysis_sections(analysis, signals, None)),
+        *first,
+        *_warnings_sections((*notes, *analysis.warnings)),
+    )
     return Page(
         title=f"Controller from recordings: {name}",
         verdict=f"{gains_text(analysis.controller, signals)}: not yet tried on the rig.",
         tone="warn",
-        summary=(margins_sentence(analysis), "Next: verify it on the rig before it is left alone with it."),
+        answers=(
+            ("Found", f"{gains_text(analysis.controller, signals)}, from {len(analysis.points)} points."),
+            ("How sure", margins_sentence(analysis)),
+            (
+                "What to do",
+                "Try it on the rig, or have autotune deploy and verify do so, before the loop is left to it.",
+            ),
+        ),
         sections=sections,
     )
 
@@ -156,7 +168,7 @@ def deployment_page(name: str, signals: SignalSettings, done: Deployment) -> Pag
         title=f"Gains handed over: {name}",
         verdict=verdict,
         tone="warn" if verification is None else "good" if done.kept else "bad",
-        summary=(_next_step(verification),),
+        answers=(("What to do", _next_step(verification)),),
         sections=(
             Section(title="Gains", tables=(gains,)),
             *((_verification_section(verification, signals),) if verification is not None else ()),
@@ -185,55 +197,52 @@ def verification_page(
         title=f"Verification: {name}",
         verdict=f"{said}: {gains_text(controller, signals)}; {verification.reason}.",
         tone="good" if verification.accepted else "bad",
-        summary=(_next_step(verification),),
+        answers=(("What to do", _next_step(verification)),),
         sections=(_verification_section(verification, signals),),
     )
 
 
 def _next_step(verification: Verification | None) -> str:
     if verification is None:
-        return "Next: verify the controller on the rig."
+        return "Verify the controller on the rig."
     if verification.accepted:
-        return "Next: watch the loop through its usual operating range; the points were measured at one of them."
+        return "Watch the loop through its usual operating range; the points were measured at one of them."
     return (
-        "Next: compare prediction and measurement below; diagnose the recording against the fitted model to find"
+        "Compare prediction and measurement below; diagnose the recording against the fitted model to find"
         " which physics was left out."
     )
 
 
-def _verdict(tuning: Tuning, signals: SignalSettings) -> tuple[str, bool]:
+def _verdict(tuning: Tuning, signals: SignalSettings, dry_run: bool) -> tuple[str, bool]:
     gains = gains_text(tuning.analysis.controller, signals)
     if tuning.verification is None:
         return f"{gains}: designed, not verified on the rig.", False
     if tuning.verification.accepted:
         held = "the rig holds its old gains" if tuning.old_controller else "its gains are in result.json"
         where = "the rig holds it now" if tuning.deployed else held
+        where = "this was its simulated twin, the rig was not touched" if dry_run else where
         return f"Accepted: {gains}; {tuning.verification.reason}; {where}.", True
     return f"Not accepted: {gains}; {tuning.verification.reason}. The old gains were kept.", False
 
 
-def _summary(tuning: Tuning, signals: SignalSettings, diagnosis: Diagnosis | None) -> tuple[str, ...]:
-    experiment = tuning.experiment
-    old = tuning.old_controller
-    lines = [
-        f"{len(experiment.points)} Bode points in {experiment.sweep_time_s:.0f} s after the plant first moved"
-        f" ({experiment.rig_time_s:.0f} s on the rig in all). The command that holds the operating point is"
-        f" {experiment.u_rest:.4g} ± {1.96 * experiment.u_rest_sd:.2g} {signals.u_unit}; the measurement's noise has a"
-        f" standard deviation of {experiment.noise_sd:.3g} {signals.y_unit}.",
-        margins_sentence(tuning.analysis),
-    ]
+def _answers(tuning: Tuning, signals: SignalSettings, diagnosis: Diagnosis | None) -> tuple[tuple[str, str], ...]:
+    experiment, old = tuning.experiment, tuning.old_controller
+    found = (
+        f"{len(experiment.points)} points of the Bode diagram in {experiment.sweep_time_s:.0f} s of oscillation"
+        f" ({experiment.rig_time_s:.0f} s on the rig in all)."
+    )
     if old is not None:
-        new = gains_text(tuning.analysis.controller, signals)
-        before = gains_text(old, signals)
-        lines.append(
-            f"Before: {before}. Now: {new}." if tuning.deployed else f"The rig holds: {before}. Designed: {new}."
-        )
-    lines.append(
+        new, before = gains_text(tuning.analysis.controller, signals), gains_text(old, signals)
+        found += f" Before: {before}. Now: {new}." if tuning.deployed else f" The rig holds {before}; designed: {new}."
+    sure = margins_sentence(tuning.analysis)
+    if tuning.verification is not None:
+        sure += " The loop was tried on the rig: below, measured beside what was predicted."
+    todo = (
         _next_step(tuning.verification)
         if diagnosis is None or diagnosis.verdict == "none"
-        else "Next: read below why the loop differs from its prediction, and correct that or the model."
+        else "Read below why the loop differs from its prediction, and correct that or the model."
     )
-    return tuple(lines)
+    return ("Found", found), ("How sure", sure), ("What to do", todo)
 
 
 def _experiment_section(
@@ -261,6 +270,9 @@ def _experiment_section(
     return Section(
         title="The experiment",
         text=(
+            f"The command that holds the operating point is {experiment.u_rest:.4g} ± {1.96 * experiment.u_rest_sd:.2g}"
+            f" {signals.u_unit}; the measurement's noise has a standard deviation of {experiment.noise_sd:.3g}"
+            f" {signals.y_unit}.",
             f"It ended because: {experiment.reason}; {sentence(experiment.output)}.",
             f"Link latency {_milliseconds(timing.latency_s)}, lateness of the loop {_milliseconds(timing.lateness_s)}"
             f" (median, 99 %, worst); {timing.missed} sample(s) missed, {timing.unusable} unusable.",
@@ -270,8 +282,8 @@ def _experiment_section(
             *figures,
             Figure(
                 figure=_cycles_figure(recordings, experiment.segments, signals),
-                caption="Two periods of every limit cycle that a point was made from, y over u; the numbers are rad/s.",
-                height_px=380,
+                caption="Two periods of every limit cycle that a point was made from: y around its mean, over u.",
+                height_px=420,
             ),
         ),
     )
@@ -281,22 +293,22 @@ def _milliseconds(values: tuple[float, float, float]) -> str:
     return " / ".join(f"{1e3 * value:.2g}" for value in values) + " ms"
 
 
+_CYCLE_COLOURS = (BLUE, ORANGE, GREEN, RED, PURPLE, GREY)
+
+
 def _cycles_figure(recordings: Sequence[Recording], segments: Sequence[Segment], signals: SignalSettings) -> Chart:
-    ordered = sorted(segments, key=lambda segment: segment.point.omega_rad_s)
-    titles = [f"{segment.point.omega_rad_s:.2g}" for segment in ordered]
-    figure = make_subplots(rows=2, cols=len(ordered), shared_xaxes=True, subplot_titles=titles, vertical_spacing=0.08)
-    for i, segment in enumerate(ordered, start=1):
-        span = 2 * 2 * math.pi / segment.point.omega_rad_s
-        part = recordings[segment.part].between(max(segment.start_s, segment.end_s - span), segment.end_s)
-        t = part.t - part.t[0]
-        add_line(figure, *thinned(t, part.y, 600), "y", BLUE, width=1.0, row=1, col=i, showlegend=False)
-        add_line(
-            figure, *thinned(t, part.u, 600), "u", ORANGE, width=1.0, row=2, col=i, showlegend=False, line_shape="hv"
-        )
-        figure.update_yaxes(matches="y", showticklabels=i == 1, row=1, col=i)
-    figure.update_xaxes(title="s", row=2)
-    figure.update_yaxes(title=f"y [{signals.y_unit}]", row=1, col=1)
-    figure.update_yaxes(title=f"u [{signals.u_unit}]", row=2, col=1)
+    figure = make_subplots(rows=2, shared_xaxes=True, vertical_spacing=0.06, row_heights=[0.6, 0.4])
+    for i, segment in enumerate(sorted(segments, key=lambda segment: segment.point.omega_rad_s)):
+        period = 2 * math.pi / segment.point.omega_rad_s
+        part = recordings[segment.part].between(max(segment.start_s, segment.end_s - 2 * period), segment.end_s)
+        t = (part.t - part.t[0]) / period
+        name, colour = f"{segment.point.omega_rad_s:.3g} rad/s", _CYCLE_COLOURS[i % len(_CYCLE_COLOURS)]
+        y = part.y - np.nanmean(part.y)
+        add_line(figure, *thinned(t, y, 600), name, colour, width=1.2, row=1, col=1)
+        add_line(figure, *thinned(t, part.u, 600), name, colour, width=1.2, row=2, col=1, line_shape="hv")
+    figure.update_xaxes(title="periods", row=2, col=1)
+    figure.update_yaxes(title=axis_title("y - mean", signals.y_unit), row=1, col=1)
+    figure.update_yaxes(title=axis_title("u", signals.u_unit), row=2, col=1)
     return figure
 
 
@@ -326,8 +338,8 @@ def _verification_section(verification: Verification, signals: SignalSettings) -
         figures=(
             Figure(
                 figure=_step_figure(verification, signals),
-                caption="Measured loop and the band that holds 95 % of what plant uncertainty and noise predict, as"
-                " figure 9 of the paper: set-point step on the left half, load step on the right.",
+                caption="Measured loop and the band that holds 95 % of what plant uncertainty and noise predict:"
+                " set-point step on the left half, load step on the right.",
                 height_px=500,
             ),
         ),
@@ -383,11 +395,11 @@ def _step_figure(verification: Verification, signals: SignalSettings) -> Chart:
     rest = float(np.median(verification.u[early] - prediction.u[early]))  # the command that holds the operating point
     add_line(figure, *thinned(test.t, verification.u - rest), "u of the law", ORANGE, width=1.0, row=2, col=1)
     add_line(figure, *thinned(test.t, prediction.u), "predicted u", RED, row=2, col=1, showlegend=False)
-    figure.update_yaxes(title=f"y - operating point [{signals.y_unit}]", row=1, col=1)
-    figure.update_yaxes(title=f"Δu [{signals.u_unit}]", row=2, col=1)
+    figure.update_yaxes(title=axis_title("y - operating point", signals.y_unit), row=1, col=1)
+    figure.update_yaxes(title=axis_title("Δu", signals.u_unit), row=2, col=1)
     figure.update_xaxes(title="time [s]", row=2, col=1)
     return figure
 
 
-def _warnings_section(warnings: Sequence[str]) -> Section:
-    return Section(title="Warnings", text=tuple(warnings) or ("None.",))
+def _warnings_sections(warnings: Sequence[str]) -> tuple[Section, ...]:
+    return (Section(title="Warnings", text=tuple(dict.fromkeys(warnings))),) if warnings else ()

@@ -9,8 +9,11 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from autotune.report.chart import Chart, Scatter, make_subplots
+from autotune.report.figures import phase_axis
 from autotune.report.page import Figure, Page, Section, add_line, lines_figure, write_page
 
 
@@ -80,3 +83,12 @@ def test_every_chart_is_drawn_without_a_request(tmp_path):
         browser.close()
     assert wrong == []
     assert [url for url in asked if not url.startswith(("file:", "blob:", "data:"))] == []
+
+
+@given(delay_deg=st.floats(0.0, 20000.0), lowest=st.floats(-400.0, -5.0))
+def test_a_phase_axis_has_few_ticks_and_shows_every_point_however_far_dead_time_turns(delay_deg, lowest):
+    points = np.linspace(-5.0, lowest, 7)
+    low, high, step = phase_axis([points], [np.linspace(-1.0, -1.0 - delay_deg, 50)])
+    assert low <= points.min()
+    assert high >= points.max()
+    assert (high - low) / step <= 9
