@@ -13,6 +13,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from autotune.batch.pieces import Record, read_record
+from autotune.batch.plant_figures import plant_figures
 from autotune.batch.settings import CampaignSettings, LoopSettings
 from autotune.controller import Controller, PIDController, read_controller
 from autotune.design.margins import Margins, margins
@@ -65,6 +66,8 @@ class Row:
         Their range [rad/s].
     G_r, omega_0r_rad_s, omega_d_rad_s : float
         Reduced model (8), or (24) without omega_0r.
+    gain, integrators, lags_s, dead_time_s, step, step_s
+        The fitted plant, see :class:`PlantFigures`.
     K, Ti_s, Td_s, Tf_s, h2, modulus, phase_deg, delay_margin_s : float
         The designed controller, and its norm (11) and margins on the fitted plant.
     K_now, Ti_now_s, h2_now, modulus_now, phase_now_deg : float
@@ -97,6 +100,12 @@ class Row:
     G_r: float | None = None
     omega_0r_rad_s: float | None = None
     omega_d_rad_s: float | None = None
+    gain: float | None = None
+    integrators: int | None = None
+    lags_s: str | None = None
+    dead_time_s: float | None = None
+    step: str | None = None
+    step_s: float | None = None
     K: float | None = None
     Ti_s: float | None = None
     Td_s: float | None = None
@@ -292,6 +301,7 @@ def _designed(row: Row, analysis: Analysis, present: Controller | None, settings
         modulus=m.modulus,
         phase_deg=math.degrees(m.phase_rad),
         delay_margin_s=m.delay_s,
+        **plant_figures(analysis.fit.plant),
     )
     if present is not None:
         row = _compared(row, present, margins(analysis.fit.plant, present), settings)

@@ -77,7 +77,22 @@ def prove(
     _print_confusion(console, marks)
     _print_table(console, rows)
     failures = keep_failures(campaign, marks)
+    _write_page(campaign, result, marks)
+    console.print(f"report: {out / 'report.html'}", markup=False)
     console.print(f"answers revealed; {sum(m.failed for m in marks)} of {len(marks)} cases to study in {failures}")
+
+
+def _write_page(campaign: Campaign, result: dict[str, Any], marks: Sequence[Mark]) -> None:
+    """Write one page of the whole proof, and leave pages of single cases only where there is something to study."""
+    from autotune.report.page import write_page
+    from autotune.report.proof_page import proof_page
+    from sim.score import confusion, wilson
+
+    for seed, m in zip(campaign.seeds, marks, strict=True):
+        if not m.failed:
+            (campaign.diagnosis(seed) / "report.html").unlink(missing_ok=True)
+    missed = [asdict(m) for m in marks if m.failed]
+    write_page(proof_page(result, missed, confusion(marks), wilson), campaign.out / "report.html")
 
 
 def _diagnose_all(console: Console, tasks: Sequence[tuple[Campaign, int]], workers: int, scheduler: str | None) -> None:

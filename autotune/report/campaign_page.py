@@ -9,7 +9,7 @@ import numpy as np
 
 from autotune.batch.loop import ATTENTION, Attention, Row
 from autotune.batch.settings import CampaignSettings
-from autotune.report.page import GREEN, GREY, ORANGE, RED, Figure, Page, Section, Table, Tone, lines_figure
+from autotune.report.page import GREEN, GREY, ORANGE, RED, Figure, Page, Picture, Section, Table, Tone, lines_figure
 
 _TITLES: dict[Attention, str] = {
     "act": "Needs action",
@@ -26,7 +26,7 @@ _WORDS: dict[Attention, tuple[str, str]] = {
 }
 _COLOURS: dict[Attention, str] = {"act": RED, "failed": GREY, "look": ORANGE, "fine": GREEN}
 
-_Columns = dict[str, Callable[[Row], str]]
+_Columns = dict[str, Callable[[Row], str | Picture]]
 
 
 def campaign_page(settings: CampaignSettings, rows: Sequence[Row]) -> Page:
@@ -58,9 +58,23 @@ def campaign_page(settings: CampaignSettings, rows: Sequence[Row]) -> Page:
         title=settings.name,
         verdict=f"Of {len(rows)} loops, {said}.",
         tone=tone,
+        answers=_answers(counts),
         summary=tuple(summary),
         sections=(*sections, *_present_margins(settings, rows), *_notes(rows)),
     )
+
+
+def _answers(counts: Counter[Attention]) -> tuple[tuple[str, str], ...]:
+    """Return what to do, the most pressing first."""
+    todo = {
+        "act": "Retune what needs action first: its margins are missed or physics is missing.",
+        "failed": "Read why the loops under 'Not analysed' failed; each names its remedy.",
+        "look": "Look at the loops that could do better when there is time.",
+        "fine": "Nothing to do.",
+    }
+    first = next((attention for attention in ATTENTION if counts[attention]), "fine")
+    sure = "Every figure rests on the loop's own record; what was left out of it is said under Notes."
+    return ("How sure", sure), ("What to do", todo[first])
 
 
 def _section(settings: CampaignSettings, attention: Attention, rows: Sequence[Row]) -> Section:
@@ -120,6 +134,19 @@ def _error(row: Row) -> str:
     return f"{_number(row.nominal, '.3g')} → {_number(row.extended, '.3g')} ({_number(row.noise_floor, '.3g')})"
 
 
+def _step(row: Row) -> str | Picture:
+    if not row.step or row.step_s is None:
+        return ""
+    values = np.array(row.step.split(), dtype=np.float64)
+    return Picture(values=values, says=f"response to a step over {_time(row.step_s)}")
+
+
+def _gain(row: Row) -> str:
+    unit = f"\N{NO-BREAK SPACE}{row.y_unit}/{row.u_unit}" if row.u_unit and row.y_unit else ""
+    per_second = "/s" if row.integrators else ""
+    return "" if row.gain is None else f"{row.gain:.3g}{unit}{per_second}"
+
+
 _FAILED: _Columns = {"file": lambda row: row.file.rsplit("/", 1)[-1], "record": _record}
 _COLUMNS: dict[str, _Columns] = {
     "identify": {
@@ -128,6 +155,10 @@ _COLUMNS: dict[str, _Columns] = {
         "record": _record,
     },
     "design": {
+        "plant's step": _step,
+        "gain": _gain,
+        "lags [s]": lambda row: (row.lags_s or "") + (", integrator" if row.integrators else ""),
+        "dead time [s]": lambda row: _number(row.dead_time_s, ".3g"),
         "new K, Ti": lambda row: _gains(row.K, row.Ti_s),
         "modulus, phase margin": lambda row: _margins(row.modulus, row.phase_deg),
         "present K, Ti": lambda row: _gains(row.K_now, row.Ti_now_s),

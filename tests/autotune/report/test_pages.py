@@ -1,0 +1,69 @@
+"""Pages of many loops and of a proof: what a reader finds on them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from autotune.batch.loop import Row
+from autotune.batch.plant_figures import plant_figures
+from autotune.batch.settings import CampaignSettings
+from autotune.models import TransferFunction
+from autotune.report.campaign_page import campaign_page
+from autotune.report.page import write_page
+from autotune.report.proof_page import proof_page
+from sim.score import wilson
+
+
+@given(gain=st.floats(0.1, 100.0), lag_s=st.floats(0.01, 1e4), delay_s=st.floats(0.0, 100.0))
+def test_the_step_of_a_lag_with_dead_time_in_a_few_numbers_is_the_textbooks(gain, lag_s, delay_s):
+    found = plant_figures(TransferFunction(num=(gain,), den=(lag_s, 1.0), delay_s=delay_s))
+    assert found["gain"] == pytest.approx(gain)
+    assert float(found["lags_s"]) == pytest.approx(lag_s, rel=6e-3)
+    step = np.array(found["step"].split(), dtype=float)
+    t = np.linspace(0.0, found["step_s"], step.size)
+    np.testing.assert_allclose(step, gain * -np.expm1(-np.maximum(t - delay_s, 0.0) / lag_s), atol=0.012 * gain)
+
+
+def test_an_oscillating_pair_is_told_by_its_frequency_and_damping():
+    found = plant_figures(TransferFunction(num=(8.0,), den=(1.0, 0.4, 4.0, 0.0)))
+    assert found["lags_s"] == "2 rad/s with damping 0.1"
+    assert (found["integrators"], found["gain"]) == (1, 2.0)
+
+
+def test_a_campaigns_page_shows_every_loops_plant_and_says_what_to_do(tmp_path):
+    figures = plant_figures(TransferFunction(num=(0.8,), den=(90.0, 1.0), delay_s=20.0))
+    rows = [
+        Row(
+            loop="TIC1",
+            attention="act",
+            reason="margin 40 % too small",
+            u_unit="%",
+            y_unit="degC",
+            K=1.0,
+            Ti_s=90.0,
+            **figures,
+        ),
+        Row(loop="TIC2", attention="fine", K=1.0, Ti_s=90.0, **figures),
+    ]
+    write_page(campaign_page(CampaignSettings(name="boilers"), rows), tmp_path / "page.html")
+    content = (tmp_path / "page.html").read_text(encoding="utf-8")
+    assert content.count("<polyline") == 2
+    for said in ("0.8\N{NO-BREAK SPACE}degC/%", ">90<", ">20<", "Retune what needs action first"):
+        assert said in content
+
+
+def test_the_page_of_a_proof_has_its_figures_calibration_and_misses(tmp_path):
+    mark = {"case": "case_1", "kind": "single", "strength": "clear", "rig": "servo", "verdict": "effect", "gap": 0.2}
+    mark |= {"true_names": ["plant.coulomb_friction"], "named": ["actuator.backlash"], "probabilities": [0.6]}
+    mark |= {"right": [False], "place_right": False}
+    row = {"figure": "clear effects named", "asked": ">= 90 %", "value": 0.5, "interval": [0.1, 0.9]}
+    row |= {"count": 2, "met": False}
+    result = {"table": [row], "cases": 2, "marks": [mark], "sha256": "ab" * 32}
+    page = proof_page(result, [mark], [("plant.coulomb_friction", 2, 1, [("actuator.backlash", 1)])], wilson)
+    write_page(page, tmp_path / "page.html")
+    content = (tmp_path / "page.html").read_text(encoding="utf-8")
+    for said in ("1 of 2 concealed cases", "Not reached: clear effects named", "actuator.backlash (0.60)", "0 of 1"):
+        assert said in content
