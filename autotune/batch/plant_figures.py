@@ -40,9 +40,9 @@ def plant_figures(plant: TransferFunction) -> PlantFigures:
     order = np.argsort(np.abs(plant.poles))
     poles = [complex(pole) for pole in plant.poles[order] if abs(pole) > 0.0 and pole.imag >= 0.0]
     slowest = max((1.0 / abs(pole) for pole in poles), default=max(plant.delay_s, 1.0))
-    span = _LAGS_SHOWN * slowest + 1.5 * plant.delay_s
+    span = _LAGS_SHOWN * slowest + plant.delay_s
     t = np.linspace(0.0, span, _VALUES)
-    late = np.linspace(0.0, span, 20 * _VALUES)
+    late = np.linspace(0.0, _LAGS_SHOWN * slowest, 20 * _VALUES)
     _, rational = signal.step((plant.num, plant.den), T=late)
     step = np.interp(t - plant.delay_s, late, rational, left=0.0)
     return PlantFigures(
