@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from autotune.experiment.rig import HoldsGains, Rig
     from autotune.experiment.verify import Verification
     from autotune.identification.parametric import PlantFit
+    from autotune.pipeline.audit import AuditLog
     from autotune.pipeline.folder import Measured
 
     Form: TypeAlias = str
@@ -62,6 +63,7 @@ def deploy(
     """Write gains into the rig's own controller, read them back, verify the loop; else restore the old gains."""
     from autotune.config import load_config
     from autotune.experiment.verify import expected_margins
+    from autotune.pipeline.audit import audit_log
     from autotune.pipeline.deployment import deploy as hand_over
     from autotune.pipeline.folder import JOURNAL, next_free
     from autotune.pipeline.held_gains import held_by
@@ -82,7 +84,8 @@ def deploy(
         )
     folder = _folder(config, run, out)
     console = Console(highlight=False, soft_wrap=True)
-    _restore_interrupted(rig, folder / JOURNAL, console, yes)
+    audit = audit_log(content, folder, "deploy")
+    _restore_interrupted(rig, folder / JOURNAL, console, yes, audit)
 
     def agree(old: PIDController, to_be: PIDController) -> None:
         console.print(_comparison(content, old, to_be, form, (u_span, y_span), fit))
@@ -94,7 +97,8 @@ def deploy(
         assert fit is not None
         return _verify(rig, content, held, fit, measured, folder)
 
-    done = hand_over(rig, new, folder / JOURNAL, agree=agree, try_out=try_out if verify else None)
+    trial = try_out if verify else None
+    done = hand_over(rig, new, folder / JOURNAL, agree=agree, try_out=trial, audit=audit)
     verification = done.verification
     result = next_free(folder / "deploy.json")
     write_json(
@@ -206,7 +210,7 @@ def _folder(config: Path, run: Path | None, out: Path | None) -> Path:
     return folder
 
 
-def _restore_interrupted(rig: HoldsGains, journal: Path, console: Console, yes: bool) -> None:
+def _restore_interrupted(rig: HoldsGains, journal: Path, console: Console, yes: bool, audit: AuditLog) -> None:
     """Offer to write the old gains back where an earlier hand-over did not come to its end."""
     from autotune.pipeline.deployment import Journal, restore
 
@@ -224,7 +228,7 @@ def _restore_interrupted(rig: HoldsGains, journal: Path, console: Console, yes: 
             where=str(journal),
             remedy="move the journal away if the gains are right now",
         )
-    restore(rig, old, journal)
+    restore(rig, old, journal, audit=audit, why="an earlier hand-over was interrupted")
     console.print("The old gains are in place again.")
 
 

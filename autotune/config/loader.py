@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 import os
-from typing import Any
+from typing import Annotated, Any
 
-from pydantic import model_validator
+from pydantic import Field, model_validator
 
 from autotune.config.procedure import (
     ControllerSettings,
@@ -37,6 +37,12 @@ class Config(Section):
     design: DesignSettings = DesignSettings()
     controller: ControllerSettings | None = None
     verification: VerificationSettings = VerificationSettings()
+    audit_log: Annotated[
+        Text | None,
+        Field(
+            description="file that each change of the rig's gains is appended to; default: audit.jsonl by the journal"
+        ),
+    ] = None
 
     @model_validator(mode="after")
     def _on_the_grid(self) -> Config:

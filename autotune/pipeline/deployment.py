@@ -16,6 +16,7 @@ from autotune.controller import PIDController
 from autotune.errors import AutotuneError, ExperimentStopped, InputError
 from autotune.experiment.rig import HoldsGains
 from autotune.experiment.verify import Verification
+from autotune.pipeline.audit import AuditLog
 from autotune.pipeline.held_gains import held_by
 from autotune.run_log import jsonable
 
@@ -43,19 +44,24 @@ class Journal:
     ----------
     path : Path
         File to append to; made by the first note.
+    audit : AuditLog, optional
+        Gets a line for every step that changes the rig's gains.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, audit: AuditLog | None = None) -> None:
         self.path = path
+        self.audit = audit
+        self._old: PIDController | None = None
 
-    def note(self, step: Step, controller: PIDController) -> None:
-        """Append a step and bring it to the disk.
+    def note(self, step: Step, controller: PIDController, why: str = "") -> None:
+        """Append a step and bring it to the disk; in the audit log with why it is taken.
 
         Raises
         ------
         ExperimentStopped
             The file cannot be written.
         """
+        where = self.path
         at = datetime.now(UTC).isoformat(timespec="milliseconds")
         line = json.dumps(jsonable({"gains": step.value, "at": at, **asdict(controller)}))
         try:
@@ -63,10 +69,15 @@ class Journal:
                 file.write(line + "\n")
                 file.flush()
                 os.fsync(file.fileno())
+            if step is Step.READ:
+                self._old = controller
+            elif self.audit is not None:
+                where = self.audit.path
+                self.audit.note(step.value, old=self._old or controller, new=controller, why=why)
         except OSError as error:
             raise ExperimentStopped(
                 f"the journal cannot be written ({error.strerror})",
-                where=str(self.path),
+                where=str(where),
                 remedy="free space on the disk; no gains are written that are not in it first",
             ) from error
 
@@ -131,7 +142,14 @@ def read_gains(rig: HoldsGains) -> PIDController:
         rig.close()
 
 
-def hand_over(rig: HoldsGains, controller: PIDController | None, journal: Path) -> PIDController:
+def hand_over(
+    rig: HoldsGains,
+    controller: PIDController | None,
+    journal: Path,
+    *,
+    audit: AuditLog | None = None,
+    why: str = "",
+) -> PIDController:
     """Write verified gains into the rig's own controller, and the old ones back if that fails halfway.
 
     Where the journal says that an earlier hand-over was interrupted, the gains from before it are restored first.
@@ -144,6 +162,10 @@ def hand_over(rig: HoldsGains, controller: PIDController | None, journal: Path) 
         New gains; None only reads the old ones.
     journal : Path
         File that says what is about to be written before it is, so that a killed process leaves no riddle.
+    audit : AuditLog, optional
+        Gets a line for every change of the rig's gains.
+    why : str
+        Of the new gains, for the audit log.
 
     Returns
     -------
@@ -155,14 +177,14 @@ def hand_over(rig: HoldsGains, controller: PIDController | None, journal: Path) 
     LinkError
         The new gains could not be written and read back; the message says whether the old ones are in place again.
     """
-    notes = Journal(journal)
+    notes = Journal(journal, audit)
     before = notes.unfinished()
     if before is not None:
-        restore(rig, before, journal)
+        restore(rig, before, journal, audit=audit, why="an earlier hand-over was interrupted")
     old = read_gains(rig)
     notes.note(Step.READ, old)
     if controller is not None:
-        _write(rig, controller, old, notes, Step.WRITTEN)
+        _write(rig, controller, old, notes, Step.WRITTEN, why)
     return old
 
 
@@ -173,6 +195,7 @@ def deploy(
     *,
     agree: Callable[[PIDController, PIDController], None],
     try_out: Callable[[PIDController], Verification] | None,
+    audit: AuditLog | None = None,
 ) -> Deployment:
     """Hand new gains to the rig's own controller, try them, and take them back unless they behave as predicted.
 
@@ -188,13 +211,15 @@ def deploy(
         Shown the old and the new gains before anything is written; raises where they are refused.
     try_out : callable or None
         Runs the verification with the gains as the rig read them back; None keeps them without.
+    audit : AuditLog, optional
+        Gets a line for every change of the rig's gains.
 
     Raises
     ------
     LinkError, ExperimentStopped, OperatorStop
         Writing or verification was broken off; the message says whether the old gains are in place again.
     """
-    notes = Journal(journal)
+    notes = Journal(journal, audit)
     old = read_gains(rig)
     agree(old, controller)
     notes.note(Step.READ, old)
@@ -207,13 +232,15 @@ def deploy(
         _take_back(rig, old, notes, error, "the verification was broken off")
         raise
     if verification.accepted:
-        notes.note(Step.KEPT, held)
+        notes.note(Step.KEPT, held, verification.reason)
     else:
-        restore(rig, old, journal)
+        restore(rig, old, journal, audit=audit, why=verification.reason)
     return Deployment(old=old, new=held, verification=verification)
 
 
-def restore(rig: HoldsGains, old: PIDController, journal: Path) -> None:
+def restore(
+    rig: HoldsGains, old: PIDController, journal: Path, *, audit: AuditLog | None = None, why: str = ""
+) -> None:
     """Write the old gains back.
 
     Parameters
@@ -224,25 +251,31 @@ def restore(rig: HoldsGains, old: PIDController, journal: Path) -> None:
         Gains to go back to.
     journal : Path
         The journal of the hand-over; it stays open-ended where this fails.
+    audit : AuditLog, optional
+        Gets a line before and after.
+    why : str
+        For the audit log.
 
     Raises
     ------
     LinkError
         They could not be written and read back.
     """
-    notes = Journal(journal)
+    notes = Journal(journal, audit)
     with contextlib.suppress(
         ExperimentStopped
     ):  # the journal is open-ended already: a full disk must not keep new gains
-        notes.note(Step.RESTORING, old)
+        notes.note(Step.RESTORING, old, why)
     try:
         rig.write_gains(old)
     finally:
         rig.close()
-    notes.note(Step.RESTORED, old)
+    notes.note(Step.RESTORED, old, why)
 
 
-def _write(rig: HoldsGains, new: PIDController, old: PIDController, notes: Journal, done: Step) -> PIDController:
+def _write(
+    rig: HoldsGains, new: PIDController, old: PIDController, notes: Journal, done: Step, why: str = ""
+) -> PIDController:
     """Write the new gains, or the old ones where that fails; return the new ones as the rig holds them.
 
     Raises
@@ -251,7 +284,7 @@ def _write(rig: HoldsGains, new: PIDController, old: PIDController, notes: Journ
         The rig's registers cannot hold them, or only far from what they are; nothing was written.
     """
     new = held_by(rig, new, DesignSettings())
-    notes.note(Step.WRITING, new)
+    notes.note(Step.WRITING, new, why)
     try:
         try:
             rig.write_gains(new)
@@ -261,14 +294,14 @@ def _write(rig: HoldsGains, new: PIDController, old: PIDController, notes: Journ
     except AutotuneError as error:
         _take_back(rig, old, notes, error, "the new gains could not be written")
         raise
-    notes.note(done, held)
+    notes.note(done, held, why)
     return held
 
 
 def _take_back(rig: HoldsGains, old: PIDController, notes: Journal, error: BaseException, what: str) -> None:
     """Restore the old gains after an error, and raise one of its kind that says whether they are in place."""
     try:
-        restore(rig, old, notes.path)
+        restore(rig, old, notes.path, audit=notes.audit, why=what)
         state, remedy = "the old gains are in place again", "check the link and the rig, and deploy again"
     except AutotuneError as second:
         state = f"the old gains could not be written back ({second.what}): the rig may hold old, new or mixed gains"

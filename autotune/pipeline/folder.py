@@ -24,6 +24,8 @@ PROGRESS, CONFIG, REPORT = "progress.jsonl", "config.toml", "report.html"
 #: what a new run writes, its configuration apart, which may be the one that it was given
 FILES_OF_A_RUN = (RECORDING, VERIFICATION, RESULT, JOURNAL, PROGRESS, REPORT)
 
+#: registers that no point depends on: a scale that turned out to be too coarse for the gains may be changed
+_OF_GAINS = tuple(f"rig.registers.{name}" for name in ("K", "Ti", "Td", "Tf", "gains", "unlock"))
 #: sections of the configuration that the measured points depend on
 EXPERIMENT_SECTIONS = ("rig", "signals", "limits", "operating_point", "experiment")
 
@@ -176,7 +178,11 @@ def differences(stored: Config, given: Config) -> tuple[str, ...]:
     """Return the keys that the measured points depend on and that differ, each with both values."""
     was, now = (_flat(config.model_dump(mode="json", include=set(EXPERIMENT_SECTIONS))) for config in (stored, given))
     keys = [*was, *(key for key in now if key not in was)]
-    return tuple(f"{key} = {now.get(key)!r}, was {was.get(key)!r}" for key in keys if now.get(key) != was.get(key))
+    return tuple(
+        f"{key} = {now.get(key)!r}, was {was.get(key)!r}"
+        for key in keys
+        if now.get(key) != was.get(key) and not key.startswith(_OF_GAINS)
+    )
 
 
 def _flat(table: Mapping[str, Any], path: str = "") -> dict[str, Any]:

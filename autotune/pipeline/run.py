@@ -19,6 +19,7 @@ from autotune.experiment.sweep import missing_phases
 from autotune.experiment.verify import Verification, run_verification
 from autotune.outputs import unwritable
 from autotune.pipeline.analysis import Analysis, analyse
+from autotune.pipeline.audit import audit_log
 from autotune.pipeline.deployment import hand_over
 from autotune.pipeline.folder import (
     JOURNAL,
@@ -164,13 +165,16 @@ def _tune(
         accepted = verification is not None and verification.accepted
         old, deployed = None, False
         if isinstance(rig, HoldsGains):
-            old = hand_over(rig, analysis.controller if accepted and deploy else None, out / JOURNAL)
+            audit = audit_log(config, out, "run")
+            new = analysis.controller if accepted and deploy else None
+            said = verification.reason if verification is not None else ""
+            old = hand_over(rig, new, out / JOURNAL, audit=audit, why=said)
             deployed = accepted and deploy
         log.gains(old, analysis.controller, deployed=deployed)
         if isinstance(rig, HoldsGains) and old is not None and deployed and keep is not None:
             log.waiting(DECISION_S)
             if not keep(DECISION_S):
-                hand_over(rig, old, out / JOURNAL)
+                hand_over(rig, old, out / JOURNAL, audit=audit, why="the operator asked for the old gains")
                 deployed = False
             log.gains(old, analysis.controller, deployed=deployed)
     except AutotuneError as error:

@@ -7,10 +7,13 @@ import math
 import os
 import pty
 import signal
+import socket
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +29,7 @@ from autotune.errors import ExperimentStopped, InputError, LinkError
 from autotune.experiment.loop import ControlLoop
 from autotune.experiment.run import envelope_of
 from autotune.experiment.verify import Verification
+from autotune.pipeline.audit import AuditLog, audit_log, user
 from autotune.pipeline.deployment import Journal, deploy, hand_over, restore
 from autotune.recording import RecordingWriter
 from drivers.simulated import SimulatedRig
@@ -297,3 +301,59 @@ def test_a_line_of_the_journal_that_was_cut_off_was_not_acted_upon(tmp_path: Pat
         file.write('{"gains": "writ')
     assert journal.unfinished() is None
     assert replace(rig.read_gains(), K=2.0).Ti_s == math.inf
+
+
+def audit_of(folder: Path) -> AuditLog:
+    return audit_log(load_config(ROOT / "configs" / "servo_sim.toml"), folder, "deploy")
+
+
+def lines(log: AuditLog) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in log.path.read_text().splitlines()]
+
+
+def test_the_audit_log_says_who_changed_what_when_from_where_and_why(line: Line, tmp_path: Path) -> None:
+    log = audit_of(tmp_path)
+    before = datetime.now(UTC)
+    deploy(line.rig(), NEW, tmp_path / "journal.jsonl", agree=agreed, try_out=verified(True), audit=log)
+    held = PIDController(K=NEW.K, Ti_s=NEW.Ti_s)
+    deploy(line.rig(), OLD, tmp_path / "journal.jsonl", agree=lambda *_: None, try_out=verified(False), audit=log)
+    found = lines(log)
+    assert [one["verdict"] for one in found] == [
+        "writing", "written and read back, on trial", "verified, kept",
+        "writing", "written and read back, on trial", "restoring", "restored",
+    ]  # fmt: skip
+    for one in found:
+        assert (one["who"], one["host"], one["command"]) == (user(), socket.gethostname(), "deploy")
+        assert before <= datetime.fromisoformat(one["at"]) <= datetime.now(UTC)
+        assert datetime.fromisoformat(one["at"]).utcoffset() == timedelta(0)
+        assert one["configuration"] == log.configuration
+    assert (found[2]["old"]["K"], found[2]["new"]["K"]) == (OLD.K, held.K)
+    assert (found[-1]["old"]["K"], found[-1]["new"]["K"]) == (held.K, held.K)  # the old gains again
+
+
+def test_one_changed_key_is_another_configuration(tmp_path: Path) -> None:
+    config = load_config(ROOT / "configs" / "servo_sim.toml")
+    swing = config.limits.model_copy(update={"swing": 0.4})
+    hashes = {
+        audit_log(one, tmp_path, "run").configuration for one in (config, config.model_copy(update={"limits": swing}))
+    }
+    assert len(hashes) == 2
+    assert audit_log(config.model_copy(update={"audit_log": "/var/log/rig.jsonl"}), tmp_path, "run").path.is_absolute()
+
+
+def test_the_audit_log_is_appended_to_by_many_and_never_rewritten(tmp_path: Path) -> None:
+    log = audit_of(tmp_path)
+    log.path.write_text('{"cut off by a full di')
+    with ThreadPoolExecutor(8) as pool:
+        for done in [pool.submit(log.note, f"step {k}", old=OLD, new=NEW) for k in range(200)]:
+            done.result()
+    cut, *rest = log.path.read_text().splitlines()
+    assert cut == '{"cut off by a full di'
+    assert {json.loads(one)["verdict"] for one in rest if one} == {f"step {k}" for k in range(200)}
+
+
+def test_no_gains_are_written_that_the_audit_log_cannot_take(line: Line, tmp_path: Path) -> None:
+    log = replace(audit_of(tmp_path), path=tmp_path)  # a folder is no file
+    with pytest.raises(ExperimentStopped, match="record of the gains cannot be written"):
+        deploy(line.rig(), NEW, tmp_path / "journal.jsonl", agree=agreed, try_out=None, audit=log)
+    assert line.gains == OLD
