@@ -1,3 +1,126 @@
-"""Relay autotuner with hardware in the loop: measures a rig's Bode points, designs its controller, verifies it."""
+"""Relay autotuner with hardware in the loop: measures a rig's Bode points, designs its controller, verifies it.
+
+In Python, ``import autotune as at``:
+
+=====================  ======================================================================================
+``read``               a recording from a file, a DataFrame or arrays
+``example``            recordings and plants to try things on
+``frequency_points``   points of the frequency response, with covariance
+``reduce``             the cautious model of points or of a plant
+``tune``               PI or PID with margins, on points or on a model
+``margins``            margins of a loop
+``validate``           nu-gap and stability margins b of a model beside its plant
+``delay``              coefficients and dead time, by three methods; two delays
+``OnlineEstimator``    the same row by row, for a live rig
+``closed_loop``        the plant from a recording of its loop, by the papers' methods
+``transition``         the fastest smooth transition within limits
+``simulate``           a model driven by a recording
+``diagnose``           where and why recordings differ from a model
+``plot``               any result, on matplotlib axes or as a plotly figure
+``to_control``         to python-control, and ``from_control`` back
+``to_pandas``          any result as a DataFrame
+=====================  ======================================================================================
+
+``PI``, ``TransferFunction``, ``Recording``, ``read_model`` and ``read_controller`` make what these take. Results show
+themselves in a notebook. The rooms below (``autotune.identification``, ``autotune.design``, ..) can be imported too.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
 
 __version__ = "0.1.0"
+
+if TYPE_CHECKING:
+    from autotune.api.control_systems import from_control, to_control
+    from autotune.api.examples import example
+    from autotune.api.methods import (
+        closed_loop,
+        delay,
+        diagnose,
+        margins,
+        reduce,
+        simulate,
+        transition,
+        tune,
+        validate,
+    )
+    from autotune.api.plots import plot
+    from autotune.api.points import Points, frequency_points
+    from autotune.api.recordings import read
+    from autotune.api.shown import to_pandas
+    from autotune.controller import PIDController as PI  # noqa: N814 - as people write it
+    from autotune.controller import read_controller
+    from autotune.identification.delay.online_modulating import OnlineEstimator
+    from autotune.models import TransferFunction, read_model
+    from autotune.recording import Recording
+
+#: name -> module and name there
+_HOMES = {
+    "read": "autotune.api.recordings",
+    "example": "autotune.api.examples",
+    "frequency_points": "autotune.api.points",
+    "Points": "autotune.api.points",
+    "reduce": "autotune.api.methods",
+    "tune": "autotune.api.methods",
+    "margins": "autotune.api.methods",
+    "validate": "autotune.api.methods",
+    "delay": "autotune.api.methods",
+    "closed_loop": "autotune.api.methods",
+    "transition": "autotune.api.methods",
+    "simulate": "autotune.api.methods",
+    "diagnose": "autotune.api.methods",
+    "plot": "autotune.api.plots",
+    "to_control": "autotune.api.control_systems",
+    "from_control": "autotune.api.control_systems",
+    "to_pandas": "autotune.api.shown",
+    "PI": "autotune.controller:PIDController",
+    "OnlineEstimator": "autotune.identification.delay.online_modulating",
+    "TransferFunction": "autotune.models",
+    "Recording": "autotune.recording",
+    "read_model": "autotune.models",
+    "read_controller": "autotune.controller",
+}
+
+__all__ = [
+    "PI",
+    "OnlineEstimator",
+    "Points",
+    "Recording",
+    "TransferFunction",
+    "closed_loop",
+    "delay",
+    "diagnose",
+    "example",
+    "frequency_points",
+    "from_control",
+    "margins",
+    "plot",
+    "read",
+    "read_controller",
+    "read_model",
+    "reduce",
+    "simulate",
+    "to_control",
+    "to_pandas",
+    "transition",
+    "tune",
+    "validate",
+]
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name when it is first used: the command line and a bare import stay fast."""
+    home = _HOMES.get(name)
+    if home is None:
+        raise AttributeError(f"module 'autotune' has no attribute {name!r}")
+    importlib.import_module("autotune.api.shown")  # results show themselves from the first one on
+    module, _, there = home.partition(":")
+    value = getattr(importlib.import_module(module), there or name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict
+from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -16,8 +17,24 @@ from autotune.cli.recordings import R, T, U, Y, read_one, signal_names
 from autotune.outputs import Output, claim
 
 if TYPE_CHECKING:
+    from autotune.controller import Controller
     from autotune.identification.closed_loop.dither_proposal import DitherLimits
     from autotune.identification.closed_loop.identify import ClosedLoopIdentification
+    from autotune.identification.closed_loop.state_space import InnovationModel
+    from autotune.recording import Recording
+
+
+class ClosedLoopMethod(StrEnum):
+    """How the plant is identified; the names of ``autotune.identification.closed_loop.methods``."""
+
+    prediction_error = "prediction-error"
+    indirect = "indirect"
+    indirect_refitted = "indirect-refitted"
+    van_overschee = "van-overschee"
+    oku_tanaka = "oku-tanaka"
+    ort = "ort"
+    ssarx = "ssarx"
+    pbsid = "pbsid"
 
 
 @identify.command("closed-loop")
@@ -39,6 +56,17 @@ def closed_loop(
     config: Annotated[
         Path | None, typer.Option(help="configuration of the rig: a dither is proposed within its limits")
     ] = None,
+    method: Annotated[
+        ClosedLoopMethod,
+        typer.Option(help="prediction-error has regions, evidence and a verdict; the others are the papers' own"),
+    ] = ClosedLoopMethod.prediction_error,
+    more_u: Annotated[list[str] | None, typer.Option(metavar="COLUMN", help="a further input; may be repeated")] = None,
+    more_y: Annotated[
+        list[str] | None, typer.Option(metavar="COLUMN", help="a further output; may be repeated")
+    ] = None,
+    more_r: Annotated[
+        list[str] | None, typer.Option(metavar="COLUMN", help="what was added to that further input; may be repeated")
+    ] = None,
     t: T = None,
     u: U = None,
     y: Y = None,
@@ -53,6 +81,13 @@ def closed_loop(
     place = Output(out, inputs=(recording, controller, config), overwrite=overwrite)
     data = read_one(recording, signal_names(t, u, y, r))
     law = None if controller is None else read_controller(controller)
+    if method is not ClosedLoopMethod.prediction_error or more_u or more_y:
+        model = _by_method(data, method.value, order, law, (more_u or [], more_y or [], more_r or []))
+        place.json(model_json(model, method.value))
+        poles = ", ".join(f"{pole:.4g}" for pole in model.poles)
+        typer.echo(f"order {model.order} by {method.value}, poles {poles}")
+        typer.echo(f"wrote {out}")
+        return
     with console.status("reading the loop") as status:
         result = identify_closed_loop(
             data,
@@ -68,6 +103,54 @@ def closed_loop(
         console.print(f"warning: {warning}", markup=False, soft_wrap=True)
     typer.echo(summary(result))
     typer.echo(f"wrote {out}")
+
+
+def _by_method(
+    data: Recording,
+    method: Any,
+    order: int | None,
+    law: Controller | None,
+    more: tuple[list[str], list[str], list[str]],
+) -> InnovationModel:
+    """Return the model of a method that gives nothing but a model, of as many signals as are named."""
+    from autotune.identification.closed_loop.signals import model_of_recording
+
+    return model_of_recording(data, method=method, order=order, controller=law, more=more)
+
+
+def model_json(model: InnovationModel, method: str) -> dict[str, Any]:
+    """Return the content of ``closed_loop.json`` of a model without regions."""
+    single = model.B.shape[1] == 1 and len(model.C) == 1
+    content: dict[str, Any] = {
+        "method": method,
+        "order": model.order,
+        "input_delay": model.input_delay,
+        "sample_time_s": model.sample_time_s,
+    }
+    if single:
+        num, den = model.polynomials()
+        content |= {"num": num.tolist(), "den": den.tolist()}
+        content["noise_variance"] = float(model.innovation_covariance[0, 0])
+    content["poles"] = [[pole.real, pole.imag] for pole in model.poles]
+    return content | state_space_json(model)
+
+
+def state_space_json(model: InnovationModel) -> dict[str, Any]:
+    """Return the model's matrices and its noise model, H = noise_num / den where there is one output."""
+    import numpy as np
+
+    matrices = {name: getattr(model, name).tolist() for name in ("A", "B", "C", "D", "K")}
+    noise: dict[str, Any] = {"covariance": model.innovation_covariance.tolist()}
+    if len(model.C) == 1:
+        den = np.real(np.poly(model.A))
+        impulse = [1.0]
+        x = model.K
+        for _ in range(model.order):
+            impulse.append(float((model.C @ x)[0, 0]))
+            x = model.A @ x
+        noise["num"] = np.convolve(den, impulse)[: model.order + 1].tolist()
+        noise["den"] = den.tolist()
+    return {"state_space": matrices, "noise_model": noise}
 
 
 def _limits(config: Path) -> DitherLimits:
@@ -121,6 +204,7 @@ def closed_loop_json(result: ClosedLoopIdentification) -> dict[str, Any]:
             for c in result.evidence
         ],
         "warnings": list(result.warnings),
+        **state_space_json(model),
     }
     if result.law is not None:
         share = result.law.beyond_rounding

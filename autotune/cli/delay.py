@@ -39,6 +39,14 @@ class PastInput(StrEnum):
     zero = "zero"
 
 
+class DelayMethod(StrEnum):
+    """How the delay is identified."""
+
+    output_error = "output-error"
+    algebraic = "algebraic"
+    online = "online"
+
+
 @identify.command("delay")
 def identify_delay_command(
     recording: Annotated[Path, typer.Argument(help="recording of u and y")],
@@ -59,6 +67,25 @@ def identify_delay_command(
     integrator: Annotated[bool, typer.Option("--integrator", help="the plant integrates: a0 = 0")] = False,
     offset: Annotated[bool, typer.Option(help="estimate a constant offset of u or y")] = True,
     coloured: Annotated[bool, typer.Option(help="allow coloured (autoregressive) noise")] = True,
+    method: Annotated[
+        DelayMethod,
+        typer.Option(
+            help="output-error is maximum likelihood; algebraic and online are modulating functions, on intervals or "
+            "row by row"
+        ),
+    ] = DelayMethod.output_error,
+    delays: Annotated[
+        int, typer.Option(min=1, max=2, help="2: x'' + a x(t - h1) = b u(t - h2), the output is delayed as well")
+    ] = 1,
+    interval: Annotated[
+        float | None, typer.Option(help="length of the modulated intervals [s]; default a seventh of the record")
+    ] = None,
+    forgetting: Annotated[
+        float | None, typer.Option(help="of --method online: rate of the kernels [1/s]; default 100 over the record")
+    ] = None,
+    start_delay: Annotated[
+        float | None, typer.Option(help="starting value of the delay [s]; found when absent")
+    ] = None,
     t: T = None,
     u: U = None,
     y: Y = None,
@@ -73,6 +100,15 @@ def identify_delay_command(
 
     place = Output(out, inputs=(recording,), overwrite=overwrite)
     record = read_one(recording, signal_names(t, u, y, r))
+    if delays == 2:
+        place.json(_two_delays(record, interval))
+        typer.echo(f"wrote {out}")
+        return
+    if method is not DelayMethod.output_error:
+        model = _by_modulating(record, order, method, interval, forgetting, start_delay, hold)
+        place.by(lambda part: write_delay_model(model, part))
+        typer.echo(f"{describe(model)}; wrote {out}")
+        return
     with Console(stderr=True).status("searching the delay") as status:
         model = identify_delay(
             record,
@@ -88,6 +124,38 @@ def identify_delay_command(
         )
     place.by(lambda part: write_delay_model(model, part))
     typer.echo(f"{describe(model)}; wrote {out}")
+
+
+def _by_modulating(
+    record: Recording,
+    order: int,
+    method: DelayMethod,
+    interval_s: float | None,
+    forgetting: float | None,
+    start_s: float | None,
+    hold: Hold | None,
+) -> DelayModel:
+    from autotune.identification.delay.methods import algebraic_delay, online_delay
+
+    held: Literal["zero", "linear"] | None = None if hold is None else ("zero" if hold is Hold.zero else "linear")
+    if method is DelayMethod.online and start_s is not None:
+        return online_delay(record, order, forgetting=forgetting, start_s=start_s, hold=held)
+    found = algebraic_delay(record, order, interval_s=interval_s, start_s=start_s or 0.0, hold=held)
+    if method is DelayMethod.algebraic:
+        return found
+    return online_delay(record, order, forgetting=forgetting, start_s=found.delay_s, hold=held)
+
+
+def _two_delays(record: Recording, interval_s: float | None) -> dict[str, object]:
+    """Return the content of the file of a model with two delays, and print it."""
+    from autotune.identification.delay.two_delays import intervals_of, two_delays
+
+    found = two_delays(record, intervals_of(record, interval_s))
+    values, sd = found.values, found.standard_deviations
+    names = ("a", "b", "h1", "h2")
+    parts = [f"{name} {value:.5g} +- {1.96 * s:.2g}" for name, value, s in zip(names, values, sd, strict=True)]
+    typer.echo(f"x'' + a x(t - h1) = b u(t - h2): {', '.join(parts)} (95 %)")
+    return found.to_json()
 
 
 def describe(model: DelayModel) -> str:

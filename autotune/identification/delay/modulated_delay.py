@@ -76,6 +76,7 @@ def modulated_delay(
     expansion: int | None = None,
     delay_s: float = 0.0,
     linear: bool = True,
+    offset: bool = False,
     iterations: int = 50,
 ) -> ModulatedDelay:
     """Estimate a, b and h by modulating functions and least squares over intervals, iterating on h.
@@ -98,6 +99,8 @@ def modulated_delay(
         delays of a grid that explain the intervals best.
     linear : bool
         Whether u runs linearly between rows; held otherwise.
+    offset : bool
+        Whether a constant is estimated, as where u and y are counted from an operating point.
     iterations : int
         Largest number of steps.
 
@@ -128,7 +131,9 @@ def modulated_delay(
     require_window(window, order)
     recording.require_finite()
     modulated = _modulated(recording, window, order, intervals, linear, expansion)
-    unknowns = order + modulated.whole.size
+    lengths = np.array([[T_2 - T_1] for T_1, T_2 in intervals])  # of which the windows' areas are one share
+    modulated = replace(modulated, constant=lengths if offset else np.zeros((len(intervals), 0)))
+    unknowns = order + modulated.whole.size + int(offset)
     if _inside(recording, intervals, 0.0).sum() < unknowns:
         raise InputError(
             f"{len(intervals)} intervals, of which {_inside(recording, intervals, 0.0).sum()} within the record, for "
@@ -179,11 +184,11 @@ def _iterate(
     Y = modulated.output
     n = Y.shape[1] - 1
     longest = max(T_2 - T_1 for T_1, T_2 in intervals)
-    step, count, solution = np.inf, 0, np.zeros(n + modulated.whole.size)
+    step, count, solution = np.inf, 0, np.zeros(n + modulated.whole.size + modulated.constant.shape[1])
     while count < iterations and abs(step) > 1e-6:
         inside = _inside(recording, intervals, h)
         # sum (-1)^i L^-i a_i I_{y,f^(i)} + b I_{u_h,f} + .. = (-1)^n L^-n I_{y,f^(n)}
-        matrix = np.column_stack([Y[:, :n], modulated.of_input(h)])[inside]
+        matrix = np.column_stack([Y[:, :n], modulated.of_input(h), modulated.constant])[inside]
         if matrix.shape[0] < matrix.shape[1]:
             break
         solution = np.linalg.lstsq(matrix, Y[inside, n], rcond=None)[0]
@@ -206,9 +211,10 @@ def _residual(recording: Recording, intervals: Sequence[Interval], modulated: Mo
     """Return what the equations leave at a delay, with one gain and no expansion; infinite with too few intervals."""
     inside = _inside(recording, intervals, h)
     Y = modulated.output[inside]
-    if len(Y) < Y.shape[1] - 1 + modulated.whole.size:
+    if len(Y) < Y.shape[1] - 1 + modulated.whole.size + modulated.constant.shape[1]:
         return float("inf")
-    matrix = np.column_stack([Y[:, :-1], (modulated.of_input(h) @ modulated.whole)[inside]])
+    of_u = (modulated.of_input(h) @ modulated.whole)[inside]
+    matrix = np.column_stack([Y[:, :-1], of_u, modulated.constant[inside]])
     left = Y[:, -1] - matrix @ np.linalg.lstsq(matrix, Y[:, -1], rcond=None)[0]
     total = float(Y[:, -1] @ Y[:, -1]) * (1.0 - matrix.shape[1] / len(Y))
     return float(left @ left) / total if total > 0.0 else float("inf")

@@ -21,6 +21,9 @@ from autotune.recording import Recording
 Interval: TypeAlias = tuple[float, float]
 
 
+_NONE = np.zeros((0, 0))
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Modulated:
     """Integrals over all intervals.
@@ -36,12 +39,15 @@ class Modulated:
     step : callable
         From the family's coefficients and b's sign to what the delay still lacks, in shares of the longest interval;
         with sign 0 it is the sign of the coefficients.
+    constant : (intervals, 0 or 1) array
+        Integrals of the window, where a constant is estimated.
     """
 
     output: FloatArray
     of_input: Callable[[float], FloatArray]
     whole: FloatArray
     step: Callable[[FloatArray, float], float]
+    constant: FloatArray
 
 
 def modulated_by_fourier_sums(
@@ -98,7 +104,7 @@ def modulated_by_fourier_sums(
         return float(np.arctan2(sign * b[lowest + 1], sign * b[lowest]) / omega)
 
     whole = [1.0] * constant + [1.0, 0.0] * (len(terms) - constant)
-    return Modulated(output=Y, of_input=of_input, whole=np.array(whole), step=step)
+    return Modulated(output=Y, of_input=of_input, whole=np.array(whole), step=step, constant=_NONE)
 
 
 def modulated_by_expansion(
@@ -115,7 +121,7 @@ def modulated_by_expansion(
     def step(b: FloatArray, sign: float) -> float:  # b_1 / b_0, at most a quarter of an interval at once
         return float(np.clip(b[1] / b[0], -0.25, 0.25)) if b[0] != 0.0 else 0.0
 
-    return Modulated(output=Y, of_input=of_input, whole=np.eye(expansion + 1)[0], step=step)
+    return Modulated(output=Y, of_input=of_input, whole=np.eye(expansion + 1)[0], step=step, constant=_NONE)
 
 
 @njit(cache=True)

@@ -14,7 +14,10 @@ H, LAST_T, LAST_U, LAST_Y, FIRST_T, ROW, WEIGHT, SPREAD = range(8)
 _TRACE = 1e-9
 #: weight of the averaged equations from which on what they leave is taken for noise, and then of that itself
 _SETTLED = 0.8
-_KNOWN = 0.3
+#: Age of the kernels, in their number over lambda, from which on the equations are averaged.
+_FILLED = 2.5
+_KNOWN = 0.2
+_LONGER = 3.0
 
 
 @njit(cache=True)
@@ -114,6 +117,7 @@ def step_row(
     memory_s: float,
     linear: bool,
     delayed: bool,
+    offset: bool,
     after: float,
     rate: float,
 ) -> tuple[FloatArray, FloatArray, bool]:
@@ -135,8 +139,12 @@ def step_row(
     if gain > 0.0:
         # the implicit step (I + dt Lambda C^T C) A_new = A + dt Lambda C^T D; its matrix is positive definite
         A[:] = cholesky_solve(np.eye(A.size) + step * gain * (C.T @ C), A + step * gain * (C.T @ D), 0.0)[0]
-    else:
-        _averaged(C, D, A, R, slow, spread, scalars, step, n, lam, memory_s)
+    elif (t[k] - scalars[FIRST_T] - scalars[H]) * lam > _FILLED * kernels:  # what was before the first row is forgotten
+        if offset:
+            whole = np.ones((C.shape[0], A.size))
+            whole[:, : A.size - 1] = C
+            C = whole
+        _averaged(C, D, A, R, slow, spread, scalars, step, n, lam, memory_s, offset)
     if delayed and t[k] - scalars[FIRST_T] > after and A[n] != 0.0:
         moved = step * rate * A[n + 1] / A[n]
         scalars[H] += moved
@@ -145,7 +153,7 @@ def step_row(
         if not 0.0 <= scalars[H] <= t[k] - scalars[FIRST_T]:
             return np.zeros(n), R, False
     scalars[LAST_T], scalars[LAST_U], scalars[LAST_Y] = t[k], u[k], y
-    state = _state(A, _derivatives(Jy, n, lam), _derivatives(Jh, 1, lam), n, lam)
+    state = _state(A, _derivatives(Jy, n, lam), _derivatives(Jh, 1, lam), n, lam, offset)
     return state, _covariance(R, spread, scalars[WEIGHT], scalars[SPREAD], memory_s), True
 
 
@@ -162,13 +170,15 @@ def _averaged(
     n: int,
     lam: float,
     memory_s: float,
+    offset: bool,
 ) -> None:
     """Move A by the averaged equations' own inverse, which no unit changes; keep what its covariance is made of."""
     factor = 1.0
+    known = A.size - 1 if offset else A.size
     for j in range(n + C.shape[0]):  # kernels of area 1: every equation in the same unit, whatever that of time
         factor *= lam / max(j, 1)
         if j >= n:
-            C[j - n] *= factor
+            C[j - n, :known] *= factor  # a constant's integral over a kernel of area 1 is itself
             D[j - n] *= factor
     fresh = 1.0 - np.exp(-step / memory_s)
     scalars[WEIGHT] += fresh * (1.0 - scalars[WEIGHT])
@@ -182,8 +192,9 @@ def _averaged(
     # the density at frequency zero of the regressors times what the equations leave
     corner = lam / (2.0 * (n + C.shape[0]))
     slow += (1.0 - np.exp(-step * corner)) * (C.T @ (D - C @ A) - slow)
-    spread += fresh * (np.outer(slow, slow) * 2.0 / corner - spread)
-    scalars[SPREAD] += fresh * (1.0 - scalars[SPREAD])
+    newer = fresh / _LONGER  # few independent values come in one memory
+    spread += newer * (np.outer(slow, slow) * 2.0 / corner - spread)
+    scalars[SPREAD] += newer * (1.0 - scalars[SPREAD])
 
 
 @njit(cache=True)
@@ -198,7 +209,7 @@ def _covariance(R: FloatArray, spread: FloatArray, weight: float, known: float, 
 
 
 @njit(cache=True)
-def _state(A: FloatArray, Y: FloatArray, U: FloatArray, n: int, lam: float) -> FloatArray:
+def _state(A: FloatArray, Y: FloatArray, U: FloatArray, n: int, lam: float, offset: bool) -> FloatArray:
     """Solve the equations of the kernels j < n, whose end terms carry x..x^(n-1)(T)."""
     ends = np.zeros((n + 1, n))  # g_j^(k)(T)
     ends[0, 0] = 1.0
@@ -207,8 +218,10 @@ def _state(A: FloatArray, Y: FloatArray, U: FloatArray, n: int, lam: float) -> F
             ends[k, j] = lam * ends[k - 1, j] - (j * ends[k - 1, j - 1] if j > 0 else 0.0)
     M = np.zeros((n, n))
     r = np.zeros(n)
+    area = 1.0
     for j in range(n):
-        r[j] = -A[n] * U[0, j]
+        area *= max(j, 1) / lam
+        r[j] = -A[n] * U[0, j] - (A[A.size - 1] * area if offset else 0.0)
         for i in range(n + 1):
             coefficient = -1.0 if i == n else A[i]
             r[j] -= coefficient * (-1.0) ** i * Y[i, j]

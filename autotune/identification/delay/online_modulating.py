@@ -63,7 +63,7 @@ class OnlineEstimate:
     state : (N, n) array
         x, x', .. at each row; NaN until the kernels have filled.
     covariance : (N, n + 2, n + 2) array
-        Of (a_0.., b, delay); NaN until the equations have been averaged for two times memory, and with the paper's
+        Of (a_0.., b, delay); NaN until the equations have been averaged for two times the memory, and with the paper's
         scalar gain; zero for a delay that is not followed.
     """
 
@@ -110,11 +110,13 @@ class OnlineEstimator:
         How the delay is followed; the plant has none where not given.
     linear : bool
         Whether u runs linearly between rows; held otherwise.
+    offset : bool
+        Whether a constant is estimated, as where u and y are counted from an operating point; not with ``gain``.
 
     Raises
     ------
     InputError
-        Settings that are not positive.
+        Settings that are not positive, or both a gain and an offset.
 
     Notes
     -----
@@ -133,13 +135,16 @@ class OnlineEstimator:
         gain: float | None = None,
         delay: DelayTracking | None = None,
         linear: bool = True,
+        offset: bool = False,
     ) -> None:
         memory_s = (4.0 * order + 8.0) / forgetting if memory_s is None and forgetting > 0.0 else memory_s
         if not (forgetting > 0 and (gain is None or gain > 0) and (memory_s or 0.0) > 0 and order >= 1):
             raise InputError("forgetting, memory, gain and order must be positive", where="follow")
-        self._n, self._delay, self._linear = order, delay, linear
+        if gain is not None and offset:
+            raise InputError("a scalar gain has no offset", where="follow", remedy="give memory_s instead")
+        self._n, self._delay, self._linear, self._offset = order, delay, linear, offset
         self._forgetting, self._memory_s, self._gain = float(forgetting), float(memory_s or 0.0), float(gain or 0.0)
-        kernels, unknowns = 2 * order + 2, order + (2 if delay else 1)
+        kernels, unknowns = 2 * order + 2, order + (2 if delay else 1) + int(offset)
         self._chains = np.zeros(kernels), np.zeros(kernels)
         self._averages = np.zeros(unknowns), np.zeros((unknowns,) * 2), np.zeros(unknowns), np.zeros((unknowns,) * 2)
         self._t, self._u, self._past = np.empty(_ROOM), np.empty(_ROOM), np.zeros((_ROOM, kernels))
@@ -183,7 +188,7 @@ class OnlineEstimator:
             return self._sample(t, np.full(n, np.nan), np.full((len(self._averages[0]),) * 2, np.nan))
         state, covariance, locked = chain.step_row(
             k, self._t, self._u, self._past, y, *self._chains, *self._averages, self._scalars, n, self._forgetting,
-            self._gain, self._memory_s, self._linear, self._delay is not None,
+            self._gain, self._memory_s, self._linear, self._delay is not None, self._offset,
             self._delay.after_s if self._delay else np.inf, self._delay.rate if self._delay else 0.0,
         )  # fmt: skip
         if not locked:

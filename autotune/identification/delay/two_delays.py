@@ -6,38 +6,119 @@ With f(t) = 1 - cos(2 pi (t - T_1)/L), whose shifts are sums of 1, cos and sin, 
 
 up to second order in the delays. Misprint of the paper: its line swaps a and b and lacks the 2 pi. The signals are
 shifted by the delays found and the step is repeated; at the fixed point the sines are zero and the equation exact.
+
+The polish takes the noise into account: the equations are linear in y, so their errors under white noise have a
+covariance that is known for given a and h_1, and generalised least squares weights them by it. No initial function is
+needed, and the plant may be unstable. Windows with a harmonic or two of their own length tell more than f alone.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
+from scipy.linalg import cholesky, solve_triangular
 
 from autotune.arrays import FloatArray
 from autotune.errors import IdentificationError, InputError
 from autotune.identification.delay.modulated_integrals import Interval
 from autotune.recording import Recording
 
+#: Samples of an interval in the polish, and harmonics of its length that modulate it besides.
+_SAMPLES = 100
+_HARMONICS = 2
+#: Intervals in a record and their overlap, where none are given.
+_LENGTHS, _OVERLAP = 8.0, 5
+#: Starting delays, in intervals, and how far below zero a fixed point may lie because of noise.
+_STARTS = (0.0, 0.2, 0.4, 0.6)
+_EARLY = 0.02
+#: Combinations of the equations with less of the noise than this share say what the others say: windows overlap.
+_OWN = 1e-4
+#: Steps of the polish, and the condition of its scaled equations above which they leave something open.
+_ROUNDS = 3
+_DETERMINED = 1e6
 
-@dataclass(frozen=True, kw_only=True)
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class TwoDelays:
-    """Estimates of x''(t) + a x(t - h_1) = b u(t - h_2), and the steps taken to the fixed point."""
+    """Estimates of x''(t) + a x(t - h_1) = b u(t - h_2).
+
+    Attributes
+    ----------
+    a, b, h1_s, h2_s : float
+        Coefficients and delays [s].
+    covariance : (4, 4) array
+        Of (a, b, h_1, h_2); NaN without the polish.
+    noise_sd : float
+        Of white noise on y [y unit]; NaN without the polish.
+    iterations : int
+        Steps of the paper's iteration.
+    """
 
     a: float
     b: float
     h1_s: float
     h2_s: float
+    covariance: FloatArray
+    noise_sd: float
     iterations: int
+
+    @property
+    def values(self) -> FloatArray:
+        """(a, b, h_1, h_2)."""
+        return np.array([self.a, self.b, self.h1_s, self.h2_s])
+
+    @property
+    def standard_deviations(self) -> FloatArray:
+        """Of (a, b, h_1, h_2)."""
+        return np.sqrt(np.diag(self.covariance))
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the content of the file that ``autotune identify delay --delays 2`` writes."""
+        sd = self.standard_deviations
+        return {
+            "equation": "x''(t) + a x(t - h1) = b u(t - h2)",
+            "a": self.a,
+            "b": self.b,
+            "h1_s": self.h1_s,
+            "h2_s": self.h2_s,
+            "sd": dict(zip(("a", "b", "h1_s", "h2_s"), sd.tolist(), strict=True)),
+            "covariance": self.covariance.tolist(),
+            "noise_sd": self.noise_sd,
+        }
+
+
+def intervals_of(recording: Recording, length_s: float | None = None) -> list[Interval]:
+    """Return overlapping intervals of one length over the later part of a record: the first part is the delays' past.
+
+    Parameters
+    ----------
+    recording : Recording
+        The record.
+    length_s : float, optional
+        Length of an interval [s], some times the delays; an eighth of the record when absent.
+    """
+    begin, end = float(recording.t[0]), float(recording.t[-1])
+    length = (end - begin) / _LENGTHS if length_s is None else length_s
+    if not 0.0 < length < 0.4 * (end - begin):
+        raise InputError(
+            f"intervals of {length:g} s in a record of {end - begin:.4g} s",
+            where=recording.name,
+            remedy="give a positive length of at most two fifths of the record",
+        )
+    count = int((end - begin - 2.5 * length) / length * _OVERLAP) + 1
+    return [(at, at + length) for at in np.linspace(begin + length, end - 1.5 * length, count).tolist()]
 
 
 def two_delays(
     recording: Recording,
     intervals: Sequence[Interval],
     *,
-    start_s: tuple[float, float] = (0.0, 0.0),
+    start_s: tuple[float, float] | None = None,
     iterations: int = 30,
+    polish: bool = True,
 ) -> TwoDelays:
     """Estimate a, b and both delays by modulating functions over intervals of one length.
 
@@ -47,22 +128,26 @@ def two_delays(
         u and y, linear between rows, from the first interval's beginning less the delays on.
     intervals : sequence of (float, float)
         (T_1, T_2) [s], all of one length, at least four.
-    start_s : (float, float)
-        Starting values of h_1 and h_2 [s].
+    start_s : (float, float), optional
+        Starting values of h_1 and h_2 [s]; zeros and, where these come to no fixed point, a few others when absent.
     iterations : int
         Largest number of steps.
+    polish : bool
+        Whether more equations are weighted by their covariance from there, which also gives that of the estimate;
+        without it the estimate is the paper's.
 
     Raises
     ------
     InputError
         Fewer than four intervals, or of unequal lengths.
     IdentificationError
-        The iteration left the record, or the gains vanish.
+        The iteration left the record, the gains vanish, or it has no fixed point.
 
     Notes
     -----
-    For a periodic output the delays are defined up to its period. Noise on y stands in the regressors: a and b are
-    biased towards zero as it grows (Table 2).
+    For a periodic output the delays are defined up to its period. In the paper's estimate noise on y stands in the
+    regressors: a and b are biased towards zero as it grows (Table 2). The polish presumes noise that is white from row
+    to row.
 
     References
     ----------
@@ -73,8 +158,30 @@ def two_delays(
         raise InputError(f"{lengths.size} intervals", where="intervals", remedy="give at least four, all of one length")
     recording.require_finite()
     L = float(lengths[0])
-    s = np.linspace(0.0, 1.0, max(64, round(L / recording.sample_time_s)) + 1)
     starts = np.array([T_1 for T_1, _ in intervals])
+    begun = [start_s] if start_s is not None else [(q * L, w * L) for q in _STARTS for w in _STARTS]
+    found: list[tuple[float, TwoDelays]] = []
+    refusal: IdentificationError | None = None
+    for pair in begun:
+        try:
+            found.append(_iterated(recording, starts, L, pair, iterations))
+        except IdentificationError as error:
+            refusal = refusal or error
+            continue
+        if len(found) == 1 and (pair == (0.0, 0.0) or start_s is not None):
+            break  # the paper's own start
+    if not found:
+        assert refusal is not None
+        raise refusal
+    best = min(found, key=lambda pair: pair[0])[1]
+    return _polished(recording, starts, L, best) if polish else best
+
+
+def _iterated(
+    recording: Recording, starts: FloatArray, L: float, start: tuple[float, float], iterations: int
+) -> tuple[float, TwoDelays]:
+    """Return what the equations leave and the estimate at the fixed point that the paper's iteration comes to."""
+    s = np.linspace(0.0, 1.0, max(64, round(L / recording.sample_time_s)) + 1)
     omega = 2.0 * np.pi / L
     weights = np.full(s.size, L / (s.size - 1))
     weights[[0, -1]] *= 0.5
@@ -82,22 +189,124 @@ def two_delays(
     sine = weights * np.sin(2.0 * np.pi * s)
     # L^-2 I_{x,f''}, from rows that stay where they are
     target = omega**2 * _shifted(recording, recording.y, starts, L * s, 0.0) @ (weights * np.cos(2.0 * np.pi * s))
-    h1, h2 = start_s
-    a = b = 0.0
+    h1, h2 = start
     count = 0
     while count < iterations:
         count += 1
         x = _shifted(recording, recording.y, starts, L * s, h1)
         u = _shifted(recording, recording.u, starts, L * s, h2)
         matrix = np.column_stack([u @ f, u @ sine, -(x @ f), -(x @ sine)])
-        b, b_sine, a, a_sine = np.linalg.lstsq(matrix, target, rcond=None)[0]
+        solution = np.linalg.lstsq(matrix, target, rcond=None)[0]
+        b, b_sine, a, a_sine = solution
         if a == 0.0 or b == 0.0:
             raise IdentificationError("a gain vanishes", where=recording.name, remedy="the record excites too little")
         steps = np.arctan([a_sine / a, b_sine / b]) / omega  # the arctangent keeps a step below a quarter of L
         h1, h2 = h1 + float(steps[0]), h2 + float(steps[1])
         if np.max(np.abs(steps)) < 1e-7 * L:
             break
-    return TwoDelays(a=float(a), b=float(b), h1_s=h1, h2_s=h2, iterations=count)
+    if not (np.max(np.abs(steps)) < 1e-3 * L and min(h1, h2) > -_EARLY * L):
+        raise IdentificationError(
+            f"the iteration has no fixed point (last: delays {h1:.4g} and {h2:.4g} s)",
+            where=recording.name,
+            remedy="start nearer to the delays, or take other intervals",
+        )
+    left = float(np.linalg.norm(matrix @ solution - target))
+    return left, TwoDelays(
+        a=float(a), b=float(b), h1_s=h1, h2_s=h2, covariance=np.full((4, 4), np.nan), noise_sd=float("nan"),
+        iterations=count,
+    )  # fmt: skip
+
+
+def _polished(recording: Recording, starts: FloatArray, L: float, start: TwoDelays) -> TwoDelays:
+    """Maximise the likelihood of the modulated equations, y being the output with white noise."""
+    equations = _Equations.of(recording, starts, L, start.values)
+    values = start.values
+    for _ in range(_ROUNDS):  # Gauss-Newton steps of generalised least squares
+        errors, factor = equations.errors(values)
+        step = 1e-4 * np.maximum(np.abs(values), [1e-2, 1e-2, 0.1 * L, 0.1 * L])
+        ahead = [equations.left(values + step * unit) for unit in np.eye(4)]
+        jacobian = (np.column_stack(ahead) - errors[:, None]) / step
+        whitened = solve_triangular(factor, np.column_stack([jacobian, errors]), lower=True)
+        size = np.linalg.norm(whitened[:, :4], axis=0)
+        if not np.linalg.cond(whitened[:, :4] / size) < _DETERMINED:
+            raise IdentificationError(
+                "the record does not determine both delays", where=recording.name, remedy="excite more frequencies"
+            )
+        values = values - np.linalg.lstsq(whitened[:, :4], whitened[:, 4], rcond=None)[0]
+    left = solve_triangular(factor, equations.left(values), lower=True)
+    variance = float(left @ left) / max(left.size - 4, 1)
+    information = whitened[:, :4] / size
+    covariance = variance * np.linalg.inv(information.T @ information) / np.outer(size, size)
+    a, b, h1, h2 = (float(value) for value in values)
+    return replace(
+        start, a=a, b=b, h1_s=h1, h2_s=h2, covariance=covariance,
+        noise_sd=float(np.sqrt(equations.rows_per_bin * variance)),
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Equations:
+    """The record in bins of a fraction of an interval, and the intervals it is modulated on."""
+
+    t: FloatArray
+    u: FloatArray
+    y: FloatArray
+    starts: FloatArray
+    L: float
+    rows_per_bin: float
+    kept: FloatArray
+
+    @classmethod
+    def of(cls, recording: Recording, starts: FloatArray, L: float, values: FloatArray) -> _Equations:
+        """Average the record into bins, and keep those combinations of equations that say something of their own."""
+        width = L / _SAMPLES
+        at = np.floor((recording.t - recording.t[0]) / width).astype(np.int64)
+        rows = np.bincount(at)
+        kept = rows > 0
+        t, u, y = (np.bincount(at, values)[kept] / rows[kept] for values in (recording.t, recording.u, recording.y))
+        made = cls(t=t, u=u, y=y, starts=starts, L=L, rows_per_bin=float(np.mean(rows[kept])), kept=np.eye(0))
+        of_y, _ = made._of_signals(values)
+        sizes, vectors = np.linalg.eigh(of_y @ of_y.T)
+        return replace(made, kept=vectors[:, sizes > _OWN * sizes[-1]].T)
+
+    def _of_signals(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return what multiplies y and u in the equations."""
+        a, b, h1, h2 = values
+        return self._weights(0.0, True) + a * self._weights(h1, False), -b * self._weights(h2, False)
+
+    def _weights(self, h: float, second: bool) -> FloatArray:
+        """Return the windows (or their second derivatives) shifted by h on every bin, (equations, bins)."""
+        s = (self.t + h - self.starts[:, None]) / self.L
+        inside = (s > 0.0) & (s < 1.0)
+        step = np.gradient(self.t)
+        rows = [np.where(inside, window, 0.0) * step for window in _windows(s, second)]
+        return np.vstack(rows) / (self.L**2 if second else 1.0)
+
+    def errors(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return what the equations leave, and the factor of its covariance for noise of variance 1 in a bin."""
+        of_y, of_u = self._of_signals(values)
+        noisy = self.kept @ of_y
+        return noisy @ self.y + self.kept @ (of_u @ self.u), np.asarray(cholesky(noisy @ noisy.T, lower=True))
+
+    def left(self, values: FloatArray) -> FloatArray:
+        """Return what the equations leave."""
+        of_y, of_u = self._of_signals(values)
+        return np.asarray(self.kept @ (of_y @ self.y + of_u @ self.u), dtype=np.float64)
+
+
+def _windows(s: FloatArray, second: bool) -> list[FloatArray]:
+    """Return (1 - cos)^2 (1, cos q, sin q ..) of 2 pi s, or their second derivatives by s: smooth at the ends."""
+    angles = 2.0 * np.pi * s
+    waves = {q: (np.cos(q * angles), np.sin(q * angles)) for q in range(_HARMONICS + 3)}
+    windows = []
+    for q in range(_HARMONICS + 1):
+        for sine in (False, True)[: 2 if q else 1]:
+            total = np.zeros(s.shape)
+            for weight, j in ((1.5, 0), (-1.0, 1), (-1.0, -1), (0.25, 2), (0.25, -2)):
+                wave = waves[abs(q + j)][int(sine)] * (np.sign(q + j) if sine else 1.0)
+                total += weight * wave * (-((2.0 * np.pi * (q + j)) ** 2) if second else 1.0)
+            windows.append(total)
+    return windows
 
 
 def _shifted(recording: Recording, values: FloatArray, starts: FloatArray, offsets: FloatArray, h: float) -> FloatArray:

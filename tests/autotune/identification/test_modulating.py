@@ -156,14 +156,21 @@ def test_a_posteriori_refusals():
 
 
 def test_example_3_two_delays():
-    """Paper's Table 2 at noise .1: sd a .043, b .025, h1 .01, h2 .017; recomputed .044, .025, .017, .019."""
+    """Paper's Table 2 at noise .1: sd a .043, b .025, h1 .01, h2 .017; recomputed .044, .025, .017, .019.
+
+    Two sines hold just four numbers, so nothing is more precise than the paper's estimate here; the polish says how
+    precise that is."""
     intervals = [(15.0 + 2.0 * k, 25.0 + 2.0 * k) for k in range(20)]
-    exact = two_delays(example_3(), intervals)
-    assert np.allclose([exact.a, exact.b, exact.h1_s, exact.h2_s], [2.7, 1.5, 2.0, 4.0], atol=1e-6)
+    truth = [2.7, 1.5, 2.0, 4.0]
+    assert np.allclose(two_delays(example_3(), intervals, polish=False).values, truth, atol=1e-6)
+    assert np.allclose(two_delays(example_3(), intervals).values, truth, atol=5e-5)
     runs = [two_delays(example_3(0.1, seed), intervals) for seed in range(15)]
-    found = np.array([[run.a, run.b, run.h1_s, run.h2_s] for run in runs])
+    found = np.array([run.values for run in runs])
     ratio = found.std(axis=0, ddof=1) / [0.044, 0.025, 0.017, 0.019]
     assert np.all((ratio > 0.5) & (ratio < 1.65))
+    inside = np.abs(found - truth) < 1.96 * np.array([run.standard_deviations for run in runs])
+    assert np.mean(inside) > 0.85
+    assert np.mean([run.noise_sd for run in runs]) == pytest.approx(0.1, rel=0.1)
     with pytest.raises(IdentificationError, match="leave the record"):
         two_delays(example_3(), intervals, start_s=(40.0, 0.0))
     with pytest.raises(InputError, match="one length"):
@@ -281,10 +288,10 @@ def test_no_unit_changes_what_is_followed(u_unit, y_unit, t_unit):
     u = u_example_1(t)
     y = response(u_example_1, t, lambda _: 0.5)[0] + np.random.default_rng(0).standard_normal(t.size)
     tracking = DelayTracking(after_s=14.0, rate=0.4)
-    own = follow(Recording(t=t, u=u, y=y), 2, forgetting=1.0, delay=tracking)
+    own = follow(Recording(t=t, u=u, y=y), 2, forgetting=1.0, memory_s=10.0, delay=tracking)
     other = follow(
         Recording(t=t * t_unit, u=u * u_unit, y=y * y_unit), 2, forgetting=1.0 / t_unit,
-        delay=DelayTracking(after_s=14.0 * t_unit, rate=0.4 / t_unit),
+        memory_s=10.0 * t_unit, delay=DelayTracking(after_s=14.0 * t_unit, rate=0.4 / t_unit),
     )  # fmt: skip
     factor = np.array([t_unit**-2, t_unit**-1, y_unit / u_unit * t_unit**-2, t_unit])
     for k in (2500, 4000):
@@ -295,17 +302,17 @@ def test_no_unit_changes_what_is_followed(u_unit, y_unit, t_unit):
 
 def test_the_covariance_of_what_is_followed_covers_the_truth():
     """Noise 1: at 5 the bias of the noisy regressors, which the covariance does not hold, is as large as it."""
-    t = np.arange(4001) / 50.0
+    t = np.arange(5001) / 25.0
     x = response(u_example_1, t, lambda _: 0.0)[0]
     inside = []
-    for seed in range(12):
+    for seed in range(16):
         y = x + np.random.default_rng(seed).standard_normal(t.size)
         found = follow(Recording(t=t, u=u_example_1(t), y=y), 2, forgetting=1.0, memory_s=15.0)
-        for k in (3000, 4000):
+        for k in (3000, 4000, 5000):
             error = np.array([*found.a[k], found.b[k]]) - [*A, B]
             inside.append(np.abs(error) < 1.96 * found.standard_deviations[k, :3])
     assert np.all(np.mean(inside, axis=0) > 0.8)
-    assert np.all(found.standard_deviations[4000, :3] < 0.02 * np.abs([*A, B]))
+    assert np.all(found.standard_deviations[5000, :3] < 0.02 * np.abs([*A, B]))
 
 
 def test_rows_that_a_live_rig_must_not_hand_over():

@@ -1,0 +1,352 @@
+"""Reduce, design, margins, validation, delays, closed loops, transitions: from what a person has, in one call each."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from autotune.api.plants import as_controller, as_plant
+from autotune.api.points import as_points
+from autotune.api.recordings import Source, read
+from autotune.controller import Controller
+
+if TYPE_CHECKING:
+    from autotune.design.margins import Margins
+    from autotune.design.nugap import Validation
+    from autotune.design.reference import Trajectory
+    from autotune.design.specification import Design
+    from autotune.identification.closed_loop.identify import ClosedLoopIdentification
+    from autotune.identification.closed_loop.state_space import InnovationModel
+    from autotune.identification.delay.model import DelayModel
+    from autotune.identification.delay.two_delays import TwoDelays
+    from autotune.identification.reduction import ReducedModel
+
+
+def reduce(source: Any, **settings: Any) -> ReducedModel:
+    """Return the cautious low-order model (8) or (24) of points or of a known plant.
+
+    Parameters
+    ----------
+    source : points, TransferFunction, model or its file, python-control system
+        Points are reduced on their regions.
+    **settings
+        Of :func:`autotune.identification.reduction.reduce_points`: ``kind``, ``conditions``, ``static_gain``.
+
+    Returns
+    -------
+    ReducedModel
+        Its ``transfer_function()`` is the model; ``warnings`` say what it does not promise.
+
+    Examples
+    --------
+    >>> import autotune as at
+    >>> model = at.reduce(at.example("ball"))
+    >>> round(model.G_r, 1), model.integrating
+    (-65.5, True)
+    """
+    from autotune.identification.reduction import reduce_points, reduce_transfer_function
+
+    points = as_points(source)
+    return reduce_transfer_function(as_plant(source)) if points is None else reduce_points(points, **settings)
+
+
+def tune(
+    plant: Any,
+    *,
+    modulus_margin: float = 0.5,
+    phase_margin_deg: float = 45.0,
+    noise_gain: float = 0.1,
+    kind: str = "pi",
+    certificate: bool = True,
+    **settings: Any,
+) -> Design:
+    """Return the PI or PID that rejects load steps best and keeps the margins.
+
+    Parameters
+    ----------
+    plant : points, TransferFunction, model or its file, reduced or delay model, python-control system
+        On points the margins hold for every plant that fits them.
+    modulus_margin : float
+        Smallest distance of the Nyquist curve from -1, 0 to 1.
+    phase_margin_deg : float
+        Smallest phase margin [deg].
+    noise_gain : float
+        Largest amplification of measurement noise to the command, N_max [u unit/y unit].
+    kind : {"pi", "pid"}
+        Structure.
+    certificate : bool
+        Whether a lower bound of the norm is proven (PI on a model).
+    **settings
+        Further ones of :class:`autotune.design.specification.Specification`, such as ``delay_margin_s``.
+
+    Returns
+    -------
+    Design
+        ``controller``, ``margins``, ``h2`` and what binds.
+
+    Raises
+    ------
+    DesignError
+        No such controller; names the nearest margins that can be had.
+
+    Examples
+    --------
+    >>> import autotune as at
+    >>> found = at.tune(at.example("ball"), noise_gain=0.1)
+    >>> found.margins.modulus >= 0.499
+    True
+    """
+    from autotune.design.specification import Specification
+
+    wanted = Specification(
+        modulus_margin=modulus_margin,
+        phase_margin_rad=math.radians(phase_margin_deg),
+        noise_gain=noise_gain,
+        **settings,
+    )
+    points = as_points(plant)
+    if points is not None:
+        from autotune.design.robust import design_on_points
+
+        return design_on_points(points, wanted, _kind(kind))
+    from autotune.design.synthesis import design as on_model
+
+    return on_model(as_plant(plant), wanted, _kind(kind), certificate=certificate)
+
+
+def _kind(kind: str) -> Any:
+    return kind.lower()
+
+
+def margins(plant: Any, controller: Any) -> Margins:
+    """Return stability, modulus, phase, delay and gain margin, noise gain and H2 norm of a loop.
+
+    Parameters
+    ----------
+    plant : TransferFunction, model or its file, reduced or delay model, python-control system
+        The plant.
+    controller : PI, design, controller file, python-control system
+        The controller; a sampled one is taken with its hold.
+
+    Examples
+    --------
+    >>> import autotune as at
+    >>> found = at.margins(at.example("ball"), at.PI(K=-0.023, Ti_s=3.0))
+    >>> round(found.modulus, 4), found.stable
+    (0.6818, True)
+    """
+    from autotune.design.margins import margins as of_loop
+
+    return of_loop(as_plant(plant), as_controller(controller))
+
+
+def validate(plant: Any, model: Any, controller: Any = None, *, scaling: float | None = None) -> Validation:
+    """Return criterion (10): the nu-gap of a plant and a model of it, beside the stability margins b with a controller.
+
+    Parameters
+    ----------
+    plant, model : TransferFunction, model or its file, reduced model, python-control system
+        H and H_r.
+    controller : PI, design, controller file, optional
+        C; designed on ``model`` when absent.
+    scaling : float, optional
+        k: plants are taken as k H, the controller as C/k, on which the nu-gap depends. The loop's own, the controller's
+        gain at crossover, when absent; 1 is the criterion as the paper prints it.
+
+    Examples
+    --------
+    >>> import autotune as at
+    >>> ball = at.example("ball")
+    >>> found = at.validate(ball, at.reduce(ball), at.PI(K=-0.023, Ti_s=3.0))
+    >>> found.holds
+    True
+    """
+    from autotune.design.nugap import loop_scaling
+    from autotune.design.nugap import validate as compare
+
+    reduced = as_plant(model)
+    law: Controller = tune(reduced).controller if controller is None else as_controller(controller)
+    k = loop_scaling(reduced, law) if scaling is None else scaling
+    return compare(as_plant(plant), reduced, law, scaling=k)
+
+
+def transition(
+    plant: Any,
+    *,
+    y_start: float,
+    y_end: float,
+    u_rest: float,
+    u_min: float,
+    u_max: float,
+    u_rate: float = math.inf,
+    y_speed: float = math.inf,
+) -> Trajectory:
+    """Return the fastest smooth transition between two rests within limits, and the command that follows it.
+
+    Parameters
+    ----------
+    plant : delay model, TransferFunction without zeros, model or its file
+        What the command is computed with.
+    y_start, y_end : float
+        Outputs at rest.
+    u_rest : float
+        Command that holds ``y_start``.
+    u_min, u_max, u_rate, y_speed : float
+        Limits of the command, of its change per second, and of the output's speed.
+
+    Examples
+    --------
+    >>> import autotune as at
+    >>> plant = at.TransferFunction(num=(2.0,), den=(6.0, 5.0, 1.0), delay_s=0.5)
+    >>> found = at.transition(plant, y_start=0.0, y_end=1.0, u_rest=0.0, u_min=-2.0, u_max=2.0)
+    >>> found.binding
+    'command'
+    """
+    from autotune.design.reference import flat_transition
+
+    return flat_transition(
+        as_plant(plant), y_start=y_start, y_end=y_end, u_rest=u_rest, u_min=u_min, u_max=u_max, u_rate=u_rate,
+        y_speed=y_speed,
+    )  # fmt: skip
+
+
+def delay(
+    recording: Source,
+    order: int = 2,
+    *,
+    method: str = "output-error",
+    delays: int = 1,
+    interval_s: float | None = None,
+    **settings: Any,
+) -> DelayModel | TwoDelays:
+    """Return the model x^(n) = sum a_i x^(i) + b u(t - h) of a recording, with its covariance.
+
+    Parameters
+    ----------
+    recording : Recording, path, DataFrame, mapping of arrays
+        u and y, in open or closed loop.
+    order : int
+        Order n.
+    method : {"output-error", "algebraic", "online"}
+        Maximum likelihood, which needs no starting value; or the modulating functions, on intervals or row by row.
+    delays : {1, 2}
+        2 is x'' + a x(t - h_1) = b u(t - h_2).
+    interval_s : float, optional
+        Length of the modulated intervals [s].
+    **settings
+        Of :func:`autotune.identification.delay.identify.identify_delay`, such as ``max_delay_s`` or ``integrator``.
+
+    Examples
+    --------
+    >>> import autotune as at
+    >>> model = at.delay(at.example("oven"))
+    >>> abs(model.delay_s - 0.5) < 0.05
+    True
+    """
+    record = read(recording)
+    if delays == 2:
+        from autotune.identification.delay.two_delays import intervals_of, two_delays
+
+        return two_delays(record, intervals_of(record, interval_s), **settings)
+    if method == "output-error":
+        from autotune.identification.delay.identify import identify_delay
+
+        return identify_delay(record, order, **settings)
+    from autotune.identification.delay.methods import algebraic_delay, online_delay
+
+    if method == "online" and "start_s" in settings:
+        return online_delay(record, order, **settings)
+    found = algebraic_delay(record, order, interval_s=interval_s)
+    return found if method == "algebraic" else online_delay(record, order, start_s=found.delay_s, **settings)
+
+
+def closed_loop(
+    recording: Source,
+    order: int | None = None,
+    *,
+    controller: Any = None,
+    method: str = "prediction-error",
+    more: tuple[Sequence[str], Sequence[str], Sequence[str]] = ((), (), ()),
+    **settings: Any,
+) -> ClosedLoopIdentification | InnovationModel:
+    """Return the plant's model from a recording of its loop.
+
+    Parameters
+    ----------
+    recording : Recording, path, DataFrame, mapping of arrays
+        u, y, and r where it is known.
+    order : int, optional
+        Number of states; chosen from the data when absent.
+    controller : PI, design, controller file, optional
+        Checked against the data.
+    method : str
+        "prediction-error", with regions, evidence and a verdict on the excitation; or one of
+        :data:`autotune.identification.closed_loop.methods.METHODS`, which give a model alone.
+    more : three sequences of str
+        Columns of further inputs, outputs and excitations.
+    **settings
+        Of :func:`autotune.identification.closed_loop.identify.identify_closed_loop`, such as ``max_order``.
+
+    Examples
+    --------
+    >>> import autotune as at
+    >>> found = at.closed_loop(at.example("loop"), order=5)
+    >>> len(found.poles)
+    5
+    """
+    record = read(recording)
+    law = None if controller is None else as_controller(controller)
+    if method == "prediction-error" and not any(more):
+        from autotune.identification.closed_loop.identify import identify_closed_loop
+
+        return identify_closed_loop(record, order=order, controller=law, **settings)
+    from autotune.identification.closed_loop.methods import METHODS
+    from autotune.identification.closed_loop.signals import model_of_recording
+
+    named = next((known for known in METHODS if known == method), None)
+    if named is None:
+        from autotune.errors import InputError
+
+        raise InputError(f"method {method!r}", where="closed_loop", remedy=f"one of {', '.join(METHODS)}")
+    return model_of_recording(record, method=named, order=order, controller=law, more=more)
+
+
+def simulate(model: Any, recording: Source, *, horizon_s: float | None = None) -> Any:
+    """Return y simulated with a recording's u, shape (N,); with a horizon as forecasts of that length.
+
+    Parameters
+    ----------
+    model : Model or its file
+        The chain of blocks with its effects.
+    recording : Recording, path, DataFrame, mapping of arrays
+        u, and y for the state to begin with.
+    horizon_s : float, optional
+        Length of the windows [s] before which the state is estimated anew; one free run when absent.
+    """
+    from autotune.api.diagnosing import simulated
+
+    return np.asarray(simulated(model, read(recording), horizon_s))
+
+
+def diagnose(model: Any, recordings: Source, controller: Any = None, **settings: Any) -> Any:
+    """Return where and why recordings differ from a model's simulation.
+
+    Parameters
+    ----------
+    model : Model or its file
+        What the rig is believed to be.
+    recordings : recording or list of recordings, paths, DataFrames
+        Best with different excitation.
+    controller : PI, controller file, optional
+        The law that u was computed by.
+    **settings
+        Handed on to the diagnosis.
+    """
+    from autotune.api.diagnosing import diagnosed
+    from autotune.api.recordings import recordings as all_of
+
+    law = None if controller is None else as_controller(controller)
+    return diagnosed(model, all_of(recordings), law, **settings)

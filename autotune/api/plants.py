@@ -1,0 +1,62 @@
+"""Plants and controllers from what a person has."""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+from autotune.controller import Controller, DiscreteController, PIDController, read_controller
+from autotune.errors import InputError
+from autotune.models import Model, TransferFunction, read_model
+
+
+def as_plant(source: Any) -> TransferFunction:
+    """Return the transfer function of a model, a reduced model, a delay model, a file, or a python-control system.
+
+    Raises
+    ------
+    InputError
+        Nothing of these, or a system in discrete time.
+    """
+    if isinstance(source, TransferFunction):
+        return source
+    if isinstance(source, str | os.PathLike):
+        return read_model(source).transfer_function()
+    if isinstance(source, Model) or hasattr(source, "transfer_function"):
+        return _checked(source.transfer_function())
+    if hasattr(source, "dt"):  # python-control's mark of a system
+        from autotune.api.control_systems import from_control
+
+        return _checked(from_control(source))
+    raise InputError(
+        f"a {type(source).__name__} is no plant",
+        where="plant",
+        remedy="give a TransferFunction, a model or its file, a reduced or delay model, or a python-control system",
+    )
+
+
+def _checked(plant: Any) -> TransferFunction:
+    if not isinstance(plant, TransferFunction):
+        raise InputError("a system in discrete time", where="plant", remedy="give the plant in continuous time")
+    return plant
+
+
+def as_controller(source: Any) -> Controller:
+    """Return the controller in a design, a file, or a python-control system."""
+    if isinstance(source, PIDController | TransferFunction | DiscreteController):
+        return source
+    if isinstance(source, str | os.PathLike):
+        return read_controller(source)
+    if hasattr(source, "controller"):
+        return as_controller(source.controller)
+    if hasattr(source, "dt"):
+        from autotune.api.control_systems import from_control
+
+        made = from_control(source)
+        if isinstance(made, TransferFunction | DiscreteController):
+            return made
+    raise InputError(
+        f"a {type(source).__name__} is no controller",
+        where="controller",
+        remedy="give PI(K=, Ti_s=), a design, a controller file, or a python-control system",
+    )

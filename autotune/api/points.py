@@ -1,0 +1,81 @@
+"""Points of the frequency response, as a tuple that shows, converts and plots itself."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+from autotune.api.recordings import Source, recordings
+from autotune.points import FrequencyPoint, read_points
+
+
+class Points(tuple[FrequencyPoint, ...]):
+    """Frequency points in ascending order; every function of the project takes it for the tuple that it is.
+
+    Attributes
+    ----------
+    notes : tuple of str
+        What was found out on the way.
+    """
+
+    notes: tuple[str, ...]
+
+    def __new__(cls, points: Iterable[FrequencyPoint], notes: Iterable[str] = ()) -> Points:
+        """Return the points sorted by frequency."""
+        made = super().__new__(cls, sorted(points, key=lambda point: point.omega_rad_s))
+        made.notes = tuple(notes)
+        return made
+
+    def __repr__(self) -> str:
+        band = f", {self[0].omega_rad_s:.4g} to {self[-1].omega_rad_s:.4g} rad/s" if self else ""
+        return f"<{len(self)} frequency points{band}>"
+
+
+def frequency_points(source: Source, *, largest_relative_sd: float = 0.5, **names: str) -> Points:
+    """Return points of the frequency response with their covariance, from recordings of any excitation.
+
+    Parameters
+    ----------
+    source : recording, path, DataFrame, list of these, or a points file
+        Relay, multisine, random binary or steps, in open loop or closed loop; the kind is found out. Several are
+        merged by their covariance. A path that ends in .json is a file of points.
+    largest_relative_sd : float
+        Points less certain than this share of their gain are left out.
+    **names : str
+        Columns, as in :func:`autotune.read`.
+
+    Returns
+    -------
+    Points
+
+    Raises
+    ------
+    IdentificationError
+        The recordings move too little, or contradict each other.
+
+    Examples
+    --------
+    >>> import autotune as at
+    >>> points = at.frequency_points(at.example("oven"))
+    >>> at.plot(points)                                                       # doctest: +SKIP
+    >>> float(abs(points[0].response) / 2.0) > 0.9
+    True
+    """
+    from autotune.identification.frequency.recorded import combine
+    from autotune.identification.frequency.recorded import frequency_points as estimate
+
+    if isinstance(source, str) and source.endswith(".json"):
+        return Points(read_points(source))
+    estimates = [estimate(one, largest_relative_sd=largest_relative_sd) for one in recordings(source, **names)]
+    combined = combine(estimates)
+    return Points(combined.points, combined.notes)
+
+
+def as_points(source: Any) -> Points | None:
+    """Return the points in something, None where there are none."""
+    if isinstance(source, Points):
+        return source
+    if isinstance(source, list | tuple) and source and isinstance(source[0], FrequencyPoint):
+        return Points(source)
+    measured = getattr(source, "design_points", None)
+    return Points(measured) if measured else None

@@ -1,0 +1,253 @@
+"""Results as tables: for a notebook (``_repr_html_``) and for pandas."""
+
+from __future__ import annotations
+
+import html as escaping
+import math
+from collections.abc import Sequence
+from functools import singledispatch
+from typing import Any
+
+import numpy as np
+
+from autotune.api.points import Points, as_points
+from autotune.controller import DiscreteController, PIDController
+from autotune.design.margins import Margins
+from autotune.design.nugap import Validation
+from autotune.design.reference import Trajectory
+from autotune.design.specification import Design
+from autotune.errors import InputError
+from autotune.identification.closed_loop.identify import ClosedLoopIdentification
+from autotune.identification.closed_loop.state_space import InnovationModel
+from autotune.identification.delay.model import DelayModel
+from autotune.identification.delay.two_delays import TwoDelays
+from autotune.identification.envelope import polar_sd
+from autotune.identification.reduction import ReducedModel
+from autotune.models import Model, TransferFunction
+from autotune.recording import Recording
+
+Row = Sequence[str]
+
+
+@singledispatch
+def rows_of(result: Any) -> tuple[str, Row, list[Row]]:
+    """Return the title, the header and the rows of a result's table."""
+    raise InputError(f"a {type(result).__name__} has no table", where="show")
+
+
+@rows_of.register
+def _(result: Recording) -> tuple[str, Row, list[Row]]:
+    units = result.metadata.get("units", {})
+    columns = {"u": result.u, "y": result.y, **result.extra}
+    rows = [
+        (name, str(units.get(name, "")), *(_number(f(values)) for f in (np.nanmin, np.nanmean, np.nanmax, np.nanstd)))
+        for name, values in columns.items()
+    ]
+    title = (
+        f"Recording {result.name}: {len(result)} rows, {result.duration_s:.6g} s, {result.sample_time_s:.4g} s apart"
+    )
+    return title, ("column", "unit", "least", "mean", "largest", "sd"), [*rows]
+
+
+@rows_of.register
+def _(result: Points) -> tuple[str, Row, list[Row]]:
+    rows = []
+    for point in result:
+        gain_sd, phase_sd = polar_sd(point)
+        phase = f"{math.degrees(point.phase_rad):.2f}", f"{math.degrees(phase_sd):.2g}"
+        rows.append((_number(point.omega_rad_s), _number(point.gain), f"{100 * gain_sd:.2g} %", *phase, point.source))
+    return f"{len(result)} frequency points", ("rad/s", "gain", "sd", "phase [deg]", "sd [deg]", "source"), [*rows]
+
+
+@rows_of.register
+def _(result: ReducedModel) -> tuple[str, Row, list[Row]]:
+    form = "G_r (1 - s/w_d) / (s (1 + s/w_d))" if result.integrating else "G_r (1 - s/w_d) / ((1 + s/w_0)(1 + s/w_d))"
+    values = [("G_r", result.G_r, result.sd[0]), ("w_d [rad/s]", result.omega_d_rad_s, result.sd[2])]
+    if result.omega_0r_rad_s is not None:
+        values.insert(1, ("w_0 [rad/s]", result.omega_0r_rad_s, result.sd[1]))
+    rows = [(name, _number(value), f"{100 * sd:.2g} %" if sd else "exact") for name, value, sd in values]
+    return f"Reduced model {form}", ("", "value", "sd"), [*rows, *(("note", text, "") for text in result.warnings)]
+
+
+@rows_of.register
+def _(result: Margins) -> tuple[str, Row, list[Row]]:
+    rows = [
+        ("modulus margin", _number(result.modulus), ""),
+        ("phase margin", _number(math.degrees(result.phase_rad)), "deg"),
+        ("delay margin", _number(result.delay_s), "s"),
+        ("gain margin", _number(result.gain), ""),
+        ("crossover", _number(result.crossover_rad_s), "rad/s"),
+        ("noise gain", _number(result.noise_gain), "u/y"),
+        ("H2 norm", _number(result.h2), ""),
+    ]
+    return (
+        "Margins" if result.stable else "UNSTABLE: figures of the Nyquist curve, no margins",
+        ("", "", "unit"),
+        [*rows],
+    )
+
+
+@rows_of.register
+def _(result: PIDController) -> tuple[str, Row, list[Row]]:
+    rows = [("K", _number(result.K), "u/y"), ("T_I", _number(result.Ti_s), "s")]
+    if result.kind == "pid":
+        rows += [("T_D", _number(result.Td_s), "s"), ("T_f", _number(result.Tf_s), "s")]
+    return f"{result.kind.upper()} controller", ("", "", "unit"), [*rows]
+
+
+@rows_of.register
+def _(result: Design) -> tuple[str, Row, list[Row]]:
+    rows: list[Row] = [*rows_of(result.controller)[2], *rows_of(result.margins)[2]]
+    rows.append(("binding", ", ".join(result.binding) or "none", ""))
+    if result.h2_lower_bound is not None:
+        rows.append(("least possible H2", _number(result.h2_lower_bound), ""))
+    return f"Design: {result.kind.upper()}", ("", "", "unit"), [*rows]
+
+
+@rows_of.register
+def _(result: Validation) -> tuple[str, Row, list[Row]]:
+    rows = [
+        ("nu-gap of plant and model", _number(result.nu_gap)),
+        ("b with the model", _number(result.b_reduced)),
+        ("b with the plant", _number(result.b_rig)),
+        ("scaling k", _number(result.scaling)),
+    ]
+    return f"Criterion (10) {'holds' if result.holds else 'does not hold'}", ("", ""), [*rows]
+
+
+@rows_of.register
+def _(result: DelayModel) -> tuple[str, Row, list[Row]]:
+    n, sd = result.order, result.standard_deviations
+    names = [*(f"a{i}" for i in range(n)), "b", "delay [s]", "constant"]
+    rows = [(name, _number(v), _number(s)) for name, v, s in zip(names, result.values, sd, strict=False)]
+    rows.append(("noise sd", _number(result.noise_sd), ""))
+    return f"x^({n}) = sum a_i x^(i) + b u(t - h)", ("", "value", "sd"), [*rows]
+
+
+@rows_of.register
+def _(result: TwoDelays) -> tuple[str, Row, list[Row]]:
+    names, sds = ("a", "b", "h1 [s]", "h2 [s]"), result.standard_deviations
+    rows = [(name, _number(v), _number(s)) for name, v, s in zip(names, result.values, sds, strict=True)]
+    return "x'' + a x(t - h1) = b u(t - h2)", ("", "value", "sd"), [*rows]
+
+
+@rows_of.register
+def _(result: InnovationModel) -> tuple[str, Row, list[Row]]:
+    rows = [(f"{pole.real:.5g} {pole.imag:+.5g}i", _number(abs(pole))) for pole in result.poles]
+    return (
+        f"State space of order {result.order}, sample time {result.sample_time_s:g} s",
+        ("pole", "magnitude"),
+        [*rows],
+    )
+
+
+@rows_of.register
+def _(result: ClosedLoopIdentification) -> tuple[str, Row, list[Row]]:
+    rows = []
+    for pole, covariance in zip(result.poles, result.pole_covariance, strict=True):
+        sd = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+        rows.append((f"{pole.real:.5g} {pole.imag:+.5g}i", _number(sd[0]), _number(sd[1])))
+    title = f"Plant of order {result.estimate.model.order} from its loop: {result.excitation.sentence}"
+    return title, ("pole", "sd (real)", "sd (imaginary)"), [*rows, *((text, "", "") for text in result.warnings)]
+
+
+@rows_of.register(TransferFunction)
+@rows_of.register(DiscreteController)
+def _(result: TransferFunction | DiscreteController) -> tuple[str, Row, list[Row]]:
+    s = "s" if isinstance(result, TransferFunction) else "q^-1"
+    order = "descending" if s == "s" else "ascending"
+    rows = [("num", ", ".join(map(_number, result.num))), ("den", ", ".join(map(_number, result.den)))]
+    if isinstance(result, TransferFunction) and result.delay_s:
+        rows.append(("dead time [s]", _number(result.delay_s)))
+    return f"Transfer function, {order} powers of {s}", ("", ""), [*rows]
+
+
+@rows_of.register
+def _(result: Trajectory) -> tuple[str, Row, list[Row]]:
+    rows = [("duration [s]", _number(result.duration_s)), ("decided by", result.binding)]
+    return f"Transition from {result.y[0]:.4g} to {result.y[-1]:.4g}", ("", ""), [*rows]
+
+
+@rows_of.register
+def _(result: Model) -> tuple[str, Row, list[Row]]:
+    rows = [(block.name, block.place, *rows_of(block.dynamics)[2][0][1:], *rows_of(block.dynamics)[2][1][1:],
+             _number(block.dynamics.delay_s)) for block in result.blocks]  # fmt: skip
+    return f"Model {result.name}", ("block", "place", "num", "den", "delay [s]"), [*rows]
+
+
+#: What shows itself in a notebook.
+SHOWN: tuple[type, ...] = (
+    Recording, Points, ReducedModel, Margins, PIDController, Design, Validation, DelayModel, TwoDelays, InnovationModel,
+    ClosedLoopIdentification, TransferFunction, DiscreteController, Trajectory, Model,
+)  # fmt: skip
+
+
+def html(result: Any) -> str:
+    """Return a result's table for a notebook."""
+    title, header, rows = rows_of(result)
+    esc = escaping.escape
+    head = "".join(f"<th>{esc(cell)}</th>" for cell in header) if any(header) else ""
+    body = "".join("<tr>" + "".join(f"<td>{esc(str(cell))}</td>" for cell in row) + "</tr>" for row in rows)
+    return f"<table><caption><b>{esc(title)}</b></caption><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
+
+
+def _number(value: Any) -> str:
+    return f"{float(value):.5g}"
+
+
+def to_pandas(result: Any) -> Any:
+    """Return a recording, points, or any result as a pandas DataFrame.
+
+    Parameters
+    ----------
+    result : object
+        A recording has its time [s] as index and a column each; points have their gain, phase and standard deviations;
+        a transition its time, y and u; another result the rows of its table.
+
+    Returns
+    -------
+    pandas.DataFrame
+
+    Raises
+    ------
+    InputError
+        pandas is not installed.
+
+    Examples
+    --------
+    >>> import autotune as at
+    >>> list(at.to_pandas(at.example("oven")).columns)
+    ['u', 'y']
+    """
+    try:
+        import pandas as pd  # type: ignore[import-untyped, unused-ignore]
+    except ImportError:
+        raise InputError(
+            "pandas is not installed", where="to_pandas", remedy="pip install 'relay-autotune[notebook]'"
+        ) from None
+    if isinstance(result, Recording):
+        columns = {"u": result.u, "y": result.y, **result.extra}
+        return pd.DataFrame(columns, index=pd.Index(result.t, name="t"))
+    if isinstance(result, Trajectory):
+        return pd.DataFrame({"y": result.y, "u": result.u}, index=pd.Index(result.t_s, name="t"))
+    points = result if isinstance(result, Points) else None
+    if points is None and not isinstance(result, SHOWN):
+        points = as_points(result)
+    if points is not None:
+        sds = [polar_sd(point) for point in points]
+        return pd.DataFrame(
+            {
+                "gain": [point.gain for point in points],
+                "gain_sd": [sd[0] * point.gain for sd, point in zip(sds, points, strict=True)],
+                "phase_deg": [math.degrees(point.phase_rad) for point in points],
+                "phase_sd_deg": [math.degrees(sd[1]) for sd in sds],
+                "source": [point.source for point in points],
+            },
+            index=pd.Index([point.omega_rad_s for point in points], name="omega_rad_s"),
+        )
+    _, header, rows = rows_of(result)
+    return pd.DataFrame(rows, columns=[name or str(i) for i, name in enumerate(header)])
+
+
+for _shown in SHOWN:
+    setattr(_shown, "_repr_html_", html)  # noqa: B010 - the rooms below know nothing of notebooks
