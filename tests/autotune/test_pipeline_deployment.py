@@ -303,6 +303,11 @@ def test_a_line_of_the_journal_that_was_cut_off_was_not_acted_upon(tmp_path: Pat
     assert replace(rig.read_gains(), K=2.0).Ti_s == math.inf
 
 
+def patient(line: Line) -> Any:
+    """Return the rig on a line that is not cut, however late the computer is."""
+    return rig_of(tcp_settings(line.relay.port, APART, timeout_s=20.0))
+
+
 def audit_of(folder: Path) -> AuditLog:
     return audit_log(load_config(ROOT / "configs" / "servo_sim.toml"), folder, "deploy")
 
@@ -314,9 +319,9 @@ def lines(log: AuditLog) -> list[dict[str, Any]]:
 def test_the_audit_log_says_who_changed_what_when_from_where_and_why(line: Line, tmp_path: Path) -> None:
     log = audit_of(tmp_path)
     before = datetime.now(UTC)
-    deploy(line.rig(), NEW, tmp_path / "journal.jsonl", agree=agreed, try_out=verified(True), audit=log)
+    deploy(patient(line), NEW, tmp_path / "journal.jsonl", agree=agreed, try_out=verified(True), audit=log)
     held = PIDController(K=NEW.K, Ti_s=NEW.Ti_s)
-    deploy(line.rig(), OLD, tmp_path / "journal.jsonl", agree=lambda *_: None, try_out=verified(False), audit=log)
+    deploy(patient(line), OLD, tmp_path / "journal.jsonl", agree=lambda *_: None, try_out=verified(False), audit=log)
     found = lines(log)
     assert [one["verdict"] for one in found] == [
         "writing", "written and read back, on trial", "verified, kept",
@@ -353,5 +358,5 @@ def test_the_audit_log_is_appended_to_by_many_and_never_rewritten(tmp_path: Path
 def test_no_gains_are_written_that_the_audit_log_cannot_take(line: Line, tmp_path: Path) -> None:
     log = replace(audit_of(tmp_path), path=tmp_path)  # a folder is no file
     with pytest.raises(ExperimentStopped, match="journal cannot be written"):
-        deploy(line.rig(), NEW, tmp_path / "journal.jsonl", agree=agreed, try_out=None, audit=log)
+        deploy(patient(line), NEW, tmp_path / "journal.jsonl", agree=agreed, try_out=None, audit=log)
     assert line.gains == OLD
