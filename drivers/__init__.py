@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from autotune.config.rig import RigSettings, SimulatedRigSettings, TwinSettings
+from autotune.config.rig import PlantSettings, RigSettings, SimulatedRigSettings, TwinSettings
 from autotune.controller import PIDController
 from autotune.errors import InputError
 from autotune.experiment.rig import Rig
@@ -53,8 +53,10 @@ def twin_of(settings: RigSettings) -> SimulatedRigSettings:
     twin = getattr(settings, "twin", None)
     if isinstance(twin, TwinSettings):
         return SimulatedRigSettings(
-            kind="simulated", plant=twin.plant, seed=twin.seed, noise=twin.noise, start=twin.start
+            kind="simulated", **{name: getattr(twin, name) for name in PlantSettings.model_fields}
         )
     raise InputError(
-        "the rig has no simulated twin", where="rig.twin", remedy='name its plant: [rig.twin] plant = "ball"'
+        "the rig has no simulated twin",
+        where="rig.twin",
+        remedy='name its plant, [rig.twin] plant = "ball", or its model = "FILE.toml"',
     )

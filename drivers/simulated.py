@@ -9,8 +9,9 @@ from autotune.controller import PIDController
 from autotune.errors import LinkError
 from autotune.experiment.rig import Reading
 from drivers.kinds import Session
+from drivers.plants import plant_of
 from sim.imperfections import FaultyPlant
-from sim.plant import Plant, make_plant
+from sim.plant import Plant
 
 
 class VirtualClock:
@@ -120,5 +121,4 @@ class SimulatedRig:
 
 def open_kind(settings: SimulatedRigSettings, session: Session) -> SimulatedRig:
     """Return the rig that ``[rig] kind = "simulated"`` describes, not yet opened."""
-    plant = make_plant(settings.plant, seed=settings.seed, noise=settings.noise, start=settings.start)
-    return SimulatedRig(plant, u_safe=session.u_safe, controller=session.controller)
+    return SimulatedRig(plant_of(settings, u_safe=session.u_safe), u_safe=session.u_safe, controller=session.controller)

@@ -21,8 +21,9 @@ from autotune.config.rig import (
 from autotune.controller import PIDController
 from autotune.errors import InputError
 from drivers.gain_settings import controller_of, settings_of
+from drivers.plants import plant_of
 from sim.modbus_rig import ModbusRig, Refusal, RtuTransport, TcpTransport
-from sim.plant import Plant, make_plant
+from sim.plant import Plant
 from sim.register_device import RegisterDevice
 from sim.registers import RegisterSpec
 from sim.serial_line import SerialLine
@@ -92,7 +93,7 @@ def device_of(config: Config, plant: Plant | None = None) -> RegisterDevice:
     permissives = {f"permissive {one.name!r}": one for one in settings.permissives}
     specs |= {name: spec_of(register) for name, register in permissives.items()}
     device = RegisterDevice(
-        plant or make_plant(twin.plant, seed=twin.seed, noise=twin.noise, start=twin.start),
+        plant or plant_of(twin, u_safe=config.limits.u_safe),
         specs,
         u_safe=config.limits.u_safe,
         u_range=(config.limits.u_min, config.limits.u_max),
@@ -161,7 +162,7 @@ def served_on_line(config: Config, settings: SerialSettings) -> Iterator[SerialR
     """
     twin, controller = _twin(settings), config.controller
     device = device_on_line(
-        make_plant(twin.plant, seed=twin.seed, noise=twin.noise, start=twin.start, converters=False),
+        plant_of(twin, u_safe=config.limits.u_safe, converters=False),
         u_range=(config.limits.u_min, config.limits.u_max),
         u_safe=config.limits.u_safe,
         gains=(controller.K, controller.Ti_s) if controller else (0.0, 1.0),
@@ -178,7 +179,9 @@ def served_on_line(config: Config, settings: SerialSettings) -> Iterator[SerialR
 def _twin(settings: AnyModbusSettings | SerialSettings) -> TwinSettings:
     if settings.twin is None:
         raise InputError(
-            "the rig has no simulated twin", where="rig.twin", remedy='name one: [rig.twin] plant = "ball"'
+            "the rig has no simulated twin",
+            where="rig.twin",
+            remedy='name one, [rig.twin] plant = "ball", or its model = "FILE.toml"',
         )
     return settings.twin
 

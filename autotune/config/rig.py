@@ -5,19 +5,32 @@ from __future__ import annotations
 import math
 from typing import Annotated, Literal, TypeAlias, get_args
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from autotune.config.registers import RegisterMap, RegisterSettings
 from autotune.schema import Number, Section
 
 
 class PlantSettings(Section):
-    """A simulated plant: which, and what is drawn for it."""
+    """A simulated plant: one of four or that of a model file, and what is drawn for it."""
 
-    plant: Annotated[Literal["ball", "servo", "two_tank", "thermal"], Field(description="which simulated plant")]
+    plant: Annotated[
+        Literal["ball", "servo", "two_tank", "thermal"] | None, Field(description="which simulated plant")
+    ] = None
+    model: Annotated[
+        str | None, Field(description="model file (TOML) of the plant in place of plant: a chain of blocks, equations")
+    ] = None
     seed: Annotated[int, Field(ge=0, description="draws the hover voltage and the noise")] = 0
     noise: Annotated[float | None, Field(ge=0, description="half-width of the uniform noise on y [y unit]")] = None
     start: Annotated[str | None, Field(description='where it starts, "floor" or "afloat" for the ball')] = None
+
+    @model_validator(mode="after")
+    def _one_plant(self) -> PlantSettings:
+        if (self.plant is None) == (self.model is None):
+            raise ValueError("give plant or model, and not both")
+        if self.model is not None and self.start is not None:
+            raise ValueError("start is of the four plants; a model starts at rest, or where its states say")
+        return self
 
 
 class SimulatedRigSettings(PlantSettings):
