@@ -13,11 +13,14 @@ from pydantic import BaseModel
 from rich.console import Console
 
 from autotune.cli import app
+from autotune.cli.init_keys import REGISTER, Table, add_registers, register, set_keys
 from autotune.errors import InputError
 
 Kind = Literal["simulated", "modbus_tcp", "modbus_tls", "modbus_rtu", "serial"]
 Plant = Literal["ball", "servo", "two_tank", "thermal"]
-Table = dict[str, Any]
+
+#: samples of a sweep: some 15 to 40 a period, a few periods for each of five points, and the way there
+SWEEP_SAMPLES = 1e4
 
 #: what is known of the simulated plants
 PLANTS: Mapping[Plant, Table] = {
@@ -27,7 +30,7 @@ PLANTS: Mapping[Plant, Table] = {
         "limits": {"u_min": 0.0, "u_max": 10.0, "u_safe": 0.0, "u_rate": 200.0, "y_min": 1.0, "y_max": 9.0,
                    "swing": 3.0, "time_s": 180.0},
         "operating_point": {"y": 5.0, "u_guess": 5.0, "u_uncertainty": 0.5, "approach": "ramp"},
-        "experiment": {"gain_sd": 0.0035, "budget_s": 58.0},
+        "experiment": {"gain_sd": 0.005, "budget_s": 58.0},
         "controller": {"K": -0.01, "Ti_s": 6.0},
     },
     "servo": {
@@ -72,10 +75,28 @@ def init(
     host: Annotated[str | None, typer.Option(help="address of a Modbus TCP or TLS device")] = None,
     device: Annotated[str | None, typer.Option(help="serial device, see autotune ports")] = None,
     y_register: Annotated[
-        str | None, typer.Option(metavar="TABLE:ADDRESS:TYPE", help="Modbus register of y, e.g. input:0:int16")
+        str | None, typer.Option(metavar=REGISTER, help="Modbus register of y, e.g. input:0:int16,scale=0.01")
     ] = None,
     u_register: Annotated[
-        str | None, typer.Option(metavar="TABLE:ADDRESS:TYPE", help="Modbus register of u, e.g. holding:0:int16")
+        str | None, typer.Option(metavar=REGISTER, help="Modbus register of u, e.g. holding:0:float32")
+    ] = None,
+    registers: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--register",
+            metavar=f"NAME={REGISTER}",
+            help="any further register of the map, e.g. heartbeat=holding:2:uint16, enable=holding:20,bit=3,"
+            " gains.PB_percent=holding:30,scale=0.1; may be given more than once",
+        ),
+    ] = None,
+    model: Annotated[str | None, typer.Option(help="model file of the twin, in place of --plant")] = None,
+    keys: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set",
+            metavar="KEY=VALUE",
+            help="any other key by its path, e.g. rig.port=1502; may be given more than once",
+        ),
     ] = None,
     y_span: Annotated[
         tuple[float, float] | None, typer.Option(help="y at count 0 and at full scale of a microcontroller [y unit]")
@@ -107,6 +128,9 @@ def init(
         content = _simulated(name)
     else:
         reached = _reached(questions, chosen, host, device, y_register, u_register, y_span, u_span)
+        if registers and "registers" not in reached:
+            raise InputError(f'kind = "{chosen}" has no registers', where="--register", remedy="leave it out")
+        add_registers(reached.get("registers", {}), registers or ())
         answers = {
             "u_unit": questions.ask("--u-unit", u_unit, "unit of the command u", str, ""),
             "y_unit": questions.ask("--y-unit", y_unit, "unit of the measurement y", str, ""),
@@ -118,8 +142,9 @@ def init(
             "u": questions.ask("--u", u, "command that holds it there, about", float),
         }
         questions.require()
-        content = _real(reached, answers, plant)
+        content = _real(reached, answers, plant, model)
     content = {"name": config.stem, **content}
+    set_keys(content, keys or ())
     validated(Config, content, str(config))
     try:
         with config.open("x", encoding="utf-8") as file:
@@ -200,13 +225,6 @@ def _pair(answer: str) -> tuple[float, float]:
     return float(parts[0]), float(parts[1])
 
 
-def _register(answer: str) -> Table:
-    parts = answer.split(":")
-    if len(parts) != 3 or not parts[1].isdigit():
-        raise InputError(f"{answer!r}: TABLE:ADDRESS:TYPE is wanted", where="register", remedy="e.g. input:0:int16")
-    return {"table": parts[0], "address": int(parts[1]), "type": parts[2]}
-
-
 def _reached(
     questions: _Questions,
     kind: Kind,
@@ -229,8 +247,8 @@ def _reached(
         return rig
     if kind == "modbus_tls":
         rig |= {f"{which}_file": f"certificates/{name}" for which, name in _CERTIFICATES.items()}
-    y = questions.ask("--y-register", y_register, "register of y, TABLE:ADDRESS:TYPE, e.g. input:0:int16", _register)
-    u = questions.ask("--u-register", u_register, "register of u, TABLE:ADDRESS:TYPE, e.g. holding:0:int16", _register)
+    y = questions.ask("--y-register", y_register, "register of y, TABLE:ADDRESS:TYPE, e.g. input:0:int16", register)
+    u = questions.ask("--u-register", u_register, "register of u, TABLE:ADDRESS:TYPE, e.g. holding:0:int16", register)
     return rig | {"registers": {"y": y, "u": u}}
 
 
@@ -242,7 +260,7 @@ def _simulated(plant: Plant) -> Table:
     return {"rig": {"kind": "simulated", "plant": plant, **known.pop("rig", {})}, **known}
 
 
-def _real(rig: Table, answers: Table, plant: Plant | None) -> Table:
+def _real(rig: Table, answers: Table, plant: Plant | None, model: str | None) -> Table:
     """Return the configuration of a real rig: what was answered, and cautious values that follow from it."""
     u_min, u_max = answers["u_range"]
     y_min, y_max = answers["y_range"]
@@ -251,16 +269,20 @@ def _real(rig: Table, answers: Table, plant: Plant | None) -> Table:
         raise InputError(f"y = {answers['y']:g} is not within {y_min:g}..{y_max:g}", where="operating_point.y")
     # a quarter of the room leaves the rest to overshoot; rounded to what a person would have written
     swing = _rounded(0.25 * room)
-    if plant is not None:
+    if model is not None:
+        rig = rig | {"twin": {"model": model}}
+    elif plant is not None:
         rig = rig | {"twin": {"plant": plant, **PLANTS[plant].get("rig", {})}}
+    T_s = answers["sample_time_s"]
+    budget_s = max(60.0, _rounded(SWEEP_SAMPLES * T_s))
     return {
         "rig": rig,
         "signals": {name: answers[name] for name in ("sample_time_s", "u_unit", "y_unit")},
         "limits": {"u_min": u_min, "u_max": u_max, "u_safe": answers["u_safe"],
-                   "y_min": y_min, "y_max": y_max, "swing": swing, "time_s": 600.0},
+                   "y_min": y_min, "y_max": y_max, "swing": swing, "time_s": 4.0 * budget_s},
         "operating_point": {"y": answers["y"], "u_guess": answers["u"],
                             "u_uncertainty": _rounded(0.05 * (u_max - u_min)), "approach": "hold"},
-        "experiment": {"points": 5, "budget_s": 300.0},
+        "experiment": {"points": 5, "budget_s": budget_s},
     }  # fmt: skip
 
 
@@ -274,9 +296,10 @@ def _text(content: Table, path: Path) -> str:
 
     lines = [f"# {path.name}: what autotune run does, and on what. A line that begins with #: is a default."]
     lines += ["# autotune schema --out config.schema.json lets editors complete the keys.", ""]
-    lines += [f"name = {_value(content['name'])}"]
+    plain = {name: field for name, field in Config.model_fields.items() if _model(field.annotation, {}) is None}
+    lines += [f"{name} = {_value(content[name])}" for name in plain if name in content]
     for name, field in Config.model_fields.items():
-        if name == "name":
+        if name in plain:
             continue
         model = _model(field.annotation, content.get(name, {}))
         if model is not None:
@@ -299,7 +322,7 @@ def _section(path: str, model: type[BaseModel], given: Mapping[str, Any] | None)
     written, after = [], []
     for name, field in sorted(model.model_fields.items(), key=lambda named: named[0] != "kind"):
         inner = None if path.endswith("registers") else _model(field.annotation, {})
-        if inner is not None:
+        if inner is not None and not isinstance(given_here.get(name), list | tuple):
             if name in given_here:
                 after += _section(f"{path}.{name}", inner, given_here[name])
             continue

@@ -16,7 +16,8 @@ from typer.testing import CliRunner
 
 from autotune.cli import app
 from autotune.config import load_config
-from autotune.config.rig import SerialSettings
+from autotune.config.registers import RegisterMap
+from autotune.config.rig import ModbusTcpSettings, SerialSettings
 from autotune.errors import InputError
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
@@ -58,6 +59,75 @@ def test_what_is_written_loads_and_keeps_the_answers(tmp_path: Path, kind: str, 
     assert (config.limits.u_min, config.limits.u_max, config.limits.u_safe) == (0.0, 10.0, 0.0)
     assert (config.operating_point.y, config.operating_point.u_guess) == (50.0, 4.0)
     assert config.operating_point.y - config.limits.swing >= config.limits.y_min
+
+
+def test_every_field_of_the_register_map_and_every_other_key_has_a_flag(tmp_path: Path) -> None:
+    path = tmp_path / "rig.toml"
+    registers = {name: f"holding:{10 + 2 * i}:uint16" for i, name in enumerate(RegisterMap.model_fields)}
+    for name in ("y", "u", "gains", "unlock", "heartbeat_echo"):
+        del registers[name]
+    flags = [part for name, place in registers.items() for part in ("--register", f"{name}={place}")]
+    flags += ["--register", "heartbeat_echo=input:40:int64,word_order=little,scale=1e-3"]
+    flags += ["--set", 'rig.registers.unlock={ address = 90, type = "uint16", code = 4711 }', "--set", "rig.port=1502"]
+    flags += ["--set", "limits.u_rate=5", "--set", "audit_log=gains.jsonl", "--model", "plant.toml"]
+    command("init", path, "--kind", "modbus_tcp", "--host", "10.0.0.2", *MODBUS, *REAL, *flags)
+    config = load_config(path)
+    assert isinstance(config.rig, ModbusTcpSettings)
+    mapped = config.rig.registers.mapped()
+    assert set(mapped) == {*registers, "y", "u", "heartbeat_echo"}
+    assert (mapped["K"].address, mapped["K"].type) == (10 + 2 * list(RegisterMap.model_fields).index("K"), "uint16")
+    echo = mapped["heartbeat_echo"]
+    assert (echo.table, echo.type, echo.word_order, echo.scale) == ("input", "int64", "little", 1e-3)
+    assert config.rig.registers.unlock is not None
+    assert (config.rig.port, config.limits.u_rate, config.audit_log) == (1502, 5.0, "gains.jsonl")
+    assert config.rig.twin is not None
+    assert config.rig.twin.model == "plant.toml"
+
+
+def test_gains_in_a_makers_form_bits_and_codes_have_flags(tmp_path: Path) -> None:
+    path = tmp_path / "rig.toml"
+    flags = ["--register", "gains.PB_percent=holding:30,scale=0.1"]
+    flags += ["--set", "rig.registers.gains.form=proportional-band"]
+    flags += ["--register", "enable=holding:20,bit=3", "--register", "in_command=input:21,on=7"]
+    command("init", path, "--kind", "modbus_tcp", "--host", "10.0.0.2", *MODBUS, *REAL, *flags)
+    config = load_config(path)
+    assert isinstance(config.rig, ModbusTcpSettings)
+    assert config.rig.registers.held_gains is not None
+    assert config.rig.registers.held_gains.form == "proportional-band"
+    mapped = config.rig.registers.mapped()
+    assert (mapped["enable"].bit, mapped["in_command"].codes) == (3, (7, 0))
+
+
+@pytest.mark.parametrize(
+    ("flags", "reason"),
+    [
+        (["--register", "enable"], "NAME=TABLE:ADDRESS"),
+        (["--register", "enable=coil"], "TABLE:ADDRESS"),
+        (["--register", "enable=coil:1", "--register", "enable=coil:2"], "given twice"),
+        (["--register", "enabel=coil:1"], "did you mean 'enable'"),
+        (["--register", "enable=holding:1,bit"], "KEY=VALUE is wanted"),
+        (["--set", "rig.port"], "KEY=VALUE is wanted"),
+        (["--set", "rig.kind.x=1"], "kind is no table"),
+        (["--set", "rig.prot=1"], "did you mean 'port'"),
+    ],
+)
+def test_a_flag_that_says_nothing_is_refused_and_nothing_is_written(
+    tmp_path: Path, flags: list[str], reason: str
+) -> None:
+    path = tmp_path / "rig.toml"
+    with pytest.raises(InputError, match=reason):
+        command("init", path, "--kind", "modbus_tcp", "--host", "h", *MODBUS, *REAL, *flags)
+    assert not path.exists()
+
+
+def test_the_time_of_a_first_run_follows_from_the_sample_time(tmp_path: Path) -> None:
+    for sample_s in (0.01, 1.0):
+        path = tmp_path / f"rig_{sample_s:g}.toml"
+        given = ["--kind", "modbus_tcp", "--host", "h", *MODBUS, *REAL, "--sample-time", f"{sample_s}"]
+        command("init", path, *given)
+        config = load_config(path)
+        assert config.experiment.budget_s == pytest.approx(1e4 * sample_s)
+        assert config.limits.time_s == 4.0 * config.experiment.budget_s
 
 
 def test_every_key_of_the_schema_is_in_the_file_with_its_meaning_and_every_default_can_be_uncommented(
