@@ -249,7 +249,8 @@ def _rig(content: Config) -> Iterator[Check]:
         check = _permission("the rig's port", reach.device)
         yield replace(check, verdict="wrong") if check.remedy else check  # this port is needed, others are not
     if reach == Reach():
-        yield Check(subject="the rig", found=f'kind = "{content.rig.kind}", in this process')
+        nothing = "nothing that could be looked for before it is opened"
+        yield Check(subject="the rig", found=f'kind = "{content.rig.kind}": {nothing}')
 
 
 def _file(name: str) -> Check:

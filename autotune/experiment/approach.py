@@ -16,7 +16,7 @@ from autotune.experiment.feasibility import supported_rad_s
 from autotune.experiment.limits import Watch
 from autotune.experiment.loop import ControlLoop
 from autotune.experiment.monitor import RECENT
-from autotune.experiment.oscillation import Oscillation, noise_half, too_noisy
+from autotune.experiment.oscillation import Oscillation, mean_command, noise_half, too_noisy
 from autotune.experiment.relay import RelaySettings
 from autotune.identification.frequency.limit_cycle_points import limit_cycle_points
 from autotune.points import FrequencyPoint
@@ -350,8 +350,8 @@ def _balance(oscillation: Oscillation, config: Config, known: Known, tell: Tell)
         edges = oscillation.edges
         if not switched or len(edges) < 3:
             continue
-        _, u, y = loop.history(edges[-3])
-        mean = float(np.mean(u[: edges[-1] - edges[-3]]))
+        y = loop.history(edges[-3])[2]
+        mean = mean_command(loop, edges)
         asymmetry = (mean - oscillation.settings.midpoint) / oscillation.settings.amplitude
         high = float(np.nanmax(y)) - float(np.nanmin(y)) - 2.0 * known.noise_half
         if abs(asymmetry) > 0.3:
@@ -370,10 +370,10 @@ def _balance(oscillation: Oscillation, config: Config, known: Known, tell: Tell)
                     remedy="look for a drifting load or an actuator that answers up and down differently",
                 )
             oscillation.move_midpoint(mean)
-            oscillation.edges = edges[-1:]
+            oscillation.forget()
         elif high > 1.7 * swing:
             oscillation.settings = replace(oscillation.settings, amplitude=0.5 * oscillation.settings.amplitude)
-            oscillation.edges = edges[-1:]
+            oscillation.forget()
         elif len(edges) >= 5:
             t, u, y = loop.history(edges[-5] - 2)
             try:

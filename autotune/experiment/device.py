@@ -71,6 +71,7 @@ class DeviceOscillation(Oscillation):
         self._state = replace(self._state, level=side)
         if switched:
             self.edges.append(tick.k - 1)
+            self.slots.append(tick.slot - 1)
             self._last_switch_s = tick.t_s
         self._check_alive(tick)
         return tick, switched

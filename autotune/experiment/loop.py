@@ -31,6 +31,8 @@ SLICE_S = 0.1
 ABORT = getattr(signal, "SIGUSR1", signal.SIGINT)
 #: sample times that the loop may always be behind its schedule, however short limits.late_s is
 LATE_SAMPLES = 2
+#: rows over which the share of missed samples is counted
+LOOK_BACK_ROWS = 100
 #: what lies at least between two rows [s], where a virtual clock stands still
 SHORTLY_S = 1e-6
 
@@ -51,8 +53,8 @@ class Tick:
         Whether ``y`` is this sample's own; an unusable one is NaN in the recording.
     u : float
         Command held until now [u unit].
-    slots : int
-        Sample times since the tick before: 1, or more where samples were missed between the two.
+    slot : int
+        Number of the sample time that it belongs to: ahead of ``k`` by the samples that were missed.
     """
 
     k: int
@@ -60,17 +62,31 @@ class Tick:
     y: float
     usable: bool
     u: float
-    slots: int = 1
+    slot: int = 0
 
 
 @dataclass(frozen=True, kw_only=True)
 class Timing:
-    """Latency and lateness of the loop [s]: median, 99th percentile, worst; and the samples that were left out."""
+    """Latency and lateness of the loop [s]: median, 99th percentile, worst; and the samples that were left out.
+
+    Attributes
+    ----------
+    latency_s, lateness_s : (float, float, float)
+        Time of a reading on the link, and from a sample's deadline to when the loop woke for it [s].
+    missed, unusable, rows : int
+        Sample times without a row, rows whose reading was not used, rows.
+    """
 
     latency_s: tuple[float, float, float]
     lateness_s: tuple[float, float, float]
     missed: int
     unusable: int
+    rows: int = 0
+
+    @property
+    def missed_share(self) -> float:
+        """Share of the sample times that have no row."""
+        return self.missed / max(self.missed + self.rows, 1)
 
     def to_table(self) -> dict[str, Any]:
         """Return the timing as a table of the recording's sidecar."""
@@ -79,6 +95,7 @@ class Timing:
             "lateness_s": [value for value in self.lateness_s if math.isfinite(value)],
             "missed_samples": self.missed,
             "unusable_samples": self.unusable,
+            "rows": self.rows,
         }
 
     @classmethod
@@ -90,6 +107,7 @@ class Timing:
             lateness_s=tuple(table.get("lateness_s") or unknown),
             missed=table.get("missed_samples", 0),
             unusable=table.get("unusable_samples", 0),
+            rows=table.get("rows", 0),
         )
 
 
@@ -155,11 +173,12 @@ class ControlLoop:
         self._exchange = rig.exchange if isinstance(rig, Exchanges) else None
         self._feed = rig.feed if isinstance(rig, Feeds) else None
         self._missed, self._slots = 0, 1
+        self._recent_slots: deque[int] = deque(maxlen=LOOK_BACK_ROWS)
         self._stop_signal = ""
         self._start_s = self._device_start_s = 0.0
         self._deadline_s = 0.0
         self._exits = contextlib.ExitStack()
-        self.tick = Tick(k=-1, t_s=0.0, y=math.nan, usable=False, u=math.nan)
+        self.tick = Tick(k=-1, t_s=0.0, y=math.nan, usable=False, u=math.nan, slot=-1)
         self._reading = Reading(t_s=0.0, y=math.nan)
 
     @property
@@ -245,7 +264,8 @@ class ControlLoop:
         lost = round((self._time_of(row.reading) - self.tick.t_s) / self.sample_time_s) - 1
         for _ in range(lost):
             before = self.tick
-            self.tick = replace(before, k=before.k + 1, t_s=before.t_s + self.sample_time_s, usable=False)
+            t_s = before.t_s + self.sample_time_s
+            self.tick = replace(before, k=before.k + 1, t_s=t_s, usable=False, slot=before.slot + 1)
             self._write_row(row.u_mean, extra or {})
         self._reading = row.reading
         self._deadline_s = self.rig.clock.now()
@@ -271,11 +291,17 @@ class ControlLoop:
             lateness_s=spread(self._lateness),
             missed=self._missed,
             unusable=self._rows.unusable,
+            rows=len(self._rows),
         )
 
     def slower_than(self, latency_s: float) -> float:
         """Return the share of the latest readings that took longer [s]."""
         return sum(value > latency_s for value in self._latency) / max(len(self._latency), 1)
+
+    @property
+    def missed_share(self) -> float:
+        """Share of the latest sample times whose sample was missed."""
+        return 1.0 - len(self._recent_slots) / max(sum(self._recent_slots), 1)
 
     def comment(self, text: str) -> None:
         """Write a line into the recording for a person who reads it."""
@@ -316,10 +342,10 @@ class ControlLoop:
                 f"link too slow: {behind_s:.3g} s behind the schedule of a sample every {step:g} s",
                 remedy="raise signals.sample_time_s, or unload the computer or the link; autotune doctor measures it",
             )
-        if behind_s > step:
-            self._slots += int(behind_s / step)
-            self._missed += int(behind_s / step)
-            self._deadline_s += step * int(behind_s / step)
+        lost = max(0, int(behind_s / step + 1e-6))  # a deadline that is reached just now is not met a second time
+        self._slots += lost
+        self._missed += lost
+        self._deadline_s += step * lost
         while True:
             self._look_for_stop()
             clock.sleep_until(min(self._deadline_s, clock.now() + SLICE_S))
@@ -328,6 +354,7 @@ class ControlLoop:
             if self._feed is not None:
                 self._feed()
         self._lateness.append(max(0.0, clock.now() - self._deadline_s))
+        self._recent_slots.append(self._slots)
 
     def _look_for_stop(self) -> None:
         if self._stop_signal:
@@ -343,7 +370,7 @@ class ControlLoop:
             self._latency.append(reading.latency_s)
         t_s = self._time_of(reading)
         y, usable = self.monitor.judge(reading, u)
-        tick = Tick(k=self.tick.k + 1, t_s=t_s, y=y, usable=usable, u=u, slots=self._slots)
+        tick = Tick(k=self.tick.k + 1, t_s=t_s, y=y, usable=usable, u=u, slot=self.tick.slot + self._slots)
         if self.monitor.recent:
             self.envelope.check_measurement(self.monitor.recent, self.watch, self.monitor.noise)
         self.envelope.check_time(t_s)

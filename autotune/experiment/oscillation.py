@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from statistics import median
 
 import numpy as np
 
-from autotune.errors import ExperimentStopped
+from autotune.errors import ExperimentStopped, LinkError
 from autotune.experiment.loop import ControlLoop, Tick
 from autotune.experiment.relay import RelaySettings, RelayState, relay_step
 
@@ -22,6 +23,8 @@ PROVEN = 2
 NOISE_ROWS = 100
 #: rows in which y leaves its limits by a sensor's jump, and standard deviations of a step between rows that are one
 JUMP_ROWS, JUMP_SIGMAS = 6, 6.0
+#: share of missed samples from which on a relay that fails has failed on them
+MISSED_SHARE = 0.2
 #: half-width of the noise, as a part of limits.swing, from which on a relay that fails has failed on it
 NOISY_SHARE = 0.25
 
@@ -43,6 +46,13 @@ def jumped(loop: ControlLoop) -> bool:
     steps = np.abs(np.diff(y[np.isfinite(y)]))
     usual = 1.4826 * float(np.median(steps[:-JUMP_ROWS])) if steps.size > 2 * JUMP_ROWS else math.inf
     return bool(np.any(steps[-JUMP_ROWS:] > JUMP_SIGMAS * usual)) and usual > 0.0
+
+
+def mean_command(loop: ControlLoop, edges: Sequence[int]) -> float:
+    """Return the mean command of the last whole period, every command weighted by the time it was held [u unit]."""
+    t, u, _ = loop.history(edges[-3])
+    rows = edges[-1] - edges[-3]
+    return float(np.average(u[:rows], weights=np.diff(t[: rows + 1])))
 
 
 def too_noisy(loop: ControlLoop) -> bool:
@@ -68,8 +78,9 @@ class Oscillation:
 
     Attributes
     ----------
-    edges : list of int
-        Rows at which the command switched since the setting was made, the row of the change first if it was a switch.
+    edges, slots : list of int
+        Rows at which the command switched since the setting was made, the row of the change first if it was a switch;
+        and the sample times that they belong to, which run ahead of the rows where samples were missed.
     """
 
     def __init__(
@@ -84,6 +95,8 @@ class Oscillation:
         self.loop = loop
         self.settings = settings
         self.edges: list[int] = []
+        self.slots: list[int] = []
+        self._stepped = loop.tick.slot - 1
         self.start_row = loop.tick.k
         self._state = RelayState()
         self._patience_s = patience_s
@@ -115,11 +128,15 @@ class Oscillation:
         """
         self._turning_s, self._foreseen = turning_s, foreseen
         self.settings = settings
-        self.edges = []
+        self.edges, self.slots = [], []
         self.start_row = self.loop.tick.k
         self._patience_s = patience_s
         self._nudge_s = nudge_s
         self._last_switch_s = self.loop.tick.t_s
+
+    def forget(self) -> None:
+        """Forget the switches but the last."""
+        self.edges, self.slots = self.edges[-1:], self.slots[-1:]
 
     def move_centre(self, y_centre: float) -> None:
         """Oscillate around another measurement [y unit]; the setting is otherwise the same."""
@@ -141,7 +158,8 @@ class Oscillation:
         tick = self.loop.tick
         limits = self.loop.envelope.settings
         before = self._state.level
-        self._state, u = relay_step(self._state, self.settings, tick.y)
+        self._state, u = relay_step(self._state, self.settings, tick.y, slots=tick.slot - self._stepped)
+        self._stepped = tick.slot
         if not limits.u_min <= u <= limits.u_max:
             raise ExperimentStopped(
                 f"saturated: the relay's level {u:.4g} is outside {limits.u_min:g}..{limits.u_max:g}",
@@ -150,6 +168,7 @@ class Oscillation:
         switched = before not in (0, self._state.level)
         if switched:
             self.edges.append(tick.k)
+            self.slots.append(tick.slot)
             self._last_switch_s = tick.t_s
         elif tick.t_s - max(self._last_switch_s, self._last_nudge_s) > self._nudge_s:
             self._last_nudge_s = tick.t_s
@@ -166,6 +185,12 @@ class Oscillation:
         away = y - self.settings.y_centre
         if type(error) is not ExperimentStopped or abs(away) <= limits.swing:
             return error
+        if self.loop.missed_share > MISSED_SHARE:
+            return LinkError(
+                f"link too slow: {100 * self.loop.missed_share:.0f} % of the latest samples were missed, and"
+                f" y = {y:.4g} left the swing of {limits.swing:g} around {self.settings.y_centre:g}",
+                remedy="unload the computer or the link (autotune doctor measures it), or raise signals.sample_time_s",
+            )
         if jumped(self.loop):
             return ExperimentStopped(
                 f"the sensor jumps: y = {y:.4g} left the swing of {limits.swing:g} around {self.settings.y_centre:g} in"

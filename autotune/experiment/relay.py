@@ -57,9 +57,9 @@ class RelayState:
     Attributes
     ----------
     k : int
-        Number of the next sample.
-    recent : tuple of float
-        Last readings, the newest last [y unit].
+        Number of the next sample, on the grid of sample times: one that was missed counts.
+    recent : tuple of (int, float)
+        Last readings with their numbers, the newest last [y unit].
     decided : {-1, 1}
         Side the relay has decided for.
     level : {-1, 1}
@@ -71,14 +71,14 @@ class RelayState:
     """
 
     k: int = 0
-    recent: tuple[float, ...] = ()
+    recent: tuple[tuple[int, float], ...] = ()
     decided: int = 0
     level: int = 0
     pending: tuple[tuple[float, int], ...] = ()
     switches: int = 0
 
 
-def relay_step(state: RelayState, settings: RelaySettings, y: float) -> tuple[RelayState, float]:
+def relay_step(state: RelayState, settings: RelaySettings, y: float, *, slots: int = 1) -> tuple[RelayState, float]:
     """Advance the relay by one sample.
 
     Parameters
@@ -87,6 +87,9 @@ def relay_step(state: RelayState, settings: RelaySettings, y: float) -> tuple[Re
         The settings may change from one step to the next; decisions on their way keep their arrival.
     y : float
         Measurement of this sample [y unit].
+    slots : int
+        Sample times since the sample before: more than 1 where some were missed. Delay and smoothing count time, so
+        that lost samples do not stretch them.
 
     Returns
     -------
@@ -96,8 +99,9 @@ def relay_step(state: RelayState, settings: RelaySettings, y: float) -> tuple[Re
         Command to hold until the next sample [u unit]. A switch that falls between two samples is made by one command
         in between, whose area is that of the switch at its exact instant.
     """
-    recent = (*state.recent[-(settings.smoothing - 1) :], y) if settings.smoothing > 1 else (y,)
-    error = settings.plant_sign * (settings.y_centre - sum(recent) / len(recent))
+    k = state.k + slots - 1
+    recent = (*(one for one in state.recent if one[0] > k - settings.smoothing), (k, y))
+    error = settings.plant_sign * (settings.y_centre - sum(reading for _, reading in recent) / len(recent))
     decided = state.decided
     if decided == 0:
         decided = 1 if error >= 0.0 else -1
@@ -109,10 +113,10 @@ def relay_step(state: RelayState, settings: RelaySettings, y: float) -> tuple[Re
     level = state.level if state.level != 0 else decided
     switches = state.switches
     if decided != state.decided and state.decided != 0:
-        pending = (*pending, (max(state.k + settings.delay_samples, pending[-1][0] if pending else 0.0), decided))
+        pending = (*pending, (max(k + settings.delay_samples, pending[-1][0] if pending else 0.0), decided))
         switches += 1
-    mean, level, pending = _mean_level(state.k, level, pending)
-    new = RelayState(k=state.k + 1, recent=recent, decided=decided, level=level, pending=pending, switches=switches)
+    mean, level, pending = _mean_level(k, level, pending)
+    new = RelayState(k=k + 1, recent=recent, decided=decided, level=level, pending=pending, switches=switches)
     return new, settings.midpoint + settings.amplitude * mean
 
 

@@ -25,6 +25,8 @@ from autotune.recording import RecordingWriter
 
 #: rows whose mean is compared with that of as many rows before, to see whether y stands still
 REST_ROWS = 50
+#: share of missed samples from which on the reader is told
+NOTABLE_SHARE = 0.005
 #: part of limits.time_s to wait for that
 REST_SHARE = 0.3
 
@@ -212,7 +214,17 @@ def _result(
         sweep_time_s=sum(part.sweep_time_s for part in parts),
         parts=parts,
         reason="completed",
-        warnings=doubts(segments, config, known.link_rad_s),
+        warnings=(*doubts(segments, config, known.link_rad_s), *_missed(timing)),
+    )
+
+
+def _missed(timing: Timing) -> tuple[str, ...]:
+    """Return what the reader should know of samples that were missed."""
+    if timing.missed_share <= NOTABLE_SHARE:
+        return ()
+    return (
+        f"{timing.missed} samples were missed, {100 * timing.missed_share:.2g} % of all: the loop was up to"
+        f" {1e3 * timing.lateness_s[2]:.3g} ms late; autotune doctor CONFIG says what this computer does",
     )
 
 

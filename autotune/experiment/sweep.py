@@ -13,7 +13,7 @@ from autotune.errors import ExperimentStopped, IdentificationError
 from autotune.experiment.approach import Known
 from autotune.experiment.cycles import Earlier, measured, refined
 from autotune.experiment.loop import ControlLoop
-from autotune.experiment.oscillation import PATIENCE, Oscillation
+from autotune.experiment.oscillation import PATIENCE, Oscillation, mean_command
 from autotune.experiment.plan import Choice, Goal, allot, choose, phase_targets, time_s
 from autotune.experiment.relay import RelaySettings
 from autotune.experiment.result import Cycle, Segment, State
@@ -198,36 +198,38 @@ def _measure(
         turning_s=choice.turning_s,
         foreseen=foreseen,
     )
-    start = oscillation.start_row if settled else -1
+    # sample times count here and not rows: some may have been missed
+    start, start_row, lead = loop.tick.slot if settled else -1, oscillation.start_row, 0
     turning = round(choice.turning_s / step_s)
     skip = 0  # edges before the cycle that is measured
     while True:
         tick, switched = oscillation.step()
-        edges = oscillation.edges[skip:]
-        if switched and len(edges) > 2 and _rebalanced(oscillation, edges):
+        edges = oscillation.slots[skip:]
+        if switched and len(edges) > 2 and _rebalanced(oscillation):
             skip, start = len(oscillation.edges) - 1, -1
             continue
         if start < 0 and edges:
-            start = edges[0] + turning
+            start, start_row, lead = edges[0] + turning, oscillation.edges[skip], turning
         if len(edges) < 2 * LEAST_PERIODS:
             continue
         period = (edges[-1] + edges[-2] - edges[1] - edges[0]) / (len(edges) - 2)
         periods = max(LEAST_PERIODS, min(wanted, int((until_s / step_s - start) / period)))
         # the next setting takes over at the extremum of y: not before it, and not when the next switch is near
-        since_switch = tick.k - edges[-1]
+        since_switch = tick.slot - edges[-1]
         at_extremum = turning <= since_switch <= turning + 0.15 * period
-        if tick.k < start + periods * period + 1 or not at_extremum:
+        if tick.slot < start + periods * period + 1 or not at_extremum:
             continue
-        t = loop.history(start)[0]
-        row_s = (t[-1] - t[0]) / (t.size - 1)  # on the clock of the stamps, which may be the device's
-        return WholePeriods(start_s=float(t[0]), end_s=float(t[0] + periods * period * row_s), periods=periods)
+        t = loop.history(start_row)[0]
+        t = t[int(np.searchsorted(t, t[0] + (lead - 0.5) * step_s)) :]
+        # a sample time on the clock of the stamps, which may be the device's
+        slot_s = (t[-1] - t[0]) / round((t[-1] - t[0]) / step_s)
+        return WholePeriods(start_s=float(t[0]), end_s=float(t[0] + periods * period * slot_s), periods=periods)
 
 
-def _rebalanced(oscillation: Oscillation, edges: list[int]) -> bool:
+def _rebalanced(oscillation: Oscillation) -> bool:
     """Correct the mid-point where the last period was lopsided, and say whether it was."""
-    _, u, _ = oscillation.loop.history(edges[-3])
     settings = oscillation.settings
-    mean = float(np.mean(u[: edges[-1] - edges[-3]]))
+    mean = mean_command(oscillation.loop, oscillation.edges)
     if abs(mean - settings.midpoint) / settings.amplitude <= 2.0 * LARGEST_ASYMMETRY:
         return False
     step = oscillation.loop.envelope.u_step

@@ -219,14 +219,18 @@ def run_test(
             loop.step(u_next)
         y, u = try_on_device(loop, loop.rig, law.controller, setpoint, load, tell)
         return (y - operating_y)[test.settle :], u[test.settle :]
-    y, u = np.full(count, np.nan), np.empty(count)
+    y, u = np.full(count, np.nan), np.full(count, np.nan)
     state = law.initial(u_hold, operating_y, operating_y)
-    for k in range(count):
+    start, k, before = loop.tick.slot, 0, -1
+    while (k := loop.tick.slot - start) < count:
         tick = loop.tick
         tell(k)
         y[k] = tick.y - operating_y if tick.usable else np.nan
-        u[k], state = law.step(state, float(setpoint[k]), tick.y)
+        for missed in range(before + 1, k + 1):  # the law's time goes on where samples were missed
+            u[missed], state = law.step(state, float(setpoint[k]), tick.y)
         loop.step(loop.nearest(u[k] + load[k]), extra={"r": float(setpoint[k])})
+        before = k
+    u[before + 1 :] = u[before]
     return y[test.settle :], u[test.settle :]
 
 

@@ -3,10 +3,10 @@
 ``console``: a line that begins with ``$`` is run by the shell; the lines under it are what it prints, ``...`` for any
 text, and each of them has to come. ``# exit status N`` behind a command is its status, 0 where there is none. One that
 ends in ``&`` runs on to the end of the page. ``sh`` is a script. ``python`` is executed in one namespace per page.
-``toml`` and ``diff`` are files where their first line names one (``# NAME``); a ``toml`` without a name replaces those
-tables in a configuration of the project, which has to load. A block with the word ``rig-time`` is a real-time one and
-takes minutes; one with the word ``board`` needs a board and one with ``dry`` would build an environment: there make
-says what it would do.
+``toml``, ``diff`` and ``python`` are files where their first line names one (``# NAME``); a ``toml`` without a name
+replaces those tables in a configuration of the project, which has to load. A block with the word ``rig-time`` is a
+real-time one and takes minutes; one with the word ``board`` needs a board and one with ``dry`` would build an
+environment: there make says what it would do.
 """
 
 from __future__ import annotations
@@ -97,6 +97,8 @@ class Reader:
         match block.language:
             case "console":
                 self._console(block, where)
+            case "python" if re.match(r"# \S+\.py\n", block.content):
+                self._file(block, where)
             case "python":
                 # a class defined on a page finds its module, and a traceback its line
                 exec(compile("\n" * block.line + block.content, str(self._page), "exec"), self._names)
@@ -113,7 +115,7 @@ class Reader:
         return path
 
     def _file(self, block: Block, where: str) -> None:
-        name = re.match(r"# (\S+\.(?:toml|diff))\n", block.content)
+        name = re.match(r"# (\S+\.(?:toml|diff|py))\n", block.content)
         if name:
             (self._folder / name[1]).write_text(block.content, encoding="utf-8")
         elif block.language == "toml":
