@@ -16,7 +16,7 @@ In Python, ``import autotune as at``:
 ``transition``         the fastest smooth transition within limits
 ``simulate``           a model driven by a recording
 ``diagnose``           where and why recordings differ from a model
-``plot``               any result, on matplotlib axes or as a plotly figure
+``plot``               any result, on matplotlib axes or as an interactive chart
 ``to_control``         to python-control, and ``from_control`` back
 ``to_pandas``          any result as a DataFrame
 =====================  ======================================================================================

@@ -1,8 +1,10 @@
-"""One function that draws any result: on matplotlib axes where they are given, else as a plotly figure."""
+"""One function that draws any result: on matplotlib axes where they are given, else as an interactive chart."""
 
 from __future__ import annotations
 
+import html
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,9 +15,12 @@ from autotune.design.reference import Trajectory
 from autotune.errors import InputError
 from autotune.identification.closed_loop.state_space import InnovationModel
 from autotune.recording import Recording
+from autotune.report.chart import Chart
 from autotune.report.figures import Curve, bode_figure, frequencies, gain_phase, gain_phase_bars, recording_figure
-from autotune.report.page import BLUE, GREEN, ORANGE, PURPLE
+from autotune.report.page import BLUE, GREEN, ORANGE, PURPLE, Figure, Page, Section, write_page
 
+_HEIGHT = 420
+_BARE = "<style>h1, h2, .verdict { display: none }</style>"
 _COLOURS = (ORANGE, BLUE, GREEN, PURPLE)
 
 
@@ -33,8 +38,9 @@ def plot(*results: Any, ax: Any = None, names: Sequence[str] = ()) -> Any:
 
     Returns
     -------
-    plotly.graph_objects.Figure or the axes
-        A notebook shows the figure by itself; ``.show()`` opens a browser.
+    autotune.report.chart.Chart or the axes
+        A notebook shows the chart by itself, without a network; ``plotly.io.from_json(chart.to_json())`` is plotly's
+        own figure of it.
 
     Examples
     --------
@@ -96,7 +102,7 @@ def _bode(results: Sequence[Any], ax: Any, names: Sequence[str]) -> Any:
     every = [point for _, points, _ in estimates for point in points]
     omega = frequencies(every) if every else _grid(curves[0].system)
     at_first = every[0].response if every else curves[0].system.response(omega[:1])[0]
-    sign = 1 if abs(np.angle(at_first)) <= 0.75 * np.pi else -1
+    sign = 1 if np.angle(at_first) <= np.pi / 6.0 else -1  # a lag and an integrator turn a positive gain backwards
     if ax is None:
         return bode_figure(estimates, curves, omega, sign, "")
     pair = np.atleast_1d(ax).ravel()
@@ -136,3 +142,20 @@ def _on_axes(ax: Any, t: FloatArray, columns: Sequence[FloatArray], names: Seque
         one.set(ylabel=name)
     pair[-1].set(xlabel=time)
     return ax
+
+
+def chart_html(chart: Chart) -> str:
+    """Return a chart for a notebook: a frame with its own page, drawing library included."""
+    import tempfile
+
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "chart.html"
+        figure = Figure(figure=chart, caption="", height_px=_HEIGHT)
+        write_page(
+            Page(title="", verdict="", tone="good", summary=(), sections=(Section(title="", figures=(figure,)),)), path
+        )
+        content = path.read_text(encoding="utf-8").replace("</head>", f"{_BARE}</head>", 1)
+    return f'<iframe srcdoc="{html.escape(content)}" width="100%" height="{_HEIGHT + 160}" style="border:0"></iframe>'
+
+
+setattr(Chart, "_repr_html_", chart_html)  # noqa: B010 - the page knows nothing of notebooks

@@ -41,6 +41,7 @@ from autotune.cli import (  # noqa: E402, F401, I001
     delay,
     closed_loop,
     design,
+    references,
     diagnose,
     investigate,
     batch,
@@ -56,7 +57,18 @@ from autotune.cli import (  # noqa: E402, F401, I001
 TOUR = {
     "Before the first run": ("init", "doctor", "schema"),
     "At a rig": ("run", "deploy", "verify", "live", "dither", "investigate", "probe", "ports", "rig"),
-    "From recordings to a controller": ("import", "tune", "identify", "reduce", "design", "margins", "controller"),
+    "From recordings to a controller": (
+        "import",
+        "tune",
+        "identify",
+        "reduce",
+        "validate",
+        "design",
+        "rst",
+        "margins",
+        "reference",
+        "controller",
+    ),
     "In operation, and where model and rig differ": ("watch", "simulate", "diagnose", "batch", "prove"),
 }
 

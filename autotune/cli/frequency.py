@@ -11,6 +11,7 @@ import typer
 from autotune.cli import app, identify
 from autotune.cli.common import OVERWRITE
 from autotune.cli.recordings import R, T, U, Y, read_all, signal_names
+from autotune.errors import InputError
 from autotune.outputs import Output
 
 if TYPE_CHECKING:
@@ -66,8 +67,9 @@ def _line(point: FrequencyPoint) -> str:
 
 @app.command("reduce")
 def reduce(
-    points: Annotated[Path, typer.Option(help="points file of identify frequency (JSON)")],
     out: Annotated[Path, typer.Option(help="reduced model to write: a model file (TOML)")],
+    points: Annotated[Path | None, typer.Option(help="points file of identify frequency (JSON)")] = None,
+    model: Annotated[Path | None, typer.Option(help="model file (TOML) of a plant that is known")] = None,
     kind: Annotated[
         Literal["auto", "self-regulating", "integrating"],
         typer.Option(help="structure (8) or (24); auto lets the data decide"),
@@ -84,11 +86,21 @@ def reduce(
     ] = None,
     overwrite: OVERWRITE = False,
 ) -> None:
-    """Reduce measured points to the cautious low-order model that a robust PI is designed on."""
-    from autotune.identification.reduction import reduce_points
+    """Reduce measured points, or a known plant, to the cautious low-order model that a robust PI is designed on."""
+    from autotune.identification.reduction import reduce_points, reduce_transfer_function
     from autotune.points import read_points
 
-    place = Output(out, inputs=(points,), overwrite=overwrite)
+    place = Output(out, inputs=(points, model), overwrite=overwrite)
+    if (points is None) == (model is None):
+        raise InputError("give one of --points and --model", where="autotune reduce")
+    if model is not None:
+        from autotune.models import read_model
+
+        reduced = reduce_transfer_function(read_model(model).transfer_function())
+        place.by(lambda part: _write(reduced, part))
+        _say(reduced, out)
+        return
+    assert points is not None
     known = None
     if static_gain is not None:
         known = (static_gain, static_gain_sd if static_gain_sd is not None else 0.01 * abs(static_gain))
@@ -96,9 +108,13 @@ def reduce(
         read_points(points), kind=None if kind == "auto" else kind, conditions=conditions, static_gain=known
     )
     place.by(lambda part: _write(reduced, part))
+    _say(reduced, out)
+
+
+def _say(reduced: ReducedModel, out: Path) -> None:
     lag = "" if reduced.omega_0r_rad_s is None else f", omega_0r = {reduced.omega_0r_rad_s:.4g} rad/s"
     name = "integrating (24)" if reduced.integrating else "self-regulating (8)"
-    typer.echo(f"{name}: {reduced.evidence}")
+    typer.echo(f"{name}: {reduced.evidence or 'of a known plant'}")
     typer.echo(f"G_r = {reduced.G_r:.4g}{lag}, omega_d = {reduced.omega_d_rad_s:.4g} rad/s; written to {out}")
     for warning in reduced.warnings:
         typer.echo(f"warning: {warning}")
