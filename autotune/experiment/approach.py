@@ -118,8 +118,8 @@ def preflight(loop: ControlLoop, config: Config, tell: Tell) -> Known:
         )
     link_rad_s = supported_rad_s(timing, loop.sample_time_s, config.experiment.gain_sd, exact=loop.is_exact)
     tell(
-        f"a reading takes {1e3 * typical:.2g} ms, up to {1e3 * late:.2g} ms in 99 %:"
-        f" this link supports points up to {link_rad_s:.3g} rad/s"
+        f"a reading takes {1e3 * typical:.2g} ms, up to {1e3 * late:.2g} ms in 99 %, and the loop is up to"
+        f" {1e3 * timing.lateness_s[1]:.2g} ms late: this link supports points up to {link_rad_s:.3g} rad/s"
     )
     loop.note(link_rad_s=link_rad_s)
     steps = np.diff(y)

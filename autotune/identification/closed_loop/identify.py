@@ -28,6 +28,7 @@ from autotune.identification.closed_loop.confidence import (
 from autotune.identification.closed_loop.control_law import CONTRADICTION, LawCheck, check_law
 from autotune.identification.closed_loop.design_points import design_points
 from autotune.identification.closed_loop.dither_proposal import DitherLimits, DitherProposal, propose_dither
+from autotune.identification.closed_loop.gaps import bridged
 from autotune.identification.closed_loop.hold import without_hold
 from autotune.identification.closed_loop.loop_excitation import ExcitationVerdict, judge, own_motion, require_excitation
 from autotune.identification.closed_loop.order import Candidate, choose_order, default_past_window, fixed_order
@@ -186,6 +187,8 @@ def _fitted(
 def usable_stretch(recording: Recording) -> tuple[Recording, tuple[str, ...]]:
     """Return the longest stretch of equidistant rows in which u, y, r and dither are numbers, and what was left out.
 
+    Gaps of up to three samples are bridged where they are few, so that what lies between them is used together.
+
     Parameters
     ----------
     recording : Recording
@@ -203,6 +206,8 @@ def usable_stretch(recording: Recording) -> tuple[Recording, tuple[str, ...]]:
     IdentificationError
         No stretch is long enough; names what cuts the recording.
     """
+    whole = bridged(recording, _JITTER)
+    recording = whole.recording
     columns = [recording.u, recording.y]
     columns += [c for name, c in recording.extra.items() if name in ("r", "dither") and np.isfinite(c).any()]
     good = np.all([np.isfinite(column) for column in columns], axis=0)
@@ -220,6 +225,8 @@ def usable_stretch(recording: Recording) -> tuple[Recording, tuple[str, ...]]:
             remedy=f"record at least {_FEWEST_ROWS} rows, better a thousand, with the set-point or a dither moving",
         )
     warnings = []
+    if whole.gaps:
+        warnings.append(f"{whole.gaps} gap(s) of up to three samples were bridged: {whole.rows} of {len(good)} rows")
     t = recording.t[rows]
     if len(rows) < len(good):
         spared = len(good) - len(rows) == 1 and not good[-1]  # a rig's last row holds the safe command and nothing else
