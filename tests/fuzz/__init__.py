@@ -1,0 +1,1 @@
+"""Damaged files of every kind against the commands that read them: ``make fuzz``."""

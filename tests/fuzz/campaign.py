@@ -1,0 +1,273 @@
+"""One damaged input after the other through the command line, in worker processes whose time and memory are bounded."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import multiprocessing
+import os
+import random
+import re
+import resource
+import shutil
+import signal
+import sys
+import tempfile
+import time
+import traceback
+from collections import Counter, defaultdict
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+from tests.fuzz.families import FAMILIES, Call, Family
+
+#: an input that has not been answered after this time hangs [s]
+HANG_S = 60.0
+#: most memory that a worker may map [byte]: what a small machine has
+MEMORY_BYTES = 6 << 30
+WELL = (0, 2, 3)
+
+
+@dataclass(kw_only=True)
+class Tally:
+    """What became of the inputs of one family."""
+
+    inputs: int = 0
+    tracebacks: int = 0
+    hangs: int = 0
+    wrong_exits: int = 0
+    not_one_line: int = 0
+    slowest_s: float = 0.0
+    peak_MB: float = 0.0
+    exits: Counter[int] = field(default_factory=Counter)
+
+    @property
+    def faults(self) -> int:
+        """Inputs that were not answered well."""
+        return self.tracebacks + self.hangs + self.wrong_exits + self.not_one_line
+
+
+@dataclass(frozen=True, kw_only=True)
+class Answer:
+    """How one input ended: what was wrong with it, empty for nothing, its exit status, and what was said."""
+
+    family: str
+    number: int
+    fault: str
+    status: int
+    said: str
+    duration_s: float
+    peak_MB: float
+
+
+class _Hang(BaseException):
+    """An input was not answered in time."""
+
+
+def _ring(*_: object) -> None:
+    raise _Hang
+
+
+def try_one(family: Family, number: int, seed: int, folder: Path) -> Answer:
+    """Make one input and try it in this process."""
+    rng = random.Random(f"{seed} {family.name} {number}")
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    call = family.make(rng, folder)
+    began_s = time.monotonic()
+    out, err = io.StringIO(), io.StringIO()
+    signal.signal(signal.SIGALRM, _ring)
+    signal.setitimer(signal.ITIMER_REAL, HANG_S)
+    try:
+        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+            status = _called(call)
+        fault = _fault(status, out.getvalue(), err.getvalue())
+    except _Hang:
+        status, fault = -1, "hang"
+    except BaseException as error:
+        status, fault = -1, f"traceback: {traceback.format_exception(error)[-1].strip()} {_at(error)}"
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+    said = f"{call if isinstance(call, list) else family.name}\n{err.getvalue()[-2000:]}"
+    peak_MB = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    return Answer(
+        family=family.name, number=number, fault=fault, status=status, said=said,
+        duration_s=time.monotonic() - began_s, peak_MB=peak_MB,
+    )  # fmt: skip
+
+
+def _at(error: BaseException) -> str:
+    frames = [f for f in traceback.extract_tb(error.__traceback__) if "autotune" in f.filename or "drivers" in f.filename]
+    return f"({Path(frames[-1].filename).name} line {frames[-1].lineno})" if frames else ""
+
+
+def _called(call: Call) -> int:
+    from autotune.cli import main
+    from autotune.errors import AutotuneError
+
+    if not isinstance(call, list):
+        try:
+            call()
+        except AutotuneError as error:
+            print(f"autotune: {error}", file=sys.stderr)  # noqa: T201 - as the command line says it
+            return error.exit_status
+        return 0
+    sys.argv = ["autotune", *call]
+    try:
+        main()
+    except SystemExit as left:
+        return left.code if isinstance(left.code, int) else 1
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+    return 0
+
+
+def _fault(status: int, out: str, err: str) -> str:
+    if "Traceback" in err or "a defect of the tool" in err:
+        return f"traceback: {err.strip().splitlines()[-1][:300]}"
+    if status not in WELL:
+        return f"wrong exit: {status}"
+    if status == 0 and re.search(r"\bnan\b", out):
+        return "wrong exit: a result that is not finite"
+    lines = [line for line in err.splitlines() if line.startswith("autotune: ")]
+    if status in (2,) and len(lines) != 1:
+        return f"not one line: {len(lines)} lines for exit status {status}"
+    if any(not line.isprintable() for line in lines):
+        return "not one line: control characters"
+    return ""
+
+
+def _work(orders: Connection, seed: int, folder: str) -> None:
+    resource.setrlimit(resource.RLIMIT_AS, (MEMORY_BYTES, MEMORY_BYTES))
+    os.chdir(tempfile.mkdtemp(dir=folder))
+    families = {family.name: family for family in FAMILIES}
+    while (order := orders.recv()) is not None:
+        name, number = order
+        orders.send(try_one(families[name], number, seed, Path(folder) / str(os.getpid())))
+
+
+def plan(inputs: int, seed: int, names: Sequence[str] = ()) -> Iterator[tuple[str, int]]:
+    """Yield family and number of every input, mixed, so that a campaign cut short has tried all families."""
+    families = [family for family in FAMILIES if not names or family.name in names]
+    rng = random.Random(seed)
+    numbers: Counter[str] = Counter()
+    for _ in range(inputs):
+        name = rng.choices([f.name for f in families], [f.share for f in families])[0]
+        yield name, numbers[name]
+        numbers[name] += 1
+
+
+class _Worker:
+    def __init__(self, seed: int, folder: str) -> None:
+        context = multiprocessing.get_context("spawn")
+        self.line, theirs = context.Pipe()
+        self.process = context.Process(target=_work, args=(theirs, seed, folder), daemon=True)
+        self.process.start()
+        theirs.close()
+        self.order: tuple[str, int] | None = None
+        self.since_s = time.monotonic()
+
+    def give(self, order: tuple[str, int]) -> None:
+        self.order, self.since_s = order, time.monotonic()
+        self.line.send(order)
+
+
+def campaign(
+    inputs: int, seconds: float, seed: int, workers: int, names: Sequence[str] = (), report: Any = None
+) -> tuple[dict[str, Tally], list[Answer]]:
+    """Try inputs until there are enough or the time is over.
+
+    Parameters
+    ----------
+    inputs, seconds : int, float
+        Most inputs, longest time [s].
+    seed : int
+        Every input follows from it, its family and its number.
+    workers : int
+        Processes.
+    names : sequence of str
+        Families; all when empty.
+    report : callable, optional
+        Told every fault as it is found.
+
+    Returns
+    -------
+    tallies : dict of str to Tally
+        By family.
+    faults : list of Answer
+        Inputs that were not answered well.
+    """
+    tallies: dict[str, Tally] = defaultdict(Tally)
+    faults: list[Answer] = []
+    orders, until_s = plan(inputs, seed, names), time.monotonic() + seconds
+    with tempfile.TemporaryDirectory(prefix="autotune-fuzz-") as folder:
+        pool = [_Worker(seed, folder) for _ in range(workers)]
+        busy = []
+        for worker in pool:
+            if (order := next(orders, None)) is not None:
+                worker.give(order)
+                busy.append(worker)
+        while busy:
+            for i, worker in enumerate(busy):
+                answer = _answer_of(worker)
+                if answer is None:
+                    continue
+                _count(tallies[answer.family], answer)
+                if answer.fault:
+                    faults.append(answer)
+                    if report is not None:
+                        report(answer)
+                fresh = worker
+                if answer.status == -9 or answer.fault.startswith("hang"):
+                    worker.process.kill()
+                    fresh = _Worker(seed, folder)
+                order = next(orders, None) if time.monotonic() < until_s else None
+                if order is None:
+                    fresh.process.kill()
+                    busy[i] = None  # type: ignore[call-overload]
+                else:
+                    fresh.give(order)
+                    busy[i] = fresh
+            busy = [worker for worker in busy if worker is not None]
+        for worker in pool:
+            worker.process.join()
+    return dict(tallies), faults
+
+
+def _answer_of(worker: _Worker) -> Answer | None:
+    """Return what came back, a hang or a death where nothing ever will, None while it is at work."""
+    assert worker.order is not None
+    name, number = worker.order
+    fault = ""
+    try:
+        if worker.line.poll(0.02):
+            answer: Answer = worker.line.recv()
+            return answer
+    except (EOFError, ConnectionError):
+        fault = "traceback: the process died"
+    waited_s = time.monotonic() - worker.since_s
+    if not fault and waited_s > 2.0 * HANG_S:
+        fault = "hang"
+    if not fault:
+        return None
+    return Answer(family=name, number=number, fault=fault, status=-9, said="", duration_s=waited_s, peak_MB=0.0)
+
+
+def _count(tally: Tally, answer: Answer) -> None:
+    tally.inputs += 1
+    tally.exits[answer.status] += 1
+    tally.tracebacks += answer.fault.startswith("traceback")
+    tally.hangs += answer.fault.startswith("hang")
+    tally.wrong_exits += answer.fault.startswith("wrong exit")
+    tally.not_one_line += answer.fault.startswith("not one line")
+    tally.slowest_s = max(tally.slowest_s, answer.duration_s)
+    tally.peak_MB = max(tally.peak_MB, answer.peak_MB)
+
+
+def as_json(answers: Sequence[Answer]) -> str:
+    """Return faults for a file."""
+    return json.dumps([vars(answer) for answer in answers], indent=1)
