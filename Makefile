@@ -4,7 +4,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 OUT ?= runs/ball_sim
 
-.PHONY: run test lint types imports unit bench docs figures clean
+.PHONY: run test lint types imports unit fuzz bench docs figures clean
 
 run: $(VENV)/.run
 	rm -rf $(OUT)
@@ -24,6 +24,13 @@ imports: $(VENV)/.test
 
 unit: $(VENV)/.test
 	$(BIN)/pytest -n auto
+
+# damaged files, odd options and places that cannot be written, against every command that reads or writes them
+FUZZ_INPUTS ?= 50000
+FUZZ_SECONDS ?= 3600
+
+fuzz: $(VENV)/.test
+	$(BIN)/python -m tests.fuzz --inputs $(FUZZ_INPUTS) --seconds $(FUZZ_SECONDS) --faults fuzz_faults.json
 
 bench: $(VENV)/.test
 	$(BIN)/python -m tests.benchmarks

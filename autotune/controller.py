@@ -145,6 +145,8 @@ class _Rational(Section):
     def _divides(self) -> _Rational:
         if self.sample_time_s is not None and self.den[0] == 0.0:
             raise ValueError("den must begin with a value other than 0")
+        if any(0.0 < abs(value) < SMALLEST_GAIN for value in (*self.num, *self.den)):
+            raise ValueError(f"a coefficient other than 0 is smaller than {SMALLEST_GAIN:g}")
         if not any(self.den):
             raise ValueError("den is zero")
         if not any(self.num):

@@ -28,6 +28,8 @@ Hold: TypeAlias = Literal["zero", "linear"]
 MOST_BLOCKS, MOST_COEFFICIENTS = 50, 40
 #: Largest size of a number in a model file; where arithmetic overflows, a result would be none.
 LARGEST = 1e30
+#: Smallest size other than 0.
+SMALLEST = 1e-30
 
 
 def _trimmed(coefficients: Sequence[float]) -> tuple[float, ...]:
@@ -253,6 +255,8 @@ def _known(table: Any, keys: set[str], where: str) -> None:
 def _real(value: Any, key: str, where: str) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= LARGEST:
         raise InputError(f"{key} = {_shown(value)}", where=where, remedy=f"write a number within +-{LARGEST:g}")
+    if 0.0 < abs(value) < SMALLEST:
+        raise InputError(f"{key} = {value!r}", where=where, remedy=f"write 0, or a size of at least {SMALLEST:g}")
     return float(value)
 
 

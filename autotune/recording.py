@@ -23,6 +23,9 @@ from autotune.errors import InputError
 from autotune.outputs import append_whole, write_whole
 from autotune.text_files import printable, read_toml
 
+#: Largest size of a value that is computed with: far beyond every unit, far from where squares overflow.
+LARGEST = 1e15
+
 _REQUIRED = ("t", "u", "y")
 
 
@@ -156,6 +159,43 @@ class Recording:
                     remedy="cut the recording there or fill the gap with measured values",
                 )
         return self
+
+
+def usable(recording: Recording, *, moving: bool = True) -> Recording:
+    """Return a recording from outside if arithmetic can hold it and it holds something to learn from.
+
+    Parameters
+    ----------
+    recording : Recording
+        As it was read.
+    moving : bool
+        Whether y must change: nothing can be identified from one that does not.
+
+    Raises
+    ------
+    InputError
+        A size beyond 1e15, no y at all, or a constant one; names the column and the row.
+    """
+    for column in ("t", "u", "y", *recording.extra):
+        values = np.abs(recording[column])
+        over = np.isfinite(values) & (values > LARGEST)
+        if over.any():
+            at = float(recording.t[int(np.argmax(over))])
+            raise InputError(
+                f"column {column!r} exceeds {LARGEST:g} in {int(over.sum())} row(s), first at t = {at:g} s",
+                where=recording.name,
+                remedy="check the unit, or delete the rows",
+            )
+    y = recording.y[np.isfinite(recording.y)]
+    if y.size < 2:
+        raise InputError("column 'y' has no numbers", where=recording.name, remedy="give a recording with measurements")
+    if moving and float(np.ptp(y)) <= 1e-12 * float(np.max(np.abs(y))):
+        raise InputError(
+            f"column 'y' is constant ({y[0]:g}): nothing can be learnt from it",
+            where=recording.name,
+            remedy="check the column and the sensor, or record an experiment that moves y",
+        )
+    return recording
 
 
 def read_recording(path: str | os.PathLike[str]) -> Recording:

@@ -7,6 +7,7 @@ import contextlib
 import errno
 import signal
 import sys
+import warnings
 from typing import Any, NoReturn
 
 import typer
@@ -109,6 +110,8 @@ def main() -> None:
     if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
     sys.unraisablehook = _unraisable
+    if not sys.warnoptions:
+        warnings.simplefilter("ignore")  # numpy's remarks are not for the user: results are checked for what they are
     try:
         status = app(standalone_mode=False)
         sys.stdout.flush()

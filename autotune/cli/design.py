@@ -123,6 +123,10 @@ def margins_command(
 
     place = Output(out, inputs=(model, controller), overwrite=overwrite)
     m = margins(read_model(model), read_controller(controller), noise_frequency_rad_s=noise_frequency)
+    if math.isnan(m.modulus + m.phase_rad):
+        raise InputError(
+            "the loop's response leaves the range of numbers", where=str(controller), remedy="check its coefficients"
+        )
     place.json(m.to_json())
     state = "stable" if m.stable else "UNSTABLE: the figures describe the Nyquist curve, not margins"
     typer.echo(

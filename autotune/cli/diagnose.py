@@ -10,6 +10,7 @@ import typer
 from autotune.cli import app
 from autotune.cli.common import OVERWRITE
 from autotune.cli.recordings import R, T, U, Y, read_all, read_one, signal_names
+from autotune.errors import InputError
 from autotune.outputs import Output, OutputFolder
 
 
@@ -37,9 +38,15 @@ def simulate(
     from autotune.models import Model
 
     place = Output(out, inputs=(recording, model), overwrite=overwrite)
-    data = read_one(recording, signal_names(t, u, y, r))
+    data = read_one(recording, signal_names(t, u, y, r), moving=False)
     nominal = read_any_model(model)
     y_sim = forecast(nominal, data, horizon) if isinstance(nominal, Model) else of_equations(nominal, data, horizon)
+    if not np.all(np.isfinite(y_sim)):
+        at = float(data.t[int(np.argmax(~np.isfinite(y_sim)))])
+        raise InputError(
+            f"the simulation leaves the range of numbers at t = {at:g} s", where=str(model),
+            remedy="an unstable model is compared as forecasts: --horizon S",
+        )  # fmt: skip
     rows = np.column_stack([data.t, y_sim])
     place.by(lambda part: np.savetxt(part, rows, fmt="%.10g", delimiter=",", header="t,y_sim", comments=""))
     known = np.isfinite(data.y)

@@ -88,7 +88,7 @@ def reduce(
 ) -> None:
     """Reduce measured points, or a known plant, to the cautious low-order model that a robust PI is designed on."""
     from autotune.identification.reduction import reduce_points, reduce_transfer_function
-    from autotune.points import read_points
+    from autotune.points import LARGEST, SMALLEST, read_points
 
     place = Output(out, inputs=(points, model), overwrite=overwrite)
     if (points is None) == (model is None):
@@ -103,6 +103,13 @@ def reduce(
     assert points is not None
     known = None
     if static_gain is not None:
+        if not SMALLEST <= abs(static_gain) <= LARGEST or not 1e-9 * abs(static_gain) <= (
+            abs(static_gain) if static_gain_sd is None else static_gain_sd
+        ):
+            raise InputError(
+                f"static gain {static_gain:g} with standard deviation {static_gain_sd}", where="--static-gain",
+                remedy="give a gain other than 0, known to no more than nine digits",
+            )  # fmt: skip
         known = (static_gain, static_gain_sd if static_gain_sd is not None else 0.01 * abs(static_gain))
     reduced = reduce_points(
         read_points(points), kind=None if kind == "auto" else kind, conditions=conditions, static_gain=known

@@ -127,7 +127,8 @@ def _since(place: Path, began_s: float) -> list[str]:
 def _keep_traceback(error: BaseException, place: Path | None) -> Path | str:
     """Write the traceback beside the output, or where that cannot be written, and return its file."""
     text = "".join(traceback.format_exception(error))
-    folders = [place if place.is_dir() else place.parent] if place is not None else []
+    ordinary = place is not None and (place.is_dir() or place.is_file() or not place.exists())
+    folders = [place if place.is_dir() else place.parent] if place is not None and ordinary else []
     for folder in (*folders, Path(), Path(tempfile.gettempdir())):
         file = folder / f"autotune-defect-{time.strftime('%Y%m%d-%H%M%S')}-{os.getpid()}.txt"
         with contextlib.suppress(OSError, ValueError), file.open("x", encoding="utf-8", errors="replace") as handle:

@@ -32,16 +32,23 @@ def signal_names(t: str | None, u: str | None, y: str | None, r: str | None) -> 
 
 def read_all(paths: Iterable[Path], names: SignalNames) -> list[Recording]:
     """Return the recordings of all files, each uninterrupted stretch one, and say how the files were read."""
-    return [recording for path in paths for recording in _read(path, names).recordings]
+    from autotune.recording import usable
+
+    return [usable(recording) for path in paths for recording in _read(path, names).recordings]
 
 
-def read_one(path: Path, names: SignalNames) -> Recording:
-    """Return the recording of a file, its longest stretch where it has several, and say how it was read."""
+def read_one(path: Path, names: SignalNames, *, moving: bool = True) -> Recording:
+    """Return the recording of a file, its longest stretch where it has several, and say how it was read.
+
+    A y that does not move is refused, unless ``moving`` is false.
+    """
+    from autotune.recording import usable
+
     reading = _read(path, names)
     if len(reading.recordings) > 1:
         first = reading.longest.t[0], reading.longest.t[-1]
         _say(f"{path}: the longest of {len(reading.recordings)} stretches is used, {first[1] - first[0]:.6g} s")
-    return reading.longest
+    return usable(reading.longest, moving=moving)
 
 
 def _read(path: Path, names: SignalNames, form: FileForm | None = None, gap_s: float | None = None) -> Reading:

@@ -61,7 +61,7 @@ def chain_with_inputs(content: Mapping[str, Any], where: str) -> EquationModel:
         As :func:`autotune.models.read_model`, and an input that does not say what it does.
     """
     inputs = content.get("input")
-    if not isinstance(inputs, list) or not inputs:
+    if not isinstance(inputs, list) or not inputs or not all(isinstance(one, dict) for one in inputs):
         raise InputError("no [[input]]", where=where, remedy='name the command: [[input]] column = "u"')
     command = {key: value for key, value in inputs[0].items() if key != "column"}
     chain = model_of({**content, "input": command}, where)

@@ -44,14 +44,23 @@ def _print(tallies: dict[str, Tally], took_s: float, seed: int) -> None:
         for key in ("inputs", "tracebacks", "hangs", "wrong_exits", "not_one_line"):
             setattr(total, key, getattr(total, key) + getattr(tally, key))
         total.exits += tally.exits
-        total.slowest_s, total.peak_MB = max(total.slowest_s, tally.slowest_s), max(total.peak_MB, tally.peak_MB)
+        total.slowest_s, total.peak_mb = max(total.slowest_s, tally.slowest_s), max(total.peak_mb, tally.peak_mb)
     _row("all", total)
     print(f"seed {seed}, {took_s:.0f} s")
 
 
 def _row(name: str, t: Tally) -> None:
     exits = " / ".join(str(t.exits[status]) for status in (0, 2, 3))
-    cells = (t.inputs, t.tracebacks, t.hangs, t.wrong_exits, t.not_one_line, f"{t.slowest_s:.1f}", f"{t.peak_MB:.0f}", exits)
+    cells = (
+        t.inputs,
+        t.tracebacks,
+        t.hangs,
+        t.wrong_exits,
+        t.not_one_line,
+        f"{t.slowest_s:.1f}",
+        f"{t.peak_mb:.0f}",
+        exits,
+    )
     print(f"| {name:12s} | {' | '.join(map(str, cells))} |")
 
 

@@ -23,6 +23,8 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
+import typer
+
 from tests.fuzz.families import FAMILIES, Call, Family
 
 #: an input that has not been answered after this time hangs [s]
@@ -42,7 +44,7 @@ class Tally:
     wrong_exits: int = 0
     not_one_line: int = 0
     slowest_s: float = 0.0
-    peak_MB: float = 0.0
+    peak_mb: float = 0.0
     exits: Counter[int] = field(default_factory=Counter)
 
     @property
@@ -61,7 +63,7 @@ class Answer:
     status: int
     said: str
     duration_s: float
-    peak_MB: float
+    peak_mb: float
 
 
 class _Hang(BaseException):
@@ -93,32 +95,36 @@ def try_one(family: Family, number: int, seed: int, folder: Path) -> Answer:
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0.0)
     said = f"{call if isinstance(call, list) else family.name}\n{err.getvalue()[-2000:]}"
-    peak_MB = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     return Answer(
         family=family.name, number=number, fault=fault, status=status, said=said,
-        duration_s=time.monotonic() - began_s, peak_MB=peak_MB,
+        duration_s=time.monotonic() - began_s, peak_mb=peak_mb,
     )  # fmt: skip
 
 
 def _at(error: BaseException) -> str:
-    frames = [f for f in traceback.extract_tb(error.__traceback__) if "autotune" in f.filename or "drivers" in f.filename]
+    frames = [
+        f for f in traceback.extract_tb(error.__traceback__) if "autotune" in f.filename or "drivers" in f.filename
+    ]
     return f"({Path(frames[-1].filename).name} line {frames[-1].lineno})" if frames else ""
 
 
 def _called(call: Call) -> int:
-    from autotune.cli import main
+    from autotune import cli
     from autotune.errors import AutotuneError
 
     if not isinstance(call, list):
         try:
             call()
         except AutotuneError as error:
-            print(f"autotune: {error}", file=sys.stderr)  # noqa: T201 - as the command line says it
+            print(f"autotune: {error}", file=sys.stderr)
             return error.exit_status
         return 0
+    if isinstance(cli.app, typer.Typer):
+        cli.app = typer.main.get_command(cli.app)  # type: ignore[assignment] # once, and not anew for each input
     sys.argv = ["autotune", *call]
     try:
-        main()
+        cli.main()
     except SystemExit as left:
         return left.code if isinstance(left.code, int) else 1
     finally:
@@ -136,15 +142,23 @@ def _fault(status: int, out: str, err: str) -> str:
     lines = [line for line in err.splitlines() if line.startswith("autotune: ")]
     if status in (2,) and len(lines) != 1:
         return f"not one line: {len(lines)} lines for exit status {status}"
+    if "Warning:" in err:
+        return f"not one line: {err.strip().splitlines()[0][:200]}"
     if any(not line.isprintable() for line in lines):
         return "not one line: control characters"
     return ""
 
 
-def _work(orders: Connection, seed: int, folder: str) -> None:
+def _work(orders: Connection, seed: int, folder: str, warm: bool) -> None:
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY_BYTES, MEMORY_BYTES))
     os.chdir(tempfile.mkdtemp(dir=folder))
     families = {family.name: family for family in FAMILIES}
+    for name in (
+        ("models", "recordings", "points") if warm else ()
+    ):  # what compiles or loads at first takes longer than any input
+        for number in range(12):
+            with contextlib.suppress(_Hang):
+                try_one(families[name], -number - 1, 0, Path(folder) / str(os.getpid()))
     while (order := orders.recv()) is not None:
         name, number = order
         orders.send(try_one(families[name], number, seed, Path(folder) / str(os.getpid())))
@@ -162,10 +176,10 @@ def plan(inputs: int, seed: int, names: Sequence[str] = ()) -> Iterator[tuple[st
 
 
 class _Worker:
-    def __init__(self, seed: int, folder: str) -> None:
+    def __init__(self, seed: int, folder: str, warm: bool = True) -> None:
         context = multiprocessing.get_context("spawn")
         self.line, theirs = context.Pipe()
-        self.process = context.Process(target=_work, args=(theirs, seed, folder), daemon=True)
+        self.process = context.Process(target=_work, args=(theirs, seed, folder, warm), daemon=True)
         self.process.start()
         theirs.close()
         self.order: tuple[str, int] | None = None
@@ -238,6 +252,22 @@ def campaign(
     return dict(tallies), faults
 
 
+def answers(orders: Sequence[tuple[str, int]], seed: int, folder: Path) -> list[Answer]:
+    """Return what became of chosen inputs, tried one after the other in a process of their own."""
+    worker, found = _Worker(seed, str(folder), warm=False), []
+    try:
+        for order in orders:
+            worker.give(order)
+            while (answer := _answer_of(worker)) is None:
+                pass
+            found.append(answer)
+    finally:
+        worker.process.kill()
+        worker.process.join()
+        worker.line.close()
+    return found
+
+
 def _answer_of(worker: _Worker) -> Answer | None:
     """Return what came back, a hang or a death where nothing ever will, None while it is at work."""
     assert worker.order is not None
@@ -254,7 +284,7 @@ def _answer_of(worker: _Worker) -> Answer | None:
         fault = "hang"
     if not fault:
         return None
-    return Answer(family=name, number=number, fault=fault, status=-9, said="", duration_s=waited_s, peak_MB=0.0)
+    return Answer(family=name, number=number, fault=fault, status=-9, said="", duration_s=waited_s, peak_mb=0.0)
 
 
 def _count(tally: Tally, answer: Answer) -> None:
@@ -265,7 +295,7 @@ def _count(tally: Tally, answer: Answer) -> None:
     tally.wrong_exits += answer.fault.startswith("wrong exit")
     tally.not_one_line += answer.fault.startswith("not one line")
     tally.slowest_s = max(tally.slowest_s, answer.duration_s)
-    tally.peak_MB = max(tally.peak_MB, answer.peak_MB)
+    tally.peak_mb = max(tally.peak_mb, answer.peak_mb)
 
 
 def as_json(answers: Sequence[Answer]) -> str:

@@ -15,8 +15,8 @@ NUMBERS: tuple[Any, ...] = (
     float("nan"), float("inf"), float("-inf"), 10**400, -(10**400), 2**31, 2**63, 65536, 1e-3, 1e6, 12, -100.0,
 )  # fmt: skip
 OTHERS: tuple[Any, ...] = (
-    "", "x", "1", "1_000", "nan", "[/foo]", "<img src=x onerror=alert(1)>", "\x1b[2J", "ä" * 5, "x" * 300, "a/b", "../a",
-    "°C", "\u202e", True, False, [], [[]], {}, [1], [0.0], {"a": 1}, [{}], ["x"], None,
+    "", "x", "1", "1_000", "nan", "[/foo]", "<img src=x onerror=alert(1)>", "\x1b[2J", "ä" * 5, "x" * 300, "a/b",
+    "../a", "°C", "\u202e", True, False, [], [[]], {}, [1], [0.0], {"a": 1}, [{}], ["x"], None,
 )  # fmt: skip
 
 
@@ -25,7 +25,9 @@ def places(content: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
     found = [path] if path else []
     if len(path) > 8:
         return found
-    entries: Any = content.items() if isinstance(content, dict) else enumerate(content) if isinstance(content, list) else ()
+    entries: Any = (
+        content.items() if isinstance(content, dict) else enumerate(content) if isinstance(content, list) else ()
+    )
     for key, value in entries:
         found += places(value, (*path, key))
     return found
@@ -75,7 +77,9 @@ def damaged_bytes(rng: random.Random, data: bytes) -> bytes:
         lambda: data.replace(b"\n", b"\r"),
         lambda: data.replace(b",", b";"),
         lambda: data.replace(b".", b","),
-        lambda: data.replace(b"0", rng.choice((b"_0", b"NaN", b"inf", b"", b"-", b"1e400", b"\x00")), rng.randrange(1, 9)),
+        lambda: data.replace(
+            b"0", rng.choice((b"_0", b"NaN", b"inf", b"", b"-", b"1e400", b"\x00")), rng.randrange(1, 9)
+        ),
         lambda: data.replace(b"=", b"=" + b"[" * rng.choice((5, 100, 100_000)), 1),
         lambda: data.replace(b"{", b"[" * rng.choice((5, 100, 100_000)), 1),
         lambda: data + data,
@@ -122,10 +126,22 @@ def damaged_json(rng: random.Random, content: dict[str, Any]) -> bytes:
 
 
 CELLS = (
-    "", "nan", "NaN", "inf", "-inf", "1_000", "x", "1e400", "-", "0x10", "1,5", "1e-320", "°", "1 000", "--1", "Bad", "#",
-    "\x1b[2J", "99999999999999999999", "1e300", "1e18",
+    "", "nan", "NaN", "inf", "-inf", "1_000", "x", "1e400", "-", "0x10", "1,5", "1e-320", "°", "1 000", "--1", "Bad",
+    "#", "\x1b[2J", "99999999999999999999", "1e300", "1e18",
 )  # fmt: skip
-HEADERS = ("t,u,y", "t,u", "u,y,t", "t;u;y", "time,u,y", "t,u,y,y", "t,u,y,[/foo]", "t,u,y,\x1b[2J", "", "1,2,3", "t,u,y," + "x" * 300)
+HEADERS = (
+    "t,u,y",
+    "t,u",
+    "u,y,t",
+    "t;u;y",
+    "time,u,y",
+    "t,u,y,y",
+    "t,u,y,[/foo]",
+    "t,u,y,\x1b[2J",
+    "",
+    "1,2,3",
+    "t,u,y," + "x" * 300,
+)
 
 
 def damaged_csv(rng: random.Random, text: str) -> bytes:
@@ -151,4 +167,6 @@ def damaged_csv(rng: random.Random, text: str) -> bytes:
         lines = [",".join(row) for row in rows]
     else:
         lines = lines[: rng.choice((1, 2, 3, 10, 60))]
-    return ("\n".join(lines) + rng.choice(("\n", ""))).encode(rng.choice(("utf-8", "utf-8", "cp1252")), errors="replace")
+    return ("\n".join(lines) + rng.choice(("\n", ""))).encode(
+        rng.choice(("utf-8", "utf-8", "cp1252")), errors="replace"
+    )

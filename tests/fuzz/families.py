@@ -32,7 +32,14 @@ MODEL: dict[str, Any] = {
     "output": {"unit": "V", "offset": 5.0},
     "block": [
         {"name": "turbine", "place": "actuator", "num": [1.0], "den": [0.016668, 1.0]},
-        {"name": "ball speed", "place": "plant", "num": [-65.5], "den": [0.36359, 1.0], "output": "speed", "unit": "V/s"},
+        {
+            "name": "ball speed",
+            "place": "plant",
+            "num": [-65.5],
+            "den": [0.36359, 1.0],
+            "output": "speed",
+            "unit": "V/s",
+        },
         {"name": "height", "place": "plant", "num": [1.0], "den": [1.0, 0.1], "delay": 0.02},
     ],
     "effect": [{"name": "actuator.dead_zone", "parameters": {"width": {"value": 0.01, "unit": "V", "sd": 0.001}}}],
@@ -62,7 +69,8 @@ CONFIG: dict[str, Any] = {
     "rig": {"kind": "simulated", "plant": "ball", "seed": 1, "noise": 0.35},
     "signals": {"sample_time_s": 0.01, "u_unit": "V", "y_unit": "V", "u_step": 0.00244},
     "limits": {
-        "u_min": 0.0, "u_max": 10.0, "u_safe": 0.0, "u_rate": 200.0, "y_min": 1.0, "y_max": 9.0, "swing": 3.0, "time_s": 2.0,
+        "u_min": 0.0, "u_max": 10.0, "u_safe": 0.0, "u_rate": 200.0, "y_min": 1.0, "y_max": 9.0, "swing": 3.0,
+        "time_s": 2.0,
     },
     "operating_point": {"y": 5.0, "u_guess": 5.0, "u_uncertainty": 0.5, "approach": "ramp", "plant_sign": 0},
     "experiment": {"phases_deg": [-105.0, -160.0], "points": 5, "gain_sd": 0.0035, "budget_s": 5.0},
@@ -207,7 +215,11 @@ def recordings(rng: random.Random, folder: Path) -> Call:
     sound = _sound(folder)
     given = _put(folder, "r.csv", damaged_csv(rng, RECORDING))
     if rng.random() < 0.2:
-        _put(folder, "r.toml", damaged_toml(rng, {"units": {"u": "V"}, "controller": {"kind": "PI", "K": 1.0}, "hold": "zero"}))
+        _put(
+            folder,
+            "r.toml",
+            damaged_toml(rng, {"units": {"u": "V"}, "controller": {"kind": "PI", "K": 1.0}, "hold": "zero"}),
+        )
     way = rng.random()
     if way < 0.75:
         return ["simulate", "--model", sound["model"], given, "--out", sound["out"]]
@@ -244,7 +256,16 @@ def stories(rng: random.Random, folder: Path) -> Call:
     return show
 
 
-PLACES = ("/proc/out.json", "/dev/full", "no_folder\0/out", "x" * 300, "sound_model.toml/out", ".", "sound_model.toml", "/")
+PLACES = (
+    "/proc/out.json",
+    "/dev/full",
+    "no_folder\0/out",
+    "x" * 300,
+    "sound_model.toml/out",
+    ".",
+    "sound_model.toml",
+    "/dev/null/x",
+)
 
 
 def outputs(rng: random.Random, folder: Path) -> Call:
@@ -276,7 +297,7 @@ def options(rng: random.Random, folder: Path) -> Call:
     odd = rng.choice(ODD)
     commands = (
         ["design", "--points", sound["points"], rng.choice(("--modulus-margin", "--phase-margin", "--noise-gain"))],
-        ["design", "--model", sound["model"], rng.choice(("--delay-margin", "--setpoint-command", "--noise-frequency"))],
+        ["design", "--model", sound["model"], rng.choice(("--delay-margin", "--noise-frequency"))],
         ["margins", "--model", sound["model"], "--controller", sound["controller"], "--noise-frequency"],
         ["reduce", "--points", sound["points"], rng.choice(("--static-gain", "--static-gain-sd"))],
         ["simulate", "--model", sound["model"], sound["recording"], "--horizon"],
