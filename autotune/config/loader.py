@@ -60,6 +60,18 @@ class Config(Section):
         return self
 
     @model_validator(mode="after")
+    def _has_room(self) -> Config:
+        limits, at = self.limits, self.operating_point
+        if not limits.u_min < at.u_guess < limits.u_max:
+            raise ValueError(
+                f"operating_point.u_guess = {at.u_guess:g} must lie between limits.u_min and u_max, for a relay moves"
+                " the command both ways"
+            )
+        if not limits.y_min < at.y < limits.y_max:
+            raise ValueError(f"operating_point.y = {at.y:g} must lie between limits.y_min and y_max")
+        return self
+
+    @model_validator(mode="after")
     def _no_faster_than_the_program(self) -> Config:
         scan_s, sample_s = getattr(self.rig, "scan_time_s", None), self.signals.sample_time_s
         if scan_s is not None and sample_s < scan_s:

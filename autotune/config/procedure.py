@@ -69,12 +69,16 @@ class OperatingPointSettings(Section):
     ] = None
 
 
+#: A lag and an integrator, which the sweep is planned with, have their phases between these.
+Phase = Annotated[float, Field(ge=-179.0, le=-91.0)]
+
+
 class ExperimentSettings(Section):
     """Relay sweep."""
 
     phases_deg: Annotated[
-        tuple[float, float],
-        Field(description="phases of the plant (positive gain) between which points are wanted [deg]"),
+        tuple[Phase, Phase],
+        Field(description="phases of the plant (positive gain) between which points are wanted [deg], -91 to -179"),
     ] = (-105.0, -160.0)
     points: Annotated[int, Field(ge=3, le=20, description="number of points, 3 to 20")] = 5
     relay_amplitude: Annotated[
@@ -85,6 +89,12 @@ class ExperimentSettings(Section):
         float, Field(gt=0, lt=0.5, description="relative standard deviation at which a point is good enough")
     ] = 0.004
     budget_s: Annotated[Time, Field(description="rig time for the sweep [s]")] = 60.0
+
+    @model_validator(mode="after")
+    def _apart(self) -> ExperimentSettings:
+        if abs(self.phases_deg[0] - self.phases_deg[1]) < 5.0:
+            raise ValueError("phases_deg must be at least 5 degrees apart")
+        return self
 
 
 SPECIFICATIONS = {"Spec1": (0.5, 45.0), "Spec2": (0.8, 60.0)}
@@ -149,3 +159,10 @@ class VerificationSettings(Section):
     duration_s: Annotated[Time | None, Field(description="time per step [s]; chosen from the design when absent")] = (
         None
     )
+
+    @model_validator(mode="after")
+    def _steps(self) -> VerificationSettings:
+        for key, value in (("setpoint_step", self.setpoint_step), ("disturbance_step", self.disturbance_step)):
+            if value == 0.0:
+                raise ValueError(f"{key} = 0 is no step; leave the key out to have it chosen")
+        return self

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -135,6 +136,8 @@ def read_earlier(paths: Sequence[Path], sample_time_s: float) -> Earlier:
     segments: list[Segment] = []
     parts: list[Part] = []
     for path in paths:
+        if _lines(path) < 3:  # killed or out of space before its second row
+            continue
         try:
             recording = read_recording(path)
         except InputError as error:
@@ -159,6 +162,14 @@ def read_earlier(paths: Sequence[Path], sample_time_s: float) -> Earlier:
     return Earlier(recordings=tuple(recordings), segments=tuple(segments), parts=tuple(parts))
 
 
+def _lines(path: Path) -> int:
+    try:
+        with path.open("rb") as file:
+            return sum(line.endswith(b"\n") for line in itertools.islice(file, 3))
+    except OSError:
+        return 3  # reading it says why it cannot be read
+
+
 def _why(recording: Recording) -> str:
     ended = recording.metadata.get("ended", {})
     # only a loop that came to its end left an exit status
@@ -166,9 +177,12 @@ def _why(recording: Recording) -> str:
 
 
 def _finished(recording: Recording, part: int) -> list[Cycle]:
+    tables = recording.metadata.get("relay", [])
     try:
-        return [Cycle.from_table(table, part) for table in recording.metadata.get("relay", [])]
-    except (KeyError, TypeError) as error:
+        cycles = [Cycle.from_table(table, part) for table in tables]
+        # a file that lost its end, on a disk that filled or at a power cut, lost the cycles there: they are run again
+        return [cycle for cycle in cycles if cycle.end_s <= recording.t[-1] + recording.sample_time_s]
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise InputError(
             f"the sidecar's relay table lacks {error}", where=recording.name, remedy="begin a new run instead"
         ) from None

@@ -17,7 +17,7 @@ from autotune.config.procedure import LimitSettings
 from autotune.controller import PIDController
 from autotune.design.law import PILaw
 from autotune.design.margins import Margins, margins
-from autotune.errors import DesignError
+from autotune.errors import DesignError, InputError
 from autotune.experiment.device import try_on_device
 from autotune.experiment.limits import Watch
 from autotune.experiment.loop import ControlLoop
@@ -149,6 +149,12 @@ def plan_test(config: Config, law: PILaw, fit: PlantFit, crossover_rad_s: float)
     c = law.controller
     slow = 4.0 * c.Ti_s if math.isfinite(c.Ti_s) else 0.0
     duration = settings.duration_s if settings.duration_s is not None else max(12.0 / crossover_rad_s, slow)
+    if 3.0 * duration > limits.time_s:
+        raise InputError(
+            f"the steps take {3.0 * duration:.4g} s on the rig, limits.time_s = {limits.time_s:g} allows less",
+            where="verification",
+            remedy="raise limits.time_s, or give verification.duration_s",
+        )
     count = math.ceil(duration / T_s)
     step = settings.setpoint_step if settings.setpoint_step is not None else limits.swing / 3.0
     load = settings.disturbance_step

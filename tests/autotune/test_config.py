@@ -119,7 +119,9 @@ def test_the_schema_command_writes_what_editors_read(tmp_path: Path) -> None:
 def _on_register(limits: dict[str, float], **register: Any) -> Config:
     given = load_config(CONFIGS / "servo_sim.toml").model_dump()
     rig = {"kind": "modbus_tcp", "registers": {"y": {"address": 0, "table": "input"}, "u": {"address": 0, **register}}}
-    return Config.model_validate(given | {"rig": rig, "limits": given["limits"] | limits})
+    limits = given["limits"] | limits
+    at = given["operating_point"] | {"u_guess": 0.5 * (limits["u_min"] + limits["u_max"])}
+    return Config.model_validate(given | {"rig": rig, "limits": limits, "operating_point": at})
 
 
 def test_limits_are_cut_inwards_to_what_the_commands_register_can_hold() -> None:
@@ -154,3 +156,26 @@ def test_a_permissive_is_part_of_the_rigs_table(tmp_path: Path) -> None:
     rig = load_config(tmp_path / "door.toml").rig
     assert isinstance(rig, ModbusTcpSettings)
     assert [(one.name, one.type, one.holds(1.0)) for one in rig.permissives] == [("door", "bit", True)]
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "says"),
+    [
+        ("u_guess = 5.0", "u_guess = 0.0", r"u_guess = 0 must lie between limits\.u_min and u_max"),
+        ("phases_deg = [-105.0, -160.0]", "phases_deg = [-30.0, -60.0]", r"phases_deg\.0 = -30.*-91"),
+        ("phases_deg = [-105.0, -160.0]", "phases_deg = [-105.0, -106.0]", "at least 5 degrees apart"),
+        ("sample_time_s = 0.01", "sample_time_s = 1e-308", r"sample_time_s = 1e-308.*1e-6 up to 3600"),
+        ("K = -0.01", "K = 1e300", r"controller\.K = 1e\+300"),
+        ('name = "', 'name = "\\u001b[2J', "control character"),
+        ('name = "', f'name = "{"x" * 300}', "at most 200 characters"),
+    ],
+)
+def test_what_would_end_in_the_middle_of_a_run_is_refused_before_it(
+    tmp_path: Path, before: str, after: str, says: str
+) -> None:
+    shipped = (Path(__file__).parents[2] / "configs" / "ball_sim.toml").read_text()
+    assert before in shipped
+    path = write(tmp_path, shipped.replace(before, after, 1))
+    with pytest.raises(InputError, match=says) as refused:
+        load_config(path)
+    assert len(str(refused.value)) < 400

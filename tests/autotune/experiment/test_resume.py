@@ -142,3 +142,17 @@ def test_a_sidecar_that_tells_no_cycle_is_refused(tmp_path: Path) -> None:
     (tmp_path / "recording.toml").write_text("[[relay]]\nstart_s = 0.0\n")
     with pytest.raises(InputError, match=r"lacks .*begin a new run"):
         read_earlier([tmp_path / "recording.csv"], SAMPLE_S)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.0001, 0.01, 0.3, 0.6, 0.9])
+def test_a_recording_that_lost_its_end_gives_the_cycles_that_are_whole(tmp_path: Path, share: float) -> None:
+    config = ball_config()
+    recording = tmp_path / "recording.csv"
+    done = run_experiment(ball_rig(seed=3), config, recording)
+    assert read_earlier([recording], config.signals.sample_time_s).segments
+    data = recording.read_bytes()
+    recording.write_bytes(data[: int(share * len(data))])
+    earlier = read_earlier([recording], config.signals.sample_time_s)
+    assert len(earlier.segments) < len(done.points)
+    whole = 0.0 if not earlier.recordings else earlier.recordings[0].t[-1] + config.signals.sample_time_s
+    assert all(segment.end_s <= whole for segment in earlier.segments)
