@@ -9,8 +9,11 @@ import numpy as np
 
 from autotune.arrays import FloatArray
 from autotune.errors import IdentificationError, InputError
+from autotune.identification.delay.data import prepare
+from autotune.identification.delay.drift import mean_over_window
 from autotune.identification.delay.identify import identify_delay
 from autotune.identification.delay.model import DelayModel
+from autotune.identification.delay.output_error import Structure
 from autotune.models import Hold
 from autotune.recording import Recording
 
@@ -88,8 +91,8 @@ def track(
 
     Notes
     -----
-    Within a window the parameters are taken as constant: a drift over it is averaged, and its interval covers the
-    average. A window that excites too little is reported with the reason, not bridged; rows without a y, as a link
+    A model is that of the parameters' means over the window: where they moved within it, linearly in time, the means and
+    their intervals are those of a fit that lets them (:mod:`autotune.identification.delay.drift`). A window that excites too little is reported with the reason, not bridged; rows without a y, as a link
     loses them, are left out.
     """
     begin, end = float(recording.t[0]), float(recording.t[-1])
@@ -119,7 +122,9 @@ def track(
 
         try:
             last = _fit_window(fit, last)
-            yield Window(end_s=float(at), model=last)
+            data = prepare(part, hold=hold, start_s=at - window_s, skip_missing=True)
+            structure = Structure(order=order, integrator=integrator)
+            yield Window(end_s=float(at), model=mean_over_window(data, structure, last))
         except IdentificationError as error:
             yield Window(end_s=float(at), model=None, reason=error.what)
 

@@ -169,3 +169,38 @@ def test_a_rig_is_watched_while_its_present_loop_runs(tmp_path):
     assert float(last["time_constant_1"]) == pytest.approx(0.08, rel=0.05)
     assert last["verdict"] == "keep"
     assert (out / "recording.csv").is_file()
+
+
+def drifting_loop(seed: int, delay_rate: float, gain_rate: float) -> Recording:
+    """The loop of the others with a dead time or a gain that moves all the time, and set-points far apart or near."""
+    from scipy.signal import cont2discrete, tf2ss
+
+    dt, rng = 0.02, np.random.default_rng(seed)
+    A, B, C, _, _ = cont2discrete(tf2ss([1.0], np.polymul([2.0, 1.0], [0.5, 1.0])), dt)
+    t = np.arange(6000) * dt
+    r = np.repeat(rng.uniform(-1.0, 1.0, 24), 250 if seed % 2 else 700)[: t.size]
+    u, y, x, integral = np.zeros(t.size), np.zeros(t.size), np.zeros(2), 0.0
+    for k in range(t.size):
+        y[k] = float((C @ x)[0]) + 0.01 * rng.standard_normal()
+        e = r[k] - y[k]
+        integral += dt * e
+        u[k] = 0.8 * (e + integral / 2.2)
+        late = np.interp(t[k] - (0.4 + delay_rate * t[k]), t[: k + 1], u[: k + 1], left=0.0)
+        x = A @ x + B[:, 0] * (2.0 + gain_rate * t[k]) * late
+    return Recording(t=t, u=u + 4.0, y=y + 10.0, name="drifting loop")
+
+
+def test_a_parameter_that_moves_within_a_window_has_its_mean_inside_the_interval():
+    """Where the set-point moved tells more about then than about the window's mean; constants alone miss it."""
+    misses = []
+    for seed, (delay_rate, gain_rate) in enumerate([(0.004, 0.0), (0.004, 0.0), (0.0, 0.006), (0.0, 0.006)]):
+        for fit in track(drifting_loop(seed, delay_rate, gain_rate), 2, window_s=60.0, every_s=30.0, max_delay_s=5.0):
+            if fit.model is None:
+                continue
+            middle = fit.end_s - 30.0
+            found = {q.name: q for q in quantities(fit.model)}
+            for name, truth in {"dead time": 0.4 + delay_rate * middle, "gain": 2.0 + gain_rate * middle}.items():
+                misses.append((found[name].value - truth) / found[name].sd)
+    assert len(misses) >= 12
+    assert np.mean(np.abs(misses) < 1.96) >= 0.9
+    assert np.sqrt(np.mean(np.square(misses))) < 1.3
