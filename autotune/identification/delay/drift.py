@@ -1,7 +1,7 @@
 """Parameters that move within a window: the mean of each over the window, and an interval that holds it.
 
-A model with constant parameters, fitted to a record in which one of them moved, gives its value where the record excited
-most, and the interval of a constant. Here every coefficient, the gain and the delay may also move linearly in time: the
+A model with constant parameters, fitted to a record in which one of them moved, gives its value where the record
+excited most, and the interval of a constant. Here every coefficient, the gain and the delay may also move linearly in time: the
 sensitivity to that is, for a movement that is slow against the plant, the sensitivity to the parameter times the time
 from the window's middle. What the joint fit moves the level by is what the constant fit was off the mean by.
 """
@@ -22,7 +22,7 @@ from autotune.identification.delay.response import output
 
 #: Probability with which constants may be taken for moving.
 _LEVEL = 0.05
-#: Gauss-Newton steps of the joint fit, and the step of a difference in standard deviations.
+#: Step of a difference, in standard deviations.
 _STEP = 0.1
 
 
@@ -48,7 +48,6 @@ def mean_over_window(data: DelayData, structure: Structure, model: DelayModel) -
     -----
     First order in the drift; what moves faster than the window is averaged as the record weights it.
     """
-    n = structure.order
     usable = data.usable_from(model.delay_s * 1.02)
     whitening = np.array(model.noise_ar)
     point = solve_linear(usable, structure, model.a, model.delay_s, whitening)

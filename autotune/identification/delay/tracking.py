@@ -91,9 +91,9 @@ def track(
 
     Notes
     -----
-    A model is that of the parameters' means over the window: where they moved within it, linearly in time, the means and
-    their intervals are those of a fit that lets them (:mod:`autotune.identification.delay.drift`). A window that excites too little is reported with the reason, not bridged; rows without a y, as a link
-    loses them, are left out.
+    A model is that of the parameters' means over the window: where they moved within it, linearly in time, the means
+    and their intervals are those of a fit that lets them (:mod:`autotune.identification.delay.drift`). A window that
+    excites too little is reported with the reason, not bridged; rows without a y, as a link loses them, are left out.
     """
     begin, end = float(recording.t[0]), float(recording.t[-1])
     if not every_s > 0.0 or not 0.0 < window_s <= end - begin:
