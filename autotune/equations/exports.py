@@ -207,8 +207,8 @@ def as_python(model: EquationModel) -> str:
 
 _PYTHON_TAKEN = (
     "False None True and as assert async await break class continue def del elif else except finally for from global "
-    "if import in is lambda nonlocal not or pass raise return try while with yield x p t inputs math derivatives output "
-    "min max abs _sign STATES INPUTS DELAYS PARAMETERS "
+    "if import in is lambda nonlocal not or pass raise return try while with yield x p t inputs math derivatives "
+    "output min max abs _sign STATES INPUTS DELAYS PARAMETERS "
 )
 _PYTHON_WORDS = frozenset(_PYTHON_TAKEN.split())
 
