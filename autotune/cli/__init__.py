@@ -44,6 +44,7 @@ from autotune.cli import (  # noqa: E402, F401, I001
     design,
     references,
     diagnose,
+    model,
     investigate,
     batch,
     prove,
@@ -70,7 +71,7 @@ TOUR = {
         "reference",
         "controller",
     ),
-    "In operation, and where model and rig differ": ("watch", "simulate", "diagnose", "batch", "prove"),
+    "In operation, and where model and rig differ": ("watch", "model", "simulate", "diagnose", "batch", "prove"),
 }
 
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -12,6 +13,11 @@ from autotune.cli.common import OVERWRITE
 from autotune.cli.recordings import R, T, U, Y, read_all, read_one, signal_names
 from autotune.errors import InputError
 from autotune.outputs import Output, OutputFolder
+
+if TYPE_CHECKING:
+    from autotune.equations import EquationModel
+    from autotune.equations.black_box import BlackBox
+    from autotune.recording import Recording
 
 
 @app.command()
@@ -33,14 +39,14 @@ def simulate(
     import numpy as np
 
     from autotune.diagnosis.simulation.forecast import forecast
-    from autotune.equations import forecast as of_equations
+    from autotune.equations.files import forecast_any as of_any
     from autotune.equations.files import read_any_model
     from autotune.models import Model
 
     place = Output(out, inputs=(recording, model), overwrite=overwrite)
     data = read_one(recording, signal_names(t, u, y, r), moving=False)
     nominal = read_any_model(model)
-    y_sim = forecast(nominal, data, horizon) if isinstance(nominal, Model) else of_equations(nominal, data, horizon)
+    y_sim = forecast(nominal, data, horizon) if isinstance(nominal, Model) else of_any(nominal, data, horizon)
     if not np.all(np.isfinite(y_sim)):
         at = float(data.t[int(np.argmax(~np.isfinite(y_sim)))])
         raise InputError(
@@ -84,14 +90,18 @@ def diagnose(
     from autotune.controller import read_controller
     from autotune.diagnosis.diagnose import diagnose as find
     from autotune.diagnosis.effects import kind_of
+    from autotune.equations.files import read_any_model
     from autotune.experiment_design.next_experiment import with_next_experiment
-    from autotune.models import read_model, write_model
+    from autotune.models import Model, write_model
     from autotune.report.diagnosis_page import write_diagnosis_page
 
     files = ("diagnosis.json", "extended_model.toml", "report.html")
     place = OutputFolder(out, files, inputs=(model, controller, *recordings), overwrite=overwrite)
-    nominal = read_model(model)
+    nominal = read_any_model(model)
     data = read_all(recordings, signal_names(t, u, y, r))
+    if not isinstance(nominal, Model):
+        _diagnose_equations(nominal, data, without or (), place, out, model)
+        return
     law = None if controller is None else read_controller(controller)
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
     # many short products: waiting for each other costs linear algebra's threads more than they save
@@ -115,4 +125,39 @@ def diagnose(
         typer.echo(sentence)
     if found.description is not None:
         typer.echo(found.description.sentence)
+    typer.echo(f"diagnosis.json, extended_model.toml and report.html are in {out}")
+
+
+def _diagnose_equations(
+    nominal: EquationModel | BlackBox,
+    data: Sequence[Recording],
+    without: Sequence[str],
+    place: OutputFolder,
+    out: Path,
+    model: Path,
+) -> None:
+    """Diagnose a model of equations and write its files."""
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+    from threadpoolctl import threadpool_limits
+
+    from autotune.diagnosis.equations import diagnose_equations
+    from autotune.equations.effects import equation_of
+    from autotune.equations.files import write_any
+    from autotune.report.equations_page import write_equations_page
+
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
+    with threadpool_limits(1), Progress(*columns, console=Console(stderr=True), transient=True) as progress:
+        task = progress.add_task("diagnosing", total=1.0)
+        found = diagnose_equations(
+            nominal, data, without, lambda what, share: progress.update(task, description=what, completed=share)
+        )
+    with place.filled() as folder:
+        found.write(folder / "diagnosis.json")
+        extended = found.extended_model
+        written = {e.name: equation_of(found.equations, e) for e in extended.effects}
+        write_any(extended, folder / "extended_model.toml", written, model.parent)
+        write_equations_page(found, folder / "report.html")
+    for sentence in found.sentences:
+        typer.echo(sentence)
     typer.echo(f"diagnosis.json, extended_model.toml and report.html are in {out}")

@@ -231,7 +231,7 @@ def _speed_and_position(model: EquationModel, effect: Effect) -> tuple[Expressio
         if port is None:
             raise InputError(f"no port {effect.port!r}", where=model.name, remedy="declare it with [[port]]")
         across = port.across
-        position = _position_under(model, across) if across is not None else None
+        position = position_under(model, across) if across is not None else None
         return across, position if position is not None else across
     name = effect.state or next((s.name for s in model.states if s.kind in ("position", "level", "temperature")), "")
     state = next((one for one in model.states if one.name == name), None)
@@ -242,7 +242,7 @@ def _speed_and_position(model: EquationModel, effect: Effect) -> tuple[Expressio
     return Name(name), Name(state.of) if state.of else Name(name)
 
 
-def _position_under(model: EquationModel, across: Expression) -> Expression | None:
+def position_under(model: EquationModel, across: Expression) -> Expression | None:
     """Return the difference of positions whose speeds a port lies across, where every name in it is a speed."""
     of = {one.name: one.of for one in model.states if one.of}
     known = {one.name for one in model.states}

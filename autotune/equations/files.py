@@ -3,19 +3,30 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
 from typing import TypeAlias
 
+import tomli_w
+
+from autotune.arrays import FloatArray
+from autotune.equations.black_box import BlackBox, run_closed
 from autotune.equations.chain import chain_with_inputs
+from autotune.equations.fmu import fmu_of
+from autotune.equations.forecast import forecast
 from autotune.equations.model import EquationModel
-from autotune.equations.read import equations_of
+from autotune.equations.read import content_of, equations_of, write_equations
+from autotune.errors import InputError
 from autotune.models import Model, read_model
+from autotune.recording import Recording
 from autotune.text_files import read_toml
 
-AnyModel: TypeAlias = Model | EquationModel
+AnyModel: TypeAlias = Model | EquationModel | BlackBox
 
 
 def read_any_model(path: str | os.PathLike[str]) -> AnyModel:
-    """Read a model file: a chain of blocks, with one input or several, or equations.
+    """Read a model file: a chain of blocks, with one input or several, equations, or an FMU.
 
     Raises
     ------
@@ -25,6 +36,59 @@ def read_any_model(path: str | os.PathLike[str]) -> AnyModel:
     content = read_toml(path)
     if "block" in content and isinstance(content.get("input"), list):
         return chain_with_inputs(content, str(path))
+    if "fmu" in content:
+        return fmu_of(content, str(path))
     if "state" not in content:
         return read_model(path)
     return equations_of(content, str(path))
+
+
+def write_any(
+    model: EquationModel | BlackBox, path: Path, equations: Mapping[str, str] | None = None, base: Path | None = None
+) -> None:
+    """Write a model file that :func:`read_any_model` reads back.
+
+    Parameters
+    ----------
+    model : EquationModel or BlackBox
+        What to write.
+    path : path
+        Where to.
+    equations : mapping of effect name to equation, optional
+        For the reader.
+    base : path, optional
+        Folder that an FMU's path counted from so far.
+
+    Raises
+    ------
+    InputError
+        A Python function, which no file holds.
+    """
+    if isinstance(model, EquationModel):
+        write_equations(model, path, equations)
+        return
+    if "fmu" not in model.source:
+        raise InputError("a Python function is no file", where=model.name, remedy="write its equations, or an FMU")
+    shell = content_of(replace(model.shell(), parameters=model.parameters), equations)
+    for table, variable in zip(shell["input"], model.source["variables"], strict=True):
+        table["variable"] = variable
+    fmu = ((base or Path()) / model.source["fmu"]).resolve()
+    content = {"name": model.name, "fmu": str(fmu), "input": shell["input"], "output": {"value": model.source["value"]}}
+    content["output"] |= {"unit": model.output_unit} if model.output_unit else {}
+    content |= {key: shell[key] for key in ("parameters", "effect") if key in shell}
+    Path(path).write_bytes(tomli_w.dumps(content).encode())
+
+
+def forecast_any(model: EquationModel | BlackBox, recording: Recording, horizon_s: float | None = None) -> FloatArray:
+    """Simulate equations or a closed model with a recording's inputs, see :func:`autotune.equations.forecast.forecast`.
+
+    Raises
+    ------
+    InputError
+        As there; a horizon for a closed model, whose state cannot be set.
+    """
+    if isinstance(model, EquationModel):
+        return forecast(model, recording, horizon_s)
+    if horizon_s is not None:
+        raise InputError("the state of a closed model cannot be set", where="--horizon", remedy="leave --horizon out")
+    return run_closed(model, recording)

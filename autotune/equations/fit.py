@@ -88,7 +88,7 @@ def window_rows(t: FloatArray, horizon_s: float | None) -> tuple[IntArray, IntAr
 def values_of(compiled: Compiled, z: FloatArray) -> FloatArray:
     """Return the parameters at distances z from their nominal values, in units of what is believed of them."""
     value, spread = compiled.parameter_vector, np.array([p.spread for p in compiled.parameters])
-    moved = np.where(value == 0.0, spread * z, value * np.exp(np.clip(spread * z, -50.0, 50.0)))
+    moved = np.where(_linear(compiled), value + spread * z, value * np.exp(np.clip(spread * z, -50.0, 50.0)))
     return np.asarray(np.where(spread > 0.0, moved, value), dtype=np.float64)
 
 
@@ -157,6 +157,7 @@ def retune(
     compiled: Compiled,
     recordings: Sequence[Recording],
     *,
+    longest_s: float = np.inf,
     free: BoolArray | None = None,
     progress: Callable[[float], None] = lambda share: None,
 ) -> Fitted:
@@ -166,6 +167,8 @@ def retune(
     ----------
     compiled, recordings, free, progress
         As for :func:`fit`.
+    longest_s : float
+        Length of the longest windows [s], where that is not to be the whole recording.
 
     Returns
     -------
@@ -179,7 +182,7 @@ def retune(
         As :func:`fit`.
     """
     whole = max(float(one.t[-1] - one.t[0]) for one in recordings)
-    longest = min(compiled.model.horizon_s or np.inf, whole)
+    longest = min(compiled.model.horizon_s or np.inf, longest_s, whole)
     rows = min(len(one) for one in recordings)
     counts = [count for count in SHORT_TO_LONG if rows * longest / whole / count >= LEAST_ROWS]
     lengths = [longest / count for count in counts or [1]]
@@ -256,7 +259,7 @@ class _Descent:
         z, compiled = self._z, self._compiled
         p = values_of(compiled, z)
         spread = np.array([q.spread for q in compiled.parameters])
-        per_z = np.where(compiled.parameter_vector == 0.0, spread, p * spread)
+        per_z = np.where(_linear(compiled), spread, p * spread)
         steps = STEP * np.maximum(np.abs(p), np.abs(per_z))
         steps = np.where(steps > 0.0, steps, STEP)
         found = []
@@ -336,7 +339,7 @@ class _Descent:
         J = np.vstack([part for part, _ in self._derivatives()]) / self._sd
         covariance = np.linalg.inv(J.T @ J + np.eye(self._which.size))
         spread = np.array([q.spread for q in compiled.parameters])
-        per_z = np.where(compiled.parameter_vector == 0.0, spread, np.abs(p) * spread)
+        per_z = np.where(_linear(compiled), spread, np.abs(p) * spread)
         sd, whole = np.zeros(p.size), np.zeros((J.shape[0], p.size))
         sd[self._which] = np.sqrt(np.diag(covariance)) * per_z[self._which]
         whole[:, self._which] = J
@@ -349,6 +352,11 @@ class _Descent:
             compiled=compiled, parameters=p, sd=sd, z=self._z, windows=tuple(one.windows for one in self._data),
             simulated=simulated, residuals=residuals, noise_sd=self._sd, jacobian=whole, converged=converged,
         )  # fmt: skip
+
+
+def _linear(compiled: Compiled) -> BoolArray:
+    """Return which parameters are sought on a linear scale."""
+    return np.array([p.linear or p.value == 0.0 for p in compiled.parameters], dtype=bool)
 
 
 def _covered(rows: int, windows: Windows) -> BoolArray:

@@ -90,12 +90,15 @@ class ModelParameter:
         Its nominal value.
     spread : float
         Relative standard deviation of what is believed (absolute where the value is 0); 0: it is not retuned.
+    linear: bool
+        Whether it may change its sign: it is sought as ``value + spread z``, and the spread is absolute.
     """
 
     name: str
     value: float
     unit: str = ""
     spread: float = SPREAD
+    linear: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)

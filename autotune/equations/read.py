@@ -64,11 +64,11 @@ def equations_of(content: Mapping[str, Any], where: str) -> EquationModel:
     horizon = content.get("horizon_s")
     model = EquationModel(
         name=str(content.get("name", Path(where).stem)),
-        inputs=tuple(_input(one, f"{where} [[input]] {i + 1}") for i, one in enumerate(inputs)),
+        inputs=tuple(input_of(one, f"{where} [[input]] {i + 1}") for i, one in enumerate(inputs)),
         output=_expression(output, "value", f"{where} [output]"),
         output_unit=_text(output, "unit", f"{where} [output]"),
         states=tuple(_state(one, f"{where} [[state]] {i + 1}") for i, one in enumerate(states)),
-        parameters=tuple(_parameter(n, one, where) for n, one in _table(content, "parameters", where).items()),
+        parameters=tuple(parameter_of(n, one, where) for n, one in _table(content, "parameters", where).items()),
         defines=tuple(
             (name, parse(_scalar(text, f"{where} [define] {name}"), f"{where} [define] {name}"))
             for name, text in _table(content, "define", where).items()
@@ -147,7 +147,8 @@ def _positive(value: Any, key: str, where: str) -> float:
     return float(value)
 
 
-def _input(table: Mapping[str, Any], where: str) -> InputColumn:
+def input_of(table: Mapping[str, Any], where: str) -> InputColumn:
+    """Return the input that an ``[[input]]`` table states."""
     _known(table, {"column", "unit", "hold", "kind", "delay", "offset"}, where)
     delay = _real(table.get("delay", 0.0), "delay", where)
     if delay < 0.0:
@@ -174,7 +175,8 @@ def _state(table: Mapping[str, Any], where: str) -> State:
     )
 
 
-def _parameter(name: str, given: Any, where: str) -> ModelParameter:
+def parameter_of(name: str, given: Any, where: str) -> ModelParameter:
+    """Return the parameter that a ``[parameters.NAME]`` table, or a number alone, states."""
     where = f"{where} [parameters.{name}]"
     table = given if isinstance(given, dict) else {"value": given}
     _known(table, {"value", "unit", "spread", "fixed", "sd"}, where)

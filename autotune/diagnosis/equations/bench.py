@@ -1,0 +1,467 @@
+"""What a search asks of a model: fit it with effects, try one more, and tell what numbers and starts can explain."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from types import MappingProxyType
+from typing import Protocol
+
+import numpy as np
+
+from autotune.arrays import BoolArray, FloatArray
+from autotune.diagnosis.equations.candidates import Signals, Trial
+from autotune.equations.effects import Applied, apply, with_values
+from autotune.equations.expressions import Expression, to_text
+from autotune.equations.fit import Fitted, fit, retune, values_of
+from autotune.equations.model import EquationModel, ModelParameter
+from autotune.equations.sensitivity import Windows
+from autotune.equations.simulate import Compiled, Drive, compile_model, drive_of, simulate
+from autotune.equations.starts import fitted_starts
+from autotune.errors import InputError
+from autotune.models import Effect, Parameter
+from autotune.recording import Recording
+
+#: Parameters of effects that may have either sign, and those that are not sought.
+SIGNED = frozenset({"high", "low", "second_order", "third_order", "offset", "phase", "time", "in_phase", "quadrature",
+                    "amplitude", "fold"})  # fmt: skip
+SIGNED_RATES = frozenset({"actuator.gain_drift", "sensor.drift", "environment.drifting_load", "plant.leak",
+                          "plant.cubic_stiffness"})  # fmt: skip
+GIVEN = frozenset({"origin", "zero", "surroundings", "stiffness", "end"})
+#: Parameters that act on samples or delays: sought from outside, by direct search.
+OUTER = frozenset({("actuator.backlash", "width"), ("actuator.stiction", "band"), ("timing.dead_time", "delay")})
+#: Windows per recording that a search works on: long enough to tell, short enough to converge.
+WINDOWS = 3
+#: Share of the recording that is kept for judging, and of that the share that a start state is found from.
+HELD_OUT, SETTLED = 1.0 / 3.0, 0.15
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Outcome:
+    """A model fitted with effects.
+
+    Attributes
+    ----------
+    effects : tuple of Effect
+        With their fitted values; the model's own first.
+    fitted : Fitted
+        The fit.
+    count : int
+        Numbers that were fitted, start states apart.
+    residual : (rows,) array
+        Reading less simulation at the rows that count, all recordings.
+    """
+
+    effects: tuple[Effect, ...]
+    fitted: Fitted
+    count: int
+    residual: FloatArray
+
+    @property
+    def rss(self) -> float:
+        """Residual sum of squares."""
+        return float(self.residual @ self.residual)
+
+
+class Bench(Protocol):
+    """A model that a search works on; ``model`` are its equations, or the shell of a closed model."""
+
+    @property
+    def model(self) -> EquationModel:
+        """The equations, or a shell with the same inputs."""
+        ...
+
+    @property
+    def recordings(self) -> tuple[Recording, ...]:
+        """What was measured; readings that do not count are no numbers."""
+        ...
+
+    @property
+    def is_closed(self) -> bool:
+        """Whether only inputs and reading can be reached."""
+        ...
+
+    def retuned(self) -> Outcome:
+        """Return the model with its own numbers retuned."""
+        ...
+
+    def as_it_is(self, retuned: Outcome) -> Outcome:
+        """Return the model with its nominal numbers."""
+        ...
+
+    def fitted(self, effects: Sequence[Effect], start: Outcome, iterations: int) -> Outcome:
+        """Return the model fitted with effects, from where another fit ended."""
+        ...
+
+    def with_trial(self, outcome: Outcome, effect: Effect) -> FloatArray | None:
+        """Return how the readings change at the rows that count with one more effect, None where it runs away."""
+        ...
+
+    def explained(self, outcome: Outcome) -> FloatArray:
+        """Return an orthonormal basis of what numbers can explain at the rows that count."""
+        ...
+
+    def without_starts(self, outcome: Outcome, d: FloatArray) -> FloatArray:
+        """Return a change of the readings without what other start states make of it."""
+        ...
+
+    def signals(self, outcome: Outcome) -> Signals:
+        """Return what the recordings show under a fit."""
+        ...
+
+    def periodic(self, outcome: Outcome, signals: Signals) -> list[Trial]:
+        """Return loads at the frequencies that stand out of a residual."""
+        ...
+
+    def held_out_error(self, outcome: Outcome, refits: bool) -> float:
+        """Return the rms error on the last third of every recording, the numbers fitted to the rest."""
+        ...
+
+
+class EquationBench:
+    """Equations on recordings.
+
+    Parameters
+    ----------
+    model : EquationModel
+        The nominal model.
+    recordings : sequence of Recording
+        What was measured.
+    good : sequence of (N,) bool array
+        Rows whose reading counts.
+    """
+
+    def __init__(self, model: EquationModel, recordings: Sequence[Recording], good: Sequence[BoolArray]) -> None:
+        self._model = model
+        self._recordings = tuple(
+            replace(r, y=np.where(ok, r.y, np.nan)) for r, ok in zip(recordings, good, strict=True)
+        )
+        self._rows = [np.isfinite(r.y) for r in self.recordings]
+        self._drives = [drive_of(model, r) for r in self.recordings]
+        span = max(float(r.t[-1] - r.t[0]) for r in recordings)
+        self.length_s = model.horizon_s or span / WINDOWS
+
+    @property
+    def model(self) -> EquationModel:
+        """The equations."""
+        return self._model
+
+    @property
+    def recordings(self) -> tuple[Recording, ...]:
+        """What was measured; readings that do not count are no numbers."""
+        return self._recordings
+
+    @property
+    def is_closed(self) -> bool:
+        """Every state can be reached."""
+        return False
+
+    def retuned(self) -> Outcome:
+        """Return the model with its own numbers retuned, on windows of the search's length."""
+        compiled, _ = self._compiled(self.model.effects, {})
+        found = retune(compiled, self.recordings, longest_s=self.length_s)
+        return self._outcome(tuple(self.model.effects), found)
+
+    def as_it_is(self, retuned: Outcome) -> Outcome:
+        """Return the model with its nominal numbers, only start states fitted."""
+        compiled, _ = self._compiled(self.model.effects, {})
+        none = np.zeros(len(compiled.parameters), dtype=bool)
+        try:
+            found = fit(compiled, self.recordings, free=none, windows=retuned.fitted.windows, iterations=4)
+        except InputError:
+            return retuned
+        return self._outcome(tuple(self.model.effects), found)
+
+    def held_out_error(self, outcome: Outcome, refits: bool) -> float:
+        """Return the rms error on the last third of every recording, the numbers fitted to the rest."""
+        compiled, applied = self._compiled(outcome.effects, self._spreads())
+        cuts = [int((1.0 - HELD_OUT) * len(r)) for r in self.recordings]
+        z = np.zeros(len(compiled.parameters))
+        own = len(self.model.parameters)
+        z[:own] = outcome.fitted.z[:own]
+        each = list(zip(self.recordings, cuts, outcome.fitted.windows, strict=True))
+        errors = []
+        try:
+            if refits:
+                first = [replace(r, y=np.where(np.arange(len(r)) < k, r.y, np.nan)) for r, k, _ in each]
+                windows = [_until(w, k) for _, k, w in each]
+                z = fit(
+                    compiled, [_driven(r, self.model, applied) for r in first], z=z, windows=windows, iterations=8
+                ).z
+            p = values_of(compiled, z)
+            for r, k, _ in each:
+                drive = applied.before(drive_of(self.model, r))
+                at, end, judged = np.array([k]), np.array([len(r)]), k + int(SETTLED * (len(r) - k))
+                w = fitted_starts(compiled, p, drive, r.y, np.isfinite(r.y), at, end, share=SETTLED)
+                y = applied.after(simulate(compiled, p, drive, w.states, starts=at, stops=end).y)
+                errors.append((r.y - np.nan_to_num(y, nan=1e150))[judged:])
+        except InputError:
+            return float("inf")
+        e = np.concatenate(errors)
+        return float(np.sqrt(np.nanmean(e**2)))
+
+    def periodic(self, outcome: Outcome, signals: Signals) -> list[Trial]:
+        """Return loads at the frequencies that stand out of a residual."""
+        residual = max(outcome.fitted.residuals, key=len)
+        e = np.nan_to_num(residual - np.nanmean(residual)) * np.hanning(residual.size)
+        power = np.abs(np.fft.rfft(e))
+        power[:3] = 0.0
+        found = []
+        for k in np.argsort(-power)[:3]:
+            frequency = float(np.fft.rfftfreq(e.size, signals.dt_s)[k])
+            for name, size in signals.sizes.items():
+                state = next((s for s in self.model.states if s.name == name), None)
+                if (self.model.ports and state) or (state and state.kind not in ("speed", "level", "temperature")):
+                    continue
+                for key in ("in_phase", "quadrature"):
+                    values = {"in_phase": 1e-6 * size, "quadrature": 1e-6 * size, key: 0.05 * size}
+                    parameters = {k: Parameter(value=v) for k, v in (values | {"frequency": frequency}).items()}
+                    where = {"state" if state else "port": name}
+                    effect = Effect(name="environment.periodic_load", parameters=parameters, **where)
+                    found.append(Trial(effect=effect, scaled=(key,)))
+        return found
+
+    def _compiled(self, effects: Sequence[Effect], spreads: Mapping[str, float]) -> tuple[Compiled, Applied]:
+        applied = apply(self.model, effects)
+        late = tuple(replace(one, delay_s=float(d)) for one, d in zip(self.model.inputs, applied.delays, strict=True))
+        compiled = compile_model(replace(self.model, inputs=late), applied.extensions)
+        own = len(self.model.parameters)
+        scaled_for_search = tuple(sought(p, effects, spreads) for p in compiled.parameters[own:])
+        return replace(compiled, parameters=(*compiled.parameters[:own], *scaled_for_search)), applied
+
+    def _spreads(self) -> dict[str, float]:
+        u = np.concatenate([r[self.model.columns[0]] for r in self.recordings])
+        span = max(float(r.t[-1] - r.t[0]) for r in self.recordings)
+        size = {"high": float(np.std(u)), "low": float(np.std(u)), "time": 0.2 * span, "phase": 1.0}
+        spread = max(float(np.max(s)) for s in self._sizes.values()) if self._sizes else 0.0
+        return size | ({"in_phase": spread, "quadrature": spread} if spread else {})
+
+    def fitted(self, effects: Sequence[Effect], start: Outcome, iterations: int = 15) -> Outcome:
+        """Return the model fitted with effects; what acts on samples is sought by a direct search around."""
+        outer = [(i, key) for i, e in enumerate(effects) for key in e.parameters if (e.name, key) in OUTER]
+        if not outer or iterations < 5:
+            return self._inner(effects, start, iterations)
+        i, key = outer[-1]
+        best, tried = None, float(effects[i].parameters[key].value)
+        factor = 2.0
+        while factor > 1.03:
+            for value in (tried / factor, tried * factor) if best else (tried / factor, tried, tried * factor):
+                try:
+                    new = self._inner(_changed(effects, i, key, value), best or start, 4)
+                except InputError:
+                    continue
+                if best is None or new.rss < best.rss:
+                    best = new
+            if best is None:
+                break
+            moved = float(best.effects[i].parameters[key].value)
+            factor = factor if moved != tried and factor < 2.5 else np.sqrt(factor)
+            tried = moved
+        return best or self._inner(effects, start, iterations)
+
+    def _inner(self, effects: Sequence[Effect], start: Outcome, iterations: int) -> Outcome:
+        compiled, applied = self._compiled(effects, self._spreads())
+        z = np.zeros(len(compiled.parameters))
+        own = len(self.model.parameters)
+        z[:own] = start.fitted.z[:own]
+        windows = [
+            Windows(starts=w.starts, stops=w.stops, states=self._states(compiled, start, w, k))
+            for k, w in enumerate(start.fitted.windows)
+        ]
+        recordings = [_driven(r, self.model, applied) for r in self.recordings]
+        found = fit(compiled, recordings, z=z, windows=windows, iterations=iterations)
+        return self._outcome(tuple(effects), found)
+
+    def _states(self, compiled: Compiled, start: Outcome, w: Windows, number: int) -> FloatArray:
+        """Return start states by name, those of new effects at what they would hold at rest."""
+        known = dict(zip(start.fitted.compiled.states, w.states.T, strict=True))
+        u = self._drives[number].inputs[np.maximum(w.starts - 1, 0), 0] - self.model.inputs[0].offset
+        y = np.nan_to_num(start.fitted.simulated[number][w.starts])
+        columns = []
+        for name in compiled.states:
+            at_command = name.startswith(("lag_", "asymmetric_lag_", "rate_limit_"))
+            at_reading = name.startswith(("slow_mode_", "resonance_")) and name.endswith("memory")
+            fresh = u if at_command else y if at_reading else np.zeros(w.starts.size)
+            if at_command and any(e.name == "sensor.lag" for e in start.effects):
+                fresh = y
+            columns.append(known.get(name, fresh))
+        return np.column_stack(columns)
+
+    def _outcome(self, effects: tuple[Effect, ...], found: Fitted) -> Outcome:
+        values = {
+            p.name: (float(v), float(s))
+            for p, v, s in zip(found.compiled.parameters, found.parameters, found.sd, strict=True)
+        }
+        residual = np.concatenate([r[ok] for r, ok in zip(found.residuals, self._rows, strict=True)])
+        outer = sum((e.name, key) in OUTER for e in effects for key in e.parameters)
+        count = sum(p.spread > 0.0 for p in found.compiled.parameters) + outer
+        return Outcome(effects=with_values(effects, values), fitted=found, count=count, residual=residual)
+
+    def _simulated(self, compiled: Compiled, applied: Applied, outcome: Outcome) -> FloatArray | None:
+        """Return readings at the rows that count, the outcome's numbers and start states given."""
+        own = len(self.model.parameters)
+        p = compiled.parameter_vector
+        p[:own] = outcome.fitted.parameters[:own]
+        parts = []
+        for k, (drive, w) in enumerate(zip(self._drives, outcome.fitted.windows, strict=True)):
+            x = self._states(compiled, outcome, w, k)
+            run = simulate(compiled, p, applied.before(drive), x, starts=w.starts, stops=w.stops)
+            parts.append(run.y[self._rows[k]])
+        y = np.concatenate(parts)
+        return y if np.all(np.isfinite(y)) else None
+
+    def with_trial(self, outcome: Outcome, effect: Effect) -> FloatArray | None:
+        """Return how the readings change with one more effect, everything else as it is."""
+        base = self._simulated(*self._compiled(outcome.effects, {}), outcome)
+        new = self._simulated(*self._compiled((*outcome.effects, effect), {}), outcome)
+        return None if base is None or new is None else new - base
+
+    def explained(self, outcome: Outcome) -> FloatArray:
+        """Return an orthonormal basis of what the numbers of a fit can explain, start states projected out."""
+        J = outcome.fitted.jacobian
+        U, s, _ = np.linalg.svd(J, full_matrices=False)
+        return np.asarray(U[:, s > 1.0])
+
+    def without_starts(self, outcome: Outcome, d: FloatArray) -> FloatArray:
+        """Return a change of the readings without what other start states make of it, to first order."""
+        parts, at = [], 0
+        for k, w in enumerate(outcome.fitted.windows):
+            rows = self._rows[k]
+            X = self._start_bases(outcome)[k]
+            here = d[at : at + int(rows.sum())].copy()
+            at += here.size
+            index = np.cumsum(rows) - 1
+            for (a, b), Q in zip(zip(w.starts, w.stops, strict=True), X, strict=True):
+                part = index[a:b][rows[a:b]]
+                here[part] -= Q @ (Q.T @ here[part])
+            parts.append(here)
+        return np.concatenate(parts)
+
+    def _start_bases(self, outcome: Outcome) -> list[list[FloatArray]]:
+        key = id(outcome)
+        if getattr(self, "_bases_of", None) != key:
+            self._bases_of, self._bases = key, [self._basis(outcome, k) for k in range(len(self.recordings))]
+        return self._bases
+
+    def _basis(self, outcome: Outcome, k: int) -> list[FloatArray]:
+        from autotune.equations.sensitivity import STEP, sensitivities
+        from autotune.equations.starts import state_scales
+
+        f = outcome.fitted
+        w = f.windows[k]
+        applied = apply(self.model, outcome.effects)
+        drive = applied.before(self._drives[k])
+        scales = state_scales(f.compiled, f.parameters, drive, w.states[0])
+        s = sensitivities(
+            f.compiled, f.parameters, drive, w, parameter_steps=np.ones(f.parameters.size), state_steps=STEP * scales,
+            which=(),
+        )  # fmt: skip
+        found = []
+        for a, b in zip(w.starts, w.stops, strict=True):
+            X = np.nan_to_num(s.to_states[a:b][self._rows[k][a:b]] * scales)
+            U, v, _ = np.linalg.svd(X, full_matrices=False)
+            found.append(U[:, v > 1e-6 * max(float(v.max(initial=0.0)), 1e-300)])
+        return found
+
+    _sizes: Mapping[str, float] = MappingProxyType({})
+
+    def signals(self, outcome: Outcome) -> Signals:
+        """Return states, differences across ports, and sizes of derivatives under a fit."""
+        model = self.model
+        positions = {one.name: _position_text(model, one.across) for one in model.ports}
+        wanted = {name: name for name in model.state_names}
+        wanted |= {one.name: to_text(one.across) for one in model.ports if one.across is not None}
+        wanted |= {f"{name}:position": text for name, text in positions.items() if text}
+        compiled = compile_model(model, apply(model, outcome.effects).extensions, list(wanted.values()))
+        p = outcome.fitted.parameters
+        runs: list[FloatArray] = []
+        for drive, w in zip(self._drives, outcome.fitted.windows, strict=True):
+            states = self._states(compiled, outcome, w, len(runs))
+            runs.append(simulate(compiled, p, drive, states, starts=w.starts, stops=w.stops).outputs)
+        columns = np.concatenate(runs)
+        columns = columns[np.all(np.isfinite(columns), axis=1)]
+        values = {name: columns[:, 1 + i] for i, name in enumerate(wanted)}
+        dt = float(np.median(np.concatenate([np.diff(r.t) for r in self.recordings])))
+        sizes = {n: float(np.std(np.diff(values[n]) / dt)) + 1e-12 for n in model.state_names}
+        for port in model.ports:
+            sizes[port.name] = self._force_size(outcome, port.name, sizes)
+        self._sizes = sizes
+        duration = max(float(r.t[-1] - r.t[0]) for r in self.recordings)
+        u = np.concatenate([d.inputs[:, 0] for d in self._drives])
+        return Signals(u=u, y=columns[:, 0], values=values, sizes=sizes, dt_s=dt, duration_s=duration,
+                       slow_s=0.05 * duration)  # fmt: skip
+
+    def _force_size(self, outcome: Outcome, port: str, sizes: Mapping[str, float]) -> float:
+        """Return the force at a port that would make the largest derivative as large as it is."""
+        from autotune.equations.expressions import Number
+        from autotune.equations.model import Extension
+        from autotune.equations.simulate import derivatives
+
+        x = np.zeros((1, len(self.model.states)))
+        u = self._drives[0].inputs[:1]
+        p = outcome.fitted.parameters[: len(self.model.parameters)]
+        none = derivatives(compile_model(self.model), p, x, u)[0]
+        one = Extension(name="unit", port={port: Number(1.0)})
+        change = np.abs(derivatives(compile_model(self.model, [one]), p, x, u)[0] - none)[0]
+        ratios = [sizes[n] / c for n, c in zip(self.model.state_names, change, strict=True) if c > 0.0]
+        return max(ratios, default=1.0)
+
+
+def counted(recordings: Sequence[Recording], good: Sequence[BoolArray]) -> tuple[Recording, ...]:
+    """Return recordings whose readings that do not count are no numbers."""
+    return tuple(replace(r, y=np.where(ok, r.y, np.nan)) for r, ok in zip(recordings, good, strict=True))
+
+
+def _driven(recording: Recording, model: EquationModel, applied: Applied) -> Recording:
+    """Return a recording with its inputs as effects on samples leave them."""
+    drive = applied.before(Drive(t=recording.t, inputs=np.column_stack([recording[c] for c in model.columns])))
+    changed = dict(zip(model.columns, drive.inputs.T, strict=True))
+    extra = {name: changed.get(name, values) for name, values in recording.extra.items()}
+    return replace(recording, u=np.ascontiguousarray(changed.get("u", recording.u)), extra=extra)
+
+
+def _changed(effects: Sequence[Effect], i: int, key: str, value: float) -> tuple[Effect, ...]:
+    parameters = dict(effects[i].parameters)
+    parameters[key] = replace(parameters[key], value=value)
+    return (*effects[:i], replace(effects[i], parameters=parameters), *effects[i + 1 :])
+
+
+def scaled(trial: Trial, factor: float) -> Effect:
+    """Return a trial's effect with its amplitude times a factor; what may not change its sign keeps it."""
+    parameters = dict(trial.effect.parameters)
+    for key in trial.scaled:
+        signed = key in SIGNED or trial.effect.name in SIGNED_RATES
+        times = factor if signed else abs(factor)
+        parameters[key] = replace(parameters[key], value=parameters[key].value * times)
+    return replace(trial.effect, parameters=parameters)
+
+
+def sought(p: ModelParameter, effects: Sequence[Effect], spreads: Mapping[str, float]) -> ModelParameter:
+    """Return an effect's parameter with the scale that it is sought on."""
+    number, key = _number_and_key(p.name, effects)
+    if key in GIVEN or p.spread == 0.0 or (effects[number].name == "plant.hard_stop" and key == "damping"):
+        return replace(p, spread=0.0)
+    if key in SIGNED or (key in ("rate", "coefficient") and effects[number].name in SIGNED_RATES):
+        return replace(p, linear=True, spread=spreads.get(key, 3.0 * abs(p.value) + 1e-300))
+    return p
+
+
+def _number_and_key(name: str, effects: Sequence[Effect]) -> tuple[int, str]:
+    for number, effect in enumerate(effects):
+        prefix = f"{effect.name.split('.')[1]}_{number}_"
+        if name.startswith(prefix):
+            return number, name.removeprefix(prefix)
+    raise AssertionError(name)
+
+
+def _position_text(model: EquationModel, across: Expression | None) -> str:
+    from autotune.equations.effects import position_under
+
+    tree = None if across is None else position_under(model, across)
+    return "" if tree is None else to_text(tree)
+
+
+def _until(w: Windows, row: int) -> Windows:
+    """Return the windows that begin before a row, the last one cut there."""
+    keep = w.starts < row - 20
+    return replace(w, starts=w.starts[keep], stops=np.minimum(w.stops[keep], row), states=w.states[keep])

@@ -1,0 +1,231 @@
+"""Which effects can sit where in a model, and with which values they are tried."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from types import MappingProxyType
+
+import numpy as np
+
+from autotune.arrays import FloatArray
+from autotune.equations.model import EquationModel
+from autotune.models import Effect, Parameter
+
+#: Effects by what a state is, or by what acts at a port.
+ON_SPEED = ("plant.coulomb_friction", "plant.quadratic_drag", "plant.viscous_friction", "plant.stribeck_friction")
+ON_POSITION = ("plant.cubic_stiffness", "plant.sine_torque", "plant.hysteresis", "plant.hard_stop")
+ON_LEVEL = ("plant.sqrt_outflow", "plant.leak", "plant.nonlinear_loss")
+ON_TEMPERATURE = ("plant.radiation_loss", "plant.leak", "plant.nonlinear_loss")
+LOADS = ("environment.step_load", "environment.periodic_load", "environment.drifting_load")
+ON_COMMAND = (
+    "actuator.saturation", "actuator.dead_zone", "actuator.nonlinear_gain", "actuator.offset", "actuator.gain_drift",
+    "actuator.lag", "actuator.rate_limit", "actuator.backlash", "actuator.stiction", "timing.dead_time",
+)  # fmt: skip
+ON_READING = ("sensor.lag", "sensor.nonlinear_gain", "sensor.drift")
+BY_KIND = {
+    "speed": ON_SPEED, "level": ON_LEVEL, "temperature": ON_TEMPERATURE, "pressure": ON_LEVEL, "current": (),
+    "force": (*ON_SPEED, *ON_POSITION), "torque": (*ON_SPEED, *ON_POSITION), "flow": ON_LEVEL, "heat": ON_TEMPERATURE,
+}  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True)
+class Trial:
+    """An effect with values to try.
+
+    Attributes
+    ----------
+    effect : Effect
+        With those values.
+    scaled : tuple of str
+        Parameters that are its amplitude: first order tells how large, and with which sign.
+    """
+
+    effect: Effect
+    scaled: tuple[str, ...] = ()
+
+    @property
+    def place(self) -> str:
+        """State, port or input that it acts on, for telling trials of one effect apart."""
+        return self.effect.state or self.effect.port or self.effect.input
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Signals:
+    """What the recordings show under the retuned model.
+
+    Attributes
+    ----------
+    u : (rows,) array
+        The command.
+    y : (rows,) array
+        The simulated reading.
+    values : mapping of state or port to (rows,) arrays
+        States, and differences across ports.
+    sizes : mapping of state or port to float
+        How large a derivative (or a force at a port) typically is.
+    dt_s, duration_s, slow_s : float
+        Sample time, length of a recording, and the slowest lag that is looked for [s].
+    """
+
+    u: FloatArray
+    y: FloatArray
+    values: dict[str, FloatArray]
+    sizes: dict[str, float]
+    dt_s: float
+    duration_s: float
+    slow_s: float
+
+
+def trials(model: EquationModel, signals: Signals, without: Sequence[str] = (), black_box: bool = False) -> list[Trial]:
+    """Return every effect with the values it is tried with.
+
+    Parameters
+    ----------
+    model : EquationModel
+        Says what states, ports and inputs are.
+    signals : Signals
+        Sizes to try.
+    without : sequence of str
+        Effects that are left out.
+    black_box : bool
+        Whether only inputs and output can be reached.
+    """
+    found = [*_on_command(model, signals), *_on_reading(signals)]
+    if not black_box:
+        places: list[tuple[str, str, str]] = [("port", port.name, port.kind) for port in model.ports]
+        if not places:  # without ports effects act on a state's derivative
+            places = [("state", state.name, state.kind) for state in model.states]
+        for key, name, kind in places:
+            for effect in BY_KIND.get(kind, ()):
+                found += _on_place(model, signals, key, name, effect)
+            if kind in ("speed", "level", "temperature", "force", "torque", "flow", "heat"):
+                found += _loads(signals, key, name)
+            if kind == "speed":
+                found += [one for effect in ON_POSITION for one in _on_place(model, signals, key, name, effect)]
+    else:
+        for one in model.inputs:
+            if one.kind:
+                found += _loads(signals, "input", one.column)
+    return [one for one in found if one.effect.name not in without and one.effect.name not in _present(model)]
+
+
+def _present(model: EquationModel) -> set[str]:
+    return {effect.name for effect in model.effects}
+
+
+def _effect(name: str, key: str = "", place: str = "", **values: float) -> Effect:
+    parameters = MappingProxyType({k: Parameter(value=float(v)) for k, v in values.items()})
+    where = {key: place} if key else {}
+    return Effect(name=name, parameters=parameters, **where)
+
+
+def _on_place(model: EquationModel, s: Signals, key: str, name: str, effect: str) -> Iterator[Trial]:
+    """Yield trials of an effect that acts as a force, flow or heat."""
+    force = 0.05 * s.sizes.get(name, 1.0)
+    v = s.values.get(name, np.zeros(1))
+    size = max(float(np.quantile(np.abs(v), 0.9)), 1e-12)
+    state = next((one for one in model.states if one.name == name), None)
+    position = s.values.get(f"{name}:position" if key == "port" else (state.of if state else ""), None)
+    match effect:
+        case "plant.coulomb_friction":
+            yield Trial(effect=_effect(effect, key, name, level=force), scaled=("level",))
+        case "plant.stribeck_friction":
+            for share in (0.03, 0.15):
+                values = {"level": force, "breakaway": 2.0 * force, "stribeck_speed": share * size}
+                yield Trial(effect=_effect(effect, key, name, **values), scaled=("level", "breakaway"))
+        case "plant.viscous_friction":
+            yield Trial(effect=_effect(effect, key, name, coefficient=force / size), scaled=("coefficient",))
+        case "plant.quadratic_drag" | "plant.nonlinear_loss":
+            yield Trial(effect=_effect(effect, key, name, coefficient=force / size**2), scaled=("coefficient",))
+        case "plant.leak":
+            yield Trial(effect=_effect(effect, key, name, rate=force / size), scaled=("rate",))
+        case "plant.sqrt_outflow" if float(np.quantile(v, 0.05)) >= -0.05 * size:
+            yield Trial(effect=_effect(effect, key, name, coefficient=force / np.sqrt(size)), scaled=("coefficient",))
+        case "plant.radiation_loss":
+            yield from _radiation(model, s, key, name, force)
+        case _ if position is not None:
+            yield from _on_position(key, name, effect, force, position, s)
+
+
+def _radiation(model: EquationModel, s: Signals, key: str, name: str, force: float) -> Iterator[Trial]:
+    units = {one.name: one.unit for one in model.states}
+    zero = 0.0 if units.get(name, "").strip().lower() in ("k", "kelvin") else 273.15
+    v = s.values.get(name, np.zeros(1))
+    top = float(np.max(v)) + zero
+    if top > 100.0:
+        ground = float(np.min(v)) + zero
+        values = {"coefficient": force / max(top**4 - ground**4, 1e-300), "zero": zero, "surroundings": ground}
+        # where the surroundings are is not sought: a loss there is the same as an offset
+        yield Trial(effect=_effect("plant.radiation_loss", key, name, **values), scaled=("coefficient",))
+
+
+def _on_position(key: str, name: str, effect: str, force: float, x: FloatArray, s: Signals) -> Iterator[Trial]:
+    span = float(np.max(x) - np.min(x)) + 1e-300
+    match effect:
+        case "plant.cubic_stiffness":
+            size = float(np.quantile(np.abs(x), 0.95)) + 1e-300
+            yield Trial(effect=_effect(effect, key, name, coefficient=force / size**3), scaled=("coefficient",))
+        case "plant.sine_torque":
+            for period in (0.2 * span, 0.35 * span, 0.6 * span, 2.0 * np.pi):
+                for phase in (0.0, 0.5 * np.pi):
+                    values = {"amplitude": force, "period": period, "phase": phase or 1e-3}
+                    yield Trial(effect=_effect(effect, key, name, **values), scaled=("amplitude",))
+        case "plant.hysteresis":
+            for share in (0.05, 0.25):
+                values = {"amplitude": force, "width": share * span}
+                yield Trial(effect=_effect(effect, key, name, **values), scaled=("amplitude",))
+        case "plant.hard_stop":
+            stiffness = (0.5 / s.dt_s) ** 2
+            for side, level in (("high", np.quantile(x, 0.97)), ("low", np.quantile(x, 0.03))):
+                values = {side: float(level), "stiffness": stiffness, "damping": np.sqrt(stiffness)}
+                yield Trial(effect=_effect(effect, key, name, **values))
+
+
+def _loads(s: Signals, key: str, name: str) -> Iterator[Trial]:
+    force = 0.05 * s.sizes.get(name, 1.0)
+    for share in np.linspace(0.04, 0.96, 24):
+        values = {"amplitude": force, "time": float(share) * s.duration_s}
+        yield Trial(effect=_effect("environment.step_load", key, name, **values), scaled=("amplitude",))
+    yield Trial(effect=_effect("environment.drifting_load", key, name, rate=force / s.duration_s), scaled=("rate",))
+
+
+def _on_command(model: EquationModel, s: Signals) -> Iterator[Trial]:
+    column = model.columns[0]
+    at = ("input", column)
+    offset = model.inputs[0].offset
+    u = s.u - offset
+    size = float(np.std(u)) + 1e-300
+    top, bottom = (float(np.quantile(u, q)) for q in (0.999, 0.001))
+    for share in (0.05, 0.2, 0.4):
+        yield Trial(effect=_effect("actuator.saturation", *at, high=top - share * (top - bottom)))
+        yield Trial(effect=_effect("actuator.saturation", *at, low=bottom + share * (top - bottom)))
+    for share in (0.1, 0.4):
+        yield Trial(effect=_effect("actuator.dead_zone", *at, half_width=share * size))
+    middle = float(np.mean(u))
+    yield Trial(effect=_effect("actuator.nonlinear_gain", *at, second_order=0.05 / size, origin=middle),
+                scaled=("second_order",))  # fmt: skip
+    yield Trial(effect=_effect("actuator.nonlinear_gain", *at, third_order=0.05 / size**2, origin=middle),
+                scaled=("third_order",))  # fmt: skip
+    yield Trial(effect=_effect("actuator.offset", *at, offset=0.05 * size), scaled=("offset",))
+    yield Trial(effect=_effect("actuator.gain_drift", *at, rate=0.05 / s.duration_s), scaled=("rate",))
+    for factor in (2.0, 8.0, 30.0):
+        yield Trial(effect=_effect("actuator.lag", *at, time_constant=min(factor * s.dt_s, s.slow_s)))
+        yield Trial(effect=_effect("timing.dead_time", *at, delay=min(factor * s.dt_s, s.slow_s)))
+    step = float(np.quantile(np.abs(np.diff(u)), 0.98)) + 1e-9 * size
+    for rows in (3.0, 10.0, 30.0):
+        yield Trial(effect=_effect("actuator.rate_limit", *at, rate=step / (rows * s.dt_s)))
+    for share in (0.2, 0.6):
+        yield Trial(effect=_effect("actuator.backlash", *at, width=share * size))
+        yield Trial(effect=_effect("actuator.stiction", *at, band=share * size))
+
+
+def _on_reading(s: Signals) -> Iterator[Trial]:
+    size, middle = float(np.nanstd(s.y)) + 1e-300, float(np.nanmean(s.y))
+    for factor in (3.0, 15.0):
+        yield Trial(effect=_effect("sensor.lag", time_constant=min(factor * s.dt_s, s.slow_s)))
+    yield Trial(effect=_effect("sensor.nonlinear_gain", second_order=0.05 / size, origin=middle),
+                scaled=("second_order",))  # fmt: skip
+    yield Trial(effect=_effect("sensor.nonlinear_gain", third_order=0.05 / size**2, origin=middle),
+                scaled=("third_order",))  # fmt: skip
+    yield Trial(effect=_effect("sensor.drift", rate=0.05 * size / s.duration_s), scaled=("rate",))

@@ -1,0 +1,226 @@
+"""A closed model (an FMU, a step function) on recordings, as a search asks for it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from autotune.arrays import BoolArray, FloatArray, IntArray
+from autotune.diagnosis.equations.bench import HELD_OUT, OUTER, Outcome, sought
+from autotune.diagnosis.equations.candidates import Signals, Trial
+from autotune.equations.black_box import BlackBox, driven, read_out
+from autotune.equations.effects import OUTPUTS, apply, with_values
+from autotune.equations.fit import Fitted, values_of
+from autotune.equations.model import EquationModel, ModelParameter
+from autotune.equations.simulate import Compiled, Drive, compile_model
+from autotune.errors import InputError
+from autotune.models import Effect
+from autotune.recording import Recording
+
+#: Relative step of the finite differences in units of belief: a closed model's own solver makes noise.
+_STEP = 1e-2
+
+
+class ClosedBench:
+    """A closed model on recordings; each recording is one run from the model's own start.
+
+    Parameters
+    ----------
+    box : BlackBox
+        The model.
+    recordings : sequence of Recording
+        What was measured.
+    good : sequence of (N,) bool array
+        Rows whose reading counts.
+    """
+
+    def __init__(self, box: BlackBox, recordings: Sequence[Recording], good: Sequence[BoolArray]) -> None:
+        self._box, self._shell = box, box.shell()
+        self._recordings = tuple(
+            replace(r, y=np.where(ok, r.y, np.nan)) for r, ok in zip(recordings, good, strict=True)
+        )
+        self._rows = [np.isfinite(r.y) for r in self._recordings]
+        self._drives = []
+        for r in self._recordings:
+            r.require_finite(box.columns)
+            self._drives.append(Drive(t=r.t, inputs=np.column_stack([r[c] for c in box.columns])))
+
+    @property
+    def model(self) -> EquationModel:
+        """The shell: the same inputs, nothing inside."""
+        return self._shell
+
+    @property
+    def recordings(self) -> tuple[Recording, ...]:
+        """What was measured; readings that do not count are no numbers."""
+        return self._recordings
+
+    @property
+    def is_closed(self) -> bool:
+        """Only inputs and reading can be reached."""
+        return True
+
+    def _compiled(self, effects: Sequence[Effect]) -> Compiled:
+        """Return the shell with the model's parameters and those of effects, dead times among them."""
+        compiled = compile_model(self._shell, apply(self._shell, effects).extensions)
+        u = np.concatenate([d.inputs[:, 0] for d in self._drives])
+        span = max(float(d.t[-1] - d.t[0]) for d in self._drives)
+        spreads = {"high": float(np.std(u)), "low": float(np.std(u)), "time": 0.2 * span, "phase": 1.0}
+        inside = tuple(sought(p, effects, spreads) for p in compiled.parameters)
+        outside = tuple(
+            ModelParameter(name=f"{e.name.split('.')[1]}_{i}_{key}", value=e.parameters[key].value, spread=1.0)
+            for i, e in enumerate(effects) for key in e.parameters if (e.name, key) in OUTER
+        )  # fmt: skip
+        return replace(compiled, parameters=(*self._box.parameters, *inside, *outside))
+
+    def _simulated(self, compiled: Compiled, effects: Sequence[Effect], z: FloatArray) -> list[FloatArray]:
+        """Return y at every row of every recording."""
+        p = values_of(compiled, z)
+        values = {q.name: (float(v), 0.0) for q, v in zip(compiled.parameters, p, strict=True)}
+        now = with_values(effects, values)
+        applied = apply(self._shell, now)
+        at_input = [e for e in applied.extensions if e.output is None]
+        own = {q.name: values[q.name][0] for q in self._box.parameters}
+        found = []
+        for drive in self._drives:
+            arriving = driven(self._box, at_input, applied.delays, applied.before(drive))
+            y = self._box.simulation(own, arriving)
+            found.append(applied.after(read_out(y, drive, [e for e in now if e.name in OUTPUTS])))
+        return found
+
+    def _fit(
+        self, effects: Sequence[Effect], z: FloatArray, iterations: int, free: bool, rows: Sequence[BoolArray]
+    ) -> Outcome:
+        """Return a Gauss-Newton fit with Levenberg's damping, beliefs counted."""
+        compiled = self._compiled(effects)
+        which = np.flatnonzero([free and q.spread > 0.0 for q in compiled.parameters])
+        y = np.concatenate([r.y[ok] for r, ok in zip(self._recordings, rows, strict=True)])
+
+        def left(at: FloatArray) -> FloatArray:
+            runs = self._simulated(compiled, effects, at)
+            return np.asarray(y - np.concatenate([run[ok] for run, ok in zip(runs, rows, strict=True)]))
+
+        e, damping, J = left(z), 1e-3, np.zeros((y.size, which.size))
+        if not np.all(np.isfinite(e)):
+            raise InputError("the simulation runs away", where=self._box.name, remedy="check its parameters and inputs")
+        for _ in range(iterations if which.size else 0):
+            sd = float(np.sqrt(np.mean(e**2))) + 1e-300
+            J = self._jacobian(left, z, e, which)
+            H, g = J.T @ J / sd**2 + np.eye(which.size), J.T @ e / sd**2 - z[which]
+            moved, gained = False, 0.0
+            for _ in range(8):
+                new = z.copy()
+                new[which] += np.clip(np.linalg.solve(H + damping * np.diag(np.diag(H)), g), -2.0, 2.0)
+                try:
+                    after = left(new)
+                except InputError:
+                    after = np.full_like(e, np.inf)
+                cost = float(e @ e / sd**2 + z[which] @ z[which])
+                then = float(after @ after / sd**2 + new[which] @ new[which]) if np.all(np.isfinite(after)) else np.inf
+                if then < cost:
+                    z, e, moved, gained = new, after, True, (cost - then) / cost
+                    damping = max(0.2 * damping, 1e-9)
+                    break
+                damping *= 10.0
+            if not moved or gained < 1e-4:
+                break
+        return self._outcome(tuple(effects), compiled, z, e, J, which)
+
+    @staticmethod
+    def _jacobian(
+        left: Callable[[FloatArray], FloatArray], z: FloatArray, e: FloatArray, which: IntArray
+    ) -> FloatArray:
+        J = np.zeros((e.size, which.size))
+        for column, i in enumerate(which):
+            step = z.copy()
+            step[i] += _STEP
+            J[:, column] = (e - left(step)) / _STEP
+        return J
+
+    def _outcome(
+        self, effects: tuple[Effect, ...], compiled: Compiled, z: FloatArray, e: FloatArray, J: FloatArray,
+        which: IntArray,
+    ) -> Outcome:  # fmt: skip
+        sd = float(np.sqrt(np.mean(e**2))) + 1e-300
+        p, spread = values_of(compiled, z), np.array([q.spread for q in compiled.parameters])
+        linear = np.array([q.linear or q.value == 0.0 for q in compiled.parameters], dtype=bool)
+        deviation = np.zeros(p.size)
+        if which.size:
+            covariance = np.linalg.inv(J.T @ J / sd**2 + np.eye(which.size))
+            per_z = np.where(linear, spread, np.abs(p) * spread)
+            deviation[which] = np.sqrt(np.diag(covariance)) * per_z[which]
+        whole = np.zeros((e.size, p.size))
+        whole[:, which] = J / sd
+        runs = self._simulated(compiled, effects, z)
+        residuals = tuple(r.y - y for r, y in zip(self._recordings, runs, strict=True))
+        fitted = Fitted(
+            compiled=compiled, parameters=p, sd=deviation, z=z, windows=(), simulated=tuple(runs), residuals=residuals,
+            noise_sd=sd, jacobian=whole, converged=True,
+        )  # fmt: skip
+        values = {q.name: (float(v), float(s)) for q, v, s in zip(compiled.parameters, p, deviation, strict=True)}
+        residual = np.concatenate([r[ok] for r, ok in zip(residuals, self._rows, strict=True)])
+        return Outcome(effects=with_values(effects, values), fitted=fitted, count=int(which.size), residual=residual)
+
+    def _start(self, compiled: Compiled, start: Outcome | None) -> FloatArray:
+        z = np.zeros(len(compiled.parameters))
+        if start is not None:
+            own = len(self._box.parameters)
+            z[:own] = start.fitted.z[:own]
+        return z
+
+    def retuned(self) -> Outcome:
+        """Return the model with its own numbers retuned."""
+        effects = self._box.effects
+        return self._fit(effects, self._start(self._compiled(effects), None), 20, True, self._rows)
+
+    def as_it_is(self, retuned: Outcome) -> Outcome:
+        """Return the model with its nominal numbers."""
+        effects = self._box.effects
+        return self._fit(effects, self._start(self._compiled(effects), None), 1, False, self._rows)
+
+    def fitted(self, effects: Sequence[Effect], start: Outcome, iterations: int = 15) -> Outcome:
+        """Return the model fitted with effects, from where another fit ended."""
+        return self._fit(effects, self._start(self._compiled(effects), start), iterations, True, self._rows)
+
+    def with_trial(self, outcome: Outcome, effect: Effect) -> FloatArray | None:
+        """Return how the readings change at the rows that count with one more effect."""
+        effects = (*outcome.effects, effect)
+        compiled = self._compiled(effects)
+        runs = self._simulated(compiled, effects, self._start(compiled, outcome))
+        d = np.concatenate([
+            (new - old)[ok] for new, old, ok in zip(runs, outcome.fitted.simulated, self._rows, strict=True)
+        ])  # fmt: skip
+        return d if np.all(np.isfinite(d)) else None
+
+    def explained(self, outcome: Outcome) -> FloatArray:
+        """Return an orthonormal basis of what numbers can explain at the rows that count."""
+        U, s, _ = np.linalg.svd(outcome.fitted.jacobian, full_matrices=False)
+        return np.asarray(U[:, s > 1.0])
+
+    def without_starts(self, outcome: Outcome, d: FloatArray) -> FloatArray:
+        """Return the change as it is: the start is inside the model."""
+        return d
+
+    def signals(self, outcome: Outcome) -> Signals:
+        """Return command, reading and sizes of inputs that take forces."""
+        u = np.concatenate([d.inputs[:, 0] for d in self._drives])
+        dt = float(np.median(np.concatenate([np.diff(d.t) for d in self._drives])))
+        duration = max(float(d.t[-1] - d.t[0]) for d in self._drives)
+        sizes = {one.column: float(np.std(u)) for one in self._box.inputs if one.kind}
+        return Signals(u=u, y=np.concatenate(outcome.fitted.simulated), values={}, sizes=sizes, dt_s=dt,
+                       duration_s=duration, slow_s=0.05 * duration)  # fmt: skip
+
+    def periodic(self, outcome: Outcome, signals: Signals) -> list[Trial]:
+        """Return none: a load of free frequency needs a place inside."""
+        return []
+
+    def held_out_error(self, outcome: Outcome, refits: bool) -> float:
+        """Return the rms error on the last third of every recording, the numbers fitted to the rest."""
+        cut = [int((1.0 - HELD_OUT) * len(r)) for r in self._recordings]
+        first = [ok & (np.arange(ok.size) < k) for ok, k in zip(self._rows, cut, strict=True)]
+        if refits:
+            outcome = self._fit(outcome.effects, self._start(self._compiled(outcome.effects), outcome), 6, True, first)
+        e = np.concatenate([r[k:] for r, k in zip(outcome.fitted.residuals, cut, strict=True)])
+        return float(np.sqrt(np.nanmean(e**2)))

@@ -1,0 +1,272 @@
+"""What a diagnosis of equations says: verdict, effects with probabilities, sentences, diagnosis.json."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from autotune.diagnosis.effects import KINDS, kind_of
+from autotune.diagnosis.equations.bench import Bench, EquationBench, Outcome
+from autotune.diagnosis.equations.closed import ClosedBench
+from autotune.diagnosis.equations.search import NOISE_ALONE, Progress, Searched, search
+from autotune.diagnosis.evidence.samples import SampleEffect, inspect
+from autotune.diagnosis.selection.probability import TEMPERATURE, Candidate, weighed
+from autotune.diagnosis.verdict import UNKNOWN
+from autotune.equations.black_box import BlackBox
+from autotune.equations.effects import equation_of
+from autotune.equations.identifiability import undetermined
+from autotune.equations.model import EquationModel
+from autotune.errors import InputError
+from autotune.models import Effect
+from autotune.recording import Recording
+
+#: Residual variance of the noise's up to which chosen effects explain the recordings.
+EXPLAINED = 1.25
+#: Share of what retuning leaves above the noise that effects must explain to be named, where that is not all.
+MOST = 0.85
+#: Share of the recording that is kept for judging.
+HELD_OUT = 1.0 / 3.0
+#: Share of what is kept that a start state is found from, and that is not judged.
+SETTLED = 0.15
+#: Decrease that retuning must bring before the verdict is "parameters".
+NUMBERS = 25.0
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class EquationDiagnosis:
+    """Outcome of a diagnosis of equations.
+
+    Attributes
+    ----------
+    verdict : str
+        ``none``, ``parameters``, ``effect`` or ``unexplained``.
+    effects : tuple of Effect
+        What was added, the most important first.
+    probabilities : tuple of float
+        Of each of them.
+    samples : tuple of SampleEffect
+        What single rows show.
+    candidates : tuple of Candidate
+        Hypotheses with their probabilities.
+    places : tuple of str
+        Where the mismatch sits.
+    errors : tuple of float
+        Held-out errors over the spread of y: nominal, retuned, extended, noise.
+    extended_model : EquationModel
+        The model to go on with.
+    sentences : tuple of str
+        The finding in words.
+    searched : Searched
+        All hypotheses.
+    recordings : tuple of Recording
+        What was measured.
+    """
+
+    verdict: Literal["none", "parameters", "effect", "unexplained"]
+    effects: tuple[Effect, ...]
+    probabilities: tuple[float, ...]
+    samples: tuple[SampleEffect, ...]
+    candidates: tuple[Candidate, ...]
+    places: tuple[str, ...]
+    errors: tuple[float, float, float, float]
+    extended_model: EquationModel | BlackBox
+    sentences: tuple[str, ...]
+    searched: Searched
+    recordings: tuple[Recording, ...]
+
+    @property
+    def equations(self) -> EquationModel:
+        """The extended model's equations; of a closed model the shell that its effects act in."""
+        model = self.extended_model
+        return model if isinstance(model, EquationModel) else model.shell()
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the content of diagnosis.json."""
+        whole = [[i, float(r.t[0]), float(r.t[-1])] for i, r in enumerate(self.recordings)]
+        model = self.equations
+        return {
+            "schema": 1,
+            "verdict": self.verdict,
+            "effects": [
+                _effect_table(e, p, model, whole) for e, p in zip(self.effects, self.probabilities, strict=True)
+            ] + [_sample_table(s, whole) for s in self.samples],
+            "candidates": [{"name": c.name, "probability": round(c.probability, 4)} for c in self.candidates],
+            "places": list(self.places),
+            "fit": {"metric": "nrmse", "held_out": True}
+            | dict(zip(("nominal", "retuned", "extended", "noise_floor"), self.errors, strict=True)),
+            "parameters": {
+                p.name: {"value": float(v), "sd": float(s), "nominal": float(n.value), "unit": p.unit}
+                for p, v, s, n in zip(
+                    self.searched.chosen.fitted.compiled.parameters, self.searched.chosen.fitted.parameters,
+                    self.searched.chosen.fitted.sd, self.searched.nominal.fitted.compiled.parameters, strict=False,
+                )
+            },
+            "undetermined": [one.sentence for one in undetermined(self.searched.retuned.fitted)],
+            "next_experiment": None,
+        }  # fmt: skip
+
+    def write(self, path: Path) -> None:
+        """Write diagnosis.json."""
+        path.write_text(json.dumps(self.as_json(), indent=2) + "\n", encoding="utf-8")
+
+
+def _effect_table(e: Effect, p: float, model: EquationModel, whole: list[list[float]]) -> dict[str, Any]:
+    shown = {k: q for k, q in e.parameters.items() if np.isfinite(q.sd) and q.sd != 0.0} or dict(e.parameters)
+    return {
+        "name": e.name, "probability": round(p, 4), "places": list(_places(e.name)),
+        "parameters": {
+            k: {"value": q.value, "sd": q.sd if np.isfinite(q.sd) else None, "unit": q.unit} for k, q in shown.items()
+        },
+        "state": e.state or None, "input": e.input or None, "port": e.port or None,
+        "equation": equation_of(model, e), "windows": whole,
+    }  # fmt: skip
+
+
+def _sample_table(s: SampleEffect, whole: list[list[float]]) -> dict[str, Any]:
+    return {
+        "name": s.name, "probability": 0.97, "places": ["sensor"],
+        "parameters": {k: {"value": q.value, "sd": q.sd if np.isfinite(q.sd) else None, "unit": q.unit}
+                       for k, q in s.parameters.items()},
+        "state": None, "input": None, "port": None, "equation": s.equation,
+        "windows": [list(w) for w in s.windows] or whole,
+    }  # fmt: skip
+
+
+def _places(name: str) -> tuple[str, ...]:
+    return kind_of(name).may_sit if name in KINDS else (name.split(".")[0],)
+
+
+def diagnose_equations(
+    model: EquationModel | BlackBox,
+    recordings: Sequence[Recording],
+    without: Sequence[str] = (),
+    progress: Progress = lambda what, share: None,
+) -> EquationDiagnosis:
+    """Find where and why recordings differ from the simulation of equations.
+
+    Parameters
+    ----------
+    model : EquationModel
+        The nominal model; effects that it already has are kept.
+    recordings : sequence of Recording
+        At least one; several with different excitation tell more.
+    without : sequence of str
+        Effects that are left out.
+    progress : callable
+        Told what is being done and the share done, 0 to 1.
+
+    Returns
+    -------
+    EquationDiagnosis
+        Verdict, effects with probabilities, and the extended model.
+
+    Raises
+    ------
+    InputError
+        No recording, fewer than 100 readings, a missing column, or a model that runs away.
+    """
+    if not recordings:
+        raise InputError("no recording", where="diagnose", remedy="give at least one")
+    for one in recordings:
+        if np.isfinite(one.y).sum() < 100:
+            raise InputError(f"{len(one)} rows", where=one.name, remedy="a diagnosis needs at least 100 readings")
+    good, seen = inspect(recordings, without)
+    bench: Bench = (
+        ClosedBench(model, recordings, good) if isinstance(model, BlackBox) else EquationBench(model, recordings, good)
+    )
+    found = search(bench, [*without, *(s.name for s in seen)], progress)
+    progress("checking on held-out rows", 0.95)
+    errors = _held_out(bench, found)
+    return _judged(model, recordings, found, tuple(seen), errors)
+
+
+def _judged(
+    model: EquationModel | BlackBox, recordings: Sequence[Recording], found: Searched, seen: tuple[SampleEffect, ...],
+    errors: tuple[float, float, float, float],
+) -> EquationDiagnosis:  # fmt: skip
+    added = found.chosen.effects[len(model.effects) :]
+    left, before = (found.variance_ratio(one) - 1.0 for one in (found.chosen, found.retuned))
+    explains = left < EXPLAINED - 1.0 or left < (1.0 - MOST) * before
+    better = errors[2] < errors[1] or errors[2] < 1.1 * errors[3]
+    verdict: Literal["none", "parameters", "effect", "unexplained"]
+    if (added and explains and better) or (seen and left < 1.0):
+        verdict = "effect"
+    elif added or left > 2.0 * (NOISE_ALONE - 1.0) + 0.1:
+        verdict = "unexplained"
+    elif found.score(found.nominal) - found.score(found.retuned) > NUMBERS:
+        verdict = "parameters"
+    else:
+        verdict = "none"
+    candidates = _candidates(found, 1.0 if verdict == "unexplained" else UNKNOWN)
+    named = tuple(added) if verdict == "effect" else ()
+    places = dict.fromkeys(p for e in named for p in _places(e.name)) | (dict.fromkeys(["sensor"]) if seen else {})
+    if verdict == "unexplained":
+        best = min(found.tried, key=found.score, default=None)
+        places = dict.fromkeys(_places(best.effects[-1].name) if best else ("plant",))
+    use = found.chosen if verdict in ("effect", "unexplained") and better else found.retuned
+    extended = model if verdict == "none" else _with_numbers(model, use)
+    return EquationDiagnosis(
+        verdict=verdict, effects=named, probabilities=tuple(_probability(e, candidates) for e in named),
+        samples=seen if verdict == "effect" else (), candidates=candidates, places=tuple(places), errors=errors,
+        extended_model=extended, searched=found, recordings=tuple(recordings),
+        sentences=_sentences(verdict, named, seen, candidates, tuple(places), errors, found),
+    )  # fmt: skip
+
+
+def _with_numbers(model: EquationModel | BlackBox, outcome: Outcome) -> EquationModel | BlackBox:
+    """Return a model with the numbers and effects of a fit."""
+    own = len(model.parameters)
+    values = outcome.fitted.parameters[:own]
+    if isinstance(model, BlackBox):
+        numbers = tuple(replace(p, value=float(v)) for p, v in zip(model.parameters, values, strict=True))
+        return replace(model, parameters=numbers, effects=outcome.effects)
+    return replace(model.with_parameters(values), effects=outcome.effects)
+
+
+def _candidates(found: Searched, unknown: float) -> tuple[Candidate, ...]:
+    scores: dict[str, float] = {}
+    base = len(found.retuned.effects)
+    for one in (found.retuned, *found.tried):
+        name = "+".join(e.name for e in one.effects[base:]) or "none"
+        scores[name] = min(scores.get(name, np.inf), found.score(one))
+    return weighed(scores, TEMPERATURE * max(1.0, found.variance_ratio(found.chosen)), unknown)
+
+
+def _probability(effect: Effect, candidates: Sequence[Candidate]) -> float:
+    same = set(kind_of(effect.name).same) if effect.name in KINDS else set()
+    total = sum(c.probability for c in candidates if {effect.name, *same} & set(c.name.split("+")))
+    return float(min(max(total, 0.0), 0.99))
+
+
+def _sentences(
+    verdict: str, named: Sequence[Effect], seen: Sequence[SampleEffect], candidates: Sequence[Candidate],
+    places: Sequence[str], errors: tuple[float, float, float, float], found: Searched,
+) -> tuple[str, ...]:  # fmt: skip
+    numbers = ("Held-out error, as a share of the spread of y: nominal {:.3g}, retuned {:.3g}, extended {:.3g}, "
+               "noise {:.3g}.").format(*errors)  # fmt: skip
+    unknown = tuple(f"{one.sentence[0].upper()}{one.sentence[1:]}." for one in undetermined(found.retuned.fitted))
+    match verdict:
+        case "none":
+            first = "The simulation explains the recordings to within noise."
+        case "parameters":
+            first = "The structure is right, its numbers are not: retuned, the simulation explains the recordings."
+        case "effect":
+            told = [f"{e.name} at {e.state or e.port or e.input or 'the reading'} (probability "
+                    f"{_probability(e, candidates):.2f})" for e in named]  # fmt: skip
+            first = f"Physics was left out: {' and '.join([*told, *(s.name for s in seen)])}."
+        case _:
+            first = f"Something is missing that no candidate explains to within noise; it shows at {', '.join(places)}."
+    return (first, *unknown, numbers)
+
+
+def _held_out(bench: Bench, found: Searched) -> tuple[float, float, float, float]:
+    """Return errors on the last third of every recording, the numbers fitted to the rest."""
+    spread = float(np.nanstd(np.concatenate([r.y for r in bench.recordings]))) or 1.0
+    noise = found.noise.total_sd / spread
+    return (*(bench.held_out_error(one, one is not found.nominal) / spread
+              for one in (found.nominal, found.retuned, found.chosen)), noise)  # type: ignore[return-value]  # fmt: skip
