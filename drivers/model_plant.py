@@ -10,6 +10,7 @@ from scipy.optimize import root
 
 from autotune.arrays import ComplexArray, FloatArray
 from autotune.config.rig import PlantSettings
+from autotune.equations.black_box import BlackBox
 from autotune.equations.chain import from_chain
 from autotune.equations.files import read_any_model
 from autotune.equations.linearise import linearise, transfer_function
@@ -31,6 +32,8 @@ def model_plant(settings: PlantSettings, path: str, *, u_start: float) -> ModelP
         The model file cannot be read, or has what a twin does not take along.
     """
     model = read_any_model(path)
+    if isinstance(model, BlackBox):
+        raise InputError("an FMU as a twin", where=path, remedy="give its equations, or a chain of blocks")
     if model.effects:
         raise InputError(
             f"{len(model.effects)} [[effect]] of a diagnosis, which a twin does not take along",

@@ -15,8 +15,8 @@ from autotune.diagnosis.equations.bench import Bench, EquationBench, Outcome
 from autotune.diagnosis.equations.closed import ClosedBench
 from autotune.diagnosis.equations.search import NOISE_ALONE, Progress, Searched, search
 from autotune.diagnosis.evidence.samples import SampleEffect, inspect
-from autotune.diagnosis.selection.probability import TEMPERATURE, Candidate, weighed
-from autotune.diagnosis.verdict import UNKNOWN
+from autotune.diagnosis.selection.probability import Candidate, weighed
+from autotune.diagnosis.thresholds import IN_USE
 from autotune.equations.black_box import BlackBox
 from autotune.equations.effects import equation_of
 from autotune.equations.identifiability import undetermined
@@ -202,7 +202,7 @@ def _judged(
         verdict = "parameters"
     else:
         verdict = "none"
-    candidates = _candidates(found, 1.0 if verdict == "unexplained" else UNKNOWN)
+    candidates = _candidates(found, 1.0 if verdict == "unexplained" else IN_USE.unknown_odds)
     named = tuple(added) if verdict == "effect" else ()
     places = dict.fromkeys(p for e in named for p in _places(e.name)) | (dict.fromkeys(["sensor"]) if seen else {})
     if verdict == "unexplained":
@@ -234,7 +234,7 @@ def _candidates(found: Searched, unknown: float) -> tuple[Candidate, ...]:
     for one in (found.retuned, *found.tried):
         name = "+".join(e.name for e in one.effects[base:]) or "none"
         scores[name] = min(scores.get(name, np.inf), found.score(one))
-    return weighed(scores, TEMPERATURE * max(1.0, found.variance_ratio(found.chosen)), unknown)
+    return weighed(scores, IN_USE.temperature * max(1.0, found.variance_ratio(found.chosen)), unknown)
 
 
 def _probability(effect: Effect, candidates: Sequence[Candidate]) -> float:

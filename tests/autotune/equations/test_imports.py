@@ -14,12 +14,9 @@ from typer.testing import CliRunner
 from autotune.cli import app
 from autotune.equations import EquationModel, compile_model, derivatives
 from autotune.equations.imports import from_control, from_matlab
-from autotune.equations.plant import EquationPlant
 from autotune.equations.transfer_text import parse_transfer_function
 from autotune.errors import InputError
 from autotune.models import Model, read_model
-from sim.plant import Plant
-from tests.autotune.equations.models import model, one_state
 
 OMEGA = np.logspace(-2, 2, 9)
 
@@ -106,27 +103,3 @@ def test_vectors_of_matlab() -> None:
     for num, den in (("[]", "[1]"), ("[a]", "[1]"), ("[1 2 3]", "[1 1]")):
         with pytest.raises(InputError):
             from_matlab(num, den)
-
-
-def test_equations_make_a_plant_like_the_simulated_ones() -> None:
-    plant = EquationPlant(model(), noise=0.01, seed=1)
-    assert isinstance(plant, Plant)
-    for _ in range(200):
-        plant.advance(0.5, 0.05)
-    rest = float(np.arcsin(0.5 / (0.5 * 9.81 * 0.3)))
-    assert plant.time_s == pytest.approx(10.0)
-    assert plant.u_applied == 0.5
-    assert abs(plant.y_true - rest) < 0.1
-    assert abs(plant.measure() - plant.y_true) <= 0.01
-    gain = abs(plant.response(np.array([0.01]))[0])
-    assert gain == pytest.approx(1.0 / (0.5 * 9.81 * 0.3), rel=0.01)
-
-
-def test_a_plant_keeps_commands_that_are_on_their_way() -> None:
-    late = EquationPlant(one_state("u - x", input=[{"column": "u", "delay": 0.25}]))
-    reading = []
-    for k in range(20):
-        late.advance(float(k >= 2), 0.1)
-        reading.append(late.y_true)
-    t = 0.1 * np.arange(1, 21)
-    np.testing.assert_allclose(reading, np.where(t > 0.45, 1.0 - np.exp(-(t - 0.45)), 0.0), atol=1e-6)

@@ -19,6 +19,10 @@ from tests.autotune.equations.models import model
 J, C, M, L, G = 0.06, 0.018, 0.55, 0.29, 9.81  # the truth: other numbers than the nominal ones
 
 
+Torque = Callable[[float, np.ndarray], float]
+Acts = Callable[[np.ndarray], np.ndarray]
+
+
 def recorded(
     seed: int,
     torque: Callable[[float, np.ndarray], float],
