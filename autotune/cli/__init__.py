@@ -43,6 +43,7 @@ from autotune.cli import (  # noqa: E402, F401, I001
     closed_loop,
     design,
     references,
+    paper,
     diagnose,
     model,
     investigate,

@@ -1,9 +1,9 @@
 """Parameters that move within a window: the mean of each over the window, and an interval that holds it.
 
 A model with constant parameters, fitted to a record in which one of them moved, gives its value where the record
-excited most, and the interval of a constant. Here every coefficient, the gain and the delay may also move linearly in time: the
-sensitivity to that is, for a movement that is slow against the plant, the sensitivity to the parameter times the time
-from the window's middle. What the joint fit moves the level by is what the constant fit was off the mean by.
+excited most, and the interval of a constant. Here every coefficient, the gain and the delay may also move linearly in
+time: the sensitivity to that is, for a movement that is slow against the plant, the sensitivity to the parameter times
+the time from the window's middle. What the joint fit moves the level by is what the constant fit was off the mean by.
 """
 
 from __future__ import annotations

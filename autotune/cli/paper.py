@@ -1,0 +1,129 @@
+"""Commands: the figures and tables of the papers, for one's own run or for the papers' examples."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from autotune.cli import app
+from autotune.cli.common import OVERWRITE
+from autotune.errors import InputError
+from autotune.outputs import Output
+
+if TYPE_CHECKING:
+    from autotune.identification.closed_loop.state_space import InnovationModel
+
+paper = typer.Typer(help="Draw the figures and tables of the papers.", no_args_is_help=True)
+app.add_typer(paper, name="paper")
+
+#: Title, method and window of figures 2 to 5.
+_DRAWN: dict[str, tuple[Any, int]] = {
+    "this paper": ("indirect", 15),
+    "Van Overschee-De Moor": ("van-overschee", 10),
+    "Oku-Tanaka": ("oku-tanaka", 20),
+    "SSARX": ("ssarx", 30),
+    "ORT": ("ort", 20),
+    "default": ("prediction-error", 0),
+}
+
+
+@paper.command("relay")
+def relay(
+    out: Annotated[Path, typer.Option(help="page to write (HTML)")],
+    points: Annotated[
+        Path | None, typer.Option(help="points (JSON): result.json of a run, or of identify frequency")
+    ] = None,
+    plant: Annotated[
+        Path | None, typer.Option(help="model file (TOML) of the plant, where it is known; fitted to the points else")
+    ] = None,
+    controller: Annotated[
+        Path | None, typer.Option(help="controller file (TOML); the PI designed on the reduced model when absent")
+    ] = None,
+    beside: Annotated[list[Path] | None, typer.Option(help="a further controller file; may be repeated")] = None,
+    noise_gain: Annotated[float, typer.Option(help="N_max of the design and of (26) [u/y unit]")] = 0.1,
+    overwrite: OVERWRITE = False,
+) -> None:
+    """Tables I and II and figures 6 to 8 of Le & Mendes for a run's points, or for a known plant."""
+    from autotune.api.methods import reduce, tune, validate
+    from autotune.api.plants import as_plant
+    from autotune.api.points import Points
+    from autotune.controller import read_controller
+    from autotune.identification.parametric import fit_plant
+    from autotune.points import read_points
+    from autotune.report.page import write_page
+    from autotune.report.relay_figures import relay_page
+
+    place = Output(out, inputs=(points, plant, controller), overwrite=overwrite)
+    if points is None and plant is None:
+        raise InputError("give --points, --plant or both", where="autotune paper relay")
+    measured = Points([] if points is None else read_points(points))
+    known = fit_plant(measured).plant if plant is None else as_plant(plant)
+    reduced = reduce(measured if measured else known)
+    law = tune(reduced, noise_gain=noise_gain, certificate=False).controller if controller is None else None
+    first = law if law is not None else read_controller(controller or Path())
+    others = {path.stem: read_controller(path) for path in beside or []}
+    page = relay_page(
+        measured,
+        reduced,
+        known,
+        {"PI" if controller is None else controller.stem: first, **others},
+        validate(known, reduced, first),
+        noise_gain,
+        "the plant" if plant is not None else "the plant fitted to the points",
+    )
+    place.by(lambda part: write_page(page, part))
+    typer.echo(f"{page.verdict} wrote {out}")
+
+
+@paper.command("closed-loop")
+def closed_loop(
+    out: Annotated[Path, typer.Option(help="page to write (HTML)")],
+    sets: Annotated[int, typer.Option(min=1, help="data sets of 1229 samples of the paper's example")] = 100,
+    overwrite: OVERWRITE = False,
+) -> None:
+    """Figures 2 to 5 of Pouliquen et al.: poles by each method and the noise models, on the paper's example."""
+    from rich.progress import track
+    from threadpoolctl import threadpool_limits
+
+    from autotune.api.examples import LOOP_NOISE, LOOP_PLANT
+    from autotune.identification.closed_loop.state_space import from_polynomials
+    from autotune.report.loop_figures import loop_page
+    from autotune.report.page import write_page
+
+    place = Output(out, inputs=(), overwrite=overwrite)
+    models: dict[str, list[InnovationModel]] = {title: [] for title in _DRAWN}
+    with threadpool_limits(1):
+        for seed in track(range(sets), description="data sets", transient=True):
+            _estimate(seed, models)
+    truth = from_polynomials(*LOOP_PLANT, LOOP_NOISE, variance=1.0 / 9.0)
+    place.by(lambda part: write_page(loop_page(models, truth, sets), part))
+    found = ", ".join(f"{title} {len(every)}" for title, every in models.items())
+    typer.echo(f"models of {sets} sets: {found}; wrote {out}")
+
+
+def _estimate(seed: int, models: dict[str, list[InnovationModel]]) -> None:
+    """Add every method's model of one data set; a method without a model of it is left out."""
+    import contextlib
+
+    from autotune.api.examples import LOOP_CONTROLLER, example
+    from autotune.controller import DiscreteController
+    from autotune.errors import IdentificationError
+    from autotune.identification.closed_loop.methods import closed_loop_model, markov_of
+
+    data = example("loop", seed=seed)
+    law = DiscreteController(num=LOOP_CONTROLLER[0], den=LOOP_CONTROLLER[1], sample_time_s=1.0)
+    for title, (method, window) in _DRAWN.items():
+        with contextlib.suppress(IdentificationError):
+            models[title].append(
+                closed_loop_model(
+                    data.u[:, None],
+                    data.y[:, None],
+                    method=method,
+                    order=5,
+                    r=data.extra["r"][:, None],
+                    controller_markov=markov_of(law, 40),
+                    window=window or None,
+                )
+            )

@@ -1,0 +1,63 @@
+"""Figures and tables of the papers from an installed tool: for any points, any plant, and the paper's own loop."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import autotune as at
+from autotune.cli import app
+from autotune.controller import PIDController, write_controller
+from autotune.models import Block, Model, Port, write_model
+from autotune.points import points_to_json
+from autotune.report.relay_figures import bandwidth_limit
+from tests.autotune.design.plants import BALL
+
+
+def run(*words: object) -> str:
+    result = CliRunner().invoke(app, [str(word) for word in words], catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    return result.output
+
+
+def test_the_page_of_a_known_plant_has_the_row_of_table_ii(tmp_path):
+    block = Block(name="ball", place="plant", dynamics=BALL)
+    write_model(Model(name="ball", input=Port(), output=Port(), blocks=(block,)), tmp_path / "ball.toml")
+    write_controller(PIDController(K=-0.023, Ti_s=3.0), tmp_path / "pi.toml")
+    run("paper", "relay", "--plant", tmp_path / "ball.toml", "--controller", tmp_path / "pi.toml", "--beside",
+        tmp_path / "pi.toml", "--out", tmp_path / "page.html")  # fmt: skip
+    page = (tmp_path / "page.html").read_text(encoding="utf-8")
+    for figure in ("0.6818", "48.16", "0.607", "1.384", "57.14", "5.214"):  # recomputed row, and omega_d
+        assert figure in page, figure
+    for title in ("Table I:", "Table II:", "Figure 6", "Figure 7", "Figure 8"):
+        assert title in page
+
+
+def test_the_page_of_measured_points_needs_no_plant(tmp_path):
+    points = at.frequency_points(at.example("oven"), largest_relative_sd=0.05)
+    (tmp_path / "result.json").write_text(json.dumps({"points": points_to_json(points)}), encoding="utf-8")
+    run("paper", "relay", "--points", tmp_path / "result.json", "--noise-gain", 10, "--out", tmp_path / "page.html")
+    assert "the plant fitted to the points" in (tmp_path / "page.html").read_text(encoding="utf-8")
+    neither = CliRunner().invoke(app, ["paper", "relay", "--out", str(tmp_path / "none.html")])
+    assert "give --points, --plant or both" in str(neither.exception)
+
+
+def test_the_bandwidth_that_a_noise_gain_leaves():
+    """(26) continues the slope at the plant's crossover, 4.15 rad/s; the plant itself reaches 1/N_max before."""
+    omega = np.geomspace(0.1, 100.0, 2000)
+    limit = bandwidth_limit(BALL, 0.1, omega)
+    assert abs(BALL.response(np.array([limit]))[0]) == pytest.approx(10.0, rel=1e-3)
+    assert limit == pytest.approx(4.15, rel=0.1)
+    assert math.isnan(bandwidth_limit(BALL, 1e-9, omega))
+
+
+def test_the_loops_figures_hold_every_method_of_the_paper(tmp_path):
+    printed = run("paper", "closed-loop", "--sets", 2, "--out", tmp_path / "loop.html")
+    assert "this paper 2" in printed
+    page = (tmp_path / "loop.html").read_text(encoding="utf-8")
+    for title in ("Figure 2", "Figure 3", "Figure 4", "Figure 5", "Oku-Tanaka", "SSARX", "ORT"):
+        assert title in page
