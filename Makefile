@@ -4,7 +4,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 OUT ?= runs/ball_sim
 
-.PHONY: run test lint types imports unit fuzz bench docs figures clean
+.PHONY: run test lint types imports unit fuzz bench docs figures dist clean
 
 run: $(VENV)/.run
 	rm -rf $(OUT)
@@ -42,6 +42,9 @@ docs: $(VENV)/.docs
 
 figures: $(VENV)/.docs
 	$(BIN)/python -m docs.draw_figures
+
+dist:
+	.ci/dist
 
 $(VENV)/.run: pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit("Python >= 3.11 is needed, this is " + sys.version.split()[0] if sys.version_info < (3, 11) else 0)'

@@ -8,7 +8,7 @@ import errno
 import signal
 import sys
 import warnings
-from typing import Any, NoReturn
+from typing import Annotated, Any, NoReturn
 
 import typer
 from rich.console import Console
@@ -31,6 +31,24 @@ app = typer.Typer(
 )
 identify = typer.Typer(help="Identify the plant from a recording.", no_args_is_help=True)
 app.add_typer(identify, name="identify")
+
+
+def _say_version(asked: bool) -> None:
+    if asked:
+        from autotune import __version__
+
+        typer.echo(f"relay-autotune {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _root(
+    _version: Annotated[
+        bool, typer.Option("--version", is_eager=True, callback=_say_version, help="Say the version and leave.")
+    ] = False,
+) -> None:
+    """Commission a control loop: measure its Bode points with a relay, design its controller, verify it."""
+
 
 # Each room of commands registers itself on the two apps above; the order here is the order in --help.
 from autotune.cli import (  # noqa: E402, F401, I001

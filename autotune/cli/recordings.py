@@ -94,8 +94,12 @@ def import_file(
     ] = None,
 ) -> None:
     """Turn a file as engineers have it into recordings of the project's form, with a sidecar that says how."""
+    from dataclasses import replace
+
     from autotune.errors import InputError
     from autotune.files.table import FileForm
+    from autotune.outputs import OutputFolder
+    from autotune.recording import write_recording
 
     if decimal not in (None, ".", ","):
         raise InputError(f"decimal mark {decimal!r}", where="--decimal", remedy="give . or ,")
@@ -106,28 +110,11 @@ def import_file(
     reading = _read(file, signal_names(t, u, y, r), form, gap)
     first = out or Path(f"{file.stem}_recording.csv")
     paths = [first, *(first.with_stem(f"{first.stem}_{i}") for i in range(2, len(reading.recordings) + 1))]
-    for path in paths:
-        for there in (path, path.with_suffix(".toml")):
-            if there.exists():
-                raise InputError("is there already", where=str(there), remedy="choose another --out")
-    for path, recording in zip(paths, reading.recordings, strict=True):
-        _write(path, recording, reading)
+    names = [name for path in paths for name in (path.name, path.with_suffix(".toml").name)]
+    with OutputFolder(first.parent, names, inputs=(file,)).filled() as folder:
+        for path, recording in zip(paths, reading.recordings, strict=True):
+            kept = replace(recording, metadata={**recording.metadata, "notes": list(reading.notes)})
+            write_recording(kept, folder / path.name)
+    for path, one in zip(paths, reading.recordings, strict=True):
+        typer.echo(f"wrote {path}: {len(one)} rows, {one.duration_s:.6g} s, {one.sample_time_s:.6g} s apart")
     typer.echo(f"now: autotune tune {' '.join(map(str, paths))} --out DIR")
-
-
-def _write(path: Path, recording: Recording, reading: Reading) -> None:
-    from dataclasses import replace
-
-    from autotune.errors import InputError
-    from autotune.recording import write_recording
-
-    kept = replace(recording, metadata={**recording.metadata, "notes": list(reading.notes)})
-    try:
-        write_recording(kept, path)
-    except OSError as error:
-        raise InputError(
-            f"cannot be written ({error.strerror})", where=str(path), remedy="choose another --out"
-        ) from None
-    typer.echo(
-        f"wrote {path}: {len(recording)} rows, {recording.duration_s:.6g} s, {recording.sample_time_s:.6g} s apart"
-    )

@@ -39,7 +39,7 @@ def test_import_writes_the_projects_form_and_says_where_it_came_from(trace, tmp_
     assert len(recording) == N
     assert recording.metadata["units"]["u"] == "%"
     assert recording.metadata["file"]["columns"]["y"] == "Kanal B"
-    with pytest.raises(InputError, match="is there already"):
+    with pytest.raises(InputError, match="exists already"):
         call("import", trace, "--u", "Kanal C", "--y", "Kanal B", "--out", out)
 
 
