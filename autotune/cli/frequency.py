@@ -72,11 +72,11 @@ def reduce(
     model: Annotated[Path | None, typer.Option(help="model file (TOML) of a plant that is known")] = None,
     kind: Annotated[
         Literal["auto", "self-regulating", "integrating"],
-        typer.Option(help="structure (8) or (24); auto lets the data decide"),
+        typer.Option(help="structure of the model; auto lets the data decide"),
     ] = "auto",
     conditions: Annotated[
         Literal["regions", "estimates"],
-        typer.Option(help="hold conditions (5) on the points' 95 % regions, or on the estimates as the paper does"),
+        typer.Option(help="bound the points' 95 % regions, or only the estimates"),
     ] = "regions",
     static_gain: Annotated[
         float | None, typer.Option(help="measured static gain with its sign [y unit/u unit]; none when absent")
@@ -120,7 +120,7 @@ def reduce(
 
 def _say(reduced: ReducedModel, out: Path) -> None:
     lag = "" if reduced.omega_0r_rad_s is None else f", omega_0r = {reduced.omega_0r_rad_s:.4g} rad/s"
-    name = "integrating (24)" if reduced.integrating else "self-regulating (8)"
+    name = "integrating" if reduced.integrating else "self-regulating"
     typer.echo(f"{name}: {reduced.evidence or 'of a known plant'}")
     typer.echo(f"G_r = {reduced.G_r:.4g}{lag}, omega_d = {reduced.omega_d_rad_s:.4g} rad/s; written to {out}")
     for warning in reduced.warnings:

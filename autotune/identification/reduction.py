@@ -121,7 +121,9 @@ def reduce_transfer_function(plant: TransferFunction) -> ReducedModel:
     scales = [*corners, *([1.0 / plant.delay_s] if plant.delay_s > 0.0 else [])]
     if not scales or plant.integrators > 1:
         raise IdentificationError(
-            "the plant is not in class (1)", where=_WHERE, remedy="give it dynamics of that class"
+            "the plant is not one of lags, at most one integrator, and dead time",
+            where=_WHERE,
+            remedy="give it such dynamics",
         )
     omega = np.geomspace(1e-4 * min(scales), 1e2 * max(scales), 6000)
     low = plant.response(omega[:1])[0] * (1j if plant.integrators else 1.0)
@@ -135,7 +137,7 @@ def reduce_transfer_function(plant: TransferFunction) -> ReducedModel:
         np.diff(envelope.phase_rad[falling]) > 1e-9
     ):
         raise IdentificationError(
-            "gain or phase rises with frequency: outside class (1) of the reduced models",
+            "gain or phase rises with frequency, as those of no plant of lags and dead time do",
             where=_WHERE,
             remedy="design on the plant itself",
         )
@@ -240,7 +242,7 @@ def _reduced(
         return both, _by_conditions(both, gain, static_gain_known=False), ()
     except IdentificationError:
         warning = (
-            "single points are too uncertain to bound the phase: conditions (5) hold on the band of the plants that"
+            "single points are too uncertain to bound the phase: the reduced model bounds the band of the plants that"
             " fit all of them, if the plant is one of lags, integrator and dead time"
         )
         return known, _by_conditions(known, gain, static_gain_known=False), (warning,)
@@ -252,9 +254,9 @@ def _choose(fitted: Sequence[FrequencyPoint], fit: PlantFit, kind: Kind | None) 
     if kind == "self-regulating" and (fit.integrating or static_sd > _STATIC_GAIN_SD):
         found = "integrate" if fit.integrating else _open_gain(static_sd)
         raise IdentificationError(
-            f"the points {found}: G_r and omega_0r of (8) are not determined by them",
+            f"the points {found}: gain G_r and lag omega_0r are not determined by them",
             where=_WHERE,
-            remedy="measure the static gain (two steady states) and give it, or use the integrating model (24)",
+            remedy="measure the static gain (two steady states) and give it, or use the integrating model",
         )
     if kind is not None:
         return kind, "asked for", ()

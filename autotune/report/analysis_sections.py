@@ -18,7 +18,15 @@ from autotune.experiment.result import ExperimentResult
 from autotune.identification.parametric import PlantFit
 from autotune.pipeline import Analysis
 from autotune.points import FrequencyPoint
-from autotune.report.figures import Curve, bode_figure, frequencies, nichols_figure, nyquist_figure, sensitivity_figure
+from autotune.report.figures import (
+    Curve,
+    bode_figure,
+    frequencies,
+    gain_phase,
+    nichols_figure,
+    nyquist_figure,
+    sensitivity_figure,
+)
 from autotune.report.page import BLUE, GREEN, GREY, ORANGE, PURPLE, RED, Figure, Section, Table
 
 
@@ -66,10 +74,8 @@ def _grid(analysis: Analysis, decades: float) -> FloatArray:
 def _points_section(analysis: Analysis, signals: SignalSettings, experiment: ExperimentResult | None) -> Section:
     sign = analysis.fit.sign
     omega = _grid(analysis, 0.7)
-    described = _described(experiment, sign) if experiment else ()
     estimates = _by_source(analysis.points)
-    if described:
-        estimates.append(("describing function, (20)-(22)", described, PURPLE))
+    compared = _described_table(analysis.points, sign, experiment) if experiment else None
     gain_unit = f"{signals.y_unit}/{signals.u_unit}" if signals.u_unit and signals.y_unit else ""
     curves = (
         Curve(name="fitted plant", system=analysis.fit.plant, colour=GREY, dash="dot"),
@@ -78,33 +84,37 @@ def _points_section(analysis: Analysis, signals: SignalSettings, experiment: Exp
     return Section(
         title="Bode points",
         text=(
-            (
-                "Each point is the ratio of the recorded measurement's Fourier coefficient to that of the recorded,"
-                " held command over whole periods; its region counts the noise that was found beside the oscillation."
-                if all(point.source in _RELAY_SOURCES for point in analysis.points)
-                else "Colours tell the estimates apart: relay points come from whole periods of a limit cycle,"
-                " closed-loop points from a model of the loop under control, others from a band of frequencies. Each"
-                " region counts the noise of its own experiment."
-                if len({point.source in _RELAY_SOURCES for point in analysis.points}) > 1
-                else "Each point is estimated over a band of frequencies, leakage and drift removed; its region counts"
-                " the noise in that band."
-            )
-            + (
-                " The first-harmonic formulas (20)-(22), which trust the delay that was asked for and the relay's ideal"
-                " wave, are shown with their error against it."
-                if described
-                else ""
-            ),
+            "Each point is the ratio of the recorded measurement's Fourier coefficient to that of the recorded,"
+            " held command over whole periods; its region counts the noise that was found beside the oscillation."
+            if all(point.source in _RELAY_SOURCES for point in analysis.points)
+            else "Colours tell the estimates apart: relay points come from whole periods of a limit cycle,"
+            " closed-loop points from a model of the loop under control, others from a band of frequencies. Each"
+            " region counts the noise of its own experiment."
+            if len({point.source in _RELAY_SOURCES for point in analysis.points}) > 1
+            else "Each point is estimated over a band of frequencies, leakage and drift removed; its region counts"
+            " the noise in that band.",
         ),
-        tables=(_points_table(analysis.points, sign, experiment),),
+        tables=(_points_table(analysis.points, sign, gain_unit),),
         figures=(
             Figure(
                 figure=bode_figure(estimates, curves, omega, sign, gain_unit),
-                caption="Gain and phase (of the positive-gain plant) as in figure 6 of the method's paper. The reduced"
-                " model lies above the gain and below the phase, which is what makes its margins a guarantee.",
+                caption=("Gain and phase, the phase for the positive gain." if sign < 0 else "Gain and phase.")
+                + (
+                    " The reduced model lies above the gain and below the phase of the plant, which makes its margins a"
+                    " guarantee."
+                    if analysis.reduced is not None
+                    else ""
+                ),
                 height_px=560,
             ),
         ),
+        details=(
+            "The first-harmonic formulas trust the delay that was asked for and the relay's ideal wave; their error"
+            " against the recorded signals:",
+        )
+        if compared
+        else (),
+        detail_tables=(compared,) if compared else (),
     )
 
 
@@ -122,50 +132,29 @@ def _by_source(points: Sequence[FrequencyPoint]) -> list[tuple[str, Sequence[Fre
     return [(f"{name}, 95 %", group, _SOURCE_COLOURS.get(name, GREY)) for name, group in groups.items()]
 
 
-def _described(experiment: ExperimentResult, sign: int) -> tuple[FrequencyPoint, ...]:
-    """Return the describing-function estimates as points without a region."""
-    return tuple(
-        FrequencyPoint(
-            omega_rad_s=segment.describing.omega_rad_s,
-            response=complex(sign * segment.describing.gain * np.exp(1j * segment.describing.phase_rad)),
-            covariance=((0.0, 0.0), (0.0, 0.0)),
-            source="describing function",
-        )
-        for segment in experiment.segments
-    )
+def _points_table(points: Sequence[FrequencyPoint], sign: int, gain_unit: str) -> Table:
+    _, phases = gain_phase(np.array([sign * point.response for point in points], dtype=np.complex128))
+    rows = []
+    for point, phase in zip(points, phases, strict=True):
+        sd = math.sqrt(np.trace(np.array(point.covariance)) / 2.0) / point.gain
+        cells = (f"{point.omega_rad_s:.4g}", f"{point.gain:.5g}", f"{phase:.2f}")
+        rows.append((*cells, f"{100 * 1.96 * sd:.2g} %", f"{math.degrees(1.96 * sd):.2g}", point.source))
+    gain = f"gain [{gain_unit}]" if gain_unit else "gain"
+    header = ("ω [rad/s]", gain, "phase [deg]", "gain ±95 %", "phase ±95 % [deg]", "kind")
+    return Table(header=header, rows=tuple(rows))
 
 
-def _points_table(points: Sequence[FrequencyPoint], sign: int, experiment: ExperimentResult | None) -> Table:
-    described = {segment.point.omega_rad_s: segment.describing for segment in experiment.segments} if experiment else {}
+def _described_table(points: Sequence[FrequencyPoint], sign: int, experiment: ExperimentResult) -> Table | None:
+    """Return the error of the describing function's estimates, where the experiment was a relay's."""
+    described = {segment.point.omega_rad_s: segment.describing for segment in experiment.segments}
     rows = []
     for point in points:
-        response = sign * point.response
-        phase = math.degrees(np.angle(response))
-        phase = phase - 360.0 if phase > 0 else phase
-        sd = math.sqrt(np.trace(np.array(point.covariance)) / 2.0) / point.gain
-        row = [
-            f"{point.omega_rad_s:.4g}",
-            f"{point.gain:.5g}",
-            f"{phase:.2f}",
-            f"{100 * 1.96 * sd:.2g} %",
-            f"{math.degrees(1.96 * sd):.2g}",
-            point.source,
-        ]
-        if described:
-            found = described.get(point.omega_rad_s)
-            row += (
-                [
-                    f"{100 * (found.gain / point.gain - 1):+.0f} %",
-                    f"{math.degrees(_wrapped(found.phase_rad - math.radians(phase))):+.1f}",
-                ]
-                if found
-                else ["", ""]
-            )
-        rows.append(tuple(row))
-    header = ("ω [rad/s]", "gain", "phase [deg]", "gain ±95 %", "phase ±95 % [deg]", "kind")
-    return Table(
-        header=(*header, "(21) gain error", "(20) phase error [deg]") if described else header, rows=tuple(rows)
-    )
+        found = described.get(point.omega_rad_s)
+        if found is not None:
+            turned = _wrapped(found.phase_rad - float(np.angle(sign * point.response)))
+            gain = f"{100 * (found.gain / point.gain - 1):+.0f} %"
+            rows.append((f"{point.omega_rad_s:.4g}", gain, f"{math.degrees(turned):+.1f}"))
+    return Table(header=("ω [rad/s]", "gain error", "phase error [deg]"), rows=tuple(rows)) if rows else None
 
 
 def _wrapped(angle_rad: float) -> float:
@@ -184,34 +173,32 @@ def _model_section(analysis: Analysis) -> Section:
         return Section(
             title="Model", text=(fitted, f"There is no reduced model: {why}." if isinstance(why, str) and why else "")
         )
-    lag = [] if reduced.omega_0r_rad_s is None else [("ω_0r [rad/s]", f"{reduced.omega_0r_rad_s:.4g}", "")]
-    ball_paper = ("-65", "5.17") if reduced.integrating else ("", "")
+    lag = [("lag frequency ω_0r [rad/s]", f"{reduced.omega_0r_rad_s:.4g}")] if reduced.omega_0r_rad_s else []
     return Section(
         title="Reduced model",
         text=(
-            f"Structure: {'(24), integrating' if reduced.integrating else '(8), self-regulating'} ({reduced.evidence}),"
-            f" under the conditions (5) on the {reduced.conditions}.",
+            f"{'Integrating' if reduced.integrating else 'Self-regulating'} ({reduced.evidence}). It bounds the plant"
+            " from the side that matters: gain from above and phase from below, on the"
+            f" {reduced.conditions} of the points.",
             fitted,
         ),
         tables=(
             Table(
-                caption="Table I: reduced model (the paper's figures are those of its ball in a tube)",
-                header=("parameter", "this plant", "paper's ball"),
+                header=("parameter", "value"),
                 rows=(
-                    ("G_r", f"{reduced.G_r:.4g}", ball_paper[0]),
+                    ("gain G_r", f"{reduced.G_r:.4g}"),
                     *lag,
-                    ("ω_d [rad/s]", f"{reduced.omega_d_rad_s:.4g}", ball_paper[1]),
+                    ("delay frequency ω_d [rad/s]", f"{reduced.omega_d_rad_s:.4g}"),
                 ),
             ),
+        ),
+        detail_tables=(
             Table(
-                caption="Criterion (10): ν-gap(H, H_r) < b(C, H_r) ≤ b(C, H), on the fitted plant."
-                " Its numbers depend on the units of u and y; the second row weighs them as the loop does at its"
-                " crossover.",
-                header=("scaling k", "ν-gap", "b(C, H_r)", "b(C, H)", "(10) holds", "paper's ball"),
-                rows=(
-                    (*_validation_row(analysis.unscaled), "<0.004, 0.028, 0.038"),
-                    (*_validation_row(analysis.scaled), ""),
-                ),
+                caption="The controller carries over from the reduced model H_r to the plant H where ν-gap(H, H_r) <"
+                " b(C, H_r) ≤ b(C, H), here on the fitted plant. The numbers depend on the units of u and y; the second"
+                " row weighs them as the loop does at its crossover.",
+                header=("scaling k", "ν-gap", "b(C, H_r)", "b(C, H)", "holds"),
+                rows=(_validation_row(analysis.unscaled), _validation_row(analysis.scaled)),
             ),
         ),
     )
@@ -259,16 +246,15 @@ def _loop_section(analysis: Analysis) -> Section:
     )
     design, m, d = analysis.design, analysis.margins, analysis.design.margins
     binding = ", ".join(design.binding) or "none"
-    paper = ("-0.023", "3", "0.683", "48", "0.03", "0.61", "1.54", "56.8")
     rows = (
-        ("K", f"{controller.K:.5g}", f"{controller.K:.5g}", paper[0]),
-        ("T_I [s]", f"{controller.Ti_s:.5g}", f"{controller.Ti_s:.5g}", paper[1]),
-        ("modulus margin M_m", f"{d.modulus:.4f}", f"{m.modulus:.4f}", paper[2]),
-        ("phase margin [deg]", f"{math.degrees(d.phase_rad):.2f}", f"{math.degrees(m.phase_rad):.2f}", paper[3]),
-        ("noise gain", f"{d.noise_gain:.4g}", f"{m.noise_gain:.4g}", paper[4]),
-        ("delay margin M_ret [s]", f"{d.delay_s:.3g}", f"{m.delay_s:.3g}", paper[5]),
-        ("crossover ω_gc [rad/s]", f"{d.crossover_rad_s:.4g}", f"{m.crossover_rad_s:.4g}", paper[6]),
-        ("H2 norm (11)", f"{d.h2:.4g}", f"{m.h2:.4g}", paper[7]),
+        ("K", f"{controller.K:.5g}", f"{controller.K:.5g}"),
+        ("T_I [s]", f"{controller.Ti_s:.5g}", f"{controller.Ti_s:.5g}"),
+        ("modulus margin", f"{d.modulus:.4f}", f"{m.modulus:.4f}"),
+        ("phase margin [deg]", f"{math.degrees(d.phase_rad):.2f}", f"{math.degrees(m.phase_rad):.2f}"),
+        ("noise gain", f"{d.noise_gain:.4g}", f"{m.noise_gain:.4g}"),
+        ("delay margin [s]", f"{d.delay_s:.3g}", f"{m.delay_s:.3g}"),
+        ("crossover [rad/s]", f"{d.crossover_rad_s:.4g}", f"{m.crossover_rad_s:.4g}"),
+        ("H2 norm under load", f"{d.h2:.4g}", f"{m.h2:.4g}"),
     )
     return Section(
         title="Controller and margins",
@@ -279,28 +265,26 @@ def _loop_section(analysis: Analysis) -> Section:
             "Checked: "
             + "; ".join(f"{one.sentence}{'' if one.kept else ' (not kept)'}" for one in analysis.checks)
             + ".",
-            _certificate(analysis),
         ),
         tables=(
             Table(
-                caption="Table II: the controller on the model it was designed with and on the fitted plant"
-                " (the paper's figures are those of its ball, PI-MR)",
-                header=("", "designed on", "fitted plant", "paper's ball"),
+                caption="The controller on what it was designed with, and on the fitted plant",
+                header=("", "designed on", "fitted plant"),
                 rows=rows,
             ),
-            _price_table(analysis),
         ),
+        details=(_certificate(analysis),),
+        detail_tables=(_price_table(analysis),),
         figures=(
             Figure(
                 figure=nyquist_figure(loops, analysis.points, controller, omega, spec.modulus_margin),
                 caption="Nyquist: the loops stay outside the circle of the modulus margin; ellipses are the points'"
                 " 95 % regions times C.",
-                height_px=520,
+                square=True,
             ),
             Figure(
                 figure=nichols_figure(loops, omega, spec.modulus_margin, spec.phase_margin_rad),
-                caption="Black-Nichols, as figures 7 and 8 of the paper: the required phase margin as a bar, the"
-                " modulus margin as a closed curve.",
+                caption="Black-Nichols: the required phase margin as a bar, the modulus margin as a closed curve.",
             ),
             Figure(
                 figure=sensitivity_figure(loops, omega, spec.modulus_margin),
@@ -311,7 +295,7 @@ def _loop_section(analysis: Analysis) -> Section:
 
 
 _PROMISES = {
-    "reduced model": "margins of every plant of class (1) that (5) bounds by the reduced model",
+    "reduced model": "margins of every plant that the reduced model bounds: lags and dead time, falling gain and phase",
     "points": "margins of every aperiodic plant through the points' 95 % regions",
     "fitted plant": "margins of every plant in the 95 % region of the fit, if its structure is right",
 }
@@ -339,7 +323,7 @@ def _price_table(analysis: Analysis) -> Table:
         )
     return Table(
         caption="The price of each guarantee: designs of the same specification, judged on the fitted plant",
-        header=("designed on", "what is promised", "K", "T_I [s]", "H2 norm", "M_m", "phase margin [deg]"),
+        header=("designed on", "what is promised", "K", "T_I [s]", "H2 norm", "modulus margin", "phase margin [deg]"),
         rows=tuple(rows),
     )
 
