@@ -34,8 +34,8 @@ class LimitSettings(Section):
     time_s: Annotated[Time, Field(description="longest time on the rig [s]")] = 600.0
     late_s: Annotated[
         float,
-        Field(gt=0, le=60, description="longest time the loop may be behind its schedule [s]; two samples always are"),
-    ] = 0.1
+        Field(gt=0, le=60, description="longest time the loop may be behind its schedule [s]; five samples always are"),
+    ] = 0.15
 
     @model_validator(mode="after")
     def _ordered(self) -> LimitSettings:

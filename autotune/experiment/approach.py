@@ -10,7 +10,7 @@ from statistics import median
 import numpy as np
 
 from autotune.arrays import FloatArray
-from autotune.config import Config
+from autotune.config.procedure import OperatingPointSettings
 from autotune.errors import ExperimentStopped, IdentificationError, LinkError
 from autotune.experiment.feasibility import supported_rad_s
 from autotune.experiment.limits import Watch
@@ -87,8 +87,15 @@ class Known:
     warnings: tuple[str, ...] = ()
 
 
-def preflight(loop: ControlLoop, config: Config, tell: Tell) -> Known:
+def preflight(loop: ControlLoop, point: OperatingPointSettings, gain_sd: float, tell: Tell) -> Known:
     """Look before anything moves: link, noise, a sensor that is alive and in range.
+
+    Parameters
+    ----------
+    loop, point, tell
+        The open loop, how its operating point is reached, and who is told.
+    gain_sd : float
+        Relative standard deviation at which a point is good enough.
 
     Raises
     ------
@@ -96,13 +103,13 @@ def preflight(loop: ControlLoop, config: Config, tell: Tell) -> Known:
         Link too slow, sensor at its rail or frozen.
     """
     tell("looking at link and noise")
-    start_u = config.operating_point.u_guess if config.operating_point.approach == "hold" else loop.tick.u
+    start_u = point.u_guess if point.approach == "hold" else loop.tick.u
     first_row = loop.tick.k
     first: tuple[float, ...] = ()
     for _ in range(PREFLIGHT_SAMPLES):
         loop.step(loop.nearest(start_u))
         first = first if len(first) == RECENT else loop.monitor.recent
-        if config.operating_point.approach == "ramp":
+        if point.approach == "ramp":
             _check_at_rest(loop, first_row, first)
     y = loop.history(first_row)[2][1:]
     y = y[np.isfinite(y)]
@@ -116,7 +123,7 @@ def preflight(loop: ControlLoop, config: Config, tell: Tell) -> Known:
             where="preflight",
             remedy="raise signals.sample_time_s, or use a faster link",
         )
-    link_rad_s = supported_rad_s(timing, loop.sample_time_s, config.experiment.gain_sd, exact=loop.is_exact)
+    link_rad_s = supported_rad_s(timing, loop.sample_time_s, gain_sd, exact=loop.is_exact)
     tell(
         f"a reading takes {1e3 * typical:.2g} ms, up to {1e3 * late:.2g} ms in 99 %, and the loop is up to"
         f" {1e3 * timing.lateness_s[1]:.2g} ms late: this link supports points up to {link_rad_s:.3g} rad/s"
@@ -127,16 +134,17 @@ def preflight(loop: ControlLoop, config: Config, tell: Tell) -> Known:
     typical = 1.4826 * float(np.median(np.abs(steps)))
     noise_sd = min(float(np.std(steps)), typical if typical > 0.0 else math.inf) / math.sqrt(2.0)
     noise_half = min(0.5 * float(np.max(np.abs(steps))), 3.0 * noise_sd)
-    if noise_half > 0.4 * config.limits.swing:
+    limits = loop.envelope.settings
+    if noise_half > 0.4 * limits.swing:
         raise ExperimentStopped(
-            f"drowned in noise: y is restless by +-{noise_half:.3g} where limits.swing allows {config.limits.swing:g}",
+            f"drowned in noise: y is restless by +-{noise_half:.3g} where limits.swing allows {limits.swing:g}",
             where="preflight",
             remedy="filter the measurement at the device, or allow more swing",
         )
     changes = float(np.mean(steps != 0.0))
     loop.monitor.noise = noise_half
-    loop.monitor.jump = 0.5 * config.limits.swing
-    loop.monitor.u_tolerance = 0.02 * (config.limits.u_max - config.limits.u_min)
+    loop.monitor.jump = 0.5 * limits.swing
+    loop.monitor.u_tolerance = 0.02 * (limits.u_max - limits.u_min)
     if changes > RESTLESS:
         # a sensor at its rail repeats its full scale half of the time; the longest run seen says how it repeats itself
         loop.monitor.max_repeats = 4 * _longest_run(y) + 20
@@ -144,7 +152,7 @@ def preflight(loop: ControlLoop, config: Config, tell: Tell) -> Known:
         noise_sd=noise_sd,
         noise_half=noise_half,
         y_rest=float(np.mean(y)),
-        plant_sign=config.operating_point.plant_sign,
+        plant_sign=point.plant_sign,
         link_rad_s=link_rad_s,
     )
 
@@ -169,13 +177,15 @@ def _longest_run(y: FloatArray) -> int:
     return int(np.max(np.diff(np.concatenate([[-1], changes, [y.size - 1]]))))
 
 
-def approach(loop: ControlLoop, config: Config, known: Known, tell: Tell, *, u_rest: float | None = None) -> Known:
+def approach(
+    loop: ControlLoop, point: OperatingPointSettings, known: Known, tell: Tell, *, u_rest: float | None = None
+) -> Known:
     """Bring the plant to where it answers, and learn the sign of its gain and a first guess of the mid-point.
 
     Parameters
     ----------
-    loop, config, known, tell
-        The open loop, the settings, what is known, and who is told.
+    loop, point, known, tell
+        The open loop, where it is commissioned and how to get there, what is known, and who is told.
     u_rest : float, optional
         Command that holds the operating point, where it is known from before: makes the ramp short [u unit].
 
@@ -184,28 +194,29 @@ def approach(loop: ControlLoop, config: Config, known: Known, tell: Tell, *, u_r
     ExperimentStopped
         The plant does not answer, answers before it should, or with the sign it should not have.
     """
-    if config.operating_point.approach == "ramp":
-        point = config.operating_point
+    if point.approach == "ramp":
         reach = BRACKET * point.u_uncertainty
         bracket = (point.u_guess - reach, point.u_guess + reach)
         if u_rest is not None:
             bracket = (max(bracket[0], u_rest - 0.25 * reach), bracket[1])
-        return _ramp(loop, config, known, tell, bracket)
-    u_guess = u_rest if u_rest is not None else config.operating_point.u_guess
-    known = replace(known, midpoint=u_guess, y_moved=config.operating_point.y)
+        return _ramp(loop, point, known, tell, bracket)
+    u_guess = u_rest if u_rest is not None else point.u_guess
+    known = replace(known, midpoint=u_guess, y_moved=point.y)
     known = replace(known, first_move_s=loop.tick.t_s)
-    return known if known.plant_sign != 0 else _find_sign(loop, config, known, tell)
+    return known if known.plant_sign != 0 else _find_sign(loop, point, known, tell)
 
 
-def _ramp(loop: ControlLoop, config: Config, known: Known, tell: Tell, bracket: tuple[float, float]) -> Known:
+def _ramp(
+    loop: ControlLoop, point: OperatingPointSettings, known: Known, tell: Tell, bracket: tuple[float, float]
+) -> Known:
     """Ramp the command through the bracket until y leaves its rest."""
-    point = config.operating_point
+    limits = loop.envelope.settings
     rate = point.ramp_rate if point.ramp_rate is not None else point.u_uncertainty / 600.0 / loop.sample_time_s
-    low, high = max(bracket[0], config.limits.u_min), min(bracket[1], config.limits.u_max)
+    low, high = max(bracket[0], limits.u_min), min(bracket[1], limits.u_max)
     while abs(loop.tick.u - low) > rate * loop.sample_time_s + loop.envelope.u_step:
         loop.step(loop.nearest(low))
     tell(f"ramping the command from {low:.3g} to {high:.3g} until the plant moves")
-    distance = 2.0 * known.noise_half + MOVED_SHARE * config.limits.swing
+    distance = 2.0 * known.noise_half + MOVED_SHARE * limits.swing
     start_s = half_s = loop.tick.t_s
     moved = 0.0
     while abs(moved) < distance:
@@ -251,12 +262,12 @@ def _sign_of(moved: float, climbed: float, loop: ControlLoop, known: Known) -> i
     return sign
 
 
-def _find_sign(loop: ControlLoop, config: Config, known: Known, tell: Tell) -> Known:
+def _find_sign(loop: ControlLoop, point: OperatingPointSettings, known: Known, tell: Tell) -> Known:
     """Push the command up, then down, and compare how y moves."""
     tell("finding the sign of the plant's gain")
-    push = 0.5 * config.operating_point.u_uncertainty
-    distance = 4.0 * known.noise_half + 0.1 * config.limits.swing
-    patience = 0.1 * config.limits.time_s
+    push = 0.5 * point.u_uncertainty
+    distance = 4.0 * known.noise_half + 0.1 * loop.envelope.settings.swing
+    patience = 0.1 * loop.envelope.settings.time_s
     slopes = []
     for direction in (1.0, -1.0):
         start = loop.tick
@@ -278,8 +289,17 @@ def _find_sign(loop: ControlLoop, config: Config, known: Known, tell: Tell) -> K
     return replace(known, plant_sign=1 if slopes[0] > slopes[1] else -1, midpoint=midpoint)
 
 
-def find_midpoint(loop: ControlLoop, config: Config, known: Known, tell: Tell) -> tuple[Known, Oscillation]:
+def find_midpoint(
+    loop: ControlLoop, point: OperatingPointSettings, largest: float | None, known: Known, tell: Tell
+) -> tuple[Known, Oscillation]:
     """Catch the plant with a relay without inserted delay, lead it to the operating point, and find the mid-point.
+
+    Parameters
+    ----------
+    loop, point, known, tell
+        As :func:`approach`.
+    largest : float or None
+        Half-amplitude of the relay that was asked for [u unit].
 
     Returns
     -------
@@ -288,12 +308,12 @@ def find_midpoint(loop: ControlLoop, config: Config, known: Known, tell: Tell) -
     oscillation : Oscillation
         The relay, running, for the sweep to go on with.
     """
+    limits = loop.envelope.settings
     tell("catching the plant and finding the relay's mid-point")
-    point = config.operating_point
-    room = min(known.midpoint - config.limits.u_min, config.limits.u_max - known.midpoint)
+    room = min(known.midpoint - limits.u_min, limits.u_max - known.midpoint)
     # where ramp or pushes have told the mid-point roughly, the relay need not reach across all of its uncertainty
     reach = 0.4 if point.approach == "ramp" or point.plant_sign == 0 else BRACKET
-    amplitude = min(config.experiment.relay_amplitude or reach * point.u_uncertainty, 0.9 * room)
+    amplitude = min(largest or reach * point.u_uncertainty, 0.9 * room)
     if amplitude <= 0.0:
         raise ExperimentStopped(
             f"saturated: the mid-point {known.midpoint:.4g} is at the end of the command's range",
@@ -312,18 +332,18 @@ def find_midpoint(loop: ControlLoop, config: Config, known: Known, tell: Tell) -
     oscillation = Oscillation(
         loop,
         settings,
-        patience_s=PATIENCE_SHARE * config.limits.time_s,
-        nudge_s=NUDGE_SHARE * config.limits.time_s,
+        patience_s=PATIENCE_SHARE * limits.time_s,
+        nudge_s=NUDGE_SHARE * limits.time_s,
         sign_is_sure=seen,
     )
-    _lead(oscillation, config, known)
+    _lead(oscillation, point.y, known)
     loop.watch = Watch(y_centre=point.y, afloat=True)
-    return _balance(oscillation, config, known, tell), oscillation
+    return _balance(oscillation, known, tell), oscillation
 
 
-def _lead(oscillation: Oscillation, config: Config, known: Known) -> None:
+def _lead(oscillation: Oscillation, y: float, known: Known) -> None:
     """Move the relay's centre from where the plant was caught to the operating point, at the speed it had."""
-    target = config.operating_point.y
+    target = y
     # ahead of the plant, so that the relay pulls it away from its rest at once
     centre = known.y_moved + LEAD * (target - known.y_moved)
     step = max(known.speed, SMALL) * oscillation.loop.sample_time_s
@@ -331,18 +351,18 @@ def _lead(oscillation: Oscillation, config: Config, known: Known) -> None:
         centre = min(centre + step, target) if centre < target else max(centre - step, target)
         oscillation.move_centre(centre)
         oscillation.step()
-    while abs(oscillation.loop.tick.y - target) > 0.8 * config.limits.swing:
+    while abs(oscillation.loop.tick.y - target) > 0.8 * oscillation.loop.envelope.settings.swing:
         oscillation.step()
 
 
-def _balance(oscillation: Oscillation, config: Config, known: Known, tell: Tell) -> Known:
+def _balance(oscillation: Oscillation, known: Known, tell: Tell) -> Known:
     """Oscillate until the duty is near one half and two whole periods agree; take the first point from them."""
     loop = oscillation.loop
-    swing = config.limits.swing
+    swing = loop.envelope.settings.swing
     oscillation.change(
         oscillation.settings,
-        patience_s=PATIENCE_SHARE * config.limits.time_s,
-        nudge_s=NUDGE_SHARE * config.limits.time_s,
+        patience_s=PATIENCE_SHARE * loop.envelope.settings.time_s,
+        nudge_s=NUDGE_SHARE * loop.envelope.settings.time_s,
     )
     tries = 0
     while True:

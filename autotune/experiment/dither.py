@@ -224,6 +224,6 @@ def _next(amplitude: float, departure: float, swing: float, largest: float) -> f
 def _bring_to_operating_point(loop: ControlLoop, config: Config) -> float:
     """Return the command that holds the plant there: measured on the way, or what the rig applies now."""
     if config.operating_point.approach == "ramp":
-        wait_for_rest(loop, config)
+        wait_for_rest(loop)
         return float_on(loop, config).midpoint
     return loop.tick.u

@@ -178,12 +178,14 @@ def _brought_there(loop: ControlLoop, config: Config) -> float:
     def silent(_: str) -> None:
         return
 
-    if config.operating_point.approach == "ramp":
-        wait_for_rest(loop, config)
-    known = preflight(loop, config, silent)
-    if config.operating_point.approach == "hold":
-        return config.operating_point.u_guess
-    known, oscillation = find_midpoint(loop, config, approach(loop, config, known, silent), silent)
+    point, wanted = config.operating_point, config.experiment
+    if point.approach == "ramp":
+        wait_for_rest(loop)
+    known = preflight(loop, point, wanted.gain_sd, silent)
+    if point.approach == "hold":
+        return point.u_guess
+    known = approach(loop, point, known, silent)
+    known, oscillation = find_midpoint(loop, point, wanted.relay_amplitude, known, silent)
     # y turns midway between two switches: handed over there, a slow law does not have to stop a plant in full swing
     half = float(np.median(np.diff(oscillation.edges[-5:]))) if len(oscillation.edges) > 1 else 0.0
     while not oscillation.step()[1]:

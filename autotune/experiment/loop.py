@@ -30,7 +30,7 @@ SLICE_S = 0.1
 #: what an onlooker's Abort arrives as; Ctrl-C itself where the system has no signal to spare
 ABORT = getattr(signal, "SIGUSR1", signal.SIGINT)
 #: sample times that the loop may always be behind its schedule, however short limits.late_s is
-LATE_SAMPLES = 2
+LATE_SAMPLES = 5
 #: rows over which the share of missed samples is counted
 LOOK_BACK_ROWS = 100
 #: what lies at least between two rows [s], where a virtual clock stands still

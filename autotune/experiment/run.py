@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from autotune.config import Config
+from autotune.config.procedure import ExperimentSettings
 from autotune.errors import AutotuneError, ExperimentStopped
 from autotune.experiment.approach import Known, approach, find_midpoint, preflight
 from autotune.experiment.cycles import Earlier, refined
@@ -84,11 +85,11 @@ def run_experiment(
         What ended it; the rig is safe and the recording readable.
     """
     earlier = earlier or Earlier()
-    if not missing_phases(config, earlier):
+    if not missing_phases(config.experiment, earlier):
         final = refined(earlier.segments, earlier.rows, config.signals.sample_time_s)
         last = earlier.recordings[-1].metadata
         known = Known(first_move_s=math.nan, link_rad_s=last.get("link_rad_s", math.inf))
-        return _result(final, config, earlier.parts, Timing.from_table(last.get("timing", {})), known)
+        return _result(final, config.experiment, earlier.parts, Timing.from_table(last.get("timing", {})), known)
     extra = further_columns(rig)
     writer = RecordingWriter(recording, ("t", "u", "y", *extra), recording_metadata(config))
     with ControlLoop(rig=rig, envelope=envelope_of(config), writer=writer, extra=extra) as loop:
@@ -111,16 +112,17 @@ def experiment_on(
     try:
         journal.enter(State.PREFLIGHT)
         if earlier.recordings and config.operating_point.approach == "ramp":
-            wait_for_rest(loop, config)
-        known = preflight(loop, config, journal.tell)
+            wait_for_rest(loop)
+        point, wanted = config.operating_point, config.experiment
+        known = preflight(loop, point, wanted.gain_sd, journal.tell)
         journal.enter(State.APPROACH)
-        known = approach(loop, config, known, journal.tell, u_rest=earlier.u_rest)
+        known = approach(loop, point, known, journal.tell, u_rest=earlier.u_rest)
         journal.enter(State.MIDPOINT)
-        known, oscillation = find_midpoint(loop, config, known, journal.tell)
+        known, oscillation = find_midpoint(loop, point, wanted.relay_amplitude, known, journal.tell)
         if isinstance(loop.rig, RunsLaws):
             oscillation = DeviceOscillation(loop.rig, oscillation)
         journal.enter(State.SWEEP)
-        segments, known = sweep(loop, config, known, oscillation, journal.show, earlier)
+        segments, known = sweep(loop, point, wanted, known, oscillation, journal.show, earlier)
     except AutotuneError as error:
         error.where = error.where or journal.state.value
         raise
@@ -134,35 +136,34 @@ def experiment_on(
     journal.enter(State.HAND_BACK)
     journal.show("all points measured", 0.0, known)
     loop.watch = Watch(afloat=True)
-    result = _result(segments, config, (*earlier.parts, part), loop.timing, known)
+    result = _result(segments, wanted, (*earlier.parts, part), loop.timing, known)
     loop.step(loop.nearest(result.u_rest))
     return result
 
 
-def wait_for_rest(loop: ControlLoop, config: Config) -> None:
+def wait_for_rest(loop: ControlLoop) -> None:
     """Hold the safe command until y stands still: a plant may still be on its way back from what was done before.
 
     Parameters
     ----------
     loop : ControlLoop
-        Open.
-    config : Config
-        Its ``limits.swing`` says what standing still is, ``limits.time_s`` how long to wait for it at most.
+        Open. Its ``limits.swing`` says what standing still is, ``limits.time_s`` how long to wait for it at most.
 
     Raises
     ------
     ExperimentStopped
         y still moves.
     """
-    start_s, patience_s = loop.tick.t_s, REST_SHARE * config.limits.time_s
+    limits = loop.envelope.settings
+    start_s, patience_s = loop.tick.t_s, REST_SHARE * limits.time_s
     while loop.tick.t_s - start_s <= patience_s:
-        loop.step(loop.nearest(config.limits.u_safe))
+        loop.step(loop.nearest(limits.u_safe))
         y = loop.history(max(0, loop.tick.k - 2 * REST_ROWS))[2]
         if y.size < 2 * REST_ROWS:
             continue
         change = abs(float(np.nanmean(y[REST_ROWS:]) - np.nanmean(y[:REST_ROWS])))
         noise_sd = float(np.nanstd(np.diff(y))) / math.sqrt(2.0)  # a slow movement is not in the differences
-        if change < max(3.0 * noise_sd * math.sqrt(2.0 / REST_ROWS), 1e-3 * config.limits.swing):
+        if change < max(3.0 * noise_sd * math.sqrt(2.0 / REST_ROWS), 1e-3 * limits.swing):
             return
     raise ExperimentStopped(
         f"drifting: y still moves {patience_s:.3g} s after the safe command was set",
@@ -191,13 +192,14 @@ def float_on(loop: ControlLoop, config: Config, *, u_rest: float | None = None) 
     def silent(_: str) -> None:
         return
 
-    known = approach(loop, config, preflight(loop, config, silent), silent, u_rest=u_rest)
-    known, _ = find_midpoint(loop, config, known, silent)
+    point, wanted = config.operating_point, config.experiment
+    known = approach(loop, point, preflight(loop, point, wanted.gain_sd, silent), silent, u_rest=u_rest)
+    known, _ = find_midpoint(loop, point, wanted.relay_amplitude, known, silent)
     return known
 
 
 def _result(
-    segments: tuple[Segment, ...], config: Config, parts: tuple[Part, ...], timing: Timing, known: Known
+    segments: tuple[Segment, ...], wanted: ExperimentSettings, parts: tuple[Part, ...], timing: Timing, known: Known
 ) -> ExperimentResult:
     u_means = np.array([segment.u_mean for segment in segments])
     spread = float(np.std(u_means, ddof=1)) if u_means.size > 1 else math.nan
@@ -214,7 +216,7 @@ def _result(
         sweep_time_s=sum(part.sweep_time_s for part in parts),
         parts=parts,
         reason="completed",
-        warnings=(*doubts(segments, config, known.link_rad_s), *_missed(timing)),
+        warnings=(*doubts(segments, wanted, known.link_rad_s), *_missed(timing)),
     )
 
 

@@ -8,10 +8,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from autotune.config import Config
+from autotune.config.procedure import ExperimentSettings, OperatingPointSettings
 from autotune.errors import ExperimentStopped, IdentificationError
 from autotune.experiment.approach import Known
 from autotune.experiment.cycles import Earlier, measured, refined
+from autotune.experiment.limits import Envelope
 from autotune.experiment.loop import ControlLoop
 from autotune.experiment.oscillation import PATIENCE, Oscillation, mean_command
 from autotune.experiment.plan import Choice, Goal, allot, choose, phase_targets, time_s
@@ -32,14 +33,20 @@ Show = Callable[[str, float, Known, RelaySettings], None]
 
 
 def sweep(
-    loop: ControlLoop, config: Config, known: Known, oscillation: Oscillation, show: Show, earlier: Earlier
+    loop: ControlLoop,
+    point: OperatingPointSettings,
+    wanted: ExperimentSettings,
+    known: Known,
+    oscillation: Oscillation,
+    show: Show,
+    earlier: Earlier,
 ) -> tuple[tuple[Segment, ...], Known]:
     """Measure a point at every phase that is wanted and not yet measured, within the budget of rig time.
 
     Parameters
     ----------
-    loop, config, known, oscillation
-        The open loop, the settings, what is known, and the relay that runs.
+    loop, point, wanted, known, oscillation
+        The open loop, its operating point, the points that are wanted, what is known, and the relay that runs.
     show : callable
         Told what happens, the rig time that is expected to remain [s], what is known and which relay runs.
     earlier : Earlier
@@ -57,8 +64,7 @@ def sweep(
     ExperimentStopped
         A limit, no oscillation, an asymmetry that does not go away, or an oscillation drowned in noise.
     """
-    wanted = config.experiment
-    targets = missing_phases(config, earlier)
+    targets = missing_phases(wanted, earlier)
     end_s = known.first_move_s + wanted.budget_s - earlier.swept_s
     part, count = len(earlier.recordings), len(earlier.segments)
     segments = list(earlier.segments)
@@ -67,12 +73,12 @@ def sweep(
             known,
             points=tuple(one.point for one in segments),
             swept=True,
-            warnings=doubts(segments, config, known.link_rad_s),
+            warnings=doubts(segments, wanted, known.link_rad_s),
         )
     loop.note(first_move_s=known.first_move_s)
     for i, target in enumerate(targets):
-        choices = [_choice(config, known, one) for one in targets[i:]]
-        goal = _goal(config, known)
+        goal = _goal(loop.envelope, wanted.relay_amplitude, known)
+        choices = [_choice(goal, point.y, known, one) for one in targets[i:]]
         left_s = end_s - loop.tick.t_s
         periods = allot(choices, goal, wanted.gain_sd, LEAST_PERIODS, left_s)
         expected_s = sum(time_s(choice, count) for choice, count in zip(choices, periods, strict=True))
@@ -105,7 +111,7 @@ def sweep(
             noise_sd=segment.noise_sd,
             points=(*(known.points if known.swept else ()), segment.point),
             swept=True,
-            warnings=doubts(segments, config, known.link_rad_s),
+            warnings=doubts(segments, wanted, known.link_rad_s),
         )
 
     def rows(number: int) -> Rows:
@@ -115,17 +121,16 @@ def sweep(
     return final, replace(known, points=tuple(one.point for one in final))
 
 
-def missing_phases(config: Config, earlier: Earlier) -> tuple[float, ...]:
+def missing_phases(wanted: ExperimentSettings, earlier: Earlier) -> tuple[float, ...]:
     """Return the phases of the positive-gain plant that no finished cycle has aimed at, in their order [rad]."""
-    wanted = config.experiment
     done = [one.phase_rad for one in earlier.segments]
     targets = phase_targets(*wanted.phases_deg, wanted.points)
     return tuple(phase for phase in targets if not any(math.isclose(phase, other) for other in done))
 
 
-def doubts(segments: Sequence[Segment], config: Config, link_rad_s: float) -> tuple[str, ...]:
+def doubts(segments: Sequence[Segment], experiment: ExperimentSettings, link_rad_s: float) -> tuple[str, ...]:
     """Return what the reader should know of points not as good as was wanted, or beyond what the link supports."""
-    wanted = config.experiment.gain_sd
+    wanted = experiment.gain_sd
     sds = [math.sqrt(float(np.trace(one.point.covariance)) / 2.0) / one.point.gain for one in segments]
     beyond = tuple(
         f"point at {omega:.3g} rad/s is beyond the {link_rad_s:.3g} rad/s that this link supports: its phase may be off"
@@ -136,7 +141,7 @@ def doubts(segments: Sequence[Segment], config: Config, link_rad_s: float) -> tu
     coarse = [sd for sd in sds if sd > 1.1 * wanted]
     if not coarse:
         return beyond
-    enough_s = config.experiment.budget_s * (max(coarse) / wanted) ** 2  # a variance falls as the time grows
+    enough_s = experiment.budget_s * (max(coarse) / wanted) ** 2  # a variance falls as the time grows
     return (
         *beyond,
         f"{len(coarse)} of {len(sds)} points are known to {100 * max(coarse):.2g} % at worst, {100 * wanted:.2g} % was"
@@ -144,28 +149,28 @@ def doubts(segments: Sequence[Segment], config: Config, link_rad_s: float) -> tu
     )
 
 
-def _goal(config: Config, known: Known) -> Goal:
-    limits = config.limits
+def _goal(envelope: Envelope, amplitude: float | None, known: Known) -> Goal:
+    limits = envelope.settings
     return Goal(
         peak=(PEAK_SHARE if known.swept else FIRST_PEAK_SHARE) * limits.swing,
         noise_sd=known.noise_sd,
-        sample_time_s=config.signals.sample_time_s,
-        u_step=config.signals.u_step,
+        sample_time_s=envelope.sample_time_s,
+        u_step=envelope.u_step,
         u_room=0.95 * min(known.midpoint - limits.u_min, limits.u_max - known.midpoint),
-        amplitude=config.experiment.relay_amplitude,
+        amplitude=amplitude,
     )
 
 
-def _choice(config: Config, known: Known, phase_rad: float) -> Choice:
+def _choice(goal: Goal, y_centre: float, known: Known, phase_rad: float) -> Choice:
     midpoint = known.midpoint
-    if config.signals.u_step > 0.0:
-        midpoint = config.signals.u_step * round(midpoint / config.signals.u_step)
+    if goal.u_step > 0.0:
+        midpoint = goal.u_step * round(midpoint / goal.u_step)
     return choose(
         known.points,
         phase_rad,
-        _goal(config, known),
+        goal,
         midpoint=midpoint,
-        y_centre=config.operating_point.y,
+        y_centre=y_centre,
         plant_sign=known.plant_sign,
     )
 

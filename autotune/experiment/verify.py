@@ -307,7 +307,7 @@ def run_verification(
     with ControlLoop(rig=rig, envelope=envelope_of(config), writer=writer, extra=extra) as loop:
         loop.metadata["controller"] = {"kind": controller.kind, "K": controller.K, "Ti_s": controller.Ti_s}
         if config.operating_point.approach == "ramp":
-            wait_for_rest(loop, config)
+            wait_for_rest(loop)
         known = float_on(loop, config, u_rest=u_rest)
         loop.note(test_start_s=loop.tick.t_s)
         y, u = run_test(loop, law, test, config.operating_point.y, known.midpoint, on_progress)

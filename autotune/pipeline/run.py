@@ -140,7 +140,7 @@ def _tune(
     analysis: Analysis | None = None
     try:
         recording = next_free(out / RECORDING)
-        if missing_phases(config, earlier):
+        if missing_phases(config.experiment, earlier):
             log.recording(recording)
         experiment = run_experiment(rig, config, recording, earlier=earlier, on_progress=on_progress)
         analysis = analyse(experiment.points, config.design, facts=_facts(config, experiment))
