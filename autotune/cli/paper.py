@@ -45,7 +45,7 @@ def relay(
     noise_gain: Annotated[float, typer.Option(help="N_max of the design and of (26) [u/y unit]")] = 0.1,
     overwrite: OVERWRITE = False,
 ) -> None:
-    """Tables I and II and figures 6 to 8 of Le & Mendes for a run's points, or for a known plant."""
+    """Tables I and II and figures 6 to 9 of Le & Mendes for a run's points, or for a known plant."""
     from autotune.api.methods import reduce, tune, validate
     from autotune.api.plants import as_plant
     from autotune.api.points import Points

@@ -1,11 +1,13 @@
-"""Tables I and II and figures 6 to 8 of Le & Mendes 2010 for any points and any controller."""
+"""Tables I and II and figures 6 to 9 of Le & Mendes 2010 for any points and any controller."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from typing import Literal
 
 import numpy as np
+from scipy.signal import cont2discrete
 
 from autotune.arrays import FloatArray
 from autotune.controller import Controller, PIDController
@@ -14,10 +16,14 @@ from autotune.design.nugap import Validation
 from autotune.identification.reduction import ReducedModel
 from autotune.models import TransferFunction
 from autotune.points import FrequencyPoint
+from autotune.report.chart import make_subplots
 from autotune.report.figures import Curve, bode_figure, nichols_figure, sensitivity_figure
-from autotune.report.page import BLUE, GREEN, ORANGE, PURPLE, Figure, Page, Section, Table
+from autotune.report.page import BLUE, GREEN, ORANGE, PURPLE, Figure, Page, Section, Table, add_line
 
 _PHASE = math.radians(45.0)
+#: Time after a step, over the slowest crossover; steps drawn and computed between them.
+_SETTLING = 25.0
+_STEPS, _SUBSTEPS = 1000, 8
 
 
 def bandwidth_limit(plant: TransferFunction, noise_gain: float, omega: FloatArray) -> float:
@@ -55,7 +61,7 @@ def relay_page(
     noise_gain: float,
     plant_name: str,
 ) -> Page:
-    """Return the page with both tables and the three figures.
+    """Return the page with both tables and the four figures.
 
     Parameters
     ----------
@@ -97,7 +103,7 @@ def relay_page(
         caption="The reduced model's gain is nowhere below, its phase nowhere above, up to -180 degrees.",
     )
     return Page(
-        title="Relay with delay, reduced model and PI: tables I and II, figures 6 to 8",
+        title="Relay with delay, reduced model and PI: tables I and II, figures 6 to 9",
         verdict=f"Criterion (10) {'holds' if validation.holds else 'does not hold'} at the scaling "
         f"{validation.scaling:.3g}.{shown}",
         tone="good" if validation.holds else "bad",
@@ -108,8 +114,82 @@ def relay_page(
             Section(title="Figure 6: Bode diagrams", figures=(bode,)),
             Section(title="Figure 7: the first controller on model and plant", figures=_robust(seven, omega)),
             Section(title=f"Figure 8: the controllers on {plant_name}", figures=_robust(eight, omega)),
+            Section(title="Figure 9: set-point step and load step", figures=(_responses(plant, controllers, colours),)),
         ),
     )
+
+
+def _responses(plant: TransferFunction, controllers: Mapping[str, Controller], colours: Sequence[str]) -> Figure:
+    """Draw y and u of the linear loop after a step of the set-point and, half way, a step of the load."""
+    slowest = min(margins(plant, c).crossover_rad_s for c in controllers.values())
+    half_s = _SETTLING / slowest
+    figure = make_subplots(rows=2, cols=1, shared_xaxes=True, vertical_spacing=0.06, row_heights=[0.6, 0.4])
+    for i, (name, controller) in enumerate(controllers.items()):
+        t, y, u = step_responses(plant, controller, half_s)
+        for row, values in ((1, y), (2, u)):
+            add_line(figure, t, values, name, colours[i % len(colours)], row=row, col=1, showlegend=row == 1)
+    figure.update_yaxes(title="y", row=1, col=1)
+    figure.update_yaxes(title="u", row=2, col=1)
+    figure.update_xaxes(title="time [s]", row=2, col=1)
+    return Figure(
+        figure=figure,
+        caption="A unit step of the set-point at 0, a step of load at the plant's input half way; the linear loop, "
+        "without limits or noise.",
+        height_px=520,
+    )
+
+
+def step_responses(
+    plant: TransferFunction, controller: Controller, half_s: float
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return t, y and u of a loop after a unit set-point step at 0 and a load step at ``half_s``.
+
+    Parameters
+    ----------
+    plant : TransferFunction
+        Strictly proper; its dead time is rounded to a step.
+    controller : PIDController or TransferFunction
+        Acts on the error.
+    half_s : float
+        Time of the load step, half of what is simulated [s].
+
+    Returns
+    -------
+    t, y, u : (1001,) arrays
+        The load is half of the largest command that the set-point step took, with the sign that command had.
+    """
+    law = controller.transfer_function() if isinstance(controller, PIDController) else controller
+    assert isinstance(law, TransferFunction)
+    fine = 2.0 * half_s / _STEPS / _SUBSTEPS
+    b, a = _sampled(plant, fine, "zoh")
+    d, c = _sampled(law, fine, "bilinear")
+    b = np.concatenate([np.zeros(round(plant.delay_s / fine)), b])
+    y, u, count = np.zeros(_STEPS * _SUBSTEPS + 1), np.zeros(_STEPS * _SUBSTEPS + 1), _STEPS * _SUBSTEPS + 1
+    at_plant, load = np.zeros(count), 0.0
+    for k in range(count):
+        y[k] = _next(b, at_plant, k) - _next(np.concatenate([[0.0], a[1:]]), y, k)
+        u[k] = _next(d, 1.0 - y, k) - _next(np.concatenate([[0.0], c[1:]]), u, k)
+        if k == count // 2:
+            load = 0.5 * u[int(np.argmax(np.abs(u[: k + 1])))]
+        at_plant[k] = u[k] + load
+    thin = slice(None, None, _SUBSTEPS)
+    return fine * np.arange(count, dtype=np.float64)[thin], y[thin], u[thin]
+
+
+def _sampled(
+    system: TransferFunction, step_s: float, method: Literal["zoh", "bilinear"]
+) -> tuple[FloatArray, FloatArray]:
+    """Return numerator and denominator in ascending powers of the delay operator, dead time left out."""
+    given = np.array(system.num, dtype=np.float64), np.array(system.den, dtype=np.float64)
+    found = cont2discrete(given, step_s, method=method)
+    num, den = np.real(np.ravel(found[0])), np.real(np.ravel(found[1]))
+    return np.asarray(num / den[0], dtype=np.float64), np.asarray(den / den[0], dtype=np.float64)
+
+
+def _next(weights: FloatArray, signal: FloatArray, k: int) -> float:
+    """Return the sum of weights[i] signal[k - i]."""
+    known = min(len(weights), k + 1)
+    return float(weights[:known] @ signal[k::-1][:known]) if k else float(weights[0] * signal[0])
 
 
 def _loop(plant: TransferFunction, controller: Controller) -> TransferFunction:

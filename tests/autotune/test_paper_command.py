@@ -14,7 +14,7 @@ from autotune.cli import app
 from autotune.controller import PIDController, write_controller
 from autotune.models import Block, Model, Port, write_model
 from autotune.points import points_to_json
-from autotune.report.relay_figures import bandwidth_limit
+from autotune.report.relay_figures import bandwidth_limit, step_responses
 from tests.autotune.design.plants import BALL
 
 
@@ -33,7 +33,7 @@ def test_the_page_of_a_known_plant_has_the_row_of_table_ii(tmp_path):
     page = (tmp_path / "page.html").read_text(encoding="utf-8")
     for figure in ("0.6818", "48.16", "0.607", "1.384", "57.14", "5.214"):  # recomputed row, and omega_d
         assert figure in page, figure
-    for title in ("Table I:", "Table II:", "Figure 6", "Figure 7", "Figure 8"):
+    for title in ("Table I:", "Table II:", "Figure 6", "Figure 7", "Figure 8", "Figure 9"):
         assert title in page
 
 
@@ -53,6 +53,19 @@ def test_the_bandwidth_that_a_noise_gain_leaves():
     assert abs(BALL.response(np.array([limit]))[0]) == pytest.approx(10.0, rel=1e-3)
     assert limit == pytest.approx(4.15, rel=0.1)
     assert math.isnan(bandwidth_limit(BALL, 1e-9, omega))
+
+
+def test_the_responses_are_those_of_python_control():
+    control = pytest.importorskip("control")
+    t, y, u = step_responses(BALL, PIDController(K=-0.023, Ti_s=3.0), 20.0)
+    plant, law = at.to_control(BALL), at.to_control(at.PI(K=-0.023, Ti_s=3.0))
+    first = t < 20.0
+    _, expected = control.step_response(control.feedback(plant * law, 1), t[first])
+    np.testing.assert_allclose(y[first], expected, atol=5e-3)
+    load = 0.5 * u[np.argmax(np.abs(u[first]))]
+    _, after = control.step_response(load * control.feedback(plant, law), t[~first] - 20.0)
+    np.testing.assert_allclose(y[~first] - y[first][-1], after, atol=0.02 * np.max(np.abs(after)) + 5e-3)
+    assert np.ptp(y[~first]) > 0.1
 
 
 def test_the_loops_figures_hold_every_method_of_the_paper(tmp_path):
