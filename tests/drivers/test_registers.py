@@ -197,7 +197,7 @@ def test_two_bits_share_a_word_and_nothing_else_does() -> None:
 def test_what_is_written_of_a_command_is_never_beyond_its_limits(
     codec: Codec, ends: tuple[float, float], at: float
 ) -> None:
-    span = codec.span if codec.resolution else (-1e6, 1e6)
+    span = room(codec)
     low, high = (span[0] + share * (span[1] - span[0]) * 1e-3 for share in sorted(ends))
     value = min(max(low + at * (high - low), low), high)
     try:
