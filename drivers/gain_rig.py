@@ -11,7 +11,8 @@ from autotune.config.registers import GainSettings, RegisterMap, UnlockSettings
 from autotune.controller import PIDController
 from autotune.errors import InputError, LinkError
 from drivers.gain_settings import controller_of, settings_of
-from drivers.register_rig import RegisterLink, RegisterRig
+from drivers.register_link import RegisterLink
+from drivers.register_rig import RegisterRig
 from drivers.registers import Codec, blocks
 
 #: steps of a register, relative to what it holds, that are fine enough for a gain

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Protocol
 
 from autotune.config.registers import RegisterMap
 from autotune.config.rig import PermissiveSettings
@@ -12,6 +11,7 @@ from autotune.errors import ExperimentStopped, LinkError, NotTaken
 from autotune.experiment.rig import Clock, Former, Reading
 from drivers.clock import MonotonicClock
 from drivers.heartbeat import Heartbeat
+from drivers.register_link import RegisterLink
 from drivers.registers import Block, Codec, blocks, codecs
 
 _SAMPLE = ("y", "u_applied", "device_time", "heartbeat_echo", "in_command")
@@ -22,35 +22,6 @@ _SCAN_S, _SCANS_LATE = 0.02, 5
 _TAKE_S = 0.25
 #: how long another master's heartbeat is looked for, in times between two of our own
 _WATCH_FEEDS = 3
-
-
-class RegisterLink(Protocol):
-    """What a rig needs of a transport; every method may raise LinkError."""
-
-    @property
-    def where(self) -> str:
-        """The device, for messages."""
-        ...
-
-    def connect(self) -> None:
-        """Connect; nothing where there is a connection."""
-        ...
-
-    def disconnect(self) -> None:
-        """Disconnect; may be called more than once."""
-        ...
-
-    def distrust(self) -> None:
-        """Make sure that no earlier answer is taken for the next one."""
-        ...
-
-    def read(self, block: Block) -> tuple[Sequence[int], bool]:
-        """Return the block's words, and whether they are suspect."""
-        ...
-
-    def write(self, table: str, address: int, words: Sequence[int]) -> bool:
-        """Write words, and return whether that is suspect."""
-        ...
 
 
 class RegisterRig:
