@@ -66,7 +66,9 @@ def _figures(rows: Sequence[Content]) -> Table:
     for row in rows:
         share = row["interval"] is not None
         value = "-" if not row["count"] else f"{100 * row['value']:.1f} %" if share else f"{row['value']:.3f}"
-        between = f"{100 * row['interval'][0]:.1f} to {100 * row['interval'][1]:.1f} %" if share else ""
+        between = (
+            f"{100 * row['interval'][0]:.1f} to {100 * row['interval'][1]:.1f} %" if share and row["count"] else ""
+        )
         met = {None: "", True: "yes", False: "no"}[row["met"]]
         cells.append((row["figure"], row["asked"], value, between, str(row["count"]), met))
     return Table(header=("figure", "asked", "measured", "95 % interval", "of", "met"), rows=tuple(cells))

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from importlib import metadata
+
 import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+import autotune
 from autotune.cli import app
 from autotune.errors import InputError
 from autotune.recording import read_recording
@@ -48,3 +51,8 @@ def test_a_command_refuses_what_it_is_not_sure_of_and_takes_names(trace, tmp_pat
     with pytest.raises(InputError, match=r"--u .* --y .* autotune import"):
         call(*words)
     assert "delay" in call(*words, "--u", "Kanal C", "--y", "Kanal B").output
+
+
+def test_the_version_is_the_packages() -> None:
+    assert call("--version").output == f"relay-autotune {autotune.__version__}\n"
+    assert autotune.__version__ == metadata.version("relay-autotune")
