@@ -14,6 +14,7 @@ In Python, ``import autotune as at``:
 ``OnlineEstimator``    the same row by row, for a live rig
 ``closed_loop``        the plant from a recording of its loop, by the papers' methods
 ``transition``         the fastest smooth transition within limits
+``Model``              a model from a file, equations, python-control, a written formula, a step function
 ``simulate``           a model driven by a recording
 ``diagnose``           where and why recordings differ from a model
 ``plot``               any result, on matplotlib axes or as an interactive chart
@@ -46,6 +47,7 @@ if TYPE_CHECKING:
         tune,
         validate,
     )
+    from autotune.api.models import Model
     from autotune.api.plots import plot
     from autotune.api.points import Points, frequency_points
     from autotune.api.recordings import read
@@ -69,6 +71,7 @@ _HOMES = {
     "delay": "autotune.api.methods",
     "closed_loop": "autotune.api.methods",
     "transition": "autotune.api.methods",
+    "Model": "autotune.api.models",
     "simulate": "autotune.api.methods",
     "diagnose": "autotune.api.methods",
     "plot": "autotune.api.plots",
@@ -85,6 +88,7 @@ _HOMES = {
 
 __all__ = [
     "PI",
+    "Model",
     "OnlineEstimator",
     "Points",
     "Recording",

@@ -15,18 +15,23 @@ from autotune.recording import Recording
 def diagnosed(model: Any, recordings: Sequence[Recording], controller: Controller | None, **settings: Any) -> Any:
     """Return the diagnosis of recordings."""
     from autotune.diagnosis import diagnose
+    from autotune.diagnosis.equations import diagnose_equations
 
-    return diagnose(_model(model), recordings, controller, **settings)
+    given = _model(model)
+    if isinstance(given, Model):
+        return diagnose(given, recordings, controller, **settings)
+    return diagnose_equations(given, recordings, **settings)
 
 
 def simulated(model: Any, recording: Recording, horizon_s: float | None) -> FloatArray:
-    """Return y simulated with a recording's u, of a chain or of equations."""
+    """Return y simulated with a recording's u, of a chain, of equations or of an FMU."""
     from autotune.diagnosis import forecast
-    from autotune.equations import forecast as of_equations
+    from autotune.equations.files import forecast_any
 
     given = _model(model)
-    run = forecast if isinstance(given, Model) else of_equations
-    return run(given, recording, horizon_s)
+    if isinstance(given, Model):
+        return forecast(given, recording, horizon_s)
+    return forecast_any(given, recording, horizon_s)
 
 
 def _model(model: Any) -> Any:

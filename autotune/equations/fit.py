@@ -20,7 +20,7 @@ from autotune.errors import InputError
 from autotune.recording import Recording
 
 #: Relative decrease of the penalised sum of squares below which a fit has converged.
-_SMALL = 1e-5
+_SMALL = 1e-4
 #: Windows that a recording is cut into, one fit after the other, each with this many rows at least.
 SHORT_TO_LONG, LEAST_ROWS = (32, 8, 2, 1), 24
 #: A longer window that leaves this many times the error of the shorter ones has lost its way.

@@ -23,7 +23,7 @@ WORTH, SHARE = 30.0, 0.02
 #: Residual variance, of the noise's that its differences show, up to which it is noise.
 NOISE_ALONE = 1.08
 #: Iterations of a first fit, and of the best ones.
-FIRST, LAST = 6, 20
+FIRST, LAST = 6, 12
 #: Of the best predicted decrease: what is less is not fitted.
 FAINT = 0.02
 
@@ -149,7 +149,7 @@ def _round(bench: Bench, base: Outcome, without: Sequence[str], progress: Progre
         except InputError:
             continue
     found.sort(key=lambda one: one.rss)
-    for k, one in enumerate(found[:3]):
+    for k, one in enumerate(found[:2]):
         progress(f"fitting {one.effects[-1].name}", share + 0.35 + 0.04 * k)
         try:
             better = bench.fitted(one.effects, one, LAST)

@@ -103,3 +103,21 @@ def test_vectors_of_matlab() -> None:
     for num, den in (("[]", "[1]"), ("[a]", "[1]"), ("[1 2 3]", "[1 1]")):
         with pytest.raises(InputError):
             from_matlab(num, den)
+
+
+def test_the_public_face_makes_models_and_simulates_them() -> None:
+    import autotune as at
+
+    t = np.arange(200) * 0.05
+    data = {"t": t, "u": np.ones(200), "y": 2.0 * (1.0 - np.exp(-t / 0.5))}
+    lag = at.Model.from_equations({
+        "input": [{"column": "u"}], "output": {"value": "x"}, "parameters": {"K": 2.0, "T": 0.5},
+        "state": [{"name": "x", "derivative": "(K*u - x)/T"}],
+    })  # fmt: skip
+
+    def step(x, inputs, p, dt):  # type: ignore[no-untyped-def]
+        lost = np.exp(-dt / p["T"])
+        return lost * x + (1.0 - lost) * p["K"] * inputs[0], x
+
+    for made in (lag, at.Model.from_text("2/(0.5s + 1)"), at.Model.from_function(step, 0.0, {"K": 2.0, "T": 0.5})):
+        np.testing.assert_allclose(at.simulate(made, data), data["y"], atol=1e-3)

@@ -1,0 +1,60 @@
+"""``at.Model``: a model from wherever a person has one."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from autotune.arrays import FloatArray
+from autotune.equations.black_box import BlackBox
+from autotune.equations.model import EquationModel
+from autotune.models import Model as Chain
+
+
+class Model:
+    """Makers of models for ``simulate`` and ``diagnose``; none of what they return is an object of this class."""
+
+    @staticmethod
+    def read(path: str | os.PathLike[str]) -> Chain | EquationModel | BlackBox:
+        """Return what a model file holds: a chain of blocks, equations, or an FMU with its inputs and parameters."""
+        from autotune.equations.files import read_any_model
+
+        return read_any_model(path)
+
+    @staticmethod
+    def from_equations(content: Mapping[str, Any], name: str = "model") -> EquationModel:
+        """Return equations from a mapping with the keys of a model file: ``input``, ``output``, ``state``, .."""
+        from autotune.equations.read import equations_of
+
+        return equations_of({"name": name, **content}, str(content.get("name", name)))
+
+    @staticmethod
+    def from_control(system: Any, name: str = "") -> Chain | EquationModel:
+        """Return a continuous system of python-control: a chain, or equations where it has several inputs."""
+        from autotune.equations.imports import from_control
+
+        return from_control(system, name)
+
+    @staticmethod
+    def from_text(text: str, name: str = "plant") -> Chain:
+        """Return a transfer function as people write it: ``-65.5/(s(0.36s+1)) e^-0.1s``, zpk, gain and lags."""
+        from autotune.equations.imports import from_coefficients
+        from autotune.equations.transfer_text import parse_transfer_function
+
+        tf = parse_transfer_function(text)
+        return from_coefficients(tf.num, tf.den, tf.delay_s, name)
+
+    @staticmethod
+    def from_function(
+        step: Callable[[Any, FloatArray, Mapping[str, float], float], tuple[Any, float]],
+        state: Any,
+        parameters: Mapping[str, float],
+        *,
+        columns: Sequence[str] = ("u",),
+        name: str = "function",
+    ) -> BlackBox:
+        """Return a step function as a model: ``step(state, inputs, parameters, dt_s) -> (next_state, y)``."""
+        from autotune.equations.black_box import from_function
+
+        return from_function(step, state, parameters, columns=columns, name=name)
