@@ -65,12 +65,13 @@ class Heartbeat:
     def allows(self, echo: float, asked_s: float) -> bool:
         """Return whether the device that was asked at ``asked_s`` [s] may show this echo."""
         if self.is_own(echo, asked_s):
-            self._is_seen = True
             return True
         # what an earlier session left is shown until the first of our own
         return not self._is_seen and asked_s - self._first_s <= self._late_s
 
     def is_own(self, echo: float, asked_s: float) -> bool:
-        """Return whether the echo is of a beat of this session that the device may still show."""
+        """Return whether the echo is of a beat of this session that the device may still show; from then on all are."""
         late = (until_s for beat, until_s in self._earlier if beat == echo)
-        return self.is_begun and (echo == self.value or any(asked_s - until_s <= self._late_s for until_s in late))
+        own = self.is_begun and (echo == self.value or any(asked_s - until_s <= self._late_s for until_s in late))
+        self._is_seen = self._is_seen or own
+        return own
