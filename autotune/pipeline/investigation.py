@@ -29,7 +29,7 @@ LARGEST_SHARE = 0.8
 
 @dataclass(frozen=True, kw_only=True)
 class Round:
-    """One experiment and what was believed after it.
+    """One experiment and the probabilities after it.
 
     Attributes
     ----------
@@ -164,7 +164,7 @@ def investigate(
         )
     rig_time_s = rounds * duration_s if rig_time_s is None else rig_time_s
     found = _diagnosed(model, recordings, without, report) if recordings else None
-    before = () if found is None else _believed(found)
+    before = () if found is None else _probabilities(found)
     known = Investigation(diagnosis=found, recordings=tuple(recordings), before=before, rounds=(), ended="")
     while True:
         keep(known)
@@ -233,7 +233,7 @@ def _round(
     recordings = (*known.recordings, replace(seen, name=str(path)))
     found = _diagnosed(model, recordings, without, report)
     one = Round(
-        number=number, recording=path.name, plan=plan, verdict=found.verdict, candidates=_believed(found)
+        number=number, recording=path.name, plan=plan, verdict=found.verdict, candidates=_probabilities(found)
     )  # fmt: skip
     return replace(known, diagnosis=found, recordings=recordings, rounds=(*known.rounds, one))
 
@@ -242,5 +242,5 @@ def _diagnosed(model: Model, recordings: Sequence[Recording], without: Sequence[
     return with_next_experiment(diagnose(model, recordings, None, without, report))
 
 
-def _believed(found: Diagnosis) -> tuple[tuple[str, float], ...]:
+def _probabilities(found: Diagnosis) -> tuple[tuple[str, float], ...]:
     return tuple((c.name, round(c.probability, 4)) for c in found.candidates)

@@ -83,7 +83,7 @@ def _described(description: Description) -> Section:
     shares = Table(
         header=("signal", "held-out share"),
         rows=tuple((name, f"{100 * share:.0f} %") for name, share in description.shares.items()),
-        caption="What a free curve over each signal takes away of the misfit above the noise, on held-out windows.",
+        caption="What a free curve over each signal takes away of the residual above the noise, on held-out windows.",
     )
     return Section(
         title="A description, not a cause",
@@ -96,7 +96,7 @@ def _described(description: Description) -> Section:
 def _curve(curve: Curve) -> Figure:
     caption = (
         f"What is missing over {curve.signal}, as a smoothing spline of no assumed form, with its 95 % band; it "
-        f"takes away {100 * curve.explained:.0f} % of the held-out misfit above the noise. It does not tell an offset."
+        f"takes away {100 * curve.explained:.0f} % of the held-out residual above the noise. It tells no offset."
     )
     return Figure(figure=curve_figure(curve), caption=caption, height_px=320)
 
@@ -140,4 +140,4 @@ def _hypotheses(found: Diagnosis) -> Section:
     odds = Table(
         header=("candidate", "probability"), rows=tuple((c.name, f"{c.probability:.3f}") for c in found.candidates)
     )
-    return Section(title="Rivals", tables=(table, odds))
+    return Section(title="Other hypotheses", tables=(table, odds))

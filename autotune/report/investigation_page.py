@@ -34,8 +34,8 @@ def _rounds(known: Investigation) -> Section:
         expected = f"{one.plan.discrimination:.0f}" if one.plan.between else "-"
         rows.append((str(one.number), done, asked, expected, _named(one.candidates)))
     table = Table(
-        header=("round", "experiment", "to tell", "expected misfit", "believed after it"), rows=tuple(rows),
-        caption="Expected misfit: of one hypothesis where another is true, in noise variances, mean over the pairs.",
+        header=("round", "experiment", "to tell", "expected chi-square", "probabilities after it"), rows=tuple(rows),
+        caption="Expected chi-square: of one hypothesis where another is true, mean over the pairs.",
     )  # fmt: skip
     text = f"Ended: {known.ended}." if known.ended else "It goes on."
     return Section(title="How it was learnt", text=(text,), tables=(table,) if rows else ())

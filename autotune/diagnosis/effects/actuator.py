@@ -50,7 +50,7 @@ def converted(u: float, step: float, origin: float) -> float:
 
 
 def _steps_over_command(scan: Scan) -> list[tuple[float, ...]]:
-    """Return the best lattice of levels: lines of the residual over u, then around them.
+    """Return the best step and origin of a converter: lines of the residual over u, then around them.
 
     A converter adds a saw-tooth of u, whose period is its step: its fundamental is a line of the influence's
     periodogram over the command, as a periodic load's is one over time. The origin is the level nearest to the middle
@@ -135,7 +135,7 @@ def without_zone(w: float, half_width: float) -> float:
 
 
 def curved(w: float, second_order: float, third_order: float) -> float:
-    """Return a command through a bent characteristic."""
+    """Return a command through a curved characteristic."""
     w += second_order * w * w
     w += third_order * w * w * w
     return w

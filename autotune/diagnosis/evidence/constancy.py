@@ -47,7 +47,7 @@ class Variation:
     Attributes
     ----------
     gain : float
-        Decrease of chi2 that it promises, in units of the residual's own variance.
+        Predicted decrease of chi2, in units of the residual's own variance.
     places : tuple of str
         Where it may enter, or what explains about as much.
     what : str

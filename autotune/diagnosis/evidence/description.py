@@ -56,7 +56,7 @@ class Curve:
     x, value, sd : (K,) array
         Signal, missing value and its 1-sigma there.
     explained : float
-        Share of the held-out misfit above the noise that the curve takes away.
+        Share of the held-out residual above the noise that the curve takes away.
     """
 
     signal: str
@@ -79,7 +79,7 @@ class Description:
     terms : tuple of Term
         The equation's terms, the most telling first; none where no simple function describes the residual.
     explained : float
-        Share of the held-out misfit above the noise that the equation takes away, 0 to 1.
+        Share of the held-out residual above the noise that the equation takes away, 0 to 1.
     curve : Curve
         The shape over the signal that tells most, without any assumed form.
     shares : mapping
@@ -107,7 +107,7 @@ class Description:
         if not self.terms:
             return f"{self.equation.capitalize()}."
         return (
-            f"A description, not a cause: {self.equation}; it takes away {100 * self.explained:.0f} % of the misfit "
+            f"A description, not a cause: {self.equation}; it takes away {100 * self.explained:.0f} % of the residual "
             "above the noise on windows that it was not fitted to."
         )
 
@@ -150,7 +150,7 @@ def describe(result: Fit, data: Data) -> Description:
     Notes
     -----
     First order: but for a position, which follows the readings, the signals are those of the fitted simulation; shapes
-    are smeared by as much as these differ from the rig's, and sizes are biased by what retuning has bent. A part that
+    are smeared by as much as these differ from the rig's, and sizes are biased by what retuning has moved. A part that
     the model's own free numbers can explain (an offset, a straight line in speed or input) is not seen. Where u is fed
     back from y, both contain the noise; windows that were not fitted tell whether that matters.
 

@@ -36,7 +36,7 @@ class FreedResidual:
         self.J = self.freed(result.jacobian[0])
         self._own = np.linalg.svd(self.J / np.maximum(np.linalg.norm(self.J, axis=0), 1e-300), full_matrices=False)[0]
         self.rows = data.rows
-        # where the misfit is so large that it was taken for noise, the floor is what changes from row to row alone
+        # where the residual is so large that it was taken for noise, the floor is what changes from row to row alone
         jitter = (
             noise_from_differences(result.residuals, data.good, data.thresholds.largest_correlation).total_sd
             / data.noise.total_sd
@@ -153,7 +153,7 @@ class FreedResidual:
         return float(total[best]), subsets[best]
 
     def explained(self, error: float, before: float) -> float:
-        """Return the share of the held-out misfit above the noise that is gone."""
+        """Return the share of the held-out residual above the noise that is gone."""
         return float(
             np.clip((before - error) / max(before - self.floor, self.data.thresholds.term_share * self.floor), 0.0, 1.0)
         )

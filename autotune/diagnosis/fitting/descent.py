@@ -15,13 +15,15 @@ from autotune.diagnosis.fitting.parameters import Parametrisation
 from autotune.diagnosis.simulation.simulator import Simulator
 from autotune.errors import AutotuneError, IdentificationError
 
+#: Decrease of the cost at which a descent stops, in units of the noise variance.
+TOLERANCE = 0.05
 #: Damping below which a small decrease means that the bottom is reached.
 SETTLED = 1e-7
 
 
 @dataclass(frozen=True, eq=False)
-class Spot:
-    """A point of the search with what its simulation left."""
+class Iterate:
+    """A point of the descent with what its simulation left."""
 
     theta: FloatArray
     x0: list[FloatArray]
@@ -78,11 +80,11 @@ class Problem:
         #: How many windows every recording has
         self.counts = [len(a) for a in data.starts]
 
-    def spot(self, theta: FloatArray, x0: list[FloatArray]) -> Spot:
+    def iterate(self, theta: FloatArray, x0: list[FloatArray]) -> Iterate:
         """Simulate at a point."""
         sim = self.parametrisation.simulator(theta)
         signals, ends = simulate(sim, x0, self.data)
-        return Spot(theta, x0, sim, ends, whiten(signals, self.data))
+        return Iterate(theta, x0, sim, ends, whiten(signals, self.data))
 
     def per_recording(self, values: AnyArray) -> list[AnyArray]:
         """Split what is known per window into recordings."""
@@ -96,7 +98,7 @@ class Problem:
     def prior(self, e: FloatArray, may: BoolArray) -> FloatArray:
         """Return what a unit of theta weighs against the data.
 
-        Where the structure is wrong its misfit counts as noise, else the fit would bend the chain out of all reason.
+        Where the structure is wrong its residual counts as noise, else the fit would move the chain out of all reason.
         """
         weight = max(1.0, float(np.sqrt(e @ e / max(self.data.rows, 1))))
         return np.where(may, weight / self.parametrisation.spreads, 0.0)
@@ -105,19 +107,19 @@ class Problem:
         """Return chi2 and the prior's penalty."""
         return float(e @ e + np.sum((prior * (theta - self.parametrisation.centre)) ** 2))
 
-    def jacobian(self, spot: Spot, may: BoolArray) -> Derivatives:
+    def jacobian(self, iterate: Iterate, may: BoolArray) -> Derivatives:
         """Return de/dtheta (N, p) and de/dx0 (N, n), all windows' states moved at once."""
-        J = np.zeros((spot.e.size, spot.theta.size))
+        J = np.zeros((iterate.e.size, iterate.theta.size))
         for i in np.flatnonzero(may):
-            J[:, i] = self._column(int(i), spot.theta, spot.x0, spot.e)
-        Jx = np.empty((spot.e.size, spot.sim.order))
-        for j in range(spot.sim.order):
+            J[:, i] = self._column(int(i), iterate.theta, iterate.x0, iterate.e)
+        Jx = np.empty((iterate.e.size, iterate.sim.order))
+        for j in range(iterate.sim.order):
             h = 1e-3 * self.scales[j]
-            shifted = [x.copy() for x in spot.x0]
+            shifted = [x.copy() for x in iterate.x0]
             for x in shifted:
                 x[:, j] += h
-            moved = whiten(simulate(spot.sim, shifted, self.data)[0], self.data)
-            column = (moved - spot.e) * (self.scales[j] / h)
+            moved = whiten(simulate(iterate.sim, shifted, self.data)[0], self.data)
+            column = (moved - iterate.e) * (self.scales[j] / h)
             Jx[:, j] = column if bounded(column) else 0.0
         return J, Jx
 
@@ -134,7 +136,7 @@ class Problem:
         h = self.nudge[i]
         moved = theta.copy()
         moved[i] += h
-        column = (self.spot(moved, x0).e - e) / h
+        column = (self.iterate(moved, x0).e - e) / h
         return column if bounded(column) else np.zeros_like(column)
 
     scales: FloatArray
@@ -183,52 +185,56 @@ def _freed(left: FloatArray, Jx: FloatArray, first: IntArray, last: IntArray, da
 
 
 def descend(
-    problem: Problem, spot: Spot, derivatives: Derivatives | None, may: BoolArray, iterations: int, tolerance: float
-) -> tuple[Spot, Derivatives | None]:
+    problem: Problem,
+    iterate: Iterate,
+    derivatives: Derivatives | None,
+    may: BoolArray,
+    iterations: int,
+) -> tuple[Iterate, Derivatives | None]:
     """Damped Gauss-Newton steps; derivatives are kept as long as they predict the decrease (chord method)."""
     damping, fresh = 1e-4, False
     for _ in range(iterations):
-        prior = problem.prior(spot.e, may)
-        cost = problem.cost(spot.e, spot.theta, prior)
+        prior = problem.prior(iterate.e, may)
+        cost = problem.cost(iterate.e, iterate.theta, prior)
         if derivatives is None:
-            derivatives, fresh = problem.jacobian(spot, may), True
-        e_left, J_left, gain_e, gain_J = eliminate(problem, derivatives, spot.e, damping)
+            derivatives, fresh = problem.jacobian(iterate, may), True
+        e_left, J_left, gain_e, gain_J = eliminate(problem, derivatives, iterate.e, damping)
         if not (np.all(np.isfinite(J_left)) and np.all(np.isfinite(e_left))):
-            return spot, None  # a derivative ran out of the model's range: the last good point stands
-        step = _step(problem, spot, derivatives[0], e_left, J_left, prior, damping, may)
+            return iterate, None  # a derivative ran out of the model's range: the last good point stands
+        step = _step(problem, iterate, derivatives[0], e_left, J_left, prior, damping, may)
         left = e_left + J_left @ step
-        promised = cost - problem.cost(left, spot.theta + step, prior)
+        predicted = cost - problem.cost(left, iterate.theta + step, prior)
         moves = problem.per_recording(problem.scales * (gain_e + gain_J @ step))
-        trial = [x - move for x, move in zip(spot.x0, moves, strict=True)]
-        new = attempted(problem, spot.theta + step, trial)
+        trial = [x - move for x, move in zip(iterate.x0, moves, strict=True)]
+        new = attempted(problem, iterate.theta + step, trial)
         decrease = -np.inf if new is None else cost - problem.cost(new.e, new.theta, prior)
-        if new is not None and decrease < 0.6 * promised:
+        if new is not None and decrease < 0.6 * predicted:
             # start states follow the step in theta to first order alone: they are put right before it is judged
             settled = resettled(problem, new, derivatives[1], damping)
             better = -np.inf if settled is None else cost - problem.cost(settled.e, settled.theta, prior)
             if better > decrease:
                 new, decrease = settled, better
         if new is not None and decrease > 0.0:
-            spot = new
+            iterate = new
             damping = max(damping / 10.0, 1e-9)
-            small = decrease < tolerance + 1e-5 * cost and (fresh or decrease > 0.5 * promised)
+            small = decrease < TOLERANCE + 1e-5 * cost and (fresh or decrease > 0.5 * predicted)
             if small and damping < SETTLED:  # damped, a step along a flat valley is small far from its end
                 break
-            if decrease < 0.6 * promised:
+            if decrease < 0.6 * predicted:
                 derivatives = None
             fresh = False
         elif fresh:
-            if promised < tolerance or damping > 1e4:
+            if predicted < TOLERANCE or damping > 1e4:
                 break
             damping *= 30.0
         else:
             derivatives = None
-    return spot, derivatives
+    return iterate, derivatives
 
 
 def _step(
     problem: Problem,
-    spot: Spot,
+    iterate: Iterate,
     J: FloatArray,
     e_left: FloatArray,
     J_left: FloatArray,
@@ -238,35 +244,35 @@ def _step(
 ) -> FloatArray:
     """Return the step in theta."""
     H = J.T @ J_left + np.diag(prior**2)
-    g = J.T @ e_left + prior**2 * (spot.theta - problem.parametrisation.centre)
+    g = J.T @ e_left + prior**2 * (iterate.theta - problem.parametrisation.centre)
     step = np.linalg.lstsq(H + damping * np.diag(np.maximum(np.diag(H), 1e-12)), -g, rcond=1e-15)[0]
     step[~may] = 0.0
     step /= max(1.0, float(np.max(np.abs(step) / problem.reach, initial=0.0)))
     return np.asarray(step)
 
 
-def resettled(problem: Problem, spot: Spot, Jx: FloatArray, damping: float) -> Spot | None:
+def resettled(problem: Problem, iterate: Iterate, Jx: FloatArray, damping: float) -> Iterate | None:
     """Return a point with the start states that fit its theta, one linear step from where they are."""
-    gain = eliminate(problem, (np.empty((spot.e.size, 0)), Jx), spot.e, damping)[2]
+    gain = eliminate(problem, (np.empty((iterate.e.size, 0)), Jx), iterate.e, damping)[2]
     moves = problem.per_recording(problem.scales * gain)
-    return attempted(problem, spot.theta, [x - move for x, move in zip(spot.x0, moves, strict=True)])
+    return attempted(problem, iterate.theta, [x - move for x, move in zip(iterate.x0, moves, strict=True)])
 
 
-def continued(problem: Problem, spot: Spot) -> Spot:
-    """Start every window where the one before ended, where that fits better: a way out of stuck start states."""
-    if all(len(x) == 1 for x in spot.x0):
-        return spot
-    trial = [x.copy() for x in spot.x0]
-    for i, (x, ends) in enumerate(zip(trial, spot.ends, strict=True)):
+def continued(problem: Problem, iterate: Iterate) -> Iterate:
+    """Start every window where the one before ended, where that fits better: a restart for stuck start states."""
+    if all(len(x) == 1 for x in iterate.x0):
+        return iterate
+    trial = [x.copy() for x in iterate.x0]
+    for i, (x, ends) in enumerate(zip(trial, iterate.ends, strict=True)):
         follows = problem.data.stops[i][:-1] == problem.data.starts[i][1:]
         x[1:][follows] = ends[:-1][follows]
-    new = attempted(problem, spot.theta, trial)
+    new = attempted(problem, iterate.theta, trial)
     if new is None:
-        return spot
-    better = problem.per_recording(problem.chi2(new.e) < 0.9 * problem.chi2(spot.e) - 2.0)
-    trial = [np.where(b[:, None], x, old) for b, x, old in zip(better, trial, spot.x0, strict=True)]
-    mixed = attempted(problem, spot.theta, trial)
-    return spot if mixed is None or mixed.e @ mixed.e >= spot.e @ spot.e else mixed
+        return iterate
+    better = problem.per_recording(problem.chi2(new.e) < 0.9 * problem.chi2(iterate.e) - 2.0)
+    trial = [np.where(b[:, None], x, old) for b, x, old in zip(better, trial, iterate.x0, strict=True)]
+    mixed = attempted(problem, iterate.theta, trial)
+    return iterate if mixed is None or mixed.e @ mixed.e >= iterate.e @ iterate.e else mixed
 
 
 def bounded(values: FloatArray) -> bool:
@@ -274,10 +280,10 @@ def bounded(values: FloatArray) -> bool:
     return bool(np.max(np.abs(values), initial=0.0) < 1e15)  # NaN compares false
 
 
-def attempted(problem: Problem, theta: FloatArray, x0: list[FloatArray]) -> Spot | None:
+def attempted(problem: Problem, theta: FloatArray, x0: list[FloatArray]) -> Iterate | None:
     """Return a trial point, None where the model there is refused or the simulation diverges."""
     try:
-        spot = problem.spot(theta, x0)
+        iterate = problem.iterate(theta, x0)
     except (AutotuneError, OverflowError):
         return None
-    return spot if bounded(spot.e) else None
+    return iterate if bounded(iterate.e) else None

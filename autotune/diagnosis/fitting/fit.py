@@ -17,8 +17,8 @@ from autotune.arrays import BoolArray, FloatArray, IntArray
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.descent import (
     Derivatives,
+    Iterate,
     Problem,
-    Spot,
     bounded,
     continued,
     descend,
@@ -59,7 +59,7 @@ class Fit:
         Simulated reading, speed, position, plant input.
     explained : (N, q) array
         What moving the free numbers can explain of a residual beyond the start states: columns that are orthonormal
-        together with the rows of what is believed of the numbers.
+        together with the rows of the numbers' prior.
     states_explain : tuple of (L, m) array
         The same for the start state of every window.
     jacobian : (N, p) and (N, n) array
@@ -111,7 +111,7 @@ class Fit:
     def without_numbers(self, direction: FloatArray) -> FloatArray:
         """Return what is left of a direction freed of start states when the free numbers may move against it too.
 
-        They pay for how far they move from what is believed: what bends them far is not explained by them whole.
+        They pay for how far they move from their prior: what moves them far is not explained by them whole.
         """
         return np.asarray(direction - self.explained @ (self.explained.T @ direction))
 
@@ -147,7 +147,6 @@ def fit(
     x0: Sequence[FloatArray] | None = None,
     iterations: int = 10,
     rounds: int = 2,
-    tolerance: float = 0.05,
     free: BoolArray | None = None,
     inherit: Fit | None = None,
 ) -> Fit:
@@ -167,8 +166,6 @@ def fit(
         Most Gauss-Newton steps per round.
     rounds : int
         Most rounds; each begins with start states carried over from the window before where that fits better.
-    tolerance : float
-        Decrease of the cost at which to stop, in units of the noise variance.
     free : (p,) bool array, optional
         Numbers that may move; all by default.
     inherit : Fit, optional
@@ -197,55 +194,55 @@ def fit(
     fits_in = x0 is not None and x0[0].shape[1] == sim.order
     states = [x.copy() for x in x0] if x0 is not None and fits_in else start_states(sim, data)
     may = np.ones(point.size, dtype=bool) if free is None else free
-    spot = problem.spot(point, states)
-    if not bounded(spot.e):
+    iterate = problem.iterate(point, states)
+    if not bounded(iterate.e):
         raise IdentificationError("the simulation runs away at the starting point", where="fit")
     derivatives = None
-    near = inherit is not None and float(spot.e @ spot.e) < 2.0 * inherit.chi2
+    near = inherit is not None and float(iterate.e @ iterate.e) < 2.0 * inherit.chi2
     if inherit is not None and near and inherit.jacobian[1].shape[1] == sim.order:
-        derivatives = problem.inherited(point, states, spot.e, inherit.jacobian)
+        derivatives = problem.inherited(point, states, iterate.e, inherit.jacobian)
     for _ in range(rounds):
-        spot, derivatives = descend(problem, spot, derivatives, may, iterations, tolerance)
-        before = spot.e @ spot.e
-        spot = continued(problem, spot)
-        if before - spot.e @ spot.e < 2.0 + 1e-4 * before:
+        iterate, derivatives = descend(problem, iterate, derivatives, may, iterations)
+        before = iterate.e @ iterate.e
+        iterate = continued(problem, iterate)
+        if before - iterate.e @ iterate.e < 2.0 + 1e-4 * before:
             break
         derivatives = None
     if derivatives is None:
-        derivatives = problem.jacobian(spot, may)
-    return _finish(problem, spot, derivatives, may)
+        derivatives = problem.jacobian(iterate, may)
+    return _finish(problem, iterate, derivatives, may)
 
 
 def residual_at(
     parametrisation: Parametrisation, data: Data, theta: FloatArray, x0: tuple[FloatArray, ...]
 ) -> FloatArray:
     """Return the whitened residual at a point, all recordings one after the other."""
-    return Problem(parametrisation, data).spot(theta, list(x0)).e
+    return Problem(parametrisation, data).iterate(theta, list(x0)).e
 
 
-def _finish(problem: Problem, spot: Spot, derivatives: Derivatives, may: BoolArray) -> Fit:
+def _finish(problem: Problem, iterate: Iterate, derivatives: Derivatives, may: BoolArray) -> Fit:
     windows = [(int(a), int(b)) for a, b in zip(problem.first, problem.last, strict=True)]
-    _, J_left, _, _ = eliminate(problem, derivatives, spot.e)
-    chi2 = float(spot.e @ spot.e)
-    prior = problem.prior(spot.e, may)
-    believed = np.where(may, 1.0 / problem.parametrisation.spreads, 0.0)
-    excess = max(1.0, chi2 / max(problem.data.rows - spot.theta.size, 1))
+    _, J_left, _, _ = eliminate(problem, derivatives, iterate.e)
+    chi2 = float(iterate.e @ iterate.e)
+    prior = problem.prior(iterate.e, may)
+    stiffness = np.where(may, 1.0 / problem.parametrisation.spreads, 0.0)
+    excess = max(1.0, chi2 / max(problem.data.rows - iterate.theta.size, 1))
     with np.errstate(over="ignore", invalid="ignore"):
-        H = J_left.T @ J_left / excess + np.diag(believed**2)
+        H = J_left.T @ J_left / excess + np.diag(stiffness**2)
     if not np.all(np.isfinite(H)):
         raise IdentificationError("derivatives leave the range of numbers", where="fit")
     edges = np.cumsum([len(r) for r in problem.data.recordings])[:-1]
-    signals = simulate(spot.sim, spot.x0, problem.data, SIGNALS)[0]
+    signals = simulate(iterate.sim, iterate.x0, problem.data, SIGNALS)[0]
     rows = zip(problem.data.recordings, signals, problem.data.good, strict=True)
     return Fit(
         parametrisation=problem.parametrisation,
-        theta=spot.theta,
-        x0=tuple(spot.x0),
+        theta=iterate.theta,
+        x0=tuple(iterate.x0),
         chi2=chi2,
-        penalty=float(np.sum((prior * (spot.theta - problem.parametrisation.centre)) ** 2)),
+        penalty=float(np.sum((prior * (iterate.theta - problem.parametrisation.centre)) ** 2)),
         covariance=np.asarray(np.linalg.pinv(H, rcond=1e-14, hermitian=True)),
         residuals=tuple(np.where(good, r.y - out[:, 0], 0.0) for r, out, good in rows),
-        whitened=tuple(np.split(spot.e, edges)),
+        whitened=tuple(np.split(iterate.e, edges)),
         signals=tuple(signals),
         explained=_basis(J_left, prior),
         jacobian=derivatives,
@@ -253,7 +250,7 @@ def _finish(problem: Problem, spot: Spot, derivatives: Derivatives, may: BoolArr
         windows=tuple(windows),
         starts=problem.data.starts,
         rows=problem.data.rows,
-        sim=spot.sim,
+        sim=iterate.sim,
     )
 
 

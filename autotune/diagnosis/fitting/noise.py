@@ -90,7 +90,7 @@ def noise_from_differences(
 
 
 def autoregressive(residuals: Sequence[FloatArray], good: Sequence[BoolArray], order: int = 2) -> Noise:
-    """Estimate an autoregressive model of a residual that is believed to be noise alone, by Yule and Walker.
+    """Estimate an autoregressive model of a residual that is taken to be noise alone, by Yule and Walker.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""What is free in a fit: the chain's own numbers, with what is believed of them, and the parameters of effects."""
+"""What is free in a fit: the chain's own numbers, with their prior, and the parameters of effects."""
 
 from __future__ import annotations
 

@@ -112,7 +112,7 @@ def far_from_prior(result: Fit, sds: float) -> bool:
 
 
 def at_operating_point(p: Parametrisation, data: Data) -> Fit:
-    """Return a fit of the operating point alone, all other numbers as they are believed."""
+    """Return a fit of the operating point alone, all other numbers at their prior."""
     free = np.array([f.kind == "u_offset" for f in p.free])
     return fit(p, data, free=free)
 

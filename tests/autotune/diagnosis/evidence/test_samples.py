@@ -79,14 +79,14 @@ def test_spikes_are_left_out_and_their_size_is_told() -> None:
 
 
 @pytest.mark.parametrize("rho", [0.0, 0.3, 0.6])
-def test_first_differences_tell_the_noise_under_a_slow_misfit(rho: float) -> None:
+def test_first_differences_tell_the_noise_under_a_slow_residual(rho: float) -> None:
     rng = np.random.default_rng(5)
     n = np.zeros(8000)
     for k in range(1, n.size):
         n[k] = rho * n[k - 1] + rng.normal()
     good = [np.ones(n.size, dtype=bool)]
-    misfit = 10.0 * np.sin(np.arange(n.size) * 0.01)
-    noise = noise_from_differences([n + misfit], good)
+    slow = 10.0 * np.sin(np.arange(n.size) * 0.01)
+    noise = noise_from_differences([n + slow], good)
     assert noise.sd == pytest.approx(1.0, rel=0.05)
     assert noise.ar[0] == pytest.approx(rho, abs=0.06)
     assert noise.total_sd == pytest.approx(1.0 / np.sqrt(1.0 - rho**2), rel=0.08)
