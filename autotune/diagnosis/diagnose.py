@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -14,7 +15,7 @@ from autotune.diagnosis.evidence.constancy import largest_variation
 from autotune.diagnosis.evidence.description import describe
 from autotune.diagnosis.evidence.held_out import held_out
 from autotune.diagnosis.evidence.law import law_effect
-from autotune.diagnosis.evidence.samples import SampleEffect, inspect, jitter_effect
+from autotune.diagnosis.evidence.samples import SampleEffect, improves, inspect, jitter_effect
 from autotune.diagnosis.findings import extended_model, found_effects, offset_of
 from autotune.diagnosis.fitting.retuning import reduced_chi2
 from autotune.diagnosis.result import Diagnosis
@@ -69,23 +70,28 @@ def diagnose(
     progress("looking at the samples", 0.0)
     good, seen = inspect(recordings, without, thresholds)
     found = search(model, recordings, good, [*without, *(effect.name for effect in seen)], progress, thresholds)
-    beside = [s for s in _beside(found, recordings, controller, seen) if s.name not in without]
-    # where single rows are disturbed, what is left beside them must explain more to be named
-    if any(s.name == "timing.jitter" for s in beside) or (seen and found.gained < thresholds.samples_sure):
-        found = replace(found, chosen=found.retuned)
+    others = [s for s in _others(found, recordings, controller, seen) if s.name not in without]
+    # where single rows are disturbed, what is left beside them must explain more to be named; beside jitter nothing is
+    if any(s.name == "timing.jitter" for s in others):
+        found = found.asking(math.inf)
+    elif seen:
+        found = found.asking(thresholds.samples_sure)
     progress("checking on held-out rows", 0.9)
-    samples = [*seen, *beside]
+    samples = [*(s for s in seen if improves(s, found.chosen.fit, found.data)), *others]
+    uneven = any(kind_of(s.name).uneven for s in samples)
     quality = held_out(found.retuned.fit, found.chosen.fit, found.data)
     evidence = Evidence(
         search=found,
         samples=tuple(samples),
-        residual=residual_tests(found.chosen.fit, found.data, found.gained),
+        residual=residual_tests(found.chosen.fit, found.data, found.gained, uneven=uneven),
         quality=quality,
         offset=offset_of(found.chosen.fit, thresholds.offset_sigmas),
     )
     verdict, candidates = judged(evidence), evidence.candidates
-    effects = found_effects(evidence) if verdict == "effect" else ()
-    description = describe(found.retuned.fit, found.data) if verdict == "unexplained" else None
+    effects = found_effects(evidence, verdict)
+    description = (
+        describe(found.retuned.fit, replace(found.data, thresholds=thresholds)) if verdict == "unexplained" else None
+    )
     places = places_of(evidence, effects, description)
     return Diagnosis(
         verdict=verdict,
@@ -111,7 +117,7 @@ def _require_rows(recordings: Sequence[Recording]) -> None:
             raise InputError(f"{len(r)} rows", where=r.name, remedy="a diagnosis needs at least 100 finite readings")
 
 
-def _beside(
+def _others(
     found: Search, recordings: Sequence[Recording], controller: Controller | None, seen: Sequence[SampleEffect]
 ) -> list[SampleEffect]:
     """Return what is no effect of the chain and explains the residual better than one: jitter, another control law."""

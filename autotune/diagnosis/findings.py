@@ -10,7 +10,7 @@ from types import MappingProxyType
 import numpy as np
 
 from autotune.diagnosis.effects import kind_of
-from autotune.diagnosis.evidence.samples import SampleEffect
+from autotune.diagnosis.evidence.samples import SampleEffect, is_nearer
 from autotune.diagnosis.fitting.fit import Fit
 from autotune.diagnosis.result import FoundEffect, Offset, OperatingRange, Verdict
 from autotune.diagnosis.selection.hypothesis import Hypothesis
@@ -43,10 +43,12 @@ def probability_of(name: str, candidates: Sequence[Candidate], most: float = Thr
     return min(max(total, 0.0), most)
 
 
-def found_effects(evidence: Evidence) -> tuple[FoundEffect, ...]:
-    """Return the effects that are named, the most important first."""
+def found_effects(evidence: Evidence, verdict: Verdict) -> tuple[FoundEffect, ...]:
+    """Return the effects that are named, the most important first; where none explains all, what samples show alone."""
     search, chosen = evidence.search, evidence.search.chosen
     everywhere = tuple((i, float(r.t[0]), float(r.t[-1])) for i, r in enumerate(search.data.recordings))
+    if verdict != "effect":
+        return tuple(_of_samples(s, everywhere, evidence.limits) for s in evidence.samples)
     effects: list[tuple[float, FoundEffect]] = []
     for effect in _with_uncertainty(chosen, chosen.fit.model.effects):
         effects.append((_lost_without(search, effect.name), _found_effect(effect, evidence, everywhere)))
@@ -155,18 +157,6 @@ def extended_model(evidence: Evidence, verdict: Verdict, nominal: Model) -> Mode
     ends = [
         Effect(name=s.name, parameters=s.parameters)
         for s in evidence.samples
-        if _simulated(s, use.fit, evidence.limits.rounding)
+        if is_nearer(s, use.fit, evidence.limits.rounding)
     ]
     return replace(extended, effects=(*_with_uncertainty(use, extended.effects), *ends))
-
-
-def _simulated(effect: SampleEffect, result: Fit, share: float) -> bool:
-    """Whether a simulation is nearer to the readings with what their samples show; beside much noise no rounding is."""
-    kind = kind_of(effect.name)
-    if not kind.steps:
-        return kind.is_simulated
-    step = effect.parameters["step"].value
-    y = [s[:, 0] + e for s, e in zip(result.signals, result.residuals, strict=True)]
-    rounded = [r - step * np.round(s[:, 0] / step) for r, s in zip(y, result.signals, strict=True)]
-    squares = [float(np.nansum(np.concatenate(e) ** 2)) for e in (rounded, result.residuals)]
-    return squares[0] < share * squares[1]

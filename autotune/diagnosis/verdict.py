@@ -73,6 +73,8 @@ class Evidence:
         found = self.search
         best = min(found.all, key=penalised)
         retuned, limits = found.retuned.fit, self.limits
+        # a clock that jitters disturbs commands too, which leaves something slow: what varies is weighed against it
+        jitter = sum(s.evidence for s in self.samples if kind_of(s.name).sought == "residual")
         holds = {
             "effects": bool(found.chosen.names),
             "samples": bool(self.samples),
@@ -81,7 +83,8 @@ class Evidence:
             "another structure": bool(STRUCTURES.keys() & set(best.names))
             and worth_adding(found.retuned, best, limits),
             "offset": self.offset is not None,
-            "missing": self.residual.reduced_chi2 > limits.missing,
+            "missing": self.residual.is_missing,
+            "jitter explains more": self.residual.varies.gain < limits.lesser_share * jitter,
             "wrong numbers": found.nominal.chi2 - retuned.chi2 - retuned.penalty > limits.numbers_decrease,
         }
         return frozenset(name for name, one in holds.items() if one)
@@ -101,13 +104,14 @@ def odds_of_unknown(residual: ResidualTests, explains_most: bool, limits: Thresh
 
 #: Each row: what must hold, what must not, and the verdict. The first row that fits decides.
 TABLE: tuple[tuple[set[str], set[str], Verdict], ...] = (
-    ({"effects", "adequate"}, {"samples"}, "effect"),
-    ({"effects"}, {"samples"}, "unexplained"),
-    ({"another structure"}, {"samples"}, "unexplained"),
-    (set(), {"samples", "constant"}, "unexplained"),
+    ({"effects", "adequate"}, set(), "effect"),
+    ({"effects"}, set(), "unexplained"),
+    ({"another structure"}, set(), "unexplained"),
+    ({"jitter explains more"}, set(), "effect"),
+    (set(), {"constant"}, "unexplained"),
+    ({"missing"}, {"adequate"}, "unexplained"),
     ({"samples"}, set(), "effect"),
     ({"offset", "adequate"}, set(), "effect"),
-    ({"missing"}, {"adequate"}, "unexplained"),
     ({"wrong numbers"}, set(), "parameters"),
     (set(), set(), "none"),
 )
@@ -150,8 +154,7 @@ def sentences_of(
             first = "The structure is right, its numbers are not: retuned, the simulation explains the recordings."
         case "effect":
             names = " and ".join(f"{e.name} (probability {e.probability:.2f})" for e in effects)
-            is_all = residual.is_noise or evidence.samples
-            rest = "" if is_all else " What is left is not noise: something smaller is missing as well."
+            rest = "" if residual.is_noise else " What is left is not noise: something smaller is missing as well."
             first = f"Physics was left out: {names}.{rest}"
         case _:
             first = f"Something is missing that no candidate explains to within noise; it shows at {', '.join(places)}."

@@ -100,7 +100,7 @@ def judged(row: Shown, limits: Thresholds) -> str:
     if row.names:
         most = dominates(row.quality, limits) and left.is_lesser
         return "named" if left.is_noise or most else "abstained"
-    missing = not left.is_constant or (not left.is_noise and left.reduced_chi2 > limits.missing)
+    missing = not left.is_constant or (not left.is_noise and left.is_missing)
     return "abstained" if missing else "neither"
 
 

@@ -383,6 +383,8 @@ class EffectKind:
         Its parameters as people name them.
     steps : bool
         Whether it makes steps of the readings that no derivative of a start state leads through.
+    uneven : bool
+        Whether it makes some rows' noise larger than others': then the residual's variance says nothing of a model.
     excludes : tuple of str
         Effects that are not looked for where this one is seen in the samples.
     confusable : tuple of str
@@ -416,6 +418,7 @@ class EffectKind:
     acts_in: Callable[[Values], tuple[int, float]] | None = None
     readable: Callable[[Mapping[str, Parameter]], dict[str, Parameter]] | None = None
     steps: bool = False
+    uneven: bool = False
     excludes: tuple[str, ...] = ()
     confusable: tuple[str, ...] = ()
     same: tuple[str, ...] = ()

@@ -13,7 +13,7 @@ _LJUNG = "Ljung, System Identification, 2nd ed., sec. 5.1"
 
 
 def curved(z: float, second_order: float, third_order: float) -> float:
-    """Return a reading through a bent characteristic."""
+    """Return a reading through a curved characteristic."""
     z += second_order * z * z
     z += third_order * z * z * z
     return z
@@ -133,6 +133,7 @@ SENSOR = (
             Quantity(name="size", unit="{y}", role="observed"),
         ),
         sought="samples",
+        uneven=True,
         reference="Ljung, System Identification, 2nd ed., sec. 15.2",
     ),
 )

@@ -48,6 +48,7 @@ TIMING = (
         equation="y is taken at t + d, d random from row to row",
         parameters=(Quantity(name="sd", unit="s", role="observed"),),
         sought="residual",
+        uneven=True,
         reference=_LJUNG,
     ),
 )

@@ -35,6 +35,8 @@ class ResidualTests:
         What would explain most of it among what swings, bends and goes past the chain.
     gained : float
         Penalised chi-square that the effects gained beside the retuned model.
+    uneven : bool
+        Whether samples show that some rows' noise is larger than others': the variance then says nothing.
     limits : Thresholds
         What decides between two findings.
     """
@@ -45,6 +47,7 @@ class ResidualTests:
     slow_chance: float
     varies: Variation
     gained: float
+    uneven: bool = False
     limits: Thresholds = field(default_factory=Thresholds)
 
     @property
@@ -56,7 +59,13 @@ class ResidualTests:
     @property
     def is_noise(self) -> bool:
         """Whether it is noise: no more variance than its jitter shows, no slow part, and nothing that varies."""
-        return self.reduced_chi2 < self.allowed and self._is_white(self.limits.white) and self.is_constant
+        even = self.uneven or self.reduced_chi2 < self.allowed
+        return even and self._is_white(self.limits.white) and self.is_constant
+
+    @property
+    def is_missing(self) -> bool:
+        """Whether its variance alone shows that something is missing."""
+        return not self.uneven and self.reduced_chi2 > self.limits.missing
 
     @property
     def is_constant(self) -> bool:
@@ -82,11 +91,12 @@ class ResidualTests:
             "slow": self.slow,
             "slow_chance": self.slow_chance,
             "gained": self.gained,
+            "uneven": self.uneven,
             "varies": varies,
         }
 
 
-def residual_tests(result: Fit, data: Data, gained: float) -> ResidualTests:
+def residual_tests(result: Fit, data: Data, gained: float, *, uneven: bool = False) -> ResidualTests:
     """Return what a model leaves.
 
     Parameters
@@ -97,6 +107,8 @@ def residual_tests(result: Fit, data: Data, gained: float) -> ResidualTests:
         What it was fitted to.
     gained : float
         Penalised chi-square that its effects gained beside the retuned model.
+    uneven : bool
+        Whether samples show that some rows' noise is larger than others'.
     """
     return ResidualTests(
         reduced_chi2=reduced_chi2(result, data),
@@ -105,6 +117,7 @@ def residual_tests(result: Fit, data: Data, gained: float) -> ResidualTests:
         slow_chance=_slow_chance(result),
         varies=largest_variation(result, data),
         gained=gained,
+        uneven=uneven,
         limits=data.thresholds,
     )
 

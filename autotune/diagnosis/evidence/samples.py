@@ -12,6 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from autotune.arrays import BoolArray, FloatArray
+from autotune.diagnosis.effects import kind_of
+from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import Fit
 from autotune.diagnosis.thresholds import IN_USE, Thresholds
 from autotune.models import Parameter
@@ -29,9 +31,11 @@ class SampleEffect:
     parameters : mapping
         Values with units.
     evidence : float
-        Decrease of chi2 that it is worth, comparable with a fit's.
+        Decrease of chi2 that it brings, comparable with a fit's.
     windows : tuple of (recording, t0, t1)
         When it acts; empty for always.
+    rows : tuple of (N,) bool array
+        Rows that it spoils and that no fit sees; empty for all or none.
     """
 
     name: str
@@ -39,6 +43,7 @@ class SampleEffect:
     parameters: Mapping[str, Parameter]
     evidence: float
     windows: tuple[tuple[int, float, float], ...] = ()
+    rows: tuple[BoolArray, ...] = ()
 
 
 def converter_step(y: FloatArray) -> float:
@@ -54,7 +59,7 @@ def converter_step(y: FloatArray) -> float:
     gaps = gaps[gaps > 1e-4 * np.max(gaps)]
     step = float(np.median(gaps[gaps <= 1.5 * np.min(gaps)]))
     multiples = gaps / step
-    regular = float(np.mean(np.abs(multiples - np.round(multiples)) < 0.05)) > 0.97
+    regular = float(np.mean(np.abs(multiples - np.round(multiples)) < _ON_STEP)) > _REGULAR
     return step if regular and step > 0.02 * jitter_of(y) else 0.0
 
 
@@ -176,6 +181,7 @@ def _saturation(
         parameters={key: Parameter(value=v, unit=unit, sd=1e-5 * abs(v)) for key, v in levels.items()},
         evidence=20.0 * sum(int(r.sum()) for r in rows),
         windows=tuple(_runs(recordings, rows)),
+        rows=tuple(rows),
     )
 
 
@@ -222,6 +228,7 @@ def _dropout(recordings: Sequence[Recording], frozen: Sequence[BoolArray], share
         },
         evidence=20.0 * rows,
         windows=tuple(windows),
+        rows=tuple(frozen),
     )
 
 
@@ -237,7 +244,76 @@ def _outliers(
         },
         evidence=40.0 * sum(int(s.sum()) for s in lone),
         windows=tuple(_runs(recordings, lone)),
+        rows=tuple(lone),
     )
+
+
+def improves(effect: SampleEffect, result: Fit, data: Data) -> bool:
+    """Whether a simulation is nearer to readings that were not fitted with what their samples show.
+
+    Parameters
+    ----------
+    effect : SampleEffect
+        What the samples show.
+    result : Fit
+        The simulation, in which it does not act.
+    data : Data
+        What that was fitted to: rows that the effect spoils do not count there.
+
+    Notes
+    -----
+    A reading that is repeated is the one before it, exactly. A clipped one is its limit. A spike is one where the
+    simulation does not explain it either: it is farther off than noise brings. A converter's step is found in one half
+    of the readings and predicts the values of the other.
+    """
+    limits, kind = data.thresholds, kind_of(effect.name)
+    simulated = [s[:, 0] for s in result.signals]
+    if kind.steps:
+        return _step_predicts(data)
+    if not effect.rows or not any(rows.any() for rows in effect.rows):
+        return True
+    left = [r.y[rows] - s[rows] for r, s, rows in zip(data.recordings, simulated, effect.rows, strict=True)]
+    off = np.concatenate(left)
+    off = off[np.isfinite(off)]
+    if kind.is_simulated:  # limits: the simulation goes beyond them, or noise does
+        low, high = (effect.parameters[key].value if key in effect.parameters else bound for key, bound in _ENDS)
+        ends = [np.clip(s[rows], low, high) for s, rows in zip(simulated, effect.rows, strict=True)]
+        clipped = np.concatenate([r.y[rows] - e for r, e, rows in zip(data.recordings, ends, effect.rows, strict=True)])
+        return float(np.nansum(clipped**2)) <= float(np.sum(off**2))
+    noise = data.noise.total_sd
+    if kind.name == "sensor.outliers":
+        return off.size > 0 and float(np.median(np.abs(off))) > limits.least_outlier * noise
+    return float(np.sum(off**2)) > 0.0
+
+
+def _step_predicts(data: Data) -> bool:
+    """Whether the values of every half of the readings are apart by multiples of the step found in the other."""
+    y = np.concatenate([r.y[np.isfinite(r.y)] for r in data.recordings])
+    halves = y[: y.size // 2], y[y.size // 2 :]
+    for known, unknown in (halves, halves[::-1]):
+        step, gaps = converter_step(known), np.diff(np.unique(unknown))
+        if step == 0.0 or not gaps.size:
+            return False
+        multiples = gaps / step
+        if not float(np.mean(np.abs(multiples - np.round(multiples)) < _ON_STEP)) > _REGULAR:
+            return False
+    return True
+
+
+def is_nearer(effect: SampleEffect, result: Fit, share: float) -> bool:
+    """Whether a simulation with an effect leaves less than a share of the squared error; beside noise none does."""
+    kind = kind_of(effect.name)
+    if not kind.steps:
+        return kind.is_simulated
+    step = effect.parameters["step"].value
+    pairs = zip([s[:, 0] for s in result.signals], result.residuals, strict=True)
+    rounded = np.concatenate([s + e - step * np.round(s / step) for s, e in pairs])
+    return float(np.nansum(rounded**2)) < share * float(np.nansum(np.concatenate(result.residuals) ** 2))
+
+
+#: Distance from a level, in steps, at which a reading lies on it, and the share of readings that do.
+_ON_STEP, _REGULAR = 0.05, 0.97
+_ENDS = (("low", -np.inf), ("high", np.inf))
 
 
 def jitter_effect(

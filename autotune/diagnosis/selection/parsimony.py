@@ -56,6 +56,42 @@ def needed(smaller: Hypothesis, larger: Hypothesis, data: Data, base: Fit) -> bo
     return more and worth_adding(smaller, larger, limits) and enough
 
 
+def charge(h: Hypothesis, chosen: Hypothesis, lead: float, data: Data, base: Fit) -> float:
+    """Return what a hypothesis has to pay beside the chosen one: nothing, unless its further numbers are not needed.
+
+    A richer one that is ahead by less than the lead of simplicity pays that lead; one that is not needed all that it is
+    ahead as well.
+    """
+    ahead = penalised(chosen) - penalised(h)
+    if h.parameters <= chosen.parameters or ahead <= 0.0:
+        return 0.0
+    if ahead < lead:
+        return lead
+    return 0.0 if needed(chosen, h, data, base) else ahead + lead
+
+
+def settled(chosen: Hypothesis, pool: Sequence[Hypothesis], data: Data, base: Fit) -> Hypothesis:
+    """Return the hypothesis that no other is ahead of once that has paid: what is named is what is most probable.
+
+    Parameters
+    ----------
+    chosen : Hypothesis
+        Where to begin.
+    pool : sequence of Hypothesis
+        All that were fitted, the retuned model among them.
+    data, base : Data, Fit
+        What they were fitted to, and the retuned model.
+    """
+    lead = final_lead(base, min(pool, key=penalised), data)
+    for _ in pool:
+        paid = {id(h): penalised(h) + charge(h, chosen, lead, data, base) for h in pool}
+        best = min(pool, key=lambda h, paid=paid: paid[id(h)])  # type: ignore[misc]  # bound at once
+        if paid[id(best)] >= penalised(chosen):
+            break
+        chosen = best
+    return chosen
+
+
 def _inexact(h: Hypothesis, limits: Thresholds) -> float:
     """Return the share of what is explained that a hypothesis's simulation may be wrong by."""
     return limits.impact_error if any(kind.impacts for kind in h.kinds) else limits.simulation_error

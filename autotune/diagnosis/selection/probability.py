@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from autotune.diagnosis.selection.hypothesis import penalised
-from autotune.diagnosis.selection.parsimony import final_lead, needed
+from autotune.diagnosis.selection.parsimony import charge, final_lead
 from autotune.diagnosis.selection.search import Search
 
 
@@ -31,20 +31,14 @@ def candidates_of(found: Search, unknown_odds: float) -> tuple[Candidate, ...]:
 
     Notes
     -----
-    A richer hypothesis that beats the chosen one by less than the lead that simplicity was given pays that lead here
-    too, one that was not needed all that it is ahead as well: the probabilities weigh what the choice weighed.
+    The probabilities weigh what the choice weighed, see :func:`autotune.diagnosis.selection.parsimony.charge`.
     """
     pool = found.all
     chosen = found.chosen
     lead = final_lead(found.retuned.fit, min(pool, key=penalised), found.data)
     scores: dict[str, float] = {}
     for h in pool:
-        ahead, pays = penalised(chosen) - penalised(h), 0.0
-        if h.parameters > chosen.parameters and ahead > 0.0:
-            if ahead < lead:
-                pays = lead
-            elif not needed(chosen, h, found.data, found.retuned.fit):
-                pays = ahead + lead
+        pays = charge(h, chosen, lead, found.data, found.retuned.fit)
         name = "+".join(h.names) if h.names else "none"
         scores[name] = min(scores.get(name, math.inf), penalised(h) + pays)
     temperature = found.data.thresholds.temperature

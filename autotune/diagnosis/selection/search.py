@@ -28,6 +28,7 @@ from autotune.diagnosis.selection.hypothesis import Hypothesis, merged, penalise
 from autotune.diagnosis.selection.parsimony import (
     final_lead,
     needed,
+    settled,
     simplest,
     simplicity_lead,
     worth_adding,
@@ -70,6 +71,13 @@ class Search:
     def all(self) -> tuple[Hypothesis, ...]:
         """Every hypothesis, the retuned model first."""
         return (self.retuned, *self.singles, *self.pairs, *self.triples)
+
+    def asking(self, least: float) -> Search:
+        """Return the search with a least decrease that effects must bring, for the choice and for the probabilities."""
+        thresholds = replace(self.data.thresholds, least_decrease=least, least_decrease_beyond=least)
+        keeps = worth_adding(self.retuned, self.chosen, thresholds)
+        chosen = self.chosen if keeps else self.retuned
+        return replace(self, data=replace(self.data, thresholds=thresholds), chosen=chosen)
 
     @property
     def gained(self) -> float:
@@ -180,6 +188,7 @@ def _extended(data: Data, base: Fit, nominal: Fit, bench: Bench, progress: Progr
     if reduced_chi2(chosen.fit, stage.data) > limits.model_error:
         fewer = [h for h in (*singles, *pairs) if h.parameters < chosen.parameters]
         chosen = simplest([chosen, *fewer], final_lead(stage.base, chosen, stage.data))
+    chosen = settled(chosen, (retuned, *singles, *pairs, *triples), stage.data, stage.base)
     return Search(
         data=stage.data,
         nominal=nominal,
