@@ -67,44 +67,55 @@ def diagnose(
         No recording, fewer than 100 rows, or u that is not finite.
     """
     _require_rows(recordings)
-    progress("looking at the samples", 0.0)
-    good, seen = inspect(recordings, without, thresholds)
-    found = search(model, recordings, good, [*without, *(effect.name for effect in seen)], progress, thresholds)
-    others = [s for s in _others(found, recordings, controller, seen) if s.name not in without]
-    # where single rows are disturbed, what is left beside them must explain more to be named; beside jitter nothing is
-    if any(s.name == "timing.jitter" for s in others):
-        found = found.asking(math.inf)
-    elif seen:
-        found = found.asking(thresholds.samples_sure)
-    progress("checking on held-out rows", 0.9)
-    samples = [*(s for s in seen if improves(s, found.chosen.fit, found.data)), *others]
-    uneven = any(kind_of(s.name).uneven for s in samples)
-    quality = held_out(found.retuned.fit, found.chosen.fit, found.data)
-    evidence = Evidence(
-        search=found,
-        samples=tuple(samples),
-        residual=residual_tests(found.chosen.fit, found.data, found.gained, uneven=uneven),
-        quality=quality,
-        offset=offset_of(found.chosen.fit, thresholds.offset_sigmas),
-    )
-    verdict, candidates = judged(evidence), evidence.candidates
+    evidence = _gathered(model, recordings, controller, without, progress, thresholds)
+    found, verdict = evidence.search, judged(evidence)
     effects = found_effects(evidence, verdict)
-    description = (
-        describe(found.retuned.fit, replace(found.data, thresholds=thresholds)) if verdict == "unexplained" else None
-    )
+    plain = replace(found.data, thresholds=thresholds)
+    description = describe(found.retuned.fit, plain) if verdict == "unexplained" else None
     places = places_of(evidence, effects, description)
     return Diagnosis(
         verdict=verdict,
         effects=effects,
-        candidates=candidates,
+        candidates=evidence.candidates,
         places=places,
-        fit=quality,
+        fit=evidence.quality,
         next_experiment=None,
         extended_model=extended_model(evidence, verdict, model),
         sentences=sentences_of(verdict, effects, evidence, places),
         residual=evidence.residual,
         description=description,
         search=found,
+    )
+
+
+def _gathered(
+    model: Model,
+    recordings: Sequence[Recording],
+    controller: Controller | None,
+    without: Sequence[str],
+    progress: Progress,
+    thresholds: Thresholds,
+) -> Evidence:
+    """Return all that the verdict rests on: samples, search, what is beside the chain, the residual, held-out rows."""
+    progress("looking at the samples", 0.0)
+    good, seen = inspect(recordings, without, thresholds)
+    found = search(model, recordings, good, [*without, *(effect.name for effect in seen)], progress, thresholds)
+    others = [s for s in _others(found, recordings, controller, seen) if s.name not in without]
+    # where single rows are disturbed, what is left beside them must explain more to be named; beside jitter nothing is
+    if any(kind_of(s.name).sought == "residual" for s in others):
+        found = found.asking(math.inf)
+    elif seen:
+        found = found.asking(thresholds.samples_sure)
+    progress("checking on held-out rows", 0.9)
+    chosen = found.chosen.fit
+    samples = (*(s for s in seen if improves(s, chosen, found.data)), *others)
+    uneven = any(kind_of(s.name).uneven for s in samples)
+    return Evidence(
+        search=found,
+        samples=samples,
+        residual=residual_tests(chosen, found.data, found.gained, uneven=uneven),
+        quality=held_out(found.retuned.fit, chosen, found.data),
+        offset=offset_of(chosen, thresholds.offset_sigmas),
     )
 
 

@@ -11,7 +11,7 @@ from autotune.config import Config
 from autotune.diagnosis.diagnose import diagnose
 from autotune.diagnosis.result import Diagnosis
 from autotune.diagnosis.selection.search import Progress as Report
-from autotune.diagnosis.simulation.simulator import assemble
+from autotune.diagnosis.simulation.assembly import assemble
 from autotune.errors import AutotuneError, InputError
 from autotune.experiment.excitation import run_excitation
 from autotune.experiment.rig import Rig

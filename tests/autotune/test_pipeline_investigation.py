@@ -14,7 +14,7 @@ from autotune.cli import app
 from autotune.config import Config, load_config
 from autotune.diagnosis.diagnose import diagnose
 from autotune.diagnosis.effects import CATALOGUE
-from autotune.diagnosis.simulation.simulator import assemble
+from autotune.diagnosis.simulation.assembly import assemble
 from autotune.errors import ExperimentStopped, InputError
 from autotune.experiment.excitation import Excitation
 from autotune.experiment_design import with_next_experiment

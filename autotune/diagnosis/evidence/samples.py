@@ -19,6 +19,12 @@ from autotune.diagnosis.thresholds import IN_USE, Thresholds
 from autotune.models import Parameter
 from autotune.recording import Recording
 
+#: Distance from a level, in steps, at which a reading lies on it, and the share of readings that do.
+_ON_STEP, _REGULAR = 0.05, 0.97
+#: Distance of two values, as a share of the largest, that is how numbers are written.
+_TINY = 1e-4
+_ENDS = (("low", -np.inf), ("high", np.inf))
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SampleEffect:
@@ -56,7 +62,7 @@ def converter_step(y: FloatArray) -> float:
     if values.size < 3:
         return 0.0
     gaps = np.diff(values)
-    gaps = gaps[gaps > 1e-4 * np.max(gaps)]
+    gaps = gaps[gaps > _TINY * np.max(gaps)]
     step = float(np.median(gaps[gaps <= 1.5 * np.min(gaps)]))
     multiples = gaps / step
     regular = float(np.mean(np.abs(multiples - np.round(multiples)) < _ON_STEP)) > _REGULAR
@@ -294,7 +300,7 @@ def _step_predicts(data: Data) -> bool:
         step, gaps = converter_step(known), np.diff(np.unique(unknown))
         if step == 0.0 or not gaps.size:
             return False
-        multiples = gaps / step
+        multiples = gaps[gaps > _TINY * np.max(gaps)] / step
         if not float(np.mean(np.abs(multiples - np.round(multiples)) < _ON_STEP)) > _REGULAR:
             return False
     return True
@@ -309,11 +315,6 @@ def is_nearer(effect: SampleEffect, result: Fit, share: float) -> bool:
     pairs = zip([s[:, 0] for s in result.signals], result.residuals, strict=True)
     rounded = np.concatenate([s + e - step * np.round(s / step) for s, e in pairs])
     return float(np.nansum(rounded**2)) < share * float(np.nansum(np.concatenate(result.residuals) ** 2))
-
-
-#: Distance from a level, in steps, at which a reading lies on it, and the share of readings that do.
-_ON_STEP, _REGULAR = 0.05, 0.97
-_ENDS = (("low", -np.inf), ("high", np.inf))
 
 
 def jitter_effect(

@@ -201,6 +201,18 @@ def fit(
     near = inherit is not None and float(iterate.e @ iterate.e) < 2.0 * inherit.chi2
     if inherit is not None and near and inherit.jacobian[1].shape[1] == sim.order:
         derivatives = problem.inherited(point, states, iterate.e, inherit.jacobian)
+    return _descended(problem, iterate, derivatives, may, iterations, rounds)
+
+
+def _descended(
+    problem: Problem,
+    iterate: Iterate,
+    derivatives: Derivatives | None,
+    may: BoolArray,
+    iterations: int,
+    rounds: int,
+) -> Fit:
+    """Return the fit that rounds of descent lead to, start states carried over between them."""
     for _ in range(rounds):
         iterate, derivatives = descend(problem, iterate, derivatives, may, iterations)
         before = iterate.e @ iterate.e

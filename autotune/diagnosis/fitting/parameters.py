@@ -12,7 +12,8 @@ import numpy as np
 
 from autotune.arrays import FloatArray
 from autotune.diagnosis.effects import kind_of
-from autotune.diagnosis.simulation.simulator import Simulator, assemble
+from autotune.diagnosis.simulation.assembly import assemble
+from autotune.diagnosis.simulation.simulator import Simulator
 from autotune.diagnosis.thresholds import Thresholds
 from autotune.models import Block, Effect, Model, Parameter, TransferFunction
 

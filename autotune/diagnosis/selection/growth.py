@@ -13,7 +13,7 @@ from autotune.diagnosis.selection.parsimony import needed, simplest, simplicity_
 from autotune.diagnosis.selection.polishing import polish
 from autotune.diagnosis.selection.scan import searched
 from autotune.diagnosis.selection.screening import Bench, Width, extend
-from autotune.diagnosis.simulation.simulator import states_that_stay
+from autotune.diagnosis.simulation.assembly import states_that_stay
 from autotune.diagnosis.thresholds import Thresholds
 from autotune.models import Effect
 

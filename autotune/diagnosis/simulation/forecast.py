@@ -12,7 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from autotune.arrays import BoolArray, FloatArray
-from autotune.diagnosis.simulation.simulator import Simulator, Windows, assemble
+from autotune.diagnosis.simulation.assembly import assemble
+from autotune.diagnosis.simulation.simulator import Simulator, Windows
 from autotune.errors import InputError
 from autotune.models import Model
 from autotune.recording import Recording

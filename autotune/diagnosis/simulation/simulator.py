@@ -10,21 +10,19 @@ from functools import cache, lru_cache
 import numpy as np
 
 from autotune.arrays import FloatArray, IntArray
-from autotune.diagnosis.effects import ALL, KINDS, kind_of
+from autotune.diagnosis.effects import ALL
 from autotune.diagnosis.effects.base import STAGES, EffectKind, StageName
 from autotune.diagnosis.simulation import kernel
-from autotune.diagnosis.simulation.chain import Chain, chain_of
+from autotune.diagnosis.simulation.chain import Chain
 from autotune.diagnosis.simulation.compiled import Layout, Run, compiled_run, layout_of
 from autotune.diagnosis.simulation.transitions import transition_table
-from autotune.errors import InputError
-from autotune.models import Effect, Model
 from autotune.recording import Recording
 
 #: Sub-steps of a sample at most, of one whose command runs straight between rows, and the largest sub-step of a forced
 #: plant in units of its fastest time constant.
 _MOST, _LINEAR, _FASTEST = 8, 4, 0.2
 #: 0 degrees Celsius [K].
-_ICE = 273.15
+ICE_K = 273.15
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -89,13 +87,13 @@ class Simulator:
         kept = tuple(kind for kind in self.kinds if not kind.steps)
         acts = self.acts.copy()
         for kind in set(self.kinds) - set(kept):
-            acts[_layout().flag(kind.name)] = 0
+            acts[layout().flag(kind.name)] = 0
         return replace(self, kinds=kept, acts=acts)
 
     def stepped(self, y: FloatArray) -> FloatArray:
         """Return what effects that make steps of readings make of them."""
         for kind in (kind for kind in self.kinds if kind.steps):
-            values = {q.name: float(self.values[_layout().slots[kind.name, q.name]]) for q in kind.parameters}
+            values = {q.name: float(self.values[layout().slots[kind.name, q.name]]) for q in kind.parameters}
             y = np.array([kind.lines[0].does(one, **values) for one in y])
         return y
 
@@ -216,7 +214,8 @@ def _acts_at(kind: EffectKind, *names: StageName) -> bool:
 
 
 @cache
-def _layout() -> Layout:
+def layout() -> Layout:
+    """Return the layout of the compiled simulation with all effects of the catalogue."""
     return layout_of(ALL)
 
 
@@ -235,103 +234,3 @@ def _rows(windows: Windows | None, count: int) -> IntArray:
     if windows is None:
         return np.array([[0], [count]], dtype=np.int64)
     return np.stack((windows.starts, windows.stops)).astype(np.int64)
-
-
-def assemble(model: Model) -> Simulator:
-    """Assemble a model with its effects for simulation.
-
-    Parameters
-    ----------
-    model : Model
-        Chain and effects.
-
-    Returns
-    -------
-    Simulator
-        What runs it.
-
-    Raises
-    ------
-    InputError
-        An effect that is not in the catalogue, stands twice, lacks a parameter, or does not fit the chain.
-    """
-    layout = _layout()
-    values, acts = np.zeros(len(layout.slots)), np.zeros(len(layout.kinds), dtype=np.int64)
-    blocks, fall, u_offset = model.blocks, None, model.input.offset
-    kinds: list[EffectKind] = []
-    for effect in model.effects:
-        kind = kind_of(effect.name, model.name)
-        if not kind.is_simulated:
-            continue
-        if kind in kinds:
-            raise InputError(f"{kind.name} stands twice", where=model.name, remedy="leave one of the two out")
-        kinds.append(kind)
-        given = values_of(effect, kind, model)
-        if kind.lines:
-            acts[layout.flag(kind.name)] = 1
-            for q in kind.parameters:
-                values[layout.slots[kind.name, q.name]] = given[q.name]
-        if kind.linear is not None:
-            part = kind.linear
-            if part.falling is not None:
-                fall = part.falling(blocks, given)
-            elif fall is not None and part.blocks is not None:
-                fall = part.blocks(fall, given)
-            blocks = part.blocks(blocks, given) if part.blocks is not None else blocks
-            u_offset += part.u_offset(given) if part.u_offset is not None else 0.0
-    chain = chain_of(blocks, model.name)
-    for kind in kinds:
-        if not kind.needs.holds(chain):
-            raise InputError(kind.needs.otherwise, where=model.name, remedy=f"leave {kind.name} out")
-    return Simulator(
-        chain=chain,
-        falling=chain if fall is None else chain_of(fall, model.name),
-        kinds=tuple(kinds),
-        values=values,
-        acts=acts,
-        u_offset=u_offset,
-        y_offset=model.output.offset,
-        kelvin=model.output.offset + (_ICE if "c" in model.output.unit.lower() else 0.0),
-        linear_hold=model.input.hold == "linear",
-    )
-
-
-def values_of(effect: Effect, kind: EffectKind, model: Model) -> dict[str, float]:
-    """Return an effect's parameters, neutral ones where they are not given.
-
-    Raises
-    ------
-    InputError
-        A parameter that it does not have, lacks, or cannot take.
-    """
-    known = ", ".join(q.name for q in kind.parameters)
-    for key in effect.parameters:
-        if kind.quantity(key) is None:
-            raise InputError(f"{effect.name} has no parameter {key!r}", where=model.name, remedy=f"known: {known}")
-    if not effect.parameters and all(q.neutral is not None for q in kind.parameters):
-        raise InputError(f"{effect.name} has no parameters", where=model.name, remedy=f"known: {known}")
-    values: dict[str, float] = {}
-    for q in kind.parameters:
-        if q.name in effect.parameters:
-            values[q.name] = effect.parameters[q.name].value
-            if q.nonzero and not values[q.name] > 0.0:
-                what = f"{effect.name} has {q.name} = {values[q.name]:g}"
-                raise InputError(what, where=model.name, remedy="give it a value above zero")
-        elif q.neutral is None:
-            raise InputError(
-                f"{effect.name} lacks {q.name}", where=model.name, remedy=f"add {q.name} to its parameters"
-            )
-        else:
-            values[q.name] = q.neutral
-    wrong = kind.possible(values, model) if kind.possible is not None else ""
-    if wrong:
-        raise InputError(wrong, where=model.name, remedy=f"leave {effect.name} out")
-    return values
-
-
-def states_that_stay(name: str, order: int) -> slice:
-    """Return the states that stay when an effect is taken out of a chain of an order: all but those of its block."""
-    part = KINDS[name].linear
-    if part is None or part.unless_lagged:
-        return slice(0, order)
-    return slice(part.states, order) if part.at == "front" else slice(0, order - part.states)

@@ -14,8 +14,8 @@ from autotune.diagnosis.effects import ALL
 from autotune.diagnosis.effects.base import STAGES, EffectKind, Line, Quantity
 from autotune.diagnosis.effects.checks import require_complete
 from autotune.diagnosis.simulation import stages
+from autotune.diagnosis.simulation.assembly import assemble
 from autotune.diagnosis.simulation.compiled import layout_of, run_of, source_of
-from autotune.diagnosis.simulation.simulator import assemble
 from autotune.errors import InputError
 from autotune.models import Block, Model, Port, TransferFunction
 from autotune.recording import Recording

@@ -10,7 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from autotune.diagnosis.simulation.simulator import Windows, assemble
+from autotune.diagnosis.simulation.assembly import assemble
+from autotune.diagnosis.simulation.simulator import Windows
 from autotune.errors import InputError
 from autotune.models import Block, Effect, Model, Parameter, Port, TransferFunction
 from autotune.recording import Recording

@@ -1,0 +1,112 @@
+"""A model assembled for simulation: blocks and lines of its effects put in, parameters and structure checked."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from autotune.diagnosis.effects import KINDS, kind_of
+from autotune.diagnosis.effects.base import EffectKind
+from autotune.diagnosis.simulation.chain import chain_of
+from autotune.diagnosis.simulation.simulator import ICE_K, Simulator, layout
+from autotune.errors import InputError
+from autotune.models import Effect, Model
+
+
+def assemble(model: Model) -> Simulator:
+    """Assemble a model with its effects for simulation.
+
+    Parameters
+    ----------
+    model : Model
+        Chain and effects.
+
+    Returns
+    -------
+    Simulator
+        What runs it.
+
+    Raises
+    ------
+    InputError
+        An effect that is not in the catalogue, stands twice, lacks a parameter, or does not fit the chain.
+    """
+    known = layout()
+    values, acts = np.zeros(len(known.slots)), np.zeros(len(known.kinds), dtype=np.int64)
+    blocks, fall, u_offset = model.blocks, None, model.input.offset
+    kinds: list[EffectKind] = []
+    for effect in model.effects:
+        kind = kind_of(effect.name, model.name)
+        if not kind.is_simulated:
+            continue
+        if kind in kinds:
+            raise InputError(f"{kind.name} stands twice", where=model.name, remedy="leave one of the two out")
+        kinds.append(kind)
+        given = values_of(effect, kind, model)
+        if kind.lines:
+            acts[known.flag(kind.name)] = 1
+            for q in kind.parameters:
+                values[known.slots[kind.name, q.name]] = given[q.name]
+        if kind.linear is not None:
+            part = kind.linear
+            if part.falling is not None:
+                fall = part.falling(blocks, given)
+            elif fall is not None and part.blocks is not None:
+                fall = part.blocks(fall, given)
+            blocks = part.blocks(blocks, given) if part.blocks is not None else blocks
+            u_offset += part.u_offset(given) if part.u_offset is not None else 0.0
+    chain = chain_of(blocks, model.name)
+    for kind in kinds:
+        if not kind.needs.holds(chain):
+            raise InputError(kind.needs.otherwise, where=model.name, remedy=f"leave {kind.name} out")
+    return Simulator(
+        chain=chain,
+        falling=chain if fall is None else chain_of(fall, model.name),
+        kinds=tuple(kinds),
+        values=values,
+        acts=acts,
+        u_offset=u_offset,
+        y_offset=model.output.offset,
+        kelvin=model.output.offset + (ICE_K if "c" in model.output.unit.lower() else 0.0),
+        linear_hold=model.input.hold == "linear",
+    )
+
+
+def values_of(effect: Effect, kind: EffectKind, model: Model) -> dict[str, float]:
+    """Return an effect's parameters, neutral ones where they are not given.
+
+    Raises
+    ------
+    InputError
+        A parameter that it does not have, lacks, or cannot take.
+    """
+    known = ", ".join(q.name for q in kind.parameters)
+    for key in effect.parameters:
+        if kind.quantity(key) is None:
+            raise InputError(f"{effect.name} has no parameter {key!r}", where=model.name, remedy=f"known: {known}")
+    if not effect.parameters and all(q.neutral is not None for q in kind.parameters):
+        raise InputError(f"{effect.name} has no parameters", where=model.name, remedy=f"known: {known}")
+    values: dict[str, float] = {}
+    for q in kind.parameters:
+        if q.name in effect.parameters:
+            values[q.name] = effect.parameters[q.name].value
+            if q.nonzero and not values[q.name] > 0.0:
+                what = f"{effect.name} has {q.name} = {values[q.name]:g}"
+                raise InputError(what, where=model.name, remedy="give it a value above zero")
+        elif q.neutral is None:
+            raise InputError(
+                f"{effect.name} lacks {q.name}", where=model.name, remedy=f"add {q.name} to its parameters"
+            )
+        else:
+            values[q.name] = q.neutral
+    wrong = kind.possible(values, model) if kind.possible is not None else ""
+    if wrong:
+        raise InputError(wrong, where=model.name, remedy=f"leave {effect.name} out")
+    return values
+
+
+def states_that_stay(name: str, order: int) -> slice:
+    """Return the states that stay when an effect is taken out of a chain of an order: all but those of its block."""
+    part = KINDS[name].linear
+    if part is None or part.unless_lagged:
+        return slice(0, order)
+    return slice(part.states, order) if part.at == "front" else slice(0, order - part.states)
