@@ -48,6 +48,7 @@ def investigate(
     from autotune.cli.common import ProgressBar, new_folder, rig_of
     from autotune.config import load_config
     from autotune.models import read_model
+    from autotune.pipeline.investigation import Budget, Listeners
     from autotune.pipeline.investigation import investigate as find_out
 
     content = load_config(config)
@@ -57,8 +58,9 @@ def investigate(
     new_folder(out, (ROUNDS, "diagnosis.json", "extended_model.toml", "report.html"), (config, model))
     with ProgressBar() as bar:
         known = find_out(
-            rig, content, nominal, given, out, rounds=rounds, duration_s=duration, rig_time_s=rig_time,
-            without=without or (), report=bar.work, on_progress=bar.show, keep=lambda known: _keep(known, out),
+            rig, content, nominal, given, out,
+            budget=Budget(rounds=rounds, duration_s=duration, rig_time_s=rig_time), without=without or (),
+            told=Listeners(report=bar.work, on_progress=bar.show, keep=lambda known: _keep(known, out)),
         )  # fmt: skip
     for one in known.rounds:
         kind, on = one.plan.excitation.kind, one.plan.excitation.on

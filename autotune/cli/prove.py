@@ -131,7 +131,7 @@ def tie_resolved(out: Path, seed: int) -> dict[str, Any]:
     """
     from autotune.config import load_config
     from autotune.models import read_model
-    from autotune.pipeline.investigation import investigate
+    from autotune.pipeline.investigation import Budget, investigate
     from autotune.recording import read_recording
     from drivers.simulated import SimulatedRig
     from sim.ties import draw, write
@@ -145,7 +145,7 @@ def tie_resolved(out: Path, seed: int) -> dict[str, Any]:
     write(tie, folder)
     known = investigate(
         SimulatedRig(tie.rig(), u_safe=0.0), load_config(folder / "config.toml"), read_model(folder / "model.toml"),
-        [read_recording(folder / "first.csv")], folder, rounds=1, duration_s=TIE_DURATION_S,
+        [read_recording(folder / "first.csv")], folder, budget=Budget(rounds=1, duration_s=TIE_DURATION_S),
     )  # fmt: skip
     (old, p), one = known.before[0], known.rounds[0] if known.rounds else None
     new, q = one.candidates[0] if one is not None else (old, p)

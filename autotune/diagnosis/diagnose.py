@@ -14,8 +14,9 @@ from autotune.diagnosis.evidence.adequacy import is_white, residual_tests
 from autotune.diagnosis.evidence.constancy import largest_variation
 from autotune.diagnosis.evidence.description import describe
 from autotune.diagnosis.evidence.held_out import held_out
+from autotune.diagnosis.evidence.jitter import jitter_effect
 from autotune.diagnosis.evidence.law import law_effect
-from autotune.diagnosis.evidence.samples import SampleEffect, improves, inspect, jitter_effect
+from autotune.diagnosis.evidence.samples import SampleEffect, improves, inspect
 from autotune.diagnosis.findings import extended_model, found_effects, offset_of
 from autotune.diagnosis.fitting.retuning import reduced_chi2
 from autotune.diagnosis.result import Diagnosis

@@ -101,6 +101,63 @@ class Investigation:
         }
 
 
+@dataclass(frozen=True, kw_only=True)
+class Budget:
+    """What an investigation may take.
+
+    Attributes
+    ----------
+    rounds : int
+        Most experiments.
+    duration_s : float, optional
+        Time under excitation per round [s]; the experiment's budget of the configuration by default.
+    rig_time_s : float, optional
+        Time under excitation in all [s]; as many rounds as asked for by default.
+    """
+
+    rounds: int = 3
+    duration_s: float | None = None
+    rig_time_s: float | None = None
+
+    def of(self, config: Config) -> tuple[float, float]:
+        """Return the time under excitation per round and in all [s].
+
+        Raises
+        ------
+        InputError
+            A round leaves too little time for the way to the operating point.
+        """
+        duration_s = config.experiment.budget_s if self.duration_s is None else self.duration_s
+        if duration_s > LARGEST_SHARE * config.limits.time_s:
+            raise InputError(
+                f"{duration_s:g} s under excitation leave too little of limits.time_s = {config.limits.time_s:g} s",
+                where="--duration",
+                remedy=f"ask for at most {LARGEST_SHARE * config.limits.time_s:.4g} s, or raise limits.time_s",
+            )
+        return duration_s, self.rounds * duration_s if self.rig_time_s is None else self.rig_time_s
+
+
+@dataclass(frozen=True, kw_only=True)
+class Listeners:
+    """Who is told what.
+
+    Attributes
+    ----------
+    report, on_progress : callable
+        Told what is being computed, and where the rig is.
+    keep : callable
+        Given what is known after every diagnosis and at every end, so that nothing is lost.
+    """
+
+    report: Report = lambda what, share: None
+    on_progress: OnProgress | None = None
+    keep: Callable[[Investigation], None] = lambda known: None
+
+
+#: Three rounds of the configuration's length, and nobody who listens.
+_USUAL, _NOBODY = Budget(), Listeners()
+
+
 def investigate(
     rig: Rig,
     config: Config,
@@ -108,13 +165,9 @@ def investigate(
     recordings: Sequence[Recording],
     out: Path,
     *,
-    rounds: int = 3,
-    duration_s: float | None = None,
-    rig_time_s: float | None = None,
+    budget: Budget = _USUAL,
     without: Sequence[str] = (),
-    report: Report = lambda what, share: None,
-    on_progress: OnProgress | None = None,
-    keep: Callable[[Investigation], None] = lambda known: None,
+    told: Listeners = _NOBODY,
 ) -> Investigation:
     """Diagnose, run the experiment that separates the open hypotheses best, and again.
 
@@ -131,18 +184,12 @@ def investigate(
     out : Path
         Folder for the recordings: ``rig_N.csv`` is everything that the rig saw in round N, ``recording_N.csv`` its
         rows under excitation, which are diagnosed.
-    rounds : int
-        Most experiments.
-    duration_s : float, optional
-        Time under excitation per round [s]; the experiment's budget of the configuration by default.
-    rig_time_s : float, optional
-        Time under excitation in all [s]; as many rounds as asked for by default.
+    budget : Budget
+        Rounds and times.
     without : sequence of str
         Effects left out of the catalogue.
-    report, on_progress : callable
-        Told what is being computed, and where the rig is.
-    keep : callable
-        Given what is known after every diagnosis and at every end, so that nothing is lost.
+    told : Listeners
+        Who is told what is computed, where the rig is, and what is known.
 
     Returns
     -------
@@ -155,37 +202,29 @@ def investigate(
     ExperimentStopped, LinkError, OperatorStop
         What ended a round; the rig is safe, and what was known before has been kept.
     """
-    duration_s = config.experiment.budget_s if duration_s is None else duration_s
-    if duration_s > LARGEST_SHARE * config.limits.time_s:
-        raise InputError(
-            f"{duration_s:g} s under excitation leave too little of limits.time_s = {config.limits.time_s:g} s",
-            where="--duration",
-            remedy=f"ask for at most {LARGEST_SHARE * config.limits.time_s:.4g} s, or raise limits.time_s",
-        )
-    rig_time_s = rounds * duration_s if rig_time_s is None else rig_time_s
-    found = _diagnosed(model, recordings, without, report) if recordings else None
+    budget.of(config)
+    found = _diagnosed(model, recordings, without, told.report) if recordings else None
     before = () if found is None else _probabilities(found)
     known = Investigation(diagnosis=found, recordings=tuple(recordings), before=before, rounds=(), ended="")
     while True:
-        keep(known)
-        plan, ended = _next(known, config, model, rounds, duration_s, rig_time_s, report)
+        told.keep(known)
+        plan, ended = _next(known, config, model, budget, told.report)
         if plan is None:
             known = replace(known, ended=ended)
-            keep(known)
+            told.keep(known)
             return known
-        known = _round(known, plan, rig, config, model, out, without, report, on_progress, keep)
+        known = _round(known, plan, rig, config, model, out, without, told)
 
 
 def _next(
     known: Investigation,
     config: Config,
     model: Model,
-    rounds: int,
-    duration_s: float,
-    rig_time_s: float,
+    budget: Budget,
     report: Report,
 ) -> tuple[Plan | None, str]:
     """Return the next experiment, or why there is none."""
+    rounds, (duration_s, rig_time_s) = budget.rounds, budget.of(config)
     done = len(known.rounds)
     found = known.diagnosis
     if found is None:
@@ -217,21 +256,19 @@ def _round(
     model: Model,
     out: Path,
     without: Sequence[str],
-    report: Report,
-    on_progress: OnProgress | None,
-    keep: Callable[[Investigation], None],
+    told: Listeners,
 ) -> Investigation:
     """Run one experiment and diagnose everything again."""
     number = len(known.rounds) + 1
     try:
-        seen = run_excitation(rig, config, out / f"rig_{number}.csv", plan.excitation, on_progress=on_progress)
+        seen = run_excitation(rig, config, out / f"rig_{number}.csv", plan.excitation, on_progress=told.on_progress)
     except AutotuneError as error:
-        keep(replace(known, ended=f"round {number}: {error}"))
+        told.keep(replace(known, ended=f"round {number}: {error}"))
         raise
     path = out / f"recording_{number}.csv"
     write_recording(seen, path)
     recordings = (*known.recordings, replace(seen, name=str(path)))
-    found = _diagnosed(model, recordings, without, report)
+    found = _diagnosed(model, recordings, without, told.report)
     one = Round(
         number=number, recording=path.name, plan=plan, verdict=found.verdict, candidates=_probabilities(found)
     )  # fmt: skip

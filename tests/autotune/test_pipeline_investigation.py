@@ -22,7 +22,7 @@ from autotune.experiment_design.conditions import as_recorded, conditions_of
 from autotune.experiment_design.open_hypotheses import open_hypotheses
 from autotune.experiment_design.plan import excitations, planned_recording
 from autotune.models import Block, Model, Port, TransferFunction, read_model, write_model
-from autotune.pipeline.investigation import Investigation, investigate
+from autotune.pipeline.investigation import Budget, Investigation, Listeners, investigate
 from autotune.recording import Recording, read_recording, write_recording
 from drivers.simulated import SimulatedRig
 from sim.imperfections import Fault, FaultyPlant
@@ -82,7 +82,13 @@ def small_steps(seed: int, rows: int = 500) -> Recording:
 def test_a_square_root_outflow_that_may_as_well_be_an_overflow_is_told_by_one_experiment(tmp_path: Path) -> None:
     rig = SimulatedRig(tanks(23), u_safe=0.0)
     known = investigate(
-        rig, tanks_config(), tanks_model(), [small_steps(2)], tmp_path, rounds=1, duration_s=1200.0, without=WITHOUT
+        rig,
+        tanks_config(),
+        tanks_model(),
+        [small_steps(2)],
+        tmp_path,
+        budget=Budget(rounds=1, duration_s=1200.0),
+        without=WITHOUT,
     )
     believed = dict(known.before)
     assert believed["plant.hard_stop"] > 0.05
@@ -133,7 +139,7 @@ def test_an_integrating_plant_is_not_driven_without_a_control_law() -> None:
 def test_an_excitation_longer_than_the_rig_may_be_used_is_refused_before_the_rig_is_touched(tmp_path: Path) -> None:
     rig = SimulatedRig(tanks(6), u_safe=0.0)
     with pytest.raises(InputError, match=r"limits\.time_s"):
-        investigate(rig, tanks_config(), tanks_model(), [], tmp_path, duration_s=19000.0)
+        investigate(rig, tanks_config(), tanks_model(), [], tmp_path, budget=Budget(duration_s=19000.0))
     assert list(tmp_path.iterdir()) == []
 
 
@@ -142,7 +148,14 @@ def test_a_fault_in_a_round_leaves_the_rig_safe_and_says_in_which_round(tmp_path
     kept: list[Investigation] = []
     with pytest.raises(ExperimentStopped):
         investigate(
-            rig, tanks_config(), tanks_model(), [], tmp_path, duration_s=2000.0, without=WITHOUT, keep=kept.append
+            rig,
+            tanks_config(),
+            tanks_model(),
+            [],
+            tmp_path,
+            budget=Budget(duration_s=2000.0),
+            without=WITHOUT,
+            told=Listeners(keep=kept.append),
         )
     assert kept[-1].ended.startswith("round 1: ")
     assert rig.command == 0.0

@@ -1,4 +1,7 @@
-"""Effects of the actuator, in the order in which a command passes them."""
+"""Effects of the actuator, in the order in which a command passes them.
+
+One record and its functions per effect: the file is as long as its place has effects.
+"""
 
 from __future__ import annotations
 
@@ -8,18 +11,8 @@ from dataclasses import replace
 import numpy as np
 
 from autotune.arrays import FloatArray
-from autotune.diagnosis.effects.base import (
-    ACTUATOR_LAG,
-    Blocks,
-    EffectKind,
-    Line,
-    LinearPart,
-    Memory,
-    Quantity,
-    Scan,
-    SignalSizes,
-    Values,
-)
+from autotune.diagnosis.effects.base import ACTUATOR_LAG, EffectKind, Quantity, Scan, SignalSizes
+from autotune.diagnosis.effects.stages import Blocks, Line, LinearPart, Memory, Values
 from autotune.models import Block, TransferFunction
 
 _LJUNG = "Ljung, System Identification, 2nd ed., sec. 5.1"

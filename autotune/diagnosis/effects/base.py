@@ -1,19 +1,22 @@
 """What is known of one effect, in one record: equation, parameters, compiled lines, linear part, searches, source.
 
 An effect acts in one or both of two ways. A *line* is a small plain function of scalars that is put into the compiled
-simulation at a stage (:data:`STAGES`); its arguments are taken by their names: signals of the stage, the effect's own
-parameters, its memory. A *linear part* changes the blocks of the chain. What is incomplete is
+simulation at a stage (:data:`autotune.diagnosis.effects.stages.STAGES`); its arguments are taken by their names:
+signals of the stage, the effect's own parameters, its memory. A *linear part* changes the blocks of the chain. What is incomplete is
 refused when the package is imported, see :mod:`autotune.diagnosis.effects.checks`.
+
+Most of the file says what each attribute means.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol, TypeAlias
+from typing import Literal, Protocol, TypeAlias
 
 from autotune.arrays import FloatArray
-from autotune.models import Block, Model, Parameter
+from autotune.diagnosis.effects.stages import Line, LinearPart, Memory, Values
+from autotune.models import Model, Parameter
 
 #: What a parameter is to a search.
 #: ``amplitude``: the effect is about proportional to it, so that a first-order look tells its size.
@@ -27,8 +30,6 @@ Sign: TypeAlias = Literal["positive", "real"]
 #: Where an effect is looked for: among hypotheses that are fitted; as a structure that is fitted beside them and is no
 #: effect; in the operating point that every fit has; in the samples; in the residual; in the recomputed law.
 Sought: TypeAlias = Literal["hypothesis", "structure", "operating point", "samples", "residual", "law"]
-Values: TypeAlias = Mapping[str, float]
-Blocks: TypeAlias = tuple[Block, ...]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -158,118 +159,6 @@ POSITION_STATE = Structure(
 ACTUATOR_LAG = Structure(
     holds=lambda chain: chain.has_actuator_lag, otherwise="an asymmetric lag needs an actuator of first order"
 )
-
-StageName: TypeAlias = Literal[
-    "clock", "converter", "command", "load", "force", "travel", "friction", "outflow", "stop", "sensor", "reading"
-]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Stage:
-    """A place of the compiled simulation where lines act.
-
-    Attributes
-    ----------
-    value : tuple of str
-        What passes through and comes back changed; empty where contributions are added up.
-    signals : tuple of str
-        What a line may ask for besides.
-    is_force : bool
-        Whether it acts at the plant within a sub-step.
-    """
-
-    value: tuple[str, ...] = ()
-    signals: tuple[str, ...] = ()
-    is_force: bool = False
-
-
-#: The stages in the order in which a sample passes them. ``t`` counts from the recording's first row [s].
-STAGES: Mapping[StageName, Stage] = {
-    # when a command acts: time since the first row, in and out
-    "clock": Stage(value=("elapsed",)),
-    # the absolute command
-    "converter": Stage(value=("u",), signals=("t",)),
-    # the command from the operating point on; ``offset`` is the command there
-    "command": Stage(value=("w",), signals=("offset", "dt", "t")),
-    # forces at the plant's input that no state changes; ``number`` is the recording's
-    "load": Stage(signals=("t", "number"), is_force=True),
-    # forces that go with plant input w, speed v, position or level x, first level, gain from force to speed or level;
-    # ``kelvin`` is the absolute temperature at the operating point, were y one
-    "force": Stage(signals=("w", "v", "x", "level", "y_offset", "gain", "kelvin"), is_force=True),
-    # what is remembered of a travel dx of the position, after every sub-step's first trial
-    "travel": Stage(signals=("dx", "dt"), is_force=True),
-    # level of a dry friction, which at most stops the motion
-    "friction": Stage(signals=("v",), is_force=True),
-    # what is added at the input of the plant's last block, whose gain is ``gain_last``
-    "outflow": Stage(signals=("x", "level", "gain_last"), is_force=True),
-    # position and speed after a sub-step; ``y_offset`` is the reading at position 0
-    "stop": Stage(value=("x", "v"), signals=("y_offset",)),
-    # the last block's output
-    "sensor": Stage(value=("z",), signals=("t",)),
-    # the absolute reading
-    "reading": Stage(value=("y",), signals=("t",)),
-}
-
-
-@dataclass(frozen=True, kw_only=True)
-class Line:
-    """A function of the compiled simulation: scalars in, the stage's value or contribution out.
-
-    Its source is copied into the generated simulation: it may use ``math`` and functions of its own file. Where the
-    effect has a memory the function may take it by its name; in a stage with a value it then returns value and memory,
-    in ``travel`` the memory alone.
-    """
-
-    stage: StageName
-    does: Callable[..., Any]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Memory:
-    """What an effect keeps from one sub-step to the next.
-
-    Attributes
-    ----------
-    name : str
-        The lines' argument.
-    start : {"command", "zero"}
-        What it is where a window begins that follows no other: the command in force there, or 0.
-    replayed : bool
-        Whether it remembers every command before the window, as a play does.
-    """
-
-    name: str
-    start: Literal["command", "zero"] = "command"
-    replayed: bool = False
-
-
-@dataclass(frozen=True, kw_only=True)
-class LinearPart:
-    """What an effect makes of the chain itself.
-
-    Attributes
-    ----------
-    blocks : callable
-        The chain's blocks with the effect in them.
-    falling : callable, optional
-        The blocks that act while the command falls; what rises follows ``blocks``.
-    u_offset : callable, optional
-        What is added to the command's operating point.
-    states : int
-        States that it adds, ``at`` the chain's front or back.
-    unless_lagged : bool
-        Whether it adds none where an actuator's lag is there already.
-    start : callable, optional
-        Start states of those, (W, states), for windows with commands before them and linear outputs, (W,) each.
-    """
-
-    blocks: Callable[[Blocks, Values], Blocks] | None = None
-    falling: Callable[[Blocks, Values], Blocks] | None = None
-    u_offset: Callable[[Values], float] | None = None
-    states: int = 0
-    at: Literal["front", "back"] = "back"
-    unless_lagged: bool = False
-    start: Callable[[FloatArray, FloatArray, Values], FloatArray] | None = None
 
 
 class Scan(Protocol):

@@ -6,7 +6,8 @@ import inspect
 from collections.abc import Iterator, Sequence
 from typing import get_args
 
-from autotune.diagnosis.effects.base import STAGES, EffectKind, Line, Role, StageName
+from autotune.diagnosis.effects.base import EffectKind, Role
+from autotune.diagnosis.effects.stages import STAGES, Line, StageName
 from autotune.errors import InputError
 
 PLACES = ("actuator", "plant", "sensor", "timing", "environment", "controller")

@@ -8,7 +8,8 @@ from collections.abc import Mapping
 import numpy as np
 
 from autotune.diagnosis.effects.actuator import NEVER
-from autotune.diagnosis.effects.base import EffectKind, Line, Quantity, Scan, Values
+from autotune.diagnosis.effects.base import EffectKind, Quantity, Scan
+from autotune.diagnosis.effects.stages import Line, Values
 from autotune.models import Parameter
 
 _ASTROM = "Astrom and Hagglund, Advanced PID Control, 2006, ch. 4"

@@ -1,4 +1,7 @@
-"""Effects of the plant: forces at its input, dry friction, stops, and modes that its chain lacks."""
+"""Effects of the plant: forces at its input, dry friction, stops, and modes that its chain lacks.
+
+One record and its functions per effect: the file is as long as its place has effects.
+"""
 
 from __future__ import annotations
 
@@ -13,16 +16,12 @@ from autotune.diagnosis.effects.base import (
     LEVEL,
     MECHANICAL,
     POSITION_STATE,
-    Blocks,
     EffectKind,
     Fitted,
-    Line,
-    LinearPart,
-    Memory,
     Quantity,
     SignalSizes,
-    Values,
 )
+from autotune.diagnosis.effects.stages import Blocks, Line, LinearPart, Memory, Values
 from autotune.models import Block, Model, TransferFunction
 
 _OLSSON = "Olsson, Astrom, Canudas de Wit, Gafvert and Lischinsky, Eur. J. Control 4, 1998"

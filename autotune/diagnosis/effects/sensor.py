@@ -6,7 +6,8 @@ import math
 
 from autotune.arrays import FloatArray
 from autotune.diagnosis.effects.actuator import NEVER, limit_starts
-from autotune.diagnosis.effects.base import Blocks, EffectKind, Line, LinearPart, Quantity, Values
+from autotune.diagnosis.effects.base import EffectKind, Quantity
+from autotune.diagnosis.effects.stages import Blocks, Line, LinearPart, Values
 from autotune.models import Block, TransferFunction
 
 _LJUNG = "Ljung, System Identification, 2nd ed., sec. 5.1"

@@ -4,6 +4,8 @@ To first order the simulation error of a fit is the linear chain's response to w
 added at the command, at the plant's input or to the reading, and s a signal of the fitted simulation. Every candidate
 function is therefore sent through the chain from there to the reading, window by window, and nothing is ever
 differentiated; what start states and the fit's own free numbers could explain is taken out before anything is credited.
+
+Records of what is said, and how it is found: the file is a little longer than others.
 """
 
 from __future__ import annotations

@@ -3,6 +3,8 @@
 A law is a sum of parts, each with a gain: u = K (b r - y) + K/T_I integral(r - y) - K T_d dy/dt for P, PI, PD and PID,
 one part, the whole of C(s) or C(q) acting on e = r - y, for a law given as polynomials. What a recording shows are the
 gains of the parts, estimated beside a bias, the free response of the law's own states, and a dither that is unknown.
+
+Parts, filters and ways of computing one law belong together: the file is longer than others.
 """
 
 from __future__ import annotations

@@ -1,6 +1,8 @@
 """Cheap looks at recordings and residuals, each with one sentence of what it says: pictures before any hypothesis.
 
 Every screen is a pure function of what was recorded and of a fit; it blames nothing, it shows where to look.
+
+One record and one function per screen: the file is as long as there are screens.
 """
 
 from __future__ import annotations

@@ -9,7 +9,8 @@ import numpy as np
 
 from autotune.arrays import BoolArray, FloatArray
 from autotune.diagnosis.effects import kind_of
-from autotune.diagnosis.effects.base import EffectKind, Values
+from autotune.diagnosis.effects.base import EffectKind
+from autotune.diagnosis.effects.stages import Values
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import Fit, fit, residual_at, start_states
 from autotune.diagnosis.fitting.parameters import Parametrisation

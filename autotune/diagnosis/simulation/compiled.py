@@ -25,7 +25,8 @@ from pathlib import Path
 
 from autotune.arrays import FloatArray
 from autotune.diagnosis.effects import ALL
-from autotune.diagnosis.effects.base import STAGES, EffectKind, Line, StageName
+from autotune.diagnosis.effects.base import EffectKind
+from autotune.diagnosis.effects.stages import STAGES, Line, StageName
 from autotune.diagnosis.simulation import kernel, stages
 from autotune.errors import InputError
 

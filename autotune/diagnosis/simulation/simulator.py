@@ -11,7 +11,8 @@ import numpy as np
 
 from autotune.arrays import FloatArray, IntArray
 from autotune.diagnosis.effects import ALL
-from autotune.diagnosis.effects.base import STAGES, EffectKind, StageName
+from autotune.diagnosis.effects.base import EffectKind
+from autotune.diagnosis.effects.stages import STAGES, StageName
 from autotune.diagnosis.simulation import kernel
 from autotune.diagnosis.simulation.chain import Chain
 from autotune.diagnosis.simulation.compiled import Layout, Run, compiled_run, layout_of

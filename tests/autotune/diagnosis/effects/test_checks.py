@@ -13,8 +13,9 @@ import pytest
 
 import autotune
 from autotune.diagnosis.effects import ALL, CATALOGUE, kind_of
-from autotune.diagnosis.effects.base import EffectKind, Line, LinearPart, Memory, Quantity
+from autotune.diagnosis.effects.base import EffectKind, Quantity
 from autotune.diagnosis.effects.checks import require_complete
+from autotune.diagnosis.effects.stages import Line, LinearPart, Memory
 from autotune.errors import InputError
 
 

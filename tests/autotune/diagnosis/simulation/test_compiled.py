@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 
 from autotune.diagnosis.effects import ALL
-from autotune.diagnosis.effects.base import STAGES, EffectKind, Line, Quantity
+from autotune.diagnosis.effects.base import EffectKind, Quantity
 from autotune.diagnosis.effects.checks import require_complete
+from autotune.diagnosis.effects.stages import STAGES, Line
 from autotune.diagnosis.simulation import stages
 from autotune.diagnosis.simulation.assembly import assemble
 from autotune.diagnosis.simulation.compiled import layout_of, run_of, source_of
