@@ -2,8 +2,8 @@
 
 An effect acts in one or both of two ways. A *line* is a small plain function of scalars that is put into the compiled
 simulation at a stage (:data:`autotune.diagnosis.effects.stages.STAGES`); its arguments are taken by their names:
-signals of the stage, the effect's own parameters, its memory. A *linear part* changes the blocks of the chain. What is incomplete is
-refused when the package is imported, see :mod:`autotune.diagnosis.effects.checks`.
+signals of the stage, the effect's own parameters, its memory. A *linear part* changes the blocks of the chain. What is
+incomplete is refused when the package is imported, see :mod:`autotune.diagnosis.effects.checks`.
 
 Most of the file says what each attribute means.
 """

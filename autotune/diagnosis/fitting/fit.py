@@ -162,10 +162,9 @@ def fit(
         Start; the parametrisation's centre by default.
     x0 : sequence of (W, n) array, optional
         Start states to begin from; rest by default.
-    iterations : int
-        Most Gauss-Newton steps per round.
-    rounds : int
-        Most rounds; each begins with start states carried over from the window before where that fits better.
+    iterations, rounds : int
+        Most Gauss-Newton steps per round, and most rounds; each begins with start states carried over from the window
+        before where that fits better.
     free : (p,) bool array, optional
         Numbers that may move; all by default.
     inherit : Fit, optional
@@ -179,7 +178,7 @@ def fit(
     Raises
     ------
     IdentificationError
-        The simulation diverges at the starting point, or derivatives leave the range of numbers.
+        The simulation diverges at the start, or derivatives leave the range of numbers.
 
     Notes
     -----
