@@ -158,10 +158,8 @@ def fit(
         What is free, and where to start.
     data : Data
         What to fit to.
-    theta : (p,) array, optional
-        Start; the parametrisation's centre by default.
-    x0 : sequence of (W, n) array, optional
-        Start states to begin from; rest by default.
+    theta, x0 : (p,) array, sequence of (W, n) array, optional
+        Start; the parametrisation's centre and rest by default.
     iterations, rounds : int
         Most Gauss-Newton steps per round, and most rounds; each begins with start states carried over from the window
         before where that fits better.
