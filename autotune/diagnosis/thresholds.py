@@ -46,7 +46,7 @@ class Thresholds:
     least_frozen_share: float = _known(1e-3, "of the rows", "that repeat a reading before a dropout is named", "convention")
     spike: float = _known(7.0, "robust sd", "out of its neighbours' mean that make a spike", "chance")
     least_spikes: int = _known(3, "rows", "before outliers are named", "chance")
-    least_outlier: float = _known(3.0, "noise sd", "that spikes are off the simulation in the median: else it explains them", "chance")
+    least_outlier: float = _known(3.0, "robust sd", "of spikes out of their neighbours in the residual: else the simulation explains them", "chance")
     least_clipped: int = _known(5, "rows", "at an extreme reading before a saturation is named", "chance")
     least_equal_share: float = _known(0.02, "of the rows", "that equal the one before, before rounding is named", "counted")
     least_rounding: float = _known(0.05, "of the noise", "variance of a converter's rounding that matters", "convention")

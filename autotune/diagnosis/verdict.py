@@ -118,8 +118,12 @@ TABLE: tuple[tuple[set[str], set[str], Verdict], ...] = (
 
 
 def judged(evidence: Evidence) -> Verdict:
+    """Return the verdict on evidence."""
+    return verdict_of(evidence.facts)
+
+
+def verdict_of(facts: frozenset[str]) -> Verdict:
     """Return the verdict of the first row of the table that fits."""
-    facts = evidence.facts
     return next(verdict for holds, lacks, verdict in TABLE if holds <= facts and not lacks & facts)
 
 

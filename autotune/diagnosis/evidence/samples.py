@@ -268,8 +268,8 @@ def improves(effect: SampleEffect, result: Fit, data: Data) -> bool:
 
     Notes
     -----
-    A reading that is repeated is the one before it, exactly. A clipped one is its limit. A spike is one where the
-    simulation does not explain it either: it is farther off than noise brings. A converter's step is found in one half
+    A reading that is repeated is the one before it, exactly. A clipped one is its limit. A spike stands out of
+    the residual too: the simulation does not explain it. A converter's step is found in one half
     of the readings and predicts the values of the other.
     """
     limits, kind = data.thresholds, kind_of(effect.name)
@@ -286,10 +286,18 @@ def improves(effect: SampleEffect, result: Fit, data: Data) -> bool:
         ends = [np.clip(s[rows], low, high) for s, rows in zip(simulated, effect.rows, strict=True)]
         clipped = np.concatenate([r.y[rows] - e for r, e, rows in zip(data.recordings, ends, effect.rows, strict=True)])
         return float(np.nansum(clipped**2)) <= float(np.sum(off**2))
-    noise = data.noise.total_sd
-    if kind.name == "sensor.outliers":
-        return off.size > 0 and float(np.median(np.abs(off))) > limits.least_outlier * noise
+    if kind.uneven:
+        return _stand_out(effect, [r.y - s for r, s in zip(data.recordings, simulated, strict=True)], limits)
     return float(np.sum(off**2)) > 0.0
+
+
+def _stand_out(effect: SampleEffect, residuals: Sequence[FloatArray], limits: Thresholds) -> bool:
+    """Whether spikes stand out of the residual too, beside their neighbours: what the simulation explains does not."""
+    alone = [e[1:-1] - 0.5 * (e[:-2] + e[2:]) for e in residuals]
+    usual = np.concatenate([d[~rows[1:-1]] for d, rows in zip(alone, effect.rows, strict=True)])
+    spikes_of = np.concatenate([d[rows[1:-1]] for d, rows in zip(alone, effect.rows, strict=True)])
+    spread = 1.4826 * float(np.nanmedian(np.abs(usual)))
+    return bool(np.nanmedian(np.abs(spikes_of)) > limits.least_outlier * spread)
 
 
 def _step_predicts(data: Data) -> bool:
