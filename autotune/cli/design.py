@@ -16,7 +16,8 @@ from autotune.errors import InputError
 from autotune.outputs import Output
 
 if TYPE_CHECKING:
-    from autotune.design.specification import Design
+    from autotune.design.specification import Design, Specification
+    from autotune.models import TransferFunction
 
 
 class Kind(StrEnum):
@@ -40,13 +41,20 @@ def design_command(
     points: Annotated[Path | None, typer.Option(help="points file (JSON) to design on, with its regions")] = None,
     modulus_margin: Annotated[float, typer.Option(help="smallest distance of L from -1, between 0 and 1")] = 0.5,
     phase_margin: Annotated[float, typer.Option(help="smallest phase margin [deg]")] = 45.0,
-    noise_gain: Annotated[float, typer.Option(help="largest noise amplification y to u, N_max [u/y unit]")] = 0.1,
-    noise: Annotated[
-        Noise, typer.Option(help="bound: |C| <= M_m N_max at high frequency (16); true: |C/(1+L)| <= N_max (15)")
-    ] = Noise.BOUND,
-    noise_frequency: Annotated[
-        float | None, typer.Option(help="lowest frequency of the noise for (15) [rad/s]; default the crossover")
+    noise_gain: Annotated[
+        float | None,
+        typer.Option(help="largest noise amplification y to u, N_max [u/y unit]; default from the plant's gain"),
     ] = None,
+    noise: Annotated[
+        Noise, typer.Option(help="true: |C/(1+L)| <= N_max (15); bound: |C| <= M_m N_max (16), which implies it")
+    ] = Noise.TRUE,
+    noise_frequency: Annotated[
+        float | None, typer.Option(help="lowest frequency of the noise [rad/s]; default the crossover")
+    ] = None,
+    criterion: Annotated[
+        Literal["h2", "iae"],
+        typer.Option(help="minimised after a step of load: the norm (11), or the integral of the absolute error"),
+    ] = "h2",
     delay_margin: Annotated[float, typer.Option(help="smallest delay margin [s]; 0 asks for none")] = 0.0,
     setpoint_command: Annotated[
         float | None, typer.Option(help="largest immediate command per unit set-point step [u/y unit]; default none")
@@ -56,34 +64,50 @@ def design_command(
     certificate: Annotated[bool, typer.Option(help="prove a lower bound on the H2 norm (PI on a model)")] = True,
     overwrite: OVERWRITE = False,
 ) -> None:
-    """Design the PI or PID with the smallest H2 norm under margins, on a model or straight on measured points."""
+    """Design the PI or PID that rejects a step of load best under margins, on a model or straight on points."""
     from autotune.controller import write_controller
+    from autotune.design.noise import LoopFacts, default_noise_gain
     from autotune.design.specification import Specification
 
-    specification = Specification(
-        modulus_margin=modulus_margin,
-        phase_margin_rad=math.radians(phase_margin),
-        noise_gain=noise_gain,
-        noise="true" if noise is Noise.TRUE else "bound",
-        noise_frequency_rad_s=noise_frequency,
-        delay_margin_s=delay_margin,
-        setpoint_command=math.inf if setpoint_command is None else setpoint_command,
-    )
     if (model is None) == (points is None):
         raise InputError("give one of --model and --points", where="autotune design")
+
+    def asked(plant: TransferFunction, highest_rad_s: float) -> Specification:
+        allowed = noise_gain
+        if allowed is None:
+            allowed, words = default_noise_gain(plant, LoopFacts(), highest_rad_s)
+            typer.echo(f"noise gain at most {allowed:.4g}: {words}")
+        return Specification(
+            modulus_margin=modulus_margin,
+            phase_margin_rad=math.radians(phase_margin),
+            noise_gain=allowed,
+            noise="true" if noise is Noise.TRUE else "bound",
+            noise_frequency_rad_s=noise_frequency,
+            delay_margin_s=delay_margin,
+            setpoint_command=math.inf if setpoint_command is None else setpoint_command,
+            criterion=criterion,
+        )
+
     place = Output(out, inputs=(model, points), overwrite=overwrite)
     law = None if controller is None else Output(controller, inputs=(model, points, out), overwrite=overwrite)
     if model is not None:
+        from autotune.design.loop import characteristic_frequencies, transfer_function_of
         from autotune.design.synthesis import design
         from autotune.models import read_model
 
-        designed = design(read_model(model), specification, kind.value, certificate=certificate)
+        H = transfer_function_of(read_model(model))
+        highest_rad_s = float(10.0 * characteristic_frequencies(H)[-1])
+        designed = design(H, asked(H, highest_rad_s), kind.value, certificate=certificate)
     else:
-        from autotune.design.robust import design_on_points
+        from autotune.identification.parametric import fit_plant
+        from autotune.pipeline.analysis import of_use, on_measured
         from autotune.points import read_points
 
         assert points is not None
-        designed = design_on_points(read_points(points), specification, kind.value)
+        measured = of_use(read_points(points))
+        fit = fit_plant(measured)
+        source, designed, looked = on_measured(measured, fit, asked(fit.plant, measured[-1].omega_rad_s), kind.value)
+        typer.echo(f"designed on the {source}; checked: " + "; ".join(check.sentence for check in looked))
     place.json(designed.to_json())
     if law is not None:
         law.by(lambda part: write_controller(designed.controller, part))

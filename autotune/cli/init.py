@@ -39,7 +39,6 @@ PLANTS: Mapping[Plant, Table] = {
                    "time_s": 120.0},
         "operating_point": {"y": 0.0, "u_guess": 0.0, "u_uncertainty": 0.3, "approach": "hold"},
         "experiment": {"budget_s": 30.0},
-        "design": {"noise_gain": 20.0},
         "controller": {"K": 1.0, "Ti_s": 1.0},
     },
     "two_tank": {
@@ -49,7 +48,6 @@ PLANTS: Mapping[Plant, Table] = {
                    "time_s": 20000.0},
         "operating_point": {"y": 10.0, "u_guess": 3.0, "u_uncertainty": 0.4, "approach": "hold"},
         "experiment": {"budget_s": 7200.0},
-        "design": {"noise_gain": 5.0},
         "controller": {"K": 0.5, "Ti_s": 200.0},
     },
     "thermal": {
@@ -59,7 +57,6 @@ PLANTS: Mapping[Plant, Table] = {
                    "time_s": 20000.0},
         "operating_point": {"y": 50.0, "u_guess": 18.0, "u_uncertainty": 3.0, "approach": "hold"},
         "experiment": {"budget_s": 7200.0},
-        "design": {"noise_gain": 20.0},
         "controller": {"K": 0.5, "Ti_s": 200.0},
     },
 }  # fmt: skip

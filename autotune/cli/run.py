@@ -187,6 +187,10 @@ def tune(
         float | None, typer.Option(help="lowest frequency of the noise [rad/s]; default the crossover")
     ] = None,
     kind: Annotated[Literal["pi", "pid"], typer.Option(help="structure of the controller")] = "pi",
+    criterion: Annotated[
+        Literal["iae", "h2"],
+        typer.Option(help="minimised after a step of load: integral of the absolute error, or the norm (11)"),
+    ] = "iae",
     source: Annotated[
         Literal["auto", "reduced model", "points", "fitted plant"],
         typer.Option(help="what to design on; auto: the first that keeps its margins on everything measured"),
@@ -219,6 +223,7 @@ def tune(
         phase_margin_deg=phase_margin,
         noise_gain=noise_gain,
         noise_frequency_rad_s=noise_frequency,
+        criterion=criterion,
         source=source,
     )
     analysis = analyse(found.points, settings, fit=found.fit, facts=found.facts)

@@ -122,6 +122,10 @@ class DesignSettings(Section):
     noise_frequency_rad_s: Annotated[
         float | None, Field(gt=0, description="lowest frequency of the noise [rad/s]; the crossover when absent")
     ] = None
+    criterion: Annotated[
+        Literal["h2", "iae"],
+        Field(description="minimised after a step of load: the norm (11), or the integral of the absolute error"),
+    ] = "h2"
     source: Annotated[
         Literal["auto", "reduced model", "points", "fitted plant"],
         Field(

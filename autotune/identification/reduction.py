@@ -321,7 +321,16 @@ def _by_conditions(
         lag = np.arctan(omega / omega_0r)
     rest = -envelope.phase_rad - lag  # what the all-pass must carry: 2 atan(omega/omega_d) >= rest
     use = envelope.until_phase(_C2_UNTIL)
-    if np.max(rest[use]) >= _LARGEST_REST:  # so uncertain that no all-pass reaches: the printed range then
+    if np.max(rest[use]) >= _LARGEST_REST and static_gain_known:
+        raise IdentificationError(
+            "the dead time is so long beside the lags that no all-pass bounds the phase up to -180 deg, without which"
+            " the modulus margin is not guaranteed",
+            where=_WHERE,
+            remedy="design on the plant itself",
+        )
+    if (
+        np.max(rest[use]) >= _LARGEST_REST
+    ):  # so uncertain that no all-pass reaches: the printed range then, with a check
         use = envelope.until_phase(-0.75 * math.pi)
     if not np.any(rest[use] > 1e-12):
         raise IdentificationError(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal, TypeAlias, TypeVar
 
 import numpy as np
@@ -16,9 +16,10 @@ from autotune.design.margins import Margins, margins
 from autotune.design.noise import LoopFacts, default_noise_gain
 from autotune.design.nugap import Validation, loop_scaling, validate
 from autotune.design.on_fit import PROBABILITY, design_on_fit
+from autotune.design.on_reduced import design_on_reduced
+from autotune.design.plausibility import implausible
 from autotune.design.robust import design_on_points
-from autotune.design.specification import Design, Specification
-from autotune.design.synthesis import design
+from autotune.design.specification import Design, Kind, Specification
 from autotune.errors import AutotuneError, DesignError
 from autotune.identification.parametric import PlantFit, fit_plant
 from autotune.identification.reduction import ReducedModel, reduce_points
@@ -99,6 +100,7 @@ def specification(
         noise_gain=noise_gain,
         noise_frequency_rad_s=settings.noise_frequency_rad_s,
         delay_margin_s=_SAMPLES_OF_DELAY * (facts.sample_time_s or 0.0),
+        criterion=settings.criterion,
     )
     return asked, words
 
@@ -138,11 +140,12 @@ def analyse(
     fit = fit_plant(usable) if fit is None else fit
     asked, noise_source = specification(settings, fit, facts or LoopFacts(), _highest(usable, fit, facts))
     reduced = _reduced(usable)
-    bases = _bases(usable, fit, reduced, asked, settings)
-    source, found, looked = _first_kept(bases, settings, usable, fit)
+    bases = _bases(usable, fit, reduced, asked, settings.kind)
+    source, found, looked = _first_kept(bases, settings.source, usable, fit)
     model = reduced if isinstance(reduced, ReducedModel) else None
     H_r = None if model is None else model.transfer_function()
     controller = found.controller
+    odd = implausible(fit.plant, controller, found.binding, (facts or LoopFacts()).sample_time_s or 0.0)
     others = tuple((name, _or_reason(make)) for name, make in bases.items() if name != source) if compare else ()
     return Analysis(
         points=tuple(measured),
@@ -159,9 +162,34 @@ def analyse(
         warnings=(
             *(beyond if left_out else ()),
             *(model.warnings if source == "reduced model" and model is not None else ()),
+            *([odd] if odd is not None else []),
         ),
         notes=_binding_words(found, noise_source),
     )
+
+
+def on_measured(
+    points: Sequence[FrequencyPoint], fit: PlantFit, asked: Specification, kind: Kind
+) -> tuple[Source, Design, tuple[Check, ...]]:
+    """Return what the controller was designed on, the design, and its checks on everything measured.
+
+    Parameters
+    ----------
+    points : sequence of FrequencyPoint
+        Of use, see :func:`of_use`.
+    fit : PlantFit
+        Through them, or of the recording they come from.
+    asked : Specification
+        Constraints (18).
+    kind : {"pi", "pid"}
+        Structure.
+
+    Raises
+    ------
+    IdentificationError, DesignError
+        On no basis is there a controller that keeps its margins on all of it; the reason is that of the first.
+    """
+    return _first_kept(_bases(points, fit, _reduced(points), asked, kind), "auto", points, fit)
 
 
 def _highest(points: Sequence[FrequencyPoint], fit: PlantFit, facts: LoopFacts | None) -> float:
@@ -176,7 +204,7 @@ def _bases(
     fit: PlantFit,
     reduced: ReducedModel | AutotuneError,
     asked: Specification,
-    settings: DesignSettings,
+    kind: Kind,
 ) -> dict[Source, Callable[[], Design]]:
     """Return the ways to a controller, the one to try first before the others.
 
@@ -187,19 +215,11 @@ def _bases(
     def on_reduced() -> Design:
         if isinstance(reduced, AutotuneError):
             raise reduced
-        if settings.kind != "pi":
-            raise DesignError(
-                "a PID is not of class (2), so that margins on the reduced model are no guarantee",
-                where="reduced model",
-                remedy="design it on the points or on the fitted plant",
-            )
-        H_r = reduced.transfer_function()
-        found = design(H_r, asked, "pi", also=(fit.plant,))
-        return replace(found, margins=margins(H_r, found.controller))  # the fitted plant's own are beside them
+        return design_on_reduced(fit.plant, asked, kind, reduced=reduced, certificate=True)
 
     ways: dict[Source, Callable[[], Design]] = {
-        "points": lambda: design_on_points(points, asked, settings.kind),
-        "fitted plant": lambda: design_on_fit(fit, asked, settings.kind),
+        "points": lambda: design_on_points(points, asked, kind),
+        "fitted plant": lambda: design_on_fit(fit, asked, kind),
         "reduced model": on_reduced,
     }
     return {name: ways[name] for name in sorted(ways, key=lambda name: fit.source == "recording" and name == "points")}
@@ -207,12 +227,12 @@ def _bases(
 
 def _first_kept(
     bases: dict[Source, Callable[[], Design]],
-    settings: DesignSettings,
+    wanted: Source | Literal["auto"],
     points: Sequence[FrequencyPoint],
     fit: PlantFit,
 ) -> tuple[Source, Design, tuple[Check, ...]]:
     """Return the first design whose margins are kept on everything measured; refuse where there is none."""
-    names = list(bases) if settings.source == "auto" else [settings.source]
+    names = list(bases) if wanted == "auto" else [wanted]
     reason: AutotuneError | None = None
     for name in names:
         try:

@@ -1,0 +1,124 @@
+"""The integral of the absolute error after a step of load (IAE): what an operator sees of a disturbance.
+
+The norm (11) is the integral of the square and weighs the peak; the absolute error weighs the tail as well, which a
+slow integral action makes. Computed from the response to a slow square wave, whose odd harmonics give the settled
+response to a step of twice its amplitude, dead time exact.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.fft import irfft
+from scipy.optimize import minimize
+
+from autotune.arrays import ComplexArray, FloatArray
+
+_PER_CROSSOVER = 0.08  # radians of the crossover per step of time
+_LEAST, _MOST = 1 << 10, 1 << 16
+_WALL = 300.0  # cost of a constraint violated by all of it, in logarithms of the error
+_SPANS = (0.3, 0.1, 0.03)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LoadStep:
+    """A plant under a step of load at its input, at the harmonics of a square wave.
+
+    Attributes
+    ----------
+    omega : (N,) array
+        Odd harmonics [rad/s].
+    h : (N,) complex array
+        Plant there, its sign taken out.
+    half_period_s : float
+        Time that the response has to settle [s].
+    rows : int
+        Of the response over a whole period.
+    """
+
+    omega: FloatArray
+    h: ComplexArray
+    half_period_s: float
+    rows: int
+
+    def error(self, p: FloatArray) -> float:
+        """Return the integral of abs(y) after a unit step, output unit times s, with gains (K, T_I, T_d, T_f)."""
+        K, Ti, Td, Tf = p
+        s = 1j * self.omega
+        C = K * (1.0 + 1.0 / (Ti * s) + Td * s) / (1.0 + Tf * s)
+        spectrum = np.zeros(self.rows // 2 + 1, dtype=np.complex128)
+        k = np.arange(1, 2 * self.omega.size, 2)
+        spectrum[k] = self.h / (1.0 + self.h * C) * (-2j / (math.pi * k)) * self.rows / 2.0
+        y = irfft(spectrum, self.rows)
+        return float(np.mean(np.abs(y))) * self.half_period_s
+
+
+def load_step(
+    response: Callable[[FloatArray], ComplexArray], start: FloatArray, crossover_rad_s: float, delay_s: float
+) -> LoadStep:
+    """Return the square wave that settles under the (4,) controller ``start`` and those near it.
+
+    Parameters
+    ----------
+    response : callable
+        Plant, sign taken out, at angular frequencies [rad/s].
+    start : (4,) array
+        K, T_I, T_d, T_f of a good controller.
+    crossover_rad_s, delay_s : float
+        Of its loop and its plant.
+    """
+    K, Ti = float(start[0]), float(start[1])
+    slow = 1e-3 / (Ti + delay_s + 1.0 / crossover_rad_s)
+    static = float(np.abs(response(np.array([slow])))[0])
+    half = 15.0 * Ti * (1.0 + 1.0 / max(K * static, 1e-3)) + 40.0 / crossover_rad_s + 10.0 * delay_s
+    wanted = 2.0 * half * crossover_rad_s / _PER_CROSSOVER
+    rows = 1 << int(np.clip(math.ceil(math.log2(wanted)), math.log2(_LEAST), math.log2(_MOST)))
+    omega = np.arange(1, rows // 2, 2, dtype=np.float64) * (math.pi / half)
+    return LoadStep(omega=omega, h=response(omega), half_period_s=half, rows=rows)
+
+
+def least_error(load: LoadStep, slacks: Callable[[FloatArray], float], start: FloatArray) -> FloatArray:
+    """Return the (4,) gains of least error near the start, by simplexes against a steep wall at the constraints.
+
+    Parameters
+    ----------
+    load : LoadStep
+        What is minimised.
+    slacks : callable
+        Smallest relative slack of the constraints for (4,) gains; negative is violated.
+    start : (4,) array
+        Gains that keep the constraints; those that are 0 stay so.
+    """
+    free = start > 0.0
+    size = int(np.sum(free))
+    best, least = start, math.log(load.error(start))
+
+    def cost(x: FloatArray) -> float:
+        p = start.copy()
+        p[free] = start[free] * np.exp(x)
+        violated = min(slacks(p), 0.0)
+        return math.log(max(load.error(p), 1e-300)) - _WALL * violated + (10.0 if violated <= -1.0 else 0.0)
+
+    inside = np.log([0.85, 0.75, 1.0, 1.0])[free]  # off the corner of two constraints, where a simplex would stay
+    for span in _SPANS:
+        for direction in (1.0, -1.0):
+            at = np.log(best[free] / start[free]) + (inside if span == _SPANS[0] else 0.0)
+            result = minimize(
+                cost,
+                at,
+                method="Nelder-Mead",
+                options={
+                    "initial_simplex": np.vstack((at, at + direction * span * (np.eye(size) - 0.5 / size))),
+                    "xatol": 1e-3,
+                    "fatol": 1e-5,
+                    "maxiter": 60 * size,
+                },
+            )
+            p = start.copy()
+            p[free] = start[free] * np.exp(result.x)
+            if slacks(p) >= 0.0 and math.log(load.error(p)) < least:
+                best, least = p, math.log(load.error(p))
+    return best
