@@ -188,9 +188,12 @@ def tune(
     ] = None,
     kind: Annotated[Literal["pi", "pid"], typer.Option(help="structure of the controller")] = "pi",
     criterion: Annotated[
-        Literal["iae", "h2"],
-        typer.Option(help="minimised after a step of load: integral of the absolute error, or the norm (11)"),
-    ] = "iae",
+        Literal["auto", "iae", "h2"],
+        typer.Option(
+            help="minimised after a step of load: integral of the absolute error, or the norm (11); auto: iae for"
+            " plain recordings, h2 for points, as in a run"
+        ),
+    ] = "auto",
     source: Annotated[
         Literal["auto", "reduced model", "points", "fitted plant"],
         typer.Option(help="what to design on; auto: the first that keeps its margins on everything measured"),
@@ -223,7 +226,7 @@ def tune(
         phase_margin_deg=phase_margin,
         noise_gain=noise_gain,
         noise_frequency_rad_s=noise_frequency,
-        criterion=criterion,
+        criterion=criterion if criterion != "auto" else "h2" if found.fit is None else "iae",
         source=source,
     )
     analysis = analyse(found.points, settings, fit=found.fit, facts=found.facts)

@@ -174,7 +174,9 @@ def test_a_killed_run_is_gone_on_with_from_its_folder_alone(resumed: tuple[Path,
     assert "killed" in first["ended"]
     assert second["rig_time_s"] < whole["experiment"]["rig_time_s"]
     assert (out / "recording.csv").read_bytes() == before
-    assert result["controller"]["K"] == pytest.approx(whole["controller"]["K"], rel=0.03)
+    # other points within their regions, and the norm is flat around its least: the gain to 15 %, the norm to 8 %
+    assert result["controller"]["K"] == pytest.approx(whole["controller"]["K"], rel=0.15)
+    assert result["controller"]["h2"] == pytest.approx(whole["controller"]["h2"], rel=0.08)
     assert "recording-2.csv" in (out / "report.html").read_text()
 
 
