@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -151,5 +152,6 @@ class GainRegisterRig(RegisterRig):
 
 def _round(value: float) -> float:
     """Return the largest 1, 2 or 5 times a power of ten that is not above the magnitude."""
-    power = 10.0 ** math.floor(math.log10(abs(value)))
+    value = max(abs(value), sys.float_info.min)  # a hundredth of the smallest gain there is may be none
+    power = 10.0 ** math.floor(math.log10(value))
     return max(step * power for step in (1.0, 2.0, 5.0) if step * power <= abs(value))
