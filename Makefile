@@ -4,7 +4,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 OUT ?= runs/ball_sim
 
-.PHONY: run test lint types imports unit fuzz bench docs figures dist clean
+.PHONY: run test lint types imports unit fuzz moments bench docs figures dist bom lock audit clean
 
 run: $(VENV)/.run
 	rm -rf $(OUT)
@@ -32,6 +32,10 @@ FUZZ_SECONDS ?= 3600
 fuzz: $(VENV)/.test
 	$(BIN)/python -m tests.fuzz --inputs $(FUZZ_INPUTS) --seconds $(FUZZ_SECONDS) --faults fuzz_faults.json
 
+# Ctrl-C, and a disk that fills, at random moments; the disk needs root
+moments: $(VENV)/.test
+	$(BIN)/python -m tests.fuzz.moments
+
 bench: $(VENV)/.test
 	$(BIN)/python -m tests.benchmarks
 
@@ -46,20 +50,44 @@ figures: $(VENV)/.docs
 dist:
 	.ci/dist
 
-$(VENV)/.run: pyproject.toml
+# Everything is installed from the lock files, which name every version and the hashes of its files; pip's own
+# configuration says where packages come from. make lock writes them anew where pyproject.toml asks for other packages.
+LOCKED = -m pip install --disable-pip-version-check --require-hashes -r
+SELF = -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
+
+$(VENV)/.run: pyproject.toml .ci/lock/run.txt
 	$(PYTHON) -c 'import sys; sys.exit("Python >= 3.11 is needed, this is " + sys.version.split()[0] if sys.version_info < (3, 11) else 0)'
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	@echo "Installing into $(VENV): about half a GB, one to five minutes. The first run then compiles for about a minute."
-	$(BIN)/python -m pip install --disable-pip-version-check -e .
+	$(BIN)/python $(LOCKED) .ci/lock/run.txt
+	$(BIN)/python $(SELF)
 	touch $@
 
-$(VENV)/.test: $(VENV)/.run
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[test]'
+$(VENV)/.test: $(VENV)/.run .ci/lock/test.txt
+	$(BIN)/python $(LOCKED) .ci/lock/test.txt --quiet
 	touch $@
 
-$(VENV)/.docs: $(VENV)/.run
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[docs]'
+$(VENV)/.docs: $(VENV)/.run .ci/lock/docs.txt
+	$(BIN)/python $(LOCKED) .ci/lock/docs.txt --quiet
 	touch $@
+
+$(VENV)/tools/.done: .ci/lock/tools.txt
+	$(PYTHON) -m venv $(VENV)/tools
+	$(VENV)/tools/bin/python $(LOCKED) .ci/lock/tools.txt --quiet
+	touch $@
+
+lock: $(VENV)/tools/.done
+	$(VENV)/tools/bin/python -m pip install --quiet --disable-pip-version-check uv
+	.ci/lock.sh $(VENV)/tools/bin/uv
+
+audit: $(VENV)/tools/.done
+	$(VENV)/tools/bin/python .ci/audit.py
+
+# what the wheel of make dist needs, as a bill of materials beside it
+bom: $(VENV)/tools/.done
+	mkdir -p dist
+	$(VENV)/tools/bin/cyclonedx-py requirements --pyproject pyproject.toml --mc-type library --output-reproducible \
+		-o dist/relay_autotune.cdx.json .ci/lock/run.txt
 
 clean:
 	rm -rf docs/_build docs/api/autotune docs/api/drivers docs/api/sim $(VENV) .mypy_cache .ruff_cache .pytest_cache runs

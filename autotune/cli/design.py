@@ -99,12 +99,16 @@ def design_command(
         highest_rad_s = float(10.0 * characteristic_frequencies(H)[-1])
         designed = design(H, asked(H, highest_rad_s), kind.value, certificate=certificate)
     else:
+        from autotune.identification.frequency.thinning import said, thinned
         from autotune.identification.parametric import fit_plant
         from autotune.pipeline.analysis import of_use, on_measured
         from autotune.points import read_points
 
         assert points is not None
-        measured = of_use(read_points(points))
+        given = of_use(read_points(points))
+        measured = list(thinned(given))
+        for note in said(len(given), len(measured)):
+            typer.echo(f"note: {note}")
         fit = fit_plant(measured)
         source, designed, looked = on_measured(measured, fit, asked(fit.plant, measured[-1].omega_rad_s), kind.value)
         typer.echo(f"designed on the {source}; checked: " + "; ".join(check.sentence for check in looked))

@@ -87,6 +87,7 @@ def reduce(
     overwrite: OVERWRITE = False,
 ) -> None:
     """Reduce measured points, or a known plant, to the cautious low-order model that a robust PI is designed on."""
+    from autotune.identification.frequency.thinning import said, thinned
     from autotune.identification.reduction import reduce_points, reduce_transfer_function
     from autotune.points import LARGEST, SMALLEST, read_points
 
@@ -111,9 +112,11 @@ def reduce(
                 remedy="give a gain other than 0, known to no more than nine digits",
             )  # fmt: skip
         known = (static_gain, static_gain_sd if static_gain_sd is not None else 0.01 * abs(static_gain))
-    reduced = reduce_points(
-        read_points(points), kind=None if kind == "auto" else kind, conditions=conditions, static_gain=known
-    )
+    given = read_points(points)
+    few = thinned(given)
+    for note in said(len(given), len(few)):
+        typer.echo(f"note: {note}")
+    reduced = reduce_points(few, kind=None if kind == "auto" else kind, conditions=conditions, static_gain=known)
     place.by(lambda part: _write(reduced, part))
     _say(reduced, out)
 

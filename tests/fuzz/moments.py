@@ -161,6 +161,7 @@ def main() -> int:
     parser.add_argument("--seconds", type=float, default=1e9, help="time after which no further trial begins")
     parser.add_argument("--without-disk", action="store_true")
     given = parser.parse_args()
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell has its background jobs ignore it
     rng, ends = random.Random(given.seed), Counter[tuple[str, str]]()
     until_s = time.monotonic() + given.seconds
     names = [*LONG, *([] if given.without_disk else ["disk"] * 3)]
