@@ -19,6 +19,8 @@ from autotune.errors import InputError
 LONGEST_TEXT_BYTES = 64 << 20
 #: Deepest nesting of tables and lists; the formats of this project need six.
 DEEPEST_NESTING = 32
+#: Largest integer; floating point has none beyond 1e308, and no count or address of these formats comes near this.
+LARGEST_INTEGER = 10**30
 
 
 def read_text(path: str | os.PathLike[str]) -> str:
@@ -118,6 +120,8 @@ def _require_plain(content: Any, depth: int) -> None:
         raise RecursionError
     if isinstance(content, str) and (found := next(filter(is_control, content), None)) is not None:
         raise ValueError(f"the text {printable(content[:40])!r} holds the control character U+{ord(found):04X}")
+    if isinstance(content, int) and abs(content) > LARGEST_INTEGER:
+        raise ValueError(f"an integer of {len(str(abs(content)))} digits is beyond what arithmetic holds")
     if isinstance(content, dict):
         for key, value in content.items():
             _require_plain(key, depth)
