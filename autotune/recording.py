@@ -141,6 +141,10 @@ class Recording:
         }
         return replace(self, t=t, u=self.u[held], y=np.interp(t, self.t, self.y), extra=MappingProxyType(extra))
 
+    def at_even_times(self) -> Recording:
+        """Return the recording with its rows evenly spaced between its first stamp and its last one."""
+        return replace(self, t=np.linspace(self.t[0], self.t[-1], len(self)))
+
     def require_finite(self, columns: Iterable[str] = ("u", "y")) -> Recording:
         """Return self if the columns hold no NaN or infinity.
 

@@ -16,10 +16,13 @@ from autotune.diagnosis.evidence.description import describe
 from autotune.diagnosis.evidence.held_out import held_out
 from autotune.diagnosis.evidence.jitter import jitter_effect
 from autotune.diagnosis.evidence.law import law_effect
-from autotune.diagnosis.evidence.samples import SampleEffect, improves, inspect
+from autotune.diagnosis.evidence.samples import SampleEffect, improves, inspect, is_material
+from autotune.diagnosis.evidence.stamps import evened
 from autotune.diagnosis.findings import extended_model, found_effects, offset_of
+from autotune.diagnosis.fitting.fit import RUNAWAY
 from autotune.diagnosis.fitting.retuning import reduced_chi2
 from autotune.diagnosis.result import Diagnosis
+from autotune.diagnosis.selection.rig_search import search_rig
 from autotune.diagnosis.selection.search import Progress, Search, search
 from autotune.diagnosis.thresholds import IN_USE, Thresholds
 from autotune.diagnosis.verdict import Evidence, judged, places_of, sentences_of
@@ -69,6 +72,7 @@ def diagnose(
     """
     _require_rows(recordings)
     evidence = _gathered(model, recordings, controller, without, progress, thresholds)
+    evidence = _of_rig(evidence, model, without, progress)
     found, verdict = evidence.search, judged(evidence)
     effects = found_effects(evidence, verdict)
     plain = replace(found.data, thresholds=thresholds)
@@ -99,11 +103,13 @@ def _gathered(
 ) -> Evidence:
     """Return all that the verdict rests on: samples, search, what is beside the chain, the residual, held-out rows."""
     progress("looking at the samples", 0.0)
+    recordings, late = evened(model, recordings, thresholds)
     good, seen = inspect(recordings, without, thresholds)
     found = search(model, recordings, good, [*without, *(effect.name for effect in seen)], progress, thresholds)
     others = [s for s in _others(found, recordings, controller, seen) if s.name not in without]
+    others = others if late is None else [late, *(s for s in others if s.name != late.name)]
     # where single rows are disturbed, what is left beside them must explain more to be named; beside jitter nothing is
-    if any(kind_of(s.name).sought == "residual" for s in others):
+    if any(kind_of(s.name).sought == "residual" for s in others if s is not late):
         found = found.asking(math.inf)
     elif seen:
         found = found.asking(thresholds.samples_sure)
@@ -118,6 +124,24 @@ def _gathered(
         quality=held_out(found.retuned.fit, chosen, found.data),
         offset=offset_of(chosen, thresholds.offset_sigmas),
     )
+
+
+def _of_rig(evidence: Evidence, model: Model, without: Sequence[str], progress: Progress) -> Evidence:
+    """Return the evidence of left-out stretches where the model's own error and not noise is what remains."""
+    limits, recordings = evidence.limits, evidence.search.data.recordings
+    if evidence.residual.is_noise:
+        return evidence
+    # readings that are repeated are readings all the same for a free run
+    good, _ = inspect(recordings, ("sensor.dropout", "sensor.saturation"), limits)
+    seen = [s.name for s in evidence.samples]
+    try:
+        rig = search_rig(model, recordings, good, [*without, *seen], progress, limits)
+    except RUNAWAY:
+        return evidence
+    fit, data = rig.chosen.fit, rig.chosen.data
+    samples = tuple(s for s in evidence.samples if kind_of(s.name).sought == "residual" or is_material(s, fit, data))
+    quality = rig.quality(evidence.quality.noise_floor)
+    return replace(evidence, search=rig.as_search(), samples=samples, quality=quality, offset=None, rig=rig)
 
 
 def _require_rows(recordings: Sequence[Recording]) -> None:

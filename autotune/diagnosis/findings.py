@@ -129,7 +129,9 @@ def _with_uncertainty(h: Hypothesis, effects: tuple[Effect, ...]) -> tuple[Effec
     for i, f in enumerate(p.free):
         if f.kind == "effect":
             spans[f.index] = float(sd[i]) * (p.value(i, h.fit.theta) if f.positive else f.size)
-    for number, effect in enumerate(effects):
+    numbers = {e.name: i for i, e in enumerate(p.model.effects)}
+    for effect in effects:
+        number = numbers.get(effect.name, -1)
         parameters = {
             key: replace(q, sd=spans.get((number, j), math.nan) or math.nan)
             for j, (key, q) in enumerate(effect.parameters.items())
@@ -153,10 +155,15 @@ def extended_model(evidence: Evidence, verdict: Verdict, nominal: Model) -> Mode
     found = evidence.search
     named = evidence.quality.is_better and verdict in ("effect", "unexplained")
     use = found.chosen if named else found.retuned
-    extended = nominal if verdict == "none" else use.fit.model
+    stands = evidence.rig is not None and evidence.rig.keeps_nominal(evidence.limits.material_numbers)
+    extended = nominal if verdict == "none" or stands else use.fit.model
+    if evidence.rig is not None and len(found.data.recordings) == 1:
+        # what came at a time of one recording is no property of the rig
+        lasting = tuple(e for e in extended.effects if not kind_of(e.name).at_a_time)
+        extended = replace(extended, effects=lasting)
     ends = [
         Effect(name=s.name, parameters=s.parameters)
         for s in evidence.samples
-        if is_nearer(s, use.fit, evidence.limits.rounding)
+        if kind_of(s.name).late_stamps or is_nearer(s, use.fit, evidence.limits.rounding)
     ]
     return replace(extended, effects=(*_with_uncertainty(use, extended.effects), *ends))

@@ -15,6 +15,7 @@ from autotune.diagnosis.result import FoundEffect, Offset, Verdict
 from autotune.diagnosis.selection.hypothesis import penalised
 from autotune.diagnosis.selection.parsimony import worth_adding
 from autotune.diagnosis.selection.probability import Candidate, candidates_of
+from autotune.diagnosis.selection.judged import RigSearch
 from autotune.diagnosis.selection.search import Search
 from autotune.diagnosis.thresholds import Thresholds
 
@@ -35,6 +36,8 @@ class Evidence:
         Errors on rows that were not fitted.
     offset : Offset, optional
         Shift of the operating point that is far outside its uncertainty.
+    rig : RigSearch, optional
+        What stretches that were left out say, where the model's error and not noise decides.
     """
 
     search: Search
@@ -42,6 +45,7 @@ class Evidence:
     residual: ResidualTests
     quality: FitQuality
     offset: Offset | None
+    rig: RigSearch | None = None
 
     @property
     def limits(self) -> Thresholds:
@@ -65,6 +69,8 @@ class Evidence:
     @cached_property
     def candidates(self) -> tuple[Candidate, ...]:
         """Every hypothesis with its probability, best first."""
+        if self.rig is not None:
+            return self.rig.candidates(self.limits)
         return candidates_of(self.search, self.unknown_odds)
 
     @cached_property
@@ -77,6 +83,7 @@ class Evidence:
         jitter = sum(s.evidence for s in self.samples if kind_of(s.name).sought == "residual")
         holds = {
             "effects": bool(found.chosen.names),
+            "rig": self.rig is not None,
             "samples": bool(self.samples),
             "adequate": self.residual.is_noise or self.explains_most,
             "constant": self.residual.is_constant,
@@ -104,6 +111,9 @@ def odds_of_unknown(residual: ResidualTests, explains_most: bool, limits: Thresh
 
 #: Each row: what must hold, what must not, and the verdict. The first row that fits decides.
 TABLE: tuple[tuple[set[str], set[str], Verdict], ...] = (
+    ({"rig", "effects"}, set(), "effect"),
+    ({"rig", "samples"}, set(), "effect"),
+    ({"rig"}, set(), "unexplained"),
     ({"effects", "adequate"}, set(), "effect"),
     ({"effects"}, set(), "unexplained"),
     ({"another structure"}, set(), "unexplained"),

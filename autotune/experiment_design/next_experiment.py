@@ -14,7 +14,7 @@ import numpy as np
 from autotune.diagnosis.effects import kind_of
 from autotune.diagnosis.result import Diagnosis, FoundEffect, NextExperiment
 from autotune.errors import InputError
-from autotune.experiment_design.conditions import as_recorded
+from autotune.experiment_design.conditions import as_recorded, is_driven
 from autotune.experiment_design.open_hypotheses import open_hypotheses
 from autotune.experiment_design.plan import plan_in
 
@@ -42,12 +42,12 @@ def next_experiment(found: Diagnosis) -> NextExperiment | None:
             return _extra_signal(effect)
     if found.verdict == "effect" and len(open_hypotheses(found)) < 2:
         return None
-    return _planned(found) or (_larger_swing(found) if found.verdict == "unexplained" else None)
+    return _planned(found) or (_larger_swing(found) if found.verdict == "unexplained" and is_driven(found) else None)
 
 
 def _planned(found: Diagnosis) -> NextExperiment | None:
     """Return the experiment that separates the hypotheses alive best; nothing where none does."""
-    if len(open_hypotheses(found)) < 2:
+    if len(open_hypotheses(found)) < 2 or not is_driven(found):
         return None
     recorded = as_recorded(found)
     rows = min(PLANNED_ROWS, *(len(r) for r in found.search.data.recordings))

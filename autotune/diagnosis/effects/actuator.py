@@ -201,6 +201,7 @@ ACTUATOR = (
         starts=lambda s: [(c * s.w,) for c in (0.05, 0.2, 0.5)],
         nudge=0.06,
         confusable=("actuator.stiction", "timing.dead_time"),
+        odds={"any": 0.05, "shaft": 0.1, "carriage": 0.03, "lifted": 0.01, "arm": 0.01, "valve": 0.7, "process": 0.2},
         reference="Nordin and Gutman, Automatica 38, 2002",
     ),
     EffectKind(
@@ -217,6 +218,7 @@ ACTUATOR = (
         lasting=True,
         nudge=0.02,  # its local minima are narrow
         confusable=("actuator.backlash", "actuator.quantisation"),
+        odds={"valve": 0.4, "process": 0.15},
         reference="Stenman, Gustafsson and Forsman, Int. J. Adapt. Control 17, 2003",
     ),
     EffectKind(
@@ -227,6 +229,7 @@ ACTUATOR = (
         starts=lambda s: [(c * s.w,) for c in (0.01, 0.04, 0.12, 0.3)],
         nudge=0.06,
         confusable=("plant.coulomb_friction", "actuator.nonlinear_gain"),
+        odds={"any": 0.15, "level": 0.1, "thermal": 0.05, "valve": 0.1, "damper": 0.0},
         reference=_ASTROM,
     ),
     EffectKind(
@@ -239,6 +242,7 @@ ACTUATOR = (
         lines=(Line(stage="command", does=curved),),
         starts=lambda s: [(0.05 / s.w, 1e-3 / s.w**2), (1e-3 / s.w, 0.05 / s.w**2)],
         confusable=("actuator.saturation", "sensor.nonlinear_gain"),
+        odds={"any": 0.1, "arm": 0.5, "speed": 0.15, "carriage": 0.03, "thermal": 0.05, "shaft": 0.05, "valve": 0.05},
         reference=_LJUNG,
     ),
     EffectKind(
@@ -251,6 +255,7 @@ ACTUATOR = (
         lines=(Line(stage="command", does=limited),),
         starts=lambda s: limit_starts(s.w_low, s.w_high, (0.05, 0.15, 0.3)),
         confusable=("actuator.nonlinear_gain", "actuator.rate_limit"),
+        odds={"any": 0.15, "level": 0.3},
         reference=_ASTROM,
     ),
     EffectKind(
@@ -262,6 +267,7 @@ ACTUATOR = (
         sub_steps=4,
         starts=lambda s: [(s.w / (c * s.lag_s),) for c in (0.03, 0.06, 0.1, 0.16, 0.25, 0.4, 0.6, 1.0, 1.5)],
         confusable=("actuator.lag",),
+        odds={"any": 0.03, "damper": 0},
         reference=_ASTROM,
     ),
     EffectKind(
@@ -272,6 +278,8 @@ ACTUATOR = (
         starts=lambda s: [(0.01 / s.duration_s,)],
         confusable=("environment.drifting_load", "sensor.drift"),
         places=("actuator", "plant"),
+        at_a_time=True,
+        odds={"any": 0.02, "damper": 0, "arm": 0.005, "oscillator": 0.005},
         reference=_LJUNG,
     ),
     EffectKind(
@@ -283,6 +291,7 @@ ACTUATOR = (
         confusable=("timing.dead_time", "actuator.rate_limit"),
         same=("sensor.lag",),
         places=("actuator", "sensor", "plant"),
+        odds={"any": 0.2, "damper": 0.05},
         reference=_LJUNG,
     ),
     EffectKind(
@@ -304,6 +313,7 @@ ACTUATOR = (
         needs=ACTUATOR_LAG,
         starts=_asymmetric_starts,
         confusable=("actuator.lag", "actuator.nonlinear_gain"),
+        odds={"any": 0.02, "damper": 0},
         reference=_LJUNG,
     ),
     EffectKind(

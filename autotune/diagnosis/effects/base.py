@@ -11,7 +11,7 @@ Most of the file says what each attribute means.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal, Protocol, TypeAlias
 
 from autotune.arrays import FloatArray
@@ -27,9 +27,10 @@ from autotune.models import Model, Parameter
 #: ``observed``: read off the samples, never simulated.
 Role: TypeAlias = Literal["amplitude", "limit", "threshold", "time", "shape", "location", "mark", "observed"]
 Sign: TypeAlias = Literal["positive", "real"]
-#: Where an effect is looked for: among hypotheses that are fitted; as a structure that is fitted beside them and is no
+#: Where an effect is looked for: among hypotheses that are fitted; among those of rigs alone, where model error and not
+#: noise decides; as a structure that is fitted beside them and is no
 #: effect; in the operating point that every fit has; in the samples; in the residual; in the recomputed law.
-Sought: TypeAlias = Literal["hypothesis", "structure", "operating point", "samples", "residual", "law"]
+Sought: TypeAlias = Literal["hypothesis", "rig", "structure", "operating point", "samples", "residual", "law"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,6 +54,8 @@ class Quantity:
         Whether the effect's equation divides by it: a value that is not above zero is refused.
     size_with : tuple of str
         Parameters that have one size together, as the two parts of a sinusoid: one of them may be near zero.
+    held : callable, optional
+        Given an effect's values, whether a fit leaves this one as it is.
     turns : bool
         Whether it acts by the angle that it adds up until a recording's end: the longer the recording, the smaller are
         the steps in which it is searched.
@@ -65,6 +68,7 @@ class Quantity:
     neutral: float | None = None
     nonzero: bool = False
     size_with: tuple[str, ...] = ()
+    held: Callable[[Values], bool] | None = None
     turns: bool = False
 
     @property
@@ -96,6 +100,10 @@ class SignalSizes:
         Dominant time constant, sample time, and length of the longest recording.
     levels : int
         Number of levels one above the other, 0 where the plant has a speed.
+    turn : float
+        One turn in the measurement's unit where that is an angle and a spring pulls the position back, else 0.
+    static : bool
+        Whether the plant is a law without dynamics.
     """
 
     w: float
@@ -114,6 +122,8 @@ class SignalSizes:
     dt_s: float
     duration_s: float
     levels: int
+    turn: float = 0.0
+    static: bool = False
 
 
 class Chain(Protocol):
@@ -121,7 +131,15 @@ class Chain(Protocol):
 
     @property
     def is_mechanical(self) -> bool:
-        """Whether the plant has a speed and a position."""
+        """Whether the plant has a speed."""
+
+    @property
+    def has_travel(self) -> bool:
+        """Whether it has a position beside its speed."""
+
+    @property
+    def is_static(self) -> bool:
+        """Whether the plant is a law without dynamics."""
 
     @property
     def is_integrating(self) -> bool:
@@ -145,11 +163,14 @@ class Structure:
 
 
 ANY = Structure(holds=lambda chain: True, otherwise="")
-MECHANICAL = Structure(
-    holds=lambda chain: chain.is_mechanical, otherwise="friction, drag and stiffness need a speed and a position"
+MECHANICAL = Structure(holds=lambda chain: chain.is_mechanical, otherwise="friction and drag need a speed")
+RUBBING = Structure(
+    holds=lambda chain: chain.is_mechanical or chain.is_static,
+    otherwise="dry friction needs a speed, or a plant that is a force over a speed",
 )
+TRAVEL = Structure(holds=lambda chain: chain.has_travel, otherwise="stiffness and torques need a speed and a position")
 LEVEL = Structure(
-    holds=lambda chain: not chain.is_mechanical and not chain.is_integrating,
+    holds=lambda chain: not (chain.is_mechanical or chain.is_integrating or chain.is_static),
     otherwise="it needs a plant that settles at a level",
 )
 INTEGRATING = Structure(holds=lambda chain: chain.is_integrating, otherwise="it needs a plant that integrates")
@@ -270,10 +291,14 @@ class EffectKind:
         Recording (-1 for all) and time from which it acts; always and everywhere by default.
     readable : callable, optional
         Its parameters as people name them.
+    at_a_time : bool
+        Whether it counts from a recording's beginning: seen once, it is nothing that the next recording has too.
     steps : bool
         Whether it makes steps of the readings that no derivative of a start state leads through.
     uneven : bool
         Whether it makes some rows' noise larger than others': then the residual's variance says nothing of a model.
+    late_stamps : bool
+        Whether it says that stamps are wrong where they are uneven: a simulation then runs at even times.
     excludes : tuple of str
         Effects that are not looked for where this one is seen in the samples.
     confusable : tuple of str
@@ -283,6 +308,9 @@ class EffectKind:
         load and sensor are the same on a chain that settles; on others one of them simply explains nothing.
     places : tuple of str
         Where it may sit, several where command and measurement cannot say; its own by default.
+    odds : mapping
+        Prior odds that a rig of a kind (:mod:`autotune.diagnosis.effects.rigs`; ``any`` for all others) has it and its
+        model lacks it. They count where model error and not noise decides; without odds it is not considered there.
     """
 
     name: str
@@ -306,12 +334,15 @@ class EffectKind:
     stand_in: Callable[[Fitted], bool] | None = None
     acts_in: Callable[[Values], tuple[int, float]] | None = None
     readable: Callable[[Mapping[str, Parameter]], dict[str, Parameter]] | None = None
+    at_a_time: bool = False
     steps: bool = False
     uneven: bool = False
+    late_stamps: bool = False
     excludes: tuple[str, ...] = ()
     confusable: tuple[str, ...] = ()
     same: tuple[str, ...] = ()
     places: tuple[str, ...] = ()
+    odds: Mapping[str, float] = field(default_factory=dict, hash=False, compare=False)
 
     @property
     def place(self) -> str:

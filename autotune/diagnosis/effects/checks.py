@@ -46,7 +46,7 @@ def _of(kind: EffectKind) -> Iterator[tuple[str, str]]:
         yield "a simulated effect has observed parameters", "give its parameters the roles that a search needs"
     if not observed and not kind.is_simulated:
         yield "nothing would be simulated", "add lines=(Line(stage=..., does=...),) or linear=LinearPart(...)"
-    if kind.sought in ("hypothesis", "structure") and not _has_starts(kind):
+    if kind.sought in ("hypothesis", "rig", "structure") and not _has_starts(kind):
         yield "no fit would ever start", "give starts=lambda sizes: [...] or search=..."
     if kind.is_simulated:
         yield from _simulated(kind)

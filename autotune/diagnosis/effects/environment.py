@@ -119,6 +119,8 @@ ENVIRONMENT = (
         acts_in=_acts_in,
         confusable=("actuator.offset", "environment.drifting_load"),
         places=_PLACES,
+        at_a_time=True,
+        odds={"any": 0.01, "damper": 0.0},
         reference=_ASTROM,
     ),
     EffectKind(
@@ -149,6 +151,8 @@ ENVIRONMENT = (
         confusable=("actuator.gain_drift",),
         same=("sensor.drift",),
         places=_PLACES,
+        at_a_time=True,
+        odds={"any": 0.03, "damper": 0},
         reference=_ASTROM,
     ),
 )

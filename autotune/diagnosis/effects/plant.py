@@ -16,6 +16,8 @@ from autotune.diagnosis.effects.base import (
     LEVEL,
     MECHANICAL,
     POSITION_STATE,
+    RUBBING,
+    TRAVEL,
     EffectKind,
     Fitted,
     Quantity,
@@ -33,6 +35,13 @@ _ICE = 273.15
 def dry(v: float, level: float) -> float:
     """Return the level of a friction that does not depend on speed."""
     return level
+
+
+def yielded(z: float, through: float, level: float, transition: float) -> float:
+    """Return the force of a damper that yields: dry friction over the speed of a plant that is a law."""
+    if transition > 0.0:
+        return z + level * math.tanh(through / transition)
+    return z + (math.copysign(level, through) if through != 0.0 else 0.0)
 
 
 def dropping(v: float, level: float, breakaway: float, stribeck_speed: float) -> float:
@@ -56,9 +65,20 @@ def weighed(w: float, x: float, slope: float) -> float:
     return slope * x * w
 
 
-def cogging(x: float, y_offset: float, amplitude: float, period: float, phase: float) -> float:
-    """Return a force that is periodic in position."""
-    return -(amplitude * math.sin(2.0 * math.pi * (x + y_offset) / period + phase))
+def cogging(
+    x: float, y_offset: float, gain: float, amplitude: float, period: float, phase: float, gravity: float
+) -> float:
+    """Return a force that is periodic in position; as gravity it takes the place of the spring that stood for it."""
+    angle = 2.0 * math.pi * (x + y_offset) / period + phase
+    if gravity > 0.0:
+        per_turn = period / (2.0 * math.pi)
+        return (x - per_turn * (math.sin(angle) - math.sin(angle - x / per_turn))) / gain
+    return -(amplitude * math.sin(angle))
+
+
+def rising(x: float, gain: float, coefficient: float) -> float:
+    """Return what a loss that grows with the square of the difference adds to the linear one."""
+    return -(coefficient * x * abs(x) / gain)
 
 
 def held_back(turned: float, amplitude: float) -> float:
@@ -124,7 +144,28 @@ def _is_friction_or_spring(fitted: Fitted) -> bool:
 
 def _is_slope(fitted: Fitted) -> bool:
     """Whether not one period of a load periodic in position was travelled."""
-    return fitted.values["period"] > fitted.travelled
+    gravity = fitted.values.get("gravity", 0.0) > 0.0
+    return not gravity and fitted.values["period"] > fitted.travelled
+
+
+def _is_gravity(values: Values) -> bool:
+    """Whether a sine stands for gravity: one turn is its period, and the spring's stiffness its size."""
+    return values.get("gravity", 0.0) > 0.0
+
+
+def _sine_starts(s: SignalSizes) -> list[tuple[float, ...]]:
+    """Return gravity where an angle is pulled back, else torques periodic in position."""
+    if s.turn:
+        return [(abs(s.turn / (2.0 * math.pi * s.gain)), s.turn, 0.0, 1.0)]
+    periods = (0.3 * 1.25**i * s.x for i in range(13))
+    return [(0.05 * s.f, period, phase, 0.0) for period in periods for phase in (0.0, 1.57)]
+
+
+def _dry_starts(s: SignalSizes) -> list[tuple[float, ...]]:
+    """Return levels of a dry friction, as forces at the plant's input; of a damper in the reading's unit."""
+    if s.static:
+        return [(c * s.y, d * s.f) for c in (0.3, 0.6) for d in (0.05, 0.2)]
+    return [(c * s.f,) for c in (0.003, 0.015, 0.06, 0.2)]
 
 
 def _with_resonance(blocks: Blocks, values: Values) -> Blocks:
@@ -155,14 +196,19 @@ PLANT = (
     EffectKind(
         name="plant.coulomb_friction",
         equation="force = -level sign(speed), sticking at rest",
-        parameters=(Quantity(name="level", unit="{f}", role="amplitude"),),
-        lines=(Line(stage="friction", does=dry),),
+        parameters=(
+            Quantity(name="level", unit="{f}", role="amplitude"),
+            # of a damper, whose plant is a law: speed over which its force turns round
+            Quantity(name="transition", unit="{f}", role="shape", neutral=0.0),
+        ),
+        lines=(Line(stage="friction", does=dry), Line(stage="sensor", does=yielded)),
         sub_steps=2,
-        needs=MECHANICAL,
-        suits=MECHANICAL,
-        starts=lambda s: [(c * s.f,) for c in (0.003, 0.015, 0.06, 0.2)],
+        needs=RUBBING,
+        suits=RUBBING,
+        starts=_dry_starts,
         nudge=0.06,
         confusable=("plant.stribeck_friction", "actuator.dead_zone", "plant.quadratic_drag"),
+        odds={"arm": 0.7, "shaft": 0.7, "carriage": 0.7, "speed": 0.7, "lifted": 0.1, "oscillator": 0.2, "damper": 1.0},
         reference=_OLSSON,
     ),
     EffectKind(
@@ -180,6 +226,7 @@ PLANT = (
         starts=lambda s: [(c * s.f, 2.0 * c * s.f, d * s.v) for c in (0.02, 0.1) for d in (0.05, 0.2)],
         nudge=0.06,
         confusable=("plant.coulomb_friction",),
+        odds={"arm": 0.15, "shaft": 0.2, "carriage": 0.2, "speed": 0.2, "lifted": 0.03, "oscillator": 0.05},
         reference=_OLSSON,
     ),
     EffectKind(
@@ -191,6 +238,7 @@ PLANT = (
         suits=MECHANICAL,
         starts=lambda s: [(0.05 / s.v,), (0.5 / s.v,)],
         confusable=("plant.coulomb_friction", "actuator.nonlinear_gain"),
+        odds={"arm": 0.15, "shaft": 0.1, "carriage": 0.1, "speed": 0.2, "lifted": 0.1, "oscillator": 0.1},
         reference=_KHALIL,
     ),
     EffectKind(
@@ -198,10 +246,11 @@ PLANT = (
         equation="force = -coefficient x^3",
         parameters=(Quantity(name="coefficient", unit="{f}/{y}^3", role="amplitude", sign="real"),),
         lines=(Line(stage="force", does=hardened),),
-        needs=MECHANICAL,
-        suits=MECHANICAL,
+        needs=TRAVEL,
+        suits=TRAVEL,
         starts=lambda s: [(0.02 * s.f / s.x**3,), (0.3 * s.f / s.x**3,)],
         confusable=("plant.leak", "plant.position_dependent_gain"),
+        odds={"arm": 0.1, "oscillator": 0.3, "carriage": 0.02, "shaft": 0.02, "lifted": 0.02},
         reference="Wigren and Schoukens, Three free data sets, ECC 2013",
     ),
     EffectKind(
@@ -211,6 +260,7 @@ PLANT = (
         lines=(Line(stage="force", does=weighed),),
         starts=lambda s: [(0.02 / s.x,), (-0.02 / s.x,)],
         confusable=("plant.leak", "actuator.nonlinear_gain", "sensor.nonlinear_gain"),
+        odds={"lifted": 0.2, "level": 0.02, "carriage": 0.003, "arm": 0.003, "shaft": 0.003},
         reference=_KHALIL,
     ),
     EffectKind(
@@ -227,6 +277,7 @@ PLANT = (
         starts=lambda s: limit_starts(s.y_low, s.y_high, (-0.005, 0.02, 0.1)),
         impacts=True,
         confusable=("sensor.saturation",),
+        odds={"lifted": 0.01, "carriage": 0.03, "arm": 0.01, "shaft": 0.01},
         reference=_KHALIL,
     ),
     EffectKind(
@@ -241,6 +292,7 @@ PLANT = (
         suits=LEVEL,
         starts=lambda s: [(c * s.x,) * (2 if s.levels == 2 else 1) for c in (1.5, 6.0)],
         confusable=("actuator.nonlinear_gain", "sensor.nonlinear_gain", "plant.radiation_loss"),
+        odds={"level": 1.0},
         reference="Torricelli; Wigren and Schoukens, Three free data sets, ECC 2013",
     ),
     EffectKind(
@@ -269,6 +321,7 @@ PLANT = (
         nudge=0.06,
         stand_in=_is_friction_or_spring,
         confusable=("plant.coulomb_friction", "actuator.backlash"),
+        odds={"valve": 0.05, "carriage": 0.01, "arm": 0.01, "shaft": 0.02, "damper": 0},
         reference="Dahl, AIAA J. 14, 1976; Bouc and Wen with exponent 1",
     ),
     EffectKind(
@@ -280,7 +333,20 @@ PLANT = (
         possible=_kelvin,
         starts=lambda s: [(c / (s.x_offset + _ICE) ** 3,) for c in (0.02, 0.3)],
         confusable=("plant.sqrt_outflow", "actuator.nonlinear_gain", "sensor.nonlinear_gain"),
+        odds={"thermal": 0.05},
         reference="Stefan and Boltzmann",
+    ),
+    EffectKind(
+        name="plant.nonlinear_loss",
+        equation="tau dx/dt = -x - coefficient x |x| + gain w: a loss that grows faster than its difference",
+        parameters=(Quantity(name="coefficient", unit="1/({y})", role="amplitude"),),
+        lines=(Line(stage="force", does=rising),),
+        sought="rig",
+        suits=LEVEL,
+        starts=lambda s: [(0.05 / s.x,), (0.5 / s.x,)],
+        confusable=("plant.radiation_loss", "actuator.nonlinear_gain"),
+        odds={"thermal": 0.03},
+        reference="Incropera and DeWitt, Fundamentals of Heat and Mass Transfer, ch. 9: free convection",
     ),
     EffectKind(
         name="plant.leak",
@@ -290,21 +356,25 @@ PLANT = (
         suits=INTEGRATING,
         starts=lambda s: [(0.02 * abs(s.f * s.gain) / s.x,)],
         confusable=("plant.position_dependent_gain", "plant.cubic_stiffness"),
+        odds={"lifted": 0.3, "carriage": 0.05, "level": 0.3, "process": 0.1},
         reference=_KHALIL,
     ),
     EffectKind(
         name="plant.sine_torque",
-        equation="force = -amplitude sin(2 pi x / period + phase)",
+        equation="force = -amplitude sin(2 pi x / period + phase); as gravity it carries the stiffness",
         parameters=(
-            Quantity(name="amplitude", unit="{f}", role="amplitude", sign="real"),
-            Quantity(name="period", unit="{y}", role="shape", nonzero=True),
+            Quantity(name="amplitude", unit="{f}", role="amplitude", sign="real", held=_is_gravity),
+            Quantity(name="period", unit="{y}", role="shape", nonzero=True, held=_is_gravity),
             Quantity(name="phase", unit="rad", role="shape", sign="real", neutral=0.0),
+            Quantity(name="gravity", unit="", role="mark", neutral=0.0),
         ),
         lines=(Line(stage="force", does=cogging),),
-        suits=MECHANICAL,
-        starts=lambda s: [(0.05 * s.f, p, a) for p in (0.3 * 1.25**i * s.x for i in range(13)) for a in (0.0, 1.57)],
+        needs=TRAVEL,
+        suits=TRAVEL,
+        starts=_sine_starts,
         stand_in=_is_slope,
         confusable=("plant.cubic_stiffness",),
+        odds={"arm": 1.5, "shaft": 0.03, "carriage": 0.01},
         reference=_KHALIL,
     ),
     EffectKind(
@@ -320,6 +390,7 @@ PLANT = (
         starts=lambda s: [(0.03, c * s.lag_s) for c in (2.5, 8.0)],
         confusable=("plant.hysteresis", "environment.step_load", "environment.drifting_load"),
         places=("plant", "sensor"),
+        odds={"thermal": 0.01, "level": 0.005, "process": 0.005},
         reference="Ljung, System Identification, 2nd ed., sec. 16.4: the order of a linear model",
     ),
 )

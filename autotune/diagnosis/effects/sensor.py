@@ -61,6 +61,7 @@ SENSOR = (
         confusable=("timing.dead_time",),
         same=("actuator.lag",),
         places=("sensor", "actuator", "plant"),
+        odds={"any": 0.2, "damper": 0.05},
         reference=_LJUNG,
     ),
     EffectKind(
@@ -73,6 +74,7 @@ SENSOR = (
         lines=(Line(stage="sensor", does=curved),),
         starts=lambda s: [(0.05 / s.x, 1e-3 / s.x**2), (1e-3 / s.x, 0.05 / s.x**2)],
         confusable=("actuator.nonlinear_gain", "plant.position_dependent_gain"),
+        odds={"any": 0.002, "level": 0.03},
         reference=_LJUNG,
     ),
     EffectKind(
@@ -83,6 +85,8 @@ SENSOR = (
         starts=lambda s: [(0.01 * s.y / s.duration_s,)],
         confusable=("actuator.gain_drift",),
         same=("environment.drifting_load",),
+        at_a_time=True,
+        odds={"any": 0.02, "damper": 0},
         reference=_LJUNG,
     ),
     EffectKind(
@@ -103,6 +107,7 @@ SENSOR = (
         lines=(Line(stage="reading", does=limited),),
         starts=lambda s: limit_starts(s.y_low, s.y_high, (0.02, 0.1)),
         confusable=("plant.hard_stop",),
+        odds={"any": 0.03, "lifted": 0.01},
         reference=_LJUNG,
     ),
     EffectKind(

@@ -56,8 +56,8 @@ STAGES: Mapping[StageName, Stage] = {
     "outflow": Stage(signals=("x", "level", "gain_last"), is_force=True),
     # position and speed after a sub-step; ``y_offset`` is the reading at position 0
     "stop": Stage(value=("x", "v"), signals=("y_offset",)),
-    # the last block's output
-    "sensor": Stage(value=("z",), signals=("t",)),
+    # the last block's output; ``through`` is the input of a plant that is a law without dynamics, 0 of any other
+    "sensor": Stage(value=("z",), signals=("t", "through")),
     # the absolute reading
     "reading": Stage(value=("y",), signals=("t",)),
 }

@@ -33,6 +33,7 @@ TIMING = (
         starts=lambda s: [(c,) for c in (0.5 * s.dt_s, 2.5 * s.dt_s, 6.0 * s.dt_s, 14.0 * s.dt_s, 0.3 * s.lag_s)],
         confusable=("sensor.lag", "actuator.lag", "actuator.backlash"),
         places=("timing", "actuator", "sensor"),
+        odds={"any": 0.2, "damper": 0.05},
         reference=_LJUNG,
     ),
     EffectKind(
@@ -50,6 +51,7 @@ TIMING = (
         parameters=(Quantity(name="sd", unit="s", role="observed"),),
         sought="residual",
         uneven=True,
+        late_stamps=True,
         reference=_LJUNG,
     ),
 )

@@ -142,7 +142,7 @@ def inspect(
     total = sum(len(r) for r in recordings)
     if (
         count >= limits.least_frozen_rows
-        and count > limits.least_frozen_share * total
+        and limits.least_frozen_share * total < count < limits.most_frozen * total
         and "sensor.dropout" not in without
     ):
         effects.append(_dropout(recordings, frozen, count / total))
@@ -252,6 +252,24 @@ def _outliers(
         windows=tuple(_runs(recordings, lone)),
         rows=tuple(lone),
     )
+
+
+def is_material(effect: SampleEffect, result: Fit, data: Data) -> bool:
+    """Whether what single samples show matters beside what a free run leaves of a rig.
+
+    A converter's step does where its rounding is a tenth of the residual's variance, a spoiled reading where it is far
+    farther from the simulation than others: a plant at rest repeats its reading as well, and a slow converter does.
+    """
+    good = [g & np.isfinite(e) for g, e in zip(data.good, result.residuals, strict=True)]
+    squares = [np.square(r.y - s[:, 0]) for r, s in zip(data.recordings, result.signals, strict=True)]
+    usual = float(np.mean(np.concatenate([q[g] for q, g in zip(squares, good, strict=True)])))
+    if kind_of(effect.name).steps:
+        return effect.parameters["step"].value ** 2 / 12.0 > data.thresholds.material * usual
+    if not effect.rows or not any(rows.any() for rows in effect.rows):
+        return True
+    spoiled = np.concatenate([q[rows] for q, rows in zip(squares, effect.rows, strict=True)])
+    spoiled = spoiled[np.isfinite(spoiled)]
+    return bool(spoiled.size) and float(np.mean(spoiled)) > data.thresholds.spoiled * usual
 
 
 def improves(effect: SampleEffect, result: Fit, data: Data) -> bool:

@@ -107,6 +107,11 @@ class Data:
         return [_innovations(r, good, starts, ar, sd) for r, good, starts in rows]
 
 
+def as_white(data: Data, sd: float) -> Data:
+    """Return data whose residuals are taken for white, of a standard deviation."""
+    return replace(data, noise=replace(data.noise, sd=sd, ar=()))
+
+
 @njit(cache=True, nogil=True)
 def _innovations(r: FloatArray, good: BoolArray, starts: IntArray, ar: FloatArray, sd: float) -> FloatArray:
     """Return e_k = (r_k - a1 r_{k-1} - ...) / sd, r before a start taken for zero."""

@@ -201,7 +201,7 @@ def descend(
         e_left, J_left, gain_e, gain_J = eliminate(problem, derivatives, iterate.e, damping)
         if not (np.all(np.isfinite(J_left)) and np.all(np.isfinite(e_left))):
             return iterate, None  # a derivative ran out of the model's range: the last good point stands
-        step = _step(problem, iterate, derivatives[0], e_left, J_left, prior, damping, may)
+        step = step_of(problem, iterate, derivatives[0], (e_left, J_left), prior, may, damping)
         left = e_left + J_left @ step
         predicted = cost - problem.cost(left, iterate.theta + step, prior)
         moves = problem.per_recording(problem.scales * (gain_e + gain_J @ step))
@@ -232,17 +232,17 @@ def descend(
     return iterate, derivatives
 
 
-def _step(
+def step_of(
     problem: Problem,
     iterate: Iterate,
     J: FloatArray,
-    e_left: FloatArray,
-    J_left: FloatArray,
+    left: Derivatives,
     prior: FloatArray,
-    damping: float,
     may: BoolArray,
+    damping: float = 0.0,
 ) -> FloatArray:
-    """Return the step in theta."""
+    """Return the step in theta; ``left`` is what start states cannot explain of residual and Jacobian."""
+    e_left, J_left = left
     H = J.T @ J_left + np.diag(prior**2)
     g = J.T @ e_left + prior**2 * (iterate.theta - problem.parametrisation.centre)
     step = np.linalg.lstsq(H + damping * np.diag(np.maximum(np.diag(H), 1e-12)), -g, rcond=1e-15)[0]

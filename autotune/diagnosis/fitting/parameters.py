@@ -18,6 +18,9 @@ from autotune.diagnosis.thresholds import Thresholds
 from autotune.models import Block, Effect, Model, Parameter, TransferFunction
 
 Kind: TypeAlias = Literal["gain", "den", "num", "delay", "u_offset", "effect"]
+#: How many times as uncertain as other numbers the damping of a mode that rings is: it is read off a decay that
+#: friction shapes as well.
+DAMPING = 4.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -185,7 +188,8 @@ def chain_parameters(
         den, num = block.dynamics.den, block.dynamics.num
         for j in range(len(den) - 1):
             if den[j] != 0.0 and den[-1] != 0.0:
-                free.append(Free(name=f"{block.name} den[{j}]", kind="den", index=(i, j), spread=prior_spread))
+                spread = prior_spread * (DAMPING if _is_damping(den, j) else 1.0)
+                free.append(Free(name=f"{block.name} den[{j}]", kind="den", index=(i, j), spread=spread))
                 centre.append(0.0)
         for j in range(len(num) - 1):
             if num[j] != 0.0:
@@ -200,6 +204,11 @@ def chain_parameters(
     free.append(Free(name="input offset", kind="u_offset", positive=False, size=input_size))
     centre.append(0.0)
     return free, centre
+
+
+def _is_damping(den: Sequence[float], j: int) -> bool:
+    """Whether a coefficient is the damping of a mode that rings."""
+    return len(den) == 3 and j == 1 and den[1] ** 2 < 4.0 * den[0] * den[2]
 
 
 def parametrise(
@@ -230,7 +239,8 @@ def parametrise(
         kind = kind_of(effect.name)
         for j, (key, parameter) in enumerate(effect.parameters.items()):
             q = kind.quantity(key)
-            if q is None or not q.is_fitted:
+            values = {name: given.value for name, given in effect.parameters.items()}
+            if q is None or not q.is_fitted or (q.held is not None and q.held(values)):
                 continue
             positive = q.sign == "positive"
             parts = [effect.parameters[k].value for k in (key, *q.size_with) if k in effect.parameters]

@@ -19,6 +19,10 @@ from autotune.models import Effect, Model
 
 #: Most simulations of one effect while it is shrunk, and the share of chi2 that a simulation counts that ran away.
 SHRINKINGS, RAN_AWAY = 4, 1e6
+#: One turn in units of an angle.
+TURNS = {"rad": 2.0 * np.pi, "deg": 360.0, "°": 360.0}
+#: Share of the forces inside a plant below which the command does not drive it.
+UNDRIVEN = 0.03
 #: Factors of an effect that are tried: of a signed one, of one that acts one way.
 SIGNED, ONE_WAY = (-20.0, 20.0), (0.0, 4.0)
 
@@ -46,9 +50,12 @@ def signal_sizes(base: Fit, data: Data) -> SignalSizes:
         # the spikes that a differentiating controller puts into u say nothing of the sizes at work
         return max(float(np.nanquantile(np.abs(values), 0.98)), tiny)
 
+    inner = 0.0
+    if sim.chain.is_mechanical:  # forces show in what they move as well, where the command is constant in it alone
+        inner = largest(signals[:, 2 if sim.chain.has_spring else 1]) / abs(float(sim.chain.gains[0]))
     return SignalSizes(
         w=largest(w),
-        f=largest(signals[:, 3]),
+        f=max(largest(signals[:, 3]), inner if largest(signals[:, 3]) < UNDRIVEN * inner else 0.0),
         v=largest(signals[:, 1]),
         x=largest(signals[:, 2]),
         y=largest(y - sim.y_offset),
@@ -63,6 +70,8 @@ def signal_sizes(base: Fit, data: Data) -> SignalSizes:
         dt_s=data.recordings[0].sample_time_s,
         duration_s=max(r.duration_s for r in data.recordings),
         levels=sim.chain.levels,
+        turn=TURNS.get(base.parametrisation.model.output.unit, 0.0) if sim.chain.has_spring else 0.0,
+        static=sim.chain.is_static,
     )
 
 
@@ -93,7 +102,8 @@ def extended(base: Fit, effect: Effect, data: Data) -> tuple[Parametrisation, Fl
     # an effect's own centre is its starting value; those fitted already keep the scale of their search
     free = (*old.free, *p.free[len(old.free) :])
     p = replace(p, free=free, centre=np.concatenate([old.centre, p.centre[len(old.free) :]]))
-    return p, theta, carried_states(base, effect, data)
+    grows = p.simulator(theta).order > base.sim.order  # a lag may be one that the chain has already
+    return p, theta, carried_states(base, effect, data) if grows else base.x0
 
 
 def carried_states(base: Fit, effect: Effect, data: Data) -> tuple[FloatArray, ...]:

@@ -118,7 +118,7 @@ def freed(result: Fit, data: Data) -> Fit:
         return result
 
 
-def _distinct(group: Sequence[Prediction]) -> list[Effect]:
+def distinct(group: Sequence[Prediction]) -> list[Effect]:
     """Return the starting points of one effect that differ once they have the size that is predicted."""
     kept: list[Effect] = []
     for p in group:
@@ -150,7 +150,7 @@ def extend(
     ranked = sorted(best_predictions(base.fit, data, bench, found_directly).values(), key=lambda g: -g[0].decrease)
     first, rest = ranked[: width.effects], ranked[width.effects :]
     tried = [*first, *(group for group in rest if kind_of(group[0].effect.name).impacts)]
-    starts = [e for group in tried if group[0].decrease > width.least for e in _distinct(group)[: width.starts]]
+    starts = [e for group in tried if group[0].decrease > width.least for e in distinct(group)[: width.starts]]
     begun = [h for h in bench.pool.map(lambda effect: _begun(base.fit, effect, data), starts) if h is not None]
     begun.sort(key=penalised)
     finished = [h for k, h in enumerate(begun) if _goes_on(h, begun[:k], base, data.thresholds)]

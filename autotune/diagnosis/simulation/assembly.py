@@ -6,7 +6,7 @@ import numpy as np
 
 from autotune.diagnosis.effects import KINDS, kind_of
 from autotune.diagnosis.effects.base import EffectKind
-from autotune.diagnosis.simulation.chain import chain_of
+from autotune.diagnosis.simulation.chain import blocks_of, chain_of
 from autotune.diagnosis.simulation.simulator import ICE_K, Simulator, layout
 from autotune.errors import InputError
 from autotune.models import Effect, Model
@@ -32,7 +32,7 @@ def assemble(model: Model) -> Simulator:
     """
     known = layout()
     values, acts = np.zeros(len(known.slots)), np.zeros(len(known.kinds), dtype=np.int64)
-    blocks, fall, u_offset = model.blocks, None, model.input.offset
+    blocks, fall, u_offset = blocks_of(model), None, model.input.offset
     kinds: list[EffectKind] = []
     for effect in model.effects:
         kind = kind_of(effect.name, model.name)

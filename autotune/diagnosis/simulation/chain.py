@@ -6,8 +6,9 @@ are in controllable form. Forces enter at the input of the first plant block, in
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
 import numpy as np
@@ -19,6 +20,9 @@ from autotune.models import Block, Model
 
 #: Positions in a chain's ``where``.
 ACTUATOR, SPEED, POSITION = range(3)
+#: What a speed is called, and its units.
+_SPEED = re.compile(r"speed|velocity|\brpm\b")
+_SPEED_UNIT = re.compile(r"^(m|mm|cm|km|rad|deg|°|rev|turns?)/(s|min|h)$|^rpm$|^1/min$")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -44,6 +48,8 @@ class Chain:
         Dead time of all blocks together, which commutes with the linear chain.
     plant : slice
         The states of the plant's blocks.
+    is_static : bool
+        Whether the plant is a law without dynamics, as a damper's force over its speed.
     """
 
     A: FloatArray
@@ -54,6 +60,7 @@ class Chain:
     levels: int
     delay_s: float
     plant: slice
+    is_static: bool = False
 
     @property
     def order(self) -> int:
@@ -77,8 +84,18 @@ class Chain:
 
     @property
     def is_mechanical(self) -> bool:
-        """Whether the plant has a speed and a position."""
+        """Whether the plant has a speed."""
         return bool(self.taps[kernel.SPEED].any())
+
+    @property
+    def has_travel(self) -> bool:
+        """Whether it has a position beside its speed."""
+        return self.is_mechanical and bool((self.taps[kernel.POSITION] != self.taps[kernel.SPEED]).any())
+
+    @property
+    def has_spring(self) -> bool:
+        """Whether a spring, or gravity, pulls the position back: the plant settles."""
+        return self.has_travel and not self.is_integrating
 
     @property
     def is_integrating(self) -> bool:
@@ -109,7 +126,15 @@ def _realise(block: Block) -> tuple[FloatArray, FloatArray, FloatArray, float]:
 
 def build_chain(model: Model) -> Chain:
     """Arrange a model's blocks in state space, see :func:`chain_of`; its effects are not looked at."""
-    return chain_of(model.blocks, model.name)
+    return chain_of(blocks_of(model), model.name)
+
+
+def blocks_of(model: Model) -> tuple[Block, ...]:
+    """Return a model's blocks, the last one with the unit of the measurement where it has none of its own."""
+    last = model.blocks[-1]
+    if last.unit or last.output or not model.output.unit:
+        return model.blocks
+    return (*model.blocks[:-1], replace(last, unit=model.output.unit))
 
 
 @lru_cache(maxsize=64)
@@ -136,7 +161,7 @@ def chain_of(blocks: tuple[Block, ...], name: str) -> Chain:
     order = sum(len(block.dynamics.den) - 1 for block in blocks)
     if not 1 <= order <= 12:
         raise InputError(f"the chain has {order} states", where=name, remedy="diagnosis handles 1 to 12 states")
-    plant = _plant_blocks(blocks)
+    plant, law = _plant_blocks(blocks), _law(blocks)
     A, B = np.zeros((order, order)), np.zeros((order, kernel.INPUTS))
     taps, gains = np.zeros((5, order)), np.ones(4)
     gains[2:] = 0.0
@@ -152,6 +177,7 @@ def chain_of(blocks: tuple[Block, ...], name: str) -> Chain:
             direct[1] = 1.0
         if number == plant[-1] and number != plant[0]:
             direct[2] = 1.0
+        before = row.copy(), direct[0]
         states = slice(at, at + n)
         A[states, states] = a
         A[states] += np.outer(b, row)
@@ -166,23 +192,52 @@ def chain_of(blocks: tuple[Block, ...], name: str) -> Chain:
         if number in plant:
             edges = [min(edges[0], at), at + n]
         at += n
+        if number == law:
+            taps[kernel.PLANT_IN], gains[2] = before
     taps[kernel.OUTPUT], gains[3] = row, direct[0]
+    if law is not None:
+        taps[[kernel.SPEED, kernel.POSITION, kernel.FIRST_LEVEL]], signals.where[:] = 0.0, -1
     return Chain(
-        A=A, B=B, taps=taps, gains=gains, where=signals.where, levels=0 if taps[kernel.SPEED].any() else len(plant),
-        delay_s=sum(block.dynamics.delay_s for block in blocks), plant=slice(*edges),
-    )  # fmt: skip
+        A=A,
+        B=B,
+        taps=taps,
+        gains=gains,
+        where=signals.where,
+        levels=0 if taps[kernel.SPEED].any() else len(plant),
+        delay_s=sum(block.dynamics.delay_s for block in blocks),
+        plant=slice(*edges),
+        is_static=law is not None,
+    )
 
 
 def _plant_blocks(blocks: Sequence[Block]) -> list[int]:
     """Return the numbers of the plant's dynamic blocks; without any, of the slowest block."""
     dynamic = [i for i, b in enumerate(blocks) if len(b.dynamics.den) > 1]
     plant = [i for i in dynamic if blocks[i].place == "plant"]
+    if len(plant) == 1 and plant[0] - 1 in dynamic and _integrates(blocks[plant[0]]) and is_speed(blocks[plant[0] - 1]):
+        return [plant[0] - 1, *plant]  # the speed of what integrates, wherever its block is said to be
 
     def slowness(i: int) -> float:
         den = blocks[i].dynamics.den
         return float("inf") if den[-1] == 0.0 else abs(den[0] / den[-1]) ** (1.0 / (len(den) - 1))
 
     return plant or [max(dynamic, key=slowness)]
+
+
+def _law(blocks: Sequence[Block]) -> int | None:
+    """Return the number of the plant's block where the plant is a law without dynamics."""
+    plant = [i for i, b in enumerate(blocks) if b.place == "plant"]
+    return plant[0] if plant and all(len(blocks[i].dynamics.den) == 1 for i in plant) else None
+
+
+def _integrates(block: Block) -> bool:
+    return len(block.dynamics.den) == 2 and block.dynamics.den[-1] == 0.0
+
+
+def is_speed(block: Block) -> bool:
+    """Whether a first-order block's output is a speed, by its name or unit."""
+    said = f"{block.name} {block.output}".lower()
+    return len(block.dynamics.den) == 2 and bool(_SPEED.search(said) or _SPEED_UNIT.search(block.unit.lower()))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -204,10 +259,13 @@ def _note_signals(
     (first, last), (taps, gains, where) = ends, (signals.taps, signals.gains, signals.where)
     den, n = block.dynamics.den, c.size
     static = block.dynamics.num[-1] / den[-1] if den[-1] != 0.0 else block.dynamics.num[-1] / den[0]
+    static = static or 1.0  # a plant without static gain, as a derivative: forces count as they come out
     if first:
         gains[0] = static
         taps[kernel.FIRST_LEVEL] = row
-        if n == 2 and last:
+        if n == 1 and last and is_speed(block):
+            taps[kernel.SPEED], where[SPEED] = row, at
+        if n == 2 and last and c[0] != 0.0:
             taps[kernel.SPEED, at + 1] = c[0]
             where[SPEED] = at + 1
             where[POSITION] = at

@@ -47,8 +47,8 @@ SIGNALS = 4
 
 #: Positions in the vector of numbers, before the effects' values.
 (
-    STEP, DELAY, U_OFFSET, Y_OFFSET, KELVIN, GAIN, GAIN_LAST, DIRECT_IN, DIRECT_OUT, NUMBERS
-) = range(10)  # fmt: skip
+    STEP, DELAY, U_OFFSET, Y_OFFSET, KELVIN, LAW, GAIN, GAIN_LAST, DIRECT_IN, DIRECT_OUT, NUMBERS
+) = range(11)  # fmt: skip
 #: Positions in the vector of integers, before those that say which effects act.
 (
     NUMBER, SIGNALS_ASKED, LINEAR_HOLD, DIRECTIONAL, ACTUATOR, SPEED_STATE, POSITION_STATE, FORCED, SMOOTH, RUBBING,
@@ -243,9 +243,11 @@ def run(
         for k in range(first, last):
             z = _tap(taps, OUTPUT, x) + numbers[DIRECT_OUT] * w
             since = t[k] - t[0]
-            out[0, k] = (
-                reading(sensor(z, since, effects) + y_offset, since, effects) if flags[SENSING] else z + y_offset
-            )
+            if flags[SENSING]:
+                through = numbers[LAW] * (_tap(taps, PLANT_IN, x) + numbers[DIRECT_IN] * w)
+                out[0, k] = reading(sensor(z, since, through, effects) + y_offset, since, effects)
+            else:
+                out[0, k] = z + y_offset
             if out.shape[0] > 1:
                 out[1, k] = _tap(taps, SPEED, x)
                 out[2, k] = _tap(taps, POSITION, x)

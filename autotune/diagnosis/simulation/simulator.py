@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 from functools import cache, lru_cache
 
 import numpy as np
+from scipy.linalg import expm
 
 from autotune.arrays import FloatArray, IntArray
 from autotune.diagnosis.effects import ALL
@@ -143,8 +144,8 @@ class Simulator:
         chain, rows = self.chain, _rows(windows, len(recording))
         states = np.empty((2, rows.shape[1], chain.order))
         states[0] = x0
-        numbers = np.concatenate([(step, chain.delay_s, self.u_offset, self.y_offset, self.kelvin), chain.gains,
-                                  self.values])  # fmt: skip
+        place = (step, chain.delay_s, self.u_offset, self.y_offset, self.kelvin, float(chain.is_static))
+        numbers = np.concatenate([place, chain.gains, self.values])
         flags = np.concatenate([(number, signals, *self._flags), self.acts])
         out = self.compiled(
             _driven(recording), rows, states, _tables(chain, self.falling, step), chain.taps, numbers, flags
@@ -188,21 +189,22 @@ class Simulator:
         return np.asarray(np.linalg.lstsq(lhs, rhs, rcond=1e-12)[0]).reshape(chain.order)
 
     def state_sizes(self, commands: Sequence[FloatArray], readings: Sequence[FloatArray]) -> FloatArray:
-        """Return a size for every state: what the command's span makes of it, bounded by what the readings show.
+        """Return a size for every state: what moves the reading by its spread, by free motion from that state.
 
         Parameters
         ----------
         commands, readings : sequence of (N,) array
-            Of all recordings.
+            Of all recordings. What no reading shows has the size that the command's span gives it.
         """
         span = max(float(np.std(u)) for u in commands)
-        spread = max(float(np.std(y)) for y in readings)
+        spread = max(float(np.std(y)) for y in readings) or 1.0
         A, b = self.chain.A, self.chain.B[:, 0]
-        damped = A - 1e-3 * np.eye(self.chain.order) * max(float(np.abs(A).max()), 1e-9)
-        states = np.abs(np.linalg.solve(damped, b)) * span
-        tap = np.abs(self.chain.taps[kernel.OUTPUT])
-        states = np.where(tap > 0, np.minimum(states, spread / np.maximum(tap, 1e-300)), states)
-        return np.asarray(np.maximum(states, 1e-9))
+        fastest = max(float(np.abs(np.linalg.eigvals(A)).max()), 1e-9)
+        times = np.concatenate([[0.0], np.geomspace(0.05, 5.0, 8) / fastest])
+        moved = np.max([np.abs(self.chain.taps[kernel.OUTPUT] @ expm(A * t)) for t in times], axis=0)
+        driven = np.abs(np.linalg.solve(A - 1e-3 * fastest * np.eye(self.chain.order), b)) * span
+        felt = moved > 1e-12 * max(float(moved.max()), 1e-300)
+        return np.asarray(np.where(felt, spread / np.maximum(moved, 1e-300), np.maximum(driven, 1e-9)))
 
 
 _FORCED: tuple[StageName, ...] = tuple(name for name, stage in STAGES.items() if stage.is_force)

@@ -90,7 +90,7 @@ def stop(x: float, v: float, y_offset: float, effects: Effects) -> tuple[float, 
 
 
 @inlined
-def sensor(z: float, t: float, effects: Effects) -> float:
+def sensor(z: float, t: float, through: float, effects: Effects) -> float:
     """Return the last block's output."""
     return z
 

@@ -1,0 +1,195 @@
+"""What predicts: errors on stretches of recordings that were left out, and how they speak for one model or another.
+
+Where the model's own error and not noise is what remains, rows are no independent witnesses and a likelihood of white
+noise is far too sure of itself. Stretches are: the recordings are cut into a few, the numbers are fitted to all but
+one, and the free run through that one is judged. Two models are compared stretch by stretch.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from autotune.arrays import BoolArray, FloatArray, IntArray
+from autotune.diagnosis.fitting.data import Data
+from autotune.diagnosis.fitting.descent import Iterate, Problem, attempted, eliminate, step_of
+from autotune.diagnosis.fitting.fit import Fit
+
+#: Stretches that are left out, one after the other.
+STRETCHES = 8
+#: First share of every window that tells its start state and is never judged, and rows of it at least: of long windows,
+#: and of many short ones.
+HEAD, LARGE_HEAD, LEAST_HEAD = 0.12, 0.35, 8
+#: Steps of the numbers that each left-out stretch is worth, with the derivatives of the fit to all.
+STEPS = 3
+#: Ratio of errors on one stretch that counts at most: where one runs away, how far does not matter.
+FAR_OFF = 10.0
+#: Scatter of the differences, as a share of the mean error, that is assumed at least: stretches are never that alike.
+LEAST_SCATTER = 0.05
+TINY = 1e-300
+
+
+def stretches_of(data: Data) -> list[IntArray]:
+    """Return the number of the stretch that every row belongs to, per recording; -1 for what is never judged."""
+    labels = []
+    windows = sum(len(a) for a in data.starts)
+    share = LARGE_HEAD if windows >= STRETCHES else HEAD
+    for r, starts, stops in zip(data.recordings, data.starts, data.stops, strict=True):
+        label = np.full(len(r), -1, dtype=np.int64)
+        for a, b in zip(starts, stops, strict=True):
+            label[a + max(LEAST_HEAD, int(share * (b - a))) : b] = 0
+        labels.append(label)
+    if windows >= STRETCHES:
+        number = 0
+        for label, starts, stops in zip(labels, data.starts, data.stops, strict=True):
+            for a, b in zip(starts, stops, strict=True):
+                part = label[a:b]
+                part[part >= 0] = number * STRETCHES // windows
+                number += 1
+        return labels
+    total, before = sum(int((label >= 0).sum()) for label in labels), 0
+    for label in labels:
+        rows = np.flatnonzero(label >= 0)
+        label[rows] = (before + np.arange(rows.size)) * STRETCHES // max(total, 1)
+        before += rows.size
+    return labels
+
+
+def held_out_squares(result: Fit, data: Data, tuned: bool = True) -> FloatArray:
+    """Return the sum of squared errors on every stretch, with numbers fitted to the others.
+
+    Parameters
+    ----------
+    result : Fit
+        A fit to all rows of the data, whose noise is white.
+    data : Data
+        What it was fitted to.
+    tuned : bool
+        Whether numbers are fitted to the other stretches; else those of the fit are judged as they are, as a model's
+        nominal ones.
+
+    Returns
+    -------
+    (STRETCHES,) array
+        In the reading's unit squared; infinite where a simulation runs away.
+
+    Notes
+    -----
+    Numbers and start states move by a few Gauss-Newton steps with the derivatives of the fit to all rows. What a
+    window's first rows say of its start state is always known. With thresholds that is first order: a stretch on which
+    a threshold alone was felt is judged a little too well.
+    """
+    labels = np.concatenate(stretches_of(data))
+    problem = Problem(result.parametrisation, data)
+    problem.scales = result.sim.state_sizes(
+        [r.u for r in data.recordings], [r.y[g] for r, g in zip(data.recordings, data.good, strict=True)]
+    )
+    spot = problem.iterate(result.theta, [x.copy() for x in result.x0])
+    Jx = problem.jacobian(spot, np.zeros(result.theta.size, dtype=bool))[1]
+    J = result.jacobian[0] if tuned else np.zeros_like(result.jacobian[0])
+    squares = np.zeros(STRETCHES)
+    for k in range(STRETCHES):
+        out = labels == k
+        there = _without(problem, spot, (J, Jx), out)
+        squares[k] = float(there.e[out] @ there.e[out]) if there is not None else math.inf
+    return squares * data.noise.sd**2
+
+
+def _without(
+    problem: Problem, at: Iterate, derivatives: tuple[FloatArray, FloatArray], out: BoolArray
+) -> Iterate | None:
+    """Return where a fit goes when rows are left out."""
+    kept = ~out
+    J, Jx = (D * kept[:, None] for D in derivatives)
+    may = np.any(J != 0.0, axis=0)
+
+    def cost(there: Iterate) -> float:
+        return problem.cost(there.e * kept, there.theta, prior)
+
+    prior = problem.prior(at.e, may)
+    for _ in range(STEPS):
+        e_left, J_left, gain_e, gain_J = eliminate(problem, (J, Jx), at.e * kept)
+        if not (np.all(np.isfinite(J_left)) and np.all(np.isfinite(e_left))):
+            return None
+        step = step_of(problem, at, J, (e_left, J_left), prior, may)
+        moved = None
+        for share in (1.0, 0.3):
+            moves = problem.per_recording(problem.scales * (gain_e + gain_J @ (share * step)))
+            trial = attempted(problem, at.theta + share * step, [x - m for x, m in zip(at.x0, moves, strict=True)])
+            if trial is not None and cost(trial) < cost(at):
+                moved = trial
+                break
+        if moved is None:
+            break
+        at = moved
+    return at
+
+
+def advantage(squares: FloatArray, other: FloatArray) -> float:
+    """Return twice the logarithm of how much more stretches speak for the other model than for the first one.
+
+    Parameters
+    ----------
+    squares, other : (K,) array
+        Squared errors of both on the same stretches.
+
+    Returns
+    -------
+    float
+        K ln(1 + t^2/(K - 1)) for Student's t of the mean difference of their errors, with its sign: the likelihood
+        ratio of a mean that is free to one that is 0, with unknown scatter. The differences of the errors, in which the
+        stretch with the largest ones counts most, and of their logarithms, in which all count alike, must agree on the
+        sign: 0 where they do not, else the larger of both.
+
+    References
+    ----------
+    Diebold and Mariano, J. Business and Economic Statistics 13, 1995: comparing predictive accuracy.
+    """
+    errors = np.sqrt(np.maximum((squares, other), 0.0))
+    errors = np.minimum(errors, FAR_OFF * np.min(errors, axis=0) + TINY)
+    differences = (errors[0] - errors[1]) / float(np.mean(errors) + TINY)
+    logarithms = np.log(errors[0] + TINY) - np.log(errors[1] + TINY)
+    first, second = (_speaks(d) for d in (differences, logarithms))
+    return max((first, second), key=abs) if first * second > 0.0 else 0.0
+
+
+def _speaks(differences: FloatArray) -> float:
+    """Return twice the log likelihood ratio of a mean that is free to one that is 0, with the mean's sign."""
+    count, scatter = differences.size, max(float(differences.std(ddof=1)), LEAST_SCATTER)
+    t = float(differences.mean()) / (scatter / math.sqrt(count))
+    return math.copysign(count * math.log1p(t * t / (count - 1)), t)
+
+
+def correlation_rows(result: Fit, data: Data) -> float:
+    """Return how many rows of a residual count as one: its correlation length, at least 1.
+
+    Notes
+    -----
+    1 + 2 sum of the autocorrelations up to their first sign change, all windows together.
+    """
+    summed = total = 0.0
+    for e, starts, stops in zip(result.residuals, data.starts, data.stops, strict=True):
+        for part in (e[a:b] for a, b in zip(starts, stops, strict=True)):
+            spectrum = np.fft.rfft(part, 2 * part.size)
+            c = np.fft.irfft(np.abs(spectrum) ** 2)[: part.size]
+            if c[0] <= 0.0:
+                continue
+            negative = np.flatnonzero(c < 0.0)
+            end = int(negative[0]) if negative.size else part.size
+            summed += float(c[0] + 2.0 * c[1:end].sum())
+            total += float(c[0])
+    return max(1.0, summed / total) if total > 0.0 else 1.0
+
+
+def rms(residuals: Sequence[FloatArray], good: Sequence[BoolArray]) -> float:
+    """Return the root mean square of residuals over the rows that count."""
+    squares = sum(float(np.sum(e[g] ** 2)) for e, g in zip(residuals, good, strict=True))
+    return math.sqrt(squares / max(sum(int(g.sum()) for g in good), 1))
+
+
+def judged_rows(data: Data) -> int:
+    """Return how many rows are judged."""
+    pairs = zip(stretches_of(data), data.good, strict=True)
+    return max(1, sum(int(((label >= 0) & good).sum()) for label, good in pairs))

@@ -1,0 +1,75 @@
+"""Windows of a rig: as long as the plant lets a simulation run free, and short ones to begin with."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from autotune.arrays import BoolArray
+from autotune.diagnosis.fitting.data import Data, as_white
+from autotune.diagnosis.fitting.noise import Noise
+from autotune.diagnosis.simulation.chain import build_chain
+from autotune.diagnosis.thresholds import Thresholds
+from autotune.models import Model
+from autotune.recording import Recording
+
+
+@dataclass(frozen=True, kw_only=True)
+class Lengths:
+    """How long windows are [s]."""
+
+    short: float
+    long: float
+    swings: bool
+
+    @property
+    def between(self) -> tuple[float, ...]:
+        """Lengths by which a fit goes from short windows to long ones."""
+        if not self.swings or self.long < 1.5 * self.short:
+            return (self.long,)
+        if self.long < 6.0 * self.short:
+            return (self.short, self.long)
+        return (self.short, math.sqrt(self.short * self.long), self.long)
+
+
+def lengths_of(model: Model, recordings: Sequence[Recording], limits: Thresholds) -> Lengths:
+    """Return how long windows are: whole recordings, but for what integrates or rings for long."""
+    poles = np.linalg.eigvals(build_chain(model).A)
+    size = np.abs(poles)
+    settling = poles[size > 1e-9 * max(float(size.max()), 1e-12)]
+    duration, dt = max(r.duration_s for r in recordings), recordings[0].sample_time_s
+    slowest = 1.0 / float(np.abs(settling).min()) if settling.size else duration / 20.0
+    damping = float(np.min(-settling.real / np.abs(settling))) if settling.size else 1.0
+    long = duration
+    if settling.size < poles.size:
+        long = max(limits.integrating_window * slowest, limits.least_window_rows * dt)
+    elif damping < limits.ringing:
+        long = max(limits.ringing_periods * 2.0 * math.pi * slowest, limits.least_window_rows * dt)
+    long = min(long, duration)
+    short = min(max(limits.short_window * slowest, limits.least_short_rows * dt), long)
+    return Lengths(short=long if long < 1.5 * short else short, long=long, swings=damping < limits.swinging)
+
+
+def spread_of(data: Data) -> float:
+    """Return the standard deviation of the readings."""
+    return float(np.std(np.concatenate([r.y[g] for r, g in zip(data.recordings, data.good, strict=True)]))) or 1.0
+
+
+def cut(recordings: Sequence[Recording], good: Sequence[BoolArray], length_s: float, limits: Thresholds) -> Data:
+    """Return recordings in windows of a length, thinned where they are long, their residuals taken for white."""
+    starts, stops = [], []
+    for r in recordings:
+        count = max(1, round(r.duration_s / length_s))
+        edges = r.t[0] + r.duration_s / count * np.arange(count)
+        first = np.unique(np.searchsorted(r.t, edges - 1e-9)).astype(np.int64)
+        starts.append(first)
+        stops.append(np.append(first[1:], len(r)).astype(np.int64))
+    data = Data(
+        recordings=tuple(recordings), good=tuple(good), starts=tuple(starts), stops=tuple(stops), noise=Noise(sd=1.0),
+        thresholds=limits,
+    )  # fmt: skip
+    data = data.thinned(limits.rig_rows)
+    return as_white(data, spread_of(data))

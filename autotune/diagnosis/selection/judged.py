@@ -1,0 +1,154 @@
+"""Hypotheses judged by stretches that were left out: compared in pairs, ranked, weighed."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from autotune.arrays import FloatArray
+from autotune.diagnosis.evidence.held_out import FitQuality
+from autotune.diagnosis.evidence.stretches import advantage, judged_rows
+from autotune.diagnosis.fitting.data import Data
+from autotune.diagnosis.fitting.fit import Fit
+from autotune.diagnosis.fitting.long_windows import spread_of
+from autotune.diagnosis.selection.hypothesis import Hypothesis
+from autotune.diagnosis.selection.probability import Candidate, weighed
+from autotune.diagnosis.selection.search import Search
+from autotune.diagnosis.thresholds import Thresholds
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Judged:
+    """A hypothesis with its errors on left-out stretches.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Its effects.
+    fit, short : Fit
+        Fitted to long and to short windows.
+    data, few : Data
+        What they were fitted to.
+    long_squares, short_squares : (K,) array
+        Squared errors of both on left-out stretches.
+    log_odds : float
+        Logarithm of its prior odds.
+    """
+
+    names: tuple[str, ...]
+    fit: Fit
+    short: Fit
+    data: Data
+    few: Data
+    long_squares: FloatArray
+    short_squares: FloatArray
+    log_odds: float
+
+    def behind(self, other: Judged) -> float:
+        """Return twice the logarithm of the odds that another hypothesis is the better one, priors counted.
+
+        The scale, long or short, at which they differ more decides, unless the other one contradicts it. Stretches have
+        the rig and its excitation in common: together they speak for no more than ``most_evidence``.
+        """
+        both = [advantage(self.long_squares, other.long_squares), advantage(self.short_squares, other.short_squares)]
+        most = self.data.thresholds.most_evidence
+        evidence = max(both) if sum(both) > 0.0 else min(both)
+        return min(max(evidence, -most), most) - 2.0 * (self.log_odds - other.log_odds)
+
+    @property
+    def error(self) -> float:
+        """Held-out error of the free run as a share of the spread of y."""
+        return math.sqrt(float(self.long_squares.sum()) / judged_rows(self.data)) / spread_of(self.data)
+
+    def is_better(self, other: Judged, share: float) -> bool:
+        """Whether it takes a share of another one's held-out error away, at one of the scales."""
+        ratios = [
+            float(mine.sum() / theirs.sum())
+            for mine, theirs in (
+                (self.long_squares, other.long_squares),
+                (self.short_squares, other.short_squares),
+            )
+        ]
+        return math.sqrt(min(ratios)) < 1.0 - share
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RigSearch:
+    """What was found in a rig.
+
+    Attributes
+    ----------
+    nominal, retuned : Judged
+        The nominal structure with the operating point fitted alone, and all its numbers.
+    judged : tuple of Judged
+        All that were judged, the retuned one first.
+    chosen : Judged
+        The one that predicts best, for what it is.
+    """
+
+    nominal: Judged
+    retuned: Judged
+    judged: tuple[Judged, ...]
+    chosen: Judged
+
+    def as_search(self) -> Search:
+        """Return the hypotheses in the form that pages and planning know."""
+        sets: dict[int, list[Hypothesis]] = {1: [], 2: [], 3: []}
+        for one in sorted(self.judged, key=lambda j: j.behind(self.chosen)):
+            sets.setdefault(len(one.names), []).append(Hypothesis(names=one.names, fit=one.fit))
+        return Search(
+            data=self.chosen.data,
+            nominal=self.nominal.fit,
+            retuned=Hypothesis(names=(), fit=self.retuned.fit),
+            singles=tuple(sets[1]),
+            pairs=tuple(sets[2]),
+            triples=tuple(h for size, group in sets.items() if size > 2 for h in group),
+            chosen=Hypothesis(names=self.chosen.names, fit=self.chosen.fit),
+        )
+
+    def candidates(self, limits: Thresholds) -> tuple[Candidate, ...]:
+        """Return every hypothesis with its probability: what chose it weighs here too."""
+        scores: dict[str, float] = {}
+        for one in self.judged:
+            name = "+".join(one.names) if one.names else "none"
+            scores[name] = min(scores.get(name, math.inf), worst(one, self.judged))
+        chosen = "+".join(self.chosen.names) if self.chosen.names else "none"
+        scores[chosen] = min(scores.values())  # what was more, and not material, speaks for it too
+        return weighed(scores, limits.rig_temperature, limits.rig_unknown_odds)
+
+    def quality(self, noise_floor: float) -> FitQuality:
+        """Return errors of free runs through stretches that were left out."""
+        return FitQuality(
+            nominal=self.nominal.error,
+            retuned=self.retuned.error,
+            extended=self.chosen.error,
+            noise_floor=noise_floor,
+        )
+
+    def keeps_nominal(self, share: float) -> bool:
+        """Whether the nominal numbers predict about as well as those retuned, so that they stand."""
+        ratio = float(self.retuned.long_squares.sum() / self.nominal.long_squares.sum())
+        return not self.chosen.names and math.sqrt(ratio) > 1.0 - share
+
+
+def worst(one: Judged, others: Sequence[Judged]) -> float:
+    """Return how far a hypothesis is behind the one that is farthest ahead of it, in units of 2 ln odds."""
+    return max((one.behind(other) for other in others if other is not one), default=0.0)
+
+
+def ranked(found: Sequence[Judged]) -> list[Judged]:
+    """Return hypotheses by how far the best rival of each is ahead of it: the first is beaten by none, or by least."""
+    return sorted(found, key=lambda j: worst(j, found))
+
+
+def simplest(found: Sequence[Judged], material: float) -> Judged:
+    """Return the hypothesis that stretches speak for most, priors counted, without what is not material in it."""
+    order = ranked(found)
+    best = order[0]
+    while best.names:
+        lesser = [j for j in order if set(j.names) < set(best.names) and not best.is_better(j, material)]
+        if not lesser:
+            break
+        best = lesser[0]
+    return best

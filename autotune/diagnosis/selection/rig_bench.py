@@ -1,0 +1,119 @@
+"""What the search in a rig works with: data at both scales, fits that go from short windows to long, judgement."""
+
+from __future__ import annotations
+
+from concurrent.futures import Executor
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from autotune.arrays import FloatArray
+from autotune.diagnosis.effects.base import EffectKind
+from autotune.diagnosis.evidence.stretches import held_out_squares
+from autotune.diagnosis.fitting.data import Data, as_white
+from autotune.diagnosis.fitting.fit import RUNAWAY, Fit, fit, start_states
+from autotune.diagnosis.fitting.parameters import Parametrisation
+from autotune.diagnosis.selection.hypothesis import hypothesis
+from autotune.diagnosis.selection.judged import Judged
+from autotune.diagnosis.thresholds import Thresholds
+from autotune.models import Effect
+
+#: Gauss-Newton steps of a fit in the search.
+STEPS = 12
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RigBench:
+    """What the search works with.
+
+    Attributes
+    ----------
+    cuts : tuple of Data
+        The recordings in windows from short to long.
+    few : Data
+        In short windows.
+    odds : tuple of (EffectKind, float)
+        What may be missing, with its prior odds.
+    lasting : tuple of Effect
+        What long direct searches found beside the retuned model.
+    pool : Executor
+        Where simulations run.
+    """
+
+    cuts: tuple[Data, ...]
+    few: Data
+    odds: tuple[tuple[EffectKind, float], ...]
+    lasting: tuple[Effect, ...]
+    pool: Executor
+
+    @property
+    def long(self) -> Data:
+        """The recordings in long windows."""
+        return self.cuts[-1]
+
+    @property
+    def limits(self) -> Thresholds:
+        """What decides between two findings."""
+        return self.long.thresholds
+
+    @property
+    def two_scales(self) -> bool:
+        """Whether hypotheses are judged on short windows too: what swings tells of itself on long ones alone."""
+        return len(self.cuts) == 1 and self.few.starts[0].size > self.long.starts[0].size
+
+    def with_sd(self, long: float, short: float) -> RigBench:
+        """Return the bench with other standard deviations of the residual."""
+        return replace(self, cuts=tuple(as_white(d, long) for d in self.cuts), few=as_white(self.few, short))
+
+    def settled(self, p: Parametrisation, theta: FloatArray | None) -> Fit:
+        """Return a fit to long windows that went there from short ones."""
+        result: Fit | None = None
+        for data, before in zip(self.cuts, (None, *self.cuts), strict=False):
+            x0 = None if result is None or before is None else _carried(result, before, data)
+            result = fit(p, data, theta if result is None else result.theta, x0, iterations=STEPS + 3)
+        assert result is not None
+        return result
+
+    def shortened(self, result: Fit) -> Fit:
+        """Return a fit to short windows from one to long windows: start states first, then the numbers as well."""
+        p, held = result.parametrisation, np.zeros(result.theta.size, dtype=bool)
+        begun = fit(p, self.few, result.theta, free=held, iterations=STEPS)
+        return fit(p, self.few, begun.theta, begun.x0, iterations=STEPS)
+
+    def again(self, one: Judged) -> Judged:
+        """Return a hypothesis fitted again, to data with another residual."""
+        try:
+            result = fit(one.fit.parametrisation, self.long, one.fit.theta, one.fit.x0, iterations=STEPS)
+            short = self.shortened(result) if self.two_scales else result
+        except RUNAWAY:
+            return one
+        return replace(one, fit=result, short=short, data=self.long, few=self.few)
+
+    def judged(self, result: Fit, log_odds: float) -> Judged | None:
+        """Return a fit to long windows with its errors on left-out stretches; nothing where it runs away."""
+        try:
+            squares = held_out_squares(result, self.long)
+            short = result
+            if self.two_scales:
+                short = self.shortened(result)
+            return Judged(
+                names=hypothesis(result).names,
+                fit=result,
+                short=short,
+                data=self.long,
+                few=self.few,
+                long_squares=squares,
+                short_squares=held_out_squares(short, self.few) if self.two_scales else squares,
+                log_odds=log_odds,
+            )
+        except RUNAWAY:
+            return None
+
+
+def _carried(result: Fit, before: Data, data: Data) -> tuple[FloatArray, ...]:
+    """Return start states of windows: those of a fit where it had a window there, else rest."""
+    states = start_states(result.sim, data)
+    for full, starts, known, x0 in zip(states, data.starts, before.starts, result.x0, strict=True):
+        same = np.isin(starts, known)
+        full[same] = x0[np.searchsorted(known, starts[same])]
+    return tuple(states)

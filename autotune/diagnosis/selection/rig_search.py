@@ -1,0 +1,260 @@
+"""Which physics is missing in a rig: effects added one by one, judged by stretches that were left out.
+
+Where no explanation reaches the noise, the model's own error decides: there short windows with free start states favour
+whatever bends easily, and a likelihood of white noise is sure of anything. So models run free for as long as the plant
+allows, numbers are fitted to all stretches but one and judged on that one, and what is usual in a rig of its kind
+needs less evidence than what is rare.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Collection, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from autotune.arrays import BoolArray
+from autotune.diagnosis.effects import ALL
+from autotune.diagnosis.effects.base import EffectKind
+from autotune.diagnosis.effects.rigs import rig_kind
+from autotune.diagnosis.evidence.stretches import correlation_rows, rms
+from autotune.diagnosis.fitting.data import Data
+from autotune.diagnosis.fitting.fit import RUNAWAY, Fit, fit
+from autotune.diagnosis.fitting.long_windows import cut, lengths_of, spread_of
+from autotune.diagnosis.fitting.parameters import parametrise
+from autotune.diagnosis.selection.growth import without
+from autotune.diagnosis.selection.hypothesis import hypothesis, is_stand_in
+from autotune.diagnosis.selection.judged import Judged, RigSearch, ranked, simplest
+from autotune.diagnosis.selection.prediction import extended, predictions, signal_sizes, starting_effects
+from autotune.diagnosis.selection.rig_bench import STEPS, RigBench
+from autotune.diagnosis.selection.scan import searched
+from autotune.diagnosis.selection.screening import distinct
+from autotune.diagnosis.simulation.chain import build_chain
+from autotune.diagnosis.thresholds import IN_USE, Thresholds
+from autotune.models import Effect, Model
+from autotune.recording import Recording
+
+Progress = Callable[[str, float], None]
+
+
+def search_rig(
+    model: Model,
+    recordings: Sequence[Recording],
+    good: Sequence[BoolArray],
+    left_out: Collection[str] = (),
+    progress: Progress = lambda what, share: None,
+    limits: Thresholds = IN_USE,
+) -> RigSearch:
+    """Search for the physics that is missing in a rig that no explanation describes to within noise.
+
+    Parameters
+    ----------
+    model : Model
+        Nominal model.
+    recordings, good : sequences
+        What was measured, and which rows count.
+    left_out : collection of str
+        Effects that are not looked for.
+    progress : callable
+        Told what is being done and the share done, 0 to 1.
+    limits : Thresholds
+        What decides between two findings.
+
+    Returns
+    -------
+    RigSearch
+        What was judged, and what predicts best.
+
+    Raises
+    ------
+    AutotuneError, OverflowError, LinAlgError
+        The nominal model runs away on the recordings.
+
+    Notes
+    -----
+    Forward search with a beam, then what is not needed is dropped. An effect must be usual in a rig of its kind or the
+    evidence must outweigh that it is not, it must take away a tenth of the held-out error, and stretches must agree on
+    it. What is excited in no stretch but one is found with less power.
+    """
+    kind = rig_kind(model, build_chain(model))
+    moving = any(float(np.ptp(r.u)) > 0.0 for r in recordings)
+    odds = tuple(
+        (k, k.odds.get(kind, k.odds.get("any", 0.0)))
+        for k in ALL
+        if k.odds and k.name not in left_out and (moving or k.place not in ("actuator", "timing"))
+    )
+    with threadpool_limits(1), ThreadPoolExecutor(2) as pool:
+        progress("retuning on long windows", 0.0)
+        lengths = lengths_of(model, recordings, limits)
+        bench = RigBench(
+            cuts=tuple(cut(recordings, good, length, limits) for length in lengths.between),
+            few=cut(recordings, good, lengths.short, limits),
+            odds=tuple(pair for pair in odds if pair[1] > 0.0),
+            lasting=(),
+            pool=pool,
+        )
+        bench, roots = _roots(model, bench)
+        nominal, retuned = roots[0], roots[1]
+        away = np.abs(retuned.fit.theta - retuned.fit.parametrisation.centre) / retuned.fit.parametrisation.spreads
+        beam = [retuned, *([nominal] if float(np.max(away)) > limits.nominal_too else [])]
+        bench = replace(bench, lasting=tuple(_lasting(retuned, bench)))
+        found, best = [retuned], retuned
+        for size in range(limits.rig_effects):
+            progress("effects one by one", 0.1 + 0.8 * size / limits.rig_effects)
+            larger = _larger(beam, bench)
+            if not larger:
+                break
+            found += larger
+            larger = ranked((best, *larger))
+            leads = larger[0] is not best
+            larger.remove(best)
+            beam = larger[: limits.rig_beam]
+            if leads and larger[0].is_better(best, limits.material):
+                best = larger[0]
+                bench = bench.with_sd(*_scales(best))
+                beam = [bench.again(j) for j in beam]
+            elif size > 0:
+                break
+        found += _smaller(simplest(found, limits.material), bench)
+        return RigSearch(nominal=nominal, retuned=retuned, judged=tuple(found), chosen=simplest(found, limits.material))
+
+
+def _scales(one: Judged) -> tuple[float, float]:
+    """Return the residuals' standard deviations at both scales, a correlation length of rows counted as one."""
+    pairs = ((one.fit, one.data), (one.short, one.few))
+    long, short = (
+        max(rms(f.residuals, d.good) * math.sqrt(correlation_rows(f, d)), 1e-6 * spread_of(d)) for f, d in pairs
+    )
+    return long, short
+
+
+def _roots(model: Model, bench: RigBench) -> tuple[RigBench, list[Judged]]:
+    """Return the bench with the retuned model's residual, and that model at its nominal numbers and retuned."""
+    recordings = bench.long.recordings
+    p = parametrise(replace(model, effects=()), [], _input_size(model, recordings), recordings[0].sample_time_s)
+    result = bench.settled(p, None)
+    for _ in range(2):
+        long = rms(result.residuals, bench.long.good) * math.sqrt(correlation_rows(result, bench.long))
+        bench = bench.with_sd(max(long, 1e-6 * spread_of(bench.long)), bench.few.noise.sd)
+        result = bench.settled(p, result.theta)
+    short = bench.shortened(result) if bench.two_scales else result
+    sd = rms(short.residuals, bench.few.good) * math.sqrt(correlation_rows(short, bench.few))
+    bench = bench.with_sd(bench.long.noise.sd, max(sd, 1e-6 * spread_of(bench.few)))
+    retuned = bench.judged(result, 0.0)
+    offset = np.array([f.kind == "u_offset" for f in p.free])
+    at_prior = fit(p, bench.long, result.theta * offset + p.centre * ~offset, free=offset)
+    nominal = bench.judged(at_prior, 0.0)
+    if retuned is None:
+        raise OverflowError("the retuned model runs away")
+    return bench, [nominal if nominal is not None else retuned, retuned]
+
+
+def _input_size(model: Model, recordings: Sequence[Recording]) -> float:
+    """Return the step of the command's offset: the command's spread, or what moves a reading by a tenth of its own."""
+    spread = float(np.std(np.concatenate([r.u for r in recordings])))
+    if spread > 0.0:
+        return spread
+    chain = build_chain(model)
+    readings = max(float(np.nanstd(r.y)) for r in recordings)
+    try:
+        static = abs(float(chain.gains[3] - chain.taps[3] @ np.linalg.solve(chain.A, chain.B[:, 0])))
+    except np.linalg.LinAlgError:
+        return 1.0
+    return 0.1 * readings / static if 0.0 < static < math.inf and readings > 0.0 else 1.0
+
+
+def _lasting(root: Judged, bench: RigBench) -> list[Effect]:
+    names = [k.name for k, _ in bench.odds if k.lasting]
+    return [e for name in names for e in searched(name, root.short, bench.few, bench.pool)]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Start:
+    """An effect to be added to a hypothesis: where from, at which scale, and what the first order predicts."""
+
+    base: Judged
+    kind: EffectKind
+    odds: float
+    effects: tuple[Effect, ...]
+    near: Fit
+    data: Data
+    decrease: float
+
+
+def _larger(beam: Sequence[Judged], bench: RigBench) -> list[Judged]:
+    """Return hypotheses with one effect more than those of a beam, the most promising ones judged."""
+    starts: list[_Start] = []
+    for base in beam:
+        groups = [_starts(base, kind, odds, bench) for kind, odds in bench.odds if kind.name not in base.names]
+        found = [s for group in groups for s in group]
+        found.sort(key=lambda s: -s.decrease - 2.0 * math.log(s.odds))
+        starts += [s for rank, s in enumerate(found) if rank < bench.limits.rig_tried or s.odds >= bench.limits.usual]
+    fits = bench.pool.map(lambda s: _added(s, bench), starts)
+    best: dict[frozenset[str], tuple[Fit, float]] = {}
+    for s, result in zip(starts, fits, strict=True):
+        if result is None or result.cost > s.base.fit.cost - 0.3:
+            continue
+        key, log_odds = frozenset((*s.base.names, s.kind.name)), s.base.log_odds + math.log(s.odds)
+        if key not in best or result.cost < best[key][0].cost:
+            best[key] = result, log_odds
+    ranked = sorted(best.values(), key=lambda pair: pair[0].cost - 2.0 * pair[1])[: bench.limits.rig_judged]
+    done = bench.pool.map(lambda pair: bench.judged(*pair), ranked)
+    return [j for j in done if j is not None and np.all(np.isfinite(j.long_squares + j.short_squares))]
+
+
+def _starts(base: Judged, kind: EffectKind, odds: float, bench: RigBench) -> list[_Start]:
+    """Return the starting points of an effect from which the first order predicts most, at each scale that helps.
+
+    Where the free run through long windows is out of phase, no derivative there leads anywhere: short ones do.
+    """
+    scales = [(base.fit, bench.long)]
+    if len(bench.cuts) > 1 and base.error > bench.limits.out_of_phase:
+        scales.append((bench.shortened(base.fit), bench.few))
+    found = []
+    for near, data in scales:
+        if not kind.suits.holds(near.sim.chain):
+            continue
+        tried = starting_effects(kind, near, signal_sizes(near, data))
+        if kind.lasting:
+            tried += [e for e in bench.lasting if e.name == kind.name]
+        elif kind.search is not None:
+            tried += searched(kind.name, near, data, bench.pool)
+        predicted = bench.pool.map(lambda e: predictions(near, e, data), tried)
+        order = sorted((p for group in predicted for p in group), key=lambda p: -p.decrease)
+        few = tuple(distinct(order)[: bench.limits.rig_starts])
+        if few:
+            found.append(
+                _Start(base=base, kind=kind, odds=odds, effects=few, near=near, data=data, decrease=order[0].decrease)
+            )
+    return found
+
+
+def _added(start: _Start, bench: RigBench) -> Fit | None:
+    """Return the best fit of a hypothesis with one more effect to long windows; nothing where all run away."""
+    done: list[Fit] = []
+    steps = 2 * STEPS if start.kind.is_rough else STEPS
+    for effect in start.effects:
+        try:
+            p, theta, states = extended(start.near, effect, start.data)
+            result = fit(p, start.data, theta, states, iterations=steps, inherit=start.near)
+            if start.data is not bench.long:
+                result = bench.settled(p, result.theta)
+        except RUNAWAY:
+            continue
+        if not is_stand_in(hypothesis(result), start.data):
+            done.append(result)
+    return min(done, key=lambda f: f.cost, default=None)
+
+
+def _smaller(best: Judged, bench: RigBench) -> list[Judged]:
+    """Return a hypothesis with each of its effects left out: built one by one, one may have stood for another."""
+    found: list[Judged] = []
+    for index, name in enumerate(best.names if len(best.names) > 1 else ()):
+        h = without(hypothesis(best.fit), index, best.data)
+        odds = next(o for k, o in bench.odds if k.name == name)
+        judged = None if h is None else bench.judged(h.fit, best.log_odds - math.log(odds))
+        found += [judged] if judged is not None else []
+    return found

@@ -1,0 +1,88 @@
+"""Rigs whose models are wrong by more than noise: what is named there, and what is not."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from autotune.diagnosis.effects import ALL
+from autotune.diagnosis.effects.rigs import rig_kind
+from autotune.diagnosis.selection.rig_search import search_rig
+from autotune.diagnosis.simulation.chain import build_chain
+from autotune.models import Block, Model, Port, TransferFunction
+from autotune.recording import Recording
+
+
+def swing(gravity: float, friction: float, damping: float, *, seconds: float = 20.0, start: float = 1.6) -> Recording:
+    """A free swing theta'' = -g sin(theta) - c theta' - f sign(theta'), by Runge and Kutta with fine steps."""
+
+    def rate(state):
+        angle, speed = state
+        return np.array([speed, -gravity * math.sin(angle) - damping * speed - friction * math.tanh(speed / 1e-3)])
+
+    dt, pieces = 0.01, 10
+    h, state = dt / pieces, np.array([start, 0.0])
+    y = np.empty(int(seconds / dt))
+    for k in range(y.size):
+        y[k] = state[0]
+        for _ in range(pieces):
+            a = rate(state)
+            b = rate(state + 0.5 * h * a)
+            c = rate(state + 0.5 * h * b)
+            d = rate(state + h * c)
+            state = state + h / 6.0 * (a + 2.0 * b + 2.0 * c + d)
+    noise = 5e-4 * np.random.default_rng(3).normal(size=y.size)
+    return Recording(t=dt * np.arange(y.size), u=np.zeros(y.size), y=y + noise)
+
+
+def pendulum(stiffness: float, damping: float) -> Model:
+    dynamics = TransferFunction(num=(1.0,), den=(1.0, damping, stiffness))
+    block = Block(name="arm", place="plant", dynamics=dynamics, output="angle", unit="rad")
+    return Model(name="pendulum", input=Port(), output=Port(unit="rad"), blocks=(block,))
+
+
+def good(recording: Recording):
+    return [np.ones(len(recording), dtype=bool)]
+
+
+def test_gravity_and_dry_friction_of_a_pendulum_are_both_named_from_one_free_swing():
+    recording = swing(gravity=22.0, friction=0.25, damping=0.02)
+    found = search_rig(pendulum(20.0, 0.1), [recording], good(recording))
+    assert set(found.chosen.names) >= {"plant.sine_torque", "plant.coulomb_friction"}
+    assert found.chosen.error < 0.05 * found.retuned.error
+
+
+def test_a_linear_oscillation_is_given_no_effect():
+    rng = np.random.default_rng(5)
+    t = 0.01 * np.arange(1500)
+    y = 0.5 * np.exp(-0.15 * t) * np.cos(4.7 * t) + 0.01 * rng.normal(size=t.size)
+    recording = Recording(t=t, u=np.zeros(t.size), y=y)
+    found = search_rig(pendulum(21.0, 0.25), [recording], good(recording))
+    assert found.chosen.names == ()
+
+
+@pytest.mark.parametrize(
+    ("unit", "den", "output", "kind"),
+    [
+        ("rad", (1.0, 0.2, 20.0), "angle", "arm"),
+        ("degC", (300.0, 1.0), "temperature", "thermal"),
+        ("m/s", (1.0, 2.0), "speed", "speed"),
+        ("cm", (60.0, 1.0), "level", "level"),
+        ("V", (1.0, 40.0, 190000.0), "voltage", "oscillator"),
+        ("", (5.0, 1.0), "", "process"),
+    ],
+)
+def test_a_model_says_what_kind_of_rig_it_is(unit, den, output, kind):
+    block = Block(name="plant", place="plant", dynamics=TransferFunction(num=(1.0,), den=den), output=output, unit=unit)
+    model = Model(name="rig", input=Port(), output=Port(unit=unit), blocks=(block,))
+    assert rig_kind(model, build_chain(model)) == kind
+
+
+def test_dry_friction_may_be_missing_where_a_speed_is_measured_and_not_where_a_level_is():
+    friction = next(kind for kind in ALL if kind.name == "plant.coulomb_friction")
+    for output, may in (("speed", True), ("level", False)):
+        block = Block(name="x", place="plant", dynamics=TransferFunction(num=(1.0,), den=(2.0, 1.0)), output=output)
+        model = Model(name="rig", input=Port(), output=Port(), blocks=(block,))
+        assert friction.suits.holds(build_chain(model)) is may
