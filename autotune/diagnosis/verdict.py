@@ -13,9 +13,9 @@ from autotune.diagnosis.evidence.held_out import FitQuality, dominates
 from autotune.diagnosis.evidence.samples import SampleEffect
 from autotune.diagnosis.result import FoundEffect, Offset, Verdict
 from autotune.diagnosis.selection.hypothesis import penalised
+from autotune.diagnosis.selection.judged import RigSearch
 from autotune.diagnosis.selection.parsimony import worth_adding
 from autotune.diagnosis.selection.probability import Candidate, candidates_of
-from autotune.diagnosis.selection.judged import RigSearch
 from autotune.diagnosis.selection.search import Search
 from autotune.diagnosis.thresholds import Thresholds
 

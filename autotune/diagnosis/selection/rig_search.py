@@ -222,7 +222,7 @@ def _starts(base: Judged, kind: EffectKind, odds: float, bench: RigBench) -> lis
             tried += [e for e in bench.lasting if e.name == kind.name]
         elif kind.search is not None:
             tried += searched(kind.name, near, data, bench.pool)
-        predicted = bench.pool.map(lambda e: predictions(near, e, data), tried)
+        predicted = bench.pool.map(lambda e, near=near, data=data: predictions(near, e, data), tried)
         order = sorted((p for group in predicted for p in group), key=lambda p: -p.decrease)
         few = tuple(distinct(order)[: bench.limits.rig_starts])
         if few:

@@ -113,7 +113,7 @@ def test_an_effect_that_the_chain_has_no_place_for_is_refused() -> None:
         blocks=(Block(name="tank", place="plant", dynamics=TransferFunction(num=(1.0,), den=(30.0, 1.0))),),
         effects=(effect("plant.coulomb_friction", level=0.1),),
     )
-    with pytest.raises(InputError, match="speed and a position"):
+    with pytest.raises(InputError, match="dry friction needs a speed"):
         assemble(tank)
 
 
