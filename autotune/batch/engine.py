@@ -68,6 +68,9 @@ def cluster(workers: int | None = None, scheduler: str | None = None, *, process
         client = Client(scheduler, timeout=_PATIENCE_S)
     except (OSError, ValueError) as error:
         raise InputError(f"no scheduler answers ({error})", where=scheduler, remedy="start dask scheduler") from None
+    except TypeError:  # Dask's own answer to a tls:// address without certificates
+        remedy = "name the certificates in Dask's configuration (distributed.comm.tls)"
+        raise InputError("it speaks TLS, and no certificate is configured", where=scheduler, remedy=remedy) from None
     with client:
         _check(client, scheduler)
         yield client

@@ -123,6 +123,7 @@ def _gathered(
         residual=residual_tests(chosen, found.data, found.gained, uneven=uneven),
         quality=held_out(found.retuned.fit, chosen, found.data),
         offset=offset_of(chosen, thresholds.offset_sigmas),
+        evened=late is not None,
     )
 
 
@@ -135,11 +136,17 @@ def _of_rig(evidence: Evidence, model: Model, without: Sequence[str], progress: 
     good, _ = inspect(recordings, ("sensor.dropout", "sensor.saturation"), limits)
     seen = [s.name for s in evidence.samples]
     try:
-        rig = search_rig(model, recordings, good, [*without, *seen], progress, limits)
+        known = evidence.search.chosen.fit if evidence.explains_most and evidence.search.chosen.names else None
+        rig = search_rig(model, recordings, good, [*without, *seen], progress, limits, known)
     except RUNAWAY:
         return evidence
     fit, data = rig.chosen.fit, rig.chosen.data
-    samples = tuple(s for s in evidence.samples if kind_of(s.name).sought == "residual" or is_material(s, fit, data))
+    # beside effects of the rig, what samples show must matter as well
+    samples = tuple(
+        s
+        for s in evidence.samples
+        if kind_of(s.name).sought == "residual" or not rig.chosen.names or is_material(s, fit, data)
+    )
     quality = rig.quality(evidence.quality.noise_floor)
     return replace(evidence, search=rig.as_search(), samples=samples, quality=quality, offset=None, rig=rig)
 

@@ -38,6 +38,8 @@ class Evidence:
         Shift of the operating point that is far outside its uncertainty.
     rig : RigSearch, optional
         What stretches that were left out say, where the model's error and not noise decides.
+    evened : bool
+        Whether stamps were late, so that everything runs at even times.
     """
 
     search: Search
@@ -46,6 +48,7 @@ class Evidence:
     quality: FitQuality
     offset: Offset | None
     rig: RigSearch | None = None
+    evened: bool = False
 
     @property
     def limits(self) -> Thresholds:
@@ -84,6 +87,7 @@ class Evidence:
         holds = {
             "effects": bool(found.chosen.names),
             "rig": self.rig is not None,
+            "late stamps": self.evened,
             "samples": bool(self.samples),
             "adequate": self.residual.is_noise or self.explains_most,
             "constant": self.residual.is_constant,
@@ -112,8 +116,8 @@ def odds_of_unknown(residual: ResidualTests, explains_most: bool, limits: Thresh
 #: Each row: what must hold, what must not, and the verdict. The first row that fits decides.
 TABLE: tuple[tuple[set[str], set[str], Verdict], ...] = (
     ({"rig", "effects"}, set(), "effect"),
-    ({"rig", "samples"}, set(), "effect"),
-    ({"rig"}, set(), "unexplained"),
+    ({"rig", "late stamps"}, set(), "effect"),
+    ({"rig"}, {"jitter explains more"}, "unexplained"),
     ({"effects", "adequate"}, set(), "effect"),
     ({"effects"}, set(), "unexplained"),
     ({"another structure"}, set(), "unexplained"),

@@ -22,8 +22,7 @@ from pyModbusTCP.server import DataBank, ModbusServer
 
 from autotune.config.registers import RegisterMap
 from autotune.controller import PIDController
-from autotune.errors import LinkError
-from drivers.modbus import DeviceRefused
+from autotune.errors import LinkError, NotTaken
 from sim.modbus_rig import ModbusRig, RtuTransport, TcpTransport
 from sim.plant import make_plant
 from sim.serial_line import SerialLine
@@ -108,7 +107,7 @@ def test_an_address_that_a_c_slave_does_not_have_is_named(slave_program: Path) -
     beyond = SLAVE.model_copy(update={"y": SLAVE.y.model_copy(update={"address": 100})})
     with running(slave_program, "tcp") as port:
         rig = rig_of(tcp_settings(port, beyond))
-        with pytest.raises(DeviceRefused, match=r"input 100.*does not have that address"):
+        with pytest.raises(NotTaken, match=r"input 100.*does not have that address"):
             rig.open()
         rig.close()
 

@@ -267,7 +267,7 @@ ACTUATOR = (
         sub_steps=4,
         starts=lambda s: [(s.w / (c * s.lag_s),) for c in (0.03, 0.06, 0.1, 0.16, 0.25, 0.4, 0.6, 1.0, 1.5)],
         confusable=("actuator.lag",),
-        odds={"any": 0.03, "damper": 0},
+        odds={"any": 0.01, "damper": 0},
         reference=_ASTROM,
     ),
     EffectKind(

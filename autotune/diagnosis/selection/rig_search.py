@@ -47,6 +47,7 @@ def search_rig(
     left_out: Collection[str] = (),
     progress: Progress = lambda what, share: None,
     limits: Thresholds = IN_USE,
+    known: Fit | None = None,
 ) -> RigSearch:
     """Search for the physics that is missing in a rig that no explanation describes to within noise.
 
@@ -62,6 +63,8 @@ def search_rig(
         Told what is being done and the share done, 0 to 1.
     limits : Thresholds
         What decides between two findings.
+    known : Fit, optional
+        What the search beside the noise found to explain most: it is judged as well, and not as something rare.
 
     Returns
     -------
@@ -118,6 +121,7 @@ def search_rig(
                 beam = [bench.again(j) for j in beam]
             elif size > 0:
                 break
+        found += _known(known, bench)
         found += _smaller(simplest(found, limits.material), bench)
         return RigSearch(nominal=nominal, retuned=retuned, judged=tuple(found), chosen=simplest(found, limits.material))
 
@@ -249,12 +253,27 @@ def _added(start: _Start, bench: RigBench) -> Fit | None:
     return min(done, key=lambda f: f.cost, default=None)
 
 
+def _known(known: Fit | None, bench: RigBench) -> list[Judged]:
+    """Return the hypothesis that another search found, judged on the rig's stretches."""
+    if known is None:
+        return []
+    given = {k.name: o for k, o in bench.odds}
+    odds = math.prod(given.get(e.name, 0.0) for e in known.model.effects)
+    try:
+        result = bench.settled(known.parametrisation, known.theta)
+    except RUNAWAY:
+        return []
+    judged = bench.judged(result, math.log(max(odds, bench.limits.known_odds)))
+    return [judged] if judged is not None and np.all(np.isfinite(judged.long_squares)) else []
+
+
 def _smaller(best: Judged, bench: RigBench) -> list[Judged]:
     """Return a hypothesis with each of its effects left out: built one by one, one may have stood for another."""
     found: list[Judged] = []
-    for index, name in enumerate(best.names if len(best.names) > 1 else ()):
+    given = {k.name: math.log(o) for k, o in bench.odds}
+    for index in range(len(best.names) if len(best.names) > 1 else 0):
         h = without(hypothesis(best.fit), index, best.data)
-        odds = next(o for k, o in bench.odds if k.name == name)
-        judged = None if h is None else bench.judged(h.fit, best.log_odds - math.log(odds))
+        own = sum(given.get(n, -math.inf) for i, n in enumerate(best.names) if i != index)
+        judged = None if h is None else bench.judged(h.fit, max(own, best.log_odds))
         found += [judged] if judged is not None else []
     return found

@@ -189,22 +189,26 @@ class Simulator:
         return np.asarray(np.linalg.lstsq(lhs, rhs, rcond=1e-12)[0]).reshape(chain.order)
 
     def state_sizes(self, commands: Sequence[FloatArray], readings: Sequence[FloatArray]) -> FloatArray:
-        """Return a size for every state: what moves the reading by its spread, by free motion from that state.
+        """Return a size for every state: what the command's span makes of it, bounded by what the readings show.
 
         Parameters
         ----------
         commands, readings : sequence of (N,) array
-            Of all recordings. What no reading shows has the size that the command's span gives it.
+            Of all recordings. Where no command moves, a state has the size that moves the reading by its spread, by
+            free motion from there.
         """
         span = max(float(np.std(u)) for u in commands)
-        spread = max(float(np.std(y)) for y in readings) or 1.0
-        A, b = self.chain.A, self.chain.B[:, 0]
-        fastest = max(float(np.abs(np.linalg.eigvals(A)).max()), 1e-9)
-        times = np.concatenate([[0.0], np.geomspace(0.05, 5.0, 8) / fastest])
-        moved = np.max([np.abs(self.chain.taps[kernel.OUTPUT] @ expm(A * t)) for t in times], axis=0)
-        driven = np.abs(np.linalg.solve(A - 1e-3 * fastest * np.eye(self.chain.order), b)) * span
-        felt = moved > 1e-12 * max(float(moved.max()), 1e-300)
-        return np.asarray(np.where(felt, spread / np.maximum(moved, 1e-300), np.maximum(driven, 1e-9)))
+        spread = max(float(np.std(y)) for y in readings)
+        A, b, tap = self.chain.A, self.chain.B[:, 0], self.chain.taps[kernel.OUTPUT]
+        if span == 0.0 < spread:
+            fastest = max(float(np.abs(np.linalg.eigvals(A)).max()), 1e-9)
+            times = np.concatenate([[0.0], np.geomspace(0.05, 5.0, 8) / fastest])
+            moved = np.max([np.abs(tap @ expm(A * t)) for t in times], axis=0)
+            return np.asarray(spread / np.maximum(moved, 1e-12 * max(float(moved.max()), 1e-300)))
+        damped = A - 1e-3 * np.eye(self.chain.order) * max(float(np.abs(A).max()), 1e-9)
+        states = np.abs(np.linalg.solve(damped, b)) * span
+        states = np.where(np.abs(tap) > 0, np.minimum(states, spread / np.maximum(np.abs(tap), 1e-300)), states)
+        return np.asarray(np.maximum(states, 1e-9))
 
 
 _FORCED: tuple[StageName, ...] = tuple(name for name, stage in STAGES.items() if stage.is_force)

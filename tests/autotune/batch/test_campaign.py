@@ -81,10 +81,10 @@ def test_a_campaign_that_cannot_be_meant_is_refused(tmp_path, text, said):
         read_campaign(tmp_path / "c.toml")
 
 
-def test_a_campaign_in_which_nothing_can_be_analysed_is_refused_and_leaves_the_reasons(tmp_path, two_workers):
+def test_a_campaign_in_which_nothing_can_be_analysed_is_refused_and_leaves_the_reasons(tmp_path, scheduler):
     (tmp_path / "c.toml").write_text('name = "a"\n[[loop]]\nname = "TIC1"\nfile = "gone.csv"\n')
     arguments = ["batch", str(tmp_path / "c.toml"), "--out", str(tmp_path / "out")]
-    done = CliRunner().invoke(app, [*arguments, "--scheduler", two_workers.cluster.scheduler_address])
+    done = CliRunner().invoke(app, [*arguments, "--scheduler", scheduler])
     assert isinstance(done.exception, InputError)
     assert "no loop could be analysed" in str(done.exception)
     assert "failed  TIC1: " in done.output
@@ -123,9 +123,9 @@ def test_results_do_not_depend_on_the_workers(designed, tmp_path, two_workers):
         assert (alone / name).read_bytes() == (tmp_path / name).read_bytes()
 
 
-def test_the_command_runs_a_campaign_on_an_existing_scheduler_and_continues_it(designed, tmp_path, two_workers):
+def test_the_command_runs_a_campaign_on_an_existing_scheduler_and_continues_it(designed, tmp_path, scheduler):
     path, alone, _ = designed
-    words = ["batch", str(path), "--out", str(tmp_path), "--scheduler", two_workers.scheduler_info()["address"]]
+    words = ["batch", str(path), "--out", str(tmp_path), "--scheduler", scheduler]
     said = CliRunner().invoke(app, words, catch_exceptions=False)
     assert "Of 4 loops, 1 needs action, 2 could not be analysed, 1 is fine." in said.output
     assert (alone / RESULTS).read_bytes() == (tmp_path / RESULTS).read_bytes()

@@ -98,6 +98,11 @@ def test_the_embedded_cluster_is_out_of_reach_of_other_machines(two_workers):
     assert listening == {"127.0.0.1"}
 
 
+def test_a_scheduler_that_asks_for_certificates_is_refused_in_one_line(two_workers):
+    with pytest.raises(InputError, match="no certificate is configured"), cluster(two_workers.scheduler.address):
+        pass
+
+
 def test_an_existing_scheduler_and_its_two_workers(scheduler):
     with cluster(scheduler=scheduler) as client:
         client.wait_for_workers(2, timeout=30)
