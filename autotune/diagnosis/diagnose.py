@@ -141,14 +141,15 @@ def _of_rig(evidence: Evidence, model: Model, without: Sequence[str], progress: 
     except RUNAWAY:
         return evidence
     fit, data = rig.chosen.fit, rig.chosen.data
-    # beside effects of the rig, what samples show must matter as well
-    samples = tuple(
-        s
-        for s in evidence.samples
-        if kind_of(s.name).sought == "residual" or not rig.chosen.names or is_material(s, fit, data)
-    )
+    samples = tuple(s for s in evidence.samples if _stays(s, bool(rig.chosen.names)) or is_material(s, fit, data))
     quality = rig.quality(evidence.quality.noise_floor)
     return replace(evidence, search=rig.as_search(), samples=samples, quality=quality, offset=None, rig=rig)
+
+
+def _stays(sample: SampleEffect, beside_effects: bool) -> bool:
+    """Whether what samples show is told whatever a rig's free run leaves: jitter, and repeats where nothing is found."""
+    kind = kind_of(sample.name)
+    return kind.sought == "residual" or not (beside_effects or kind.is_simulated)
 
 
 def _require_rows(recordings: Sequence[Recording]) -> None:
