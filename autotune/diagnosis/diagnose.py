@@ -147,7 +147,7 @@ def _of_rig(evidence: Evidence, model: Model, without: Sequence[str], progress: 
 
 
 def _stays(sample: SampleEffect, beside_effects: bool) -> bool:
-    """Whether what samples show is told whatever a rig's free run leaves: jitter, and repeats where nothing is found."""
+    """Whether what samples show is told whatever a free run leaves: jitter, and repeats where nothing is found."""
     kind = kind_of(sample.name)
     return kind.sought == "residual" or not (beside_effects or kind.is_simulated)
 
