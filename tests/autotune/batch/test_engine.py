@@ -99,7 +99,8 @@ def test_the_embedded_cluster_is_out_of_reach_of_other_machines(two_workers):
 
 
 def test_a_scheduler_that_asks_for_certificates_is_refused_in_one_line(two_workers):
-    with pytest.raises(InputError, match="no certificate is configured"), cluster(scheduler=two_workers.scheduler.address):
+    address = two_workers.scheduler.address
+    with pytest.raises(InputError, match="no certificate is configured"), cluster(scheduler=address):
         pass
 
 
