@@ -42,7 +42,7 @@ class GainRegisterRig(RegisterRig):
     def read_gains(self) -> PIDController:
         """Return the gains the device's controller holds now."""
         self._link.connect()
-        return self._decoded([list(self._link.read(block)[0]) for block in self._parts])
+        return self._decoded([list(self._link.read(block).words) for block in self._parts])
 
     def holdable(self, controller: PIDController) -> PIDController:
         """Return the controller that the device would hold after these gains were written: rounded to its registers.
@@ -84,7 +84,7 @@ class GainRegisterRig(RegisterRig):
         """
         new = self._encoded(controller)
         self._link.connect()
-        old = [list(self._link.read(block)[0]) for block in self._parts]
+        old = [list(self._link.read(block).words) for block in self._parts]
         try:
             self._write_checked(new)
         except LinkError as error:
@@ -126,7 +126,7 @@ class GainRegisterRig(RegisterRig):
         for block, wanted in zip(self._parts, words, strict=True):
             self._link.write(block.table, block.address, wanted)
         for block, wanted in zip(self._parts, words, strict=True):
-            held = list(self._link.read(block)[0])
+            held = list(self._link.read(block).words)
             if held != wanted:
                 raise LinkError(f"read back {held} where {wanted} was written", where=self._link.where)
         self._key(self._unlock.lock if self._unlock is not None else None)

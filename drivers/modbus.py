@@ -31,6 +31,7 @@ from pymodbus.pdu import ModbusPDU
 from autotune.config.rig import AnyModbusSettings, ModbusRtuSettings, ModbusTcpSettings, ModbusTlsSettings
 from autotune.errors import InputError, LinkError
 from drivers.line_errors import LINE_ERRORS, line_errors
+from drivers.register_link import Answer
 from drivers.registers import Block
 from drivers.session_lock import SessionLock
 
@@ -129,6 +130,7 @@ class ModbusLink:
         self._unit = settings.unit_id
         self._client: _TcpClient | _RtuClient | None = None
         self._is_clean = False  # whether nothing but the next answer can come
+        self._sent_s = 0.0  # when the last request was sent
         used = {_READ[register.table][0] for register in settings.registers.mapped().values()}
         self._marker = next((function for function in (2, 1, 4, 3) if function not in used), None)
 
@@ -180,15 +182,8 @@ class ModbusLink:
         """
         self._is_clean = self._is_clean and isinstance(self._client, _TcpClient)
 
-    def read(self, block: Block) -> tuple[Sequence[int], bool]:
+    def read(self, block: Block) -> Answer:
         """Read a block of registers.
-
-        Returns
-        -------
-        words : sequence of int
-            As many as the block counts; 0 or 1 each for bits.
-        suspect : bool
-            Whether it took more than one attempt.
 
         Raises
         ------
@@ -208,7 +203,8 @@ class ModbusLink:
             return len(answer.registers) == block.count
 
         answer, attempts = self._exchange(ask, belongs, function, block.table, block.address)
-        return ([int(bit) for bit in answer.bits[: block.count]] if is_bits else answer.registers), attempts > 1
+        words = [int(bit) for bit in answer.bits[: block.count]] if is_bits else answer.registers
+        return Answer(words, attempts > 1, time.perf_counter() - self._sent_s)
 
     def write(self, table: str, address: int, words: Sequence[int]) -> bool:
         """Write side-by-side registers in one request, or one coil.
@@ -286,6 +282,7 @@ class ModbusLink:
             self._flush()
         # stays so if the request is interrupted: its answer would be the next one's
         self._is_clean = False
+        self._sent_s = time.perf_counter()
         with line_errors(self.where, also=_LOST):
             return ask(self._client)
 

@@ -163,7 +163,7 @@ def _counted(
 def _probe_one(link: ModbusLink, codec: Codec, expected: tuple[float, float] | None) -> ProbedRegister:
     (block,) = blocks([codec])
     try:
-        words = tuple(link.read(block)[0])
+        words = tuple(link.read(block).words)
     except LinkError as error:
         warning = f"{error.what}; {error.remedy}"
         return ProbedRegister(name=codec.name, register=codec.register, words=(), value=math.nan, warnings=(warning,))

@@ -3,9 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 from drivers.registers import Block
+
+
+class Answer(NamedTuple):
+    """A block of registers, as it was read.
+
+    Attributes
+    ----------
+    words : sequence of int
+        As many as the block counts; 0 or 1 each for bits.
+    suspect : bool
+        Whether it took more than one attempt.
+    took_s : float
+        Time from sending the request that was answered to its answer [s], without the attempts before it.
+    """
+
+    words: Sequence[int]
+    suspect: bool
+    took_s: float
 
 
 class RegisterLink(Protocol):
@@ -28,8 +46,8 @@ class RegisterLink(Protocol):
         """Make sure that no earlier answer is taken for the next one."""
         ...
 
-    def read(self, block: Block) -> tuple[Sequence[int], bool]:
-        """Return the block's words, and whether they are suspect."""
+    def read(self, block: Block) -> Answer:
+        """Return the block's words, whether they are suspect, and how long they took."""
         ...
 
     def write(self, table: str, address: int, words: Sequence[int]) -> bool:

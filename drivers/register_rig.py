@@ -55,8 +55,8 @@ class RegisterRig:
     A device whose program runs in cycles shows the state of an earlier one: who commands and the echo of the heartbeat
     are up to three cycles late, and that is waited for and tolerated.
 
-    A sample's time stamp is the middle between request and answer. The wait of one request is bounded by the link's
-    time-outs and retries.
+    A sample's time stamp is the middle between the request that was answered and its answer. The wait of one request is
+    bounded by the link's time-outs and retries.
     """
 
     def __init__(
@@ -298,7 +298,7 @@ class RegisterRig:
         """Return the values of those of the signals that are mapped."""
         values: dict[str, float] = {}
         for block in blocks([self._codecs[name] for name in names if name in self._codecs]):
-            values |= block.decode(self._link.read(block)[0])
+            values |= block.decode(self._link.read(block).words)
         return values
 
     def _sample(self) -> tuple[Reading, dict[str, float]]:
@@ -323,11 +323,11 @@ class RegisterRig:
         values: dict[str, float] = {}
         suspect = False
         for block in self._sample_blocks:
-            words, again = self._link.read(block)
+            answer = self._link.read(block)
             if not values:  # the first block is the one with y
-                middle_s = 0.5 * (start_s + self._clock.now())
-            values |= block.decode(words)
-            suspect |= again
+                middle_s = self._clock.now() - 0.5 * answer.took_s
+            values |= block.decode(answer.words)
+            suspect |= answer.suspect
         reading = Reading(
             t_s=middle_s,
             y=values["y"],
@@ -347,7 +347,7 @@ class RegisterRig:
         for block in parts:
             words = [word for codec, _ in block.parts for word in self._words(codec, values[codec.name])]
             suspect = self._link.write(block.table, block.address, words)
-            if suspect and list(self._link.read(block)[0]) != words:
+            if suspect and list(self._link.read(block).words) != words:
                 raise LinkError(
                     "a command was sent twice and the device holds another one",
                     where=self._link.where,
@@ -371,7 +371,7 @@ class RegisterRig:
             return codec.encode_within(value, *self._u_range)
         if codec.register.bit is None:
             return codec.encode(value)
-        return codec.encode(value, self._link.read(blocks([codec])[0])[0])
+        return codec.encode(value, self._link.read(blocks([codec])[0]).words)
 
     def _require(self, holds: bool, what: str, remedy: str) -> None:
         if not holds:

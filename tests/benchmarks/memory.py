@@ -27,6 +27,7 @@ from autotune.experiment.rig import Rig
 from autotune.experiment.run import envelope_of
 from autotune.experiment.verify import law_for
 from autotune.recording import RecordingWriter
+from drivers.register_link import Answer
 from drivers.register_rig import RegisterRig
 from drivers.registers import Block
 from drivers.simulated import SimulatedRig
@@ -66,9 +67,9 @@ class VirtualLink:
     def distrust(self) -> None:
         """No answer is ever late."""
 
-    def read(self, block: Block) -> tuple[Sequence[int], bool]:
+    def read(self, block: Block) -> Answer:
         """Return the block's words."""
-        return self._device.read(block.table, block.address, block.count, self._now_s), False
+        return Answer(self._device.read(block.table, block.address, block.count, self._now_s), False, 0.0)
 
     def write(self, table: str, address: int, words: Sequence[int]) -> bool:
         """Write words."""

@@ -128,11 +128,12 @@ def search_rig(
 
 def _scales(one: Judged) -> tuple[float, float]:
     """Return the residuals' standard deviations at both scales, a correlation length of rows counted as one."""
-    pairs = ((one.fit, one.data), (one.short, one.few))
-    long, short = (
-        max(rms(f.residuals, d.good) * math.sqrt(correlation_rows(f, d)), 1e-6 * spread_of(d)) for f, d in pairs
-    )
-    return long, short
+    return _residual_sd(one.fit, one.data), _residual_sd(one.short, one.few)
+
+
+def _residual_sd(result: Fit, data: Data) -> float:
+    """Return a residual's standard deviation as of independent rows, at least a millionth of the readings' spread."""
+    return max(rms(result.residuals, data.good) * math.sqrt(correlation_rows(result, data)), 1e-6 * spread_of(data))
 
 
 def _roots(model: Model, bench: RigBench) -> tuple[RigBench, list[Judged]]:
@@ -141,12 +142,10 @@ def _roots(model: Model, bench: RigBench) -> tuple[RigBench, list[Judged]]:
     p = parametrise(replace(model, effects=()), [], _input_size(model, recordings), recordings[0].sample_time_s)
     result = bench.settled(p, None)
     for _ in range(2):
-        long = rms(result.residuals, bench.long.good) * math.sqrt(correlation_rows(result, bench.long))
-        bench = bench.with_sd(max(long, 1e-6 * spread_of(bench.long)), bench.few.noise.sd)
+        bench = bench.with_sd(_residual_sd(result, bench.long), bench.few.noise.sd)
         result = bench.settled(p, result.theta)
     short = bench.shortened(result) if bench.two_scales else result
-    sd = rms(short.residuals, bench.few.good) * math.sqrt(correlation_rows(short, bench.few))
-    bench = bench.with_sd(bench.long.noise.sd, max(sd, 1e-6 * spread_of(bench.few)))
+    bench = bench.with_sd(bench.long.noise.sd, _residual_sd(short, bench.few))
     retuned = bench.judged(result, 0.0)
     offset = np.array([f.kind == "u_offset" for f in p.free])
     at_prior = fit(p, bench.long, result.theta * offset + p.centre * ~offset, free=offset)
