@@ -31,7 +31,7 @@ import numpy as np
 from autotune.config import Config
 from autotune.controller import PIDController
 from autotune.errors import AutotuneError, ExperimentStopped, OperatorStop
-from autotune.experiment.result import Progress
+from autotune.experiment.result import Status
 from autotune.experiment.verify import Verification, smoothed
 from autotune.models import TransferFunction
 from autotune.outputs import append_whole
@@ -68,21 +68,21 @@ class RunLog:
         self._write("recording", file=path.name)
         return path
 
-    def also(self, listener: Callable[[Progress], None] | None) -> Callable[[Progress], None]:
+    def also(self, listener: Callable[[Status], None] | None) -> Callable[[Status], None]:
         """Return a listener that writes what has changed, then tells the given one."""
 
-        def tell(progress: Progress) -> None:
-            news = (progress.state, progress.message, progress.points, progress.relay, progress.warnings)
+        def tell(status: Status) -> None:
+            news = (status.state, status.message, status.points, status.relay, status.warnings)
             if news != self._last:
                 self._last = news
-                self._progress(progress)
+                self._status(status)
             if listener is not None:
-                listener(progress)
+                listener(status)
 
         return tell
 
-    def _progress(self, progress: Progress) -> None:
-        content = asdict(progress) | {"points": points_to_json(progress.points)}
+    def _status(self, status: Status) -> None:
+        content = asdict(status) | {"points": points_to_json(status.points)}
         self._write("progress", **content)
 
     def analysed(

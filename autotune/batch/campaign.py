@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,7 @@ from autotune.batch.export import to_parquet
 from autotune.batch.loop import Finding, Row, Work
 from autotune.batch.settings import CampaignSettings, LoopSettings, matches
 from autotune.outputs import Output, write_whole
+from autotune.progress import Progress
 
 RESULTS = "results.parquet"
 
@@ -63,7 +64,7 @@ class Campaign:
                     rows[loop.name] = Row(**content["row"])
         return rows
 
-    def works(self, done: Iterable[str], advance: Callable[[str, float], None]) -> dict[str, Work]:
+    def works(self, done: Iterable[str], advance: Progress) -> dict[str, Work]:
         """Return what is left to do, by loop.
 
         Parameters
@@ -98,7 +99,7 @@ class Campaign:
         loops = [loop for loop in self.loops if loop.file == file]
         return len(loops) > 1 and self.settings.export is not None and not file.endswith(".parquet")
 
-    def _prepared(self, path: Path, file: str, advance: Callable[[str, float], None]) -> Path:
+    def _prepared(self, path: Path, file: str, advance: Progress) -> Path:
         """Return a CSV export as Parquet, of which a loop reads its own tags without the others."""
         export = self.settings.export
         assert export is not None
@@ -108,7 +109,7 @@ class Campaign:
         out = self.out / "tables" / f"{path.stem}-{hashlib.sha256(asked.encode()).hexdigest()[:16]}.parquet"
         if not out.exists():
             out.parent.mkdir(parents=True, exist_ok=True)
-            to_parquet(path, out, wanted, export, lambda share: advance(path.name, share))
+            to_parquet(path, out, wanted, export, advance)
         return out
 
     def _digest(self, loop: LoopSettings) -> str:

@@ -18,6 +18,7 @@ from autotune.files.stamps import seconds
 from autotune.files.table import Table, listed
 from autotune.files.text_file import beginning
 from autotune.files.workbook import PARQUET, WORKBOOKS, open_table, parquet_table
+from autotune.progress import Progress
 
 _BLOCK_BYTES = 16 << 20
 
@@ -101,9 +102,7 @@ def columns_of(path: Path, export: ExportSettings) -> list[str]:
     return list(beginning(path, export.form())[0].header.names)
 
 
-def to_parquet(
-    path: Path, out: Path, wanted: Sequence[str], export: ExportSettings, advance: Callable[[float], None]
-) -> None:
+def to_parquet(path: Path, out: Path, wanted: Sequence[str], export: ExportSettings, advance: Progress) -> None:
     """Turn a text export into Parquet, block by block, so that each loop reads its own columns only.
 
     Parameters
@@ -118,7 +117,7 @@ def to_parquet(
         What is said of how the export is written. Stamps are written as timestamps, all other cells as the text they
         are, with a decimal point.
     advance : callable
-        Told the share of the file that has been read.
+        Told the file and the share of it that has been read.
 
     Raises
     ------
@@ -148,7 +147,7 @@ def to_parquet(
                     stamps = pa.array(micro, from_pandas=True).cast(pa.int64()).cast(pa.timestamp("us"))
                     columns = [stamps, *(_pointed(batch.column(name), table.decimal) for name in kept)]
                     writer.write_table(pa.Table.from_arrays(columns, schema=pa.schema(fields)))
-                    advance(file.tell() / size)
+                    advance(path.name, file.tell() / size)
     except pa.ArrowInvalid as error:
         said = str(error).strip().splitlines()[0]
         raise InputError(said, where=str(path), remedy="correct the line, or leave the file out") from None

@@ -96,7 +96,7 @@ def closed_loop(
             controller=law,
             max_order=max_order,
             limits=None if config is None else _limits(config),
-            progress=lambda text: status.update(f"fitting {text}"),
+            progress=lambda what, _: status.update(f"fitting {what}"),
         )
     place.json(closed_loop_json(result))
     for warning in result.warnings:
@@ -261,7 +261,7 @@ def dither(
         raise InputError("exists already", where=str(out.with_suffix(".toml")), remedy="give --out another name")
     with ProgressBar() as bar:
         done = run_dither(
-            rig, content, out, duration_s=duration, amplitude=amplitude, dwell_s=dwell, seed=seed, on_progress=bar.show
+            rig, content, out, duration_s=duration, amplitude=amplitude, dwell_s=dwell, seed=seed, on_status=bar.show
         )
     unit_u, unit_y = content.signals.u_unit, content.signals.y_unit
     typer.echo(

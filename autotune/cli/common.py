@@ -15,7 +15,7 @@ from autotune.outputs import claim
 
 if TYPE_CHECKING:
     from autotune.config import Config
-    from autotune.experiment.result import Progress
+    from autotune.experiment.result import Status
     from autotune.experiment.rig import Rig
 
 
@@ -75,11 +75,11 @@ class ProgressBar:
         )  # fmt: skip
         self._task = self._progress.add_task("connecting", total=1.0, left="")
 
-    def show(self, progress: Progress) -> None:
+    def show(self, status: Status) -> None:
         """Show where the procedure is."""
-        left = f"{progress.remaining_s:.0f} s of rig time left" if progress.fraction > 0 else ""
-        text = f"{progress.state.value}: {progress.message}"
-        self._progress.update(self._task, completed=progress.fraction, description=text, left=left)
+        left = f"{status.remaining_s:.0f} s of rig time left" if status.fraction > 0 else ""
+        text = f"{status.state.value}: {status.message}"
+        self._progress.update(self._task, completed=status.fraction, description=text, left=left)
 
     def work(self, what: str, share: float) -> None:
         """Show what is being computed and the share done, 0 to 1."""

@@ -120,7 +120,7 @@ def identify_delay_command(
             integrator=integrator,
             offset=offset,
             coloured=coloured,
-            progress=lambda stage: status.update(stage),
+            progress=lambda what, _: status.update(what),
         )
     place.by(lambda part: write_delay_model(model, part))
     typer.echo(f"{describe(model)}; wrote {out}")

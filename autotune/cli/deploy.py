@@ -247,7 +247,7 @@ def _verify(
             next_free(folder / VERIFICATION),
             u_rest=measured.u_rest,
             noise_sd=measured.noise_sd,
-            on_progress=bar.show,
+            on_status=bar.show,
         )
 
 

@@ -60,7 +60,7 @@ def investigate(
         known = find_out(
             rig, content, nominal, given, out,
             budget=Budget(rounds=rounds, duration_s=duration, rig_time_s=rig_time), without=without or (),
-            told=Listeners(report=bar.work, on_progress=bar.show, keep=lambda known: _keep(known, out)),
+            told=Listeners(report=bar.work, on_status=bar.show, keep=lambda known: _keep(known, out)),
         )  # fmt: skip
     for one in known.rounds:
         kind, on = one.plan.excitation.kind, one.plan.excitation.on

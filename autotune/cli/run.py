@@ -75,7 +75,7 @@ def run(
                 verify=verify,
                 deploy=deploy,
                 resume=resume is not None,
-                on_progress=bar.show,
+                on_status=bar.show,
                 keep=keep,
             )
         missed = tuning.verification is not None and not tuning.verification.accepted

@@ -23,11 +23,12 @@ from autotune.diagnosis.fitting.fit import RUNAWAY
 from autotune.diagnosis.fitting.retuning import reduced_chi2
 from autotune.diagnosis.result import Diagnosis
 from autotune.diagnosis.selection.rig_search import search_rig
-from autotune.diagnosis.selection.search import Progress, Search, search
+from autotune.diagnosis.selection.search import Search, search
 from autotune.diagnosis.thresholds import IN_USE, Thresholds
 from autotune.diagnosis.verdict import Evidence, judged, places_of, sentences_of
 from autotune.errors import InputError
 from autotune.models import Model
+from autotune.progress import Progress, quiet
 from autotune.recording import Recording
 
 #: Rows that a diagnosis needs.
@@ -39,7 +40,7 @@ def diagnose(
     recordings: Sequence[Recording],
     controller: Controller | None = None,
     without: Sequence[str] = (),
-    progress: Progress = lambda what, share: None,
+    progress: Progress = quiet,
     thresholds: Thresholds = IN_USE,
 ) -> Diagnosis:
     """Find where and why recordings differ from the simulation of a model.

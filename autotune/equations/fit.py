@@ -7,7 +7,7 @@ value is sought on a logarithmic scale, so that it keeps its sign: ``p = value e
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,6 +17,7 @@ from autotune.equations.sensitivity import STEP, Sensitivities, Windows, sensiti
 from autotune.equations.simulate import Compiled, Drive, drive_of, simulate
 from autotune.equations.starts import fitted_starts, given_starts, state_scales
 from autotune.errors import InputError
+from autotune.progress import Progress, quiet
 from autotune.recording import Recording
 
 #: Relative decrease of the penalised sum of squares below which a fit has converged.
@@ -101,7 +102,7 @@ def fit(
     z: FloatArray | None = None,
     free: BoolArray | None = None,
     iterations: int = 30,
-    progress: Callable[[float], None] = lambda share: None,
+    progress: Progress = quiet,
 ) -> Fitted:
     """Fit a model's parameters on given windows.
 
@@ -122,7 +123,7 @@ def fit(
     iterations : int
         Gauss-Newton steps at most.
     progress : callable
-        Is told the share of the steps that are done.
+        Told what is being done and the share done.
 
     Returns
     -------
@@ -145,11 +146,11 @@ def fit(
     state = _Descent(compiled, data, which, z)
     converged = False
     for k in range(iterations):
-        progress(k / iterations)
+        progress("fitting", k / iterations)
         converged = state.step()
         if converged:
             break
-    progress(1.0)
+    progress("fitting", 1.0)
     return state.fitted(converged)
 
 
@@ -159,7 +160,7 @@ def retune(
     *,
     longest_s: float = np.inf,
     free: BoolArray | None = None,
-    progress: Callable[[float], None] = lambda share: None,
+    progress: Progress = quiet,
 ) -> Fitted:
     """Retune a model on short windows first, then on longer ones up to the whole free run.
 
@@ -194,7 +195,7 @@ def retune(
             new = fit(
                 compiled, recordings, z=z, free=free, horizon_s=None if last else length,
                 iterations=30 if k == len(lengths) - 1 else 12,
-                progress=lambda share, k=k: progress((k + share) / len(lengths)),  # type: ignore[misc]
+                progress=lambda what, share, k=k: progress(what, (k + share) / len(lengths)),
             )  # fmt: skip
         except InputError:
             if found is None:

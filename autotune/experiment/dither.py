@@ -20,9 +20,9 @@ from autotune.design.law import LawState, PILaw
 from autotune.errors import InputError
 from autotune.experiment.limits import Watch
 from autotune.experiment.loop import ControlLoop
-from autotune.experiment.result import Progress, State
+from autotune.experiment.result import State, Status
 from autotune.experiment.rig import HoldsGains, Rig
-from autotune.experiment.run import OnProgress, envelope_of, float_on, recording_metadata, wait_for_rest
+from autotune.experiment.run import OnStatus, envelope_of, float_on, recording_metadata, wait_for_rest
 from autotune.experiment.verify import law_for
 from autotune.recording import RecordingWriter
 
@@ -105,7 +105,7 @@ def run_dither(
     amplitude: float | None = None,
     dwell_s: tuple[float, float] | None = None,
     seed: int = 0,
-    on_progress: OnProgress | None = None,
+    on_status: OnStatus | None = None,
 ) -> DitherExperiment:
     """Run the present law with a dither on a rig and leave the rig safe.
 
@@ -125,7 +125,7 @@ def run_dither(
         Shortest and longest dwell [s]; a sample and a fiftieth of the experiment when absent.
     seed : int
         Of the dither.
-    on_progress : callable, optional
+    on_status : callable, optional
         Told where the experiment is.
 
     Returns
@@ -164,9 +164,9 @@ def run_dither(
         look, alarmed = max(1, rows // (2 * _LOOKS)), -rows
         for k in range(rows):
             tick = loop.tick
-            if on_progress is not None and k % max(1, round(0.5 / dt_s)) == 0:
+            if on_status is not None and k % max(1, round(0.5 / dt_s)) == 0:
                 left_s, message = (rows - k) * dt_s, f"dither of {now:.3g} on the present loop"
-                on_progress(Progress(state=State.SWEEP, elapsed_s=tick.t_s, remaining_s=left_s, message=message))
+                on_status(Status(state=State.SWEEP, elapsed_s=tick.t_s, remaining_s=left_s, message=message))
             away = max(0.0, abs(tick.y - centre) - loop.monitor.noise) if tick.usable else 0.0
             departure = max(departure, away)
             if amplitude is None and away > _ALARM * limits.swing and k - alarmed > look:

@@ -20,9 +20,9 @@ from autotune.design.law import LawState, PILaw
 from autotune.experiment.approach import approach, find_midpoint, preflight
 from autotune.experiment.limits import Watch
 from autotune.experiment.loop import ControlLoop, Tick
-from autotune.experiment.result import Progress, State
+from autotune.experiment.result import State, Status
 from autotune.experiment.rig import Rig
-from autotune.experiment.run import OnProgress, envelope_of, recording_metadata, wait_for_rest
+from autotune.experiment.run import OnStatus, envelope_of, recording_metadata, wait_for_rest
 from autotune.experiment.verify import law_for
 from autotune.recording import Recording, RecordingWriter, read_recording
 
@@ -116,7 +116,7 @@ def _pulses(rows: int, hold: int) -> FloatArray:
 
 
 def run_excitation(
-    rig: Rig, config: Config, recording: str | Path, excitation: Excitation, *, on_progress: OnProgress | None = None
+    rig: Rig, config: Config, recording: str | Path, excitation: Excitation, *, on_status: OnStatus | None = None
 ) -> Recording:
     """Run an excitation on a rig around its operating point and leave the rig safe.
 
@@ -130,7 +130,7 @@ def run_excitation(
         CSV to write: t, u, y, r and what was added to the command, from the first sample on.
     excitation : Excitation
         What to do.
-    on_progress : callable, optional
+    on_status : callable, optional
         Told where the experiment is.
 
     Returns
@@ -156,9 +156,9 @@ def run_excitation(
         start_s, share, alarmed_s = loop.tick.t_s, 1.0, -math.inf
         for k, wanted in enumerate(pattern):
             tick = loop.tick
-            if on_progress is not None and k % max(1, round(0.5 / dt_s)) == 0:
+            if on_status is not None and k % max(1, round(0.5 / dt_s)) == 0:
                 left_s = (pattern.size - k) * dt_s
-                on_progress(Progress(state=State.SWEEP, elapsed_s=tick.t_s, remaining_s=left_s,
+                on_status(Status(state=State.SWEEP, elapsed_s=tick.t_s, remaining_s=left_s,
                                      message=f"{excitation.kind} on the {excitation.on}"))  # fmt: skip
             if drive.away(tick) > ALARM * limits.swing and tick.t_s - alarmed_s > 0.25 * excitation.hold_s:
                 share, alarmed_s = 0.5 * share, tick.t_s

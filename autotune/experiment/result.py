@@ -29,7 +29,7 @@ class State(StrEnum):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Progress:
+class Status:
     """What a progress bar shows.
 
     Attributes

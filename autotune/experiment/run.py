@@ -19,7 +19,7 @@ from autotune.experiment.device import DeviceOscillation
 from autotune.experiment.limits import Envelope, Watch
 from autotune.experiment.loop import ControlLoop, Timing
 from autotune.experiment.relay import RelaySettings
-from autotune.experiment.result import ExperimentResult, Part, Progress, Segment, State
+from autotune.experiment.result import ExperimentResult, Part, Segment, State, Status
 from autotune.experiment.rig import Rig, RunsLaws, ShowsOutput
 from autotune.experiment.sweep import doubts, missing_phases, sweep
 from autotune.recording import RecordingWriter
@@ -31,7 +31,7 @@ NOTABLE_SHARE = 0.005
 #: part of limits.time_s to wait for that
 REST_SHARE = 0.3
 
-OnProgress = Callable[[Progress], None]
+OnStatus = Callable[[Status], None]
 
 
 def envelope_of(config: Config) -> Envelope:
@@ -61,7 +61,7 @@ def run_experiment(
     recording: str | Path,
     *,
     earlier: Earlier | None = None,
-    on_progress: OnProgress | None = None,
+    on_status: OnStatus | None = None,
 ) -> ExperimentResult:
     """Run the whole experiment on a rig and leave it safe.
 
@@ -76,7 +76,7 @@ def run_experiment(
     earlier : Earlier, optional
         What an interrupted run of the same configuration left: only the phases that are missing are measured, and the
         rig is not touched where none is.
-    on_progress : callable, optional
+    on_status : callable, optional
         Called a few times per second of rig time at most.
 
     Raises
@@ -93,12 +93,12 @@ def run_experiment(
     extra = further_columns(rig)
     writer = RecordingWriter(recording, ("t", "u", "y", *extra), recording_metadata(config))
     with ControlLoop(rig=rig, envelope=envelope_of(config), writer=writer, extra=extra) as loop:
-        result = experiment_on(loop, config, earlier=earlier, on_progress=on_progress)
+        result = experiment_on(loop, config, earlier=earlier, on_status=on_status)
     return replace(result, output=loop.metadata["ended"]["output"])
 
 
 def experiment_on(
-    loop: ControlLoop, config: Config, *, earlier: Earlier | None = None, on_progress: OnProgress | None = None
+    loop: ControlLoop, config: Config, *, earlier: Earlier | None = None, on_status: OnStatus | None = None
 ) -> ExperimentResult:
     """Go through the states on an open loop; the plant is left at rest, under the command that holds it.
 
@@ -108,7 +108,7 @@ def experiment_on(
         As :func:`run_experiment`; the loop's exit makes the rig safe.
     """
     earlier = earlier or Earlier()
-    journal = _Journal(loop, on_progress)
+    journal = _Journal(loop, on_status)
     try:
         journal.enter(State.PREFLIGHT)
         if earlier.recordings and config.operating_point.approach == "ramp":
@@ -233,10 +233,10 @@ def _missed(timing: Timing) -> tuple[str, ...]:
 class _Journal:
     """Keeps the states and their times in the sidecar and the recording, and tells whoever listens."""
 
-    def __init__(self, loop: ControlLoop, on_progress: OnProgress | None) -> None:
+    def __init__(self, loop: ControlLoop, on_status: OnStatus | None) -> None:
         self.state = State.CONNECT
         self._loop = loop
-        self._on_progress = on_progress
+        self._on_status = on_status
         self._states: list[dict[str, Any]] = []
 
     def enter(self, state: State) -> None:
@@ -252,9 +252,9 @@ class _Journal:
         self, message: str, remaining_s: float, known: Known | None = None, relay: RelaySettings | None = None
     ) -> None:
         self._loop.comment(message)
-        if self._on_progress is not None:
-            self._on_progress(
-                Progress(
+        if self._on_status is not None:
+            self._on_status(
+                Status(
                     state=self.state,
                     elapsed_s=self._loop.tick.t_s,
                     remaining_s=remaining_s,

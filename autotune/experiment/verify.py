@@ -22,10 +22,10 @@ from autotune.experiment.device import try_on_device
 from autotune.experiment.limits import Watch
 from autotune.experiment.loop import ControlLoop
 from autotune.experiment.prediction import Prediction, predict
-from autotune.experiment.result import Progress, State
+from autotune.experiment.result import State, Status
 from autotune.experiment.rig import Exchanges, Rig, RunsLaws
 from autotune.experiment.run import (
-    OnProgress,
+    OnStatus,
     envelope_of,
     float_on,
     further_columns,
@@ -179,7 +179,7 @@ def run_test(
     test: StepTest,
     operating_y: float,
     u_hold: float,
-    on_progress: OnProgress | None = None,
+    on_status: OnStatus | None = None,
 ) -> tuple[FloatArray, FloatArray]:
     """Close the loop with the new law, bumpless from ``u_hold``, let it settle, and run the test.
 
@@ -195,7 +195,7 @@ def run_test(
         What to ask.
     operating_y, u_hold : float
         Operating point [y unit] and the command that holds it [u unit].
-    on_progress : callable, optional
+    on_status : callable, optional
         Told where the test is.
 
     Returns
@@ -215,10 +215,10 @@ def run_test(
     every = max(1, round(0.5 / law.sample_time_s))
 
     def tell(k: int) -> None:
-        if on_progress is not None and k % every == 0:
+        if on_status is not None and k % every == 0:
             left_s = (count - k) * law.sample_time_s
             message = "steps with the new gains"
-            on_progress(Progress(state=State.VERIFY, elapsed_s=loop.tick.t_s, remaining_s=left_s, message=message))
+            on_status(Status(state=State.VERIFY, elapsed_s=loop.tick.t_s, remaining_s=left_s, message=message))
 
     if isinstance(loop.rig, RunsLaws):
         while loop.tick.u != (u_next := loop.nearest(u_hold)):
@@ -267,7 +267,7 @@ def run_verification(
     *,
     u_rest: float | None = None,
     noise_sd: float | None = None,
-    on_progress: OnProgress | None = None,
+    on_status: OnStatus | None = None,
 ) -> Verification:
     """Bring the rig to its operating point, close the loop with the new controller, test it and leave the rig safe.
 
@@ -286,7 +286,7 @@ def run_verification(
     u_rest, noise_sd : float, optional
         From the experiment: command that holds the operating point [u unit], standard deviation of the noise of y
         [y unit]; found on the way to the operating point where they are not known.
-    on_progress : callable, optional
+    on_status : callable, optional
         Told where the procedure is.
 
     Raises
@@ -310,7 +310,7 @@ def run_verification(
             wait_for_rest(loop)
         known = float_on(loop, config, u_rest=u_rest)
         loop.note(test_start_s=loop.tick.t_s)
-        y, u = run_test(loop, law, test, config.operating_point.y, known.midpoint, on_progress)
+        y, u = run_test(loop, law, test, config.operating_point.y, known.midpoint, on_status)
     return judge(test, y, u, law, fit, known.noise_sd if noise_sd is None else noise_sd)
 
 

@@ -21,7 +21,6 @@ from autotune.diagnosis.fitting.fit import RUNAWAY, Fit, fit
 from autotune.diagnosis.fitting.windows import slowest_lag_s, window_rows
 from autotune.diagnosis.result import Diagnosis
 from autotune.diagnosis.selection.hypothesis import Hypothesis
-from autotune.diagnosis.selection.search import Progress
 from autotune.diagnosis.simulation.simulator import Simulator
 from autotune.errors import InputError
 from autotune.experiment.excitation import KINDS, Excitation, On
@@ -29,6 +28,7 @@ from autotune.experiment.limits import Envelope
 from autotune.experiment.verify import law_for
 from autotune.experiment_design.conditions import Conditions
 from autotune.experiment_design.open_hypotheses import open_hypotheses
+from autotune.progress import Progress, quiet
 from autotune.recording import Recording
 
 #: Shares of the allowed swing and of the command's room that a planned excitation takes.
@@ -61,7 +61,7 @@ def plan_in(
     conditions: Conditions,
     duration_s: float,
     seed: int = 0,
-    progress: Progress = lambda what, share: None,
+    progress: Progress = quiet,
 ) -> Plan | None:
     """Return the experiment that best separates the open hypotheses within the limits, None where none is safe.
 

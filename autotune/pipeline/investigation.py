@@ -10,17 +10,17 @@ from typing import Any
 from autotune.config import Config
 from autotune.diagnosis.diagnose import diagnose
 from autotune.diagnosis.result import Diagnosis
-from autotune.diagnosis.selection.search import Progress as Report
 from autotune.diagnosis.simulation.assembly import assemble
 from autotune.errors import AutotuneError, InputError
 from autotune.experiment.excitation import run_excitation
 from autotune.experiment.rig import Rig
-from autotune.experiment.run import OnProgress
+from autotune.experiment.run import OnStatus
 from autotune.experiment_design.conditions import conditions_of
 from autotune.experiment_design.next_experiment import with_next_experiment
 from autotune.experiment_design.open_hypotheses import decided, open_hypotheses
 from autotune.experiment_design.plan import Plan, general, plan_in
 from autotune.models import Model
+from autotune.progress import Progress, quiet
 from autotune.recording import Recording, write_recording
 
 #: Share of the longest time on the rig that an excitation may take; the rest is for the way to the operating point.
@@ -143,14 +143,14 @@ class Listeners:
 
     Attributes
     ----------
-    report, on_progress : callable
+    report, on_status : callable
         Told what is being computed, and where the rig is.
     keep : callable
         Given what is known after every diagnosis and at every end, so that nothing is lost.
     """
 
-    report: Report = lambda what, share: None
-    on_progress: OnProgress | None = None
+    report: Progress = quiet
+    on_status: OnStatus | None = None
     keep: Callable[[Investigation], None] = lambda known: None
 
 
@@ -221,7 +221,7 @@ def _next(
     config: Config,
     model: Model,
     budget: Budget,
-    report: Report,
+    report: Progress,
 ) -> tuple[Plan | None, str]:
     """Return the next experiment, or why there is none."""
     rounds, (duration_s, rig_time_s) = budget.rounds, budget.of(config)
@@ -261,7 +261,7 @@ def _round(
     """Run one experiment and diagnose everything again."""
     number = len(known.rounds) + 1
     try:
-        seen = run_excitation(rig, config, out / f"rig_{number}.csv", plan.excitation, on_progress=told.on_progress)
+        seen = run_excitation(rig, config, out / f"rig_{number}.csv", plan.excitation, on_status=told.on_status)
     except AutotuneError as error:
         told.keep(replace(known, ended=f"round {number}: {error}"))
         raise
@@ -275,7 +275,7 @@ def _round(
     return replace(known, diagnosis=found, recordings=recordings, rounds=(*known.rounds, one))
 
 
-def _diagnosed(model: Model, recordings: Sequence[Recording], without: Sequence[str], report: Report) -> Diagnosis:
+def _diagnosed(model: Model, recordings: Sequence[Recording], without: Sequence[str], report: Progress) -> Diagnosis:
     return with_next_experiment(diagnose(model, recordings, None, without, report))
 
 

@@ -13,12 +13,12 @@ from scipy.signal import lfilter
 from autotune.config import Config
 from autotune.diagnosis.diagnose import diagnose
 from autotune.diagnosis.result import Diagnosis
-from autotune.diagnosis.selection.search import Progress
 from autotune.experiment.prediction import sampled
 from autotune.experiment.result import ExperimentResult
 from autotune.experiment_design.next_experiment import with_next_experiment
 from autotune.identification.parametric import PlantFit
 from autotune.models import Block, Model, Port, TransferFunction
+from autotune.progress import Progress
 from autotune.recording import Recording, read_recording
 
 

@@ -14,7 +14,7 @@ from autotune.errors import AutotuneError, ExperimentStopped, OperatorStop
 from autotune.experiment.cycles import Earlier
 from autotune.experiment.result import ExperimentResult
 from autotune.experiment.rig import HoldsGains, Rig
-from autotune.experiment.run import OnProgress, run_experiment
+from autotune.experiment.run import OnStatus, run_experiment
 from autotune.experiment.sweep import missing_phases
 from autotune.experiment.verify import Verification, run_verification
 from autotune.outputs import unwritable
@@ -72,7 +72,7 @@ def tune(
     verify: bool = True,
     deploy: bool = True,
     resume: bool = False,
-    on_progress: OnProgress | None = None,
+    on_status: OnStatus | None = None,
     keep: Callable[[float], bool] | None = None,
 ) -> Tuning:
     """Run the whole chain on a rig: sweep, analyse, verify, hand over the gains; files go into ``out``.
@@ -89,7 +89,7 @@ def tune(
         Whether to try the new loop on the rig, and to write the gains into the rig's own controller once accepted.
     resume : bool
         Whether to go on with what an interrupted run left in ``out``: only the points that are missing are measured.
-    on_progress : callable, optional
+    on_status : callable, optional
         Told where the procedure is.
     keep : callable, optional
         Asked once accepted gains were handed over, with the time to wait for an answer [s]; the old ones are written
@@ -120,7 +120,7 @@ def tune(
     with log_of_run as log:
         log.begin(config)
         return _tune(
-            rig, config, out, earlier, log, verify=verify, deploy=deploy, on_progress=log.also(on_progress), keep=keep
+            rig, config, out, earlier, log, verify=verify, deploy=deploy, on_status=log.also(on_status), keep=keep
         )
 
 
@@ -133,7 +133,7 @@ def _tune(
     *,
     verify: bool,
     deploy: bool,
-    on_progress: OnProgress,
+    on_status: OnStatus,
     keep: Callable[[float], bool] | None,
 ) -> Tuning:
     experiment: ExperimentResult | None = None
@@ -142,7 +142,7 @@ def _tune(
         recording = next_free(out / RECORDING)
         if missing_phases(config.experiment, earlier):
             log.recording(recording)
-        experiment = run_experiment(rig, config, recording, earlier=earlier, on_progress=on_progress)
+        experiment = run_experiment(rig, config, recording, earlier=earlier, on_status=on_status)
         analysis = analyse(experiment.points, config.design, facts=_facts(config, experiment))
         if deploy:  # what the rig can hold is what is verified, reported and handed over
             held = held_by(rig, analysis.controller, config.design, fit=analysis.fit)
@@ -159,7 +159,7 @@ def _tune(
                 log.recording(next_free(out / VERIFICATION)),
                 u_rest=experiment.u_rest,
                 noise_sd=experiment.noise_sd,
-                on_progress=on_progress,
+                on_status=on_status,
             )
             log.verified(verification)
         accepted = verification is not None and verification.accepted

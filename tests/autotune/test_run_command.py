@@ -148,7 +148,7 @@ def kill(progress):
         os.kill(os.getpid(), signal.SIGKILL)
 
 config = load_config(sys.argv[1])
-tune(rig_of(config), config, Path(sys.argv[2]), on_progress=kill)
+tune(rig_of(config), config, Path(sys.argv[2]), on_status=kill)
 """
 
 

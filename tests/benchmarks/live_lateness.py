@@ -31,7 +31,7 @@ from rich.table import Table
 from autotune.errors import AutotuneError
 from autotune.experiment.loop import ControlLoop
 from autotune.experiment.relay import RelaySettings, RelayState, relay_step
-from autotune.experiment.result import Progress, State
+from autotune.experiment.result import State, Status
 from autotune.experiment.rig import Reading
 from autotune.experiment.run import envelope_of
 from autotune.live.session import LivePage
@@ -172,9 +172,9 @@ def lateness(loop: ControlLoop) -> np.ndarray:
     return np.asarray((t % PERIOD_S)[t > start_s + CATCH_UP_S])
 
 
-def progress(elapsed_s: float, message: str) -> Progress:
+def progress(elapsed_s: float, message: str) -> Status:
     """Return what a run tells at a change."""
-    return Progress(state=State.SWEEP, elapsed_s=elapsed_s, remaining_s=math.nan, message=message, relay=RELAY)
+    return Status(state=State.SWEEP, elapsed_s=elapsed_s, remaining_s=math.nan, message=message, relay=RELAY)
 
 
 def ratio_interval(with_: Sequence[float], without: Sequence[float]) -> tuple[float, float]:

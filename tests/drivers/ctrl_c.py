@@ -13,7 +13,7 @@ from pathlib import Path
 from autotune.config import Config, load_config
 from autotune.controller import PIDController
 from autotune.errors import OperatorStop
-from autotune.experiment.result import ExperimentResult, Progress, State
+from autotune.experiment.result import ExperimentResult, State, Status
 from autotune.experiment.run import run_experiment
 from autotune.experiment.verify import run_verification
 from autotune.pipeline import Analysis, analyse, hand_over
@@ -46,7 +46,7 @@ class Operator:
     sees: str = ""
     waits: bool = False
 
-    def watch(self, progress: Progress) -> None:
+    def watch(self, progress: Status) -> None:
         """Look at the progress bar."""
         swept = progress.state == State.SWEEP
         self.sees = progress.message.split(" of ")[0] if swept else progress.state.value
@@ -133,15 +133,15 @@ def stop_in(state: str, seed: int) -> Outcome:
 
 
 def _stage(state: str, rig: AttendedRig, config: Config, path: Path) -> None:
-    watch: Callable[[Progress], None] = rig.operator.watch
+    watch: Callable[[Status], None] = rig.operator.watch
     if state == State.VERIFY.value:
         experiment, analysis = finished(rig.seed)
         run_verification(
             rig, config, analysis.controller, analysis.fit, path,
-            u_rest=experiment.u_rest, noise_sd=experiment.noise_sd, on_progress=watch,
+            u_rest=experiment.u_rest, noise_sd=experiment.noise_sd, on_status=watch,
         )  # fmt: skip
     elif state == "hand-over":
         rig.operator.sees = state
         hand_over(rig, PIDController(K=-0.025, Ti_s=3.6), path)
     else:
-        run_experiment(rig, config, path, on_progress=watch)
+        run_experiment(rig, config, path, on_status=watch)

@@ -13,7 +13,7 @@ import numpy as np
 from autotune.diagnosis.effects import KINDS, kind_of
 from autotune.diagnosis.equations.bench import Bench, EquationBench, Outcome
 from autotune.diagnosis.equations.closed import ClosedBench
-from autotune.diagnosis.equations.search import NOISE_ALONE, Progress, Searched, search
+from autotune.diagnosis.equations.search import NOISE_ALONE, Searched, search
 from autotune.diagnosis.evidence.samples import SampleEffect, inspect
 from autotune.diagnosis.selection.probability import Candidate, weighed
 from autotune.diagnosis.thresholds import IN_USE
@@ -23,6 +23,7 @@ from autotune.equations.identifiability import undetermined
 from autotune.equations.model import EquationModel
 from autotune.errors import InputError
 from autotune.models import Effect
+from autotune.progress import Progress, quiet
 from autotune.recording import Recording
 
 #: Residual variance of the noise's up to which chosen effects explain the recordings.
@@ -145,7 +146,7 @@ def diagnose_equations(
     model: EquationModel | BlackBox,
     recordings: Sequence[Recording],
     without: Sequence[str] = (),
-    progress: Progress = lambda what, share: None,
+    progress: Progress = quiet,
 ) -> EquationDiagnosis:
     """Find where and why recordings differ from the simulation of equations.
 

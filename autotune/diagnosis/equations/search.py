@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,6 +13,7 @@ from autotune.diagnosis.equations.candidates import Trial, trials
 from autotune.diagnosis.fitting.noise import Noise, noise_from_differences
 from autotune.errors import InputError
 from autotune.models import Effect
+from autotune.progress import Progress
 
 #: What a number pays beyond Schwarz's criterion: of two explanations as good as each other the simpler is taken.
 LEAD = 6.0
@@ -26,8 +27,6 @@ NOISE_ALONE = 1.08
 FIRST, LAST = 6, 12
 #: Of the best predicted decrease: what is less is not fitted.
 FAINT = 0.02
-
-Progress = Callable[[str, float], None]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -139,7 +138,7 @@ def _is_slow(bench: Bench, one: Outcome) -> bool:
 def _round(bench: Bench, base: Outcome, without: Sequence[str], progress: Progress, further: bool) -> list[Outcome]:
     """Look at every effect at every place, and fit the best."""
     share = 0.5 if further else 0.1
-    ranked = screened(bench, base, without, lambda s: progress("trying every effect", share + 0.15 * s))
+    ranked = screened(bench, base, without, lambda what, s: progress(what, share + 0.15 * s))
     count = FITTED_FURTHER if further else FITTED
     found = []
     for k, (_, effect) in enumerate(ranked[:count]):
@@ -159,9 +158,7 @@ def _round(bench: Bench, base: Outcome, without: Sequence[str], progress: Progre
     return found
 
 
-def screened(
-    bench: Bench, base: Outcome, without: Sequence[str], progress: Callable[[float], None]
-) -> list[tuple[float, Effect]]:
+def screened(bench: Bench, base: Outcome, without: Sequence[str], progress: Progress) -> list[tuple[float, Effect]]:
     """Return for every effect and place the decrease that first order predicts, with the values that bring it.
 
     Returns
@@ -179,7 +176,7 @@ def screened(
     e = e - basis @ (basis.T @ e)
     best: dict[tuple[str, str], tuple[float, Effect]] = {}
     for k, trial in enumerate(all_trials):
-        progress(k / len(all_trials))
+        progress("trying every effect", k / len(all_trials))
         d = _direction(bench, base, trial, basis)
         if d is None:
             continue

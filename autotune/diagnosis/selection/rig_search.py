@@ -9,7 +9,7 @@ needs less evidence than what is rare.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
@@ -35,9 +35,8 @@ from autotune.diagnosis.selection.screening import distinct
 from autotune.diagnosis.simulation.chain import build_chain
 from autotune.diagnosis.thresholds import IN_USE, Thresholds
 from autotune.models import Effect, Model
+from autotune.progress import Progress, quiet
 from autotune.recording import Recording
-
-Progress = Callable[[str, float], None]
 
 
 def search_rig(
@@ -45,7 +44,7 @@ def search_rig(
     recordings: Sequence[Recording],
     good: Sequence[BoolArray],
     left_out: Collection[str] = (),
-    progress: Progress = lambda what, share: None,
+    progress: Progress = quiet,
     limits: Thresholds = IN_USE,
     known: Fit | None = None,
 ) -> RigSearch:

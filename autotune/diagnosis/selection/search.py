@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
@@ -36,9 +36,8 @@ from autotune.diagnosis.selection.parsimony import (
 from autotune.diagnosis.selection.screening import Bench, Width
 from autotune.diagnosis.thresholds import IN_USE, Thresholds
 from autotune.models import Model
+from autotune.progress import Progress, quiet
 from autotune.recording import Recording
-
-Progress = Callable[[str, float], None]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -104,7 +103,7 @@ def search(
     recordings: Sequence[Recording],
     good: Sequence[BoolArray],
     without: Sequence[str] = (),
-    progress: Progress = lambda what, share: None,
+    progress: Progress = quiet,
     thresholds: Thresholds = IN_USE,
 ) -> Search:
     """Search for the physics that is missing.

@@ -8,7 +8,6 @@ recorded, tells whether the loop was moved from outside, and a controller file i
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -36,6 +35,7 @@ from autotune.identification.closed_loop.prediction_error import PredictionError
 from autotune.identification.closed_loop.state_space import InnovationModel
 from autotune.identification.closed_loop.subspace_direct import lagged_data
 from autotune.points import FrequencyPoint
+from autotune.progress import Progress, quiet
 from autotune.recording import Recording
 
 #: Rows that a first look at the excitation takes.
@@ -104,7 +104,7 @@ def identify_closed_loop(
     max_order: int = 8,
     omega_rad_s: FloatArray | None = None,
     limits: DitherLimits | None = None,
-    progress: Callable[[str], None] = lambda text: None,
+    progress: Progress = quiet,
 ) -> ClosedLoopIdentification:
     """Identify the plant from a recording of the loop under control.
 
@@ -128,7 +128,7 @@ def identify_closed_loop(
         Of the rig, for the dither that is proposed where the loop was not excited enough; what u and y did in the
         recording when absent.
     progress : callable
-        Told what is being done.
+        Told what is being done and the share done.
 
     Returns
     -------
@@ -173,14 +173,14 @@ def _fitted(
     order: int | None,
     delay: int | None,
     max_order: int,
-    progress: Callable[[str], None],
+    progress: Progress,
 ) -> tuple[PredictionErrorEstimate, tuple[Candidate, ...]]:
     if order is None:
         choice = choose_order(u, y, max_order=max_order, progress=progress)
         return choice.estimate, choice.evidence
     if order < 1 or (delay or 0) < 0:
         raise InputError(f"order {order}, delay {delay}", remedy="the order is at least 1, the dead time at least 0")
-    progress(f"order {order}")
+    progress(f"order {order}", 0.0)
     return fixed_order(u, y, order, delay=delay or 0), ()
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,6 +19,7 @@ from autotune.identification.closed_loop.subspace_direct import (
     pbsid_states,
     regress_system,
 )
+from autotune.progress import Progress, quiet
 
 #: A higher order, or a dead time, must earn this much in the criterion (strong evidence by Raftery's scale): otherwise
 #: a pole that a zero nearly cancels, placed where the noise happens to have a line, would pass for dynamics.
@@ -110,7 +111,7 @@ def choose_order(
     max_order: int = 8,
     feedthrough: bool = False,
     offset: bool = True,
-    progress: Callable[[str], None] = lambda text: None,
+    progress: Progress = quiet,
 ) -> OrderChoice:
     """Choose order and dead time by the Bayesian information criterion over polished models.
 
@@ -123,7 +124,7 @@ def choose_order(
     feedthrough, offset : bool
         As in :func:`autotune.identification.closed_loop.prediction_error.prediction_error`.
     progress : callable
-        Told what is tried.
+        Told what is tried; the share is NaN, since dead times are tried only where the data hint at one.
 
     Returns
     -------
@@ -146,7 +147,7 @@ def choose_order(
     fits: dict[tuple[int, int], PredictionErrorEstimate] = {}
 
     def try_order(order: int, delay: int, factor: LaggedData) -> None:
-        progress(f"order {order}, dead time {delay}")
+        progress(f"order {order}, dead time {delay}", math.nan)
         try:
             fits[order, delay] = start_and_polish(
                 factor,

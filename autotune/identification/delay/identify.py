@@ -6,7 +6,6 @@ output-error one their starred values are, reached from an instrumental-variable
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -27,6 +26,7 @@ from autotune.identification.delay.output_error import (
 from autotune.identification.delay.profile import profile
 from autotune.identification.delay.search import binned, scan, search
 from autotune.models import Hold
+from autotune.progress import Progress, quiet
 from autotune.recording import Recording
 
 _MIDDLE_BINS = 6000
@@ -58,7 +58,7 @@ def identify_delay(
     coloured: bool = True,
     skip_missing: bool = False,
     start: DelayModel | None = None,
-    progress: Callable[[str], None] | None = None,
+    progress: Progress = quiet,
 ) -> DelayModel:
     """Estimate coefficients, gain, delay, operating point and initial state, with their covariance.
 
@@ -88,7 +88,7 @@ def identify_delay(
     start : DelayModel, optional
         A model to begin with instead of the search, as when a window of a record follows another.
     progress : callable, optional
-        Called with what is done next.
+        Told what is being done and the share done.
 
     Returns
     -------
@@ -115,7 +115,6 @@ def identify_delay(
     F. Ollivier, S. Moutaouakil, B. Sadik, Une methode d'identification pour un systeme lineaire a retards, 2007,
     section 3 and Table 1.
     """
-    say = progress if progress is not None else lambda _: None
     if not 1 <= order <= MAX_ORDER:
         raise InputError(f"order {order}", where="order", remedy=f"orders 1 to {MAX_ORDER} are supported")
     structure = Structure(order=order, integrator=integrator, offset=offset)
@@ -128,15 +127,15 @@ def identify_delay(
     if start is not None:
         near = Point(a=start.a, h=start.delay_s, theta=np.zeros(2 + order), cost=np.inf, rows=0)
         return _polish_on_all_rows(data, data, structure, near, largest, coloured)
-    say("searching the delay")
+    progress("searching the delay", 0.0)
     candidates = search(data, structure, max_delay_s=largest)
     finest = min(c.rows_per_bin for c in candidates)
     middle = binned(data, max(_MIDDLE_BINS, 10 * data.ty.size // finest))
     best = _best_on_common_rows(middle, structure, [c.point for c in candidates], largest)
     if _doubtful(middle, structure, best):
-        say("comparing delays")
+        progress("comparing delays", 0.6)
         best = scan(binned(middle, _SCANNED_BINS), structure, best, max_delay_s=largest)
-    say("fitting")
+    progress("fitting", 0.8)
     return _polish_on_all_rows(data, middle, structure, best, largest, coloured)
 
 

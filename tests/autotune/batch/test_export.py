@@ -67,7 +67,8 @@ def test_files_that_follow_in_time_are_one_record(tmp_path):
 def test_a_csv_export_turned_into_parquet_says_the_same(tmp_path):
     loop, shares = german_loop(tmp_path), []
     out = tmp_path / "export.parquet"
-    to_parquet(tmp_path / "export.csv", out, ["TIC1.PV", "TIC1.PV.Q", "TIC1.OP", "elsewhere"], AS_GERMAN, shares.append)
+    wanted = ["TIC1.PV", "TIC1.PV.Q", "TIC1.OP", "elsewhere"]
+    to_parquet(tmp_path / "export.csv", out, wanted, AS_GERMAN, lambda _, share: shares.append(share))
     assert columns_of(out, AS_GERMAN) == ["Zeit", "TIC1.PV", "TIC1.PV.Q", "TIC1.OP"]
     direct, _ = read_export(loop, AS_GERMAN)
     prepared, _ = read_export(loop, AS_GERMAN, [out])

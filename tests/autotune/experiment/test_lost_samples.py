@@ -12,7 +12,7 @@ import pytest
 
 from autotune.errors import LinkError
 from autotune.experiment.relay import RelaySettings, RelayState, relay_step
-from autotune.experiment.result import ExperimentResult, Progress
+from autotune.experiment.result import ExperimentResult, Status
 from autotune.experiment.rig import Reading
 from autotune.experiment.run import run_experiment
 from autotune.recording import read_recording
@@ -82,10 +82,10 @@ def test_an_average_looks_back_over_time_and_not_over_rows() -> None:
 def test_a_swing_that_is_left_while_samples_are_lost_is_the_links_and_not_the_actuators(tmp_path: Path) -> None:
     rig = BusyComputer(0.0)
 
-    def fall_asleep(progress: Progress) -> None:
+    def fall_asleep(progress: Status) -> None:
         if progress.message.startswith("point 2"):
             rig.share = 1.0
 
     rig.plant = FaultyPlant(rig.plant, [Fault(kind="inverted actuator", start_s=45.0, value=5.0)])
     with pytest.raises(LinkError, match=r"link too slow: \d+ % of the latest samples were missed, and y"):
-        run_experiment(rig, ball_config(), tmp_path / "asleep.csv", on_progress=fall_asleep)
+        run_experiment(rig, ball_config(), tmp_path / "asleep.csv", on_status=fall_asleep)

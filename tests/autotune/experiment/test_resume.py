@@ -11,7 +11,7 @@ import pytest
 
 from autotune.errors import InputError, OperatorStop
 from autotune.experiment.cycles import Earlier, read_earlier
-from autotune.experiment.result import ExperimentResult, Progress
+from autotune.experiment.result import ExperimentResult, Status
 from autotune.experiment.run import run_experiment
 from autotune.points import FrequencyPoint
 from autotune.recording import read_recording
@@ -28,11 +28,11 @@ def kill_in_the_third_setting(progress):
     if len(progress.points) == 2:
         os.kill(os.getpid(), signal.SIGKILL)
 
-run_experiment(ball_rig(seed=7), ball_config(), sys.argv[1], on_progress=kill_in_the_third_setting)
+run_experiment(ball_rig(seed=7), ball_config(), sys.argv[1], on_status=kill_in_the_third_setting)
 """
 
 
-def stop_in_the_third_setting(progress: Progress) -> None:
+def stop_in_the_third_setting(progress: Status) -> None:
     if len(progress.points) == 2:
         raise OperatorStop("stopped by the test", remedy="resume")
 
@@ -124,7 +124,7 @@ def test_a_complete_sweep_needs_no_rig(resumed: tuple[ExperimentResult, Earlier]
 def test_a_rig_that_still_moves_is_waited_for(tmp_path: Path) -> None:
     rig = ball_rig(seed=3)
     with pytest.raises(OperatorStop):
-        run_experiment(rig, ball_config(), tmp_path / "recording.csv", on_progress=stop_in_the_third_setting)
+        run_experiment(rig, ball_config(), tmp_path / "recording.csv", on_status=stop_in_the_third_setting)
     # the turbine is off, and the ball is still on its way down
     earlier = read_earlier([tmp_path / "recording.csv"], SAMPLE_S)
     result = run_experiment(rig, ball_config(), tmp_path / "recording-2.csv", earlier=earlier)

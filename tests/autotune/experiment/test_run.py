@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from autotune.errors import ExperimentStopped, LinkError
-from autotune.experiment.result import ExperimentResult, Progress, State
+from autotune.experiment.result import ExperimentResult, State, Status
 from autotune.experiment.rig import Reading
 from autotune.experiment.run import float_on, run_experiment
 from autotune.recording import read_recording
@@ -23,14 +23,14 @@ from tests.autotune.experiment.rigs import CONFIG, ball_config, ball_rig, open_l
 
 
 @pytest.fixture(scope="module")
-def finished(tmp_path_factory: pytest.TempPathFactory) -> tuple[ExperimentResult, SimulatedRig, Path, list[Progress]]:
+def finished(tmp_path_factory: pytest.TempPathFactory) -> tuple[ExperimentResult, SimulatedRig, Path, list[Status]]:
     recording = tmp_path_factory.mktemp("run") / "recording.csv"
     rig = ball_rig(seed=7)
-    told: list[Progress] = []
-    return run_experiment(rig, ball_config(), recording, on_progress=told.append), rig, recording, told
+    told: list[Status] = []
+    return run_experiment(rig, ball_config(), recording, on_status=told.append), rig, recording, told
 
 
-Finished = tuple[ExperimentResult, SimulatedRig, Path, list[Progress]]
+Finished = tuple[ExperimentResult, SimulatedRig, Path, list[Status]]
 
 
 def test_five_points_in_the_wanted_range_within_their_regions(finished: Finished) -> None:
@@ -221,7 +221,7 @@ def wait(progress):
 
 rig = SimulatedRig(make_ball(seed=1), u_safe=0.0)
 try:
-    run_experiment(rig, load_config(sys.argv[1]), sys.argv[2], on_progress=wait)
+    run_experiment(rig, load_config(sys.argv[1]), sys.argv[2], on_status=wait)
 except AutotuneError as error:
     print(error, rig.command, flush=True)
     sys.exit(error.exit_status)

@@ -8,7 +8,7 @@ import pytest
 
 from autotune.errors import ExperimentStopped
 from autotune.experiment.relay import RelaySettings
-from autotune.experiment.result import Progress, State
+from autotune.experiment.result import State, Status
 from autotune.live.charts import bode_options, regions_options, strip_options
 from autotune.live.controls import Controls
 from autotune.live.story import Story
@@ -23,9 +23,9 @@ RELAY = RelaySettings(
 )
 
 
-def progress(elapsed_s: float, **content: object) -> Progress:
+def progress(elapsed_s: float, **content: object) -> Status:
     given = {"state": State.SWEEP, "elapsed_s": elapsed_s, "remaining_s": 40.0, "message": "point 2 of 5"} | content
-    return Progress(**given)  # type: ignore[arg-type]
+    return Status(**given)  # type: ignore[arg-type]
 
 
 def test_a_line_counts_once_it_has_ended(tmp_path: Path) -> None:
