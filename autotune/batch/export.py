@@ -78,7 +78,7 @@ def _signals(table: Table, loop: LoopSettings, export: ExportSettings) -> Signal
 
 
 def _roles(table: Table, loop: LoopSettings, export: ExportSettings) -> Roles:
-    """Return the columns that the loop names; the others as they are found out, where no doubt is left."""
+    """Return the columns that the loop names; the others as they are found out, where only one choice fits."""
     r = loop.r or ("r" if "r" in table.names else "")
     usual = {"u": "u", "y": "y"}
     said = {key: getattr(loop, key) for key in ("u", "y") if getattr(loop, key) != usual[key] or key in table.names}

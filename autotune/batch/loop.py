@@ -79,7 +79,7 @@ class Row:
     nominal, retuned, extended, noise_floor : float
         Simulation error on held-out rows over the spread of y.
     notes : str
-        What was corrected, left out or doubtful.
+        What was corrected, left out or uncertain.
     """
 
     loop: str

@@ -24,7 +24,7 @@ from autotune.errors import AutotuneError, ExperimentStopped, InputError, Operat
 from autotune.outputs import unwritable
 from autotune.text_files import printable, reason
 
-#: parameters of the commands that name where results go, the most telling first
+#: parameters of the commands that name where results go, the most specific first
 _PLACES = ("out", "resume")
 #: most files that a message names
 _MOST_NAMES = 6

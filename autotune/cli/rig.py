@@ -101,8 +101,8 @@ def _print_verdict(console: Console, what: str, warnings: Mapping[str, Sequence[
     for name, said in warnings.items():
         for warning in said:
             console.print(f"{name}: {warning}", markup=False)
-    doubtful = [name for name, said in warnings.items() if said]
-    verdict = f"{', '.join(doubtful)} look implausible" if doubtful else "all values are plausible"
+    implausible = [name for name, said in warnings.items() if said]
+    verdict = f"{', '.join(implausible)} look implausible" if implausible else "all values are plausible"
     console.print(f"{what} read, nothing written: {verdict}", markup=False)
 
 

@@ -120,7 +120,7 @@ def from_function(
     name : str
         What it is.
     spread : float
-        Relative standard deviation of what is believed of the parameters.
+        Relative prior standard deviation of the parameters.
 
     Returns
     -------

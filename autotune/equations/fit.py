@@ -1,7 +1,7 @@
 """Retuning: the parameters of a model, and of its extensions, that explain recordings best, beliefs counted.
 
 Gauss-Newton with Levenberg's damping on the readings' errors over the noise and on the parameters' distance from
-what is believed of them; the start states of all windows are eliminated by projection. A parameter with a nonzero
+the prior of them; the start states of all windows are eliminated by projection. A parameter with a nonzero
 value is sought on a logarithmic scale, so that it keeps its sign: ``p = value exp(spread z)`` with z standard normal.
 """
 
@@ -39,7 +39,7 @@ class Fitted:
     parameters, sd : (P,) arrays
         Estimates, and their standard deviations with the beliefs counted; 0 for what is not retuned.
     z : (P,) array
-        Distance from the nominal values in units of what is believed.
+        Distance from the nominal values in prior standard deviations.
     windows : tuple of Windows
         Start states, one entry per recording.
     simulated : tuple of (N,) array
@@ -87,7 +87,7 @@ def window_rows(t: FloatArray, horizon_s: float | None) -> tuple[IntArray, IntAr
 
 
 def values_of(compiled: Compiled, z: FloatArray) -> FloatArray:
-    """Return the parameters at distances z from their nominal values, in units of what is believed of them."""
+    """Return the parameters at distances z from their nominal values, in prior standard deviations."""
     value, spread = compiled.parameter_vector, np.array([p.spread for p in compiled.parameters])
     moved = np.where(_linear(compiled), value + spread * z, value * np.exp(np.clip(spread * z, -50.0, 50.0)))
     return np.asarray(np.where(spread > 0.0, moved, value), dtype=np.float64)

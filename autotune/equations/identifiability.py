@@ -1,8 +1,8 @@
 """Which combinations of parameters recordings determine, and which they do not: before anything is blamed.
 
-The sensitivity of the readings to the parameters, in units of the noise and of what is believed, start states
-projected out, has singular values s: along its right singular vector a recording narrows the belief from 1 to
-1/sqrt(1 + s^2). Where s is below 1, the recording says less than what was believed before.
+The sensitivity of the readings to the parameters, in units of the noise and of the prior standard deviations, start
+states projected out, has singular values s: along its right singular vector a recording narrows the belief from 1 to
+1/sqrt(1 + s^2). Where s is below 1, the recording says less than the prior.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class Combination:
     changes : tuple of float
         Relative change of each while the first changes by 1 (absolute where a nominal value is 0).
     narrowed : float
-        Standard deviation that is left along it, of what was believed: 1 where the recordings say nothing.
+        Standard deviation along it after the fit, over that of the prior: 1 where the recordings say nothing.
     """
 
     parameters: tuple[str, ...]

@@ -20,7 +20,7 @@ PortKind: TypeAlias = Literal["force", "torque", "flow", "heat"]
 InputKind: TypeAlias = Literal["", "force", "torque", "flow", "heat"]
 STATE_KINDS, PORT_KINDS, INPUT_KINDS = get_args(StateKind), get_args(PortKind), get_args(InputKind)
 
-#: Relative standard deviation of what is believed of a parameter whose file says nothing about it.
+#: Relative prior standard deviation of a parameter whose file says nothing about it.
 SPREAD = 0.3
 
 
@@ -80,7 +80,7 @@ class State:
 
 @dataclass(frozen=True, kw_only=True)
 class ModelParameter:
-    """A parameter with what is believed of it.
+    """A parameter with its prior.
 
     Attributes
     ----------
@@ -89,7 +89,7 @@ class ModelParameter:
     value : float
         Its nominal value.
     spread : float
-        Relative standard deviation of what is believed (absolute where the value is 0); 0: it is not retuned.
+        Relative prior standard deviation (absolute where the value is 0); 0: it is not retuned.
     linear: bool
         Whether it may change its sign: it is sought as ``value + spread z``, and the spread is absolute.
     """

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 ADD, SUB, MUL, DIV, NEG, SQUARE = 0, 1, 2, 3, 4, 5
-SELECT, CHOOSE = 6, 7  # by the mode of a located switch; by the sign of a register, on the spot
+SELECT, CHOOSE = 6, 7  # by the mode of a located switch; by the sign of a register, at once
 POW, EXP, LOG, SQRT = 8, 9, 10, 11
 SIN, COS, TAN, ASIN, ACOS, ATAN, ATAN2 = 12, 13, 14, 15, 16, 17, 18
 SINH, COSH, TANH = 19, 20, 21

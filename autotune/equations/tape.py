@@ -6,7 +6,7 @@ per simulation.
 
 Switched terms (``if sign abs min max``) become a choice between two registers. Where the condition depends on states
 or time the choice is a *mode* that the integrator holds fixed within a step and changes at the located crossing;
-else it is decided on the spot.
+else it is decided at once.
 """
 
 from __future__ import annotations
@@ -216,7 +216,7 @@ class _Translation:
         """Return the tape of everything."""
         slopes = [self._of(tree) for tree in self._added().values()]
         needed = len(self._tape.code)
-        self._locates = False  # what only outputs need is decided on the spot
+        self._locates = False  # what only outputs need is decided at once
         outputs = [self._of(self._reading), *(self._of(parse(text, "signal")) for text in signals)]
         return self._program(slopes, outputs, needed)
 

@@ -304,7 +304,7 @@ def find_midpoint(
     Returns
     -------
     known : Known
-        With mid-point, noise afloat and the first point.
+        With mid-point, noise at the operating point and the first point.
     oscillation : Oscillation
         The relay, running, for the sweep to go on with.
     """
@@ -337,7 +337,7 @@ def find_midpoint(
         sign_is_sure=seen,
     )
     _lead(oscillation, point.y, known)
-    loop.watch = Watch(y_centre=point.y, afloat=True)
+    loop.watch = Watch(y_centre=point.y, in_range=True)
     return _balance(oscillation, known, tell), oscillation
 
 

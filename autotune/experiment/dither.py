@@ -22,7 +22,7 @@ from autotune.experiment.limits import Watch
 from autotune.experiment.loop import ControlLoop
 from autotune.experiment.result import State, Status
 from autotune.experiment.rig import HoldsGains, Rig
-from autotune.experiment.run import OnStatus, envelope_of, float_on, recording_metadata, wait_for_rest
+from autotune.experiment.run import OnStatus, bring_to_operating_point, envelope_of, recording_metadata, wait_for_rest
 from autotune.experiment.verify import law_for
 from autotune.recording import RecordingWriter
 
@@ -157,7 +157,7 @@ def run_dither(
         largest = LARGEST_SHARE * room if amplitude is None else amplitude
         law = law_for(controller, limits, dt_s, largest)
         state = law.initial(u_hold, centre, centre)
-        loop.watch = Watch(y_centre=centre, afloat=True)
+        loop.watch = Watch(y_centre=centre, in_range=True)
         state = _settle(loop, law, state, centre, math.ceil(_SETTLE * rows))
         pattern = random_dwells(rows, longest, seed, shortest)
         now, departure, worst = _FIRST * room if amplitude is None else amplitude, 0.0, 0.0
@@ -225,5 +225,5 @@ def _bring_to_operating_point(loop: ControlLoop, config: Config) -> float:
     """Return the command that holds the plant there: measured on the way, or what the rig applies now."""
     if config.operating_point.approach == "ramp":
         wait_for_rest(loop)
-        return float_on(loop, config).midpoint
+        return bring_to_operating_point(loop, config).midpoint
     return loop.tick.u

@@ -152,7 +152,7 @@ def run_excitation(
         drive = _Drive(loop, config, u_hold, excitation.amplitude if excitation.on == "command" else 0.0)
         drive.settle(excitation.hold_s)
         # until here a plant that was left at its safe output may still have been on its way
-        loop.watch = Watch(y_centre=config.operating_point.y, afloat=True)
+        loop.watch = Watch(y_centre=config.operating_point.y, in_range=True)
         start_s, share, alarmed_s = loop.tick.t_s, 1.0, -math.inf
         for k, wanted in enumerate(pattern):
             tick = loop.tick

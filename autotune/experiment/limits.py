@@ -21,12 +21,12 @@ class Watch:
     ----------
     y_centre : float or None
         Operating point that the swing is counted from [y unit]; None while the rig is on its way to it.
-    afloat : bool
+    in_range : bool
         Whether y_min and y_max apply.
     """
 
     y_centre: float | None = None
-    afloat: bool = False
+    in_range: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -123,7 +123,7 @@ class Envelope:
         y = median(recent)
         limits = self.settings
         slack = noise if len(recent) > 1 else 0.0
-        if watch.afloat and not limits.y_min - slack <= y <= limits.y_max + slack:
+        if watch.in_range and not limits.y_min - slack <= y <= limits.y_max + slack:
             raise ExperimentStopped(
                 f"limit reached: y = {y:.4g} is outside y_min..y_max = {limits.y_min:g}..{limits.y_max:g}",
                 remedy="look for a load on the rig, or widen limits.y_min..y_max if the rig stands it",

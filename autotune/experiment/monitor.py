@@ -93,7 +93,7 @@ class ReadingMonitor:
         if not math.isfinite(reading.y):
             return "the sensor answers not a number"
         if reading.suspect:
-            return "the link answers doubtfully"
+            return "the link answers unreliably"
         # compared with the median, so that one wild reading that was let through does not make the next good one wild
         if self.recent and abs(reading.y - median(self.recent)) > self.jump + 2.0 * self.noise:
             return f"the sensor jumps from {median(self.recent):.4g} to {reading.y:.4g}"

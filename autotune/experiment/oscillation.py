@@ -222,8 +222,8 @@ class Oscillation:
         error = abs(y - self.settings.y_centre)
         if math.isnan(self._first_error):
             self._first_error = error
-        doubtful = not self._sign_is_sure and self._state.switches == 0
-        if doubtful and error - self._first_error > 0.5 * self.loop.envelope.settings.swing:
+        sign_unknown = not self._sign_is_sure and self._state.switches == 0
+        if sign_unknown and error - self._first_error > 0.5 * self.loop.envelope.settings.swing:
             raise ExperimentStopped(
                 f"wrong sign: y = {y:.4g} moves away from {self.settings.y_centre:.4g} under the command that"
                 " should bring it back",

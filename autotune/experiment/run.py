@@ -21,7 +21,7 @@ from autotune.experiment.loop import ControlLoop, Timing
 from autotune.experiment.relay import RelaySettings
 from autotune.experiment.result import ExperimentResult, Part, Segment, State, Status
 from autotune.experiment.rig import Rig, RunsLaws, ShowsOutput
-from autotune.experiment.sweep import doubts, missing_phases, sweep
+from autotune.experiment.sweep import missing_phases, sweep, sweep_warnings
 from autotune.recording import RecordingWriter
 
 #: rows whose mean is compared with that of as many rows before, to see whether y stands still
@@ -135,7 +135,7 @@ def experiment_on(
     )
     journal.enter(State.HAND_BACK)
     journal.show("all points measured", 0.0, known)
-    loop.watch = Watch(afloat=True)
+    loop.watch = Watch(in_range=True)
     result = _result(segments, wanted, (*earlier.parts, part), loop.timing, known)
     loop.step(loop.nearest(result.u_rest))
     return result
@@ -171,7 +171,7 @@ def wait_for_rest(loop: ControlLoop) -> None:
     )
 
 
-def float_on(loop: ControlLoop, config: Config, *, u_rest: float | None = None) -> Known:
+def bring_to_operating_point(loop: ControlLoop, config: Config, *, u_rest: float | None = None) -> Known:
     """Bring the plant from rest to its operating point on an open loop: for a verification after an experiment.
 
     Parameters
@@ -216,7 +216,7 @@ def _result(
         sweep_time_s=sum(part.sweep_time_s for part in parts),
         parts=parts,
         reason="completed",
-        warnings=(*doubts(segments, wanted, known.link_rad_s), *_missed(timing)),
+        warnings=(*sweep_warnings(segments, wanted, known.link_rad_s), *_missed(timing)),
     )
 
 

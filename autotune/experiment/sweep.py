@@ -73,7 +73,7 @@ def sweep(
             known,
             points=tuple(one.point for one in segments),
             swept=True,
-            warnings=doubts(segments, wanted, known.link_rad_s),
+            warnings=sweep_warnings(segments, wanted, known.link_rad_s),
         )
     loop.note(first_move_s=known.first_move_s)
     for i, target in enumerate(targets):
@@ -111,7 +111,7 @@ def sweep(
             noise_sd=segment.noise_sd,
             points=(*(known.points if known.swept else ()), segment.point),
             swept=True,
-            warnings=doubts(segments, wanted, known.link_rad_s),
+            warnings=sweep_warnings(segments, wanted, known.link_rad_s),
         )
 
     def rows(number: int) -> Rows:
@@ -128,7 +128,7 @@ def missing_phases(wanted: ExperimentSettings, earlier: Earlier) -> tuple[float,
     return tuple(phase for phase in targets if not any(math.isclose(phase, other) for other in done))
 
 
-def doubts(segments: Sequence[Segment], experiment: ExperimentSettings, link_rad_s: float) -> tuple[str, ...]:
+def sweep_warnings(segments: Sequence[Segment], experiment: ExperimentSettings, link_rad_s: float) -> tuple[str, ...]:
     """Return what the reader should know of points not as good as was wanted, or beyond what the link supports."""
     wanted = experiment.gain_sd
     sds = [math.sqrt(float(np.trace(one.point.covariance)) / 2.0) / one.point.gain for one in segments]

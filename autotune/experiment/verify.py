@@ -26,8 +26,8 @@ from autotune.experiment.result import State, Status
 from autotune.experiment.rig import Exchanges, Rig, RunsLaws
 from autotune.experiment.run import (
     OnStatus,
+    bring_to_operating_point,
     envelope_of,
-    float_on,
     further_columns,
     recording_metadata,
     wait_for_rest,
@@ -108,7 +108,7 @@ class Verification:
         Measured departure from the operating point [y unit]; the law's command [u unit].
     prediction : Prediction
         What was expected.
-    misfit, allowed : float
+    rms_error, allowed : float
         Root mean square of measured less predicted, both smoothed, and the largest that prediction and noise explain
         [y unit].
     measured, predicted : StepFigures
@@ -123,7 +123,7 @@ class Verification:
     y: FloatArray
     u: FloatArray
     prediction: Prediction
-    misfit: float
+    rms_error: float
     allowed: float
     measured: StepFigures
     predicted: StepFigures
@@ -208,7 +208,7 @@ def run_test(
     ExperimentStopped
         From the loop: the new controller took the rig to a limit.
     """
-    loop.watch = Watch(y_centre=operating_y, afloat=True)
+    loop.watch = Watch(y_centre=operating_y, in_range=True)
     count = test.settle + test.t.size
     setpoint = operating_y + np.concatenate([np.zeros(test.settle), test.setpoint])
     load = np.concatenate([np.zeros(test.settle), test.disturbance])
@@ -308,7 +308,7 @@ def run_verification(
         loop.metadata["controller"] = {"kind": controller.kind, "K": controller.K, "Ti_s": controller.Ti_s}
         if config.operating_point.approach == "ramp":
             wait_for_rest(loop)
-        known = float_on(loop, config, u_rest=u_rest)
+        known = bring_to_operating_point(loop, config, u_rest=u_rest)
         loop.note(test_start_s=loop.tick.t_s)
         y, u = run_test(loop, law, test, config.operating_point.y, known.midpoint, on_status)
     return judge(test, y, u, law, fit, known.noise_sd if noise_sd is None else noise_sd)
@@ -344,7 +344,7 @@ def judge(
     Returns
     -------
     Verification
-        Accepted where the misfit is within what drawn plants and noise give in 99 % of cases, widened by 15 % of the
+        Accepted where the rms error is within what drawn plants and noise give in 99 % of cases, widened by 15 % of the
         predicted response's rms for dynamics that the fitted structure leaves out.
     """
     rng = np.random.default_rng(seed)
@@ -353,16 +353,16 @@ def judge(
     expected = smoothed(prediction.y, test)
     measured = smoothed(np.where(usable, y, np.interp(test.t, test.t[usable], y[usable])), test)
     draws = [smoothed(draw, test) for draw in prediction.y_draws]
-    misfit = _rms(measured - expected)
+    rms_error = _rms(measured - expected)
     explained = float(np.quantile([_rms(draw - expected) for draw in draws], 0.99))
     # the response counts from the set-point, where the loop is to bring it
     allowed = math.hypot(explained, TOLERANCE * _rms(expected - test.setpoint))
-    accepted = misfit <= allowed
+    accepted = rms_error <= allowed
     drawn = [_figures(test, draw) for draw in draws]
     reason = (
-        f"the loop behaves as predicted: rms misfit {misfit:.3g}, up to {allowed:.3g} is explained"
+        f"the loop behaves as predicted: rms error {rms_error:.3g}, up to {allowed:.3g} is explained"
         if accepted
-        else f"the loop does not behave as predicted: rms misfit {misfit:.3g}, only {allowed:.3g} is explained"
+        else f"the loop does not behave as predicted: rms error {rms_error:.3g}, only {allowed:.3g} is explained"
     )
     return Verification(
         accepted=accepted,
@@ -371,7 +371,7 @@ def judge(
         y=y,
         u=u,
         prediction=prediction,
-        misfit=misfit,
+        rms_error=rms_error,
         allowed=allowed,
         measured=_figures(test, measured),
         predicted=_over(drawn, np.nanmean),

@@ -141,7 +141,7 @@ def _of_din(table: Table, numeric: Sequence[str], named: Mapping[str, str]) -> t
 
 
 def _time(table: Table, taken: set[str]) -> tuple[tuple[str, ...], bool]:
-    """Return the columns of the stamp and whether there is no doubt about them."""
+    """Return the columns of the stamp and whether only one choice fits."""
     free = [name for name in table.names if name not in taken]
     named = [name for name in free if _words(name, table) & _TIME and _form(table, name) is not None]
     stamps = [name for name in free if (form := _form(table, name)) is not None and form.pattern is not None]

@@ -116,6 +116,6 @@ def verification_json(verification: Verification) -> dict[str, Any]:
     return {
         "accepted": verification.accepted,
         "reason": verification.reason,
-        "predicted": asdict(verification.predicted) | {"misfit_allowed": verification.allowed},
-        "measured": asdict(verification.measured) | {"misfit": verification.misfit},
+        "predicted": asdict(verification.predicted) | {"rms_error_allowed": verification.allowed},
+        "measured": asdict(verification.measured) | {"rms_error": verification.rms_error},
     }

@@ -87,7 +87,7 @@ def _known(found: EquationDiagnosis) -> Section:
         for one in combinations(found.searched.retuned.fitted)
     )
     table = Table(header=("moves together", "left of the belief's width", "relative changes"), rows=rows)
-    text = "Combinations of parameters, the least determined first: 100 % is what was believed before the recordings."
+    text = "Combinations of parameters, the least determined first: 100 % is what the model file states."
     return Section(title="What the recordings determine", text=(text,), tables=(table,) if rows else ())
 
 

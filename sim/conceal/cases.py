@@ -13,12 +13,12 @@ from sim.conceal.draw import Draw, RejectedError, draw
 from sim.conceal.effects import PROCESS
 from sim.conceal.physics import Floats, Physics
 from sim.conceal.record import Record, record, scale_of, sized_effects
-from sim.conceal.retune import Chain, forecast_error, misfit, retune
+from sim.conceal.retune import Chain, forecast_error, residuals, retune
 from sim.conceal.rigs import linear_truth, model_file
 from sim.conceal.sizes import Scale, Sized
 
 FILES = ("rec1", "rec2", "unseen")
-#: Bands of the retuned structure's misfit over the noise.
+#: Bands of the retuned structure's rms residual over the noise.
 STRENGTHS = {"weak": (1.025, 1.06), "medium": (1.08, 1.25), "strong": (1.45, 3.0)}
 LAW_SIZES = {"weak": 0.5, "medium": 1.0, "strong": 2.5}
 NUISANCE = ["actuator.offset", "environment.step_load"]
@@ -26,7 +26,7 @@ ACTS_AT_TIMES = ("plant.hard_stop", "actuator.saturation")
 
 
 def retuned_ratio(d: Draw, sizes: tuple[float, ...], scale: Scale) -> tuple[float, Chain]:
-    """Misfit of the retuned structure over the noise, and that structure."""
+    """Rms residual of the retuned structure over the noise, and that structure."""
     physics, made = sized_effects(d, sizes, scale)
     records = [record(d, which, physics, made) for which in (0, 1)]
     window = round(2.0 * d.rig.horizon / d.rig.Ts)
@@ -35,7 +35,7 @@ def retuned_ratio(d: Draw, sizes: tuple[float, ...], scale: Scale) -> tuple[floa
 
 
 def search_size(d: Draw, scale: Scale, low: float, high: float) -> float:
-    """Size of a single effect at which the retuned misfit lies in the band."""
+    """Size of a single effect at which the retuned rms residual lies in the band."""
     target = float(np.exp(d.stream(5).uniform(np.log(low), np.log(high))))
     size, below, above = 1.0, 0.0, np.inf
     for _ in range(12):
@@ -120,7 +120,7 @@ def _answer(d: Draw, records: list[Record], physics: Physics, made: tuple[Sized,
     window = round(2.0 * d.rig.horizon / d.rig.Ts)
     train = [(r.u, r.y) for r in records[:2]]
     retuned, rms = retune(d.rig.chain, train, d.rig.Ts, window)
-    nominal = np.concatenate([misfit(d.rig.chain, u, y, d.rig.Ts, window) for u, y in train])
+    nominal = np.concatenate([residuals(d.rig.chain, u, y, d.rig.Ts, window) for u, y in train])
     nominal_ratio = float(np.sqrt(np.mean(nominal**2))) / d.rig.noise_sd
     if d.kind == "parameters" and nominal_ratio < 1.15:
         raise RejectedError("the numbers are wrong by less than shows")

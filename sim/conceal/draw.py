@@ -10,7 +10,7 @@ from sim.conceal import excitation as excite
 from sim.conceal.effects import BALL, EFFECTS, LOOPS, PROCESS, SERVO, Effect
 from sim.conceal.excitation import EXCITATIONS, Excitation
 from sim.conceal.physics import Floats, Physics
-from sim.conceal.rigs import Believed, believed, truth
+from sim.conceal.rigs import NominalRig, nominal_rig, truth
 
 KINDS = {"exact": 0.06, "coloured": 0.04, "parameters": 0.1, "single": 0.54, "double": 0.14, "outside": 0.12}
 RIGS = {BALL: 0.5, SERVO: 0.25, PROCESS: 0.25}
@@ -31,7 +31,7 @@ class Draw:
     attempt: int
     kind: str
     strength: str | None
-    rig: Believed
+    rig: NominalRig
     physics: Physics
     rho: float
     offset: bool
@@ -60,7 +60,7 @@ def draw(seed: int, attempt: int) -> Draw:
         rig_name
     ]
     variant = next((e.variant for e in effects if e.variant), variant)
-    rig = believed(rng, rig_name, variant)
+    rig = nominal_rig(rng, rig_name, variant)
     clean = kind in ("exact", "coloured")
     offset = bool(effects) and rig_name in LOOPS and rng.random() < 0.4 and effects[0].name != "actuator.offset"
     physics = truth(rng, rig, clean or (kind != "parameters" and rng.random() < 0.3), offset)
@@ -116,7 +116,7 @@ def _one(rng: np.random.Generator, effects: list[Effect]) -> Effect:
     return effects[int(rng.integers(len(effects)))]
 
 
-def _excitation(rng: np.random.Generator, rig: Believed, name: str, t: Floats) -> Excitation:
+def _excitation(rng: np.random.Generator, rig: NominalRig, name: str, t: Floats) -> Excitation:
     if rig.rig == BALL:
         return excite.ball(rng, name, t, rig.Ts)
     if rig.rig == SERVO:

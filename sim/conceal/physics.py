@@ -37,7 +37,7 @@ class Physics(NamedTuple):
     command_offset: float = 0.0
     command_second_order: float = 0.0
     command_quantum: float = 0.0
-    quantum_origin: float = 0.0  # deviation through which the lattice passes
+    quantum_origin: float = 0.0  # deviation at which one of its levels lies
     dead_zone: float = 0.0
     backlash: float = 0.0
     stiction: float = 0.0

@@ -1,7 +1,7 @@
 """How well the nominal structure does once its numbers are refitted: what strength is measured against.
 
-The misfit is that of free runs over windows of two horizons, the state at each window's start free; the forecast of
-the unseen recording starts every horizon from the state fitted to the two horizons before.
+The residuals are those of free runs over windows of two horizons, the state at each window's start free; the forecast
+of the unseen recording starts every horizon from the state fitted to the two horizons before.
 """
 
 from __future__ import annotations
@@ -130,7 +130,7 @@ def _powers(A: Floats, c: Floats, length: int) -> Floats:
     return out
 
 
-def misfit(chain: Chain, u: Floats, y: Floats, Ts: float, window: int) -> Floats:
+def residuals(chain: Chain, u: Floats, y: Floats, Ts: float, window: int) -> Floats:
     """Residuals of free runs over whole windows, each window's starting state fitted."""
     steps = discretise(chain, Ts)
     count = len(y) // window
@@ -142,7 +142,7 @@ def misfit(chain: Chain, u: Floats, y: Floats, Ts: float, window: int) -> Floats
 
 
 def degrees_lost(chain: Chain, window: int) -> float:
-    """Factor that makes the misfit of white noise its standard deviation."""
+    """Factor that makes the rms residual of white noise its standard deviation."""
     n = 2 + int(chain.integrating) + int(chain.tau_sensor > 0.0)
     return float(np.sqrt(window / (window - n)))
 
@@ -161,14 +161,14 @@ def retune(
 ) -> tuple[Chain, float]:
     """Refit gain, lags, delay (each within a factor of two) and one offset by damped, projected Gauss-Newton.
 
-    Returns the refitted chain and its rms misfit.
+    Returns the refitted chain and its rms residual.
     """
     count = 4 if nominal.integrating else 5
     bound = np.full(5, np.log(2.0))
     bound[3] = 10.0 * float(np.std(records[0][0 if nominal.integrating else 1]))
 
     def residual(d: Floats) -> Floats:
-        return np.concatenate([misfit(_moved(nominal, d), u, y, Ts, window) for u, y in records])
+        return np.concatenate([residuals(_moved(nominal, d), u, y, Ts, window) for u, y in records])
 
     at, damping = np.zeros(5), 1e-3
     e = residual(at)

@@ -1,4 +1,4 @@
-"""The three rigs as a person believes them to be and as they are."""
+"""The three rigs as their models say and as they are."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from sim.conceal.retune import Chain
 
 
 @dataclass(frozen=True, kw_only=True)
-class Believed:
+class NominalRig:
     """Nominal rig: its chain, its words, and how it is recorded."""
 
     rig: str
@@ -32,7 +32,7 @@ class Believed:
     noise_sd: float
 
 
-def believed(rng: np.random.Generator, rig: str, variant: str) -> Believed:
+def nominal_rig(rng: np.random.Generator, rig: str, variant: str) -> NominalRig:
     """Draw a nominal rig of one family."""
     if rig == BALL:
         Ts = float(rng.choice([0.01, 0.02]))
@@ -47,7 +47,7 @@ def believed(rng: np.random.Generator, rig: str, variant: str) -> Believed:
             y_offset=5.0,
         )
         rows = int(rng.integers(4200, 5600)) if Ts == 0.01 else 3000
-        return Believed(
+        return NominalRig(
             rig=rig,
             variant="",
             name="ball in tube",
@@ -76,7 +76,7 @@ def believed(rng: np.random.Generator, rig: str, variant: str) -> Believed:
             u_offset=0.0,
             y_offset=0.0,
         )
-        return Believed(
+        return NominalRig(
             rig=rig,
             variant=variant,
             name="position servo",
@@ -104,7 +104,7 @@ def believed(rng: np.random.Generator, rig: str, variant: str) -> Believed:
         y_offset=160.0 if thermal else 50.0,
     )
     Ts = float(rng.choice([0.5, 1.0]))
-    return Believed(
+    return NominalRig(
         rig=PROCESS,
         variant=variant,
         name="thermal process" if thermal else "level process",
@@ -122,8 +122,8 @@ def believed(rng: np.random.Generator, rig: str, variant: str) -> Believed:
     )
 
 
-def truth(rng: np.random.Generator, rig: Believed, exact: bool, offset: bool) -> Physics:
-    """Draw the rig as it is: every number within 20 % of what is believed, the operating point shifted where asked."""
+def truth(rng: np.random.Generator, rig: NominalRig, exact: bool, offset: bool) -> Physics:
+    """Draw the rig as it is: every number within 20 % of its nominal value, the operating point shifted where asked."""
     chain = rig.chain
     factors = np.ones(5) if exact else rng.uniform(0.8, 1.2, 5)
     shift = {BALL: 0.03, SERVO: 0.07, PROCESS: 0.0}[rig.rig] * float(rng.uniform(-1.0, 1.0)) if offset else 0.0
@@ -153,7 +153,7 @@ def linear_truth(p: Physics) -> Chain:
     )
 
 
-def model_file(rig: Believed) -> str:
+def model_file(rig: NominalRig) -> str:
     """Nominal model in the project's model format."""
     chain = rig.chain
     actuator, body, position, sensor = rig.blocks

@@ -99,7 +99,7 @@ def gain_drift(a: float, p: Physics, s: Scale, rng: np.random.Generator) -> Size
 
 
 def command_quantum(a: float, p: Physics, s: Scale, rng: np.random.Generator) -> Sized:
-    """Conceal a converter's step; its lattice passes through the operating point or through zero."""
+    """Conceal a converter's step; one of its levels is the operating point or zero."""
     step = 0.5 * a * s.du
     origin = -p.u_offset if rng.random() < 0.5 else 0.0
     fields = {"command_quantum": step, "quantum_origin": origin}

@@ -108,7 +108,7 @@ def verified(accepted: bool) -> Any:
         figures: Any = None
         return Verification(
             accepted=accepted, reason="", test=curve, y=curve, u=curve, prediction=curve,
-            misfit=0.0, allowed=0.0, measured=figures, predicted=figures, predicted_sd=figures,
+            rms_error=0.0, allowed=0.0, measured=figures, predicted=figures, predicted_sd=figures,
         )  # fmt: skip
 
     return try_out

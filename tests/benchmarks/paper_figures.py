@@ -171,7 +171,7 @@ def run(rig: SimulatedRig, envelope: Envelope, contender: Contender, folder: Pat
     y, u = np.empty(setpoint.size), np.empty(setpoint.size)
     writer = RecordingWriter(folder / f"{len(list(folder.iterdir()))}.csv", ("t", "u", "y"))
     with ControlLoop(rig=rig, envelope=envelope, writer=writer) as loop:
-        loop.watch = Watch(y_centre=REST, afloat=True)
+        loop.watch = Watch(y_centre=REST, in_range=True)
         state = contender.law.initial(loop.tick.u, REST, REST)
         for k, r in enumerate(setpoint.tolist()):
             y[k] = rig.plant.y_true - REST

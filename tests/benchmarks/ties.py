@@ -1,6 +1,6 @@
 """Ties: how often one experiment of the tool's choosing decides what a first, gentle recording leaves open.
 
-The stage of ``autotune prove`` by itself, with what was believed before and after each experiment; the rigs are those
+The stage of ``autotune prove`` by itself, with what was probable before and after each experiment; the rigs are those
 of :mod:`sim.ties`.
 """
 
@@ -15,8 +15,8 @@ CASES, SEED = 18, 4000
 
 
 def main() -> None:
-    """Print every tie with what was believed before and after its experiment, and how many were decided rightly."""
-    print("| left out | believed first | experiment | believed after it |\n|---|---|---|---|")
+    """Print every tie with what was probable before and after its experiment, and how many were decided rightly."""
+    print("| left out | most probable first | experiment | most probable after it |\n|---|---|---|---|")
     ties = []
     with tempfile.TemporaryDirectory(prefix="autotune-ties-") as folder:
         for seed in range(SEED, SEED + CASES):

@@ -190,7 +190,7 @@ _LOST = (
     "connection was lost",
     "no connection",
     "link too slow",
-    "answers doubtfully",
+    "answers unreliably",
     "took the actuator back",
     "echoes heartbeat",
     "restarted",

@@ -53,7 +53,7 @@ class Bench:
     def oscillation(self, **changes: object) -> DeviceOscillation:
         given = {"midpoint": self.ball.ball.u_rest, "amplitude": 0.2, "hysteresis": 0.02, "delay_samples": 8.25}
         settings = RelaySettings(y_centre=5.0, plant_sign=-1, smoothing=10, **(given | changes))  # type: ignore[arg-type]
-        self.loop.watch = Watch(y_centre=5.0, afloat=True)
+        self.loop.watch = Watch(y_centre=5.0, in_range=True)
         before = Oscillation(self.loop, settings, patience_s=5.0)
         assert isinstance(self.rig, DeviceLawRig)
         return DeviceOscillation(self.rig, before)

@@ -12,7 +12,7 @@ from sim.conceal.cases import make, write
 from sim.conceal.effects import BY_NAME, EFFECTS, PROCESS, SERVO
 from sim.conceal.loop import OPEN_LOOP, Law, Sampling, run_loop
 from sim.conceal.physics import N_STATES, SPEED, Physics, command_static
-from sim.conceal.retune import Chain, discretise, forecast_error, misfit, retune
+from sim.conceal.retune import Chain, discretise, forecast_error, residuals, retune
 from sim.conceal.sizes import Scale
 
 SERVO_TRUTH = Physics(1.0, 50.0, 0.01, 0.2, 0.0, 0.0, 0.0, 0.0)
@@ -43,7 +43,7 @@ def test_without_effects_the_event_integrator_is_the_exact_linear_chain():
     rng = np.random.default_rng(0)
     u = 50.0 + np.repeat([0.0, *rng.uniform(-10, 10, 30)], 20)  # at rest until the delay has passed
     y = respond(OVEN_TRUTH, u, 1.0)[1]
-    e = misfit(chain_of(OVEN_TRUTH), u, y, 1.0, len(u))
+    e = residuals(chain_of(OVEN_TRUTH), u, y, 1.0, len(u))
     assert np.max(np.abs(e)) < 1e-5 * np.std(y)
 
 

@@ -206,7 +206,7 @@ def _direction(bench: Bench, base: Outcome, trial: Trial, basis: FloatArray) -> 
 
 
 def predicted(e: FloatArray, d: FloatArray, trial: Trial) -> tuple[float, float]:
-    """Return the decrease that a direction promises, and the factor of its amplitude; without one, of itself whole."""
+    """Return the decrease predicted along a direction, and the factor of its amplitude, or of the whole of it."""
     size = float(d @ d)
     if size <= 1e-12 * float(e @ e):
         return 0.0, 1.0

@@ -79,7 +79,7 @@ class Description:
     place : str
         Where the terms are added to the model: ``actuator``, ``plant`` or ``sensor``.
     terms : tuple of Term
-        The equation's terms, the most telling first; none where no simple function describes the residual.
+        The equation's terms, the most informative first; none where no simple function describes the residual.
     explained : float
         Share of the held-out residual above the noise that the equation takes away, 0 to 1.
     curve : Curve

@@ -86,13 +86,13 @@ def held_out_squares(result: Fit, data: Data, tuned: bool = True) -> FloatArray:
     problem.scales = result.sim.state_sizes(
         [r.u for r in data.recordings], [r.y[g] for r, g in zip(data.recordings, data.good, strict=True)]
     )
-    spot = problem.iterate(result.theta, [x.copy() for x in result.x0])
-    Jx = problem.jacobian(spot, np.zeros(result.theta.size, dtype=bool))[1]
+    start = problem.iterate(result.theta, [x.copy() for x in result.x0])
+    Jx = problem.jacobian(start, np.zeros(result.theta.size, dtype=bool))[1]
     J = result.jacobian[0] if tuned else np.zeros_like(result.jacobian[0])
     squares = np.zeros(STRETCHES)
     for k in range(STRETCHES):
         out = labels == k
-        there = _without(problem, spot, (J, Jx), out)
+        there = _without(problem, start, (J, Jx), out)
         squares[k] = float(there.e[out] @ there.e[out]) if there is not None else math.inf
     return squares * data.noise.sd**2
 

@@ -16,7 +16,7 @@ from autotune.diagnosis.fitting.fit import Fit, fit, residual_at, start_states
 from autotune.diagnosis.fitting.parameters import Parametrisation
 from autotune.diagnosis.thresholds import Thresholds
 
-#: Share of a window on which a start state is found first: before a blow has carried its error far away.
+#: Share of a window on which a start state is found first: before an impact has carried its error far away.
 BEGINNING = 4
 #: How far effects are moved at first: for a converter its step as a share of what takes it a level off across u's span,
 #: its origin as a share of the step; how often these are halved.

@@ -11,7 +11,7 @@ from autotune.identification.closed_loop.predictor_directions import Predictor
 from autotune.identification.closed_loop.predictor_sweep import normal_equations, scatter
 from autotune.identification.closed_loop.state_space import spectral_radius
 
-#: A step that promises less than this in -2 log likelihood moves no parameter by 3 % of its standard deviation.
+#: A step predicted to lower -2 log likelihood by less than this moves no parameter by 3 % of its standard deviation.
 _TOLERANCE = 1e-3
 #: A search that cannot move any more has converged if it could have gained less than this.
 _IMMATERIAL = 0.1
@@ -21,11 +21,11 @@ _RADIUS_LIMIT = 0.9999
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Ahead:
-    """Where one step leads: a better predictor, or None with the decrease of -2 log likelihood that was promised."""
+    """Where one step leads: a better predictor, or None with the decrease of -2 log likelihood that was predicted."""
 
     predictor: Predictor | None
     errors: FloatArray
-    promise: float
+    predicted: float
     damping: float
     converged: bool
 
@@ -42,32 +42,32 @@ def improved(
 ) -> Ahead:
     """Return the outcome of one Levenberg-Marquardt step, the damping raised until the step helps.
 
-    A search has converged where an undamped step promises less than the tolerance, or where the boundary is in the way
-    and no step gains more.
+    A search has converged where an undamped step is predicted to gain less than the tolerance, or where the boundary
+    is in the way and no step gains more.
     """
     bounded = False
     while True:
-        step, promise, damping = damped_step(information, gradient, damping)
+        step, predicted, damping = damped_step(information, gradient, damping)
         trial = predictor.moved(step, directions)
-        bent = _radius(trial) > _RADIUS_LIMIT
-        bounded = bounded or bent
-        if bent:
+        beyond = _radius(trial) > _RADIUS_LIMIT
+        bounded = bounded or beyond
+        if beyond:
             step = _onto_boundary(predictor, directions, information, step)
-            promise = -float(step @ (2.0 * gradient + information @ step))
+            predicted = -float(step @ (2.0 * gradient + information @ step))
             trial = predictor.moved(step, directions)
-        if promise < _TOLERANCE and not bent:
-            return Ahead(predictor=None, errors=errors, promise=promise, damping=damping, converged=True)
-        if promise >= _TOLERANCE and _radius(trial) <= _RADIUS_LIMIT:
+        if predicted < _TOLERANCE and not beyond:
+            return Ahead(predictor=None, errors=errors, predicted=predicted, damping=damping, converged=True)
+        if predicted >= _TOLERANCE and _radius(trial) <= _RADIUS_LIMIT:
             trial_errors = scatter(trial.F, trial.H, trial.x0, u, y)
             gain = len(y) * (log_determinant(errors) - log_determinant(trial_errors))
             if gain > _TOLERANCE:
                 return Ahead(
-                    predictor=trial, errors=trial_errors, promise=promise, damping=damping / 10.0, converged=False
+                    predictor=trial, errors=trial_errors, predicted=predicted, damping=damping / 10.0, converged=False
                 )
         damping *= 10.0
         if damping > 1e3:  # no step helps: rounding, or the best model on the boundary
-            converged = bounded or promise < _IMMATERIAL
-            return Ahead(predictor=None, errors=errors, promise=promise, damping=damping, converged=converged)
+            converged = bounded or predicted < _IMMATERIAL
+            return Ahead(predictor=None, errors=errors, predicted=predicted, damping=damping, converged=converged)
 
 
 def whitened_equations(
@@ -86,7 +86,7 @@ def whitened_equations(
 
 
 def damped_step(information: FloatArray, gradient: FloatArray, damping: float) -> tuple[FloatArray, float, float]:
-    """Return the damped Gauss-Newton step, the decrease of -2 log likelihood an undamped one promises, the damping.
+    """Return the damped Gauss-Newton step, the decrease of -2 log likelihood of an undamped one, the damping.
 
     A damping below the smallest eigenvalue (unit diagonal) does nothing: it is replaced by that eigenvalue for the
     next attempt.
@@ -122,7 +122,7 @@ def _radius_gradient(predictor: Predictor, directions: FloatArray) -> FloatArray
 def _onto_boundary(
     predictor: Predictor, directions: FloatArray, information: FloatArray, step: FloatArray
 ) -> FloatArray:
-    """Return the step bent back onto the stability boundary, the nearest way in the metric of the information.
+    """Return the step brought back onto the stability boundary, the nearest way in the metric of the information.
 
     Zeros of the noise model do lie there: a trend taken out, or an integrating plant with white noise on its sensor.
     """

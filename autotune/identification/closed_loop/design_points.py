@@ -39,7 +39,7 @@ def design_points(estimate: PredictionErrorEstimate, grid_rad_s: FloatArray) -> 
     -----
     A design takes points as independent. A model with 2 n numbers has a response that n complex values fix; more points
     of it would count the same data again. Among these few, errors still are correlated, which each region leaves out,
-    and so is the doubt about the order.
+    and so is the uncertainty of the order.
     """
     grid = np.asarray(grid_rad_s, dtype=np.float64)
     critical, _ = critical_frequency(grid, estimate.model.response(grid)[:, 0, 0], None)

@@ -59,7 +59,7 @@ class PredictionErrorEstimate:
     iterations : int
         Accepted steps.
     converged : bool
-        Whether the last step promised less than the tolerance.
+        Whether the decrease predicted for the last step was less than the tolerance.
     condition : float
         Condition number of the information matrix with unit diagonal; 1 where there is no noise.
     noise_free : bool
@@ -224,8 +224,8 @@ def _search(
         if converged or iterations == max_iterations:
             break
         ahead = improved(predictor, directions[:, :used], information, gradient, errors, u, y, damping)
-        if offset and not constant and ahead.promise < _NEAR:
-            gain = damped_step(total[:-1, :-1], total[:-1, -1], 0.0)[1] - ahead.promise
+        if offset and not constant and ahead.predicted < _NEAR:
+            gain = damped_step(total[:-1, :-1], total[:-1, -1], 0.0)[1] - ahead.predicted
             constant = gain > n_y * math.log(len(y))  # what the Bayesian criterion asks of n_y parameters
             if constant:
                 damping = 0.0

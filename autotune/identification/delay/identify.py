@@ -132,7 +132,7 @@ def identify_delay(
     finest = min(c.rows_per_bin for c in candidates)
     middle = binned(data, max(_MIDDLE_BINS, 10 * data.ty.size // finest))
     best = _best_on_common_rows(middle, structure, [c.point for c in candidates], largest)
-    if _doubtful(middle, structure, best):
+    if _is_ambiguous(middle, structure, best):
         progress("comparing delays", 0.6)
         best = scan(binned(middle, _SCANNED_BINS), structure, best, max_delay_s=largest)
     progress("fitting", 0.8)
@@ -178,7 +178,7 @@ def _best_on_common_rows(data: DelayData, structure: Structure, candidates: list
     return best
 
 
-def _doubtful(data: DelayData, structure: Structure, point: Point) -> bool:
+def _is_ambiguous(data: DelayData, structure: Structure, point: Point) -> bool:
     """Whether the point may not be the lowest minimum: something is left in the residual, or b is hardly determined."""
     usable = data.usable_from(point.h)
     here = solve_linear(usable, structure, point.a, point.h)

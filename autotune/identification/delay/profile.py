@@ -1,7 +1,7 @@
 """Likelihood intervals: how far each parameter may go, the others fitted again, before the record speaks against it.
 
 Where a record determines a combination of the parameters poorly, the valley of the sum of squares bends, or runs on to
-a pole or a delay that cancels, and the inverse information at the minimum promises more than the record holds. The
+a pole or a delay that cancels, and the inverse information at the minimum says more than the record holds. The
 intervals here follow the valley instead (Meeker & Escobar, Teaching about approximate confidence regions based on
 maximum likelihood estimation, The American Statistician 49, 1995).
 """

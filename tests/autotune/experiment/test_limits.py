@@ -61,13 +61,13 @@ def test_limits_on_y_apply_where_the_procedure_says() -> None:
     low = (0.5,) * 5
     envelope().check_measurement(low, Watch())
     with pytest.raises(ExperimentStopped, match=r"y_min\.\.y_max"):
-        envelope().check_measurement(low, Watch(afloat=True))
+        envelope().check_measurement(low, Watch(in_range=True))
     with pytest.raises(ExperimentStopped, match="swing"):
         envelope().check_measurement((8.5,) * 5, Watch(y_centre=5.0))
 
 
 def test_one_wild_reading_does_not_stop_but_three_of_five_do() -> None:
-    watch = Watch(y_centre=5.0, afloat=True)
+    watch = Watch(y_centre=5.0, in_range=True)
     envelope().check_measurement((5.0, 9.9, 5.0, 9.9, 5.0), watch)
     with pytest.raises(ExperimentStopped):
         envelope().check_measurement((5.0, 9.9, 9.9, 9.9, 5.0), watch)

@@ -150,7 +150,7 @@ def test_limits_on_y_stop_the_loop_where_they_are_watched(recording: Path) -> No
     loop = open_loop(ball_rig(), recording)
     go(loop, 0.0)  # on the floor, at 10 V, nothing is watched yet
     watched = open_loop(ball_rig(), recording.with_name("watched.csv"))
-    watched.watch = Watch(afloat=True)
+    watched.watch = Watch(in_range=True)
     with pytest.raises(ExperimentStopped, match="y_min"):
         go(watched, 0.0)
 

@@ -14,7 +14,7 @@ import pytest
 from autotune.errors import ExperimentStopped, LinkError
 from autotune.experiment.result import ExperimentResult, State, Status
 from autotune.experiment.rig import Reading
-from autotune.experiment.run import float_on, run_experiment
+from autotune.experiment.run import bring_to_operating_point, run_experiment
 from autotune.recording import read_recording
 from drivers.simulated import SimulatedRig
 from sim.ball import make_ball
@@ -102,7 +102,7 @@ def test_without_noise_the_points_are_exact(tmp_path: Path) -> None:
 def test_a_ball_left_on_the_floor_is_floated_again_from_a_known_hover_voltage(tmp_path: Path) -> None:
     rig = ball_rig(seed=3)
     with open_loop(rig, tmp_path / "r.csv") as loop:
-        known = float_on(loop, ball_config(), u_rest=rig.plant.u_rest)
+        known = bring_to_operating_point(loop, ball_config(), u_rest=rig.plant.u_rest)
         assert abs(rig.plant.y_true - 5.0) < 3.0
         assert known.midpoint == pytest.approx(rig.plant.u_rest, abs=0.03)
 
