@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal, TypeAlias
 
 import numpy as np
 import tomli_w
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from autotune.arrays import ComplexArray, FloatArray
 from autotune.errors import InputError
@@ -92,15 +92,32 @@ Controller: TypeAlias = PIDController | TransferFunction | DiscreteController
 SMALLEST_GAIN = 1e-15
 
 
-class _PID(Section):
-    """Keys of a PI or PID, in a controller file or a design."""
+class _HeldPID(Section):
+    """Gains that a rig was found with: numbers, whether or not they make a controller."""
 
-    kind: Literal["pi", "pid"] | None = None
     K: Annotated[Number, Field(strict=True, description="proportional gain with its sign, a number other than 0")]
     Ti_s: Annotated[
         float | None,
         Field(strict=True, allow_inf_nan=True, description="integral time [s], a positive number; inf for none"),
     ]
+    Td_s: Annotated[Number, Field(strict=True, description="derivative time [s], 0 or more")] = 0.0
+    Tf_s: Annotated[Number, Field(strict=True, description="time constant of the filter [s], 0 or more")] = 0.0
+    setpoint_weight: Annotated[
+        Number, Field(strict=True, description="share of the set-point in the proportional part, 0 to 1")
+    ] = 1.0
+
+    @field_validator("Ti_s")
+    @classmethod
+    def _is_number(cls, value: float | None) -> float | None:
+        if value is not None and math.isnan(value):
+            raise ValueError("is not a number")
+        return value
+
+
+class _PID(_HeldPID):
+    """Keys of a PI or PID, in a controller file or a design."""
+
+    kind: Literal["pi", "pid"] | None = None
     Td_s: Annotated[Number, Field(ge=0, strict=True, description="derivative time [s], 0 or more")] = 0.0
     Tf_s: Annotated[Number, Field(ge=0, strict=True, description="time constant of the filter [s], 0 or more")] = 0.0
     setpoint_weight: Annotated[
@@ -189,7 +206,20 @@ def pid_from_table(table: Any, where: str) -> PIDController:
     return _pid(validated(_DesignedPID, table, where))
 
 
-def _pid(given: _PID) -> PIDController:
+def held_from_table(table: Any, where: str) -> PIDController:
+    """Return gains that were read from a rig and noted, to be written back as they were; ``where`` is for messages.
+
+    A device as delivered may hold K = 0 or a negative time: they are what it held. What is not a number is refused.
+
+    Raises
+    ------
+    InputError
+        A gain is missing or no finite number, or there is a key besides; names it.
+    """
+    return _pid(validated(_HeldPID, table, where))
+
+
+def _pid(given: _HeldPID) -> PIDController:
     return PIDController(
         K=given.K,
         Ti_s=math.inf if given.Ti_s is None else given.Ti_s,

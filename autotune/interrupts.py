@@ -1,4 +1,4 @@
-"""Ctrl-C while other processes start: held back here, never heard there."""
+"""Ctrl-C at the wrong moment: held back while other processes start, or while something has to come to its end."""
 
 from __future__ import annotations
 
@@ -27,6 +27,22 @@ def interrupt_held() -> Iterator[None]:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        signal.signal(signal.SIGINT, handler)
+    if came:
+        raise KeyboardInterrupt
+
+
+@contextmanager
+def interrupt_deferred() -> Iterator[None]:
+    """Let the block come to its end: a Ctrl-C meanwhile is raised after it, unless the block raises something else."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    came: list[int] = []
+    handler = signal.signal(signal.SIGINT, lambda number, _: came.append(number))
+    try:
+        yield
+    finally:
         signal.signal(signal.SIGINT, handler)
     if came:
         raise KeyboardInterrupt

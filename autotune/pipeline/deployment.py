@@ -10,15 +10,18 @@ from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from enum import StrEnum
 from pathlib import Path
+from typing import Any, NoReturn
 
 from autotune.config.procedure import DesignSettings
-from autotune.controller import PIDController
-from autotune.errors import AutotuneError, ExperimentStopped, InputError
+from autotune.controller import PIDController, held_from_table
+from autotune.errors import AutotuneError, ExperimentStopped, InputError, OperatorStop
 from autotune.experiment.rig import HoldsGains
 from autotune.experiment.verify import Verification
+from autotune.interrupts import interrupt_deferred
 from autotune.pipeline.audit import AuditLog
 from autotune.pipeline.held_gains import held_by
 from autotune.run_log import jsonable
+from autotune.text_files import read_text
 
 
 class Step(StrEnum):
@@ -87,29 +90,35 @@ class Journal:
         Raises
         ------
         InputError
-            The file is not a journal.
+            The file is not a journal, or the gains in it are no finite numbers.
         """
         if not self.path.exists():
             return None
-        text = self.path.read_text(encoding="utf-8")
-        try:
-            # a line without its end was cut off before its step was taken
-            notes = [json.loads(line) for line in text[: text.rfind("\n") + 1].splitlines()]
-            if not notes or Step(notes[-1]["gains"]) not in OPEN_ENDS:
-                return None
-            return _gains(next(note for note in reversed(notes) if note["gains"] == Step.READ))
-        except (ValueError, KeyError, TypeError, StopIteration) as error:
-            raise InputError(
-                f"not a journal of gains ({error})",
-                where=str(self.path),
-                remedy="move it away, and check the rig's gains",
-            ) from None
+        notes = self._notes()
+        if not notes or notes[-1][0] not in OPEN_ENDS:
+            return None
+        gains = next((gains for step, gains in reversed(notes) if step is Step.READ), None)
+        if gains is None:
+            raise self._no_journal("its end is open and no gains were read before")
+        return held_from_table(gains, str(self.path))
 
+    def _notes(self) -> list[tuple[Step, dict[str, Any]]]:
+        """Return the steps with their gains; a line without its end was cut off before its step was taken."""
+        text = read_text(self.path)
+        notes = []
+        for number, line in enumerate(text[: text.rfind("\n") + 1].splitlines(), start=1):
+            try:
+                note = json.loads(line)
+                note.pop("at", None)
+                notes.append((Step(note.pop("gains")), note))
+            except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
+                raise self._no_journal(f"line {number} says no step") from None
+        return notes
 
-def _gains(note: dict[str, float | None]) -> PIDController:
-    numbers = {key: value for key, value in note.items() if key not in ("gains", "at")}
-    Ti_s = numbers.pop("Ti_s")
-    return PIDController(**{key: float(value or 0.0) for key, value in numbers.items()}, Ti_s=Ti_s or float("inf"))
+    def _no_journal(self, why: str) -> InputError:
+        return InputError(
+            f"not a journal of gains: {why}", where=str(self.path), remedy="move it away, and check the rig's gains"
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -174,8 +183,9 @@ def hand_over(
 
     Raises
     ------
-    LinkError
-        The new gains could not be written and read back; the message says whether the old ones are in place again.
+    LinkError, ExperimentStopped, OperatorStop
+        The new gains could not be written and read back, the journal could not be written, Ctrl-C came between; the
+        message says whether the old ones are in place again.
     """
     notes = Journal(journal, audit)
     before = notes.unfinished()
@@ -230,7 +240,6 @@ def deploy(
         verification = try_out(held)
     except BaseException as error:
         _take_back(rig, old, notes, error, "the verification was broken off")
-        raise
     if verification.accepted:
         notes.note(Step.KEPT, held, verification.reason)
     else:
@@ -262,15 +271,15 @@ def restore(
         They could not be written and read back.
     """
     notes = Journal(journal, audit)
-    with contextlib.suppress(
-        ExperimentStopped
-    ):  # the journal is open-ended already: a full disk must not keep new gains
+    # a full disk must not keep new gains: the journal is open-ended already, and stays so where the end is missing
+    with contextlib.suppress(ExperimentStopped):
         notes.note(Step.RESTORING, old, why)
     try:
         rig.write_gains(old)
     finally:
         rig.close()
-    notes.note(Step.RESTORED, old, why)
+    with contextlib.suppress(ExperimentStopped):
+        notes.note(Step.RESTORED, old, why)
 
 
 def _write(
@@ -291,20 +300,30 @@ def _write(
             held = rig.read_gains()
         finally:
             rig.close()
-    except AutotuneError as error:
-        _take_back(rig, old, notes, error, "the new gains could not be written")
-        raise
-    notes.note(done, held, why)
+        notes.note(done, held, why)
+    except BaseException as error:
+        _take_back(rig, old, notes, error, "the hand-over was broken off")
     return held
 
 
-def _take_back(rig: HoldsGains, old: PIDController, notes: Journal, error: BaseException, what: str) -> None:
-    """Restore the old gains after an error, and raise one of its kind that says whether they are in place."""
+def _take_back(rig: HoldsGains, old: PIDController, notes: Journal, error: BaseException, what: str) -> NoReturn:
+    """Restore the old gains after whatever ended a hand-over, and raise one of its kind that says what they are now.
+
+    A second Ctrl-C waits until they are in place.
+    """
     try:
-        restore(rig, old, notes.path, audit=notes.audit, why=what)
+        with interrupt_deferred():
+            restore(rig, old, notes.path, audit=notes.audit, why=what)
         state, remedy = "the old gains are in place again", "check the link and the rig, and deploy again"
+    except KeyboardInterrupt:  # the one that waited
+        state, remedy = "the old gains are in place again", "deploy again when ready"
     except AutotuneError as second:
         state = f"the old gains could not be written back ({second.what}): the rig may hold old, new or mixed gains"
         remedy = "stop it; once the link is back, autotune deploy offers to restore them"
+    where = "hand-over of the gains"
     if isinstance(error, AutotuneError):
-        raise type(error)(f"{what} ({error.what}); {state}", where="hand-over of the gains", remedy=remedy) from error
+        raise type(error)(f"{what} ({error.what}); {state}", where=where, remedy=remedy) from error
+    if isinstance(error, KeyboardInterrupt):
+        raise OperatorStop(f"{what} by Ctrl-C; {state}", where=where, remedy=remedy) from error
+    error.add_note(f"{what}; {state}")
+    raise error

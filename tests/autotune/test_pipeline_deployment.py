@@ -25,12 +25,12 @@ from autotune.cli import app
 from autotune.config import Config, load_config
 from autotune.config.registers import RegisterMap
 from autotune.controller import PIDController
-from autotune.errors import ExperimentStopped, InputError, LinkError
+from autotune.errors import ExperimentStopped, InputError, LinkError, OperatorStop
 from autotune.experiment.loop import ControlLoop
 from autotune.experiment.run import envelope_of
 from autotune.experiment.verify import Verification
 from autotune.pipeline.audit import AuditLog, audit_log, user
-from autotune.pipeline.deployment import Journal, deploy, hand_over, restore
+from autotune.pipeline.deployment import Journal, Step, deploy, hand_over, restore
 from autotune.recording import RecordingWriter
 from drivers.simulated import SimulatedRig
 from sim.modbus_rig import ModbusRig, TcpTransport
@@ -153,6 +153,76 @@ def test_a_line_that_breaks_once_between_the_gains_leaves_the_old_ones(line: Lin
         deploy(line.rig(), NEW, journal, agree=agreed, try_out=None)
     assert line.gains == OLD
     assert Journal(journal).unfinished() is None
+
+
+def test_ctrl_c_between_the_gains_leaves_the_old_ones(line: Line, tmp_path: Path) -> None:
+    line.times, line.seen = 1, lambda: os.kill(os.getpid(), signal.SIGINT)
+    journal = tmp_path / "journal.jsonl"
+    with pytest.raises(OperatorStop, match=r"by Ctrl-C; the old gains are in place again") as stopped:
+        deploy(line.rig(), NEW, journal, agree=agreed, try_out=None)
+    assert stopped.value.exit_status == 130
+    assert line.gains == OLD
+    assert steps(journal) == ["read", "writing", "restoring", "restored"]
+
+
+def test_a_second_ctrl_c_waits_until_the_old_gains_are_back(line: Line, tmp_path: Path) -> None:
+    line.times, line.seen = 3, lambda: os.kill(os.getpid(), signal.SIGINT)  # the third hits the writing back
+    rig = rig_of(tcp_settings(line.relay.port, APART, timeout_s=0.1, retries=3))
+    with pytest.raises(OperatorStop, match="the old gains are in place again"):
+        deploy(rig, NEW, tmp_path / "journal.jsonl", agree=agreed, try_out=None)
+    assert line.gains == OLD
+
+
+def test_a_journal_that_cannot_take_the_last_step_leaves_the_old_gains(
+    line: Line, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    journal = tmp_path / "journal.jsonl"
+    real = Journal.note
+
+    def full(self: Journal, step: Step, *given: Any) -> None:  # the disk fills with the line before
+        if step is not Step.READ and step is not Step.WRITING:
+            raise ExperimentStopped("the journal cannot be written (No space left on device)")
+        real(self, step, *given)
+
+    monkeypatch.setattr(Journal, "note", full)
+    with pytest.raises(ExperimentStopped, match=r"No space left.*the old gains are in place again"):
+        deploy(line.rig(), NEW, journal, agree=agreed, try_out=None)
+    assert line.gains == OLD
+    assert Journal(journal).unfinished() == OLD  # says less than is known, and nothing false
+
+
+@pytest.mark.parametrize(
+    ("read", "named"),
+    [
+        ('"K": null, "Ti_s": 2.0', "'K'|K"),
+        ('"K": NaN, "Ti_s": 2.0', "K"),
+        ('"K": "1.5", "Ti_s": 2.0', "K"),
+        ('"K": 1.5', "'Ti_s' is missing"),
+        ('"K": 1.5, "Ti_s": NaN', "Ti_s"),
+        ('"K": 1e300, "Ti_s": 2.0', "K"),
+        ('"K": 1.5, "Ti_s": 2.0, "Td": 1.0', "unknown key 'Td'"),
+    ],
+)
+def test_gains_of_a_journal_that_no_rig_can_have_held_are_not_written(tmp_path: Path, read: str, named: str) -> None:
+    journal = tmp_path / "journal.jsonl"
+    journal.write_text(f'{{"gains": "read", {read}}}\n{{"gains": "writing", "K": 1.0, "Ti_s": 1.0}}\n')
+    with pytest.raises(InputError, match=named):
+        Journal(journal).unfinished()
+
+
+def test_what_a_device_held_as_delivered_is_gone_back_to(tmp_path: Path) -> None:
+    journal = tmp_path / "journal.jsonl"
+    Journal(journal).note(Step.READ, PIDController(K=0.0, Ti_s=0.0))
+    Journal(journal).note(Step.WRITING, NEW)
+    assert Journal(journal).unfinished() == PIDController(K=0.0, Ti_s=0.0)
+
+
+@pytest.mark.parametrize("text", ["[]\n", "1\n", '{"gains": "x"}\n', '{"gains": []}\n', "[" * 10_000 + "\n", "{}\n"])
+def test_what_is_no_journal_is_named_with_its_line(tmp_path: Path, text: str) -> None:
+    journal = tmp_path / "journal.jsonl"
+    journal.write_text(text)
+    with pytest.raises(InputError, match="not a journal of gains: line 1"):
+        Journal(journal).unfinished()
 
 
 def test_a_line_that_stays_broken_is_no_riddle(line: Line, tmp_path: Path) -> None:
