@@ -17,6 +17,8 @@ from autotune.design.loop import characteristic_frequencies
 from autotune.errors import DesignError
 from autotune.models import TransferFunction
 
+#: widest grid, highest over lowest frequency: further apart no two features of a plant are
+_WIDEST = 1e40
 _POINTS_PER_DECADE = 100
 
 
@@ -65,7 +67,8 @@ def sampled_plant(plant: TransferFunction, largest_gain: float = 1.0) -> Sampled
     Raises
     ------
     DesignError
-        A plant that is zero, that differentiates, or whose dead time the grid cannot resolve.
+        A plant that is zero, that differentiates, whose dead time the grid cannot resolve, or whose features are more
+        than 34 decades apart.
     """
     num, den = np.array(plant.num), np.array(plant.den)
     if not np.any(num):
@@ -79,6 +82,12 @@ def sampled_plant(plant: TransferFunction, largest_gain: float = 1.0) -> Sampled
     loudest = TransferFunction(num=tuple(largest_gain * b for b in plant.num), den=plant.den, delay_s=plant.delay_s)
     corners = characteristic_frequencies(loudest)
     low, high = corners[0] * 1e-4, corners[-1] * 1e2
+    if not high < _WIDEST * low:  # also where one of them is not a number
+        raise DesignError(
+            f"what matters of this plant and these gains lies from {corners[0]:.3g} to {corners[-1]:.3g} rad/s",
+            where="plant",
+            remedy="check the model's units and the noise gain that is asked for",
+        )
     omega = np.geomspace(low, high, int(_POINTS_PER_DECADE * math.log10(high / low)) + 1)
     if plant.delay_s > 0.0:
         step = 0.1 / plant.delay_s

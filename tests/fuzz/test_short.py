@@ -15,6 +15,7 @@ ONCE = {
     0: [("recordings", 60)],
     7: [("models", 76), ("models", 147), ("controllers", 66)],
     11: [("models", 568), ("options", 57)],
+    1801: [("options", 31)],
 }
 
 
