@@ -17,6 +17,10 @@ except ImportError:  # there is none outside POSIX
 
 CABLE = "check cable and power of the device"
 
+#: of a line on which what is sent comes back
+ECHO = "the line echoes what is sent"
+ECHO_REMEDY = "part RX from TX (a jumper, a loop-back plug), switch the adapter's local echo off, check rig.device"
+
 
 @contextmanager
 def line_errors(

@@ -30,7 +30,7 @@ from pymodbus.pdu import ModbusPDU
 
 from autotune.config.rig import AnyModbusSettings, ModbusRtuSettings, ModbusTcpSettings, ModbusTlsSettings
 from autotune.errors import InputError, LinkError
-from drivers.line_errors import LINE_ERRORS, line_errors
+from drivers.line_errors import ECHO, ECHO_REMEDY, LINE_ERRORS, line_errors
 from drivers.register_link import Answer
 from drivers.registers import Block
 from drivers.session_lock import SessionLock
@@ -311,17 +311,20 @@ class ModbusLink:
 
     def _await_markers(self, line: serial.Serial, deadline: float) -> None:
         """Mark the end of earlier answers with reads of the unused function; return when all of them are answered."""
-        received = b""
+        received = request = b""
         sent = 0
         while (left := deadline - time.monotonic()) > 0:
             if self._marker is not None:  # its answer may have been lost, so it is sent again at each time-out
-                request = bytes((self._unit, self._marker, 0, 0, 0, 1))
-                line.write(request + FramerRTU.compute_CRC(request).to_bytes(2, "big"))
+                content = bytes((self._unit, self._marker, 0, 0, 0, 1))
+                request = content + FramerRTU.compute_CRC(content).to_bytes(2, "big")
+                line.write(request)
                 sent += 1
             until = min(deadline, time.monotonic() + (self._settings.timeout_s if self._marker else left))
             while (left := until - time.monotonic()) > 0:
                 line.timeout = left
                 received += line.read(1) + line.read(line.in_waiting)
+                if request and request in received:  # it would pass for the acknowledgement of a write
+                    raise LinkError(ECHO, where=self.where, remedy=ECHO_REMEDY)
                 if self._marker is not None and _answers(received, self._unit, self._marker) >= sent:
                     return
 

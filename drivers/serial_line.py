@@ -17,7 +17,7 @@ import serial
 from autotune.config.rig import SerialSettings
 from autotune.errors import LinkError
 from autotune.experiment.rig import Clock
-from drivers.line_errors import LINE_ERRORS, line_errors
+from drivers.line_errors import ECHO, ECHO_REMEDY, LINE_ERRORS, line_errors
 from drivers.line_protocol import VERSION, Decoder, Frame, Kind, encode
 
 _FLASH = "flash the firmware that belongs to this version"
@@ -92,6 +92,7 @@ class SerialLink:
         self._arrived: deque[Frame] = deque()
         # a device that answers an earlier session's request must not seem to answer this one's
         self._sequence = random.randrange(0x10000)
+        self._echoes = False  # whether the last request came back
 
     @property
     def where(self) -> str:
@@ -162,6 +163,8 @@ class SerialLink:
             answer = self._answer(kind)
             if answer is not None:
                 return answer, sent_s, attempt > 0
+        if self._echoes:
+            raise LinkError(f"{ECHO}, and nobody answers", where=self.where, remedy=ECHO_REMEDY)
         raise LinkError(f"no answer to {kind.name}", where=self.where, remedy=_CABLE)
 
     def send(self, kind: Kind, *values: float) -> None:
@@ -185,6 +188,7 @@ class SerialLink:
     def _answer(self, kind: Kind) -> Frame | None:
         until = self._clock.now() + self._settings.timeout_s
         answer: Frame | None = None
+        self._echoes = False
         while answer is None and self._clock.now() < until:
             for frame in self._receive(until):
                 if frame.version != VERSION:
@@ -193,6 +197,8 @@ class SerialLink:
                     )
                 if frame.kind == Kind.ROW:
                     self._arrived.append(frame)
+                elif frame.kind == kind:  # a line of two wires, or one that is looped back
+                    self._echoes = True
                 elif frame.sequence == self._sequence:
                     answer = frame
         if answer is not None and answer.kind == Kind.REFUSED:

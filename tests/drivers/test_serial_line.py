@@ -3,10 +3,16 @@
 from __future__ import annotations
 
 import math
+import os
+import pty
 import random
+import select
 import signal
 import subprocess
 import sys
+import threading
+import tty
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -15,11 +21,12 @@ from typer.testing import CliRunner
 from autotune.cli import app
 from autotune.config import load_config
 from autotune.controller import PIDController
-from autotune.errors import InputError, LinkError
+from autotune.errors import InputError, LinkError, NotTaken
+from autotune.experiment.rig import HoldsGains
 from drivers import open_rig
 from drivers.serial_rig import SerialLineRig
 from sim.serial_line import Direction
-from tests.drivers.bench import U_RANGE, U_SAFE, Bench, serial_bench, serial_settings
+from tests.drivers.bench import U_RANGE, U_SAFE, Bench, rig_of, rtu_settings, serial_bench, serial_settings
 
 COUNT = 20.0 / 16000  # of the output
 
@@ -96,6 +103,59 @@ def test_a_late_answer_is_not_the_next_requests() -> None:
             reading = rig.read()
             assert reading.u_applied == pytest.approx(u, abs=1e-9)
             assert not reading.suspect
+
+
+@pytest.fixture
+def looped_line() -> Iterator[str]:
+    """Yield the name of a serial device whose every byte comes back, as of an adapter with RX and TX joined."""
+    far, near = pty.openpty()
+    tty.setraw(far)
+    tty.setraw(near)
+    left = threading.Event()
+
+    def back() -> None:
+        while not left.is_set():
+            if select.select([far], [], [], 0.05)[0]:
+                os.write(far, os.read(far, 4096))
+
+    thread = threading.Thread(target=back)
+    thread.start()
+    yield os.ttyname(near)
+    left.set()
+    thread.join()
+    os.close(near)
+    os.close(far)
+
+
+@pytest.mark.parametrize("kind", ["serial", "modbus_rtu"])
+def test_a_line_that_echoes_is_called_so_and_never_an_answer(looped_line: str, kind: str) -> None:
+    settings = serial_settings(looped_line, start_s=0.05, timeout_s=0.05)
+    rig = rig_of(settings if kind == "serial" else rtu_settings(looped_line))
+    with pytest.raises(NotTaken, match=r"the line echoes what is sent.*part RX from TX"):
+        rig.open()
+    assert isinstance(rig, HoldsGains)
+    with pytest.raises(LinkError, match="the line echoes what is sent"):
+        rig.write_gains(PIDController(K=1.0, Ti_s=1.0))
+    rig.close()
+
+
+def test_a_device_behind_a_line_that_echoes_is_heard() -> None:
+    asked = b""
+
+    def tamper(frame: bytes, direction: Direction) -> list[tuple[float, bytes]]:
+        nonlocal asked
+        if direction == "to device":
+            asked = frame
+            return [(0.0, frame)]
+        return [(0.0, asked), (0.0, frame)]  # two wires: what the host sent arrives at it too
+
+    with serial_bench(tamper=tamper) as bench:
+        rig = serial(bench)
+        rig.open()
+        rig.write(0.25)
+        reading = rig.read()
+        assert reading.u_applied == pytest.approx(0.25, abs=1e-9)
+        assert not reading.suspect
 
 
 def test_a_device_that_restarts_ends_the_session() -> None:
