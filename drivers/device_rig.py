@@ -57,7 +57,7 @@ class DeviceLawRig(SerialLineRig):
         Returns
         -------
         Reading
-            The sample after which the relay begins.
+            The sample after which the relay begins; of unknown y where the request had to be repeated.
 
         Raises
         ------
@@ -171,7 +171,7 @@ class DeviceLawRig(SerialLineRig):
         span = sorted((self._y.low, self._y.high))
         limits = sorted(self._y.count(min(max(limit, span[0]), span[1]), "y") for limit in y_range)
         longest = min(round(time_s / self._tick_s), _LONGEST_TICKS)
-        frame, sent_s, _ = self._link.ask(kind, *settings, ticks, longest, *limits)
+        frame, sent_s, repeated = self._link.ask(kind, *settings, ticks, longest, *limits)
         self._is_commanding = False
         received_s = self._fed_s = self._received_s = self._clock.now()
         self._latency_s = received_s - sent_s
@@ -179,8 +179,23 @@ class DeviceLawRig(SerialLineRig):
         if not runs:
             self._law, self._ticks_per_row, self._row_s = law, ticks, row_s
             self._count, self._area = 0, 0.0
+            if repeated:  # the law may run since the request whose answer was lost
+                reading = self._begun()
             self._row_at_s = reading.device_time_s
         return reading
+
+    def _begun(self) -> Reading:
+        """Return when the law began, counted back from its first row; what y was then is not known."""
+        patience_s = max(self._settings.timeout_s, 4 * self._row_s)
+        until_s = self._clock.now() + patience_s
+        first: Frame | None = None
+        while first is None or first.kind != Kind.ROW:
+            self._require(self._clock.now() < until_s, "no row came", "check cable and power")
+            first = self._link.arrived(patience_s)
+        self._link.put_back(first)
+        ticks = first.sequence * self._ticks_per_row
+        reading = self._reading(first, self._unwrapped(first.values[0]) - ticks * self._tick_s, self._received_s, 0.0)
+        return replace(reading, y=math.nan, latency_s=math.nan, suspect=True)
 
     def _row(self, frame: Frame) -> Row:
         count, area = frame.sequence, frame.values[5]

@@ -181,6 +181,10 @@ class SerialLink:
             self._arrived.extend(self._receive(until))
         return self._arrived.popleft()
 
+    def put_back(self, frame: Frame) -> None:
+        """Have a frame that the device sent by itself come again as the next."""
+        self._arrived.appendleft(frame)
+
     def forget(self) -> None:
         """Drop the frames that the device sent by itself so far."""
         self._arrived.clear()

@@ -25,7 +25,7 @@ from autotune.experiment.run import envelope_of
 from autotune.identification.frequency.limit_cycle_points import limit_cycle_points
 from autotune.recording import RecordingWriter, read_recording
 from drivers.device_rig import DeviceLawRig
-from drivers.line_protocol import Decoder, Frame, Kind
+from drivers.line_protocol import Command, Decoder, Frame, Kind
 from tests.drivers.simavr_bench import BallBehind, Uno, twin_ball, virtual_rig
 
 pytestmark = pytest.mark.system("gcc", "gcc-avr", "avr-libc", "libsimavr-dev", "libelf-dev")
@@ -125,6 +125,38 @@ def test_rows_lost_on_the_line_are_gaps_with_the_right_mean_command(
     ticks = start + np.round(1000 * t[1:]).astype(int)
     plant = [np.mean(bench.ball.u[low:high]) / 1600.0 for low, high in pairwise(ticks)]
     assert np.sum(u[1:-1]) == pytest.approx(np.sum(plant), abs=1e-9)
+
+
+def test_a_law_whose_first_acknowledgement_is_lost_goes_on_from_where_it_began(
+    uno_elf: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench = Bench(uno_elf, tmp_path)
+    feed, lost = Decoder.feed, 0
+
+    def lossy(decoder: Decoder, data: bytes) -> list[Frame]:
+        nonlocal lost
+        kept = []
+        for frame in feed(decoder, data):
+            runs = frame.kind == Kind.SAMPLE and frame.values[3] & 3 == Command.RELAY
+            lost += runs
+            if not runs or lost > 1:
+                kept.append(frame)
+        return kept
+
+    monkeypatch.setattr(Decoder, "feed", lossy)
+    with bench.loop as loop:
+        loop.step(loop.nearest(bench.ball.ball.u_rest))
+        oscillation = bench.oscillation()
+        while loop.tick.k < 80:
+            oscillation.step()
+        t, u, y = (values[1:] for values in loop.history())
+        start = round(1000 * loop._device_start_s)
+    assert lost > 1
+    assert np.diff(t[2:]) == pytest.approx(0.01)  # from the law's first tick on, though it was asked for twice
+    assert np.isnan(y).sum() == 1  # of its beginning
+    ticks = start + np.round(1000 * t[2:]).astype(int)
+    plant = [np.mean(bench.ball.u[low:high]) / 1600.0 for low, high in pairwise(ticks)]
+    assert np.sum(u[2:-1]) == pytest.approx(np.sum(plant), abs=1e-9)
 
 
 def test_a_silent_host_ends_the_law_on_the_device(uno_elf: Path, tmp_path: Path) -> None:
