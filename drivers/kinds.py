@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import import_module
-from typing import Any
+from typing import Any, get_args
 
 from autotune.config.rig import (
     RIG_SETTINGS,
@@ -85,6 +85,11 @@ class Kind:
     settings: type[Section]
     driver: str
     has_registers: bool = False
+
+    @property
+    def name(self) -> str:
+        """What ``kind`` says in ``[rig]``."""
+        return str(get_args(self.settings.model_fields["kind"].annotation)[0])
 
     def open(self, settings: Section, session: Session) -> Rig:
         """Return the rig, not yet opened."""

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
 import typer
 from pydantic import BaseModel
@@ -16,7 +16,9 @@ from autotune.cli import app
 from autotune.cli.init_keys import REGISTER, Table, add_registers, register, set_keys
 from autotune.errors import InputError
 
-Kind = Literal["simulated", "modbus_tcp", "modbus_tls", "modbus_rtu", "serial"]
+if TYPE_CHECKING:
+    from drivers.kinds import Kind
+
 Plant = Literal["ball", "servo", "two_tank", "thermal"]
 
 #: samples of a sweep: some 15 to 40 a period, a few periods for each of five points, and the way there
@@ -65,12 +67,15 @@ PLANTS: Mapping[Plant, Table] = {
 @app.command()
 def init(
     config: Annotated[Path, typer.Argument(metavar="CONFIG.toml", help="file to write; never overwritten")],
-    kind: Annotated[Kind | None, typer.Option(help="how the rig is reached")] = None,
+    kind: Annotated[
+        str | None, typer.Option(help="how the rig is reached: simulated, modbus_tcp, serial; an unknown one lists all")
+    ] = None,
     plant: Annotated[
         Plant | None, typer.Option(help="which simulated plant; of a real rig: the plant of its twin for --dry-run")
     ] = None,
     host: Annotated[str | None, typer.Option(help="address of a Modbus TCP or TLS device")] = None,
     device: Annotated[str | None, typer.Option(help="serial device, see autotune ports")] = None,
+    recording: Annotated[str | None, typer.Option(help="recording that is replayed as a rig")] = None,
     y_register: Annotated[
         str | None, typer.Option(metavar=REGISTER, help="Modbus register of y, e.g. input:0:int16,scale=0.01")
     ] = None,
@@ -114,19 +119,26 @@ def init(
 ) -> None:
     """Write a commented configuration; asks at a terminal for what no flag says."""
     from autotune.config import Config, validated
+    from autotune.config.rig import SimulatedRigSettings
+    from drivers.kinds import KINDS
 
     if config.exists():
         raise InputError("exists already", where=str(config), remedy="choose another name; nothing is overwritten")
     questions = _Questions()
-    chosen: Kind = questions.ask("--kind", kind, f"how is the rig reached ({', '.join(get_args(Kind))})", _kind)
-    if chosen == "simulated":
+    kinds = {one.name: one for one in KINDS}
+    question = f"how is the rig reached ({', '.join(kinds)})"
+    chosen: Kind = questions.ask("--kind", kind, question, lambda name: kinds[_one_of(name, kinds, "--kind")])
+    if chosen is None:  # the other questions hang on it
+        questions.require()
+    if chosen.settings is SimulatedRigSettings:
         name: Plant = questions.ask("--plant", plant, f"which plant ({', '.join(PLANTS)})", _plant)
         questions.require()
         content = _simulated(name)
     else:
-        reached = _reached(questions, chosen, host, device, y_register, u_register, y_span, u_span)
-        if registers and "registers" not in reached:
-            raise InputError(f'kind = "{chosen}" has no registers', where="--register", remedy="leave it out")
+        given = {"host": host, "device": device, "recording": recording, "y_span": y_span, "u_span": u_span}
+        reached = _reached(questions, chosen, given | {"y": y_register, "u": u_register})
+        if registers and not chosen.has_registers:
+            raise InputError(f'kind = "{chosen.name}" has no registers', where="--register", remedy="leave it out")
         add_registers(reached.get("registers", {}), registers or ())
         answers = {
             "u_unit": questions.ask("--u-unit", u_unit, "unit of the command u", str, ""),
@@ -152,7 +164,7 @@ def init(
         ) from None
     console = Console(highlight=False, soft_wrap=True)
     console.print(f"wrote {config}", markup=False)
-    if chosen == "simulated":
+    if chosen.settings is SimulatedRigSettings:
         console.print(f"next: autotune run {config} --out runs/{config.stem}", markup=False)
     else:
         console.print(f"next: read it through, then autotune doctor {config}, autotune probe {config}", markup=False)
@@ -201,18 +213,14 @@ def _checked(convert: Callable[[str], Any]) -> Callable[[str], Any]:
     return check
 
 
-def _one_of(answer: str, known: tuple[str, ...], flag: str) -> str:
+def _one_of(answer: str, known: Collection[str], flag: str) -> str:
     if answer not in known:
         raise InputError(f"{answer!r} is none of {', '.join(known)}", where=flag)
     return answer
 
 
-def _kind(answer: str) -> str:
-    return _one_of(answer, get_args(Kind), "--kind")
-
-
 def _plant(answer: str) -> str:
-    return _one_of(answer, tuple(PLANTS), "--plant")
+    return _one_of(answer, PLANTS, "--plant")
 
 
 def _pair(answer: str) -> tuple[float, float]:
@@ -222,34 +230,33 @@ def _pair(answer: str) -> tuple[float, float]:
     return float(parts[0]), float(parts[1])
 
 
-def _reached(
-    questions: _Questions,
-    kind: Kind,
-    host: str | None,
-    device: str | None,
-    y_register: str | None,
-    u_register: str | None,
-    y_span: tuple[float, float] | None,
-    u_span: tuple[float, float] | None,
-) -> Table:
-    """Return the table [rig] of a real rig."""
-    rig: Table = {"kind": kind}
-    if kind in ("modbus_tcp", "modbus_tls"):
-        rig["host"] = questions.ask("--host", host, "address of the device", str)
-    else:
-        rig["device"] = questions.ask("--device", device, "serial device (autotune ports lists them)", str)
-    if kind == "serial":
-        rig["y_span"] = questions.ask("--y-span", y_span, "y at count 0 and at the converter's full scale", _pair)
-        rig["u_span"] = questions.ask("--u-span", u_span, "u at duty 0 and at duty 1", _pair)
-        return rig
-    if kind == "modbus_tls":
-        rig |= {f"{which}_file": f"certificates/{name}" for which, name in _CERTIFICATES.items()}
-    y = questions.ask("--y-register", y_register, "register of y, TABLE:ADDRESS:TYPE, e.g. input:0:int16", register)
-    u = questions.ask("--u-register", u_register, "register of u, TABLE:ADDRESS:TYPE, e.g. holding:0:int16", register)
-    return rig | {"registers": {"y": y, "u": u}}
+#: what a kind may have to be told, in the order in which it is asked: its key, the question
+_ASKED = {
+    "host": "address of the device",
+    "device": "serial device (autotune ports lists them)",
+    "recording": "recording to replay, NAME.csv",
+    "y_span": "y at count 0 and at the converter's full scale",
+    "u_span": "u at duty 0 and at duty 1",
+}
+#: answers that follow a custom, to be looked at in the file
+_CUSTOM = {f"{which}_file": f"certificates/{name}" for which, name in
+           {"ca": "ca.pem", "cert": "host.pem", "key": "host.key"}.items()}  # fmt: skip
 
 
-_CERTIFICATES = {"ca": "ca.pem", "cert": "host.pem", "key": "host.key"}
+def _reached(questions: _Questions, kind: Kind, given: Mapping[str, Any]) -> Table:
+    """Return the table [rig] of a rig that is there: what the settings of its kind have keys for is asked."""
+    keys = kind.settings.model_fields
+    rig: Table = {"kind": kind.name} | {key: name for key, name in _CUSTOM.items() if key in keys}
+    for key, question in _ASKED.items():
+        if key in keys:
+            convert = _pair if key.endswith("_span") else str
+            rig[key] = questions.ask(f"--{key.replace('_', '-')}", given[key], question, convert)
+    if kind.has_registers:
+        asked = "register of {}, TABLE:ADDRESS:TYPE, e.g. {}:0:int16"
+        y = questions.ask("--y-register", given["y"], asked.format("y", "input"), register)
+        u = questions.ask("--u-register", given["u"], asked.format("u", "holding"), register)
+        rig["registers"] = {"y": y, "u": u}
+    return rig
 
 
 def _simulated(plant: Plant) -> Table:

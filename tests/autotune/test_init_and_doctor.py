@@ -19,6 +19,7 @@ from autotune.config import load_config
 from autotune.config.registers import RegisterMap
 from autotune.config.rig import ModbusTcpSettings, SerialSettings
 from autotune.errors import InputError
+from drivers.kinds import KINDS
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 REAL = [
@@ -49,16 +50,29 @@ def test_a_simulated_rig_is_described_as_the_shipped_configuration_does(tmp_path
         ("modbus_tls", ["--host", "10.0.0.2", *MODBUS]),
         ("modbus_rtu", ["--device", "/dev/ttyUSB0", *MODBUS]),
         ("serial", ["--device", "/dev/ttyACM0", "--y-span", "0", "100", "--u-span", "0", "10"]),
+        ("replay", ["--recording", "rig.csv"]),
     ],
 )
 def test_what_is_written_loads_and_keeps_the_answers(tmp_path: Path, kind: str, reached: list[str]) -> None:
     path = tmp_path / "rig.toml"
-    command("init", path, "--kind", kind, *reached, *REAL, "--plant", "ball")
+    plant = [] if kind == "replay" else ["--plant", "ball"]
+    command("init", path, "--kind", kind, *reached, *REAL, *plant)
     config = load_config(path)
     assert config.rig.kind == kind
     assert (config.limits.u_min, config.limits.u_max, config.limits.u_safe) == (0.0, 10.0, 0.0)
     assert (config.operating_point.y, config.operating_point.u_guess) == (50.0, 4.0)
     assert config.operating_point.y - config.limits.swing >= config.limits.y_min
+
+
+def test_every_kind_that_there_is_a_driver_for_can_be_described(tmp_path: Path) -> None:
+    answers = [*MODBUS, *REAL, "--host", "h", "--device", "/dev/ttyS9", "--recording", "r.csv"]
+    answers += ["--y-span", "0", "1", "--u-span", "0", "10"]
+    for kind in KINDS:
+        path = tmp_path / f"{kind.name}.toml"
+        command("init", path, "--kind", kind.name, *answers, *(["--plant", "ball"] if kind.name == "simulated" else []))
+        assert isinstance(load_config(path).rig, kind.settings)
+    with pytest.raises(InputError, match="'x' is none of simulated, replay, modbus_tcp"):
+        command("init", tmp_path / "x.toml", "--kind", "x")
 
 
 def test_every_field_of_the_register_map_and_every_other_key_has_a_flag(tmp_path: Path) -> None:
