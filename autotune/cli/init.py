@@ -128,8 +128,7 @@ def init(
     kinds = {one.name: one for one in KINDS}
     question = f"how is the rig reached ({', '.join(kinds)})"
     chosen: Kind = questions.ask("--kind", kind, question, lambda name: kinds[_one_of(name, kinds, "--kind")])
-    if chosen is None:  # the other questions hang on it
-        questions.require()
+    questions.require()  # the others hang on it
     if chosen.settings is SimulatedRigSettings:
         name: Plant = questions.ask("--plant", plant, f"which plant ({', '.join(PLANTS)})", _plant)
         questions.require()
