@@ -8,6 +8,7 @@ import numpy as np
 from scipy import signal
 
 from autotune.models import TransferFunction
+from autotune.poles import slowest_mode_s
 
 _VALUES = 40
 _LAGS_SHOWN = 5.0
@@ -39,7 +40,7 @@ def plant_figures(plant: TransferFunction) -> PlantFigures:
     """
     order = np.argsort(np.abs(plant.poles))
     poles = [complex(pole) for pole in plant.poles[order] if abs(pole) > 0.0 and pole.imag >= 0.0]
-    slowest = max((1.0 / abs(pole) for pole in poles), default=max(plant.delay_s, 1.0))
+    slowest = slowest_mode_s(plant.poles) or max(plant.delay_s, 1.0)
     span = _LAGS_SHOWN * slowest + plant.delay_s
     t = np.linspace(0.0, span, _VALUES)
     late = np.linspace(0.0, _LAGS_SHOWN * slowest, 20 * _VALUES)

@@ -16,6 +16,7 @@ from autotune.arrays import FloatArray
 from autotune.controller import PIDController
 from autotune.errors import DesignError
 from autotune.models import TransferFunction
+from autotune.poles import slowest_lag_s
 
 _SAMPLES = 2001
 _SHARE = 1e-6
@@ -129,7 +130,7 @@ def flat_transition(
         name = max(uses, key=lambda key: uses[key])
         return uses[name], name
 
-    slowest = max((abs(1.0 / p.real) for p in plant.poles if abs(p.real) > 0.0), default=1.0)
+    slowest = slowest_lag_s(plant.poles) or 1.0
     fast, slow = 1e-3 * slowest, 1e-3 * slowest
     while excess(slow)[0] > 1.0:
         fast, slow = slow, 2.0 * slow

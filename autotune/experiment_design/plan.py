@@ -18,7 +18,7 @@ from scipy.linalg import expm
 from autotune.arrays import FloatArray
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import RUNAWAY, Fit, fit
-from autotune.diagnosis.fitting.windows import slowest_lag_s, window_rows
+from autotune.diagnosis.fitting.windows import model_lag_s, window_rows
 from autotune.diagnosis.result import Diagnosis
 from autotune.diagnosis.selection.hypothesis import Hypothesis
 from autotune.diagnosis.simulation.simulator import Simulator
@@ -28,6 +28,7 @@ from autotune.experiment.limits import Envelope
 from autotune.experiment.verify import law_for
 from autotune.experiment_design.conditions import Conditions
 from autotune.experiment_design.open_hypotheses import open_hypotheses
+from autotune.poles import slowest_lag_s
 from autotune.progress import Progress, quiet
 from autotune.recording import Recording
 
@@ -139,9 +140,7 @@ def _slowest_s(sim: Simulator, conditions: Conditions) -> float:
     if conditions.law is not None:
         K, Ti = conditions.law.K, conditions.law.Ti_s
         A = np.block([[A - K * b @ c, b * K / Ti], [-c, np.zeros((1, 1))]])
-    rates = np.abs(np.linalg.eigvals(A).real)
-    rates = rates[rates > 1e-6 * rates.max()]
-    return float(1.0 / rates.min())
+    return slowest_lag_s(np.linalg.eigvals(A))
 
 
 def _allowed_scale(sim: Simulator, conditions: Conditions, trial: Excitation) -> float:
@@ -216,7 +215,7 @@ def _told(
 ) -> tuple[Plan, FloatArray]:
     """Return an excitation with its expected discrimination, and all readings that the hypotheses predict."""
     model, limits = found.search.retuned.fit.model, found.search.data.thresholds
-    starts, stops = window_rows(planned, limits.lags_per_window * slowest_lag_s(model), float(planned.t[0]), limits)
+    starts, stops = window_rows(planned, limits.lags_per_window * model_lag_s(model), float(planned.t[0]), limits)
     data = Data(
         recordings=(planned,), good=(np.ones(len(planned), dtype=bool),), starts=(starts,), stops=(stops,),
         noise=found.search.data.noise, thresholds=limits, numbers=(len(found.search.data.recordings),),

@@ -19,7 +19,7 @@ from autotune.arrays import FloatArray
 from autotune.diagnosis.evidence.residual import NEW, FreedResidual, Place, filled
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import Fit
-from autotune.diagnosis.fitting.windows import slowest_lag_s
+from autotune.diagnosis.fitting.windows import model_lag_s
 
 #: Fastest swing that is looked for, in cycles per slowest lag, and the most frequencies.
 FASTEST, MOST_FREQUENCIES = 0.3, 120
@@ -93,7 +93,7 @@ def largest_variation(result: Fit, data: Data) -> Variation:
     left = FreedResidual(result, data)
     e = left.beyond_numbers(left.e)
     variance = float(e @ e) / left.rows
-    lag, longest = slowest_lag_s(result.model), max(r.duration_s for r in data.recordings)
+    lag, longest = model_lag_s(result.model), max(r.duration_s for r in data.recordings)
     count = int(min(FASTEST * longest / max(lag, 1e-12), MOST_FREQUENCIES))
     entries = [(*signal, k / longest) for signal in _multiplied(left) for k in range(count + 1)]
     entries += [(*signal, 0.0) for signal in (*_bends(left), *_paths(left, lag))]

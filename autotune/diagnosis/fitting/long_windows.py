@@ -14,6 +14,7 @@ from autotune.diagnosis.fitting.noise import Noise
 from autotune.diagnosis.simulation.chain import build_chain
 from autotune.diagnosis.thresholds import Thresholds
 from autotune.models import Model
+from autotune.poles import moving, slowest_mode_s
 from autotune.recording import Recording
 
 
@@ -38,10 +39,9 @@ class Lengths:
 def lengths_of(model: Model, recordings: Sequence[Recording], limits: Thresholds) -> Lengths:
     """Return how long windows are: whole recordings, but for what integrates or rings for long."""
     poles = np.linalg.eigvals(build_chain(model).A)
-    size = np.abs(poles)
-    settling = poles[size > 1e-9 * max(float(size.max()), 1e-12)]
+    settling = moving(poles)
     duration, dt = max(r.duration_s for r in recordings), recordings[0].sample_time_s
-    slowest = 1.0 / float(np.abs(settling).min()) if settling.size else duration / 20.0
+    slowest = slowest_mode_s(poles) or duration / 20.0
     damping = float(np.min(-settling.real / np.abs(settling))) if settling.size else 1.0
     long = duration
     if settling.size < poles.size:

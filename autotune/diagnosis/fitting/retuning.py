@@ -13,7 +13,7 @@ from autotune.diagnosis.fitting.fit import RUNAWAY, Fit, fit
 from autotune.diagnosis.fitting.noise import Noise, autoregressive, noise_from_differences
 from autotune.diagnosis.fitting.parameters import Parametrisation, parametrise
 from autotune.diagnosis.fitting.restarts import renewed
-from autotune.diagnosis.fitting.windows import known_from_s, slowest_lag_s, window_rows
+from autotune.diagnosis.fitting.windows import known_from_s, model_lag_s, window_rows
 from autotune.diagnosis.thresholds import IN_USE, Thresholds
 from autotune.models import Model
 from autotune.recording import Recording
@@ -49,7 +49,7 @@ def prepare(
     data, retuned
         Data with windows and noise, and the fit.
     """
-    length = times * thresholds.lags_per_window * slowest_lag_s(model)
+    length = times * thresholds.lags_per_window * model_lag_s(model)
     largest = thresholds.largest_correlation
     noise = floored(noise_from_differences([r.y for r in recordings], good, largest), recordings)
     windows = [window_rows(r, length, known_from_s(model, r, thresholds), thresholds) for r in recordings]

@@ -8,15 +8,13 @@ from autotune.arrays import IntArray
 from autotune.diagnosis.simulation.chain import build_chain
 from autotune.diagnosis.thresholds import IN_USE, Thresholds
 from autotune.models import Model
+from autotune.poles import slowest_lag_s
 from autotune.recording import Recording
 
 
-def slowest_lag_s(model: Model) -> float:
+def model_lag_s(model: Model) -> float:
     """Return the slowest time constant of a model's chain [s], integrators left aside."""
-    poles = np.linalg.eigvals(build_chain(model).A)
-    rates = np.abs(poles.real)
-    rates = rates[rates > 1e-9 * max(float(np.abs(poles).max()), 1e-12)]
-    return float(1.0 / rates.min()) if rates.size else 0.0
+    return slowest_lag_s(np.linalg.eigvals(build_chain(model).A))
 
 
 def known_from_s(model: Model, recording: Recording, thresholds: Thresholds = IN_USE) -> float:
@@ -26,7 +24,7 @@ def known_from_s(model: Model, recording: Recording, thresholds: Thresholds = IN
     more (through a dead time, a rate limit).
     """
     delay = sum(block.dynamics.delay_s for block in model.blocks)
-    unknown = delay + thresholds.unknown_lags * slowest_lag_s(model)
+    unknown = delay + thresholds.unknown_lags * model_lag_s(model)
     return float(recording.t[0] + min(unknown, thresholds.most_left_out * recording.duration_s))
 
 

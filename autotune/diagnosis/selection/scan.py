@@ -16,7 +16,7 @@ from autotune.diagnosis.effects.base import SignalSizes
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import RUNAWAY, Fit
 from autotune.diagnosis.fitting.parameters import effect_with
-from autotune.diagnosis.fitting.windows import slowest_lag_s
+from autotune.diagnosis.fitting.windows import model_lag_s
 from autotune.diagnosis.selection.prediction import direction, predictions, signal_sizes
 from autotune.models import Effect
 from autotune.recording import Recording
@@ -56,7 +56,7 @@ class FitScan:
     @property
     def slowest_lag_s(self) -> float:
         """Slowest time constant of the nominal chain [s]."""
-        return slowest_lag_s(self.base.parametrisation.model)
+        return model_lag_s(self.base.parametrisation.model)
 
     def predicted(self, values: Sequence[tuple[float, ...]]) -> list[tuple[float, tuple[float, ...]]]:
         """Return the decrease of chi-square that the first order predicts for the effect with each set of values.
