@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import re
-from importlib import metadata
+from importlib import metadata, util
 from pathlib import Path
 from typing import Any
 
@@ -62,6 +62,17 @@ def _plain(app: Any, what: str, name: str, thing: object, options: object, lines
     lines[:] = [line if "`" in line else re.sub(r"(?<=\w)_(?!\w)", r"\_", line.replace("|", "\\|")) for line in lines]
 
 
+def _has_its_own_page(app: Any, what: str, name: str, thing: object, skip: bool, options: object) -> bool | None:
+    """Leave a function out of its package's page where its module has its name: both would be one target.
+
+    It is described on its module's page, which the package's page leads to.
+    """
+    module = app.env.temp_data.get("autodoc:module") or ""
+    if what == "module" and module and getattr(thing, "__module__", "") == f"{module}.{name}":
+        return True if util.find_spec(f"{module}.{name}") else None
+    return None
+
+
 def setup(app: Any) -> dict[str, bool]:
     """Register the renderer of formulas."""
     app.add_html_math_renderer(
@@ -70,4 +81,5 @@ def setup(app: Any) -> dict[str, bool]:
         block_renderers=(lambda translator, node: _formula(translator, node, block=True), None),
     )
     app.connect("autodoc-process-docstring", _plain)
+    app.connect("autodoc-skip-member", _has_its_own_page)
     return {"parallel_read_safe": True}
