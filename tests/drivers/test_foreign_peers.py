@@ -23,6 +23,7 @@ from pyModbusTCP.server import DataBank, ModbusServer
 from autotune.config.registers import RegisterMap
 from autotune.controller import PIDController
 from autotune.errors import LinkError, NotTaken
+from drivers.modbus import DeviceRefused
 from sim.modbus_rig import ModbusRig, RtuTransport, TcpTransport
 from sim.plant import make_plant
 from sim.serial_line import SerialLine
@@ -103,11 +104,15 @@ def test_a_c_slave_on_a_serial_line(slave_program: Path) -> None:
 
 
 @pytest.mark.system("libmodbus-dev", "gcc")
-def test_an_address_that_a_c_slave_does_not_have_is_named(slave_program: Path) -> None:
-    beyond = SLAVE.model_copy(update={"y": SLAVE.y.model_copy(update={"address": 100})})
+@pytest.mark.parametrize(("signal", "said", "error"), [("y", "input", NotTaken), ("u", "holding", DeviceRefused)])
+def test_an_address_that_a_c_slave_does_not_have_is_named(
+    slave_program: Path, signal: str, said: str, error: type[LinkError]
+) -> None:
+    """What is read before anything is written leaves a rig that was not taken; a refused write is a device's refusal."""
+    beyond = SLAVE.model_copy(update={signal: getattr(SLAVE, signal).model_copy(update={"address": 100})})
     with running(slave_program, "tcp") as port:
         rig = rig_of(tcp_settings(port, beyond))
-        with pytest.raises(NotTaken, match=r"input 100.*does not have that address"):
+        with pytest.raises(error, match=rf"{said} 100.*does not have that address"):
             rig.open()
         rig.close()
 

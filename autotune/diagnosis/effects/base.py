@@ -314,9 +314,9 @@ class EffectKind:
     """
 
     name: str
-    equation: str
-    parameters: tuple[Quantity, ...]
-    reference: str
+    equation: str = ""
+    parameters: tuple[Quantity, ...] = ()
+    reference: str = ""
     sought: Sought = "hypothesis"
     lines: tuple[Line, ...] = ()
     memory: Memory | None = None

@@ -6,11 +6,19 @@ import inspect
 from collections.abc import Iterator, Sequence
 from typing import get_args
 
-from autotune.diagnosis.effects.base import EffectKind, Role
+from autotune.diagnosis.effects.base import EffectKind, Role, SignalSizes
+from autotune.diagnosis.effects.rigs import RigKind
 from autotune.diagnosis.effects.stages import STAGES, Line, StageName
 from autotune.errors import InputError
 
 PLACES = ("actuator", "plant", "sensor", "timing", "environment", "controller")
+#: What a unit may refer to.
+UNITS = {"u": "V", "f": "N", "v": "m/s", "y": "m"}
+#: Signals of a usual size, on which starting values are tried.
+_SIZES = SignalSizes(
+    w=1.0, f=1.0, v=1.0, x=1.0, y=1.0, w_low=-1.0, w_high=1.0, y_low=-1.0, y_high=1.0, x_offset=0.0, f_peak=1.0,
+    gain=1.0, lag_s=1.0, dt_s=0.01, duration_s=100.0, levels=0,
+)  # fmt: skip
 #: What the functions of a linear part take.
 _LINEAR_TAKES = {"blocks": 2, "falling": 2, "u_offset": 1, "start": 3}
 
@@ -41,6 +49,7 @@ def _of(kind: EffectKind) -> Iterator[tuple[str, str]]:
     for q in kind.parameters:
         if q.role not in get_args(Role):
             yield f"parameter {q.name!r} has no role {q.role!r}", f"its role is one of {', '.join(get_args(Role))}"
+    yield from _units(kind)
     observed = all(q.role == "observed" for q in kind.parameters)
     if observed and kind.is_simulated:
         yield "a simulated effect has observed parameters", "give its parameters the roles that a search needs"
@@ -48,8 +57,41 @@ def _of(kind: EffectKind) -> Iterator[tuple[str, str]]:
         yield "nothing would be simulated", "add lines=(Line(stage=..., does=...),) or linear=LinearPart(...)"
     if kind.sought in ("hypothesis", "rig", "structure") and not _has_starts(kind):
         yield "no fit would ever start", "give starts=lambda sizes: [...] or search=..."
+    for rig in kind.odds:
+        if rig not in (*get_args(RigKind), "any"):
+            yield (
+                f"odds of no kind of rig: {rig!r}",
+                f"kinds are {', '.join(get_args(RigKind))}, any",
+            )
     if kind.is_simulated:
         yield from _simulated(kind)
+    yield from _starts(kind)
+
+
+def _units(kind: EffectKind) -> Iterator[tuple[str, str]]:
+    """Yield which units refer to nothing."""
+    for q in kind.parameters:
+        try:
+            q.unit.format(**UNITS)
+        except (KeyError, IndexError, ValueError):
+            yield (
+                f"unit {q.unit!r} of parameter {q.name!r} refers to nothing",
+                f"signals are {', '.join(f'{{{name}}}' for name in UNITS)}",
+            )
+
+
+def _starts(kind: EffectKind) -> Iterator[tuple[str, str]]:
+    """Yield what is wrong with starting values: a set is as long as the parameters, but for neutral ones at its end."""
+    needed = tuple(q.name for q in kind.parameters if q.neutral is None)
+    for values in kind.starts(_SIZES):
+        given = tuple(q.name for q in kind.parameters[: len(values)])
+        if len(given) != len(values) or not set(needed) <= set(given):
+            names = ", ".join(q.name for q in kind.parameters)
+            yield (
+                f"starting values {values} are not one for each parameter",
+                f"give values of {names}, in this order",
+            )
+            return
 
 
 def _has_starts(kind: EffectKind) -> bool:

@@ -49,6 +49,16 @@ def test_a_complete_record_is_taken() -> None:
         ({"name": "elsewhere.drag"}, "no place 'elsewhere'"),
         ({"parameters": ()}, "no parameters"),
         ({"starts": kind_of("actuator.stiction").starts}, "no fit would ever start"),
+        (
+            {"starts": lambda sizes: [(1.0, 2.0)]},
+            r"\(1.0, 2.0\) are not one for each.*values of coefficient",
+        ),
+        ({"starts": lambda sizes: [()]}, "not one for each parameter"),
+        (
+            {"parameters": (Quantity(name="coefficient", unit="{q}", role="amplitude"),)},
+            r"unit '\{q\}'.*are \{u\}",
+        ),
+        ({"odds": {"automobile": 0.1}}, "no kind of rig: 'automobile'"),
         ({"lines": ()}, r"nothing would be simulated; add lines="),
         ({"lines": (Line(stage="force", does=with_typing_error),)}, "takes 'coeficient', which is neither a signal"),
         ({"lines": (Line(stage="nowhere", does=dragged),)}, "no stage 'nowhere'"),  # type: ignore[arg-type]
@@ -68,20 +78,31 @@ def test_what_is_missing_or_contradicts_itself_is_refused_by_name(change: dict[s
         require_complete((*ALL, replace(DRAG, **change)))
 
 
-def test_an_incomplete_record_is_refused_when_the_package_is_imported(tmp_path: Path) -> None:
-    """The records as they are, one of them without its reference."""
-    home = Path(autotune.__file__).parent
+@pytest.mark.parametrize("left_out", ["name", "equation", "parameters", "reference", "lines", "starts"])
+def test_an_incomplete_record_is_refused_when_the_package_is_imported(tmp_path: Path, left_out: str) -> None:
+    """A record as a newcomer writes it into the file of its place, with one of its parts left out."""
     copy = tmp_path / "autotune"
-    subprocess.run(["cp", "-r", str(home), str(copy)], check=True)
+    subprocess.run(["cp", "-r", str(Path(autotune.__file__).parent), str(copy)], check=True)
     place = copy / "diagnosis" / "effects" / "timing.py"
-    text = place.read_text(encoding="utf-8")
-    assert "        reference=_LJUNG,\n" in text
-    place.write_text(text.replace("        reference=_LJUNG,\n", '        reference="",\n', 1), encoding="utf-8")
+    parts = {
+        "name": 'name="timing.slowness"', "equation": 'equation="w -> w (1 - share)"',
+        "parameters": 'parameters=(Quantity(name="share", unit="1", role="amplitude"),)',
+        "lines": 'lines=(Line(stage="command", does=slowed),)', "starts": "starts=lambda sizes: [(0.1,)]",
+        "reference": 'reference="Newton"',
+    }  # fmt: skip
+    record = ", ".join(part for key, part in parts.items() if key != left_out)
+    line = "def slowed(w: float, share: float) -> float:\n    return w * (1.0 - share)\n\n\n"
+    text = place.read_text(encoding="utf-8").replace(
+        "TIMING = (\n", f"{line}TIMING = (\n    EffectKind({record}),\n", 1
+    )
+    place.write_text(text, encoding="utf-8")
     found = subprocess.run(
         [sys.executable, "-c", "import autotune.diagnosis.effects"], cwd=tmp_path, capture_output=True, text=True
     )
     assert found.returncode != 0
-    assert "effect timing.dead_time: no reference; give reference a text" in found.stderr
+    said = found.stderr.splitlines()[-1]
+    what = {"lines": "nothing would be simulated", "starts": "no fit would ever start", "name": "'name'"}
+    assert what.get(left_out, f"effect timing.slowness: no {left_out}") in said
 
 
 def test_neutral_values_do_nothing() -> None:
