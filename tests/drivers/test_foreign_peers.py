@@ -108,7 +108,7 @@ def test_a_c_slave_on_a_serial_line(slave_program: Path) -> None:
 def test_an_address_that_a_c_slave_does_not_have_is_named(
     slave_program: Path, signal: str, said: str, error: type[LinkError]
 ) -> None:
-    """What is read before anything is written leaves a rig that was not taken; a refused write is a device's refusal."""
+    """What is read before anything is written leaves a rig that was not taken; a refused write has begun it."""
     beyond = SLAVE.model_copy(update={signal: getattr(SLAVE, signal).model_copy(update={"address": 100})})
     with running(slave_program, "tcp") as port:
         rig = rig_of(tcp_settings(port, beyond))
