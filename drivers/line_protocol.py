@@ -25,12 +25,15 @@ byte the next zero byte starts afresh. Numbers are little-endian::
     0A TRY        f32 K, Ti, set-point, load; u16 ticks per row; u32         82 SAMPLE    then 84 ROW every n ticks
                   longest time in ticks; u16 y_low, y_high; the PI on these
                   gains with load added to u; others while it runs
+    0B GET_LAW                                                               85 LAW       only while the PI runs;
+                                                                             unknown to firmware before version 3
 
     device to host
     81 INFO       u16 firmware version; u16 ticks per second; u16 y and u count at full scale; u8 device starts
     82 SAMPLE     u32 device time in us, wraps; u16 y; u16 u that acts from y's instant on; u8 state; u8 device starts
     83 GAINS      f32 K; f32 Ti
     84 ROW        as SAMPLE; u32 area: u in counts times ticks since the device's law began, up to this tick, wraps
+    85 LAW        f32 set-point; u16 ticks per row; u32 ticks left, 0 for ever; u16 y_low, y_high, u_safe, u_min, u_max
     FF REFUSED    u8 type of the request; u8 reason: 1 unknown type, 2 wrong length, 3 not in command, 4 out of range
 
     state: bits 0-1 who commands: 0 nobody (safe output), 1 the host, 2 the relay, 3 the device's PI
@@ -66,10 +69,12 @@ class Kind(IntEnum):
     GET_GAINS = 0x08
     SET_GAINS = 0x09
     TRY = 0x0A
+    GET_LAW = 0x0B
     INFO = 0x81
     SAMPLE = 0x82
     GAINS = 0x83
     ROW = 0x84
+    LAW = 0x85
     REFUSED = 0xFF
 
 
@@ -94,10 +99,12 @@ PAYLOAD = {
     Kind.GET_GAINS: struct.Struct("<"),
     Kind.SET_GAINS: struct.Struct("<ff"),
     Kind.TRY: struct.Struct("<ffffHIHH"),
+    Kind.GET_LAW: struct.Struct("<"),
     Kind.INFO: struct.Struct("<HHHHB"),
     Kind.SAMPLE: struct.Struct("<IHHBB"),
     Kind.GAINS: struct.Struct("<ff"),
     Kind.ROW: struct.Struct("<IHHBBI"),
+    Kind.LAW: struct.Struct("<fHIHHHHH"),
     Kind.REFUSED: struct.Struct("<BB"),
 }
 

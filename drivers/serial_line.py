@@ -21,9 +21,9 @@ from drivers.line_errors import ECHO, ECHO_REMEDY, LINE_ERRORS, line_errors
 from drivers.line_protocol import VERSION, Decoder, Frame, Kind, encode
 
 _FLASH = "flash the firmware that belongs to this version"
-NOT_IN_COMMAND = 3
+UNKNOWN_REQUEST, NOT_IN_COMMAND = 1, 3
 _REASONS = {
-    1: ("does not know the request", _FLASH),
+    UNKNOWN_REQUEST: ("does not know the request", _FLASH),
     2: ("finds the request too long or too short", _FLASH),
     NOT_IN_COMMAND: ("does not let the host command", "open the rig again"),
     4: ("refuses the value", "check y_span, u_span and the gains"),

@@ -15,7 +15,7 @@ from autotune.errors import InputError, LinkError, NotTaken
 from autotune.experiment.rig import Clock, Former, Reading
 from drivers.clock import MonotonicClock
 from drivers.line_protocol import PAYLOAD, Command, Frame, Kind
-from drivers.serial_line import NOT_IN_COMMAND, DeviceRefused, Port, SerialLink, open_port
+from drivers.serial_line import NOT_IN_COMMAND, UNKNOWN_REQUEST, DeviceRefused, Port, SerialLink, open_port
 
 COMMAND, _DEADMAN, _LIMIT, _TIME, _OVERRUN = 0x03, 0x04, 0x08, 0x10, 0x20
 _GAINS = PAYLOAD[Kind.SET_GAINS]
@@ -104,6 +104,7 @@ class SerialLineRig:
         self._device_time_s = 0.0
         self._received_s, self._latency_s = 0.0, 0.0  # of the sample whose device time that is, on the host's clock
         self._former: Former | None = None
+        self._former_law: tuple[float, ...] = ()  # what LAW said of it
         self._is_open = False
         self._is_commanding = False
 
@@ -119,7 +120,7 @@ class SerialLineRig:
 
     @property
     def former(self) -> Former | None:
-        """Whether the device's own PI ran before the host took command; its set-point cannot be read."""
+        """Whether the device's own PI ran before the host took command, and at which set-point."""
         return self._former
 
     def open(self) -> None:
@@ -136,9 +137,9 @@ class SerialLineRig:
             self._connect()
             self._starts = -1
             frame, *_ = self._link.ask(Kind.READ)
+            self._former = self._running() if self._state(frame) & COMMAND == Command.REGULATOR else None
         except LinkError as error:
             raise NotTaken(error.what, where=error.where, remedy=error.remedy) from None
-        self._former = Former() if self._state(frame) & COMMAND == Command.REGULATOR else None
         self._is_open = True
         self._take()
 
@@ -176,14 +177,21 @@ class SerialLineRig:
             self._exchange(Kind.READ)
 
     def hand_back(self) -> None:
-        """Refuse: the protocol does not say which set-point the device's own PI had.
+        """Give the actuator back to the device's own PI, at the set-point and within the limits it had, bumplessly.
 
         Raises
         ------
         LinkError
-            Always.
+            The device could not be reached, or how its PI ran is not known: its firmware does not say it (before
+            version 3), or it ran for another host.
         """
-        raise LinkError("the set-point it had cannot be read", where=self._link.where, remedy="start it at the rig")
+        self._require(bool(self._former_law), "how its own controller ran is not known", "start it at the rig")
+        setpoint, ticks_per_row, _, y_low, y_high, *output = self._former_law
+        self._link.ask(Kind.TAKE, *output, round(1e3 * self._settings.deadman_s))
+        frame, *_ = self._link.ask(Kind.REGULATE, setpoint, ticks_per_row, 0, y_low, y_high)
+        self._is_commanding = False
+        runs = self._state(frame) & COMMAND == Command.REGULATOR
+        self._require(runs, "the device's controller does not run", "start it at the rig")
 
     def make_safe(self) -> None:
         """Have the device set the safe output and give the actuator back.
@@ -258,6 +266,19 @@ class SerialLineRig:
         self._received_s = self._clock.now()
         self._latency_s = self._received_s - sent_s
         self._is_commanding = True
+
+    def _running(self) -> Former:
+        """Return how the device's PI runs; of its set-point what the device says."""
+        self._former_law = ()
+        try:
+            law = self._link.ask(Kind.GET_LAW)[0].values
+        except DeviceRefused as refusal:
+            if refusal.reason not in (UNKNOWN_REQUEST, NOT_IN_COMMAND):
+                raise
+            return Former()
+        if law[2] == 0:  # one that ends by itself belongs to another host's session
+            self._former_law = law
+        return Former(setpoint=self._y.value(law[0]))
 
     def _connect(self) -> None:
         """Open the line where it is not; learn the device's counts."""

@@ -129,11 +129,13 @@ class SerialRig:
         if reason:
             return bytes((_VERSION, 0xFF)) + content[2:4] + bytes((kind, reason))
         if kind == 0x01:
-            answer, body = 0x81, struct.pack("<HHHHB", 2, 1000, self._y[2], self._u[2], self.starts)
+            answer, body = 0x81, struct.pack("<HHHHB", 3, 1000, self._y[2], self._u[2], self.starts)
         elif kind in (0x08, 0x09):
             per = self._unit(self._y) / self._unit(self._u)
             value = self.device.value
             answer, body = 0x83, struct.pack("<ff", value["K"] * per, value["Ti"])
+        elif kind == 0x0B:
+            answer, body = 0x85, self._law
         else:
             if kind == 0x04:
                 self._put("u", self._value(payload, self._u))
@@ -143,7 +145,7 @@ class SerialRig:
 
     def _obeyed(self, kind: int, payload: bytes) -> int:
         """Do what has to be done before the sample is taken; return the reason of a refusal, or 0."""
-        size = {1: 0, 2: 8, 3: 0, 4: 2, 5: 0, 7: 14, 8: 0, 9: 8}.get(kind)
+        size = {1: 0, 2: 8, 3: 0, 4: 2, 5: 0, 7: 14, 8: 0, 9: 8, 11: 0}.get(kind)
         if size is None or len(payload) != size:
             return _UNKNOWN if size is None else _LENGTH
         by_host = self._by_host
@@ -157,6 +159,8 @@ class SerialRig:
             self._feed()
         elif kind == 0x04 and (not by_host or struct.unpack("<H", payload)[0] > self._u[2]):
             return _RANGE if by_host else _NOT_IN_COMMAND
+        elif kind == 0x0B and (by_host or self.device.value["automatic"] != 1.0):
+            return _NOT_IN_COMMAND
         elif kind == 0x05:
             self._put("automatic", 0.0)
             self._put("enable", 0.0)
@@ -183,6 +187,12 @@ class SerialRig:
         time_us = int(1e6 * (self._now_s + self._clock_error_s)) & 0xFFFFFFFF
         counts = (self._count(y, self._y), self._count(self.device.output, self._u))
         return struct.pack("<IHHBB", time_us, *counts, state, self.starts & 0xFF)
+
+    @property
+    def _law(self) -> bytes:
+        value = self.device.value
+        setpoint = (value["setpoint"] - self._y[0]) / self._unit(self._y)
+        return struct.pack("<fHIHHHHH", setpoint, 0, 0, 0, 0xFFFF, self._count(value["safe"], self._u), 0, self._u[2])
 
     def _feed(self) -> None:
         self._beat = (self._beat + 1.0) % 1024.0

@@ -5,14 +5,14 @@
 #include "frame.h"
 
 enum {
-    HELLO = 1, TAKE, READ, EXCHANGE, SAFE, RELAY, REGULATE, GET_GAINS, SET_GAINS, TRY,
-    INFO = 0x81, SAMPLE, GAINS, ROW, REFUSED = 0xFF
+    HELLO = 1, TAKE, READ, EXCHANGE, SAFE, RELAY, REGULATE, GET_GAINS, SET_GAINS, TRY, GET_LAW,
+    INFO = 0x81, SAMPLE, GAINS, ROW, LAW, REFUSED = 0xFF
 };
 enum { DONE, UNKNOWN, LENGTH, NOT_IN_COMMAND, RANGE };
-enum { FIRMWARE = 2 };
+enum { FIRMWARE = 3 };
 
 /* payload of each request, from HELLO on */
-static const uint8_t SIZE[] = {0, 8, 0, 2, 0, 32, 14, 0, 8, 26};
+static const uint8_t SIZE[] = {0, 8, 0, 2, 0, 32, 14, 0, 8, 26, 0};
 
 static uint16_t get16(const uint8_t *p)
 {
@@ -58,6 +58,14 @@ static uint8_t *put_sample(const device *d, uint8_t *p, const device_sample *sam
     *p++ = sample->state;
     *p++ = d->setup.starts;
     return p;
+}
+
+/* What REGULATE and TAKE would start it with again. */
+static uint8_t *put_law(const device *d, uint8_t *p)
+{
+    p = put16(put_real(p, d->setpoint), d->ticks_per_row);
+    p = put16(put16(put32(p, d->is_timed ? d->ticks_left : 0), d->y_low), d->y_high);
+    return put16(put16(put16(p, d->u_safe), d->u_min), d->u_max);
 }
 
 static uint8_t *put_head(uint8_t *p, uint8_t type, uint16_t sequence)
@@ -274,6 +282,8 @@ static uint8_t obey(device *d, uint8_t type, const uint8_t *payload)
         return set_gains(d, payload);
     case TRY:
         return start_trial(d, payload);
+    case GET_LAW:
+        return d->command == DEVICE_REGULATOR ? DONE : NOT_IN_COMMAND;
     default:
         return DONE;
     }
@@ -286,7 +296,7 @@ uint8_t device_request(device *d, const uint8_t *request, uint8_t length, uint8_
     const uint16_t sequence = get16(request + 2);
     uint8_t reason = DONE;
     uint8_t *p;
-    if (type < HELLO || type > TRY)
+    if (type < HELLO || type > GET_LAW)
         reason = UNKNOWN;
     else if (length - FRAME_HEAD != SIZE[type - HELLO])
         reason = LENGTH;
@@ -302,6 +312,8 @@ uint8_t device_request(device *d, const uint8_t *request, uint8_t length, uint8_
         *p++ = d->setup.starts;
     } else if (type == GET_GAINS || type == SET_GAINS) {
         p = put_real(put_real(put_head(answer, GAINS, sequence), d->K), d->Ti);
+    } else if (type == GET_LAW) {
+        p = put_law(d, put_head(answer, LAW, sequence));
     } else if (type == EXCHANGE) {
         d->is_owed = 1;
         d->owed_to = sequence;

@@ -10,7 +10,9 @@ import pytest
 
 from autotune.controller import PIDController
 from autotune.errors import LinkError
-from autotune.experiment.rig import HoldsGains
+from autotune.experiment.leaving import leave
+from autotune.experiment.rig import Former, HandsBack, HoldsGains
+from sim.serial_rig import SerialRig
 from tests.drivers.bench import (
     DEADMAN_S,
     LIMIT_S,
@@ -215,3 +217,42 @@ def test_the_devices_own_controller_takes_over_and_holds_the_set_point(bench: Be
     assert {change.cause for change in list(device.history)[-10:]} == {"controller"}
     rig.make_safe()
     assert device.output == pytest.approx(U_SAFE)
+
+
+@pytest.mark.parametrize("bench", ["serial", FIRMWARE, ON_DEVICE], indirect=True)
+def test_the_devices_own_controller_gets_the_actuator_back_at_its_set_point(bench: Bench) -> None:
+    rig = bench.rig
+    rig.open()
+    assert isinstance(rig, HandsBack)
+    assert rig.former is None
+    rig.write_gains(PIDController(K=0.5, Ti_s=1.0))  # type: ignore[attr-defined]  # HoldsGains
+    rig.start_controller(0.2)  # type: ignore[attr-defined]  # of these
+    rig.close()
+    rig.open()
+    assert rig.former is not None
+    assert rig.former.setpoint == pytest.approx(0.2, abs=1e-6)
+    rig.write(-0.25)
+    farewell = leave(rig, None)
+    assert farewell.output == "handed back to its own controller: automatic at set-point 0.2"
+    rig.open()  # it runs as before the session
+    assert rig.former == Former(setpoint=pytest.approx(0.2, abs=1e-6))
+    rig.make_safe()
+    assert bench.output() == pytest.approx(U_SAFE)
+
+
+def test_a_controller_whose_set_point_is_not_said_is_left_to_a_person(monkeypatch: pytest.MonkeyPatch) -> None:
+    with serial_bench() as bench:
+        rig = bench.rig
+        rig.open()
+        rig.start_controller(0.2)  # type: ignore[attr-defined]  # of this one
+        rig.close()
+        known = SerialRig._obeyed
+        monkeypatch.setattr(  # firmware before version 3
+            SerialRig, "_obeyed", lambda self, kind, payload: 1 if kind == 0x0B else known(self, kind, payload)
+        )
+        rig.open()
+        assert isinstance(rig, HandsBack)
+        assert str(rig.former) == "automatic"
+        farewell = leave(rig, None)
+        assert farewell.output == "safe output"
+        assert "was not restored: give it the actuator back at the rig" in farewell.note

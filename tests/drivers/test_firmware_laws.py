@@ -244,6 +244,30 @@ def test_the_pi_takes_over_without_a_bump_and_outlives_a_silent_host(device: Dev
     assert device.tick(510) == 40
 
 
+def test_the_pi_says_how_it_runs_and_goes_on_so_after_a_host(device: Device) -> None:
+    assert device.ask(Kind.GET_LAW).values == (Kind.GET_LAW, 3)
+    device.ask(Kind.TAKE, 40, 1000, 15000, 300)
+    device.ask(Kind.EXCHANGE, 6000)
+    device.ask(Kind.SET_GAINS, -2.0, 0.5)
+    device.ask(Kind.REGULATE, 512.5, 0, 0, 100, 900)
+    law = device.ask(Kind.GET_LAW)
+    assert law.kind == Kind.LAW
+    assert law.values == (512.5, 0, 0, 100, 900, 40, 1000, 15000)
+    before = device.tick(512)
+    device.ask(Kind.TAKE, 0, 5000, 7000, 300)  # a host's session, which has limits of its own
+    device.ask(Kind.TRY, -1.0, 1.0, 600.0, 0.0, 10, 1000, 0, 1023)
+    assert device.ask(Kind.GET_LAW).values[:3] == (600.0, 10, 1000)
+    setpoint, ticks_per_row, _, y_low, y_high, *output = law.values
+    device.ask(Kind.TAKE, *output, 300)
+    u = device.tick(512)
+    device.ask(Kind.REGULATE, setpoint, ticks_per_row, 0, y_low, y_high)
+    assert device.ask(Kind.GET_LAW).values == law.values
+    assert abs(device.tick(512) - u) <= 1  # bumpless
+    assert abs(u - before) <= 400
+    assert [device.tick(512) for _ in range(400)][-1] != 40  # no dead-man ends it
+    assert device.tick(901) == 40  # its own limit does
+
+
 @given(st.binary(max_size=300), st.integers(0, 0xFFFF))
 def test_noise_is_never_obeyed_and_what_follows_is(single: PortableFirmware, noise: bytes, sequence: int) -> None:
     receiver = ctypes.create_string_buffer(80)
