@@ -36,6 +36,12 @@ class LimitSettings(Section):
         float,
         Field(gt=0, le=60, description="longest time the loop may be behind its schedule [s]; five samples always are"),
     ] = 0.15
+    blind_s: Annotated[
+        float | None,
+        Field(
+            gt=0, le=60, description="longest time without a usable reading [s]; absent: five samples, or late_s in all"
+        ),
+    ] = None
 
     @model_validator(mode="after")
     def _ordered(self) -> LimitSettings:

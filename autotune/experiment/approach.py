@@ -147,7 +147,7 @@ def preflight(loop: ControlLoop, point: OperatingPointSettings, gain_sd: float, 
     loop.monitor.u_tolerance = 0.02 * (limits.u_max - limits.u_min)
     if changes > RESTLESS:
         # a sensor at its rail repeats its full scale half of the time; the longest run seen says how it repeats itself
-        loop.monitor.max_repeats = 4 * _longest_run(y) + 20
+        loop.monitor.same_s = (4 * _longest_run(y) + 19.5) * loop.sample_time_s
     return Known(
         noise_sd=noise_sd,
         noise_half=noise_half,

@@ -11,6 +11,8 @@ from autotune.errors import ExperimentStopped
 
 #: relative slack of the rate check: a command on the border of what is allowed is allowed in spite of rounding
 RATE_SLACK = 1e-9
+#: samples without a usable reading that are ridden through where no time is given
+BLIND_SAMPLES = 5
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,6 +32,26 @@ class Watch:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Patience:
+    """How much of something bad in a row is ridden through.
+
+    Attributes
+    ----------
+    seconds : float
+        Longest time [s].
+    samples : float
+        Most samples, which are fewer where they come on time; infinite for the time alone.
+    """
+
+    seconds: float
+    samples: float = math.inf
+
+    def is_over(self, seconds: float, samples: float, times: float = 1.0) -> bool:
+        """Return whether so much is more than that, or than several times that."""
+        return samples > times * self.samples or seconds > times * self.seconds
+
+
+@dataclass(frozen=True, kw_only=True)
 class Envelope:
     """The limits of ``[limits]`` as functions.
 
@@ -41,14 +63,20 @@ class Envelope:
         Control period that the rate of u is counted over [s].
     u_step : float
         Resolution of the command [u unit]; 0 for any value.
-    bad_samples : int
-        Unusable readings in a row that the loop rides through on its last command.
     """
 
     settings: LimitSettings
     sample_time_s: float
     u_step: float = 0.0
-    bad_samples: int = 5
+
+    @property
+    def patience(self) -> Patience:
+        """How long the loop rides on its last command without a usable reading."""
+        given = self.settings.blind_s
+        if given is not None:
+            return Patience(seconds=given + 0.5 * self.sample_time_s)
+        late_s = max(self.settings.late_s, BLIND_SAMPLES * self.sample_time_s)
+        return Patience(seconds=late_s + 0.5 * self.sample_time_s, samples=BLIND_SAMPLES)
 
     def nearest(self, u: float, u_previous: float) -> float:
         """Return the allowed command nearest to ``u``: within range and rate, on the converter's grid.

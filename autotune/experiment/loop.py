@@ -92,7 +92,7 @@ class ControlLoop:
         self.rig = rig
         self.envelope = envelope
         self.watch = Watch()
-        self.monitor = ReadingMonitor(bad_samples=envelope.bad_samples)
+        self.monitor = ReadingMonitor(envelope.patience)
         self.metadata: dict[str, Any] = {}
         self._writer = writer
         self._extra = tuple(extra)

@@ -7,12 +7,15 @@ from collections import deque
 from statistics import median
 
 from autotune.errors import ExperimentStopped, LinkError
+from autotune.experiment.limits import Patience
 from autotune.experiment.rig import Reading
 
 #: readings whose median stands for y where limits are judged
 RECENT = 5
 #: share of unusable readings among the last hundred at which the signal is called garbled
 GARBLED_SHARE = 0.25
+#: fewest equal readings that a frozen sensor is told from a link that has nothing new by
+FEWEST_REPEATS = 10
 
 
 class ReadingMonitor:
@@ -20,8 +23,8 @@ class ReadingMonitor:
 
     Parameters
     ----------
-    bad_samples : int
-        Unusable readings in a row that are ridden through.
+    patience : Patience
+        Without a usable reading; an actuator may be late for twice as long.
 
     Attributes
     ----------
@@ -29,24 +32,24 @@ class ReadingMonitor:
         Half-width of the measurement noise as far as known [y unit].
     jump : float
         Largest credible change of y within a few samples, noise apart [y unit]; a reading beyond it is unusable.
-    max_repeats : int or None
-        Equal readings in a row after which the sensor counts as frozen; None while nobody knows what to expect.
+    same_s : float
+        Time of equal readings after which the sensor counts as frozen [s]; infinite while nobody knows what to expect.
     u_tolerance : float
         Difference between commanded and applied output that is the device's rounding [u unit].
     recent : tuple of float
         The last usable readings, the newest last.
     """
 
-    def __init__(self, *, bad_samples: int) -> None:
+    def __init__(self, patience: Patience) -> None:
         self.noise = 0.0
         self.jump = math.inf
-        self.max_repeats: int | None = None
+        self.same_s = math.inf
         self.u_tolerance = math.inf
         self.recent: tuple[float, ...] = ()
-        self._bad_samples = bad_samples
-        self._bad_run = 0
-        self._repeats = 0
-        self._not_followed = 0
+        self._patience = patience
+        self._bad_run = self._repeats = self._not_followed = 0
+        # when a reading was last usable, y last changed, and the actuator first did not follow
+        self._usable_s = self._changed_s = self._astray_s = math.nan
         self._last_device_time_s = math.nan
         self._usable: deque[bool] = deque(maxlen=100)
 
@@ -67,11 +70,14 @@ class ReadingMonitor:
         """
         reason = self._unusable(reading)
         self._usable.append(not reason)
+        if math.isnan(self._usable_s):
+            self._usable_s = self._changed_s = reading.t_s
         if reason:
             self._bad_run += 1
-            if self._bad_run > self._bad_samples:
+            blind_s = reading.t_s - self._usable_s
+            if self._patience.is_over(blind_s, self._bad_run):
                 raise (LinkError if reading.suspect else ExperimentStopped)(
-                    f"{reason}, {self._bad_run} reading(s) in a row",
+                    f"{reason}, {self._bad_run} reading(s) in a row: nothing to go by for {blind_s:.3g} s",
                     where="sensor",
                     remedy="check the sensor, its wiring and its scaling in the configuration",
                 )
@@ -83,7 +89,7 @@ class ReadingMonitor:
                     remedy="check the sensor's wiring and shielding",
                 )
             return (self.recent[-1] if self.recent else math.nan), False
-        self._bad_run = 0
+        self._bad_run, self._usable_s = 0, reading.t_s
         self._check_fresh(reading)
         self._check_followed(reading, u)
         self.recent = (*self.recent[1 - RECENT :], reading.y)
@@ -103,10 +109,14 @@ class ReadingMonitor:
         old_stamp = reading.device_time_s == self._last_device_time_s
         self._last_device_time_s = reading.device_time_s
         same = old_stamp or bool(self.recent and reading.y == self.recent[-1])
-        self._repeats = self._repeats + 1 if same else 0
-        if self.max_repeats is not None and self._repeats >= self.max_repeats:
+        if not same:
+            self._repeats, self._changed_s = 0, reading.t_s
+            return
+        self._repeats += 1
+        same_s = reading.t_s - self._changed_s
+        if self._repeats >= FEWEST_REPEATS and same_s >= self.same_s:
             raise ExperimentStopped(
-                f"stale sensor: y = {reading.y:.6g} has not changed for {self._repeats} samples",
+                f"stale sensor: y = {reading.y:.6g} has not changed for {same_s:.3g} s",
                 where="sensor",
                 remedy="check that the sensor runs and that the device sends new values",
             )
@@ -114,7 +124,9 @@ class ReadingMonitor:
     def _check_followed(self, reading: Reading, u: float) -> None:
         off = math.isfinite(reading.u_applied) and abs(reading.u_applied - u) > self.u_tolerance
         self._not_followed = self._not_followed + 1 if off else 0
-        if self._not_followed > 2 * self._bad_samples:
+        if self._not_followed == 1:
+            self._astray_s = reading.t_s
+        if off and self._patience.is_over(reading.t_s - self._astray_s, self._not_followed, times=2.0):
             raise ExperimentStopped(
                 f"the actuator does not follow: commanded {u:.4g}, the device applies {reading.u_applied:.4g}",
                 where="actuator",

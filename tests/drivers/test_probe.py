@@ -123,11 +123,11 @@ def test_a_microcontroller_is_found_and_probed_and_nothing_is_written_to_it() ->
     device = device_on_line(servo(), u_range=U_RANGE, u_safe=0.0, gains=(1.5, 2.0))
     came_with = dict(device.value)
     with SerialLine() as line, SerialRig(device, line.rig_device, y_span=U_RANGE, u_span=U_RANGE):
-        assert answers_on(line.host_device) == "microcontroller, firmware 2, at 115200 bit/s"
+        assert answers_on(line.host_device) == "microcontroller, firmware 3, at 115200 bit/s"
         settings = serial_settings(line.host_device)
         found = probe_line(settings, expected={"y": (-1.0, 1.0)})
         wrong = probe_line(settings.model_copy(update={"y_span": (90.0, 110.0)}), expected={"y": (-1.0, 1.0)})
-    assert "firmware 2, 1000 ticks per second, started 1 time(s), commanded by nobody" in found.description
+    assert "firmware 3, 1000 ticks per second, started 1 time(s), commanded by nobody" in found.description
     signals = {one.name: one for one in found.signals}
     assert not any(one.warnings for one in found.signals)
     assert signals["y"].value == pytest.approx(device.plant.y_true, abs=0.02)
