@@ -324,6 +324,6 @@ def _take_back(rig: HoldsGains, old: PIDController, notes: Journal, error: BaseE
     if isinstance(error, AutotuneError):
         raise type(error)(f"{what} ({error.what}); {state}", where=where, remedy=remedy) from error
     if isinstance(error, KeyboardInterrupt):
-        raise OperatorStop(f"{what} by Ctrl-C; {state}", where=where, remedy=remedy) from error
+        raise OperatorStop(f"stopped by Ctrl-C: {what}; {state}", where=where, remedy=remedy) from error
     error.add_note(f"{what}; {state}")
     raise error

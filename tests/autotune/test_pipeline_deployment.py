@@ -158,7 +158,7 @@ def test_a_line_that_breaks_once_between_the_gains_leaves_the_old_ones(line: Lin
 def test_ctrl_c_between_the_gains_leaves_the_old_ones(line: Line, tmp_path: Path) -> None:
     line.times, line.seen = 1, lambda: os.kill(os.getpid(), signal.SIGINT)
     journal = tmp_path / "journal.jsonl"
-    with pytest.raises(OperatorStop, match=r"by Ctrl-C; the old gains are in place again") as stopped:
+    with pytest.raises(OperatorStop, match=r"stopped by Ctrl-C: .*; the old gains are in place again") as stopped:
         deploy(line.rig(), NEW, journal, agree=agreed, try_out=None)
     assert stopped.value.exit_status == 130
     assert line.gains == OLD
