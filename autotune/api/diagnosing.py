@@ -35,6 +35,6 @@ def simulated(model: Any, recording: Recording, horizon_s: float | None) -> Floa
 
 
 def _model(model: Any) -> Any:
-    from autotune.equations.files import read_any_model
+    from autotune.model_file import read_any as read_any_model
 
     return read_any_model(model) if isinstance(model, str | os.PathLike) else model

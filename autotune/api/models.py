@@ -18,7 +18,7 @@ class Model:
     @staticmethod
     def read(path: str | os.PathLike[str]) -> Chain | EquationModel | BlackBox:
         """Return what a model file holds: a chain of blocks, equations, or an FMU with its inputs and parameters."""
-        from autotune.equations.files import read_any_model
+        from autotune.model_file import read_any as read_any_model
 
         return read_any_model(path)
 

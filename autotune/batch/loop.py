@@ -23,7 +23,7 @@ from autotune.errors import AutotuneError, IdentificationError
 from autotune.experiment_design.next_experiment import with_next_experiment
 from autotune.identification.closed_loop.identify import identify_closed_loop
 from autotune.identification.frequency.recorded import FrequencyEstimate, combine, frequency_points
-from autotune.models import read_model
+from autotune.model_file import read_model
 from autotune.pipeline import Analysis, analyse, analysis_json
 from autotune.points import FrequencyPoint, points_to_json
 from autotune.recording import Recording

@@ -93,7 +93,7 @@ def design_command(
     if model is not None:
         from autotune.design.loop import characteristic_frequencies, transfer_function_of
         from autotune.design.synthesis import design
-        from autotune.models import read_model
+        from autotune.model_file import read_model
 
         H = transfer_function_of(read_model(model))
         highest_rad_s = float(10.0 * characteristic_frequencies(H)[-1])
@@ -147,7 +147,7 @@ def margins_command(
     """Compute the margins of a controller with a model; a sampled controller is taken with its hold."""
     from autotune.controller import read_controller
     from autotune.design.margins import margins
-    from autotune.models import read_model
+    from autotune.model_file import read_model
 
     place = Output(out, inputs=(model, controller), overwrite=overwrite)
     m = margins(read_model(model), read_controller(controller), noise_frequency_rad_s=noise_frequency)

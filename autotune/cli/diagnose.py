@@ -40,7 +40,7 @@ def simulate(
 
     from autotune.diagnosis.simulation.forecast import forecast
     from autotune.equations.files import forecast_any as of_any
-    from autotune.equations.files import read_any_model
+    from autotune.model_file import read_any as read_any_model
     from autotune.models import Model
 
     place = Output(out, inputs=(recording, model), overwrite=overwrite)
@@ -90,8 +90,8 @@ def diagnose(
     from autotune.controller import read_controller
     from autotune.diagnosis.diagnose import diagnose as find
     from autotune.diagnosis.effects import kind_of
-    from autotune.equations.files import read_any_model
     from autotune.experiment_design.next_experiment import with_next_experiment
+    from autotune.model_file import read_any as read_any_model
     from autotune.models import Model, write_model
     from autotune.report.diagnosis_page import write_diagnosis_page
 

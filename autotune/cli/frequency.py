@@ -95,7 +95,7 @@ def reduce(
     if (points is None) == (model is None):
         raise InputError("give one of --points and --model", where="autotune reduce")
     if model is not None:
-        from autotune.models import read_model
+        from autotune.model_file import read_model
 
         reduced = reduce_transfer_function(read_model(model).transfer_function())
         place.by(lambda part: _write(reduced, part))

@@ -47,7 +47,7 @@ def investigate(
     """Run the experiments that tell apart what a model may leave out, until one hypothesis is left."""
     from autotune.cli.common import ProgressBar, new_folder, rig_of
     from autotune.config import load_config
-    from autotune.models import read_model
+    from autotune.model_file import read_model
     from autotune.pipeline.investigation import Budget, Listeners
     from autotune.pipeline.investigation import investigate as find_out
 

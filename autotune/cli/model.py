@@ -99,7 +99,7 @@ def check(model: Annotated[Path, typer.Argument(help="model file", metavar="M.to
     from autotune.equations import EquationModel, compile_model
     from autotune.equations.black_box import BlackBox
     from autotune.equations.effects import apply
-    from autotune.equations.files import read_any_model
+    from autotune.model_file import read_any as read_any_model
 
     found = read_any_model(model)
     if isinstance(found, BlackBox):
@@ -168,8 +168,8 @@ def _equations(path: Path) -> EquationModel:
     """Return the equations of a model file; a chain without effects becomes some."""
     from autotune.equations import EquationModel
     from autotune.equations.chain import from_chain
-    from autotune.equations.files import read_any_model
     from autotune.errors import InputError
+    from autotune.model_file import read_any as read_any_model
     from autotune.models import Model
 
     found = read_any_model(path)

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from autotune.controller import Controller
-from autotune.diagnosis.effects import kind_of
+from autotune.diagnosis.effects import kind_of, require_known
 from autotune.diagnosis.evidence.adequacy import is_white, residual_tests
 from autotune.diagnosis.evidence.constancy import largest_variation
 from autotune.diagnosis.evidence.description import describe
@@ -48,7 +48,8 @@ def diagnose(
     Parameters
     ----------
     model : Model
-        The nominal chain; effects that it already has are kept as they are.
+        The nominal chain. Effects that it has are its structure: their numbers are retuned like its others, and they
+        are not found again.
     recordings : sequence of Recording
         At least one; several with different excitation tell more.
     controller : Controller, optional
@@ -69,9 +70,11 @@ def diagnose(
     Raises
     ------
     InputError
-        No recording, fewer than 100 rows, or u that is not finite.
+        No recording, fewer than 100 rows, u that is not finite, or an effect of the model that no catalogue has.
     """
+    require_known(model.effects, model.name)
     _require_rows(recordings)
+    without = [*without, *(effect.name for effect in model.effects)]
     evidence = _gathered(model, recordings, controller, without, progress, thresholds)
     evidence = _of_rig(evidence, model, without, progress)
     found, verdict = evidence.search, judged(evidence)
@@ -104,8 +107,13 @@ def _gathered(
 ) -> Evidence:
     """Return all that the verdict rests on: samples, search, what is beside the chain, the residual, held-out rows."""
     progress("looking at the samples", 0.0)
-    recordings, late = evened(model, recordings, thresholds)
-    good, seen = inspect(recordings, without, thresholds)
+    if any(kind_of(effect.name).late_stamps for effect in model.effects):
+        recordings, late = [r.at_even_times() for r in recordings], None
+    else:
+        recordings, late = evened(model, recordings, thresholds)
+    own = {effect.name for effect in model.effects}
+    good, seen = inspect(recordings, [name for name in without if name not in own], thresholds)
+    seen = [s for s in seen if s.name not in own]
     found = search(model, recordings, good, [*without, *(effect.name for effect in seen)], progress, thresholds)
     others = [s for s in _others(found, recordings, controller, seen) if s.name not in without]
     others = others if late is None else [late, *(s for s in others if s.name != late.name)]

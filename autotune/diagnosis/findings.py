@@ -50,7 +50,7 @@ def found_effects(evidence: Evidence, verdict: Verdict) -> tuple[FoundEffect, ..
     if verdict != "effect":
         return tuple(_of_samples(s, everywhere, evidence.limits) for s in evidence.samples)
     effects: list[tuple[float, FoundEffect]] = []
-    for effect in _with_uncertainty(chosen, chosen.fit.model.effects):
+    for effect in _with_uncertainty(chosen, chosen.fit.model.effects)[chosen.fit.parametrisation.own :]:
         effects.append((_lost_without(search, effect.name), _found_effect(effect, evidence, everywhere)))
     effects += [(s.evidence, _of_samples(s, everywhere, evidence.limits)) for s in evidence.samples]
     ranked = [e for _, e in sorted(effects, key=lambda pair: -pair[0])]
@@ -121,7 +121,8 @@ def _readable(effect: Effect) -> Mapping[str, Parameter]:
 def _with_uncertainty(h: Hypothesis, effects: tuple[Effect, ...]) -> tuple[Effect, ...]:
     """Return the effects with the standard deviations of their fit; NaN for a number that the data did not feel.
 
-    A limit that was not felt is none: where it came to rest, further excitation would meet it.
+    A limit that was not felt is none: where it came to rest, further excitation would meet it. One that the nominal
+    model has stays: it was not found here.
     """
     result, p = [], h.fit.parametrisation
     sd = np.sqrt(np.maximum(np.diag(h.fit.covariance), 0.0))
@@ -138,7 +139,9 @@ def _with_uncertainty(h: Hypothesis, effects: tuple[Effect, ...]) -> tuple[Effec
         }
         for q in kind_of(effect.name).parameters:
             given = parameters.get(q.name)
-            if q.role == "limit" and q.neutral is not None and given is not None and not math.isfinite(given.sd):
+            if number < p.own or q.role != "limit" or q.neutral is None or given is None:
+                continue
+            if not math.isfinite(given.sd):
                 parameters[q.name] = replace(given, value=q.neutral)
         result.append(replace(effect, parameters=MappingProxyType(parameters)))
     return tuple(result)
@@ -159,7 +162,8 @@ def extended_model(evidence: Evidence, verdict: Verdict, nominal: Model) -> Mode
     extended = nominal if verdict == "none" or stands else use.fit.model
     if evidence.rig is not None and len(found.data.recordings) == 1:
         # what came at a time of one recording is no property of the rig
-        lasting = tuple(e for e in extended.effects if not kind_of(e.name).at_a_time)
+        own = {e.name for e in nominal.effects}
+        lasting = tuple(e for e in extended.effects if e.name in own or not kind_of(e.name).at_a_time)
         extended = replace(extended, effects=lasting)
     ends = [
         Effect(name=s.name, parameters=s.parameters)

@@ -143,8 +143,9 @@ def apply(model: EquationModel, effects: Sequence[Effect] | None = None) -> Appl
     for number, effect in enumerate(acting):
         if effect.name not in KNOWN:
             raise InputError(
-                f"effect {effect.name!r} cannot be simulated", where=model.name, remedy="use a name of the catalogue"
-            )
+                f"effect {effect.name!r} cannot be simulated in equations", where=model.name,
+                remedy=f"use one of {', '.join(sorted(KNOWN))}",
+            )  # fmt: skip
         if effect.name == "timing.dead_time":
             delays = delays + np.where(_acts_on(model, effect), _value(effect, "delay", model), 0.0)
         elif effect.name in BEFORE:

@@ -6,6 +6,9 @@ by its name: what a search, the simulation or the verdict needs to know of it st
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from difflib import get_close_matches
+
 from autotune.diagnosis.effects.actuator import ACTUATOR
 from autotune.diagnosis.effects.base import EffectKind
 from autotune.diagnosis.effects.checks import require_complete
@@ -15,6 +18,7 @@ from autotune.diagnosis.effects.plant import PLANT
 from autotune.diagnosis.effects.sensor import SENSOR
 from autotune.diagnosis.effects.timing import TIMING
 from autotune.errors import InputError
+from autotune.models import Effect
 
 #: All effects, places in the order in which a sample passes them.
 ALL: tuple[EffectKind, ...] = (*ACTUATOR, *PLANT, *SENSOR, *TIMING, *ENVIRONMENT, *CONTROLLER)
@@ -36,5 +40,26 @@ def kind_of(name: str, where: str = "catalogue") -> EffectKind:
         No effect of that name.
     """
     if name not in KINDS:
-        raise InputError(f"effect {name!r} cannot be simulated", where=where, remedy="use a name of the catalogue")
+        raise unknown(name, where)
     return KINDS[name]
+
+
+def unknown(name: str, where: str, known: Iterable[str] = ()) -> InputError:
+    """Return the error of an effect that no catalogue has: the name that may be meant, and all that there are."""
+    names = sorted({*KINDS, *known})
+    near = get_close_matches(name, names, 1)
+    meant = f"did you mean {near[0]!r}? " if near else ""
+    return InputError(f"unknown effect {name!r}", where=where, remedy=f"{meant}Known are {', '.join(names)}")
+
+
+def require_known(effects: Iterable[Effect], where: str, known: Iterable[str] = ()) -> None:
+    """Refuse effects that no catalogue has, ``known`` beside it.
+
+    Raises
+    ------
+    InputError
+        The first of them, with the list of known ones.
+    """
+    for effect in effects:
+        if effect.name not in KINDS and effect.name not in known:
+            raise unknown(effect.name, where, known)

@@ -47,7 +47,12 @@ class Trial:
     @property
     def place(self) -> str:
         """State, port or input that it acts on, for telling trials of one effect apart."""
-        return self.effect.state or self.effect.port or self.effect.input
+        return place_of(self.effect)
+
+
+def place_of(effect: Effect) -> str:
+    """Return the state, port or input that an effect acts on; nothing for the reading."""
+    return effect.state or effect.port or effect.input
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -107,11 +112,7 @@ def trials(model: EquationModel, signals: Signals, without: Sequence[str] = (), 
         for one in model.inputs:
             if one.kind:
                 found += _loads(signals, "input", one.column)
-    return [one for one in found if one.effect.name not in without and one.effect.name not in _present(model)]
-
-
-def _present(model: EquationModel) -> set[str]:
-    return {effect.name for effect in model.effects}
+    return [one for one in found if one.effect.name not in without]
 
 
 def _effect(name: str, key: str = "", place: str = "", **values: float) -> Effect:

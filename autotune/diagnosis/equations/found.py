@@ -153,7 +153,7 @@ def diagnose_equations(
     Parameters
     ----------
     model : EquationModel
-        The nominal model; effects that it already has are kept.
+        The nominal model. Effects that it has are its structure: retuned like its other numbers, not found again.
     recordings : sequence of Recording
         At least one; several with different excitation tell more.
     without : sequence of str
@@ -177,6 +177,8 @@ def diagnose_equations(
         if np.isfinite(one.y).sum() < 100:
             raise InputError(f"{len(one)} rows", where=one.name, remedy="a diagnosis needs at least 100 readings")
     good, seen = inspect(recordings, without)
+    own = {effect.name for effect in model.effects}
+    seen = [one for one in seen if one.name not in own]
     bench: Bench = (
         ClosedBench(model, recordings, good) if isinstance(model, BlackBox) else EquationBench(model, recordings, good)
     )

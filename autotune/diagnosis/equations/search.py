@@ -9,7 +9,7 @@ import numpy as np
 
 from autotune.arrays import FloatArray
 from autotune.diagnosis.equations.bench import Bench, Outcome, scaled
-from autotune.diagnosis.equations.candidates import Trial, trials
+from autotune.diagnosis.equations.candidates import Trial, place_of, trials
 from autotune.diagnosis.fitting.noise import Noise, noise_from_differences
 from autotune.errors import InputError
 from autotune.models import Effect
@@ -167,11 +167,10 @@ def screened(bench: Bench, base: Outcome, without: Sequence[str], progress: Prog
         The best first; an effect at a place stands once.
     """
     signals = bench.signals(base)
-    present = {effect.name for effect in base.effects}
-    all_trials = [
-        one for one in trials(bench.model, signals, without, bench.is_closed) if one.effect.name not in present
-    ]
-    all_trials += bench.periodic(base, signals) if "environment.periodic_load" not in (*without, *present) else []
+    present = {(effect.name, place_of(effect)) for effect in base.effects}
+    tried = trials(bench.model, signals, without, bench.is_closed)
+    tried += bench.periodic(base, signals) if "environment.periodic_load" not in without else []
+    all_trials = [one for one in tried if (one.effect.name, one.place) not in present]
     basis, e = bench.explained(base), bench.without_starts(base, base.residual)
     e = e - basis @ (basis.T @ e)
     best: dict[tuple[str, str], tuple[float, Effect]] = {}

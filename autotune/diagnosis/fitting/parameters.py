@@ -15,7 +15,7 @@ from autotune.diagnosis.effects import kind_of
 from autotune.diagnosis.simulation.assembly import assemble
 from autotune.diagnosis.simulation.simulator import Simulator
 from autotune.diagnosis.thresholds import Thresholds
-from autotune.models import Block, Effect, Model, Parameter, TransferFunction
+from autotune.models import LARGEST, Block, Effect, Model, Parameter, TransferFunction
 
 Kind: TypeAlias = Literal["gain", "den", "num", "delay", "u_offset", "effect"]
 #: How many times as uncertain as other numbers the damping of a mode that rings is: it is read off a decay that
@@ -68,12 +68,20 @@ class Parametrisation:
         Nominal values in units of the search; also the prior's mean.
     fixed : mapping
         Effect parameters that are not searched, by (effect, parameter name).
+    own : int
+        How many of the effects, the first ones, the nominal model has itself: they are its structure, not a finding.
     """
 
     model: Model
     free: tuple[Free, ...]
     centre: FloatArray
     fixed: MappingProxyType[str, float] = field(default_factory=lambda: MappingProxyType({}))
+    own: int = 0
+
+    @property
+    def added(self) -> tuple[Effect, ...]:
+        """The effects that the nominal model does not have."""
+        return self.model.effects[self.own :]
 
     @property
     def spreads(self) -> FloatArray:
@@ -90,10 +98,10 @@ class Parametrisation:
         """Free numbers beyond those of the nominal structure, those that a direct search sets included."""
         located = sum(
             q.role == "location" and q.name in effect.parameters
-            for effect in self.model.effects
+            for effect in self.added
             for q in kind_of(effect.name).parameters
         )
-        return located + sum(f.kind == "effect" for f in self.free)
+        return located + sum(f.kind == "effect" and f.index[0] >= self.own for f in self.free)
 
     def simulator(self, theta: FloatArray) -> Simulator:
         """Return the model at a point of the search, assembled."""
@@ -223,9 +231,9 @@ def parametrise(
     Parameters
     ----------
     model : Model
-        Nominal model without effects.
+        Nominal model; effects that it has are part of its structure, and their numbers have the prior of its others.
     effects : sequence of Effect
-        Effects at their starting values. Parameters that count or mark stay as they are.
+        Further effects at their starting values. Parameters that count or mark stay as they are.
     input_size, sample_time_s, prior_spread : float
         As in :func:`chain_parameters`.
 
@@ -235,6 +243,7 @@ def parametrise(
         Chain and effects, ready to be fitted.
     """
     free, centre = chain_parameters(model, input_size, sample_time_s, prior_spread)
+    own, effects = len(model.effects), (*model.effects, *effects)
     for number, effect in enumerate(effects):
         kind = kind_of(effect.name)
         for j, (key, parameter) in enumerate(effect.parameters.items()):
@@ -243,12 +252,23 @@ def parametrise(
             if q is None or not q.is_fitted or (q.held is not None and q.held(values)):
                 continue
             positive = q.sign == "positive"
+            if number < own and _is_absent(parameter.value, q.neutral, positive):
+                continue
             parts = [effect.parameters[k].value for k in (key, *q.size_with) if k in effect.parameters]
             size = math.hypot(*parts) or 1.0
             name = f"{effect.name}.{key}"
-            free.append(Free(name=name, kind="effect", index=(number, j), positive=positive, size=size, turns=q.turns))
+            spread = prior_spread if number < own else math.inf
+            free.append(
+                Free(name=name, kind="effect", index=(number, j), positive=positive, size=size, spread=spread,
+                     turns=q.turns)
+            )  # fmt: skip
             centre.append(math.log(parameter.value) if positive else parameter.value / size)
-    return Parametrisation(model=replace(model, effects=tuple(effects)), free=tuple(free), centre=np.array(centre))
+    return Parametrisation(model=replace(model, effects=effects), free=tuple(free), centre=np.array(centre), own=own)
+
+
+def _is_absent(value: float, neutral: float | None, positive: bool) -> bool:
+    """Whether a nominal effect's number is one that cannot be retuned: a limit that is none, or a size of 0."""
+    return value == neutral or value == 0.0 or abs(value) >= LARGEST or (positive and value < 0.0)
 
 
 def effect_with(name: str, values: Sequence[float], units: Sequence[str] = ()) -> Effect:

@@ -92,8 +92,9 @@ def exchanged(chosen: Hypothesis, data: Data, base: Fit, bench: Bench) -> list[H
 
 
 def without(h: Hypothesis, index: int, data: Data) -> Hypothesis | None:
-    """Fit a hypothesis again with one of its effects left out; nothing where the simulation runs away without it."""
+    """Fit a hypothesis again without one of the effects it adds; nothing where the simulation runs away without it."""
     p = h.fit.parametrisation
+    index += p.own  # the nominal model's own effects stay
     keep = [i for i, f in enumerate(p.free) if f.kind != "effect" or f.index[0] != index]
     moved = [
         replace(f, index=(f.index[0] - 1, f.index[1])) if f.kind == "effect" and f.index[0] > index else f

@@ -41,8 +41,8 @@ class Hypothesis:
 
 
 def hypothesis(fit: Fit) -> Hypothesis:
-    """Return a fit as a hypothesis, named after the effects of its model."""
-    return Hypothesis(names=tuple(e.name for e in fit.parametrisation.model.effects), fit=fit)
+    """Return a fit as a hypothesis, named after the effects that its model has beyond the nominal one's."""
+    return Hypothesis(names=tuple(e.name for e in fit.parametrisation.added), fit=fit)
 
 
 def penalised(h: Hypothesis) -> float:
@@ -62,7 +62,8 @@ def merged(first: Sequence[Hypothesis], second: Sequence[Hypothesis] = ()) -> li
 
 def is_stand_in(h: Hypothesis, data: Data) -> bool:
     """Whether one of its effects came to where it is a simpler one by another name."""
-    able = [(e, kind_of(e.name)) for e in h.fit.model.effects if kind_of(e.name).stand_in is not None]
+    added = h.fit.model.effects[h.fit.parametrisation.own :]
+    able = [(e, kind_of(e.name)) for e in added if kind_of(e.name).stand_in is not None]
     if not able:
         return False
     positions = np.concatenate([signals[:, 2] for signals in h.fit.signals])

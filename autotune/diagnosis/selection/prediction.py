@@ -94,9 +94,9 @@ def extended(base: Fit, effect: Effect, data: Data) -> tuple[Parametrisation, Fl
     old = base.parametrisation
     effects = (*base.model.effects, effect)
     size = float(np.std(np.concatenate([r.u for r in data.recordings]))) or 1.0
-    p = parametrise(
-        replace(old.model, effects=()), effects, size, data.recordings[0].sample_time_s, data.thresholds.prior_spread
-    )
+    nominal = replace(old.model, effects=effects[: old.own])
+    dt_s = data.recordings[0].sample_time_s
+    p = parametrise(nominal, effects[old.own :], size, dt_s, data.thresholds.prior_spread)
     theta = p.centre.copy()
     theta[: base.theta.size] = base.theta
     # an effect's own centre is its starting value; those fitted already keep the scale of their search

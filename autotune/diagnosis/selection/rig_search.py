@@ -138,7 +138,7 @@ def _residual_sd(result: Fit, data: Data) -> float:
 def _roots(model: Model, bench: RigBench) -> tuple[RigBench, list[Judged]]:
     """Return the bench with the retuned model's residual, and that model at its nominal numbers and retuned."""
     recordings = bench.long.recordings
-    p = parametrise(replace(model, effects=()), [], _input_size(model, recordings), recordings[0].sample_time_s)
+    p = parametrise(model, [], _input_size(model, recordings), recordings[0].sample_time_s)
     result = bench.settled(p, None)
     for _ in range(2):
         bench = bench.with_sd(_residual_sd(result, bench.long), bench.few.noise.sd)
@@ -256,7 +256,7 @@ def _known(known: Fit | None, bench: RigBench) -> list[Judged]:
     if known is None:
         return []
     given = {k.name: o for k, o in bench.odds}
-    odds = math.prod(given.get(e.name, 0.0) for e in known.model.effects)
+    odds = math.prod(given.get(e.name, 0.0) for e in known.parametrisation.added)
     try:
         result = bench.settled(known.parametrisation, known.theta)
     except RUNAWAY:
