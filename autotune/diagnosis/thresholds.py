@@ -129,7 +129,7 @@ class Thresholds:
     material: float = _known(0.1, "of the held-out error", "that one more effect must take away", "convention")
     material_numbers: float = _known(0.25, "of the held-out error", "that retuned numbers must take away to replace nominal ones where no effect is found", "convention")
     spoiled: float = _known(4.0, "times the residual", "variance of spoiled readings that matters beside a rig's free run", "convention")
-    most_frozen: float = _known(0.1, "of the rows", "that repeat a reading: more of them are a slow converter, no dropout", "convention")
+    most_held: float = _known(0.5, "of the values", "that stay for more than a row: more of them are a slow converter, no dropout", "convention")
     known_odds: float = _known(0.3, "prior odds", "at least, of what the search beside the noise found to explain most", "real rigs")
     rig_effects: int = _known(4, "effects", "in one hypothesis at most", "cost")
     rig_beam: int = _known(2, "hypotheses", "that are built on", "cost")

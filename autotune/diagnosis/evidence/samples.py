@@ -86,6 +86,12 @@ def frozen_rows(y: FloatArray, least_run: int = Thresholds.least_run) -> BoolArr
     return frozen
 
 
+def held_share(recordings: Sequence[Recording]) -> float:
+    """Return the share of all values that stay for more than one row: most of a slow converter's, few of dropouts'."""
+    lengths = [np.diff(np.flatnonzero(np.concatenate([[True], np.diff(r.y) != 0.0, [True]]))) for r in recordings]
+    return float(np.mean(np.concatenate(lengths) > 1))
+
+
 def spikes(y: FloatArray, good: BoolArray, sds: float = Thresholds.spike) -> BoolArray:
     """Return the rows that stand alone out of the mean of their neighbours by so many robust standard deviations."""
     found = np.zeros(y.size, dtype=bool)
@@ -141,8 +147,8 @@ def inspect(
     count = sum(int(f.sum()) for f in frozen)
     total = sum(len(r) for r in recordings)
     if (
-        count >= limits.least_frozen_rows
-        and limits.least_frozen_share * total < count < limits.most_frozen * total
+        count >= max(limits.least_frozen_rows, limits.least_frozen_share * total)
+        and held_share(recordings) < limits.most_held
         and "sensor.dropout" not in without
     ):
         effects.append(_dropout(recordings, frozen, count / total))

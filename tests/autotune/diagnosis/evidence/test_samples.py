@@ -48,6 +48,25 @@ def test_frozen_readings_are_left_out_and_named_with_their_times() -> None:
     assert effects[0].windows[0] == pytest.approx((0, 5.0, 5.08))
 
 
+@pytest.mark.parametrize("share", [0.02, 0.1, 0.27])
+def test_samples_that_are_lost_often_are_lost_all_the_same(share: float) -> None:
+    rng, y = np.random.default_rng(3), rounded(signal(3))
+    for first in np.flatnonzero(rng.uniform(size=y.size - 4) < share / 3.0):
+        y[first + 1 : first + 4] = y[first]
+    _, effects = inspect([Recording(t=0.01 * np.arange(y.size), u=np.zeros(y.size), y=y)])
+    assert [e.name for e in effects] == ["sensor.dropout"]
+    assert effects[0].parameters["share"].value == pytest.approx(share, rel=0.2)
+
+
+@pytest.mark.parametrize("rows", [3, 4, 10])
+def test_a_converter_slower_than_the_recording_loses_no_samples(rows: int) -> None:
+    rng, fresh = np.random.default_rng(4), rounded(signal(4))
+    jumps = np.cumsum(rng.integers(rows - 1, rows + 2, fresh.size))  # its clock is not the recorder's
+    y = fresh[np.searchsorted(jumps, np.arange(fresh.size), side="right")]
+    _, effects = inspect([Recording(t=0.01 * np.arange(y.size), u=np.zeros(y.size), y=y)])
+    assert effects == []
+
+
 def test_a_reading_that_stands_once_at_its_largest_value_met_an_end_stop() -> None:
     k, level = np.arange(3000), 5.9
     growing = 5.0 + (0.5 + k / 6000.0) * np.sin(0.01 * k) + 0.001 * np.random.default_rng(1).normal(size=k.size)
