@@ -30,7 +30,11 @@ DIRECTIONS = 12
 _FACETS = 12
 _ATOMS_PER_DECADE = 16
 _RESOLUTION = 5e-4  # what the grid of time constants cannot represent, in log gain and in radians
-_MOST_INFLATION = 3.0
+#: probability below which points that miss the class contradict it
+_CONTRADICTED = 1e-3
+#: what may be missed beyond the regions, in log gain and in radians: where abs(L) is near one half, as it is next to
+#: the critical point, this moves a modulus margin of one half by one per cent
+_MATERIAL = 0.01
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -81,8 +85,9 @@ class ConsistentProcesses:
         """
         gain, phase = self.rows(omega_rad_s)
         angles = 2.0 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS
-        costs = np.cos(angles)[:, None] * gain[:, None, :] + np.sin(angles)[:, None] * phase[:, None, :]
-        return self._largest(costs.reshape(-1, gain.shape[1]), "plant").reshape(len(gain), DIRECTIONS)
+        # direction by direction: the next frequency's vertex is the last one's or its neighbour
+        costs = np.cos(angles)[:, None, None] * gain + np.sin(angles)[:, None, None] * phase
+        return self._largest(costs.reshape(-1, gain.shape[1]), "plant").reshape(DIRECTIONS, len(gain)).T
 
     def curvatures(self, omega_rad_s: FloatArray) -> FloatArray:
         """Return (M,) bounds on the second derivative of log H by log omega: how far it can leave a chord."""
@@ -164,7 +169,7 @@ def consistent_processes(
     inverse = _geometric(0.02 / omega[-1], 5.0 / omega[0]) if inverse_response else np.zeros(0)
     gain_rows, phase_rows = _rows(omega, lags, inverse, omega_0)
     radius = math.sqrt(-2.0 * math.log(1.0 - probability ** (1.0 / len(ordered))))
-    facets, centre, size = [], [], []
+    facets, centre, sd = [], [], []
     whitened_rows, whitened = [], []
     for i, point in enumerate(ordered):
         covariance = _log_covariance(point) + _RESOLUTION**2 * np.eye(2)
@@ -177,15 +182,15 @@ def consistent_processes(
         normals = np.stack((np.cos(angles), np.sin(angles)), axis=1) @ inverse_root
         facets.append(normals @ rows)
         centre.append(normals @ measured)
-        size.append(np.full(_FACETS, radius))
-    A, b, r = np.vstack(facets), np.concatenate(centre), np.concatenate(size)
-    inflation = _inflation(A, b, r, omega)
+        sd.append(math.sqrt(float(np.linalg.eigvalsh(covariance)[-1])))
+    A, b = np.vstack(facets), np.concatenate(centre)
+    inflation = _inflation(A, b, omega, radius, np.array(sd))
     return ConsistentProcesses(
         sign=sign,
         lags_s=lags,
         inverse_s=inverse,
         facets=A,
-        limits=b + inflation * r,
+        limits=b + inflation * radius,
         omega_0=omega_0,
         nominal=_closest(np.vstack(whitened_rows), np.concatenate(whitened)),
         inflation=inflation,
@@ -226,12 +231,16 @@ def _log_covariance(point: FrequencyPoint) -> FloatArray:
     return np.asarray(J @ np.array(point.covariance) @ J.T)
 
 
-def _inflation(A: FloatArray, b: FloatArray, r: FloatArray, omega: FloatArray) -> float:
-    """Return how far the regions must grow for one member to pass through all of them, with a tenth to spare."""
+def _inflation(A: FloatArray, b: FloatArray, omega: FloatArray, radius: float, sd: FloatArray) -> float:
+    """Return how far the regions must grow for one member to pass through all of them, with a tenth to spare.
+
+    A class that passes by the points by more than chance allows is the wrong one, and what it says between and beyond
+    them is no guarantee, however large the regions are made; unless what it misses is too little to matter.
+    """
     V = A.shape[1]
     result = linprog(
         np.append(np.zeros(V), 1.0),
-        A_ub=np.hstack((A, -r[:, None])),
+        A_ub=np.hstack((A, -np.full((len(A), 1), radius))),
         b_ub=b,
         bounds=[*_bounds(V), (0.0, None)],
         method="highs-ds",
@@ -239,14 +248,15 @@ def _inflation(A: FloatArray, b: FloatArray, r: FloatArray, omega: FloatArray) -
     if result.status != 0 or result.x is None:
         raise DesignError("the points determine no process", where="points", remedy="check their gains and phases")
     least = float(result.x[-1])
-    if least > _MOST_INFLATION:
-        excess = (A @ result.x[:-1] - b) / r
-        worst = omega[int(np.argmax(excess)) // _FACETS]
+    distance = np.max((A @ result.x[:-1] - b).reshape(len(omega), _FACETS), axis=1)  # in standard deviations
+    missed = np.maximum(distance - radius, 0.0) * sd
+    by_chance = len(omega) * math.exp(-0.5 * (least * radius) ** 2)
+    if by_chance < _CONTRADICTED and np.max(missed) > _MATERIAL:
         raise DesignError(
-            f"the points contradict each other as those of an aperiodic process with dead time: their regions would "
-            f"have to be {least:.1f} times as large, the one at {worst:.4g} rad/s first of all",
+            "the points contradict each other as those of an aperiodic process with dead time: their regions would "
+            f"have to be {least:.1f} times as large, the one at {omega[int(np.argmax(missed))]:.4g} rad/s first of all",
             where="points",
-            remedy="measure that point again, or design on a model if the plant resonates",
+            remedy="measure that point again, or design on a model if the plant resonates or its gain rises",
         )
     return max(1.0, 1.1 * least)
 

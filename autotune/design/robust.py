@@ -19,10 +19,18 @@ from autotune.design.figures import columns
 from autotune.design.kernels import evaluate, evaluate_grid
 from autotune.design.load_error import least_error, load_step
 from autotune.design.margins import Margins
+from autotune.design.search import minimised
 from autotune.design.specification import Design, Kind, Specification
 from autotune.design.uncertain import UncertainPlant, guaranteed, uncertain_plant
 from autotune.errors import DesignError
 from autotune.points import FrequencyPoint
+
+#: the search begins on every so many-th frequency
+_THIN = 4
+#: from so many nodes of the coarse grid, apart from each other in log gains
+_STARTS, _APART = 2, 0.25
+#: slope of the wall that a simplex meets at a constraint, norm (log) per relative slack
+_WALL = 1e4
 
 
 def design_on_points(
@@ -87,47 +95,112 @@ def _norm(plant: UncertainPlant, p: FloatArray) -> float:
 
 
 def _search(plant: UncertainPlant, specification: Specification, kind: Kind) -> FloatArray:
-    """Coarse grid on the nominal plant, the best nodes checked on the whole set, then a simplex with a steep wall."""
+    """Coarse grid on the nominal plant, the best node that the whole set keeps, then local searches, coarse to fine."""
+    coarse = plant.thinned(_THIN)
     grid = _coarse_grid(plant, specification, kind)
-    n = plant.nominal
-    thin = n.thinned(4)
-    figures = columns(evaluate_grid(thin.omega, thin.h, thin.weights, thin.turn, grid, _omega_n(specification)))
+    n = coarse.nominal
+    figures = columns(evaluate_grid(n.omega, n.h, n.weights, n.turn, grid, _omega_n(specification)))
     promising = np.flatnonzero(np.min(specification.slacks(figures)[:, :2], axis=1) >= -0.05)
     order = promising[np.argsort(np.asarray(figures.squared_norm)[promising])]
-    best, share = None, -math.inf
-    for index in order:
-        slack = float(np.min(_slacks(plant, specification, grid[index])))
-        share = max(share, slack)
-        if slack >= 0.0:
-            best = grid[index]
-            break
-    if best is None:
+    starts = _first_kept(coarse, specification, grid[order])
+    if not starts:
         raise _unreachable(plant, specification, kind, grid)
-    free = best > 0.0
-
-    def cost(x: FloatArray, start: FloatArray) -> float:
-        p = start.copy()
-        p[free] = start[free] * np.exp(x)
-        violated = np.minimum(_slacks(plant, specification, p), 0.0)
-        return _norm(plant, p) - 1e3 * float(np.min(violated)) * 10.0
-
-    for span in (0.3, 0.1, 0.03, 0.01):
-        size = int(np.sum(free))
-        simplex = np.vstack((np.zeros(size), span * (np.eye(size) - 0.5 / size)))
-        result = minimize(
-            cost,
-            np.zeros(size),
-            args=(best,),
-            method="Nelder-Mead",
-            options={"initial_simplex": simplex, "xatol": 1e-6, "fatol": 1e-9, "maxiter": 200 * size},
-        )
-        moved = best.copy()
-        moved[free] = best[free] * np.exp(result.x)
-        if np.min(_slacks(plant, specification, moved)) >= -1e-6 and _norm(plant, moved) <= _norm(plant, best):
-            best = moved
+    # a simplex is not caught by the kinks of the least slack, which the quadratic programme sometimes is; in four
+    # dimensions it is the simplex that stops short
+    near = [_simplex(coarse, specification, starts[0], 0.3)] if kind == "pi" else starts
+    found = [_quadratic(coarse, specification, start, (1.0, 0.1)) for start in near]
+    best = min(found, key=lambda p: _norm(coarse, p))
+    fine = _simplex(plant, specification, best, 0.1) if kind == "pi" else best
+    best = _quadratic(plant, specification, fine, (0.1,), best)
+    if np.min(_slacks(plant, specification, best)) < -1e-6:  # feasible between the coarse frequencies only
+        best = _quadratic(plant, specification, _inwards(plant, specification, starts[0]), (1.0, 0.1))
+    if np.min(_slacks(plant, specification, best)) < -1e-6:
+        raise _unreachable(plant, specification, kind, grid)
     if specification.criterion == "iae":
         best = _least_error(plant, specification, np.asarray(best))
     return np.asarray(best)
+
+
+def _first_kept(plant: UncertainPlant, specification: Specification, nodes: FloatArray) -> list[FloatArray]:
+    """Return the first nodes that the whole set keeps and that are no neighbours, two at most."""
+    kept: list[FloatArray] = []
+    for node in nodes:
+        free = node > 0.0
+        near = any(float(np.max(np.abs(np.log(node[free] / one[free])))) <= _APART for one in kept)
+        if not near and np.min(_slacks(plant, specification, node)) >= 0.0:
+            kept.append(node)
+        if len(kept) == _STARTS:
+            break
+    return kept
+
+
+def _inwards(plant: UncertainPlant, specification: Specification, p: FloatArray) -> FloatArray:
+    """Return the controller with as little less gain as the whole set needs; itself where no such gain is found."""
+    for factor in np.geomspace(1.0, 0.5, 30):
+        lower = p * np.array([factor, 1.0, 1.0, 1.0])
+        if np.min(_slacks(plant, specification, lower)) >= 0.0:
+            return np.asarray(lower)
+    return p
+
+
+def _simplex(plant: UncertainPlant, specification: Specification, start: FloatArray, span: float) -> FloatArray:
+    """Return the controller that a simplex of size ``span`` with a steep wall at the constraints comes to."""
+    free = start > 0.0
+    size = int(np.sum(free))
+
+    def cost(x: FloatArray) -> float:
+        p = start.copy()
+        p[free] = start[free] * np.exp(x)
+        violated = np.minimum(_slacks(plant, specification, p), 0.0)
+        return _norm(plant, p) - _WALL * float(np.min(violated))
+
+    simplex = np.vstack((np.zeros(size), span * (np.eye(size) - 0.5 / size)))
+    result = minimize(
+        cost,
+        np.zeros(size),
+        method="Nelder-Mead",
+        options={"initial_simplex": simplex, "xatol": 1e-4, "fatol": 1e-6, "maxiter": 200 * size},
+    )
+    moved = start.copy()
+    moved[free] = start[free] * np.exp(result.x)
+    return moved
+
+
+def _quadratic(
+    plant: UncertainPlant,
+    specification: Specification,
+    start: FloatArray,
+    spans: Sequence[float],
+    otherwise: FloatArray | None = None,
+) -> FloatArray:
+    """Return the best controller that sequential quadratic programming in log gains looked at.
+
+    ``otherwise``, or ``start`` where it is absent, stands where it is better, or where none keeps the constraints.
+    """
+    free = start > 0.0
+    memory: dict[bytes, tuple[float, FloatArray]] = {}
+    best: tuple[float, FloatArray] = (math.inf, start)
+    if otherwise is not None and np.min(_slacks(plant, specification, otherwise)) >= 0.0:
+        best = (_norm(plant, otherwise), otherwise)
+
+    def look(x: FloatArray) -> tuple[float, FloatArray]:
+        nonlocal best
+        key = x.tobytes()
+        if key not in memory:
+            p = start.copy()
+            p[free] = start[free] * np.exp(x)
+            norm, slacks = _norm(plant, p), _slacks(plant, specification, p)
+            if np.min(slacks) >= 0.0 and norm < best[0]:
+                best = (norm, p)
+            memory[key] = (norm, slacks - 1e-7)
+        return memory[key]
+
+    x = np.zeros(int(np.sum(free)))
+    for span in spans:
+        minimised(look, x, span, most=40, tolerance=1e-10)
+        if best[0] < math.inf:
+            x = np.log(best[1][free] / start[free])
+    return best[1]
 
 
 def _least_error(plant: UncertainPlant, specification: Specification, start: FloatArray) -> FloatArray:

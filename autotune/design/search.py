@@ -199,22 +199,49 @@ def local_search(problem: Problem, start: FloatArray, offset: FloatArray) -> tup
 
     x = np.zeros(int(np.sum(free)))
     for span in (1.0, 0.05):
-        # the stubs know no inequality constraint with its own gradient
-        result = minimize(  # type: ignore[call-overload] # see above
-            lambda z: look(z)[0],
-            x,
-            jac=lambda z: _gradient(lambda v: np.array([look(v)[0]]), z)[0],
-            constraints={
-                "type": "ineq",
-                "fun": lambda z: look(z)[1],
-                "jac": lambda z: _gradient(lambda v: look(v)[1], z),
-            },
-            bounds=[(float(value) - span, float(value) + span) for value in x],
-            method="SLSQP",
-            options={"maxiter": 60, "ftol": 1e-12},
-        )
-        x = np.log(best[1][free] / start[free]) if best[0] < math.inf else np.asarray(result.x)
+        ended = minimised(look, x, span, most=60, tolerance=1e-12)
+        x = np.log(best[1][free] / start[free]) if best[0] < math.inf else ended
     return math.sqrt(best[0]), best[1]
+
+
+def minimised(
+    look: Callable[[FloatArray], tuple[float, FloatArray]],
+    start: FloatArray,
+    span: float,
+    *,
+    most: int,
+    tolerance: float,
+) -> FloatArray:
+    """Return where sequential quadratic programming ends: value and slacks of ``look``, within ``span`` of the start.
+
+    Parameters
+    ----------
+    look : callable
+        From (P,) parameters to what is minimised and its (S,) slacks, negative where violated; remembers what it saw.
+    start : (P,) array
+        Where it begins.
+    span : float
+        Largest distance from the start in each parameter.
+    most : int
+        Largest number of steps.
+    tolerance : float
+        Of the value.
+    """
+    # the stubs know no inequality constraint with its own gradient
+    result = minimize(  # type: ignore[call-overload] # see above
+        lambda z: look(z)[0],
+        start,
+        jac=lambda z: _gradient(lambda v: np.array([look(v)[0]]), z)[0],
+        constraints={
+            "type": "ineq",
+            "fun": lambda z: look(z)[1],
+            "jac": lambda z: _gradient(lambda v: look(v)[1], z),
+        },
+        bounds=[(float(value) - span, float(value) + span) for value in start],
+        method="SLSQP",
+        options={"maxiter": most, "ftol": tolerance},
+    )
+    return np.asarray(result.x)
 
 
 def _gradient(f: Callable[[FloatArray], FloatArray], x: FloatArray) -> FloatArray:

@@ -90,21 +90,22 @@ class Specification:
         figures : Figures
             Of one loop, or of many in arrays of one shape.
         """
-        noise = (
-            np.asarray(figures.noise_gain) / self.noise_gain
-            if self.noise == "true"
-            else np.asarray(figures.controller_gain) / (self.modulus_margin * self.noise_gain)
-        )
-        delay = np.asarray(figures.delay_s)
-        return np.stack(
+        if self.noise == "true":
+            noise = figures.noise_gain / self.noise_gain
+        else:
+            noise = figures.controller_gain / (self.modulus_margin * self.noise_gain)
+        delay: float | FloatArray = np.full(np.shape(noise), np.inf)
+        if self.delay_margin_s > 0.0:
+            delay = figures.delay_s / self.delay_margin_s - 1.0
+        found = np.array(
             (
-                np.asarray(figures.modulus) / self.modulus_margin - 1.0,
-                np.asarray(figures.phase_rad) / self.phase_margin_rad - 1.0,
+                figures.modulus / self.modulus_margin - 1.0,
+                figures.phase_rad / self.phase_margin_rad - 1.0,
                 1.0 - noise,
-                delay / self.delay_margin_s - 1.0 if self.delay_margin_s > 0.0 else np.full(delay.shape, np.inf),
-            ),
-            axis=-1,
+                delay,
+            )
         )
+        return found if found.ndim == 1 else np.moveaxis(found, 0, -1)
 
     def binding(self, figures: Figures) -> tuple[str, ...]:
         """Return the names of the constraints that hold with equality, as near as the search of the criterion ends."""

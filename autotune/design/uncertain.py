@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numba import njit
@@ -40,6 +41,16 @@ class UncertainPlant:
     nominal: SampledPlant
     processes: ConsistentProcesses
 
+    def thinned(self, step: int) -> UncertainPlant:
+        """Return the set at every ``step``-th frequency and the last, for a coarse look."""
+        kept = np.append(np.arange(0, len(self.omega) - 1, step), len(self.omega) - 1)
+        return UncertainPlant(
+            omega=self.omega[kept],
+            supports=self.supports[kept],
+            nominal=self.nominal.thinned(step),
+            processes=self.processes,
+        )
+
 
 def uncertain_plant(
     points: Sequence[FrequencyPoint], *, probability: float = 0.95, inverse_response: bool = True
@@ -60,6 +71,11 @@ def uncertain_plant(
     DesignError
         See :func:`autotune.design.process_class.consistent_processes`.
     """
+    return _uncertain_plant(tuple(points), probability, inverse_response)
+
+
+@lru_cache(maxsize=4)  # PI and PID, or two specifications, are often designed on the same points
+def _uncertain_plant(points: tuple[FrequencyPoint, ...], probability: float, inverse_response: bool) -> UncertainPlant:
     processes = consistent_processes(points, probability=probability, inverse_response=inverse_response)
     first, last = processes.omega_points[0], processes.omega_points[-1]
     inner = np.geomspace(0.7 * first, 1.5 * last, int(math.log(1.5 * last / (0.7 * first)) / 0.12) + 2)
@@ -148,7 +164,7 @@ def guaranteed(
     directions = supports.shape[1]
     step = 2.0 * math.pi / directions
     a, b = np.cos(step * np.arange(directions)), np.sin(step * np.arange(directions))
-    modulus = 1e300
+    least = 1.0  # of abs(1 + L)^2: L ends at 0
     phase = math.pi
     delay = 1e300
     growth = -1e300
@@ -161,20 +177,26 @@ def guaranteed(
         C = complex(K, K * (Td * w - 1.0 / (Ti * w))) / complex(1.0, Tf * w)
         h_before[:] = h
         h[:] = supports[i] + a * math.log(abs(C)) + b * math.atan2(C.imag, C.real)
-        if i > 0:
+        near_unit = max(h[0], h_before[0]) >= 0.0 and max(h[directions // 2], h_before[directions // 2]) >= 0.0
+        if i > 0 and near_unit:
             angle = _lowest_phase_at_unit_gain(a, b, h_before, h) + math.pi
             if angle < 1e299:
                 phase, delay, crossed = min(phase, angle), min(delay, angle / w), True
         if -h[3 * directions // 4] <= -math.pi:
             growth = max(growth, h[0])
         smallest, largest = math.exp(-h[directions // 2]), math.exp(h[0])
-        nearest = max(smallest - 1.0, 1.0 - largest) ** 2
-        if smallest - 1.0 < modulus and 1.0 - largest < modulus:
+        # no point of the set is nearer than its gains and its phases say: most sets need no closer look
+        nearest = max(smallest - 1.0, 1.0 - largest, 0.0) ** 2
+        turn = min(math.pi - h[directions // 4], math.pi - h[3 * directions // 4])
+        nearest = max(nearest, 1.0 if turn >= 0.5 * math.pi else math.sin(max(turn, 0.0)) ** 2)
+        audible = w >= omega_n if omega_n >= 0.0 else crossed
+        size = abs(C)
+        if nearest < least or (audible and size * size > noise * noise * nearest):
             nearest = _nearest_to_critical(a, b, h)
-            modulus = min(modulus, math.sqrt(nearest))
-        if w >= omega_n if omega_n >= 0.0 else crossed:
-            loudest = max(loudest, abs(C))
-            noise = max(noise, abs(C) / math.sqrt(max(nearest, 1e-300)))
+            least = min(least, nearest)
+        if audible:
+            loudest, noise = max(loudest, size), max(noise, size / math.sqrt(max(nearest, 1e-300)))
+    modulus = math.sqrt(least)
     C_low = complex(K, K * (Td * omega[0] - 1.0 / (Ti * omega[0]))) / complex(1.0, Tf * omega[0])
     C_high = complex(K, K * (Td * omega[-1] - 1.0 / (Ti * omega[-1]))) / complex(1.0, Tf * omega[-1])
     at_least = math.exp(-supports[0, directions // 2]) * abs(C_low)

@@ -157,6 +157,7 @@ def reduce_points(
     kind: Kind | None = None,
     conditions: Conditions = "regions",
     static_gain: tuple[float, float] | None = None,
+    fit: PlantFit | None = None,
 ) -> ReducedModel:
     """Fit (8) or (24) to measured points, so that (5) holds on what the points and their uncertainty allow.
 
@@ -173,6 +174,8 @@ def reduce_points(
         ``estimates``: at the point estimates only, as the paper does: nothing is said below the lowest point.
     static_gain : (float, float), optional
         Measured static gain with its sign, and its standard deviation: a relay experiment does not measure it.
+    fit : PlantFit, optional
+        Of these points by :func:`fit_plant`, where it is there already; not used with a static gain.
 
     Returns
     -------
@@ -197,7 +200,8 @@ def reduce_points(
     """
     ordered = sorted(points, key=lambda point: point.omega_rad_s)
     fitted = ordered if static_gain is None else [_static_point(ordered, static_gain), *ordered]
-    fit = fit_plant(fitted)
+    if fit is None or static_gain is not None:
+        fit = fit_plant(fitted)
     require_class_one(ordered, fit.sign)
     chosen, evidence, warnings = _choose(fitted, fit, kind)
     if conditions == "regions":

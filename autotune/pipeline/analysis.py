@@ -139,8 +139,8 @@ def analyse(
     beyond = (f"{left_out} points past {LOWEST_PHASE_DEG:g} deg were left out: a PI has no use for them",)
     fit = fit_plant(usable) if fit is None else fit
     asked, noise_source = specification(settings, fit, facts or LoopFacts(), _highest(usable, fit, facts))
-    reduced = _reduced(usable)
-    bases = _bases(usable, fit, reduced, asked, settings.kind)
+    reduced = _reduced(usable, fit)
+    bases = _bases(usable, fit, lambda: reduced, asked, settings.kind)
     source, found, looked = _first_kept(bases, settings.source, usable, fit)
     model = reduced if isinstance(reduced, ReducedModel) else None
     H_r = None if model is None else model.transfer_function()
@@ -189,7 +189,7 @@ def on_measured(
     IdentificationError, DesignError
         On no basis is there a controller that keeps its margins on all of it; the reason is that of the first.
     """
-    return _first_kept(_bases(points, fit, _reduced(points), asked, kind), "auto", points, fit)
+    return _first_kept(_bases(points, fit, lambda: _reduced(points, fit), asked, kind), "auto", points, fit)
 
 
 def _highest(points: Sequence[FrequencyPoint], fit: PlantFit, facts: LoopFacts | None) -> float:
@@ -202,7 +202,7 @@ def _highest(points: Sequence[FrequencyPoint], fit: PlantFit, facts: LoopFacts |
 def _bases(
     points: Sequence[FrequencyPoint],
     fit: PlantFit,
-    reduced: ReducedModel | AutotuneError,
+    reduced: Callable[[], ReducedModel | AutotuneError],
     asked: Specification,
     kind: Kind,
 ) -> dict[Source, Callable[[], Design]]:
@@ -213,9 +213,10 @@ def _bases(
     """
 
     def on_reduced() -> Design:
-        if isinstance(reduced, AutotuneError):
-            raise reduced
-        return design_on_reduced(fit.plant, asked, kind, reduced=reduced, certificate=True)
+        H_r = reduced()
+        if isinstance(H_r, AutotuneError):
+            raise H_r
+        return design_on_reduced(fit.plant, asked, kind, reduced=H_r, certificate=True)
 
     ways: dict[Source, Callable[[], Design]] = {
         "points": lambda: design_on_points(points, asked, kind),
@@ -289,10 +290,10 @@ def of_use(points: Sequence[FrequencyPoint]) -> list[FrequencyPoint]:
     return ordered[: int(beyond[0])] if beyond.size else ordered
 
 
-def _reduced(points: Sequence[FrequencyPoint]) -> ReducedModel | AutotuneError:
+def _reduced(points: Sequence[FrequencyPoint], fit: PlantFit) -> ReducedModel | AutotuneError:
     """Return the reduced model of the points, or why there is none."""
     try:
-        return reduce_points(points)
+        return reduce_points(points, fit=fit if fit.source == "points" else None)
     except AutotuneError as error:
         return error
 

@@ -18,6 +18,7 @@ from autotune.design.synthesis import design
 from autotune.errors import DesignError
 from autotune.models import TransferFunction
 from tests.autotune.design.plants import BALL, EIGHT_LAGS, REDUCED, measured
+from tests.benchmarks.guarantees import plants, slow_points
 
 
 def _lags(constants: list[float], delay_s: float, integrator: bool) -> TransferFunction:
@@ -115,6 +116,22 @@ def test_a_resonant_plant_is_outside_the_class() -> None:
     ]
     with pytest.raises(DesignError, match="aperiodic"):
         design_on_points(points, spec1(0.1))
+
+
+def test_a_plant_whose_gain_rises_is_refused_although_wider_regions_would_hold_a_member_of_the_class() -> None:
+    """Its zero lies below its lags: regions of 1.9 times the size let the class pass, which then lost half the M_m."""
+    plant = list(plants("non-minimum phase", 8))[7]
+    with pytest.raises(DesignError, match="contradict each other"):
+        design_on_points(slow_points(plant, np.random.default_rng(7)), spec1(10.0))
+
+
+@pytest.mark.parametrize("sd", [1e-4, 3e-4])
+def test_points_more_exact_than_the_class_is_fine_are_no_contradiction(sd: float) -> None:
+    """Two in a thousand off one point is many standard deviations, and nothing to a margin of one half."""
+    points = list(measured(BALL, None, gain_sd=sd, phase_sd_deg=60.0 * sd))
+    points[2] = replace(points[2], response=points[2].response * 1.004)
+    m = margins(BALL, design_on_points(points, spec1(0.1)).controller)
+    assert m.modulus >= 0.495
 
 
 def test_wide_regions_are_answered_with_what_can_be_kept() -> None:
