@@ -94,11 +94,11 @@ def diagnose(campaign: Campaign, seed: int) -> None:
     if (out / "finished").exists():
         return
     out.mkdir(parents=True, exist_ok=True)
-    records = [str(case / "rec1.csv"), str(case / "rec2.csv")]
+    records = [str(path) for path in sorted(case.glob("rec*.csv"), key=lambda path: (len(path.name), path.name))]
     words = ["diagnose", "--model", str(case / "model.toml"), *records, "--out", str(out)]
     words += ["--without", campaign.without] if campaign.without else []
     said = _run(campaign, words)
-    if said.returncode == 0:
+    if said.returncode == 0 and (case / "unseen.csv").exists():
         horizon = f"{json.loads(campaign.answer(seed).read_text(encoding='utf-8'))['horizon']:g}"
         words = ["simulate", "--model", str(out / "extended_model.toml"), str(case / "unseen.csv")]
         said = _run(campaign, [*words, "--horizon", horizon, "--out", str(out / "unseen_sim.csv")])

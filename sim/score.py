@@ -74,13 +74,13 @@ class Row:
     met: bool | None
 
 
-def wilson(successes: int, count: int, z: float = 1.959964) -> tuple[float, float]:
+def wilson(successes: float, count: float, z: float = 1.959964) -> tuple[float, float]:
     """95 % interval of a share (Wilson 1927).
 
     Parameters
     ----------
     successes, count
-        Successes among ``count`` trials.
+        Successes among ``count`` trials; not whole where cases belong together.
     z
         Normal quantile of the interval.
 

@@ -30,7 +30,9 @@ TIE_DURATION_S = 16.0
 @app.command()
 def prove(
     out: Annotated[Path, typer.Option(help="folder of the campaign; an interrupted one is continued there")],
-    cases: Annotated[int, typer.Option(min=1, help="number of concealed cases")] = 600,
+    cases: Annotated[
+        int | None, typer.Option(min=1, help="number of concealed cases [default: 600; three for each recorded rig]")
+    ] = None,
     seed: Annotated[int, typer.Option(min=0, help="seed of the first case; below 100000 is for calibration")] = 100_000,
     ties: Annotated[int, typer.Option(min=0, help="rigs that a first recording leaves open, one experiment each")] = 24,
     workers: Annotated[int, typer.Option(min=1, help="diagnoses at the same time")] = 2,
@@ -41,25 +43,42 @@ def prove(
     scheduler: Annotated[
         str | None, typer.Option(metavar="ADDRESS", help="existing Dask scheduler, tcp://host:8786, with its workers")
     ] = None,
+    recordings: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR", help="put the effects into recordings of real rigs: a folder each, with model.toml"
+        ),
+    ] = None,
 ) -> None:
-    """Conceal effects in simulated recordings, diagnose them as a user would, reveal the answers and count."""
+    """Conceal effects in recordings, diagnose them as a user would, reveal the answers and count.
+
+    Without --recordings the recordings are simulated.
+    """
     require_extra("batch", "distributed")
     from sim.proof import Campaign, conceal, keep_failures, mark_all, seal
     from sim.score import resolved, table
 
     if scheduler is not None:
         out = out.absolute()  # its workers were started elsewhere
+    if recordings is not None:
+        from autotune.cli.prove_recorded import prove_recorded
+
+        if without:
+            raise InputError("--without and --recordings", where="prove", remedy="give one of the two")
+        prove_recorded(recordings, out, cases, seed, workers, scheduler)
+        return
+    cases = 600 if cases is None else cases
     campaign = Campaign(out=out, seeds=range(seed, seed + cases), tool=(sys.executable, "-m", "autotune.cli"))
     console = Console(highlight=False)
     for _ in track(conceal(campaign), "making cases", total=cases, console=console):
         pass
     digest = seal(campaign)
-    _publish(out / "seal.txt", digest)
+    publish(out / "seal.txt", digest)
     console.print(f"answers sealed, SHA-256 {digest}")
     if without:
         _ablate(console, campaign, without, most, workers, scheduler)
         return
-    _diagnose_all(console, [(campaign, case) for case in campaign.seeds], workers, scheduler)
+    diagnose_all(console, [(campaign, case) for case in campaign.seeds], workers, scheduler)
     tried = [tie_resolved(out / "ties", seed + i) for i in track(range(ties), "ties", console=console)]
     if seal(campaign) != digest:
         raise InputError(f"{out / 'sealed'}: an answer changed while the cases were diagnosed; start a fresh campaign")
@@ -74,8 +93,8 @@ def prove(
         "ties": tried,
     }
     write_whole(out / "proof.json", json.dumps(result, indent=1))
-    _print_confusion(console, marks)
-    _print_table(console, rows)
+    print_confusion(console, marks)
+    print_table(console, rows)
     failures = keep_failures(campaign, marks)
     _write_page(campaign, result, marks)
     console.print(f"report: {out / 'report.html'}", markup=False)
@@ -95,7 +114,7 @@ def _write_page(campaign: Campaign, result: dict[str, Any], marks: Sequence[Mark
     write_page(proof_page(result, missed, confusion(marks), wilson), campaign.out / "report.html")
 
 
-def _diagnose_all(console: Console, tasks: Sequence[tuple[Campaign, int]], workers: int, scheduler: str | None) -> None:
+def diagnose_all(console: Console, tasks: Sequence[tuple[Campaign, int]], workers: int, scheduler: str | None) -> None:
     """Diagnose cases of campaigns; each diagnosis is a program of its own, so a thread is enough to start it."""
     from autotune.batch.engine import cluster, run_all
 
@@ -161,7 +180,7 @@ def tie_resolved(out: Path, seed: int) -> dict[str, Any]:
     return answer
 
 
-def _publish(path: Path, digest: str) -> None:
+def publish(path: Path, digest: str) -> None:
     """Write the seal before anything is diagnosed; a continued campaign must have the same one."""
     if path.exists() and path.read_text(encoding="utf-8").strip() != digest:
         raise InputError(f"{path}: these answers are not the ones that were sealed; use another --out")
@@ -186,13 +205,14 @@ def _ablate(console: Console, campaign: Campaign, without: str, most: int, worke
         for seed in seeds[turn : turn + 1]
     ]
     try:
-        _diagnose_all(console, tasks, workers, scheduler)
+        diagnose_all(console, tasks, workers, scheduler)
     finally:
         ablated = {name: replace(campaign, without=name, seeds=seeds) for name, seeds in chosen.items()}
         _print_ablation(console, {name: mark_all(one, one.finished) for name, one in ablated.items()})
 
 
-def _print_confusion(console: Console, marks: Sequence[Mark]) -> None:
+def print_confusion(console: Console, marks: Sequence[Mark]) -> None:
+    """Print what was said of what."""
     from sim.score import confusion
 
     view = Table("concealed", "cases", "right", "said instead", title="Confusion matrix, by rows")
@@ -201,7 +221,8 @@ def _print_confusion(console: Console, marks: Sequence[Mark]) -> None:
     console.print(view)
 
 
-def _print_table(console: Console, rows: Sequence[Row]) -> None:
+def print_table(console: Console, rows: Sequence[Row]) -> None:
+    """Print the figures with what is asked of them."""
     view = Table("figure", "asked", "measured", "95 % interval", "of", "met", title="Proof on concealed cases")
     for row in rows:
         share = row.interval is not None

@@ -20,7 +20,12 @@ _MOST_MISSES = 200
 
 
 def proof_page(
-    result: Content, missed: Sequence[Content], confusion: Sequence[tuple[Any, ...]], interval: Interval
+    result: Content,
+    missed: Sequence[Content],
+    confusion: Sequence[tuple[Any, ...]],
+    interval: Interval,
+    what: str = "Effects were concealed in simulated recordings and sealed, then diagnosed as a user would.",
+    further: Sequence[Section] = (),
 ) -> Page:
     """Return the page of a proof.
 
@@ -34,6 +39,10 @@ def proof_page(
         Concealed effect, cases, right, and what was said in its place.
     interval : callable
         95 % interval of a share.
+    what : str
+        What was done.
+    further : sequence of Section
+        What comes after the figures.
     """
     rows, count = result["table"], result["cases"]
     short = [row["figure"] for row in rows if row["met"] is False]
@@ -45,15 +54,13 @@ def proof_page(
         verdict=verdict,
         tone=tone,
         answers=(
-            (
-                "What was done",
-                "Effects were concealed in simulated recordings and sealed, then diagnosed as a user would.",
-            ),
+            ("What was done", what),
             ("How sure", f"Intervals of 95 % beside every share. Seal: SHA-256 {result['sha256'][:16]}..."),
             ("What to do", todo),
         ),
         sections=(
             Section(title="Figures", tables=(_figures(rows),)),
+            *further,
             *_calibration(result["marks"], interval),
             Section(title=f"Missed cases ({len(missed)})", tables=(_missed(missed),) if missed else ()),
             Section(title="What was said of what", tables=(_confusion(confusion),)),
@@ -133,3 +140,25 @@ def _confusion(confusion: Sequence[tuple[Any, ...]]) -> Table:
         for name, count, right, said in confusion
     )
     return Table(header=("concealed", "cases", "right", "said instead"), rows=rows)
+
+
+def rigs_sections(
+    rigs: Sequence[tuple[str, str, int, int, int, Sequence[str]]], refused: Mapping[str, str]
+) -> tuple[Section, ...]:
+    """Return what was said on each recorded rig, and why others, and some effects, were left out.
+
+    Parameters
+    ----------
+    rigs : sequence of tuple
+        Name, what is said of the recording as it is, cases that count, right ones, wrong new names, lines for misses.
+    refused : mapping
+        Rig or effect, and the reason.
+    """
+    rows = tuple(
+        (name, before, str(count), str(right), str(wrong), "; ".join(missed))
+        for name, before, count, right, wrong, missed in rigs
+    )
+    header = ("rig", "said of the recording as it is", "cases", "right", "wrong new names", "missed")
+    tables = [Table(header=header, rows=rows, caption="Only what is new in a changed recording counts.")]
+    tables.append(Table(header=("left out", "why"), rows=tuple(refused.items())))
+    return (Section(title="Rig by rig", tables=tuple(tables)),)

@@ -21,3 +21,16 @@ def test_answers_that_were_exchanged_after_sealing_are_refused(tmp_path):
     (tmp_path / "seal.txt").write_text("0" * 64 + "\n")
     with pytest.raises(InputError, match="sealed"):
         CliRunner().invoke(app, words, catch_exceptions=False)
+
+
+def test_recordings_and_an_ablation_exclude_each_other(tmp_path):
+    words = ["prove", "--out", str(tmp_path / "out"), "--recordings", str(tmp_path), "--without", "plant.leak"]
+    with pytest.raises(InputError, match="--recordings"):
+        CliRunner().invoke(app, words, catch_exceptions=False)
+
+
+def test_a_folder_without_a_rig_is_refused(tmp_path):
+    words = ["prove", "--out", str(tmp_path / "out"), "--recordings", str(tmp_path)]
+    with pytest.raises(InputError, match=r"model\.toml"):
+        CliRunner().invoke(app, words, catch_exceptions=False)
+    assert not (tmp_path / "out").exists()
