@@ -55,38 +55,44 @@ def prove(
     Without --recordings the recordings are simulated.
     """
     require_extra("batch", "distributed")
+    if scheduler is not None:
+        out = out.absolute()  # its workers were started elsewhere
+    if recordings is None:
+        _prove_simulated(out, range(seed, seed + (cases or 600)), ties, workers, (without, most), scheduler)
+        return
+    from autotune.cli.prove_recorded import prove_recorded
+
+    if without:
+        raise InputError("--without and --recordings", where="prove", remedy="give one of the two")
+    prove_recorded(recordings, out, cases, seed, workers, scheduler)
+
+
+def _prove_simulated(
+    out: Path, seeds: range, ties: int, workers: int, ablation: tuple[str, int], scheduler: str | None
+) -> None:
+    """Prove on simulated recordings; ``ablation`` is the entry left out and the most cases of it."""
     from sim.proof import Campaign, conceal, keep_failures, mark_all, seal
     from sim.score import resolved, table
 
-    if scheduler is not None:
-        out = out.absolute()  # its workers were started elsewhere
-    if recordings is not None:
-        from autotune.cli.prove_recorded import prove_recorded
-
-        if without:
-            raise InputError("--without and --recordings", where="prove", remedy="give one of the two")
-        prove_recorded(recordings, out, cases, seed, workers, scheduler)
-        return
-    cases = 600 if cases is None else cases
-    campaign = Campaign(out=out, seeds=range(seed, seed + cases), tool=(sys.executable, "-m", "autotune.cli"))
+    campaign = Campaign(out=out, seeds=seeds, tool=(sys.executable, "-m", "autotune.cli"))
     console = Console(highlight=False)
-    for _ in track(conceal(campaign), "making cases", total=cases, console=console):
+    for _ in track(conceal(campaign), "making cases", total=len(seeds), console=console):
         pass
     digest = seal(campaign)
     publish(out / "seal.txt", digest)
     console.print(f"answers sealed, SHA-256 {digest}")
-    if without:
-        _ablate(console, campaign, without, most, workers, scheduler)
+    if ablation[0]:
+        _ablate(console, campaign, *ablation, workers, scheduler)
         return
-    diagnose_all(console, [(campaign, case) for case in campaign.seeds], workers, scheduler)
-    tried = [tie_resolved(out / "ties", seed + i) for i in track(range(ties), "ties", console=console)]
+    diagnose_all(console, [(campaign, case) for case in seeds], workers, scheduler)
+    tried = [tie_resolved(out / "ties", seeds[0] + i) for i in track(range(ties), "ties", console=console)]
     if seal(campaign) != digest:
         raise InputError(f"{out / 'sealed'}: an answer changed while the cases were diagnosed; start a fresh campaign")
-    marks = mark_all(campaign, list(campaign.seeds))
+    marks = mark_all(campaign, list(seeds))
     rows = [*table(marks), resolved([one["resolved"] for one in tried if one["experiment"]])]
     result = {
-        "seed": seed,
-        "cases": cases,
+        "seed": seeds[0],
+        "cases": len(seeds),
         "sha256": digest,
         "table": [asdict(row) for row in rows],
         "marks": [asdict(m) for m in marks],
