@@ -100,7 +100,7 @@ def deploy(
     trial = try_out if verify else None
     done = hand_over(rig, new, folder / JOURNAL, agree=agree, try_out=trial, audit=audit)
     verification = done.verification
-    result = next_free(folder / "deploy.json")
+    result = next_free(folder / "deploy.json", ".html")
     write_json(
         {
             "old": asdict(done.old),
@@ -137,7 +137,7 @@ def verify(
     gains = read_gains(rig) if isinstance(rig, HoldsGains) and controller is None else _gains(controller, None, run)
     folder = _folder(config, run, out)
     verification = _verify(rig, content, gains, fit, measured, folder)
-    result = next_free(folder / "verify.json")
+    result = next_free(folder / "verify.json", ".html")
     write_json({"controller": asdict(gains), "verification": verification_json(verification)}, result)
     page = verification_page(content.name, content.signals, gains, verification)
     write_page(page, result.with_suffix(".html"))
@@ -244,7 +244,7 @@ def _verify(
             config,
             gains,
             fit,
-            next_free(folder / VERIFICATION),
+            next_free(folder / VERIFICATION, ".toml"),
             u_rest=measured.u_rest,
             noise_sd=measured.noise_sd,
             on_status=bar.show,

@@ -37,9 +37,11 @@ def numbered(path: Path) -> Iterator[Path]:
         yield path.with_stem(f"{path.stem}-{number}")
 
 
-def next_free(path: Path) -> Path:
-    """Return the first of the numbered names that no file has."""
-    return next(each for each in numbered(path) if not each.exists())
+def next_free(path: Path, *suffixes: str) -> Path:
+    """Return the first of the numbered names that no file has, nor one beside it with one of the suffixes."""
+    return next(
+        each for each in numbered(path) if not any(one.exists() for one in (each, *map(each.with_suffix, suffixes)))
+    )
 
 
 def recordings(folder: Path, name: str = RECORDING) -> tuple[Path, ...]:

@@ -139,7 +139,7 @@ def _tune(
     experiment: ExperimentResult | None = None
     analysis: Analysis | None = None
     try:
-        recording = next_free(out / RECORDING)
+        recording = next_free(out / RECORDING, ".toml")
         if missing_phases(config.experiment, earlier):
             log.recording(recording)
         experiment = run_experiment(rig, config, recording, earlier=earlier, on_status=on_status)
@@ -156,7 +156,7 @@ def _tune(
                 config,
                 analysis.controller,
                 analysis.fit,
-                log.recording(next_free(out / VERIFICATION)),
+                log.recording(next_free(out / VERIFICATION, ".toml")),
                 u_rest=experiment.u_rest,
                 noise_sd=experiment.noise_sd,
                 on_status=on_status,

@@ -330,6 +330,19 @@ def test_a_run_that_is_gone_on_with_does_not_take_half_written_gains_for_the_old
     assert steps(half_written)[2:] == ["restoring", "restored", "read", "writing", "written and read back"]
 
 
+def test_a_second_deploy_replaces_nothing(line: Line, tmp_path: Path) -> None:
+    config = config_file(line, tmp_path)
+    call = ["deploy", str(config), "--controller", str(tmp_path / "new.toml"), "--no-verify", "--yes"]
+    folder = tmp_path / "rig-gains"
+    assert CliRunner().invoke(app, call).exit_code == 0
+    (folder / "deploy-2.html").write_text("somebody's notes")
+    first = {name: (folder / name).read_bytes() for name in ("deploy.json", "deploy.html", "deploy-2.html")}
+    assert CliRunner().invoke(app, call).exit_code == 0
+    assert {name: (folder / name).read_bytes() for name in first} == first
+    assert json.loads((folder / "deploy-3.json").read_text())["old"]["K"] == NEW.K
+    assert (folder / "deploy-3.html").exists()
+
+
 def test_old_and_new_gains_are_shown_and_an_answer_of_no_writes_nothing(line: Line, tmp_path: Path) -> None:
     config = config_file(line, tmp_path)
     call = ("deploy", config, "--controller", tmp_path / "new.toml", "--no-verify", "--form", "parallel")

@@ -16,7 +16,7 @@ from autotune.arrays import ComplexArray, FloatArray
 from autotune.errors import IdentificationError
 from autotune.identification.closed_loop.prediction_error import PredictionErrorEstimate
 from autotune.identification.closed_loop.predictor_directions import Predictor
-from autotune.identification.closed_loop.predictor_sweep import innovations
+from autotune.identification.closed_loop.series import Series
 from autotune.points import FrequencyPoint
 
 #: Information matrices worse than this hold directions that the data say nothing about.
@@ -185,14 +185,14 @@ class Whiteness:
     lags: int
 
 
-def residuals(estimate: PredictionErrorEstimate, u: FloatArray, y: FloatArray) -> FloatArray:
+def residuals(
+    estimate: PredictionErrorEstimate, u: FloatArray, y: FloatArray, starts: tuple[int, ...] = (0,)
+) -> FloatArray:
     """Return the one-step prediction errors of the polished model on the data it came from, shape (rows, n_y)."""
-    model = estimate.model
-    predictor = Predictor.of(model, estimate.offset_x, estimate.offset_y, estimate.initial_state)
-    delay = model.input_delay
-    past = np.ascontiguousarray(u[: len(u) - delay])
-    errors: FloatArray = innovations(predictor.F, predictor.H, predictor.x0, past, np.ascontiguousarray(y[delay:]))
-    return errors
+    model, states = estimate.model, estimate.initial_states
+    predictor = Predictor.of(model, estimate.offset_x, estimate.offset_y, states[0])
+    series = Series(u=np.ascontiguousarray(u), y=np.ascontiguousarray(y), starts=starts).delayed(model.input_delay)
+    return series.errors(predictor, states)
 
 
 def whiteness(estimate: PredictionErrorEstimate, errors: FloatArray) -> Whiteness:

@@ -8,7 +8,7 @@ import numpy as np
 
 from autotune.arrays import FloatArray
 from autotune.identification.closed_loop.predictor_directions import Predictor
-from autotune.identification.closed_loop.predictor_sweep import normal_equations, scatter
+from autotune.identification.closed_loop.series import Series
 from autotune.identification.closed_loop.state_space import spectral_radius
 
 #: A step predicted to lower -2 log likelihood by less than this moves no parameter by 3 % of its standard deviation.
@@ -36,8 +36,7 @@ def improved(
     information: FloatArray,
     gradient: FloatArray,
     errors: FloatArray,
-    u: FloatArray,
-    y: FloatArray,
+    series: Series,
     damping: float,
 ) -> Ahead:
     """Return the outcome of one Levenberg-Marquardt step, the damping raised until the step helps.
@@ -58,8 +57,8 @@ def improved(
         if predicted < _TOLERANCE and not beyond:
             return Ahead(predictor=None, errors=errors, predicted=predicted, damping=damping, converged=True)
         if predicted >= _TOLERANCE and _radius(trial) <= _RADIUS_LIMIT:
-            trial_errors = scatter(trial.F, trial.H, trial.x0, u, y)
-            gain = len(y) * (log_determinant(errors) - log_determinant(trial_errors))
+            trial_errors = series.scatter(trial)
+            gain = len(series) * (log_determinant(errors) - log_determinant(trial_errors))
             if gain > _TOLERANCE:
                 return Ahead(
                     predictor=trial, errors=trial_errors, predicted=predicted, damping=damping / 10.0, converged=False
@@ -71,7 +70,7 @@ def improved(
 
 
 def whitened_equations(
-    predictor: Predictor, directions: FloatArray, u: FloatArray, y: FloatArray, errors: FloatArray, phi: FloatArray
+    predictor: Predictor, directions: FloatArray, series: Series, errors: FloatArray, phi: FloatArray
 ) -> FloatArray:
     """Return the whitened normal equations; the directions change F by multiples of the orthogonal rows of phi."""
     n, of_f, P = len(predictor.x0), predictor.F.size, directions.shape[1]
@@ -79,10 +78,9 @@ def whitened_equations(
         :of_f
     ].reshape(n, -1, P)
     inner = np.concatenate([change.reshape(-1, P), directions[of_f:]])
-    covariance = errors / len(y) + np.finfo(np.float64).tiny * np.eye(len(errors))
+    covariance = errors / len(series) + np.finfo(np.float64).tiny * np.eye(len(errors))
     whitening = np.linalg.inv(np.linalg.cholesky(covariance))
-    total: FloatArray = normal_equations(predictor.F, predictor.H, predictor.x0, u, y, phi, inner, whitening)
-    return total
+    return series.normal_equations(predictor, phi, inner, directions, whitening)
 
 
 def damped_step(information: FloatArray, gradient: FloatArray, damping: float) -> tuple[FloatArray, float, float]:

@@ -1,4 +1,4 @@
-"""Short gaps of a record: samples that were lost here and there are bridged, so that all of it is used together.
+"""Gaps of a record: samples that were lost here and there are bridged, and longer gaps cut it into stretches.
 
 The command is known over a gap, it was held; only the measurement is missing. A few missing values among many are put
 in between their neighbours, which is an error of the size of the noise in those rows and in no other.
@@ -6,17 +6,20 @@ in between their neighbours, which is an error of the size of the noise in those
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
-from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
+from autotune.arrays import BoolArray, IntArray
+from autotune.errors import IdentificationError
 from autotune.recording import Recording
 
-IntArray: TypeAlias = NDArray[np.intp]
-
+#: time stamps may stray this far from the grid, as a share of the sample time
+JITTER = 0.25
+#: fewest rows a closed-loop identification accepts
+FEWEST_ROWS = 60
 #: longest gap that is bridged, in samples, and the largest share of rows that may be put in
 LONGEST, SHARE = 3, 0.05
 
@@ -44,7 +47,7 @@ def bridged(recording: Recording, jitter: float) -> Bridged:
     Parameters
     ----------
     recording : Recording
-        With gaps of its stamps.
+        With gaps of its stamps, or rows without a measurement.
     jitter : float
         How far a stamp may stray from the grid, as a share of the sample time; a row that strays further came late and
         counts as missing, its command acts from its time on.
@@ -71,14 +74,14 @@ def bridged(recording: Recording, jitter: float) -> Bridged:
 
 
 def _on_grid(recording: Recording, jitter: float) -> tuple[IntArray, IntArray]:
-    """Return the rows that stand on the grid of their predecessor, and their numbers on it."""
+    """Return the rows with a measurement that stand on the grid of their predecessor, and their numbers on it."""
     T_s = recording.sample_time_s
-    t = recording.t
+    t, measured = recording.t, np.flatnonzero(np.isfinite(recording.y))
     steps = np.diff(t) / T_s
-    if np.all(np.abs(steps - 1.0) <= jitter):
+    if measured.size == 0 or (measured.size == t.size and np.all(np.abs(steps - 1.0) <= jitter)):
         return np.arange(t.size), np.arange(t.size)
-    kept, slots = [0], [0]
-    for row in range(1, t.size):
+    kept, slots = [int(measured[0])], [0]
+    for row in measured[1:].tolist():
         step = (t[row] - t[kept[-1]]) / T_s
         whole = round(step)
         is_near = whole <= LONGEST + 1
@@ -110,3 +113,105 @@ def _filled(recording: Recording, kept: IntArray, lengths: IntArray) -> Recordin
     u[changed] = (np.interp(end, t, area) - np.interp(start, t, area)) / (end - start)
     extra = {name: values[source] for name, values in recording.extra.items()}
     return replace(recording, t=at, u=u, y=y, extra=MappingProxyType(extra))
+
+
+def usable_stretch(recording: Recording) -> tuple[Recording, tuple[str, ...]]:
+    """Return the longest of the :func:`usable_stretches`, and what was left out.
+
+    Raises
+    ------
+    IdentificationError
+        It is shorter than 60 rows; names what cuts the recording.
+    """
+    whole, good, broken = _examined(recording)
+    rows = max(_pieces(good, broken), key=len, default=np.arange(0))
+    _require(len(rows), good, broken, recording.name)
+    return _between(whole.recording, rows), _left_out(recording, whole, [rows])
+
+
+def usable_stretches(recording: Recording, shortest: int) -> tuple[tuple[Recording, ...], tuple[str, ...]]:
+    """Return the stretches of equidistant rows in which u, y, r and dither are numbers, and what was left out.
+
+    Gaps of up to three samples are bridged where they are few.
+
+    Parameters
+    ----------
+    recording : Recording
+        As a rig left it: unusable samples, missed deadlines, a start-up without set-point.
+    shortest : int
+        Fewest rows of a stretch beside the longest.
+
+    Returns
+    -------
+    stretches : tuple of Recording
+        In their order; at least 60 rows in all.
+    warnings : tuple of str
+        Which rows were left out, and time stamps that stray.
+
+    Raises
+    ------
+    IdentificationError
+        There are not enough rows; names what cuts the recording.
+    """
+    whole, good, broken = _examined(recording)
+    pieces = _pieces(good, broken)
+    pieces = [rows for rows in pieces if len(rows) >= shortest] or [max(pieces, key=len, default=np.arange(0))]
+    _require(sum(map(len, pieces)), good, broken, recording.name)
+    warnings = _left_out(recording, whole, pieces)
+    if len(pieces) > 1:
+        warnings = (f"{len(pieces)} stretches between gaps are used together", *warnings)
+    return tuple(_between(whole.recording, piece) for piece in pieces), warnings
+
+
+def _examined(recording: Recording) -> tuple[Bridged, BoolArray, BoolArray]:
+    """Return the bridged record, which of its rows hold numbers, and after which of them time jumps."""
+    whole = bridged(recording, JITTER)
+    columns = [whole.recording.u, whole.recording.y]
+    columns += [c for name, c in whole.recording.extra.items() if name in ("r", "dither") and np.isfinite(c).any()]
+    good = np.all([np.isfinite(column) for column in columns], axis=0)
+    broken = np.abs(np.diff(whole.recording.t) / whole.recording.sample_time_s - 1.0) > JITTER
+    return whole, good, broken
+
+
+def _pieces(good: BoolArray, broken: BoolArray) -> list[IntArray]:
+    """Return the rows of each stretch."""
+    ends = np.flatnonzero(broken | (good[1:] != good[:-1])) + 1
+    return [rows for rows in np.split(np.arange(good.size), ends) if rows.size and good[rows[0]]]
+
+
+def _require(rows: int, good: BoolArray, broken: BoolArray, where: str) -> None:
+    if rows >= FEWEST_ROWS:
+        return
+    reasons = f"{int((~good).sum())} rows hold values that are not numbers, time jumps {int(broken.sum())} times"
+    cut = "" if rows == len(good) else f" in one piece ({reasons})"
+    raise IdentificationError(
+        f"the record is too short: {rows} equidistant rows{cut}",
+        where=where,
+        remedy=f"record at least {FEWEST_ROWS} rows, better a thousand, with the set-point or a dither moving",
+    )
+
+
+def _between(recording: Recording, rows: IntArray) -> Recording:
+    if len(rows) == len(recording):
+        return recording
+    return recording.between(float(recording.t[rows[0]]), float(recording.t[rows[-1]]) + 0.5 * recording.sample_time_s)
+
+
+def _left_out(recording: Recording, whole: Bridged, pieces: Sequence[IntArray]) -> tuple[str, ...]:
+    """Return what was put in and left out of the record as it was given, and time stamps that stray."""
+    t, T_s, warnings = whole.recording.t, recording.sample_time_s, []
+    if whole.gaps:
+        warnings.append(f"{whole.gaps} gap(s) of up to three samples were bridged: {whole.rows} of {len(t)} rows")
+    spans = [(t[rows[0]] - 0.5 * T_s, t[rows[-1]] + 0.5 * T_s) for rows in pieces]
+    used = np.any([(recording.t >= a) & (recording.t <= b) for a, b in spans], axis=0)
+    spared = used[:-1].all()  # a rig's last row holds the safe command and nothing else
+    if not spared:
+        share = f"{int(used.sum())} of {used.size} rows"
+        first, last = t[pieces[0][0]], t[pieces[-1][-1]]
+        said = f"only t = {first:g} to {last:g} s is used ({share}): outside"
+        said = said if len(pieces) == 1 else f"{share} are used: elsewhere"
+        warnings.append(f"{said}, values are not numbers or time stamps are not equidistant")
+    stray = max(float(np.max(np.abs(np.diff(t[rows]) / T_s - 1.0), initial=0.0)) for rows in pieces)
+    if stray > 0.01:
+        warnings.append(f"time stamps stray by up to {100 * stray:.2g} % of the sample time")
+    return tuple(warnings)

@@ -8,6 +8,7 @@ recorded, tells whether the loop was moved from outside, and a controller file i
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -27,11 +28,12 @@ from autotune.identification.closed_loop.confidence import (
 from autotune.identification.closed_loop.control_law import CONTRADICTION, LawCheck, check_law
 from autotune.identification.closed_loop.design_points import design_points
 from autotune.identification.closed_loop.dither_proposal import DitherLimits, DitherProposal, propose_dither
-from autotune.identification.closed_loop.gaps import bridged
+from autotune.identification.closed_loop.gaps import usable_stretches
 from autotune.identification.closed_loop.hold import without_hold
 from autotune.identification.closed_loop.loop_excitation import ExcitationVerdict, judge, own_motion, require_excitation
 from autotune.identification.closed_loop.order import Candidate, choose_order, default_past_window, fixed_order
 from autotune.identification.closed_loop.prediction_error import PredictionErrorEstimate
+from autotune.identification.closed_loop.series import Series
 from autotune.identification.closed_loop.state_space import InnovationModel
 from autotune.identification.closed_loop.subspace_direct import lagged_data
 from autotune.points import FrequencyPoint
@@ -40,12 +42,10 @@ from autotune.recording import Recording
 
 #: Rows that a first look at the excitation takes.
 _LOOK_ROWS = 20_000
-#: Time stamps may stray this far from the grid, as a share of the sample time.
-_JITTER = 0.25
+#: Fewest rows of a stretch that is used beside others.
+_SHORTEST = 30
 #: Poles and zeros of the noise model beyond this are one for all that a record can tell.
 _ON_THE_CIRCLE = 0.999
-#: Fewest rows a closed-loop identification accepts.
-_FEWEST_ROWS = 60
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -111,8 +111,8 @@ def identify_closed_loop(
     Parameters
     ----------
     recording : Recording
-        t, u, y, and r where it is known; the longest equidistant stretch is used. A column ``dither`` is what was added
-        to the controller's output.
+        t, u, y, and r where it is known; its equidistant stretches are used together, each with an initial state of its
+        own. A column ``dither`` is what was added to the controller's output.
     order : int, optional
         Number of states; chosen from the data when absent.
     delay : int, optional
@@ -147,19 +147,20 @@ def identify_closed_loop(
     Linear and time-invariant over the record; regions are asymptotic and presume white residuals (tested). Means are
     removed and a constant is estimated, so operating points and integrators need no care.
     """
-    recording, left_out = usable_stretch(recording)
+    pieces, left_out = usable_stretches(recording, max(_SHORTEST, 3 * (order or 0)))
     warnings = list(left_out)
-    u, y, r = _columns(recording)
-    dt_s = recording.sample_time_s
-    law = _checked_law(recording, controller, r, warnings)
+    longest, starts = max(pieces, key=len), _starts(pieces)
+    u, y, r = _columns(pieces)
+    dt_s = longest.sample_time_s
+    law = _checked_law(longest, controller, r is not None, warnings)
     scale_u, scale_y = float(np.std(u)), float(np.std(y))
     u_1, y_1 = ((u - u.mean()) / scale_u)[:, None], ((y - y.mean()) / scale_y)[:, None]
     with threadpool_limits(1):  # threads spin longer on these small matrices than they work
-        motion = _look(u_1, y_1, r, recording.name)
-        estimate, evidence = _fitted(u_1, y_1, order, delay, max_order, progress)
-        white = whiteness(estimate, residuals(estimate, u_1, y_1))
+        motion = _look(u_1, y_1, r, starts, recording.name)
+        estimate, evidence = _fitted(u_1, y_1, starts, order, delay, max_order, progress)
+        white = whiteness(estimate, residuals(estimate, u_1, y_1, starts))
         estimate = in_units(estimate, scale_u, scale_y, dt_s)
-        omega = _grid(recording) if omega_rad_s is None else np.asarray(omega_rad_s, dtype=np.float64)
+        omega = _grid(dt_s, len(y)) if omega_rad_s is None else np.asarray(omega_rad_s, dtype=np.float64)
         result = _report(estimate, omega, law, motion, white)
         if not result.excitation.enough:
             result = replace(result, proposal=_proposal(result, limits or recorded_limits(u, y)))
@@ -170,96 +171,45 @@ def identify_closed_loop(
 def _fitted(
     u: FloatArray,
     y: FloatArray,
+    starts: tuple[int, ...],
     order: int | None,
     delay: int | None,
     max_order: int,
     progress: Progress,
 ) -> tuple[PredictionErrorEstimate, tuple[Candidate, ...]]:
     if order is None:
-        choice = choose_order(u, y, max_order=max_order, progress=progress)
+        choice = choose_order(u, y, max_order=max_order, progress=progress, starts=starts)
         return choice.estimate, choice.evidence
     if order < 1 or (delay or 0) < 0:
         raise InputError(f"order {order}, delay {delay}", remedy="the order is at least 1, the dead time at least 0")
     progress(f"order {order}", 0.0)
-    return fixed_order(u, y, order, delay=delay or 0), ()
+    return fixed_order(u, y, order, delay=delay or 0, starts=starts), ()
 
 
-def usable_stretch(recording: Recording) -> tuple[Recording, tuple[str, ...]]:
-    """Return the longest stretch of equidistant rows in which u, y, r and dither are numbers, and what was left out.
-
-    Gaps of up to three samples are bridged where they are few, so that what lies between them is used together.
-
-    Parameters
-    ----------
-    recording : Recording
-        As a rig left it: unusable samples, missed deadlines, a start-up without set-point.
-
-    Returns
-    -------
-    stretch : Recording
-        At least 60 rows.
-    warnings : tuple of str
-        Which rows were left out, and time stamps that stray.
-
-    Raises
-    ------
-    IdentificationError
-        No stretch is long enough; names what cuts the recording.
-    """
-    whole = bridged(recording, _JITTER)
-    recording = whole.recording
-    columns = [recording.u, recording.y]
-    columns += [c for name, c in recording.extra.items() if name in ("r", "dither") and np.isfinite(c).any()]
-    good = np.all([np.isfinite(column) for column in columns], axis=0)
-    steps = np.diff(recording.t) / recording.sample_time_s
-    broken = np.abs(steps - 1.0) > _JITTER
-    group = np.cumsum(np.concatenate([[0], broken | (good[1:] != good[:-1])]))
-    sizes = np.bincount(group, weights=good)
-    rows = np.flatnonzero((group == int(np.argmax(sizes))) & good)
-    if len(rows) < _FEWEST_ROWS:
-        reasons = f"{int((~good).sum())} rows hold values that are not numbers, time jumps {int(broken.sum())} times"
-        cut = "" if len(rows) == len(good) else f" in one piece ({reasons})"
-        raise IdentificationError(
-            f"the record is too short: {len(rows)} equidistant rows{cut}",
-            where=recording.name,
-            remedy=f"record at least {_FEWEST_ROWS} rows, better a thousand, with the set-point or a dither moving",
-        )
-    warnings = []
-    if whole.gaps:
-        warnings.append(f"{whole.gaps} gap(s) of up to three samples were bridged: {whole.rows} of {len(good)} rows")
-    t = recording.t[rows]
-    if len(rows) < len(good):
-        spared = len(good) - len(rows) == 1 and not good[-1]  # a rig's last row holds the safe command and nothing else
-        warnings += (
-            []
-            if spared
-            else [
-                f"only t = {t[0]:g} to {t[-1]:g} s is used ({len(rows)} of {len(good)} rows): outside, values are not "
-                "numbers or time stamps are not equidistant"
-            ]
-        )
-        recording = recording.between(float(t[0]), float(t[-1]) + 0.5 * recording.sample_time_s)
-    stray = float(np.max(np.abs(np.diff(t) / recording.sample_time_s - 1.0)))
-    if stray > 0.01:
-        warnings.append(f"time stamps stray by up to {100 * stray:.2g} % of the sample time")
-    return recording, tuple(warnings)
+def _starts(pieces: Sequence[Recording]) -> tuple[int, ...]:
+    """Return where each of the pieces begins when they are put one after the other."""
+    return tuple(int(row) for row in np.cumsum([0, *(len(piece) for piece in pieces[:-1])]))
 
 
-def _columns(recording: Recording) -> tuple[FloatArray, FloatArray, FloatArray | None]:
-    for name, values in (("u", recording.u), ("y", recording.y)):
+def _columns(pieces: Sequence[Recording]) -> tuple[FloatArray, FloatArray, FloatArray | None]:
+    u, y = (np.concatenate([getattr(piece, name) for piece in pieces]) for name in ("u", "y"))
+    for name, values in (("u", u), ("y", y)):
         if np.ptp(values) <= 1e-12 * max(1.0, float(np.max(np.abs(values)))):
             raise IdentificationError(
-                f"{name} does not move", where=recording.name, remedy="move the set-point or add a dither"
+                f"{name} does not move", where=pieces[0].name, remedy="move the set-point or add a dither"
             )
-    r = recording.extra.get("r")
-    return recording.u, recording.y, r if r is not None and np.all(np.isfinite(r)) else None
+    if "r" not in pieces[0].extra:
+        return u, y, None
+    r = np.concatenate([piece["r"] for piece in pieces])
+    return u, y, r if np.all(np.isfinite(r)) else None
 
 
 def _checked_law(
-    recording: Recording, controller: Controller | None, r: FloatArray | None, warnings: list[str]
+    recording: Recording, controller: Controller | None, has_r: bool, warnings: list[str]
 ) -> LawCheck | None:
     if controller is None:
         return None
+    r = recording.extra["r"] if has_r else None
     added = recording.extra.get("dither")
     added = added if added is not None and np.all(np.isfinite(added)) else None
     law = check_law(controller, recording.u, recording.y, r, recording.sample_time_s, added=added)
@@ -280,10 +230,10 @@ def _checked_law(
     return law
 
 
-def _look(u: FloatArray, y: FloatArray, r: FloatArray | None, name: str) -> float:
-    rows = min(len(u), _LOOK_ROWS)
-    p = min(12, default_past_window(rows, 2))
-    motion = own_motion(lagged_data(u[:rows], y[:rows], p))
+def _look(u: FloatArray, y: FloatArray, r: FloatArray | None, starts: tuple[int, ...], name: str) -> float:
+    few = Series(u=u, y=y, starts=starts).head(_LOOK_ROWS)
+    p = min(12, default_past_window(len(few), 2))
+    motion = own_motion(lagged_data(few.u, few.y, p, few.starts))
     moves = r is not None and float(np.ptp(r)) > 1e-9 * max(1.0, float(np.max(np.abs(r))))
     require_excitation(motion, r_recorded=r is not None, r_moves=moves, where=name)
     return motion
@@ -316,9 +266,9 @@ def in_units(
     )
 
 
-def _grid(recording: Recording) -> FloatArray:
-    nyquist = math.pi / recording.sample_time_s
-    lowest = min(6.0 * math.pi / recording.duration_s, 0.1 * nyquist)
+def _grid(sample_time_s: float, rows: int) -> FloatArray:
+    nyquist = math.pi / sample_time_s
+    lowest = min(6.0 * math.pi / (sample_time_s * (rows - 1)), 0.1 * nyquist)
     return np.geomspace(lowest, 0.8 * nyquist, 40)
 
 

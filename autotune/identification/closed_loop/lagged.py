@@ -65,13 +65,13 @@ def lagged_range(signals: Sequence[tuple[FloatArray, Sequence[int]]]) -> tuple[i
     return max(first, 0), end
 
 
-def lagged_factor(signals: Sequence[tuple[FloatArray, Sequence[int]]]) -> tuple[FloatArray, int]:
+def lagged_factor(*stretches: Sequence[tuple[FloatArray, Sequence[int]]]) -> tuple[FloatArray, int]:
     """Return the upper triangular R of the QR decomposition of the lagged data, and the number of rows.
 
     Parameters
     ----------
-    signals : sequence of (signal, offsets)
-        As in :func:`lagged_rows`.
+    stretches : sequences of (signal, offsets)
+        As in :func:`lagged_rows`; of several, the rows are stacked: none reaches over the gap between two.
 
     Returns
     -------
@@ -85,16 +85,18 @@ def lagged_factor(signals: Sequence[tuple[FloatArray, Sequence[int]]]) -> tuple[
     IdentificationError
         Fewer rows than columns: the record is too short.
     """
-    start, end = lagged_range(signals)
-    width = sum(signal.shape[1] * len(offsets) for signal, offsets in signals)
-    if end - start < width:
+    ranges = [lagged_range(signals) for signals in stretches]
+    width = sum(signal.shape[1] * len(offsets) for signal, offsets in stretches[0])
+    rows = sum(max(end - start, 0) for start, end in ranges)
+    if rows < width:
         raise IdentificationError(
-            f"the record is too short: {max(end - start, 0)} usable rows for {width} lagged columns",
+            f"the record is too short: {rows} usable rows for {width} lagged columns",
             remedy="record longer, or ask for a lower order",
         )
     R = np.zeros((0, width))
     step = max(BLOCK_ROWS, 4 * width)
-    for at in range(start, end, step):
-        block = lagged_rows(signals, at, min(at + step, end))
-        R = triangle(np.vstack([R, block]) if len(R) else block)
-    return R, end - start
+    for signals, (start, end) in zip(stretches, ranges, strict=True):
+        for at in range(start, end, step):
+            block = lagged_rows(signals, at, min(at + step, end))
+            R = triangle(np.vstack([R, block]) if len(R) else block)
+    return R, rows

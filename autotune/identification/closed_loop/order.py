@@ -11,6 +11,7 @@ from scipy.stats import chi2
 from autotune.arrays import FloatArray
 from autotune.errors import IdentificationError
 from autotune.identification.closed_loop.prediction_error import PredictionErrorEstimate, prediction_error
+from autotune.identification.closed_loop.series import Series
 from autotune.identification.closed_loop.subspace_direct import (
     LaggedData,
     autoregression,
@@ -30,6 +31,8 @@ _CANDIDATE_STEPS = 25
 CHOICE_ROWS = 20_000
 #: Rows that a start is computed from; the polish, which decides, takes them all.
 _START_ROWS = 100_000
+#: The past window is at most this part of a typical stretch: 1 / 5.
+_SHARE_OF_STRETCH = 5
 #: Residuals below this share of the signals are rounding: a higher order earns nothing by making them smaller still.
 _NOISE_FREE = 1e-7
 
@@ -81,15 +84,9 @@ def default_past_window(rows: int, channels: int) -> int:
     return int(np.clip(rows // (20 * channels), 4, 60))
 
 
-def shifted(u: FloatArray, y: FloatArray, delay: int) -> tuple[FloatArray, FloatArray]:
-    """Return u and y with the dead time taken out: rows u(t - delay), y(t)."""
-    return u[: len(u) - delay], y[delay:]
-
-
 def start_and_polish(
     data: LaggedData,
-    u: FloatArray,
-    y: FloatArray,
+    series: Series,
     order: int,
     *,
     delay: int,
@@ -101,7 +98,15 @@ def start_and_polish(
     f = min(data.p, max(10, -(-order // data.n_y) + 2))
     states = pbsid_states(data, f, feedthrough=feedthrough)
     start = replace(regress_system(data, states, order, feedthrough=feedthrough), input_delay=delay)
-    return prediction_error(start, u, y, feedthrough=feedthrough, offset=offset, max_iterations=max_iterations)
+    return prediction_error(
+        start,
+        series.u,
+        series.y,
+        feedthrough=feedthrough,
+        offset=offset,
+        max_iterations=max_iterations,
+        starts=series.starts,
+    )
 
 
 def choose_order(
@@ -112,6 +117,7 @@ def choose_order(
     feedthrough: bool = False,
     offset: bool = True,
     progress: Progress = quiet,
+    starts: tuple[int, ...] = (0,),
 ) -> OrderChoice:
     """Choose order and dead time by the Bayesian information criterion over polished models.
 
@@ -140,10 +146,10 @@ def choose_order(
     Consistent as the record grows; on a short record a mode that the data do not show is left out. A dead time is
     named only where it buys a lower order by a clear gain.
     """
-    cut = min(len(u), CHOICE_ROWS)
-    u_cut, y_cut = u[:cut], y[:cut]
-    n_u, n_y = u.shape[1], y.shape[1]
-    data = _factor(u_cut, y_cut)
+    series = Series(u=u, y=y, starts=starts)
+    few = series.head(CHOICE_ROWS)
+    cut, n_u, n_y = len(few), u.shape[1], y.shape[1]
+    data = _factor(few)
     fits: dict[tuple[int, int], PredictionErrorEstimate] = {}
 
     def try_order(order: int, delay: int, factor: LaggedData) -> None:
@@ -151,8 +157,7 @@ def choose_order(
         try:
             fits[order, delay] = start_and_polish(
                 factor,
-                u_cut,
-                y_cut,
+                few,
                 order,
                 delay=delay,
                 feedthrough=feedthrough,
@@ -172,15 +177,15 @@ def choose_order(
         )
     best = _parsimonious(fits)
     for delay in range(1, _dead_time(data, cut) + 1):
-        factor = _factor(*shifted(u_cut, y_cut, delay), p=data.p)
+        factor = _factor(few.delayed(delay), p=data.p)
         for order in range(1, best[0]):
             try_order(order, delay, factor)
     best = _parsimonious(fits)
     evidence = _evidence(fits)
-    factor = _factor(*shifted(u[:_START_ROWS], y[:_START_ROWS], best[1]), p=data.p)
+    factor = _factor(series.head(_START_ROWS).delayed(best[1]), p=data.p)
     estimate = fits[best]
     if cut < len(u) or not estimate.converged:
-        estimate = start_and_polish(factor, u, y, best[0], delay=best[1], feedthrough=feedthrough, offset=offset)
+        estimate = start_and_polish(factor, series, best[0], delay=best[1], feedthrough=feedthrough, offset=offset)
     values = pbsid_states(factor, min(factor.p, 10), feedthrough=feedthrough).singular_values
     return OrderChoice(estimate=estimate, evidence=evidence, singular_values=values, past_window=factor.p)
 
@@ -194,6 +199,7 @@ def fixed_order(
     p: int | None = None,
     feedthrough: bool = False,
     offset: bool = True,
+    starts: tuple[int, ...] = (0,),
 ) -> PredictionErrorEstimate:
     """Return the polished model of a given order and dead time: PBSIDopt start, then prediction error.
 
@@ -207,16 +213,23 @@ def fixed_order(
         Past window of the start; chosen by Akaike's criterion when absent.
     feedthrough, offset : bool
         As in :func:`autotune.identification.closed_loop.prediction_error.prediction_error`.
+    starts : tuple of int
+        First row of each stretch of equidistant rows.
     """
-    factor = _factor(*shifted(u[:_START_ROWS], y[:_START_ROWS], delay), p=p, least=order + 2)
-    return start_and_polish(factor, u, y, order, delay=delay, feedthrough=feedthrough, offset=offset)
+    series = Series(u=u, y=y, starts=starts)
+    factor = _factor(series.head(_START_ROWS).delayed(delay), p=p, least=order + 2)
+    return start_and_polish(factor, series, order, delay=delay, feedthrough=feedthrough, offset=offset)
 
 
-def _factor(u: FloatArray, y: FloatArray, p: int | None = None, least: int = 10) -> LaggedData:
-    channels = u.shape[1] + y.shape[1]
+def _factor(series: Series, p: int | None = None, least: int = 10) -> LaggedData:
+    u, y, starts = series.u, series.y, series.starts
     if p is not None:
-        return lagged_data(u, y, p)
-    data = lagged_data(u, y, default_past_window(len(u), channels))
+        return lagged_data(u, y, p, starts)
+    longest = default_past_window(len(u), u.shape[1] + y.shape[1])
+    if series.is_cut:  # a past as long as a stretch would leave nothing of it
+        typical = int(np.median([rows.stop - rows.start for rows in series.slices]))
+        longest = max(min(longest, typical // _SHARE_OF_STRETCH), 4)
+    data = lagged_data(u, y, longest, starts)
     wanted = max(choose_past_window(data), least)
     return data if wanted >= data.p else data.window(wanted)
 

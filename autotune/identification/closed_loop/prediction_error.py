@@ -16,7 +16,7 @@ from autotune.arrays import FloatArray
 from autotune.errors import IdentificationError
 from autotune.identification.closed_loop.damped_step import damped_step, improved, log_determinant, whitened_equations
 from autotune.identification.closed_loop.predictor_directions import Predictor, behaviour_directions, regressors
-from autotune.identification.closed_loop.predictor_sweep import scatter
+from autotune.identification.closed_loop.series import Series
 from autotune.identification.closed_loop.state_space import InnovationModel, balancing
 
 #: Rows that the initial state of the start is fitted on.
@@ -48,8 +48,8 @@ class PredictionErrorEstimate:
         a sufficient order, too small where the residuals are not white.
     offset_x, offset_y : (n,), (n_y,) arrays
         Constants of the state and the output equation: operating point.
-    initial_state : (n,) array
-        Estimated state at the first row used.
+    initial_states : (S, n) array
+        Estimated state at the first row used of each stretch.
     rows : int
         Rows used.
     parameters : int
@@ -75,7 +75,7 @@ class PredictionErrorEstimate:
     covariance: FloatArray
     offset_x: FloatArray
     offset_y: FloatArray
-    initial_state: FloatArray
+    initial_states: FloatArray
     rows: int
     parameters: int
     log_det: float
@@ -88,9 +88,11 @@ class PredictionErrorEstimate:
     def bic(self) -> float:
         """Bayesian information criterion, rows log det + parameters log rows; the smaller the better.
 
-        The initial state counts in full: a superfluous mode near the unit circle uses it throughout the record.
+        The initial state counts in full: a superfluous mode near the unit circle uses it throughout the record. Those
+        of further stretches count two each (Akaike 1974): what tells them does not grow with the record.
         """
-        return self.rows * self.log_det + self.parameters * float(np.log(self.rows))
+        further = self.initial_states[1:].size
+        return self.rows * self.log_det + (self.parameters - further) * float(np.log(self.rows)) + 2.0 * further
 
 
 def prediction_error(
@@ -101,6 +103,7 @@ def prediction_error(
     feedthrough: bool = False,
     offset: bool = True,
     max_iterations: int = 60,
+    starts: tuple[int, ...] = (0,),
 ) -> PredictionErrorEstimate:
     """Polish a start by minimising the determinant of the one-step prediction errors' covariance.
 
@@ -118,6 +121,8 @@ def prediction_error(
         costs precision at low frequency.
     max_iterations : int
         Accepted steps after which the search ends unconverged.
+    starts : tuple of int
+        First row of each stretch of equidistant rows; several only with one output.
 
     Returns
     -------
@@ -132,24 +137,23 @@ def prediction_error(
     -----
     The minimum found is the one in whose valley the start lies. Efficient for Gaussian innovations.
     """
-    delay = start.input_delay
-    u_past, y_now = np.ascontiguousarray(u[: len(u) - delay]), np.ascontiguousarray(y[delay:])
     if start.predictor_radius >= 1.0:
         raise IdentificationError("the start's predictor is not stable", where="prediction error")
-    u_level, y_level = (_level(signal) if offset else np.zeros(signal.shape[1]) for signal in (u_past, y_now))
-    u_past, y_now = u_past - u_level, y_now - y_level
+    series = Series(u=np.ascontiguousarray(u), y=np.ascontiguousarray(y), starts=starts).delayed(start.input_delay)
+    u_level, y_level = (_level(column) if offset else np.zeros(column.shape[1]) for column in (series.u, series.y))
+    series = series.less(u_level, y_level)
     predictor = _initial_predictor(start, feedthrough=feedthrough, n_y=y.shape[1])
-    predictor = _with_initial_state(predictor, u_past, y_now)
+    if not series.is_cut:
+        predictor = _with_initial_state(predictor, series)
     search = _search(
         predictor,
-        u_past,
-        y_now,
+        series,
         feedthrough=feedthrough,
         offset=offset,
         constant=bool(np.any(u_level) or np.any(y_level)),
         max_iterations=max_iterations,
     )
-    return _estimate(start, search, y_now, u_level, y_level)
+    return _estimate(start, search, series, u_level, y_level)
 
 
 def _level(signal: FloatArray) -> FloatArray:
@@ -164,15 +168,14 @@ def _initial_predictor(start: InnovationModel, *, feedthrough: bool, n_y: int) -
     return Predictor.of(model, np.zeros(n), np.zeros(n_y), np.zeros(n))
 
 
-def _with_initial_state(predictor: Predictor, u: FloatArray, y: FloatArray) -> Predictor:
+def _with_initial_state(predictor: Predictor, series: Series) -> Predictor:
     """Return the predictor with its initial state fitted: the errors are linear in it."""
     n = len(predictor.x0)
-    u, y = u[:_LINEAR_ROWS], y[:_LINEAR_ROWS]
+    series = series.head(_LINEAR_ROWS)
     entries = predictor.packed().size
     directions = np.eye(entries, n, n - entries)
-    errors = scatter(predictor.F, predictor.H, predictor.x0, u, y)
     nothing = np.zeros((0, predictor.F.shape[1]))
-    total = whitened_equations(predictor, directions, u, y, errors, nothing)
+    total = whitened_equations(predictor, directions, series, series.scatter(predictor), nothing)
     return predictor.moved(damped_step(total[:-1, :-1], total[:-1, -1], 0.0)[0], directions)
 
 
@@ -186,14 +189,13 @@ class _Search:
     converged: bool
 
     def noise_free(self, y: FloatArray) -> bool:
-        """Return whether the innovations are rounding."""
+        """Return whether the innovations of the outputs are rounding."""
         return bool(np.all(np.diag(self.scatter) <= len(y) * (_ROUNDING * np.std(y, axis=0)) ** 2))
 
 
 def _search(
     predictor: Predictor,
-    u: FloatArray,
-    y: FloatArray,
+    series: Series,
     *,
     feedthrough: bool,
     offset: bool,
@@ -202,7 +204,7 @@ def _search(
 ) -> _Search:
     """Search from a predictor, without a constant, if none is given, until near the end the score test asks for one."""
     damping, iterations, converged = 0.0, 0, False
-    errors = scatter(predictor.F, predictor.H, predictor.x0, u, y)
+    errors, y = series.scatter(predictor), series.y
     floor = len(y) * (_NOISE_FREE * np.std(y, axis=0)) ** 2
     n_y = y.shape[1]
     while True:
@@ -210,20 +212,21 @@ def _search(
         if renewed:
             predictor = _balanced(predictor)
         if renewed or n_y > 1:  # with one output they hold as long as the coordinates do
-            directions = behaviour_directions(predictor, feedthrough=feedthrough, offset=offset)
-            phi = regressors(predictor)
-        if len(y) * n_y <= directions.shape[1]:
+            full = behaviour_directions(predictor, feedthrough=feedthrough, offset=offset)
+            directions, phi = series.moving(predictor, full), regressors(predictor)
+        parameters = full.shape[1] + (len(series.starts) - 1) * len(predictor.x0)
+        if len(y) * n_y <= parameters:
             raise IdentificationError(
-                f"the record is too short: {len(y)} rows for {directions.shape[1]} parameters",
+                f"the record is too short: {len(y)} rows for {parameters} parameters",
                 remedy="record longer, or ask for a lower order",
             )
-        total = whitened_equations(predictor, directions, u, y, errors, phi)
+        total = whitened_equations(predictor, full, series, errors, phi)
         used = directions.shape[1] - (n_y if offset and not constant else 0)
         information, gradient = total[:used, :used], total[:used, -1]
         converged = bool(np.all(np.diag(errors) <= floor))
         if converged or iterations == max_iterations:
             break
-        ahead = improved(predictor, directions[:, :used], information, gradient, errors, u, y, damping)
+        ahead = improved(predictor, directions[:, :used], information, gradient, errors, series, damping)
         if offset and not constant and ahead.predicted < _NEAR:
             gain = damped_step(total[:-1, :-1], total[:-1, -1], 0.0)[1] - ahead.predicted
             constant = gain > n_y * math.log(len(y))  # what the Bayesian criterion asks of n_y parameters
@@ -257,18 +260,19 @@ def _balanced(predictor: Predictor) -> Predictor:
 
 
 def _estimate(
-    start: InnovationModel, search: _Search, y: FloatArray, u_level: FloatArray, y_level: FloatArray
+    start: InnovationModel, search: _Search, series: Series, u_level: FloatArray, y_level: FloatArray
 ) -> PredictionErrorEstimate:
-    predictor, rows = search.predictor, len(y)
+    predictor, rows, states = search.predictor, len(series), series.states(search.predictor)
     n, n_u, n_y = predictor.sizes
     P = search.directions.shape[1]
+    parameters = P + (states.size if series.is_cut else 0)
     d_f, d_h, _ = np.split(search.directions, np.cumsum([predictor.F.size, predictor.H.size]))
     d_f, d_h = d_f.reshape(*predictor.F.shape, P), d_h.reshape(*predictor.H.shape, P)
     A, B, K, C, D = predictor.matrices
     d_k = d_f[:, n + n_u : n + n_u + n_y]
     feedback = np.einsum("iop,or->irp", d_k, predictor.H) + np.einsum("io,orp->irp", K, d_h)  # of K H
-    freedom = rows - P / n_y
-    noise_free = search.noise_free(y)
+    freedom = rows - parameters / n_y
+    noise_free = search.noise_free(series.y)
     scale = np.sqrt(np.maximum(np.diag(search.information), np.finfo(np.float64).tiny))
     values, vectors = np.linalg.eigh(search.information / np.outer(scale, scale))
     kept = values > 1e-14 * values[-1]
@@ -292,9 +296,9 @@ def _estimate(
         covariance=inverse * rows / freedom,
         offset_x=predictor.F[:, -1] + K @ predictor.H[:, -1] - model.B @ u_level,
         offset_y=predictor.H[:, -1] + y_level - D @ u_level,
-        initial_state=predictor.x0,
+        initial_states=states,
         rows=rows,
-        parameters=P,
+        parameters=parameters,
         log_det=log_determinant(search.scatter / rows),
         iterations=search.iterations,
         converged=search.converged,

@@ -52,7 +52,7 @@ def model_of_recording(
     InputError
         A column that is not there, or that holds values that are not numbers.
     """
-    from autotune.identification.closed_loop.identify import usable_stretch
+    from autotune.identification.closed_loop.gaps import usable_stretch
 
     for column in (name for names in more for name in names):
         _ = recording[column]  # names the columns that are there

@@ -15,6 +15,7 @@ from scipy.linalg import solve_discrete_are, solve_triangular
 from autotune.arrays import FloatArray
 from autotune.errors import IdentificationError
 from autotune.identification.closed_loop.lagged import lagged_factor, least_squares, triangle
+from autotune.identification.closed_loop.series import Series
 from autotune.identification.closed_loop.state_space import InnovationModel
 
 #: Standard deviation of the white noise supposed on past samples, as a share of the signal's root mean square.
@@ -59,15 +60,15 @@ class LaggedData:
         return replace(self, R=triangle(self.R[:, keep]), p=count)
 
 
-def lagged_data(u: FloatArray, y: FloatArray, p: int) -> LaggedData:
+def lagged_data(u: FloatArray, y: FloatArray, p: int, starts: tuple[int, ...] = (0,)) -> LaggedData:
     """Return the factor of the past p samples and the present one; one pass, time linear in the rows.
 
     A trace of white noise (1e-6 of each signal) is supposed on the past: noise-free records, whose lags depend on each
     other exactly, then have a predictor too.
     """
-    z = np.hstack([u, y])
-    R, rows = lagged_factor([(z, range(-1, -p - 1, -1)), (u, [0]), (y, [0])])
-    width = p * z.shape[1]
+    series, past = Series(u=u, y=y, starts=starts), range(-1, -p - 1, -1)
+    R, rows = lagged_factor(*([(np.hstack(one), past), (one[0], [0]), (one[1], [0])] for one in series.stretches))
+    width = p * (u.shape[1] + y.shape[1])
     trace = np.zeros((width, R.shape[1]))
     np.fill_diagonal(trace, _TRACE_OF_NOISE * np.linalg.norm(R[:, :width], axis=0))
     R = triangle(np.vstack([R, trace]))

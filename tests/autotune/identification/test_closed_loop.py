@@ -219,7 +219,7 @@ def test_dither_column_belongs_to_the_law() -> None:
         (lambda r: Recording(t=r.t[:40], u=r.u[:40], y=r.y[:40]), "too short: 40 equidistant rows"),
         (lambda r: Recording(t=r.t, u=np.full_like(r.u, 5.0), y=r.y), "u does not move"),
         (lambda r: Recording(t=r.t, u=r.u, y=np.zeros_like(r.y)), "y does not move"),
-        (lambda r: Recording(t=r.t, u=r.u, y=np.where(np.arange(len(r)) % 50 == 0, np.nan, r.y)), "not numbers"),
+        (lambda r: Recording(t=r.t, u=r.u, y=np.where(np.arange(len(r)) % 10 == 0, np.nan, r.y)), "not numbers"),
     ],
 )
 def test_unusable_recordings_are_refused_by_name(spoil: Callable[[Recording], Recording], message: str) -> None:
@@ -227,12 +227,15 @@ def test_unusable_recordings_are_refused_by_name(spoil: Callable[[Recording], Re
         identify_closed_loop(spoil(ball_loop()))
 
 
-def test_longest_sound_stretch_is_used_and_named() -> None:
+def test_sound_stretches_are_used_and_what_is_left_out_is_named() -> None:
     whole = ball_loop()
-    t = whole.t + np.where(np.arange(len(whole)) > 700, 0.4, 0.0)
-    y = np.where(np.arange(len(whole)) == 2900, np.nan, whole.y)
+    rows = np.arange(len(whole))
+    t = whole.t + np.where(rows > 700, 0.4, 0.0)
+    y = np.where((rows == 2900) | (rows >= 2980), np.nan, whole.y)
     found = identify_closed_loop(Recording(t=t, u=whole.u, y=y, extra=whole.extra), order=2)
-    assert any("2199 of 3000 rows" in warning for warning in found.warnings)
+    assert found.warnings[0] == "2 stretches between gaps are used together"
+    assert any("1 of 2980 rows" in warning for warning in found.warnings)  # put in
+    assert any("2980 of 3000 rows are used" in warning for warning in found.warnings)
     assert max(abs(np.sort(found.poles.real) - [math.exp(-DT / 0.3836), 1.0])) < 0.01
 
 
