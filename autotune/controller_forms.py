@@ -24,7 +24,7 @@ from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 from autotune.controller import PIDController
-from autotune.errors import DesignError
+from autotune.errors import DesignError, InputError
 
 _NEEDED = math.nan
 
@@ -330,6 +330,38 @@ FORMS: Mapping[str, ControllerForm] = {
 }
 
 
+def require_complete(forms: Mapping[str, ControllerForm]) -> None:
+    """Refuse forms whose parts do not belong together.
+
+    Parameters
+    ----------
+    forms : mapping of str to ControllerForm
+        The table.
+
+    Raises
+    ------
+    InputError
+        The first that is wrong, with what is missing and how to add it.
+    """
+    usual, spans = PIDController(K=2.0, Ti_s=8.0, Td_s=1.0, Tf_s=0.1), Spans(u=100.0, y=50.0, sample_time_s=0.1)
+    for name, form in forms.items():
+        settings, values = set(form.settings), form.encode(usual, spans)
+        if settings != set(values):
+            what = f"encode gives {', '.join(sorted(values))}, and settings has {', '.join(sorted(settings))}"
+            raise InputError(what, where=f"form {name}", remedy="name the same settings in both")
+        if not (form.signed and set(form.signed) <= settings):
+            what = f"signed = ({', '.join(form.signed)}) is not among its settings"
+            raise InputError(what, where=f"form {name}", remedy="name the settings that change sign with K")
+        try:
+            again = form.decode(values, spans)
+        except KeyError as missing:
+            what = f"decode asks for {missing}, which is not among its settings"
+            raise InputError(what, where=f"form {name}", remedy="name the same settings in both") from None
+        if not math.isclose(again.K, usual.K, rel_tol=1e-9):
+            what = f"decode makes K = {again.K:g} of what encode made of K = {usual.K:g}"
+            raise InputError(what, where=f"form {name}", remedy="make decode the inverse of encode")
+
+
 def _zero_for_never(Ti_s: float) -> float:
     """Return an integral time as makers write it who switch integral action off by 0."""
     return 0.0 if math.isinf(Ti_s) else Ti_s
@@ -371,3 +403,6 @@ def _measurement_filtered(K: float, Ti: float, Td: float, filter_s: float) -> PI
 
 def _derivative_gain(Td: float, filter_s: float) -> float:
     return Td / filter_s if filter_s > 0.0 else 10.0
+
+
+require_complete(FORMS)

@@ -7,9 +7,12 @@ this process), and ``probe_kind(settings, expected)``, which reads everything on
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import re
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
 from typing import Any, get_args
 
 from autotune.config.rig import (
@@ -135,9 +138,42 @@ KINDS = (
     Kind(SerialSettings, "drivers.device_rig"),
 )
 
+
+def require_complete(kinds: Sequence[Kind], known: Sequence[type[Section]] = RIG_SETTINGS) -> None:
+    """Refuse a table in which something is missing; no driver is imported for that.
+
+    Parameters
+    ----------
+    kinds : sequence of Kind
+        The table.
+    known : sequence of types
+        Settings that a configuration may have.
+
+    Raises
+    ------
+    InputError
+        The first thing that is missing, and how to add it.
+    """
+    for settings in known:
+        if settings not in [kind.settings for kind in kinds]:
+            _refuse(f"no line for {settings.__name__}", f'add Kind({settings.__name__}, "drivers.FILE")')
+    for kind in kinds:
+        name = kind.settings.__name__
+        if kind.settings not in known:
+            _refuse(f"{name} is no [rig] that a configuration may have", "add it to RigSettings in config/rig.py")
+        found = find_spec(kind.driver)
+        if found is None or found.origin is None:
+            _refuse(f"{name} is reached by {kind.driver}, which does not exist", "correct its name, or write it")
+        elif not re.search(r"^def open_kind\(", Path(found.origin).read_text(encoding="utf-8"), re.MULTILINE):
+            _refuse(f"{kind.driver} has no open_kind", "add def open_kind(settings, session), which returns the rig")
+
+
+def _refuse(what: str, remedy: str) -> None:
+    raise InputError(what, where="drivers/kinds.py", remedy=remedy)
+
+
+require_complete(KINDS)
 _BY_SETTINGS = {kind.settings: kind for kind in KINDS}
-if missing := [settings.__name__ for settings in RIG_SETTINGS if settings not in _BY_SETTINGS]:
-    raise TypeError(f"no line in drivers/kinds.py for {', '.join(missing)}")
 
 
 def kind_of(settings: Section) -> Kind:

@@ -7,6 +7,7 @@ import math
 import re
 import shutil
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +17,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from autotune.controller import PIDController
-from autotune.controller_forms import FORMS, Settings, from_form, to_form
+from autotune.controller_forms import FORMS, ControllerForm, Settings, from_form, require_complete, to_form
 from autotune.design.codegen import c_source, structured_text
 from autotune.design.law import PILaw
-from autotune.errors import DesignError
+from autotune.errors import DesignError, InputError
 
 OMEGA = np.geomspace(1e-3, 1e3, 50)
 
@@ -244,3 +245,22 @@ def test_structured_text_has_standard_literals_only() -> None:
 def test_a_name_that_is_no_identifier_is_refused() -> None:
     with pytest.raises(DesignError, match="identifier"):
         c_source(LAWS[0], name="2fast; drop")
+
+
+ISA = FORMS["isa"]
+
+
+@pytest.mark.parametrize(
+    ("form", "message"),
+    [
+        (replace(ISA, settings={"K": math.nan}), "form mine: encode gives K, Td_s, Tf_s, Ti_s, and settings has K;"),
+        (replace(ISA, signed=()), r"signed = \(\) is not among its settings"),
+        (replace(ISA, signed=("Kp",)), r"signed = \(Kp\) is not among its settings"),
+        (replace(ISA, decode=FORMS["parallel"].decode), "decode asks for 'Kp'"),
+        (replace(ISA, decode=lambda v, spans: PIDController(K=-v["K"], Ti_s=v["Ti_s"])), "decode makes K = -2 of"),
+    ],
+)
+def test_a_form_whose_parts_do_not_belong_together_is_refused_by_name(form: ControllerForm, message: str) -> None:
+    require_complete(FORMS)
+    with pytest.raises(InputError, match=message):
+        require_complete({**FORMS, "mine": form})
