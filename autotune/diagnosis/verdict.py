@@ -169,10 +169,15 @@ def sentences_of(
         case "none":
             first = "The simulation explains the recordings to within noise."
         case "parameters":
-            first = "The structure is right, its numbers are not: retuned, the simulation explains the recordings."
+            first = (
+                "The numbers are not right: retuned, the simulation is nearer to the recordings, but not down to noise."
+            )
+            if residual.is_noise or q.comes_down_to_noise:
+                first = "The structure is right, its numbers are not: retuned, the simulation explains the recordings."
         case "effect":
             names = " and ".join(f"{e.name} (probability {e.probability:.2f})" for e in effects)
-            rest = "" if residual.is_noise else " What is left is not noise: something smaller is missing as well."
+            clean = residual.is_noise or q.comes_down_to_noise
+            rest = "" if clean else " What is left is not noise: something smaller is missing as well."
             first = f"Physics was left out: {names}.{rest}"
         case _:
             first = f"Something is missing that no candidate explains to within noise; it shows at {', '.join(places)}."

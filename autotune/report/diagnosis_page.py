@@ -1,19 +1,39 @@
-"""The diagnosis as a page: the verdict, the hypotheses, and what the residuals look like."""
+"""The diagnosis as a page for a sceptic: where, what, how sure; unseen rows; the law; what speaks against it."""
 
 from __future__ import annotations
 
 import os
+from dataclasses import dataclass
 
 import numpy as np
 
 from autotune.controller import Controller
 from autotune.diagnosis.evidence.description import Curve, Description
+from autotune.diagnosis.evidence.missing_law import MissingLaw, missing_law
+from autotune.diagnosis.evidence.unseen_run import UnseenRun, unseen_run
 from autotune.diagnosis.result import Diagnosis, FoundEffect
 from autotune.diagnosis.selection.hypothesis import merged, penalised
+from autotune.report.chain_diagram import chain_diagram
+from autotune.report.diagnosis_words import answers, in_the_model, objections, places_of, verdict_of
+from autotune.report.effect_words import clause, in_short, of_candidate, sentence, with_spread
+from autotune.report.law_figures import acting_figure, file_names, free_run_figure, law_figure
+from autotune.report.number_tables import numbers_table
 from autotune.report.page import Figure, Page, Section, Table, Tone, write_page
-from autotune.report.screen_figures import curve_figure, screen_sections, trace_figures
+from autotune.report.screen_figures import curve_figure, over_time, screen_sections, trace_figures
 
 _TONES: dict[str, Tone] = {"none": "good", "parameters": "good", "effect": "warn", "unexplained": "bad"}
+#: Rivals that are listed, and the probability below which one is none.
+_RIVALS, _LEAST = 8, 0.002
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Evidence:
+    """What the page computes once and says in several places."""
+
+    found: Diagnosis
+    run: UnseenRun | None
+    laws: tuple[MissingLaw, ...]
+    names: tuple[str, ...]
 
 
 def write_diagnosis_page(
@@ -35,49 +55,119 @@ def write_diagnosis_page(
     before : tuple of Section
         What led to the diagnosis, shown after its summary.
     """
-    described = () if found.description is None else (_described(found.description),)
-    traces = Section(title="Simulation against recording", figures=trace_figures(found))
-    sections = (*before, _effects(found), *described, _fits(found), _hypotheses(found), traces)
-    write_page(
-        Page(
-            title=f"Diagnosis of {found.extended_model.name}",
-            verdict=found.sentences[0],
-            tone=_TONES[found.verdict],
-            summary=(*found.sentences[1:], *_next(found)),
-            sections=(*sections, *screen_sections(found, controller)),
-        ),
-        path,
+    search = found.search
+    chosen = search.chosen.fit
+    laws = tuple(law for name in search.chosen.names if (law := missing_law(chosen, search.data, name)) is not None)
+    known = _Evidence(
+        found=found,
+        run=unseen_run(search.nominal, search.retuned.fit, chosen, search.data),
+        laws=laws,
+        names=file_names(search.data.recordings),
+    )
+    named, possible = places_of(found)
+    model = search.retuned.fit.parametrisation.model
+    page = Page(
+        title=f"Diagnosis of {found.extended_model.name}",
+        verdict=verdict_of(found),
+        tone=_TONES[found.verdict],
+        drawing=chain_diagram(model, named, possible, throughout=chosen.sim.chain.levels > 1),
+        answers=answers(found, known.run),
+        sections=(*before, *_sections(known, controller)),
+    )
+    write_page(page, path)
+
+
+def _sections(known: _Evidence, controller: Controller | None) -> tuple[Section, ...]:
+    found = known.found
+    described = () if found.description is None else (_described(found.description, found),)
+    traces = Section(title="Simulation against recording", figures=trace_figures(found, known.names))
+    return (
+        _before_and_after(known),
+        *_missing(known),
+        *described,
+        _when(known),
+        _against(known),
+        *screen_sections(found, controller, known.names),
+        traces,
     )
 
 
-def _next(found: Diagnosis) -> tuple[str, ...]:
-    following = found.next_experiment
-    if following is None:
-        return ()
-    settings = ", ".join(f"{key}: {value}" for key, value in following.settings.items())
-    return (f"Next experiment, to {following.purpose}: {following.kind} ({settings}). Expected: {following.expected}.",)
+def _before_and_after(known: _Evidence) -> Section:
+    """Show nominal, retuned and extended model on one free run, and their errors there and on all held-out rows."""
+    found, run, q = known.found, known.run, known.found.fit
+    search = found.search
+    held = {"nominal": q.nominal, "retuned": q.retuned, "extended": q.extended}
+    if search.chosen.fit is search.retuned.fit:
+        held.pop("extended")
+    rows = [
+        (name, "-" if run is None else _share(run.errors.get(name, float("nan"))), _share(error))
+        for name, error in held.items()
+    ]
+    table = Table(
+        header=("model", "this stretch", "all held-out stretches"),
+        rows=(*rows, ("noise alone", "-", _share(q.noise_floor))),
+        caption="Error as a share of the spread of y. A perfect model would come down to the noise.",
+    )
+    figures = () if run is None else (free_run_figure(run, known.names[run.number]),)
+    text = () if run is not None else ("The recordings are too short to leave a stretch of them out.",)
+    return Section(
+        title="Before and after, as one free run",
+        text=text,
+        figures=figures,
+        tables=(table, numbers_table(search.nominal, search.retuned.fit, search.chosen.fit)),
+        details=(
+            "For this picture every number was fitted again without the stretch; which effects were chosen, not. Held-"
+            "out stretches: the recordings cut into parts, each run with numbers fitted to the others.",
+        ),
+    )
 
 
-def _effects(found: Diagnosis) -> Section:
+def _share(error: float) -> str:
+    return f"{100 * error:.3g} %" if np.isfinite(error) else "runs away"
+
+
+def _missing(known: _Evidence) -> tuple[Section, ...]:
+    """Say what was added: sentences, curves, numbers; what the extended model has is said whatever the verdict."""
+    found = known.found
     rows = [row for effect in found.effects for row in _effect_rows(effect)]
-    text = "Nothing was added to the model." if not rows else "What was added to the model, the most important first."
-    table = Table(header=("effect", "probability", "places", "parameter", "value", "equation"), rows=tuple(rows))
-    return Section(title="What is missing", text=(text,), tables=(table,) if rows else ())
+    table = Table(header=("effect", "probability", "places", "parameter", "value (95 %)", "equation"), rows=tuple(rows))
+    figures = tuple(law_figure(law) for law in known.laws)
+    if not rows and not figures and not found.extended_model.effects:
+        return ()
+    without = [name for name in found.search.chosen.names if name not in {law.effect for law in known.laws}]
+    text = [] if rows else ["No effect is named."]
+    text += [line for line in (in_the_model(found),) if line]
+    text += [f"{sentence(clause(name))} That is no law over one signal: the free run shows what it does."
+             for name in without]  # fmt: skip
+    return (
+        Section(
+            title="The missing law",
+            text=tuple(text),
+            figures=figures,
+            tables=(table,) if rows else (),
+            details=(
+                "The dots are not computed from the curve: what the extended model leaves of the readings is traced"
+                " back through the linear chain to where the effect acts, bin by bin of its signal, and added to the"
+                " curve (component plus residual); the other numbers are held.",
+            )
+            if figures
+            else (),
+        ),
+    )
 
 
 def _effect_rows(effect: FoundEffect) -> list[tuple[str, ...]]:
     rows: list[tuple[str, ...]] = []
     for i, (name, p) in enumerate(effect.parameters.items()):
-        value = f"{p.value:.4g} ± {1.96 * p.sd:.2g} {p.unit}" if np.isfinite(p.sd) else f"{p.value:.4g} {p.unit}"
         first = (effect.name, f"{effect.probability:.2f}", ", ".join(effect.places)) if i == 0 else ("", "", "")
-        rows.append((*first, name, value, effect.equation if i == 0 else ""))
+        rows.append((*first, name.replace("_", " "), with_spread(p), effect.equation if i == 0 else ""))
     return rows or [(effect.name, f"{effect.probability:.2f}", ", ".join(effect.places), "", "", effect.equation)]
 
 
-def _described(description: Description) -> Section:
+def _described(description: Description, found: Diagnosis) -> Section:
     """Show what no effect of the catalogue explains, as an equation and as a curve."""
     terms = Table(
-        header=("term", "value", "unit of the whole"),
+        header=("term", "value (95 %)", "unit of the whole"),
         rows=tuple((t.text, f"{t.value:.4g} ± {1.96 * t.sd:.2g}", t.unit) for t in description.terms),
     )
     shares = Table(
@@ -89,55 +179,62 @@ def _described(description: Description) -> Section:
         title="A description, not a cause",
         text=(description.sentence,),
         tables=(terms, shares) if description.terms else (shares,),
-        figures=(_curve(description.curve),) if description.curve.explained > 0.0 else (),
+        figures=(_curve(description.curve, found),) if description.curve.explained > 0.0 else (),
     )
 
 
-def _curve(curve: Curve) -> Figure:
+def _curve(curve: Curve, found: Diagnosis) -> Figure:
     caption = (
         f"What is missing over {curve.signal}, as a smoothing spline of no assumed form, with its 95 % band; it "
         f"takes away {100 * curve.explained:.0f} % of the held-out residual above the noise. It tells no offset."
     )
-    return Figure(figure=curve_figure(curve), caption=caption, height_px=320)
+    return Figure(figure=curve_figure(curve, found), caption=caption, height_px=320)
 
 
-def _fits(found: Diagnosis) -> Section:
-    q = found.fit
-    table = Table(
-        header=("model", "held-out error / spread of y"),
-        rows=(
-            ("nominal", f"{q.nominal:.4g}"),
-            ("retuned", f"{q.retuned:.4g}"),
-            ("extended", f"{q.extended:.4g}"),
-            ("noise alone", f"{q.noise_floor:.4g}"),
-        ),
-    )
-    retuned = found.search.retuned.fit
-    numbers = Table(
-        header=("number", "retuned / nominal", "95 %"),
-        rows=tuple(
-            (
-                f.name,
-                f"{retuned.parametrisation.value(i, retuned.theta):.5g}",
-                f"± {1.96 * np.sqrt(retuned.covariance[i, i]):.2g}",
-            )
-            for i, f in enumerate(retuned.parametrisation.free)
-        ),
-        caption="Factors for gain, lags and zeros; dead time and offset in their units.",
-    )
-    return Section(title="Before and after", tables=(table, numbers))
+def _when(known: _Evidence) -> Section:
+    """Show along the recordings when each effect acts, and how large the residual is."""
+    found = known.found
+    text = [
+        f"{in_short(effect.name).capitalize()}: {_times(effect, known)}."
+        for effect in found.effects
+        if _is_at_times(effect, known)
+    ]
+    figures = [acting_figure(law, found.search.data.recordings, known.names) for law in known.laws]
+    title = "When it acts" if known.laws or found.effects else "What is left, along the recordings"
+    return Section(title=title, text=tuple(text), figures=(*figures, over_time(found)))
 
 
-def _hypotheses(found: Diagnosis) -> Section:
-    s = found.search
+def _is_at_times(effect: FoundEffect, known: _Evidence) -> bool:
+    recordings = known.found.search.data.recordings
+    ends = {(i, float(r.t[0]), float(r.t[-1])) for i, r in enumerate(recordings)}
+    return set(effect.windows) != ends
+
+
+def _times(effect: FoundEffect, known: _Evidence, most: int = 6) -> str:
+    said = [f"{a:.4g} to {b:.4g} s of {known.names[i]}" for i, a, b in effect.windows[:most]]
+    more = len(effect.windows) - len(said)
+    return ", ".join(said) + (f" and {more} more" if more > 0 else "")
+
+
+def _against(known: _Evidence) -> Section:
+    """Say what speaks against the finding: rivals, what was not excited, what is left."""
+    found, s = known.found, known.found.search
+    rows = [(of_candidate(c.name), f"{c.probability:.3f}") for c in found.candidates if c.probability >= _LEAST]
+    odds = Table(
+        header=("explanation", "probability"), rows=tuple(rows[:_RIVALS]),
+        caption="All explanations that were weighed, the likeliest first.",
+    )  # fmt: skip
     base = penalised(s.retuned)
     # pruning and exchanging fit some combinations more than once
     ranked = merged((*s.singles, *s.pairs, *s.triples))
     table = Table(
-        header=("hypothesis", "decrease of chi2, parameters paid for"),
+        header=("hypothesis", "decrease of chi-square, parameters paid for"),
         rows=tuple((" + ".join(h.names), f"{base - penalised(h):.1f}") for h in ranked),
     )
-    odds = Table(
-        header=("candidate", "probability"), rows=tuple((c.name, f"{c.probability:.3f}") for c in found.candidates)
+    return Section(
+        title="What speaks against it",
+        text=objections(found, known.run, known.laws),
+        tables=(odds,) if rows else (),
+        detail_tables=(table,) if ranked else (),
+        details=(f"{len(ranked)} combinations of effects were fitted to all rows.",) if ranked else (),
     )
-    return Section(title="Other hypotheses", tables=(table, odds))

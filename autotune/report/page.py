@@ -89,6 +89,8 @@ class Page:
         Colour of the verdict; the sentence says the same without it.
     answers : tuple of (str, str)
         What was found, how sure it is, what to do: a heading of a word or three, and a sentence or two.
+    drawing : str
+        Inline SVG that says where, above the answers.
     summary : tuple of str
         What else the reader needs to know.
     sections : tuple of Section
@@ -99,6 +101,7 @@ class Page:
     verdict: str
     tone: Tone
     answers: tuple[tuple[str, str], ...] = ()
+    drawing: str = ""
     summary: tuple[str, ...] = ()
     sections: tuple[Section, ...] = ()
 
@@ -164,6 +167,7 @@ def write_page(page: Page, path: str | os.PathLike[str]) -> None:
     body = [
         f"<h1>{_text(page.title)}</h1>",
         f'<p class="verdict {page.tone}">{_text(page.verdict)}</p>',
+        page.drawing,
         _answers(page.answers),
         *(f"<p>{_text(line)}</p>" for line in page.summary),
     ]
@@ -313,12 +317,18 @@ th { font-weight: 600; }
 .answers div { background: var(--card); padding: 0.6rem 0.9rem; border-radius: 6px; }
 .answers dt { color: var(--faint); font-size: 0.86rem; } .answers dd { margin: 0.15rem 0 0; }
 .square { width: min(100%, 560px); aspect-ratio: 1; } .small { width: 100px; height: 28px; }
+.chain { margin: 1.1rem 0; } .chain svg { width: 100%; height: auto; display: block; } .upright { display: none; }
+.chain rect { fill: var(--card); stroke: var(--line); stroke-width: 1.5; } .chain text { fill: var(--ink); }
+.chain rect.lit { fill: #d9820033; stroke: #d98200; stroke-width: 3; } .chain rect.may { stroke: #d98200; }
+.chain rect.added { stroke-dasharray: 6 4; } .chain .small-print { fill: var(--faint); font-size: 12px; }
+.chain .note { font-weight: 600; } .wire { stroke: var(--faint); stroke-width: 1.5; } .tip { fill: var(--faint); }
 details { margin: 0.8rem 0; } summary { cursor: pointer; color: var(--faint); font-size: 0.93rem; }
 .legend { display: flex; flex-wrap: wrap; gap: 0.1rem 0.4rem; }
 .legend button { all: unset; cursor: pointer; font-size: 0.86rem; padding: 0.1rem 0.4rem; border-radius: 4px; }
 .legend button:focus-visible { outline: 2px solid var(--faint); } .legend button[aria-pressed="false"] { opacity: 0.4; }
 .legend svg { width: 26px; height: 10px; margin-right: 0.4rem; fill: none; }
 figure { margin: 1.1rem 0 1.6rem; } figcaption { color: var(--faint); font-size: 0.9rem; max-width: 84ch; }
+@media (max-width: 760px) { .lying { display: none; } .upright { display: block; } }
 @media (max-width: 520px) { body { font-size: 15px; } h1 { font-size: 1.35rem; } td, th { padding-right: 0.6rem; } }
 </style>
 </head>

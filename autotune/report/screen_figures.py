@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from itertools import pairwise
+
 import numpy as np
 
 from autotune.arrays import FloatArray
@@ -22,15 +25,20 @@ from autotune.diagnosis.evidence.screens import (
     value_screen,
     window_screen,
 )
+from autotune.diagnosis.fitting.long_windows import spread_of
 from autotune.diagnosis.result import Diagnosis
 from autotune.report import chart as go
 from autotune.report.page import BLUE, GREEN, GREY, ORANGE, Figure, Section, Table, add_line, lines_figure, thinned
 
 #: Height of one screen's picture [px]; periods of the recomputed law that are drawn.
 HEIGHT, LAW_ROWS = 300, 600
+#: Pieces in which a residual's size is drawn over time, and rows of one at least.
+PIECES, LEAST_PIECE = 80, 10
 
 
-def screen_sections(found: Diagnosis, controller: Controller | None = None) -> tuple[Section, ...]:
+def screen_sections(
+    found: Diagnosis, controller: Controller | None = None, names: Sequence[str] = ()
+) -> tuple[Section, ...]:
     """Return the screens of a diagnosis as sections: samples, residual over time and frequency, over the signals.
 
     Parameters
@@ -39,8 +47,10 @@ def screen_sections(found: Diagnosis, controller: Controller | None = None) -> t
         With its search.
     controller : Controller, optional
         The stated law, where the sidecars do not state it.
+    names : sequence of str
+        The recordings' names for people; their numbers by default.
     """
-    return (_samples(found, controller), _residual(found), _signals(found))
+    return (_samples(found, controller), _residual(found, names), _signals(found))
 
 
 def _samples(found: Diagnosis, controller: Controller | None) -> Section:
@@ -66,6 +76,8 @@ def _histogram(values: FloatArray, title: str, least: tuple[float, float], *, lo
     figure = lines_figure(title, "rows", log_y=log)
     edges = np.linspace(min(values.min(), least[0]), max(values.max(), least[1]), 161)
     counts = np.histogram(values, edges)[0]
+    if log:
+        figure.update_yaxes(range=[-0.3, float(np.log10(2.0 * counts.max()))])
     middle = 0.5 * (edges[1:] + edges[:-1])
     figure.add_trace(go.Bar(x=middle, y=counts, marker={"color": BLUE}, showlegend=False, width=edges[1] - edges[0]))
     return figure
@@ -79,7 +91,7 @@ def _law(law: LawScreen, unit: str) -> go.Chart:
     return figure
 
 
-def _residual(found: Diagnosis) -> Section:
+def _residual(found: Diagnosis, names: Sequence[str]) -> Section:
     retuned, extended, data = found.search.retuned.fit, found.search.chosen.fit, found.search.data
     y_unit = found.extended_model.output.unit
     spectrum = spectrum_screen(retuned, extended, data)
@@ -87,16 +99,15 @@ def _residual(found: Diagnosis) -> Section:
     add_line(figure, spectrum.frequency_hz, spectrum.retuned, "retuned", ORANGE)
     add_line(figure, spectrum.frequency_hz, spectrum.extended, "extended", BLUE)
     add_line(figure, spectrum.frequency_hz, spectrum.noise, "noise model", GREY, dash="dot")
-    figures = [_over_time(found)]
-    figures.append(Figure(figure=figure, caption=f"Residual over frequency. {spectrum.sentence}", height_px=HEIGHT))
+    figures = [Figure(figure=figure, caption=f"Residual over frequency. {spectrum.sentence}", height_px=HEIGHT)]
     periods = period_screen(retuned, data)
     if periods is not None:
-        figures += _periods(periods, y_unit)
+        figures += _periods(periods, y_unit, names)
     direction = direction_screen(retuned, data)
     if direction is not None:
-        figure = lines_figure(f"|rate of the reading| [{y_unit}/s]", "residual / noise")
-        _add_means(figure, direction.rising, "rising", BLUE)
-        _add_means(figure, direction.falling, "falling", ORANGE)
+        figure = lines_figure(f"|rate of the reading| [{y_unit}/s]", f"residual [{y_unit}]")
+        _add_means(figure, direction.rising, "rising", BLUE, data.noise.total_sd)
+        _add_means(figure, direction.falling, "falling", ORANGE, data.noise.total_sd)
         figures.append(Figure(figure=figure, caption=f"Up against down. {direction.sentence}", height_px=HEIGHT))
     windows = window_screen(retuned, data)
     if windows is not None:
@@ -116,35 +127,42 @@ def _residual(found: Diagnosis) -> Section:
     return Section(title="What retuning leaves, when and how fast", text=text, figures=tuple(figures))
 
 
-def _over_time(found: Diagnosis) -> Figure:
-    """Draw the size of the residual in every window, one recording after the other."""
-    data, figure = found.search.data, lines_figure("t, one recording after the other [s]", "rms residual / noise")
-    middles, at = [], 0.0
-    for r, a, b in zip(data.recordings, data.starts, data.stops, strict=True):
-        middles.append(at + 0.5 * (r.t[a] + r.t[b - 1]) - r.t[0])
-        at += r.duration_s
-    t = np.concatenate(middles)
+def over_time(found: Diagnosis) -> Figure:
+    """Draw the size of the residual over time, one recording after the other, in pieces no longer than its windows."""
+    data, unit = found.search.data, found.extended_model.output.unit
+    figure = lines_figure("t, one recording after the other [s]", f"rms residual [{unit}]")
+    pieces, middles, at, row = [], [], 0.0, 0
+    longest = max(sum(len(r) for r in data.recordings) // PIECES, LEAST_PIECE)
+    for r, starts, stops in zip(data.recordings, data.starts, data.stops, strict=True):
+        for a, b in zip(starts, stops, strict=True):
+            cuts = np.linspace(a, b, max(1, round((b - a) / longest)) + 1).astype(np.int64)
+            pieces += [(row + i, row + j) for i, j in pairwise(cuts)]
+            middles += [at + 0.5 * (r.t[i] + r.t[j - 1]) - r.t[0] for i, j in pairwise(cuts)]
+        at, row = at + r.duration_s, row + len(r)
+    t = np.array(middles)
     sizes = {}
-    for fit, name, colour in (
-        (found.search.retuned.fit, "retuned", ORANGE),
-        (found.search.chosen.fit, "extended", BLUE),
-    ):
-        e = np.concatenate(fit.residuals) / data.noise.total_sd
-        sizes[name] = np.array([np.sqrt(np.mean(e[a:b] ** 2)) for a, b in fit.windows])
+    fits = {"retuned": (found.search.retuned.fit, ORANGE), "extended": (found.search.chosen.fit, BLUE)}
+    if found.search.chosen.fit is found.search.retuned.fit:
+        fits.pop("extended")
+    for name, (fit, colour) in fits.items():
+        e = np.concatenate(fit.residuals)
+        sizes[name] = np.array([np.sqrt(np.mean(e[a:b] ** 2)) for a, b in pieces])
         add_line(figure, t, sizes[name], name, colour)
-    add_line(figure, t[[0, -1]], np.ones(2), "noise", GREY, dash="dot")
+    noise = found.fit.noise_floor * spread_of(data)
+    add_line(figure, t[[0, -1]], np.full(2, noise), "noise alone", GREY, dash="dot")
+    figure.update_yaxes(rangemode="tozero")
     worst, usual = int(np.argmax(sizes["retuned"])), float(np.median(sizes["retuned"]))
     caption = (
-        f"Residual over time, window by window. Retuned it is usually {usual:.3g} times the noise, at most "
-        f"{sizes['retuned'][worst]:.3g} times, near {t[worst]:.4g} s."
+        f"Residual over time. Retuned it is usually {usual:.3g} {unit}, at most "
+        f"{sizes['retuned'][worst]:.3g} {unit}, near {t[worst]:.4g} s."
     )
     return Figure(figure=figure, caption=caption, height_px=HEIGHT)
 
 
-def _periods(screen: PeriodScreen, unit: str) -> list[Figure]:
+def _periods(screen: PeriodScreen, unit: str, names: Sequence[str]) -> list[Figure]:
     folded = lines_figure("time within the period [s]", f"mean residual [{unit}]")
     _band(folded, screen.phase, screen.mean, 1.96 * screen.spread, BLUE)
-    add_line(folded, screen.phase, screen.mean, f"recording {screen.number}", BLUE)
+    add_line(folded, screen.phase, screen.mean, names[screen.number] if names else f"recording {screen.number}", BLUE)
     orders = np.arange(1, screen.harmonics.size + 1)
     bars = lines_figure("harmonic of the period", f"amplitude of the residual [{unit}]")
     for first, name, colour in ((0, "odd", BLUE), (1, "even", ORANGE)):
@@ -167,12 +185,12 @@ def _signals(found: Diagnosis) -> Section:
     best = max(curves, key=lambda name: curves[name].explained)
     figures, rows = [], []
     for name, means in sorted(curves.items(), key=lambda pair: -pair[1].explained):
-        figure = lines_figure(name, "residual / noise")
-        _add_means(figure, means, "retuned", ORANGE)
+        figure = lines_figure(_titled(name, found), f"residual [{found.extended_model.output.unit}]")
+        _add_means(figure, means, "retuned", ORANGE, search.data.noise.total_sd)
         share = "-"
         if name in after:
             extended = means_over(name, *after[name], per_row)
-            _add_means(figure, extended, "extended", BLUE)
+            _add_means(figure, extended, "extended", BLUE, search.data.noise.total_sd)
             share = f"{100 * extended.explained:.1f} %"
         rows.append((name, f"{100 * means.explained:.1f} %", share))
         caption = f"Mean residual over {name} with 95 % bands: flat at zero where nothing is missing."
@@ -183,9 +201,19 @@ def _signals(found: Diagnosis) -> Section:
     return Section(title="Residual against every signal", text=(text,), tables=(table,), figures=tuple(figures))
 
 
-def _add_means(figure: go.Chart, means: Means, name: str, colour: str) -> None:
-    _band(figure, means.x, means.mean, 1.96 * means.error, colour)
-    add_line(figure, means.x, means.mean, name, colour)
+def _titled(name: str, found: Diagnosis) -> str:
+    """Return the title of a signal's axis, with its unit."""
+    model = found.extended_model
+    at_plant = next((b.unit for b in model.blocks if b.place == "actuator" and b.unit), model.input.unit)
+    u, y = model.input.unit, model.output.unit
+    units = {"command u": u, "command": u, "u_applied": u, "plant input": at_plant}
+    units |= {"reading": y, "position": y, "level": y, "speed": f"{y}/s", "rate of the reading": f"{y}/s"}
+    return f"{name} [{units.get(name) or '-'}]" if name in units else name
+
+
+def _add_means(figure: go.Chart, means: Means, name: str, colour: str, sd: float) -> None:
+    _band(figure, means.x, sd * means.mean, 1.96 * sd * means.error, colour)
+    add_line(figure, means.x, sd * means.mean, name, colour)
 
 
 def _band(figure: go.Chart, x: FloatArray, y: FloatArray, half: FloatArray, colour: str) -> None:
@@ -199,21 +227,24 @@ def _band(figure: go.Chart, x: FloatArray, y: FloatArray, half: FloatArray, colo
     )  # fmt: skip
 
 
-def curve_figure(curve: Curve) -> go.Chart:
+def curve_figure(curve: Curve, found: Diagnosis) -> go.Chart:
     """Return the picture of a description's free curve with its 95 % band."""
-    figure = lines_figure(curve.signal, f"missing [{curve.unit}]")
+    figure = lines_figure(_titled(curve.signal, found), f"missing [{curve.unit or '-'}]")
     _band(figure, curve.x, curve.value, 1.96 * curve.sd, GREEN)
     add_line(figure, curve.x, curve.value, "free curve", GREEN)
     return figure
 
 
-def trace_figures(found: Diagnosis) -> tuple[Figure, ...]:
+def trace_figures(found: Diagnosis, names: Sequence[str]) -> tuple[Figure, ...]:
     """Return every recording with the retuned and the extended simulation, window by window."""
-    figures = []
-    for i, r in enumerate(found.search.data.recordings):
+    figures, search = [], found.search
+    for i, (r, name) in enumerate(zip(search.data.recordings, names, strict=True)):
         figure = lines_figure("t [s]", f"y [{found.extended_model.output.unit}]")
         add_line(figure, *thinned(r.t, r.y), "measured", GREY, width=1.0)
-        add_line(figure, *thinned(r.t, found.search.retuned.fit.signals[i][:, 0]), "retuned", ORANGE)
-        add_line(figure, *thinned(r.t, found.search.chosen.fit.signals[i][:, 0]), "extended", BLUE)
-        figures.append(Figure(figure=figure, caption=f"Recording {i}: measured, and simulated window by window."))
+        add_line(figure, *thinned(r.t, search.retuned.fit.signals[i][:, 0]), "retuned", ORANGE)
+        if search.chosen.fit is not search.retuned.fit:
+            add_line(figure, *thinned(r.t, search.chosen.fit.signals[i][:, 0]), "extended", BLUE)
+        count = len(search.data.starts[i])
+        how = "in one run" if count == 1 else f"in {count} windows, the state fitted at the start of each"
+        figures.append(Figure(figure=figure, caption=f"{name}: measured, and simulated {how}.", height_px=HEIGHT))
     return tuple(figures)

@@ -27,6 +27,11 @@ class FitQuality:
         """Whether the extended model is at least as good as the retuned one where neither was fitted."""
         return self.extended <= self.retuned
 
+    @property
+    def comes_down_to_noise(self) -> bool:
+        """Whether nothing larger than the noise is left where the extended model was not fitted."""
+        return self.extended <= self.noise_floor
+
 
 def dominates(quality: FitQuality, limits: Thresholds) -> bool:
     """Whether the chosen effects explain most of a residual that nothing explains whole.
