@@ -8,6 +8,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import shutil
 import signal
 import subprocess
 from collections.abc import Iterator, Sequence
@@ -93,7 +94,8 @@ def diagnose(campaign: Campaign, seed: int) -> None:
     out, case = campaign.diagnosis(seed), campaign.case(seed)
     if (out / "finished").exists():
         return
-    out.mkdir(parents=True, exist_ok=True)
+    shutil.rmtree(out, ignore_errors=True)  # what an interrupted one has left: the tool overwrites nothing
+    out.mkdir(parents=True)
     records = [str(path) for path in sorted(case.glob("rec*.csv"), key=lambda path: (len(path.name), path.name))]
     words = ["diagnose", "--model", str(case / "model.toml"), *records, "--out", str(out)]
     words += ["--without", campaign.without] if campaign.without else []

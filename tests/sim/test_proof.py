@@ -78,9 +78,11 @@ def test_a_case_that_the_operator_stopped_is_diagnosed_again(campaign, tmp_path)
     campaign = replace(campaign, seeds=range(67, 68))
     list(conceal(campaign))
     tool = (tmp_path / "tool.py").read_text()
-    (tmp_path / "tool.py").write_text("import os, signal; os.kill(os.getpid(), signal.SIGINT)")
+    stopped = "if words[0] == 'simulate':\n    import os, signal; os.kill(os.getpid(), signal.SIGINT)"
+    (tmp_path / "tool.py").write_text(tool + stopped)
     with pytest.raises(InterruptedError):
         diagnose(campaign, 67)
-    (tmp_path / "tool.py").write_text(tool)
+    # as the diagnosis does, the tool refuses to overwrite
+    (tmp_path / "tool.py").write_text(tool.replace("write_text(json", 'open("x").write(json'))
     diagnose(campaign, 67)
     assert (campaign.diagnosis(67) / "finished").read_text() == "0\n"
