@@ -16,6 +16,8 @@ from sim.recorded.rigs import Record, RefusedError
 
 #: Smallest share of the rows on either side of a dead zone.
 LEAST_SIDE = 0.05
+#: Smallest share of a gain that drifts at a recording's end.
+LEAST_GAIN = 0.2
 
 
 def dead_zone(a: float, s: Scale, rng: np.random.Generator) -> Put:
@@ -78,8 +80,8 @@ def lag(a: float, s: Scale, rng: np.random.Generator) -> Put:
 def gain_drift(a: float, s: Scale, rng: np.random.Generator) -> Put:
     """Conceal a gain 1 + rate t of du, t from a recording's first row on."""
     rate = float(rng.choice([-0.4, 0.6])) * a / s.length
-    if 1.0 + rate * s.length < 0.2:
-        raise RefusedError("the gain would vanish within the recording")
+    if not LEAST_GAIN < 1.0 + rate * s.length < 1.0 / LEAST_GAIN:
+        raise RefusedError("the gain would all but vanish, or grow several times, within the recording")
     return Put(
         apply=lambda r, rng: replace(r, u=s.u0 + (r.u - s.u0) / (1.0 + rate * (r.t - r.t[0]))),
         parameters={"rate": (rate, "1/s")},
