@@ -182,19 +182,18 @@ class EquationBench:
         each = list(zip(self.recordings, cuts, outcome.fitted.windows, strict=True))
         errors = []
         try:
+            windows = [_until(w, k) for _, k, w in each]
             if refits:
                 first = [replace(r, y=np.where(np.arange(len(r)) < k, r.y, np.nan)) for r, k, _ in each]
-                windows = [_until(w, k) for _, k, w in each]
-                z = fit(
-                    compiled, [_driven(r, self.model, applied) for r in first], z=z, windows=windows, iterations=8
-                ).z
+                driven = [_driven(r, self.model, applied) for r in first]
+                found = fit(compiled, driven, z=z, windows=windows, iterations=8)
+                z, windows = found.z, list(found.windows)
             p = values_of(compiled, z)
-            for r, k, _ in each:
+            for (r, k, _), w in zip(each, windows, strict=True):
                 drive = applied.before(drive_of(self.model, r))
-                at, end, judged = np.array([k]), np.array([len(r)]), k + int(SETTLED * (len(r) - k))
-                w = fitted_starts(compiled, p, drive, r.y, np.isfinite(r.y), at, end, share=SETTLED)
-                y = applied.after(simulate(compiled, p, drive, w.states, starts=at, stops=end).y)
-                errors.append((r.y - np.nan_to_num(y, nan=1e150))[judged:])
+                at, end = _continued(compiled, p, drive, r.y, w, k), np.array([len(r)])
+                y = applied.after(simulate(compiled, p, drive, at.states, starts=at.starts, stops=end).y)
+                errors.append((r.y - np.nan_to_num(y, nan=1e150))[k + int(SETTLED * (len(r) - k)) :])
         except InputError:
             return float("inf")
         e = np.concatenate(errors)
@@ -459,6 +458,28 @@ def _position_text(model: EquationModel, across: Expression | None) -> str:
 
     tree = None if across is None else position_under(model, across)
     return "" if tree is None else to_text(tree)
+
+
+def _continued(compiled: Compiled, p: FloatArray, drive: Drive, y: FloatArray, before: Windows, row: int) -> Windows:
+    """Return a window from a row to the end: what came before goes on, or rest, whatever the first readings fit better.
+
+    From rest alone dry friction that holds a state would hide from the readings where that state is.
+    """
+    at, end, good = np.array([row]), np.array([y.size]), np.isfinite(y)
+    until = np.array([row + max(int(SETTLED * (y.size - row)), 1)])
+    guesses: list[FloatArray | None] = [None]
+    if before.starts.size:
+        run = simulate(compiled, p, drive, before.states[-1:], starts=before.starts[-1:], stops=at)
+        guesses += [run.ends[0]] if np.all(np.isfinite(run.ends)) else []
+    best, least = None, np.inf
+    for guess in guesses:
+        w = fitted_starts(compiled, p, drive, y, good, at, end, guess=guess, share=SETTLED)
+        e = (y - simulate(compiled, p, drive, w.states, starts=at, stops=until).y)[at[0] : until[0]]
+        left = float(np.nansum(e**2)) if np.all(np.isfinite(e[good[at[0] : until[0]]])) else np.inf
+        if best is None or left < least:
+            best, least = w, left
+    assert best is not None
+    return best
 
 
 def _until(w: Windows, row: int) -> Windows:
