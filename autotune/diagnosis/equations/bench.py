@@ -13,7 +13,7 @@ from autotune.arrays import BoolArray, FloatArray
 from autotune.diagnosis.equations.candidates import Signals, Trial
 from autotune.equations.effects import Applied, apply, with_values
 from autotune.equations.expressions import Expression, to_text
-from autotune.equations.fit import Fitted, fit, retune, values_of
+from autotune.equations.fit import LEAST_ROWS, Fitted, fit, retune, values_of
 from autotune.equations.model import EquationModel, ModelParameter
 from autotune.equations.sensitivity import Windows
 from autotune.equations.simulate import Compiled, Drive, compile_model, drive_of, simulate
@@ -32,6 +32,8 @@ GIVEN = frozenset({"origin", "zero", "surroundings", "stiffness", "end"})
 OUTER = frozenset({("actuator.backlash", "width"), ("actuator.stiction", "band"), ("timing.dead_time", "delay")})
 #: Windows per recording that a search works on: long enough to tell, short enough to converge.
 WINDOWS = 3
+#: How many times as long as short windows long ones are.
+SHORTER = 8
 #: Share of the recording that is kept for judging, and of that the share that a start state is found from.
 HELD_OUT, SETTLED = 1.0 / 3.0, 0.15
 
@@ -91,6 +93,18 @@ class Bench(Protocol):
 
     def fitted(self, effects: Sequence[Effect], start: Outcome, iterations: int) -> Outcome:
         """Return the model fitted with effects, from where another fit ended."""
+        ...
+
+    def shortened(self, outcome: Outcome) -> Outcome | None:
+        """Return the same effects on short windows, from the nominal numbers; nothing where there are none."""
+        ...
+
+    def lengthened(self, outcome: Outcome) -> Outcome:
+        """Return a fit to short windows carried on to long ones."""
+        ...
+
+    def is_sought_outside(self, effect: Effect) -> bool:
+        """Whether a direct search around the fits seeks one of the effect's numbers."""
         ...
 
     def with_trial(self, outcome: Outcome, effect: Effect) -> FloatArray | None:
@@ -271,6 +285,34 @@ class EquationBench:
         found = fit(compiled, recordings, z=z, windows=windows, iterations=iterations)
         return self._outcome(tuple(effects), found)
 
+    def shortened(self, outcome: Outcome) -> Outcome | None:
+        """Return the same effects on short windows, from the nominal numbers; nothing where there are none."""
+        compiled, applied = self._compiled(outcome.effects, self._spreads())
+        length = self.length_s / SHORTER
+        dt = max(float(np.median(np.diff(r.t))) for r in self.recordings)
+        if length / dt < LEAST_ROWS:
+            return None
+        driven = [_driven(r, self.model, applied) for r in self.recordings]
+        try:
+            return self._outcome(outcome.effects, retune(compiled, driven, longest_s=length))
+        except InputError:
+            return None
+
+    def lengthened(self, outcome: Outcome) -> Outcome:
+        """Return a fit to short windows carried on to long ones."""
+        own = len(self.model.parameters)
+        for length in (0.5 * self.length_s, self.length_s):
+            compiled, applied = self._compiled(outcome.effects, self._spreads())
+            z = np.zeros(len(compiled.parameters))
+            z[:own] = outcome.fitted.z[:own]
+            driven = [_driven(r, self.model, applied) for r in self.recordings]
+            outcome = self._outcome(outcome.effects, fit(compiled, driven, z=z, horizon_s=length, iterations=12))
+        return outcome
+
+    def is_sought_outside(self, effect: Effect) -> bool:
+        """Whether a direct search around the fits seeks one of the effect's numbers."""
+        return any((effect.name, key) in OUTER for key in effect.parameters)
+
     def _states(self, compiled: Compiled, start: Outcome, w: Windows, number: int) -> FloatArray:
         """Return start states by name, those of new effects at what they would hold at rest."""
         known = dict(zip(start.fitted.compiled.states, w.states.T, strict=True))
@@ -311,7 +353,9 @@ class EquationBench:
 
     def with_trial(self, outcome: Outcome, effect: Effect) -> FloatArray | None:
         """Return how the readings change with one more effect, everything else as it is."""
-        base = self._simulated(*self._compiled(outcome.effects, {}), outcome)
+        if self._base_of is not outcome:
+            self._base_of, self._base = outcome, self._simulated(*self._compiled(outcome.effects, {}), outcome)
+        base = self._base
         new = self._simulated(*self._compiled((*outcome.effects, effect), {}), outcome)
         return None if base is None or new is None else new - base
 
@@ -362,6 +406,8 @@ class EquationBench:
             found.append(U[:, v > 1e-6 * max(float(v.max(initial=0.0)), 1e-300)])
         return found
 
+    _base_of: Outcome | None = None
+    _base: FloatArray | None = None
     _sizes: Mapping[str, float] = MappingProxyType({})
 
     def signals(self, outcome: Outcome) -> Signals:

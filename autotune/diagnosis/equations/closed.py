@@ -184,6 +184,18 @@ class ClosedBench:
         """Return the model fitted with effects, from where another fit ended."""
         return self._fit(effects, self._start(self._compiled(effects), start), iterations, True, self._rows)
 
+    def shortened(self, outcome: Outcome) -> Outcome | None:
+        """Return nothing: a closed model starts where it starts."""
+        return None
+
+    def lengthened(self, outcome: Outcome) -> Outcome:
+        """Return the fit as it is."""
+        return outcome
+
+    def is_sought_outside(self, effect: Effect) -> bool:
+        """Return no: dead times are fitted with the other numbers."""
+        return False
+
     def with_trial(self, outcome: Outcome, effect: Effect) -> FloatArray | None:
         """Return how the readings change at the rows that count with one more effect."""
         effects = (*outcome.effects, effect)

@@ -13,10 +13,9 @@ import numpy as np
 from autotune.diagnosis.effects import KINDS, kind_of
 from autotune.diagnosis.equations.bench import Bench, EquationBench, Outcome
 from autotune.diagnosis.equations.closed import ClosedBench
-from autotune.diagnosis.equations.search import NOISE_ALONE, Searched, search
+from autotune.diagnosis.equations.search import Searched, search
 from autotune.diagnosis.evidence.samples import SampleEffect, inspect
 from autotune.diagnosis.selection.probability import Candidate, weighed
-from autotune.diagnosis.thresholds import IN_USE
 from autotune.equations.black_box import BlackBox
 from autotune.equations.effects import equation_of
 from autotune.equations.identifiability import undetermined
@@ -25,17 +24,6 @@ from autotune.errors import InputError
 from autotune.models import Effect
 from autotune.progress import Progress, quiet
 from autotune.recording import Recording
-
-#: Residual variance of the noise's up to which chosen effects explain the recordings.
-EXPLAINED = 1.25
-#: Share of what retuning leaves above the noise that effects must explain to be named, where that is not all.
-MOST = 0.85
-#: Share of the recording that is kept for judging.
-HELD_OUT = 1.0 / 3.0
-#: Share of what is kept that a start state is found from, and that is not judged.
-SETTLED = 0.15
-#: Decrease that retuning must bring before the verdict is "parameters".
-NUMBERS = 25.0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -194,18 +182,19 @@ def _judged(
 ) -> EquationDiagnosis:  # fmt: skip
     added = found.chosen.effects[len(model.effects) :]
     left, before = (found.variance_ratio(one) - 1.0 for one in (found.chosen, found.retuned))
-    explains = left < EXPLAINED - 1.0 or left < (1.0 - MOST) * before
-    better = errors[2] < errors[1] or errors[2] < 1.1 * errors[3]
+    limits = found.limits
+    explains = left < limits.equation_explained - 1.0 or left < (1.0 - limits.equation_most) * before
+    better = errors[2] < errors[1] or errors[2] < limits.equation_held_out * errors[3]
     verdict: Literal["none", "parameters", "effect", "unexplained"]
     if (added and explains and better) or (seen and left < 1.0):
         verdict = "effect"
-    elif added or left > 2.0 * (NOISE_ALONE - 1.0) + 0.1:
+    elif added or left > limits.equation_missing - 1.0:
         verdict = "unexplained"
-    elif found.score(found.nominal) - found.score(found.retuned) > NUMBERS:
+    elif found.score(found.nominal) - found.score(found.retuned) > limits.numbers_decrease:
         verdict = "parameters"
     else:
         verdict = "none"
-    candidates = _candidates(found, 1.0 if verdict == "unexplained" else IN_USE.unknown_odds)
+    candidates = _candidates(found, 1.0 if verdict == "unexplained" else limits.unknown_odds)
     named = tuple(added) if verdict == "effect" else ()
     places = dict.fromkeys(p for e in named for p in _places(e.name)) | (dict.fromkeys(["sensor"]) if seen else {})
     if verdict == "unexplained":
@@ -237,7 +226,7 @@ def _candidates(found: Searched, unknown: float) -> tuple[Candidate, ...]:
     for one in (found.retuned, *found.tried):
         name = "+".join(e.name for e in one.effects[base:]) or "none"
         scores[name] = min(scores.get(name, np.inf), found.score(one))
-    return weighed(scores, IN_USE.temperature * max(1.0, found.variance_ratio(found.chosen)), unknown)
+    return weighed(scores, found.limits.temperature * max(1.0, found.variance_ratio(found.chosen)), unknown)
 
 
 def _probability(effect: Effect, candidates: Sequence[Candidate]) -> float:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,22 +11,15 @@ from autotune.arrays import FloatArray
 from autotune.diagnosis.equations.bench import Bench, Outcome, scaled
 from autotune.diagnosis.equations.candidates import Trial, place_of, trials
 from autotune.diagnosis.fitting.noise import Noise, noise_from_differences
+from autotune.diagnosis.thresholds import IN_USE, Thresholds
 from autotune.errors import InputError
 from autotune.models import Effect
 from autotune.progress import Progress
 
-#: What a number pays beyond Schwarz's criterion: of two explanations as good as each other the simpler is taken.
-LEAD = 6.0
-#: Effects that are fitted after the first look, of the first and of a further effect; and how many are sought.
-FITTED, FITTED_FURTHER, MOST_EFFECTS = 6, 4, 2
-#: Penalised decrease that an effect must bring, and the share of the residual's sum of squares.
-WORTH, SHARE = 30.0, 0.02
-#: Residual variance, of the noise's that its differences show, up to which it is noise.
-NOISE_ALONE = 1.08
-#: Iterations of a first fit, and of the best ones.
-FIRST, LAST = 6, 12
-#: Of the best predicted decrease: what is less is not fitted.
-FAINT = 0.02
+#: Iterations of a fit that shows whether more are worth it, of a first fit, and of the best ones.
+LOOK, FIRST, LAST = 3, 6, 12
+#: Fits to short windows that go on to long ones.
+CARRIED = 3
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -43,6 +36,8 @@ class Searched:
         What differences of the chosen residual show.
     rows : float
         Rows that count, as many as independent noise would make.
+    limits : Thresholds
+        What decided.
     """
 
     nominal: Outcome
@@ -51,22 +46,24 @@ class Searched:
     tried: tuple[Outcome, ...]
     noise: Noise
     rows: float
+    limits: Thresholds
 
     def score(self, one: Outcome) -> float:
         """Return the penalised chi-square of a hypothesis, up to a constant."""
-        return penalised(one, self.rows)
+        return penalised(one, self.rows, self.limits)
 
     def variance_ratio(self, one: Outcome) -> float:
         """Return the residual's variance in units of the noise's."""
         return one.rss / one.residual.size / max(self.noise.total_sd**2, 1e-300)
 
 
-def penalised(one: Outcome, rows: float) -> float:
+def penalised(one: Outcome, rows: float, limits: Thresholds) -> float:
     """Return rows log(mean square) and what each number pays: Schwarz's criterion with unknown noise, and a lead."""
-    return rows * float(np.log(max(one.rss / one.residual.size, 1e-300))) + one.count * (float(np.log(rows)) + LEAD)
+    each = float(np.log(rows)) + limits.equation_lead
+    return rows * float(np.log(max(one.rss / one.residual.size, 1e-300))) + one.count * each
 
 
-def search(bench: Bench, without: Sequence[str], progress: Progress) -> Searched:
+def search(bench: Bench, without: Sequence[str], progress: Progress, limits: Thresholds = IN_USE) -> Searched:
     """Search for what is missing.
 
     Parameters
@@ -77,6 +74,15 @@ def search(bench: Bench, without: Sequence[str], progress: Progress) -> Searched
         Effects that are left out.
     progress : callable
         Told what is being done and the share done.
+    limits : Thresholds
+        What decides between two findings.
+
+    Notes
+    -----
+    Every effect at every place is looked at to first order, the best are fitted, and one is added after the other; what
+    the last ones make needless is dropped. Where the best fit is far from the noise, the retuned model may lie in a
+    wrong minimum, from which no first order leads out: then everything is looked at from short windows too, whose free
+    start states keep simulations near the readings, and the best go on to long ones.
     """
     progress("retuning the model", 0.02)
     retuned = bench.retuned()
@@ -85,23 +91,26 @@ def search(bench: Bench, without: Sequence[str], progress: Progress) -> Searched
     rows = _independent(retuned, noise)
     tried: list[Outcome] = []
     chosen = retuned
-    while len(chosen.effects) - len(retuned.effects) < MOST_EFFECTS:
-        if _ratio(chosen, _noise(bench, chosen)) < NOISE_ALONE and not _is_slow(bench, chosen):
+    while len(chosen.effects) - len(retuned.effects) < limits.equation_effects:
+        if _ratio(chosen, _noise(bench, chosen)) < limits.equation_noise and not _is_slow(bench, chosen, limits):
             break
-        further = chosen is not retuned
-        new = _round(bench, chosen, without, progress, further)
+        new = _round(bench, chosen, without, progress, limits, chosen is not retuned)
         tried += new
         noise = _noise(bench, min([chosen, *new], key=lambda one: one.rss))
         rows = _independent(retuned, noise)
-        best = min(new, key=lambda one: penalised(one, rows), default=None)
-        if best is None or not _worth(chosen, best, rows):
+        best = min(new, key=lambda one: penalised(one, rows, limits), default=None)
+        if best is None or not _worth(chosen, best, rows, limits):
             break
         chosen = best
-    return Searched(nominal=nominal, retuned=retuned, chosen=chosen, tried=tuple(tried), noise=noise, rows=rows)
+    chosen = _pruned(bench, chosen, len(retuned.effects), tried, rows, limits)
+    return Searched(
+        nominal=nominal, retuned=retuned, chosen=chosen, tried=tuple(tried), noise=noise, rows=rows, limits=limits
+    )
 
 
-def _worth(before: Outcome, after: Outcome, rows: float) -> bool:
-    return penalised(before, rows) - penalised(after, rows) > WORTH and after.rss < (1.0 - SHARE) * before.rss
+def _worth(before: Outcome, after: Outcome, rows: float, limits: Thresholds) -> bool:
+    more = penalised(before, rows, limits) - penalised(after, rows, limits) > limits.equation_decrease
+    return more and after.rss < (1.0 - limits.equation_share) * before.rss
 
 
 def _noise(bench: Bench, one: Outcome) -> Noise:
@@ -122,7 +131,7 @@ def _ratio(one: Outcome, noise: Noise) -> float:
     return one.rss / one.residual.size / max(noise.total_sd**2, 1e-300)
 
 
-def _is_slow(bench: Bench, one: Outcome) -> bool:
+def _is_slow(bench: Bench, one: Outcome, limits: Thresholds) -> bool:
     """Whether block means of a residual vary by more than its noise says."""
     noise, ratios = _noise(bench, one), []
     rho = noise.ar[0] if noise.ar else 0.0
@@ -132,33 +141,103 @@ def _is_slow(bench: Bench, one: Outcome) -> bool:
         means = e[: e.size // width * width].reshape(-1, width).mean(axis=1)
         wanted = noise.total_sd**2 / width * (1.0 + rho) / (1.0 - rho)
         ratios.append(float(np.mean(means**2)) / max(wanted, 1e-300))
-    return bool(np.mean(ratios) > 1.6)
+    return bool(np.mean(ratios) > limits.equation_slow)
 
 
-def _round(bench: Bench, base: Outcome, without: Sequence[str], progress: Progress, further: bool) -> list[Outcome]:
-    """Look at every effect at every place, and fit the best."""
-    share = 0.5 if further else 0.1
-    ranked = screened(bench, base, without, lambda what, s: progress(what, share + 0.15 * s))
-    count = FITTED_FURTHER if further else FITTED
-    found = []
-    for k, (_, effect) in enumerate(ranked[:count]):
-        progress(f"fitting {effect.name}", share + 0.15 + 0.2 * k / count)
-        try:
-            found.append(bench.fitted((*base.effects, effect), base, FIRST))
-        except InputError:
-            continue
+def _round(
+    bench: Bench, base: Outcome, without: Sequence[str], progress: Progress, limits: Thresholds, further: bool
+) -> list[Outcome]:
+    """Look at every effect at every place, and fit the best: on long windows, and from short ones where those fail."""
+    share, count = (0.5, limits.equation_further) if further else (0.1, limits.equation_fitted)
+
+    def told(what: str, done: float) -> None:
+        progress(what, share + 0.35 * done)
+
+    found = _grown(bench, base, without, told, limits, count)
+    best = min(found, key=lambda one: one.rss, default=base)
+    if _ratio(best, _noise(bench, best)) > limits.equation_astray:
+        short = bench.shortened(base)
+        if short is not None:
+            # the base itself goes on as well: its effects may have been fitted in a wrong minimum
+            again = [short] if further else []
+            found += _lengthened(bench, [*again, *_grown(bench, short, without, told, limits, count)])
     found.sort(key=lambda one: one.rss)
     for k, one in enumerate(found[:2]):
         progress(f"fitting {one.effects[-1].name}", share + 0.35 + 0.04 * k)
-        try:
-            better = bench.fitted(one.effects, one, LAST)
-        except InputError:
-            continue
-        found[k] = better if better.rss < one.rss else one
+        better = _attempt(bench, one.effects, one, LAST)
+        found[k] = better if better is not None and better.rss < one.rss else one
     return found
 
 
-def screened(bench: Bench, base: Outcome, without: Sequence[str], progress: Progress) -> list[tuple[float, Effect]]:
+def _grown(
+    bench: Bench, base: Outcome, without: Sequence[str], told: Progress, limits: Thresholds, count: int
+) -> list[Outcome]:
+    """Return fits of a base with each of the effects that predict most."""
+    ranked = screened(bench, base, without, lambda what, done: told(what, 0.4 * done), limits)[:count]
+    return _fitted(bench, base, [effect for _, effect in ranked], lambda what: told(what, 0.6), limits)
+
+
+def _pruned(
+    bench: Bench, chosen: Outcome, own: int, tried: list[Outcome], rows: float, limits: Thresholds
+) -> Outcome:  # fmt: skip
+    """Drop added effects that buy nothing once the others have their numbers; what is fitted so joins those tried."""
+    while len(chosen.effects) - own > 1:
+        smaller = []
+        for i in range(own, len(chosen.effects)):
+            one = _attempt(bench, (*chosen.effects[:i], *chosen.effects[i + 1 :]), chosen, LAST)
+            smaller += [] if one is None else [one]
+        tried += smaller
+        best = min(smaller, key=lambda one: penalised(one, rows, limits), default=None)
+        if best is None or _worth(best, chosen, rows, limits):
+            break
+        chosen = best
+    return chosen
+
+
+def _attempt(bench: Bench, effects: Sequence[Effect], start: Outcome, iterations: int) -> Outcome | None:
+    """Fit effects; nothing where the simulation runs away."""
+    try:
+        return bench.fitted(effects, start, iterations)
+    except InputError:
+        return None
+
+
+def _fitted(
+    bench: Bench, base: Outcome, effects: Sequence[Effect], told: Callable[[str], None], limits: Thresholds
+) -> list[Outcome]:
+    """Fit single effects for a few steps, and go on with those that are not far behind one that leaves noise."""
+    found: list[Outcome] = []
+    for effect in effects:
+        told(f"fitting {effect.name}")
+        whole = (*base.effects, effect)
+        outer = bench.is_sought_outside(effect)
+        one = _attempt(bench, whole, base, FIRST if outer else LOOK)
+        if one is None:
+            continue
+        best = min(found, key=lambda other: other.rss, default=one)
+        settled = best is not one and _ratio(best, _noise(bench, best)) < limits.equation_noise
+        behind = one.residual.size * float(np.log(one.rss / max(best.rss, 1e-300)))
+        if not outer and not (settled and behind > limits.equation_behind):
+            further = _attempt(bench, one.effects, one, FIRST)
+            one = further if further is not None and further.rss < one.rss else one
+        found.append(one)
+    return found
+
+
+def _lengthened(bench: Bench, fits: Sequence[Outcome]) -> list[Outcome]:
+    """Return the best fits to short windows carried on to long ones."""
+    found = []
+    for one in sorted(fits, key=lambda one: one.rss)[:CARRIED]:
+        try:
+            found.append(bench.lengthened(one))
+        except InputError:
+            continue
+    return found
+
+
+def screened(
+    bench: Bench, base: Outcome, without: Sequence[str], progress: Progress, limits: Thresholds = IN_USE
+) -> list[tuple[float, Effect]]:
     """Return for every effect and place the decrease that first order predicts, with the values that bring it.
 
     Returns
@@ -184,7 +263,7 @@ def screened(bench: Bench, base: Outcome, without: Sequence[str], progress: Prog
         if gain > 0.0 and (key not in best or gain > best[key][0]):
             best[key] = (gain, scaled(trial, factor))
     ranked = sorted(best.values(), key=lambda pair: -pair[0])
-    least = FAINT * ranked[0][0] if ranked else 0.0
+    least = limits.equation_faint * ranked[0][0] if ranked else 0.0
     return [pair for pair in ranked if pair[0] >= least]
 
 
