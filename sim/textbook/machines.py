@@ -327,7 +327,7 @@ CAR = Plant(
 
 MAGLEV_MODEL = """
 name = "magnetic levitation"
-horizon_s = 0.15
+horizon_s = 0.06
 [[input]]
 column = "u"
 unit = "A"

@@ -27,7 +27,7 @@ SIGNED = frozenset({"high", "low", "second_order", "third_order", "offset", "pha
                     "amplitude", "fold"})  # fmt: skip
 SIGNED_RATES = frozenset({"actuator.gain_drift", "sensor.drift", "environment.drifting_load", "plant.leak",
                           "plant.cubic_stiffness"})  # fmt: skip
-GIVEN = frozenset({"origin", "zero", "surroundings", "stiffness", "end"})
+GIVEN = frozenset({"origin", "zero", "surroundings", "end"})
 #: Parameters that act on samples or delays: sought from outside, by direct search.
 OUTER = frozenset({("actuator.backlash", "width"), ("actuator.stiction", "band"), ("timing.dead_time", "delay")})
 #: Windows per recording that a search works on: long enough to tell, short enough to converge.
@@ -484,7 +484,7 @@ def scaled(trial: Trial, factor: float) -> Effect:
 def sought(p: ModelParameter, effects: Sequence[Effect], spreads: Mapping[str, float]) -> ModelParameter:
     """Return an effect's parameter with the scale that it is sought on."""
     number, key = _number_and_key(p.name, effects)
-    if key in GIVEN or p.spread == 0.0 or (effects[number].name == "plant.hard_stop" and key == "damping"):
+    if key in GIVEN or p.spread == 0.0:
         return replace(p, spread=0.0)
     if key in SIGNED or (key in ("rate", "coefficient") and effects[number].name in SIGNED_RATES):
         return replace(p, linear=True, spread=spreads.get(key, 3.0 * abs(p.value) + 1e-300))
