@@ -53,8 +53,9 @@ _D = 1.0 / (2.0 + np.sqrt(2.0))
 _E32 = 6.0 + np.sqrt(2.0)
 
 #: Places in the memory of a run: the last step [s], whether it is stiff, steps and crossings since the last row,
-#: successive steps at the stability bound.
-_STEP, _IS_STIFF, _STEPS, _CROSSINGS, _AT_BOUND = 0, 1, 2, 3, 4
+#: successive steps at the stability bound, the row of K that is filled (an argument that is written as a number would
+#: have the function compiled once for every such number).
+_STEP, _IS_STIFF, _STEPS, _CROSSINGS, _AT_BOUND, _ROW = 0, 1, 2, 3, 4, 5
 
 
 class Tape(NamedTuple):
@@ -112,7 +113,7 @@ def _work(p: Tape, template: FloatArray, parameters: FloatArray) -> Work:
     return Work(
         r, np.zeros(r.size), np.zeros(m), np.zeros(m), np.zeros(1), np.zeros(s, dtype=np.int64),
         np.zeros(s, dtype=np.int64), np.zeros(s), np.zeros(s), np.zeros(s), np.zeros((s, s)), np.zeros(s),
-        np.zeros((n, n)), np.zeros((n, n)), np.zeros((8, n)), np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(5),
+        np.zeros((n, n)), np.zeros((n, n)), np.zeros((8, n)), np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(6),
     )  # fmt: skip
 
 
@@ -125,8 +126,9 @@ def _evaluate_slopes(p: Tape, w: Work, row: int) -> None:
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _speeds_of_switches(p: Tape, w: Work, row: int) -> None:
-    """Find how fast each switching function runs along the field in a row of K, modes fixed."""
+def _speeds_of_switches(p: Tape, w: Work) -> None:
+    """Find how fast each switching function runs along the field in the filled row of K, modes fixed."""
+    row = int(w.memory[_ROW])
     w.d[:] = 0.0
     w.d[0] = 1.0
     for i in range(p.n):
@@ -154,14 +156,22 @@ def _field(p: Tape, w: Work, x: FloatArray, t: float, row: int) -> None:
             r[p.modes[k]] = 0.0
             count += 1
     _evaluate_slopes(p, w, row)
+    w.memory[_ROW] = row
     if count > 0:
-        _slide(p, w, row, count)
+        _slide(p, w, count)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _slide(p: Tape, w: Work, at: int, count: int) -> None:
+def _field_in_row(p: Tape, w: Work, x: FloatArray, t: float) -> None:
+    """Do as :func:`_field`, into the row that the memory names: a call, where time does not count."""
+    _field(p, w, x, t, int(w.memory[_ROW]))
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _slide(p: Tape, w: Work, count: int) -> None:
     """Find the modes that keep sliding switches still: their speeds are linear in the modes."""
-    _speeds_of_switches(p, w, at)
+    at = int(w.memory[_ROW])
+    _speeds_of_switches(p, w)
     row = 0
     for k in range(p.switches.size):
         if w.sliding[k]:
@@ -173,7 +183,7 @@ def _slide(p: Tape, w: Work, at: int, count: int) -> None:
             continue
         w.r[p.modes[k]] = 1.0
         _evaluate_slopes(p, w, at)
-        _speeds_of_switches(p, w, at)
+        _speeds_of_switches(p, w)
         w.r[p.modes[k]] = 0.0
         row = 0
         for other in range(p.switches.size):
@@ -196,7 +206,8 @@ def _settle(p: Tape, w: Work, x: FloatArray, t: float) -> None:
     for _ in range(3):
         changed = False
         for k in range(p.switches.size):
-            _field(p, w, x, t, 5)  # as a stage: just beyond the edge of a root its mode is not changed yet
+            w.memory[_ROW] = 5.0
+            _field_in_row(p, w, x, t)  # as a stage: just beyond the edge of a root its mode is not changed yet
             g, mode = w.r[p.switches[k]] - w.zero[k], w.r[p.modes[k]]
             w.largest[k] = max(w.largest[k], abs(g))
             near = abs(g) <= _NEAR * w.largest[k]
@@ -213,20 +224,22 @@ def _settle(p: Tape, w: Work, x: FloatArray, t: float) -> None:
             changed = changed or slid != w.sliding[k] or (not slid and mode != w.r[p.modes[k]])
         if not changed:
             break
-    _field(p, w, x, t, 0)
+    w.memory[_ROW] = 0.0
+    _field_in_row(p, w, x, t)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def _choose(p: Tape, w: Work, x: FloatArray, t: float, k: int, before: float, g: float) -> None:
     """Set the mode of a switch whose function is at zero by where the fields of both sides lead."""
     mode = p.modes[k]
+    w.memory[_ROW] = 5.0
     w.r[mode] = 1.0
-    _field(p, w, x, t, 5)
-    _speeds_of_switches(p, w, 5)
+    _field_in_row(p, w, x, t)
+    _speeds_of_switches(p, w)
     above = w.g_dot[k]
     w.r[mode] = -1.0
-    _field(p, w, x, t, 5)
-    _speeds_of_switches(p, w, 5)
+    _field_in_row(p, w, x, t)
+    _speeds_of_switches(p, w)
     below = w.g_dot[k]
     if above < 0.0 < below:
         w.sliding[k] = 1
@@ -310,10 +323,9 @@ def _implicit(p: Tape, w: Work, x: FloatArray, t: float, h: float) -> None:
         for i in range(n):
             K[stage + 1, i] = w.e[i] + (K[1, i] if stage == 1 else 0.0)
             w.y[i] = x[i] + h * (0.5 * K[1, i] if stage == 0 else K[2, i])
-        if stage == 0:
-            _field(p, w, w.y, t + 0.5 * h, 4)
-        elif stage == 1:
-            _field(p, w, w.y, t + h, 6)
+        if stage < 2:
+            w.memory[_ROW] = 4.0 if stage == 0 else 6.0
+            _field_in_row(p, w, w.y, t + (0.5 * h if stage == 0 else h))
     for i in range(n):
         w.e[i] = h / 6.0 * (K[1, i] - 2.0 * K[2, i] + K[3, i])
 
@@ -322,12 +334,14 @@ def _implicit(p: Tape, w: Work, x: FloatArray, t: float, h: float) -> None:
 def _jacobian(p: Tape, w: Work, x: FloatArray, t: float, h: float) -> None:
     """Fill the Jacobian and the time derivative of the field at x, which is in K[0], by differences."""
     for j in range(p.n + 1):
-        w.y[:] = x
+        for i in range(p.n):
+            w.y[i] = x[i]
         step = 1e-4 * h
         if j < p.n:
             step = 1e-7 * max(w.seen[j], abs(x[j]), abs(h * w.K[0, j])) + 1e-30
             w.y[j] = x[j] + step
-        _field(p, w, w.y, t + (step if j == p.n else 0.0), 6)
+        w.memory[_ROW] = 6.0
+        _field_in_row(p, w, w.y, t + (step if j == p.n else 0.0))
         for i in range(p.n):
             if j < p.n:
                 w.J[i, j] = (w.K[6, i] - w.K[0, i]) / step
@@ -369,7 +383,8 @@ def _advance(p: Tape, w: Work, x: FloatArray, t: float, end: float, span: float,
     if p.switches.size > 0:
         _settle(p, w, x, t)
     else:
-        _field(p, w, x, t, 0)
+        w.memory[_ROW] = 0.0
+        _field_in_row(p, w, x, t)
     new_point = True
     locating, low, high = False, 0.0, 0.0  # while a crossing is located: a step before it and one beyond it
     while end - t > 1e-12 * span:
@@ -455,7 +470,8 @@ def _to_next_row(
         ended = _advance(p, w, x, t - times[0], end - times[0], span, tolerance)
         if ended != DONE:
             return ended, t
-        _field(p, w, x, end - times[0], 0)
+        w.memory[_ROW] = 0.0
+        _field_in_row(p, w, x, end - times[0])
         t = end
     return DONE, following
 
@@ -475,8 +491,9 @@ def run(
     x, at = np.zeros(p.n), np.zeros(p.linear.size, dtype=np.int64)
     close = 1e-9 * (times[-1] - times[0]) / max(times.size - 1, 1)
     for window in range(starts.size):
-        x[:] = x0[window]
-        w.seen[:] = np.abs(x)
+        for i in range(p.n):
+            x[i] = x0[window, i]
+            w.seen[i] = abs(x[i])
         w.sliding[:], w.crossed[:], w.zero[:], w.largest[:], w.memory[:] = 0, 0, 0.0, 0.0, 0.0
         t = times[starts[window]]
         for j in range(p.linear.size):
@@ -495,7 +512,8 @@ def run(
             if ended != DONE:
                 status[window, 0], status[window, 1] = ended, t
                 break
-        ends[window] = x
+        for i in range(p.n):
+            ends[window, i] = x[i]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -508,10 +526,12 @@ def look(
     found, y = np.zeros((points, p.n)), np.zeros((points, p.outputs.size))
     for i in range(points):
         w.sliding[:], w.crossed[:], w.zero[:], w.largest[:] = 0, 0, 0.0, 0.0
-        w.base[:] = inputs[i]
+        for j in range(p.linear.size):
+            w.base[j] = inputs[i, j]
         _settle(p, w, states[i], t)
         evaluate(p.code, p.dynamic, p.code.shape[0], w.r, False)
-        found[i] = w.K[0]
+        for j in range(p.n):
+            found[i, j] = w.K[0, j]
         for q in range(p.outputs.size):
             y[i, q] = w.r[p.outputs[q]]
     return found, y

@@ -242,4 +242,4 @@ def _value(tree: Expression) -> float | None:
 
 def _is_count(value: float) -> bool:
     """Whether a number is a small whole number or a simple fraction, and so no conversion."""
-    return any(abs(value * k - round(value * k)) < 1e-12 and 0 < abs(value * k) < 10 for k in (1, 2, 3, 4, 6, 8))
+    return any(0 < abs(value * k) < 10 and abs(value * k - round(value * k)) < 1e-12 for k in (1, 2, 3, 4, 6, 8))

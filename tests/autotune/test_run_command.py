@@ -65,11 +65,16 @@ def test_the_new_gains_are_in_the_journal_before_and_after_they_are_written(fini
 
 
 def test_every_verification_keeps_its_files(finished: Path) -> None:
-    for number in ("", "-2"):
+    for _ in range(2):
+        before = {file.name: file.read_bytes() for file in finished.glob("veri*")}
         done = autotune("verify", CONFIGS / "ball_sim.toml", "--run", finished)
         assert done.returncode == 0, done.stderr
-        assert f"verify{number}.html" in done.stdout
-        assert json.loads((finished / f"verify{number}.json").read_text())["verification"]["accepted"]
+        new = {file.name for file in finished.glob("veri*")} - set(before)
+        assert sorted({Path(name).suffix for name in new}) == [".csv", ".html", ".json", ".toml"]
+        (page,) = (name for name in new if name.endswith(".html"))
+        assert page in done.stdout
+        assert json.loads((finished / page).with_suffix(".json").read_text())["verification"]["accepted"]
+        assert {name: (finished / name).read_bytes() for name in before} == before
 
 
 def test_a_run_that_is_stopped_leaves_a_page_that_says_why_and_how_the_rig_was_left(tmp_path: Path) -> None:

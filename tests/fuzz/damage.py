@@ -96,7 +96,7 @@ def _cut(rng: random.Random, data: bytes) -> bytes:
 
 
 def _swapped(rng: random.Random, data: bytes) -> bytes:
-    lines = data.splitlines(keepends=True)
+    lines = data.splitlines(keepends=True) or [b""]
     for _ in range(rng.choice((1, 3, 20))):
         i, j = (rng.randrange(len(lines)) for _ in range(2))
         lines[i], lines[j] = lines[j], lines[i]

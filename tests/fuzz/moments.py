@@ -18,7 +18,7 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -119,29 +119,43 @@ def disk(size_kb: int) -> Iterator[Path]:
 def filled(rng: random.Random) -> str:
     """Run on a disk that fills at a random moment, make room, resume; return what was wrong, or how it ended."""
     with disk(4000) as place:
-        out, filler = place / "out", place / "filler"
+        filler = place / "filler"
         filler.write_bytes(b"x" * (4000 - rng.randrange(1, 1600)) * 1024)
-        done = subprocess.run(
-            [*COMMAND, "run", str(CONFIG), "--out", str(out)], capture_output=True, text=True, check=False
-        )
-        fault = _badly(done, (0, 2, 3))
-        if fault or done.returncode == 0:
-            return fault or "enough space"
-        if (fault := half_written(out)) != "":
-            return fault
-        for recording in out.glob("*.csv"):
-            if recording.read_bytes().count(b"\n") > 2:
-                read_recording(recording)
-        filler.unlink()
-        if not (out / "config.toml").exists():
-            shutil.rmtree(out, ignore_errors=True)
-            again = ["run", str(CONFIG), "--out", str(out)]
-        else:
-            again = ["run", "--resume", str(out)]
-        resumed = subprocess.run([*COMMAND, *again], capture_output=True, text=True, check=False)
-        if resumed.returncode == 2 and "the run is complete" in resumed.stderr:
-            return "complete, its page did not fit"
-        return _badly(resumed, (0,)) or f"stopped with {done.returncode}, resumed"
+        return _run_and_resumed(place / "out", filler.unlink)
+
+
+def small() -> str:
+    """Run on a file system of 100 kB, enlarge it, resume; return what was wrong, or how it ended."""
+    with disk(100) as place:
+        enlarge = ["mount", "-o", "remount,size=8000k", str(place)]
+        return _run_and_resumed(place / "out", lambda: subprocess.run(enlarge, check=True))
+
+
+def _run_and_resumed(out: Path, make_room: Callable[[], object]) -> str:
+    done = subprocess.run(
+        [*COMMAND, "run", str(CONFIG), "--out", str(out)], capture_output=True, text=True, check=False
+    )
+    fault = _badly(done, (0, 2, 3))
+    if fault or done.returncode == 0:
+        return fault or "enough space"
+    if (fault := half_written(out)) != "":
+        return fault
+    before = {file: file.read_bytes() for file in out.glob("recording*.csv")}
+    for recording, rows in before.items():
+        if rows.count(b"\n") > 2:
+            read_recording(recording)
+    make_room()
+    if not (out / "config.toml").exists():
+        shutil.rmtree(out, ignore_errors=True)
+        again, before = ["run", str(CONFIG), "--out", str(out)], {}
+    else:
+        again = ["run", "--resume", str(out)]
+    resumed = subprocess.run([*COMMAND, *again], capture_output=True, text=True, check=False)
+    if resumed.returncode == 2 and "the run is complete" in resumed.stderr:
+        return "complete, its page did not fit"
+    if any(file.read_bytes() != rows for file, rows in before.items()):
+        return "a recording was changed"
+    return _badly(resumed, (0,)) or f"stopped with {done.returncode}, resumed"
 
 
 def _badly(done: subprocess.CompletedProcess[str], well: tuple[int, ...]) -> str:
@@ -166,11 +180,14 @@ def main() -> int:
     until_s = time.monotonic() + given.seconds
     names = [*LONG, *([] if given.without_disk else ["disk"] * 3)]
     trials = [(names[i % len(names)], rng.uniform(0.0, given.longest), rng.random()) for i in range(given.times)]
+    trials += [] if given.without_disk else [("small disk", 0.0, 0.0)]
 
     def one(trial: tuple[str, float, float]) -> tuple[str, str]:
         name, after_s, seed = trial
         if time.monotonic() > until_s:
             return name, "not tried"
+        if name == "small disk":
+            return name, small()
         return name, filled(random.Random(seed)) if name == "disk" else interrupted(name, after_s)
 
     with ThreadPoolExecutor(given.workers) as pool:
