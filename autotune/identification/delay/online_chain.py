@@ -16,7 +16,8 @@ _TRACE = 1e-9
 _SETTLED = 0.8
 #: Age of the kernels, in their number over lambda, from which on the equations are averaged.
 _FILLED = 2.5
-_KNOWN = 0.2
+#: degrees of freedom of the noise's density from which on a covariance is stated
+_FREEDOM = 3.0
 _LONGER = 3.0
 
 
@@ -154,7 +155,8 @@ def step_row(
             return np.zeros(n), R, False
     scalars[LAST_T], scalars[LAST_U], scalars[LAST_Y] = t[k], u[k], y
     state = _state(A, _derivatives(Jy, n, lam), _derivatives(Jh, 1, lam), n, lam, offset)
-    return state, _covariance(R, spread, scalars[WEIGHT], scalars[SPREAD], memory_s), True
+    covariance = _covariance(R, spread, scalars[WEIGHT], scalars[SPREAD], memory_s, _corner(kernels, lam))
+    return state, covariance, True
 
 
 @njit(cache=True)
@@ -190,7 +192,7 @@ def _averaged(
     if scalars[WEIGHT] < _SETTLED:  # the way to the estimate is not its noise
         return
     # the density at frequency zero of the regressors times what the equations leave
-    corner = lam / (2.0 * (n + C.shape[0]))
+    corner = _corner(n + C.shape[0], lam)
     slow += (1.0 - np.exp(-step * corner)) * (C.T @ (D - C @ A) - slow)
     newer = fresh / _LONGER  # few independent values come in one memory
     spread += newer * (np.outer(slow, slow) * 2.0 / corner - spread)
@@ -198,14 +200,42 @@ def _averaged(
 
 
 @njit(cache=True)
-def _covariance(R: FloatArray, spread: FloatArray, weight: float, known: float, memory_s: float) -> FloatArray:
-    """Return the covariance of least squares that forgets: R^-1 Phi R^-1 / (2 memory), more while the memory fills."""
+def _corner(kernels: int, lam: float) -> float:
+    """Return the frequency [rad/s] below which what overlapping kernels leave has the density it has at zero."""
+    return lam / (2.0 * kernels)
+
+
+@njit(cache=True)
+def _covariance(
+    R: FloatArray, spread: FloatArray, weight: float, known: float, memory_s: float, corner: float
+) -> FloatArray:
+    """Return the covariance of least squares that forgets: R^-1 Phi R^-1 / (2 memory), more while the memory fills.
+
+    The estimate follows the equations with its memory, and so takes from what they leave all that is slower: of the
+    density that the filter at ``corner`` lets through the share corner/(corner + 1/memory) is seen. The average over
+    LONGER memories of the square of what is left between the two frequencies has 2 LONGER memory (corner + 1/memory)
+    degrees of freedom; the answer is larger by the square of Student's quantile over the normal one, so that 1.96
+    standard deviations are a 95 % interval.
+    """
     size = R.shape[0]
     scale = np.sqrt(np.diag(R))
-    if known < _KNOWN or np.min(scale) <= 0.0:
+    seen = corner / (corner + 1.0 / memory_s)
+    freedom = 2.0 * _LONGER * (1.0 + memory_s * corner) * known / (2.0 - known)
+    if freedom < _FREEDOM or np.min(scale) <= 0.0:
         return np.full((size, size), np.nan)
     inverse = np.linalg.inv(R / np.outer(scale, scale) + _TRACE * np.eye(size)) / np.outer(scale, scale)
-    return np.asarray(inverse @ spread @ inverse * weight * (2.0 - weight) / (2.0 * memory_s * known), dtype=np.float64)
+    factor = _student(freedom) * weight * (2.0 - weight) / (2.0 * memory_s * known * seen)
+    return np.asarray(inverse @ spread @ inverse * factor, dtype=np.float64)
+
+
+@njit(cache=True)
+def _student(freedom: float) -> float:
+    """Return the square of Student's 97.5 % quantile over the normal one (Cornish-Fisher, Abramowitz 26.7.5)."""
+    z, v = 1.959963984540054, freedom
+    first = (z**3 + z) / (4.0 * v)
+    second = (5.0 * z**5 + 16.0 * z**3 + 3.0 * z) / (96.0 * v**2)
+    third = (3.0 * z**7 + 19.0 * z**5 + 17.0 * z**3 - 15.0 * z) / (384.0 * v**3)
+    return float(((z + first + second + third) / z) ** 2)
 
 
 @njit(cache=True)

@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.signal import lfilter
+from scipy.stats import binom
 
 from autotune.errors import IdentificationError, InputError
 from autotune.identification.delay.modulated_delay import modulated_delay
@@ -300,19 +302,25 @@ def test_no_unit_changes_what_is_followed(u_unit, y_unit, t_unit):
         assert np.allclose(other.standard_deviations[k], own.standard_deviations[k] * factor, rtol=1e-3)
 
 
-def test_the_covariance_of_what_is_followed_covers_the_truth():
-    """Three times in four: the bias of the noisy regressors, as large as it at noise 5, is not in the covariance."""
+@pytest.mark.parametrize("delay", [None, DelayTracking(start_s=0.5, after_s=14.0, rate=0.4)])
+@pytest.mark.parametrize("colour", [0.0, 0.9])
+def test_a_95_percent_interval_of_what_is_followed_holds_the_truth_95_times_in_a_hundred(colour, delay):
+    """To within what 54 intervals can tell, for white noise and for coloured: 1.96 standard deviations, as stated."""
     t = np.arange(5001) / 25.0
-    x = response(u_example_1, t, lambda _: 0.0)[0]
+    h = 0.0 if delay is None else delay.start_s
+    truth = [*A, B, h]
+    x = response(u_example_1, t, lambda _: h)[0]
     inside = []
-    for seed in range(16):
-        y = x + np.random.default_rng(seed).standard_normal(t.size)
-        found = follow(Recording(t=t, u=u_example_1(t), y=y), 2, forgetting=1.0, memory_s=15.0)
-        for k in (3000, 4000, 5000):
-            error = np.array([*found.a[k], found.b[k]]) - [*A, B]
-            inside.append(np.abs(error) < 1.96 * found.standard_deviations[k, :3])
-    assert np.all(np.mean(inside, axis=0) > 0.75)
-    assert np.all(found.standard_deviations[5000, :3] < 0.02 * np.abs([*A, B]))
+    for seed in range(18):
+        noise = lfilter([1.0], [1.0, -colour], np.random.default_rng(seed).standard_normal(t.size))
+        found = follow(Recording(t=t, u=u_example_1(t), y=x + noise), 2, forgetting=1.0, memory_s=15.0, delay=delay)
+        for k in (3000, 4000, 5000):  # 40 s, nearly three memories, apart
+            error = np.array([*found.a[k], found.b[k], found.delay_s[k]]) - truth
+            inside.append(np.abs(error) <= 1.96 * found.standard_deviations[k])
+    fewest, most = binom.interval(0.998, len(inside), 0.95)
+    counts = np.sum(inside, axis=0)[: 3 if delay is None else 4]
+    assert np.all((counts >= fewest) & (counts <= most))
+    assert np.all(found.standard_deviations[5000, :3] < 0.05 * np.abs([*A, B]))
 
 
 def test_rows_that_a_live_rig_must_not_hand_over():
