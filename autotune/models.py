@@ -210,7 +210,7 @@ def read_model(path: str | os.PathLike[str]) -> Model:
 
 def model_of(content: Mapping[str, Any], where: str) -> Model:
     """Return the chain that a TOML content states; ``where`` names it in messages."""
-    _known(content, {"name", "input", "output", "block", "effect"}, where)
+    _known(content, {"name", "input", "output", "block", "effect", "reduced"}, where)
     blocks, effects = _tables(content, "block", where), _tables(content, "effect", where)
     if not blocks:
         raise InputError("no [[block]]", where=where, remedy="a model needs at least one block")
@@ -333,6 +333,11 @@ def write_model(model: Model, path: str | os.PathLike[str], equations: Mapping[s
     equations : mapping of effect name to equation, optional
         Written into the ``[[effect]]`` tables for the reader; not read back.
     """
+    write_whole(path, tomli_w.dumps(model_content(model, equations)))
+
+
+def model_content(model: Model, equations: Mapping[str, str] | None = None) -> dict[str, Any]:
+    """Return the tables of a model file, as :func:`write_model` writes them."""
     content: dict[str, Any] = {
         "name": model.name,
         "input": _port_table(model.input),
@@ -341,7 +346,7 @@ def write_model(model: Model, path: str | os.PathLike[str], equations: Mapping[s
     }
     if model.effects:
         content["effect"] = [effect_table(effect, (equations or {}).get(effect.name)) for effect in model.effects]
-    write_whole(path, tomli_w.dumps(content))
+    return content
 
 
 def _port_table(port: Port) -> dict[str, Any]:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from autotune.api.plants import as_controller, as_plant
+from autotune.api.plants import as_controller, as_plant, as_reduced
 from autotune.api.points import as_points
 from autotune.api.recordings import Source, read
 from autotune.controller import Controller
@@ -68,7 +68,8 @@ def tune(
     Parameters
     ----------
     plant : points, TransferFunction, model or its file, reduced or delay model, python-control system
-        On points the margins hold for every plant that fits them.
+        On points the margins hold for every plant that fits them; on a reduced model, a PI's are kept on what was
+        reduced as well.
     modulus_margin : float
         Smallest distance of the Nyquist curve from -1, 0 to 1.
     phase_margin_deg : float
@@ -109,9 +110,16 @@ def tune(
     )
     points = as_points(plant)
     if points is not None:
-        from autotune.design.robust import design_on_points
+        from autotune.identification.parametric import fit_plant
+        from autotune.pipeline.analysis import of_use, on_measured
 
-        return design_on_points(points, wanted, _kind(kind))
+        measured = of_use(points)
+        return on_measured(measured, fit_plant(measured), wanted, _kind(kind))[1]
+    reduced = as_reduced(plant)
+    if reduced is not None:
+        from autotune.pipeline.analysis import on_reduced_model
+
+        return on_reduced_model(reduced, wanted, _kind(kind), certificate=certificate)[0]
     from autotune.design.synthesis import design as on_model
 
     return on_model(as_plant(plant), wanted, _kind(kind), certificate=certificate)
@@ -325,6 +333,15 @@ def simulate(model: Any, recording: Source, *, horizon_s: float | None = None) -
         u, and y for the state to begin with.
     horizon_s : float, optional
         Length of the windows [s] before which the state is estimated anew; one free run when absent.
+
+    Examples
+    --------
+    >>> import autotune as at
+    >>> oven = at.example("oven")
+    >>> around = at.read({"t": oven.t, "u": oven.u - 5.0, "y": oven.y - 50.0})
+    >>> y = at.simulate(at.Model.from_text("2 e^-0.5s/((2s+1)(3s+1))"), around)
+    >>> bool((y - around.y).std() < 0.05)
+    True
     """
     from autotune.api.diagnosing import simulated
 
@@ -344,6 +361,23 @@ def diagnose(model: Any, recordings: Source, controller: Any = None, **settings:
         The law that u was computed by.
     **settings
         Handed on to the diagnosis.
+
+    Returns
+    -------
+    Diagnosis
+        ``verdict``, ``effects`` with their probabilities, ``places``, and the ``extended_model``.
+
+    Examples
+    --------
+    >>> import autotune as at
+    >>> oven = at.example("oven")
+    >>> around = at.read({"t": oven.t, "u": oven.u - 5.0, "y": oven.y - 50.0})
+    >>> believed = at.Model.from_text("1.5 e^-0.5s/((2s+1)(3s+1))")
+    >>> found = at.diagnose(believed, around)
+    >>> found.verdict
+    'parameters'
+    >>> round(found.extended_model.transfer_function().num[0], 1)
+    2.0
     """
     from autotune.api.diagnosing import diagnosed
     from autotune.api.recordings import recordings as all_of

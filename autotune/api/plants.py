@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import os
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from autotune.controller import Controller, DiscreteController, PIDController, read_controller
 from autotune.errors import InputError
 from autotune.models import Model, TransferFunction, read_model
+
+if TYPE_CHECKING:
+    from autotune.identification.reduction import ReducedModel
 
 
 def as_plant(source: Any) -> TransferFunction:
@@ -39,6 +42,16 @@ def _checked(plant: Any) -> TransferFunction:
     if not isinstance(plant, TransferFunction):
         raise InputError("a system in discrete time", where="plant", remedy="give the plant in continuous time")
     return plant
+
+
+def as_reduced(source: Any) -> ReducedModel | None:
+    """Return the reduced model that something is, or that its file holds; None for everything else."""
+    from autotune.identification.reduced_file import read_reduced
+    from autotune.identification.reduction import ReducedModel
+
+    if isinstance(source, ReducedModel):
+        return source
+    return read_reduced(source) if isinstance(source, str | os.PathLike) else None
 
 
 def as_controller(source: Any) -> Controller:

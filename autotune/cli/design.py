@@ -93,11 +93,19 @@ def design_command(
     if model is not None:
         from autotune.design.loop import characteristic_frequencies, transfer_function_of
         from autotune.design.synthesis import design
+        from autotune.identification.reduced_file import read_reduced
         from autotune.model_file import read_model
+        from autotune.pipeline.analysis import on_reduced_model
 
         H = transfer_function_of(read_model(model))
-        highest_rad_s = float(10.0 * characteristic_frequencies(H)[-1])
-        designed = design(H, asked(H, highest_rad_s), kind.value, certificate=certificate)
+        wanted = asked(H, float(10.0 * characteristic_frequencies(H)[-1]))
+        reduced = read_reduced(model)
+        if reduced is None:
+            designed = design(H, wanted, kind.value, certificate=certificate)
+        else:
+            designed, looked = on_reduced_model(reduced, wanted, kind.value, certificate=certificate)
+            seen = "; ".join(check.sentence for check in looked) or designed.certificate
+            typer.echo(f"designed on the reduced model; checked: {seen}")
     else:
         from autotune.identification.frequency.thinning import said, thinned
         from autotune.identification.parametric import fit_plant

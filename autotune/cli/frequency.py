@@ -88,6 +88,7 @@ def reduce(
 ) -> None:
     """Reduce measured points, or a known plant, to the cautious low-order model that a robust PI is designed on."""
     from autotune.identification.frequency.thinning import said, thinned
+    from autotune.identification.reduced_file import write_reduced
     from autotune.identification.reduction import reduce_points, reduce_transfer_function
     from autotune.points import LARGEST, SMALLEST, read_points
 
@@ -98,7 +99,7 @@ def reduce(
         from autotune.model_file import read_model
 
         reduced = reduce_transfer_function(read_model(model).transfer_function())
-        place.by(lambda part: _write(reduced, part))
+        place.by(lambda part: write_reduced(reduced, part))
         _say(reduced, out)
         return
     assert points is not None
@@ -117,7 +118,7 @@ def reduce(
     for note in said(len(given), len(few)):
         typer.echo(f"note: {note}")
     reduced = reduce_points(few, kind=None if kind == "auto" else kind, conditions=conditions, static_gain=known)
-    place.by(lambda part: _write(reduced, part))
+    place.by(lambda part: write_reduced(reduced, part))
     _say(reduced, out)
 
 
@@ -128,10 +129,3 @@ def _say(reduced: ReducedModel, out: Path) -> None:
     typer.echo(f"G_r = {reduced.G_r:.4g}{lag}, omega_d = {reduced.omega_d_rad_s:.4g} rad/s; written to {out}")
     for warning in reduced.warnings:
         typer.echo(f"warning: {warning}")
-
-
-def _write(reduced: ReducedModel, out: Path) -> None:
-    from autotune.models import Block, Model, Port, write_model
-
-    block = Block(name="reduced model", place="plant", dynamics=reduced.transfer_function())
-    write_model(Model(name="reduced model", input=Port(), output=Port(), blocks=(block,)), out)

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal, TypeAlias
 
 import numpy as np
@@ -71,6 +71,10 @@ class ReducedModel:
         Why this structure was chosen.
     warnings : tuple of str
         What the reader should know before relying on it.
+    plant : TransferFunction or None
+        What was reduced: the known plant, or the one fitted to the points; None where it is not known any more.
+    points : tuple of FrequencyPoint
+        The points that were reduced; empty for a known plant.
     """
 
     G_r: float
@@ -80,6 +84,8 @@ class ReducedModel:
     conditions: Literal["regions", "estimates", "exact"] = "exact"
     evidence: str = ""
     warnings: tuple[str, ...] = ()
+    plant: TransferFunction | None = field(default=None, repr=False)
+    points: tuple[FrequencyPoint, ...] = field(default=(), repr=False)
 
     @property
     def integrating(self) -> bool:
@@ -148,6 +154,7 @@ def reduce_transfer_function(plant: TransferFunction) -> ReducedModel:
         omega_0r_rad_s=omega_0r,
         omega_d_rad_s=omega_d,
         evidence=f"the plant has {plant.integrators} integrator(s)",
+        plant=plant,
     )
 
 
@@ -223,6 +230,8 @@ def reduce_points(
         conditions=conditions,
         evidence=evidence,
         warnings=warnings,
+        plant=fit.plant,
+        points=tuple(ordered),
     )
 
 

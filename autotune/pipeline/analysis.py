@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, TypeAlias, TypeVar
 
 import numpy as np
 
 from autotune.config.procedure import DesignSettings
 from autotune.controller import PIDController
-from autotune.design.checks import Check, checks
+from autotune.design.checks import Check, checks, on_plants
 from autotune.design.margins import Margins, margins
 from autotune.design.noise import LoopFacts, default_noise_gain
 from autotune.design.nugap import Validation, loop_scaling, validate
@@ -190,6 +190,44 @@ def on_measured(
         On no basis is there a controller that keeps its margins on all of it; the reason is that of the first.
     """
     return _first_kept(_bases(points, fit, lambda: _reduced(points, fit), asked, kind), "auto", points, fit)
+
+
+def on_reduced_model(
+    reduced: ReducedModel, asked: Specification, kind: Kind, *, certificate: bool = True
+) -> tuple[Design, tuple[Check, ...]]:
+    """Return the PI designed on a reduced model, and its checks on what that was reduced from.
+
+    Parameters
+    ----------
+    reduced : ReducedModel
+        With the plant or the points it bounds; without, the design's ``certificate`` says what is not known.
+    asked : Specification
+        Constraints (18).
+    kind : {"pi", "pid"}
+        ``pid`` is refused: the reduced model promises it nothing.
+    certificate : bool
+        Whether a lower bound of the norm on the reduced model is proven.
+
+    Raises
+    ------
+    IdentificationError, DesignError
+        No such controller keeps the margins on the reduced model and on what it was reduced from.
+    """
+    if reduced.points:
+        fit = fit_plant(reduced.points)
+        ways: dict[Source, Callable[[], Design]] = {
+            "reduced model": lambda: design_on_reduced(
+                reduced.plant or fit.plant, asked, kind, reduced=reduced, certificate=certificate
+            )
+        }
+        _, found, looked = _first_kept(ways, "reduced model", reduced.points, fit)
+        return found, looked
+    known = reduced.transfer_function() if reduced.plant is None else reduced.plant
+    found = design_on_reduced(known, asked, kind, reduced=reduced, certificate=certificate)
+    if reduced.plant is None:
+        said = "margins are kept on the reduced model; what it was reduced from is not known, and not checked"
+        return replace(found, certificate=f"{said}; {found.certificate}"), ()
+    return found, (on_plants((known,), found.controller, asked, "the plant that was reduced"),)
 
 
 def _highest(points: Sequence[FrequencyPoint], fit: PlantFit, facts: LoopFacts | None) -> float:

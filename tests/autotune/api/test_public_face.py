@@ -153,7 +153,7 @@ def test_each_papers_main_result_takes_a_few_lines():
     assert np.abs(loop.poles - (0.9681 + 0.1486j)).min() < 0.05
 
 
-def test_the_diagnosis_and_the_simulation_are_reached():
+def test_a_model_with_its_operating_point_simulates_the_recording():
     from autotune.models import Block, Model, Port
 
     oven, plant = at.example("oven"), at.TransferFunction(num=(2.0,), den=(6.0, 5.0, 1.0), delay_s=0.5)
@@ -163,4 +163,3 @@ def test_the_diagnosis_and_the_simulation_are_reached():
     )  # fmt: skip
     simulated = at.simulate(model, oven)
     assert np.std(simulated - oven.y) < 0.05
-    assert callable(at.diagnose)
