@@ -16,7 +16,8 @@ from autotune.diagnosis.evidence.description import describe
 from autotune.diagnosis.evidence.held_out import held_out
 from autotune.diagnosis.evidence.jitter import jitter_effect
 from autotune.diagnosis.evidence.law import law_effect
-from autotune.diagnosis.evidence.samples import SampleEffect, improves, inspect, is_material
+from autotune.diagnosis.evidence.sample_gain import improves, is_material
+from autotune.diagnosis.evidence.samples import SampleEffect, inspect
 from autotune.diagnosis.evidence.stamps import evened
 from autotune.diagnosis.findings import extended_model, found_effects, offset_of
 from autotune.diagnosis.fitting.fit import RUNAWAY

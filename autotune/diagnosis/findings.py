@@ -10,7 +10,8 @@ from types import MappingProxyType
 import numpy as np
 
 from autotune.diagnosis.effects import kind_of
-from autotune.diagnosis.evidence.samples import SampleEffect, is_nearer
+from autotune.diagnosis.evidence.sample_gain import is_nearer
+from autotune.diagnosis.evidence.samples import SampleEffect
 from autotune.diagnosis.fitting.fit import Fit
 from autotune.diagnosis.result import FoundEffect, Offset, OperatingRange, Verdict
 from autotune.diagnosis.selection.hypothesis import Hypothesis

@@ -1,4 +1,7 @@
-"""What a search asks of a model: fit it with effects, try one more, and tell what numbers and starts can explain."""
+"""What a search asks of a model: fit it with effects, try one more, and tell what numbers and starts can explain.
+
+The questions, and equations that answer all of them on their recordings: the file is longer than others.
+"""
 
 from __future__ import annotations
 

@@ -81,20 +81,13 @@ def search_rig(
     evidence must outweigh that it is not, it must take away a tenth of the held-out error, and stretches must agree on
     it. What is excited in no stretch but one is found with less power.
     """
-    kind = rig_kind(model, build_chain(model))
-    moving = any(float(np.ptp(r.u)) > 0.0 for r in recordings)
-    odds = tuple(
-        (k, k.odds.get(kind, k.odds.get("any", 0.0)))
-        for k in ALL
-        if k.odds and k.name not in left_out and (moving or k.place not in ("actuator", "timing"))
-    )
     with threadpool_limits(1), ThreadPoolExecutor(2) as pool:
         progress("retuning on long windows", 0.0)
         lengths = lengths_of(model, recordings, limits)
         bench = RigBench(
             cuts=tuple(cut(recordings, good, length, limits) for length in lengths.between),
             few=cut(recordings, good, lengths.short, limits),
-            odds=tuple(pair for pair in odds if pair[1] > 0.0),
+            odds=_odds(model, recordings, left_out),
             lasting=(),
             pool=pool,
         )
@@ -103,26 +96,48 @@ def search_rig(
         away = np.abs(retuned.fit.theta - retuned.fit.parametrisation.centre) / retuned.fit.parametrisation.spreads
         beam = [retuned, *([nominal] if float(np.max(away)) > limits.nominal_too else [])]
         bench = replace(bench, lasting=tuple(_lasting(retuned, bench)))
-        found, best = [retuned], retuned
-        for size in range(limits.rig_effects):
-            progress("effects one by one", 0.1 + 0.8 * size / limits.rig_effects)
-            larger = _larger(beam, bench)
-            if not larger:
-                break
-            found += larger
-            larger = ranked((best, *larger))
-            leads = larger[0] is not best
-            larger.remove(best)
-            beam = larger[: limits.rig_beam]
-            if leads and larger[0].is_better(best, limits.material):
-                best = larger[0]
-                bench = bench.with_sd(*_scales(best))
-                beam = [bench.again(j) for j in beam]
-            elif size > 0:
-                break
+        bench, found = _grown(retuned, beam, bench, progress, limits)
         found += _known(known, bench)
         found += _smaller(simplest(found, limits.material), bench)
         return RigSearch(nominal=nominal, retuned=retuned, judged=tuple(found), chosen=simplest(found, limits.material))
+
+
+def _odds(
+    model: Model, recordings: Sequence[Recording], left_out: Collection[str]
+) -> tuple[tuple[EffectKind, float], ...]:
+    """Return the effects that a rig of the model's kind may lack, with their prior odds."""
+    kind = rig_kind(model, build_chain(model))
+    moving = any(float(np.ptp(r.u)) > 0.0 for r in recordings)
+    odds = (
+        (k, k.odds.get(kind, k.odds.get("any", 0.0)))
+        for k in ALL
+        if k.odds and k.name not in left_out and (moving or k.place not in ("actuator", "timing"))
+    )
+    return tuple(pair for pair in odds if pair[1] > 0.0)
+
+
+def _grown(
+    retuned: Judged, beam: list[Judged], bench: RigBench, progress: Progress, limits: Thresholds
+) -> tuple[RigBench, list[Judged]]:
+    """Add effects one by one while one of them makes the free run better; return all that was judged."""
+    found, best = [retuned], retuned
+    for size in range(limits.rig_effects):
+        progress("effects one by one", 0.1 + 0.8 * size / limits.rig_effects)
+        larger = _larger(beam, bench)
+        if not larger:
+            break
+        found += larger
+        larger = ranked((best, *larger))
+        leads = larger[0] is not best
+        larger.remove(best)
+        beam = larger[: limits.rig_beam]
+        if leads and larger[0].is_better(best, limits.material):
+            best = larger[0]
+            bench = bench.with_sd(*_scales(best))
+            beam = [bench.again(j) for j in beam]
+        elif size > 0:
+            break
+    return bench, found
 
 
 def _scales(one: Judged) -> tuple[float, float]:

@@ -163,12 +163,36 @@ def chain_of(blocks: tuple[Block, ...], name: str) -> Chain:
         raise InputError(f"the chain has {order} states", where=name, remedy="diagnosis handles 1 to 12 states")
     plant, law = _plant_blocks(blocks), _law(blocks)
     A, B = np.zeros((order, order)), np.zeros((order, kernel.INPUTS))
-    taps, gains = np.zeros((5, order)), np.ones(4)
-    gains[2:] = 0.0
-    signals = _Signals(taps=taps, gains=gains, where=np.full(3, -1, dtype=np.int64))
-    row, direct = np.zeros(order), np.array([1.0, 0.0, 0.0])
-    at = 0
-    edges = [order, 0]
+    signals, edges = _arranged(blocks, plant, law, A, B)
+    taps = signals.taps
+    if law is not None:
+        taps[[kernel.SPEED, kernel.POSITION, kernel.FIRST_LEVEL]], signals.where[:] = 0.0, -1
+    return Chain(
+        A=A,
+        B=B,
+        taps=taps,
+        gains=signals.gains,
+        where=signals.where,
+        levels=0 if taps[kernel.SPEED].any() else len(plant),
+        delay_s=sum(block.dynamics.delay_s for block in blocks),
+        plant=slice(*edges),
+        is_static=law is not None,
+    )
+
+
+def _arranged(
+    blocks: Sequence[Block], plant: Sequence[int], law: int | None, A: FloatArray, B: FloatArray
+) -> tuple[_Signals, tuple[int, int]]:
+    """Fill in A and B block by block; return where signals are read, and the first of the plant's states and the next.
+
+    ``row`` and ``direct`` are how the present block's input follows from states and inputs of the chain.
+    """
+    order = A.shape[0]
+    signals = _Signals(
+        taps=np.zeros((5, order)), gains=np.array([1.0, 1.0, 0.0, 0.0]), where=np.full(3, -1, dtype=np.int64)
+    )
+    taps, gains = signals.taps, signals.gains
+    row, direct, at, edges = np.zeros(order), np.array([1.0, 0.0, 0.0]), 0, (order, 0)
     for number, block in enumerate(blocks):
         a, b, c, d = _realise(block)
         n = b.size
@@ -187,27 +211,14 @@ def chain_of(blocks: tuple[Block, ...], name: str) -> Chain:
         direct = d * direct
         if number in plant:
             _note_signals(signals, block, (number == plant[0], number == plant[-1]), at, c, row)
+            edges = (min(edges[0], at), at + n)
         if block.place == "actuator" and n == 1 and number < plant[0] and signals.where[ACTUATOR] < 0:
             signals.where[ACTUATOR] = at
-        if number in plant:
-            edges = [min(edges[0], at), at + n]
         at += n
         if number == law:
             taps[kernel.PLANT_IN], gains[2] = before
     taps[kernel.OUTPUT], gains[3] = row, direct[0]
-    if law is not None:
-        taps[[kernel.SPEED, kernel.POSITION, kernel.FIRST_LEVEL]], signals.where[:] = 0.0, -1
-    return Chain(
-        A=A,
-        B=B,
-        taps=taps,
-        gains=gains,
-        where=signals.where,
-        levels=0 if taps[kernel.SPEED].any() else len(plant),
-        delay_s=sum(block.dynamics.delay_s for block in blocks),
-        plant=slice(*edges),
-        is_static=law is not None,
-    )
+    return signals, edges
 
 
 def _plant_blocks(blocks: Sequence[Block]) -> list[int]:
