@@ -160,7 +160,12 @@ def _unraisable(unraisable: Any) -> None:
 
 
 def _hear_no_more() -> None:
-    """Ignore Ctrl-C from here on: what ends now has been said, and the interpreter's own end is no place for it."""
+    """Ignore Ctrl-C from here on: what ends now has been said, and the interpreter's own end is no place for it.
+
+    One that came while a text was executed (a dataclass that was made) would have ``python -m`` kill itself by a signal
+    at the end, whatever became of the exception; the interpreter forgets it when it executes another text.
+    """
+    exec("", {})
     with contextlib.suppress(ValueError):  # a test that calls from another thread
         signal.signal(signal.SIGINT, signal.SIG_IGN)
 

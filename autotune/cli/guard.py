@@ -46,6 +46,10 @@ class GuardedCommand(TyperCommand):
             raise
         except (KeyboardInterrupt, typer.Abort):
             _say_stopped(_place(ctx), began_s)
+        except SystemError as error:
+            if isinstance(error.__cause__, KeyboardInterrupt):  # it came within a compiled function
+                _say_stopped(_place(ctx), began_s)
+            raise _unforeseen(error, ctx) from error
         except OSError as error:
             if error.errno == errno.EPIPE and error.filename is None:  # whoever read the output has gone
                 without_stdout()

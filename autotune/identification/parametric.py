@@ -176,12 +176,18 @@ def _whitener(point: FrequencyPoint) -> FloatArray:
     return np.asarray(np.linalg.inv(np.linalg.cholesky(covariance)), dtype=np.float64)
 
 
+#: of a plant drawn from data that leave the gain open: the arithmetic that follows holds its square
+_LARGEST_LOG_GAIN = math.log(1e100)
+
+
 def _plant(parameters: FloatArray, sign: int, integrating: bool) -> TransferFunction:
     den = np.array([1.0, 0.0]) if integrating else np.array([1.0])
     for log_tau in parameters[1:-1]:
         den = np.polymul(den, [math.exp(log_tau), 1.0])
     return TransferFunction(
-        num=(sign * math.exp(parameters[0]),), den=tuple(den), delay_s=max(0.0, float(parameters[-1]))
+        num=(sign * math.exp(min(parameters[0], _LARGEST_LOG_GAIN)),),
+        den=tuple(den),
+        delay_s=max(0.0, float(parameters[-1])),
     )
 
 

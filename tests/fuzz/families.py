@@ -42,7 +42,7 @@ MODEL: dict[str, Any] = {
         },
         {"name": "height", "place": "plant", "num": [1.0], "den": [1.0, 0.1], "delay": 0.02},
     ],
-    "effect": [{"name": "actuator.dead_zone", "parameters": {"width": {"value": 0.01, "unit": "V", "sd": 0.001}}}],
+    "effect": [{"name": "actuator.dead_zone", "parameters": {"half_width": {"value": 0.01, "unit": "V", "sd": 0.001}}}],
 }
 PENDULUM: dict[str, Any] = {
     "name": "pendulum",

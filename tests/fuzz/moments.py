@@ -83,6 +83,8 @@ def interrupted(name: str, after_s: float) -> str:
             return "over before"
         lines = [line for line in said.splitlines() if line.startswith("autotune: ")]
         noise = [line for line in said.splitlines() if "Traceback" in line or "Exception ignored" in line]
+        if "KeyboardInterrupt" in said and "autotune" not in said:
+            return "before its first line"  # the interpreter's own start, which is not the tool's to say anything of
         if process.returncode != 130:
             return f"exit {process.returncode}: {said.strip()[-300:]}"
         if len(lines) != 1 or noise:
@@ -194,7 +196,7 @@ def main() -> int:
         for name, end in pool.map(one, trials):
             ends[name, end] += 1
             print(f"{name}: {end}", flush=True)
-    well = ("one line", "over before", "enough space", "resumed", "did not fit", "not tried")
+    well = ("one line", "over before", "before its first line", "enough space", "resumed", "did not fit", "not tried")
     print("\n| command | end | times |\n|---|---|---|")
     for (name, end), times in sorted(ends.items()):
         print(f"| {name} | {end} | {times} |")
