@@ -24,6 +24,8 @@ from autotune.recording import Recording
 _SMALL = 1e-4
 #: Windows that a recording is cut into, one fit after the other, each with this many rows at least.
 SHORT_TO_LONG, LEAST_ROWS = (32, 8, 2, 1), 24
+#: Rows per state, and one more, that a window has at least where a horizon is stated: the plant runs away.
+ROWS_PER_STATE = 4
 #: A longer window that leaves this many times the error of the shorter ones has lost its way.
 LOST = 30.0
 
@@ -185,7 +187,9 @@ def retune(
     whole = max(float(one.t[-1] - one.t[0]) for one in recordings)
     longest = min(compiled.model.horizon_s or np.inf, longest_s, whole)
     rows = min(len(one) for one in recordings)
-    counts = [count for count in SHORT_TO_LONG if rows * longest / whole / count >= LEAST_ROWS]
+    few = ROWS_PER_STATE * (len(compiled.states) + 1)
+    least = min(few, LEAST_ROWS) if compiled.model.horizon_s else LEAST_ROWS
+    counts = [count for count in SHORT_TO_LONG if rows * longest / whole / count >= least]
     lengths = [longest / count for count in counts or [1]]
     found: Fitted | None = None
     for k, length in enumerate(lengths):

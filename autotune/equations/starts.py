@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from scipy.optimize import least_squares
 
@@ -9,8 +11,8 @@ from autotune.arrays import BoolArray, FloatArray, IntArray
 from autotune.equations.sensitivity import STEP, Windows, sensitivities
 from autotune.equations.simulate import Compiled, Drive, derivatives, simulate
 
-#: Rows that a start state is fitted to at least.
-LEAST = 30
+#: Rows that a start state is fitted to at least; where those run away, to a part of them first, this many at least.
+LEAST, LEAST_WINDOW = 30, 4
 
 
 def given_starts(compiled: Compiled) -> FloatArray:
@@ -93,6 +95,7 @@ def fitted_starts(
     guess: FloatArray | None = None,
     iterations: int = 8,
     share: float = 0.1,
+    least: int = LEAST,
 ) -> Windows:
     """Find each window's start state: the previous window's end, then what fits its readings.
 
@@ -109,8 +112,9 @@ def fitted_starts(
     iterations : int
         Gauss-Newton steps per window.
     share : float
-        Share of a window's rows that its start is fitted to, at least ``LEAST`` rows: wrong parameters lead the rest
-        astray.
+        Share of a window's rows that its start is fitted to: wrong parameters lead the rest astray.
+    least : int
+        Rows that it is fitted to at least.
 
     Returns
     -------
@@ -125,14 +129,42 @@ def fitted_starts(
     found = []
     for k, (a, b) in enumerate(zip(starts, stops, strict=True)):
         free = np.flatnonzero(~np.isfinite(given)) if a == 0 else np.arange(x.size)
-        until = min(max(int(a + share * (b - a)), a + LEAST), b)
+        until = min(max(int(a + share * (b - a)), a + least), b)
         window = Windows(starts=np.array([a]), stops=np.array([until]), states=x[None, :])
-        window = _fitted(compiled, parameters, drive, y, good, window, scales, free, iterations)
+        if k and _is_lost(compiled, parameters, drive, y, good, window):
+            # what runs away ends far from the readings: the window begins at rest at its own first one
+            ahead = y[a:until][good[a:until]]
+            at_rest = rest_state(compiled, parameters, drive.inputs[a - 1], float(ahead[0]) if ahead.size else np.nan)
+            window = replace(window, states=at_rest[None, :])
+        for end in _ends(compiled, parameters, drive, window):
+            window = replace(window, stops=np.array([end]))
+            window = _fitted(compiled, parameters, drive, y, good, window, scales, free, iterations)
         found.append(window.states[0])
         if k + 1 < starts.size:
             run = simulate(compiled, parameters, drive, window.states, starts=np.array([a]), stops=np.array([b]))
             x = run.ends[0] if np.all(np.isfinite(run.ends)) else x
     return Windows(starts=starts, stops=stops, states=np.array(found))
+
+
+def _ends(compiled: Compiled, parameters: FloatArray, drive: Drive, window: Windows) -> list[int]:
+    """Return where to fit a start up to, one after the other: a first part that does not run away, twice that, all."""
+    first, ends = int(window.starts[0]), [int(window.stops[0])]
+    while ends[0] - first > LEAST_WINDOW:
+        run = simulate(compiled, parameters, drive, window.states, starts=window.starts, stops=np.array(ends[:1]))
+        if run.is_complete:
+            break
+        ends.insert(0, first + (ends[0] - first) // 2)
+    return ends
+
+
+def _is_lost(
+    compiled: Compiled, parameters: FloatArray, drive: Drive, y: FloatArray, good: BoolArray, window: Windows
+) -> bool:
+    """Whether a window's simulation leaves the readings by more than these have moved altogether."""
+    rows = np.flatnonzero(good[window.starts[0] : window.stops[0]]) + int(window.starts[0])
+    run = simulate(compiled, parameters, drive, window.states, starts=window.starts, stops=window.stops)
+    off = np.abs(y[rows] - run.y[rows])
+    return bool(rows.size and not np.all(off < np.ptp(y[good])))
 
 
 def _fitted(

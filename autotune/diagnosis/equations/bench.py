@@ -16,7 +16,7 @@ from autotune.arrays import BoolArray, FloatArray
 from autotune.diagnosis.equations.candidates import Signals, Trial
 from autotune.equations.effects import Applied, apply, with_values
 from autotune.equations.expressions import Expression, to_text
-from autotune.equations.fit import LEAST_ROWS, Fitted, fit, retune, values_of
+from autotune.equations.fit import LEAST_ROWS, Fitted, fit, retune, values_of, window_rows
 from autotune.equations.model import EquationModel, ModelParameter
 from autotune.equations.sensitivity import Windows
 from autotune.equations.simulate import Compiled, Drive, compile_model, drive_of, simulate
@@ -208,6 +208,9 @@ class EquationBench:
             p = values_of(compiled, z)
             for (r, k, _), w in zip(each, windows, strict=True):
                 drive = applied.before(drive_of(self.model, r))
+                if self.model.horizon_s is not None:
+                    errors.append(_forecast_errors(compiled, p, drive, r.y, k, self.model.horizon_s))
+                    continue
                 at, end = _continued(compiled, p, drive, r.y, w, k), np.array([len(r)])
                 y = applied.after(simulate(compiled, p, drive, at.states, starts=at.starts, stops=end).y)
                 errors.append((r.y - np.nan_to_num(y, nan=1e150))[k + int(SETTLED * (len(r) - k)) :])
@@ -529,6 +532,25 @@ def _continued(compiled: Compiled, p: FloatArray, drive: Drive, y: FloatArray, b
             best, least = w, left
     assert best is not None
     return best
+
+
+def _forecast_errors(
+    compiled: Compiled, p: FloatArray, drive: Drive, y: FloatArray, row: int, horizon_s: float
+) -> FloatArray:
+    """Return the errors from a row on of forecasts, each from a state that the horizon before it tells."""
+    edges, _ = window_rows(drive.t, horizon_s)
+    edges = np.append(edges, y.size)
+    errors = []
+    for before, a, b in zip(edges, edges[1:], edges[2:], strict=False):
+        if a < row:
+            continue
+        w = fitted_starts(
+            compiled, p, drive, y, np.isfinite(y), np.array([before]), np.array([b]), share=(a - before) / (b - before),
+            least=int(a - before),
+        )  # fmt: skip
+        run = simulate(compiled, p, drive, w.states, starts=w.starts, stops=w.stops)
+        errors.append((y - np.nan_to_num(run.y, nan=1e150))[a:b])
+    return np.concatenate(errors) if errors else np.full(1, np.inf)
 
 
 def _until(w: Windows, row: int) -> Windows:

@@ -92,7 +92,7 @@ def search(bench: Bench, without: Sequence[str], progress: Progress, limits: Thr
     tried: list[Outcome] = []
     chosen = retuned
     while len(chosen.effects) - len(retuned.effects) < limits.equation_effects:
-        if _ratio(chosen, _noise(bench, chosen)) < limits.equation_noise and not _is_slow(bench, chosen, limits):
+        if _is_noise(bench, chosen, limits.equation_noise, limits) and not _is_slow(bench, chosen, limits):
             break
         new = _round(bench, chosen, without, progress, limits, chosen is not retuned)
         tried += new
@@ -131,6 +131,12 @@ def _ratio(one: Outcome, noise: Noise) -> float:
     return one.rss / one.residual.size / max(noise.total_sd**2, 1e-300)
 
 
+def _is_noise(bench: Bench, one: Outcome, most: float, limits: Thresholds) -> bool:
+    """Whether a residual has a noise's variance; what goes on from row to row may be physics that is left out."""
+    noise = _noise(bench, one)
+    return _ratio(one, noise) < most and not (noise.ar and noise.ar[0] > limits.slow_noise)
+
+
 def _is_slow(bench: Bench, one: Outcome, limits: Thresholds) -> bool:
     """Whether block means of a residual vary by more than its noise says."""
     noise, ratios = _noise(bench, one), []
@@ -155,7 +161,7 @@ def _round(
 
     found = _grown(bench, base, without, told, limits, count)
     best = min(found, key=lambda one: one.rss, default=base)
-    if _ratio(best, _noise(bench, best)) > limits.equation_astray:
+    if not _is_noise(bench, best, limits.equation_astray, limits):
         short = bench.shortened(base)
         if short is not None:
             # the base itself goes on as well: its effects may have been fitted in a wrong minimum
