@@ -49,7 +49,7 @@ class Limits(_Part):
     u_safe: Number
     y_min: Number
     y_max: Number
-    swing: Number
+    swing: Annotated[float, Field(gt=0, le=LARGEST)]
     time_s: Number
 
 
