@@ -140,7 +140,9 @@ def _marked(campaign: Campaign, seed: int, before: Json, reached: float) -> Reco
         errors = answer["nrmse_unseen"]
         errors["noise"] = min(errors["noise"], reached / errors["spread"])
     said = {**said, "places": []}  # places of new names only
-    if answer["kind"] == "clean" and not raises_alarm(said, before):
+    if new_names(said, before):  # what samples show is named beside something unexplained, too
+        said = {**said, "verdict": "effect"}
+    elif answer["kind"] == "clean" and not raises_alarm(said, before):
         said = {**said, "verdict": "parameters", "effects": []}
     error = _error(campaign, seed, answer) if answer["improvable"] else None
     marked = mark(f"case_{seed:06d}", {**answer, "nuisance": list(names)}, said, error)
@@ -149,9 +151,13 @@ def _marked(campaign: Campaign, seed: int, before: Json, reached: float) -> Reco
 
 def raises_alarm(said: Json, before: Json) -> bool:
     """Whether something is said of a changed recording that was not said of the recording as it is."""
-    new = {str(e["name"]) for e in said["effects"]} - {str(e["name"]) for e in before["effects"]}
     worse = said["verdict"] in ALARMS and before["verdict"] not in (*ALARMS, "effect")
-    return bool(new) or worse or (said["verdict"] == "failed" != before["verdict"])
+    return bool(new_names(said, before)) or worse or (said["verdict"] == "failed" != before["verdict"])
+
+
+def new_names(said: Json, before: Json) -> set[str]:
+    """Names of effects that were not said of the recording as it is."""
+    return {str(e["name"]) for e in said["effects"]} - {str(e["name"]) for e in before["effects"]}
 
 
 def as_json(campaign: RecordedCampaign, marks: Sequence[RecordedMark]) -> Json:

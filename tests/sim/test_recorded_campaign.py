@@ -25,7 +25,8 @@ if words[0] == "diagnose":
     case = pathlib.Path(words[words.index("--model") + 1]).parent
     more = (case / "says").read_text().split() if (case / "says").exists() else []
     effects = [{"name": n, "probability": 0.9, "places": [n.split(".")[0]]} for n in ["actuator.lag", *more]]
-    (out / "diagnosis.json").write_text(json.dumps({"verdict": "effect", "effects": effects, "places": ["actuator"]}))
+    verdict = "unexplained" if "sensor.quantisation" in more else "effect"
+    (out / "diagnosis.json").write_text(json.dumps({"verdict": verdict, "effects": effects, "places": ["actuator"]}))
     (out / "extended_model.toml").write_text("")
 else:
     rows = pathlib.Path(words[3]).read_text().splitlines()[1:]
@@ -98,6 +99,8 @@ def test_a_case_has_what_a_user_would_have_and_the_recording_kept_back(rigs, tmp
 def test_a_name_that_was_not_said_before_is_an_alarm():
     def said(verdict, *names):
         return {"verdict": verdict, "effects": [{"name": name} for name in names]}
+
+    assert raises_alarm(said("unexplained", "sensor.quantisation"), said("unexplained"))
 
     assert raises_alarm(said("effect", "plant.leak", "sensor.lag"), said("effect", "plant.leak"))
     assert raises_alarm(said("unexplained"), said("none"))
