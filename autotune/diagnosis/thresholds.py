@@ -135,6 +135,7 @@ class Thresholds:
     rig_beam: int = _known(2, "hypotheses", "that are built on", "cost")
     rig_judged: int = _known(8, "hypotheses", "of each size whose left-out stretches are judged", "cost")
     rig_starts: int = _known(2, "starting points", "of an effect that are fitted", "cost")
+    rig_pruned: int = _known(4, "hypotheses", "leading, of which each effect is left out once more", "cost")
     rig_tried: int = _known(8, "effects", "beside one hypothesis that are fitted", "cost")
     usual: float = _known(0.15, "prior odds", "from which on an effect is always fitted", "convention")
     out_of_phase: float = _known(0.3, "of the spread", "held-out error from which on a free run may be out of phase", "convention")

@@ -9,7 +9,7 @@ import numpy as np
 
 from autotune.arrays import FloatArray
 from autotune.diagnosis.effects.base import EffectKind
-from autotune.diagnosis.evidence.stretches import held_out_squares
+from autotune.diagnosis.evidence.stretches import held_out_squares, rms
 from autotune.diagnosis.fitting.data import Data, as_white
 from autotune.diagnosis.fitting.fit import RUNAWAY, Fit, fit, start_states
 from autotune.diagnosis.fitting.parameters import Parametrisation
@@ -79,6 +79,24 @@ class RigBench:
         p, held = result.parametrisation, np.zeros(result.theta.size, dtype=bool)
         begun = fit(p, self.few, result.theta, free=held, iterations=STEPS)
         return fit(p, self.few, begun.theta, begun.x0, iterations=STEPS)
+
+    def with_both_scales(self, one: Judged) -> Judged:
+        """Return a hypothesis with those of its numbers, fitted to long or to short windows, that suit both.
+
+        Where they differ the model lacks something that one of the scales bends them for: those are taken that lose
+        the smaller share at the other one's scale.
+        """
+        if not self.two_scales:
+            return one
+        p, held = one.fit.parametrisation, np.zeros(one.fit.theta.size, dtype=bool)
+        try:
+            far = fit(p, self.long, one.short.theta, free=held, iterations=STEPS)
+            near = fit(p, self.few, one.fit.theta, free=held, iterations=STEPS)
+        except RUNAWAY:
+            return one
+        lost_far = rms(far.residuals, self.long.good) / rms(one.fit.residuals, self.long.good)
+        lost_near = rms(near.residuals, self.few.good) / rms(one.short.residuals, self.few.good)
+        return replace(one, fit=replace(far, covariance=one.short.covariance)) if lost_far < lost_near else one
 
     def again(self, one: Judged) -> Judged:
         """Return a hypothesis fitted again, to data with another residual."""

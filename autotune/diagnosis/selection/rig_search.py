@@ -17,7 +17,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from autotune.arrays import BoolArray
-from autotune.diagnosis.effects import ALL
+from autotune.diagnosis.effects import ALL, kind_of
 from autotune.diagnosis.effects.base import EffectKind
 from autotune.diagnosis.effects.rigs import rig_kind
 from autotune.diagnosis.evidence.stretches import correlation_rows, rms
@@ -32,6 +32,7 @@ from autotune.diagnosis.selection.prediction import extended, predictions, signa
 from autotune.diagnosis.selection.rig_bench import STEPS, RigBench
 from autotune.diagnosis.selection.scan import searched
 from autotune.diagnosis.selection.screening import distinct
+from autotune.diagnosis.simulation.assembly import input_size
 from autotune.diagnosis.simulation.chain import build_chain
 from autotune.diagnosis.thresholds import IN_USE, Thresholds
 from autotune.models import Effect, Model
@@ -98,8 +99,9 @@ def search_rig(
         bench = replace(bench, lasting=tuple(_lasting(retuned, bench)))
         bench, found = _grown(retuned, beam, bench, progress, limits)
         found += _known(known, bench)
-        found += _smaller(simplest(found, limits.material), bench)
-        return RigSearch(nominal=nominal, retuned=retuned, judged=tuple(found), chosen=simplest(found, limits.material))
+        found = _pruned(found, bench)
+        chosen = bench.with_both_scales(simplest(found, limits.material))
+        return RigSearch(nominal=nominal, retuned=retuned, judged=tuple(found), chosen=chosen)
 
 
 def _odds(
@@ -153,7 +155,7 @@ def _residual_sd(result: Fit, data: Data) -> float:
 def _roots(model: Model, bench: RigBench) -> tuple[RigBench, list[Judged]]:
     """Return the bench with the retuned model's residual, and that model at its nominal numbers and retuned."""
     recordings = bench.long.recordings
-    p = parametrise(model, [], _input_size(model, recordings), recordings[0].sample_time_s)
+    p = parametrise(model, [], input_size(model, recordings), recordings[0].sample_time_s)
     result = bench.settled(p, None)
     for _ in range(2):
         bench = bench.with_sd(_residual_sd(result, bench.long), bench.few.noise.sd)
@@ -167,20 +169,6 @@ def _roots(model: Model, bench: RigBench) -> tuple[RigBench, list[Judged]]:
     if retuned is None:
         raise OverflowError("the retuned model runs away")
     return bench, [nominal if nominal is not None else retuned, retuned]
-
-
-def _input_size(model: Model, recordings: Sequence[Recording]) -> float:
-    """Return the step of the command's offset: the command's spread, or what moves a reading by a tenth of its own."""
-    spread = float(np.std(np.concatenate([r.u for r in recordings])))
-    if spread > 0.0:
-        return spread
-    chain = build_chain(model)
-    readings = max(float(np.nanstd(r.y)) for r in recordings)
-    try:
-        static = abs(float(chain.gains[3] - chain.taps[3] @ np.linalg.solve(chain.A, chain.B[:, 0])))
-    except np.linalg.LinAlgError:
-        return 1.0
-    return 0.1 * readings / static if 0.0 < static < math.inf and readings > 0.0 else 1.0
 
 
 def _lasting(root: Judged, bench: RigBench) -> list[Effect]:
@@ -271,13 +259,36 @@ def _known(known: Fit | None, bench: RigBench) -> list[Judged]:
     if known is None:
         return []
     given = {k.name: o for k, o in bench.odds}
-    odds = math.prod(given.get(e.name, 0.0) for e in known.parametrisation.added)
+    names = [e.name for e in known.parametrisation.added]
+    odds = math.prod(given.get(name, 0.0) for name in names)
+    if not any(kind_of(name).at_a_time for name in names):  # such a load explains a part of everything
+        odds = max(odds, bench.limits.known_odds)
+    if odds <= 0.0:
+        return []
     try:
         result = bench.settled(known.parametrisation, known.theta)
     except RUNAWAY:
         return []
-    judged = bench.judged(result, math.log(max(odds, bench.limits.known_odds)))
+    judged = bench.judged(result, math.log(odds))
     return [judged] if judged is not None and np.all(np.isfinite(judged.long_squares)) else []
+
+
+def _pruned(found: Sequence[Judged], bench: RigBench) -> list[Judged]:
+    """Return hypotheses with those that the leading ones become when an effect is left out, and again of these.
+
+    Dry friction has many local minima: one more effect may only have led out of one.
+    """
+    result, done = list(found), set()
+    for _ in range(bench.limits.rig_effects):
+        leading = ranked(result)[: bench.limits.rig_pruned]
+        fresh = [j for j in (*leading, simplest(result, bench.limits.material)) if id(j) not in done]
+        if not fresh:
+            break
+        for one in fresh:
+            if id(one) not in done:
+                done.add(id(one))
+                result += _smaller(one, bench)
+    return result
 
 
 def _smaller(best: Judged, bench: RigBench) -> list[Judged]:

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
+
 import numpy as np
 
 from autotune.diagnosis.effects import KINDS, kind_of
 from autotune.diagnosis.effects.base import EffectKind
-from autotune.diagnosis.simulation.chain import blocks_of, chain_of
+from autotune.diagnosis.simulation.chain import blocks_of, build_chain, chain_of
 from autotune.diagnosis.simulation.simulator import ICE_K, Simulator, layout
 from autotune.errors import InputError
 from autotune.models import Effect, Model
+from autotune.recording import Recording
 
 
 def assemble(model: Model) -> Simulator:
@@ -110,3 +114,17 @@ def states_that_stay(name: str, order: int) -> slice:
     if part is None or part.unless_lagged:
         return slice(0, order)
     return slice(part.states, order) if part.at == "front" else slice(0, order - part.states)
+
+
+def input_size(model: Model, recordings: Sequence[Recording]) -> float:
+    """Return a step of the command's offset: the command's spread, or what moves a reading by a tenth of its own."""
+    spread = float(np.std(np.concatenate([r.u for r in recordings])))
+    if spread > 0.0:
+        return spread
+    chain = build_chain(model)
+    readings = max(float(np.nanstd(r.y)) for r in recordings)
+    try:
+        static = abs(float(chain.gains[3] - chain.taps[3] @ np.linalg.solve(chain.A, chain.B[:, 0])))
+    except np.linalg.LinAlgError:
+        return 1.0
+    return 0.1 * readings / static if 0.0 < static < math.inf and readings > 0.0 else 1.0

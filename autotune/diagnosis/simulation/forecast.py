@@ -14,7 +14,7 @@ import numpy as np
 
 from autotune.arrays import BoolArray, FloatArray
 from autotune.diagnosis.effects import kind_of
-from autotune.diagnosis.simulation.assembly import assemble
+from autotune.diagnosis.simulation.assembly import assemble, input_size
 from autotune.diagnosis.simulation.simulator import Simulator, Windows
 from autotune.errors import InputError
 from autotune.models import Model
@@ -162,7 +162,7 @@ def forecast(model: Model, recording: Recording, horizon_s: float | None = None)
         recording=recording,
         good=good.astype(np.float64),
         scales=sim.state_sizes([recording.u], [recording.y[good]]),
-        bias_size=max(float(np.std(recording.u)), 1e-9),
+        bias_size=input_size(model, [recording]),
         dt_s=recording.sample_time_s,
     )
     if horizon_s is None:

@@ -77,3 +77,15 @@ def test_behind_a_coarse_converter_the_forecast_takes_its_steps() -> None:
     stepped = np.abs(forecast(replace(model, effects=(converter,)), r, 3.0) - r.y)[300:]
     assert np.sqrt(np.mean(plain**2)) > 0.9 * step / np.sqrt(12.0)  # no state explains the rounding
     assert np.mean(stepped < 1e-9) > 0.9
+
+
+def test_where_nothing_drives_a_swing_a_shift_of_its_centre_is_found_from_the_past() -> None:
+    t = 0.01 * np.arange(2000)
+    noise = 0.01 * np.random.default_rng(2).normal(size=t.size)
+    y = 0.3 + np.exp(-0.1 * t) * np.cos(np.sqrt(16.0 - 0.01) * t) + noise  # at rest, by the model, at 0
+    dynamics = TransferFunction(num=(1.0,), den=(1.0, 0.2, 16.0))
+    swing = Model(
+        name="swing", input=Port(), output=Port(), blocks=(Block(name="arm", place="plant", dynamics=dynamics),)
+    )
+    error = (forecast(swing, Recording(t=t, u=np.zeros(t.size), y=y), 3.0) - y)[600:]
+    assert np.sqrt(np.mean(error**2)) < 1.5 * 0.01
