@@ -18,7 +18,7 @@ import numpy as np
 from sim.conceal.cases import STRENGTHS
 from sim.conceal.physics import Floats
 from sim.recorded import chain as linear
-from sim.recorded.effects import EFFECTS, Effect, require_exact
+from sim.recorded.effects import EFFECTS, Effect, require_exact, require_no_converter
 from sim.recorded.readings import Put, Scale
 from sim.recorded.rigs import Record, RefusedError, Rig
 
@@ -112,6 +112,7 @@ def search_size(ready: Ready, effect: Effect, strength: str, seed: int) -> Put:
     for _ in range(TRIES):
         try:
             put = effect.make(size, ready.scale, np.random.default_rng([seed, 6]))
+            require_no_converter(ready.rig.every, [r for part in changed(ready, put, seed) for r in part])
             found, _ = ratio(ready, put, seed)
         except RefusedError as why:
             found, reason = np.inf, str(why)

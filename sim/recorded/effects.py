@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from sim.recorded import commands, readings
 from sim.recorded.readings import Maker
-from sim.recorded.rigs import RefusedError, Rig
+from sim.recorded.rigs import Record, RefusedError, Rig
 
 #: Error of a reading guessed from its neighbours, over the residual, above which y between rows is not known.
 BETWEEN = 2.0
@@ -118,3 +119,23 @@ def roughness(rig: Rig) -> float:
     """Rms error of each second reading guessed from its neighbours."""
     guessed = [r.y[1:-1] - 0.5 * (r.y[2:] + r.y[:-2]) for r in rig.given]
     return float(np.sqrt(np.mean(np.concatenate(guessed) ** 2)))
+
+
+def require_no_converter(before: Sequence[Record], after: Sequence[Record]) -> None:
+    """Refuse a changed command that rounding to the recorded one's levels turns into it, as a converter does.
+
+    A command of few levels says no more: every effect that moves it by less than half their distance would be one.
+
+    Raises
+    ------
+    RefusedError
+        With that reason.
+    """
+    levels = np.unique(np.concatenate([r.u for r in before]))
+    middles = 0.5 * (levels[1:] + levels[:-1])
+    rounded = all(
+        np.array_equal(levels[np.searchsorted(middles, b.u)], a.u) for a, b in zip(before, after, strict=True)
+    )
+    same = all(np.array_equal(a.u, b.u) for a, b in zip(before, after, strict=True))
+    if rounded and not same:
+        raise RefusedError("a converter to the levels of the recorded command would explain the same")

@@ -12,7 +12,7 @@ from sim.conceal.retune import Chain as OwnChain
 from sim.conceal.retune import discretise as own_discretise
 from sim.recorded import cases, commands, readings
 from sim.recorded.chain import Block, Chain, discretise, forecast_error, free_runs, misfit, moved, retune
-from sim.recorded.effects import BY_NAME, EFFECTS, require_exact
+from sim.recorded.effects import BY_NAME, EFFECTS, require_exact, require_no_converter
 from sim.recorded.readings import Scale
 from sim.recorded.rigs import Record, RefusedError, find, read
 from tests.sim.recorded_rig import NOISE, record, write_recording, write_rig
@@ -227,6 +227,15 @@ def test_a_command_that_does_not_move_takes_no_effect_of_the_command(tmp_path):
     require_exact(BY_NAME["sensor.saturation"], rig, 1.0)
     with pytest.raises(RefusedError, match="from row to row"):
         require_exact(BY_NAME["sensor.lag"], rig, 1e-6)
+
+
+def test_a_change_that_a_converter_to_the_recorded_levels_would_undo_is_refused():
+    relay = Record(name="fit", t=np.arange(40) * 0.1, u=np.repeat([2.0, 6.0], 20), y=np.zeros(40))
+    small, large = (replace(relay, u=relay.u + size * np.sin(relay.t)) for size in (1.5, 2.5))
+    with pytest.raises(RefusedError, match="converter"):
+        require_no_converter([relay], [small])
+    require_no_converter([relay], [large])
+    require_no_converter([relay], [relay])  # an effect of the reading
 
 
 def test_a_folder_that_cannot_be_used_says_why(tmp_path):
