@@ -65,10 +65,20 @@ def diagnose(
     recordings: Annotated[
         list[Path], typer.Argument(help="recordings, best with different excitation", metavar="REC.csv...")
     ],
-    model: Annotated[Path, typer.Option(help="nominal model", metavar="M.toml")],
     out: Annotated[
-        Path, typer.Option(help="folder for diagnosis.json, extended_model.toml, report.html", metavar="DIR")
+        Path,
+        typer.Option(
+            help="folder for diagnosis.json, extended_model.toml and report.html; routine.json with --routine",
+            metavar="DIR",
+        ),
     ],
+    model: Annotated[Path | None, typer.Option(help="nominal model; none with --routine", metavar="M.toml")] = None,
+    routine: Annotated[
+        bool,
+        typer.Option(
+            "--routine", help="a loop in operation, without test or model: valve, tuning, or something outside"
+        ),
+    ] = False,
     controller: Annotated[
         Path | None,
         typer.Option(help="law that u was computed by; default: the recordings' sidecars", metavar="C.toml"),
@@ -83,6 +93,17 @@ def diagnose(
     overwrite: OVERWRITE = False,
 ) -> None:
     """Find where and why recordings differ from the simulation: numbers, missing physics, or something else."""
+    if routine:
+        from autotune.cli.routine import look_at
+
+        look_at(recordings, out, {"--model": model, "--controller": controller, "--without": without},
+                signal_names(t, u, y, r), overwrite=overwrite)  # fmt: skip
+        return
+    if model is None:
+        raise InputError(
+            "no model", where="diagnose",
+            remedy="give --model M.toml, or --routine for a loop in operation that has no model",
+        )  # fmt: skip
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
     from threadpoolctl import threadpool_limits

@@ -1,0 +1,103 @@
+"""The verdict on a loop in operation in words, and what to do next."""
+
+from __future__ import annotations
+
+from autotune.diagnosis.routine.result import RoutineDiagnosis
+from autotune.diagnosis.routine.thresholds import RoutineThresholds
+
+
+def said(found: RoutineDiagnosis, limits: RoutineThresholds) -> tuple[str, ...]:
+    """Return the finding in words, the verdict first."""
+    seen = found.oscillation
+    period = f"{seen.period_s:.4g} s"
+    match found.verdict:
+        case "stiction" | "backlash":
+            first = _valve(found)
+        case "tight_tuning":
+            assert found.answer is not None
+            first = (
+                f"Tight tuning: after changes of the set-point y swings with a period of {found.answer.period_s:.4g} s"
+                f" and a damping ratio of {found.answer.damping:g}; a well damped answer predicts stretches left out"
+                " clearly worse."
+            )
+        case "outside_oscillation":
+            first = (
+                f"An oscillation from outside with a period of {period}: over {seen.periods:.0f} periods its phase"
+                f" lasts (one sine predicts {seen.phase_kept:.0%} of y on stretches left out), which neither a badly"
+                " damped loop nor a valve that sticks explains."
+            )
+        case "none":
+            first = "Nothing found: no regular oscillation, and no fault of the valve that the free runs would show."
+        case _:
+            first = (
+                f"The loop oscillates with a period of {period}, and this record does not tell whether by its tuning,"
+                " its valve or from outside."
+            )
+    return (first, _runs(found), *_doubts(found, limits))
+
+
+def _valve(found: RoutineDiagnosis) -> str:
+    assert found.band is not None
+    assert found.jump is not None
+    band, jump, span = found.band, found.jump, found.bench.span
+    name = "Stiction" if found.verdict == "stiction" else "Play (backlash)"
+    said = (
+        f"{name} in the valve: the command must turn by {band.value:.3g} ({band.low:.3g} to {band.high:.3g}, unit of u;"
+        f" {band.value / span:.0%} of u's range) before the valve follows"
+    )
+    if found.verdict == "stiction":
+        said += f", and it then slips by {jump.value:.3g} ({jump.low:.3g} to {jump.high:.3g})"
+    return said + ("." if found.kinds_apart else "; sticking and play are not told apart here.")
+
+
+def _runs(found: RoutineDiagnosis) -> str:
+    runs = ", ".join(f"{name} {found.error_of(name):.3g}" for name in found.runs)
+    won = max(c.won for c in found.wide.values())
+    return (
+        f"Error of the free runs on {found.spread.size} stretches left out, over the spread of y: {runs};"
+        f" a valve with a wide band is better than a linear one on {won} of them."
+    )
+
+
+def _doubts(found: RoutineDiagnosis, limits: RoutineThresholds) -> tuple[str, ...]:
+    seen = found.oscillation
+    if found.verdict == "abstain":
+        reasons = []
+        if found.answer is None:
+            reasons.append("the set-point does not move or was not recorded, so the loop's own damping is not seen")
+        if seen.periods < limits.least_periods:
+            reasons.append(f"{seen.periods:.0f} periods are too few to see whether its phase lasts")
+        elif seen.phase_kept > limits.least_phase:
+            reasons.append("its phase lasts, and a valve that sticks is not ruled out")
+        else:
+            reasons.append("its phase does not last")
+        best = max(found.wide.values(), key=lambda c: c.decrease)
+        if best.decrease > 0.0:
+            reasons.append("a faulty valve is better than a linear one, but not clearly")
+        elif all(c.decrease < 0.0 and c.chance > 1.0 - limits.unlikely for c in found.wide.values()):
+            reasons.append("a valve with a wide band is clearly worse than a linear one, so it is not the valve")
+        return (f"Why not: {'; '.join(reasons)}.",)
+    if found.verdict in ("stiction", "backlash") and found.bench.of.stretches < 2 * limits.least_stretches:
+        return (f"The record holds {found.bench.of.stretches} stretches only; a longer one narrows the interval.",)
+    return ()
+
+
+def following(found: RoutineDiagnosis) -> str:
+    """Return what to do next."""
+    match found.verdict:
+        case "stiction" | "backlash":
+            return (
+                "Put the loop in manual, move the command by half the band in one direction, then back, and watch"
+                " whether y follows; then see to the packing, the linkage or the positioner of the valve."
+            )
+        case "tight_tuning":
+            return "Reduce the controller's gain, or tune the loop anew."
+        case "outside_oscillation":
+            return "Look for the same period in the loops upstream and in the supply."
+        case "none":
+            return "Nothing to do; record again when the loop oscillates."
+        case _:
+            return (
+                "Put the loop in manual for ten periods: what goes on oscillating comes from outside. Or change the"
+                " set-point by steps, ten periods apart, and record r."
+            )
