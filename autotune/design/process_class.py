@@ -140,6 +140,10 @@ def _program(A: FloatArray, b: FloatArray) -> highspy.Highs:
     return solver
 
 
+#: rounding of a covariance that was turned, as a share of its trace
+_ROUNDING = 1e-14
+
+
 def consistent_processes(
     points: Sequence[FrequencyPoint], *, probability: float = 0.95, inverse_response: bool = False
 ) -> ConsistentProcesses:
@@ -172,7 +176,9 @@ def consistent_processes(
     facets, centre, sd = [], [], []
     whitened_rows, whitened = [], []
     for i, point in enumerate(ordered):
-        covariance = _log_covariance(point) + _RESOLUTION**2 * np.eye(2)
+        covariance = _log_covariance(point)
+        # the second floor is the rounding of a region that is far longer than wide
+        covariance = covariance + (_RESOLUTION**2 + _ROUNDING * np.trace(covariance)) * np.eye(2)
         root = np.linalg.cholesky(covariance)
         rows, measured = np.stack((gain_rows[i], phase_rows[i])), np.array([log_gain[i], phase[i]])
         inverse_root = np.linalg.inv(root)

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from autotune.arrays import FloatArray
+from autotune.arrays import BoolArray, FloatArray
 from autotune.identification.closed_loop.predictor_directions import Predictor
 from autotune.identification.closed_loop.predictor_sweep import innovations, normal_equations, scatter
 
@@ -122,9 +122,9 @@ class Series:
         return np.asarray(sum(_eliminated(part, of_state) for part in parts), dtype=np.float64)
 
 
-def _of_state(predictor: Predictor, directions: FloatArray) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+def _of_state(predictor: Predictor, directions: FloatArray) -> BoolArray:
     """Return which directions are of the initial state; with one output they are of nothing else."""
-    moves: np.ndarray[tuple[int], np.dtype[np.bool_]] = np.any(directions[-len(predictor.x0) :] != 0.0, axis=0)
+    moves: BoolArray = np.any(directions[-len(predictor.x0) :] != 0.0, axis=0)
     return moves
 
 
@@ -141,7 +141,7 @@ def _fitted_state(predictor: Predictor, u: FloatArray, y: FloatArray) -> FloatAr
     return x0
 
 
-def _eliminated(total: FloatArray, of_state: np.ndarray[tuple[int], np.dtype[np.bool_]]) -> FloatArray:
+def _eliminated(total: FloatArray, of_state: BoolArray) -> FloatArray:
     """Return the normal equations of the other columns, those of the state at their best for every step."""
     own, cross, rest = total[np.ix_(of_state, of_state)], total[np.ix_(~of_state, of_state)], ~of_state
     return np.asarray(total[np.ix_(rest, rest)] - cross @ _inverse(own) @ cross.T, dtype=np.float64)
