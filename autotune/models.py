@@ -110,11 +110,35 @@ class TransferFunction:
 
 @dataclass(frozen=True, kw_only=True)
 class Port:
-    """The chain's input or output: unit, operating-point offset and, at the input, how u runs between samples."""
+    """The chain's input or output.
+
+    Attributes
+    ----------
+    unit : str
+        Unit of the signal.
+    offset : float
+        Operating point.
+    hold : {"zero", "linear"}
+        At the input, how u runs between samples.
+    recorded : (float, float), optional
+        Lowest and highest value of the recordings that the model was fitted to: its range of validity. Beyond it laws
+        are extrapolated.
+    """
 
     unit: str = ""
     offset: float = 0.0
     hold: Hold = "zero"
+    recorded: tuple[float, float] | None = None
+
+    def beyond(self, values: FloatArray) -> tuple[float, float]:
+        """Return how far values leave the recorded range, in its spans, and which share of them does; 0 without one."""
+        if self.recorded is None or not np.isfinite(values).any():
+            return 0.0, 0.0
+        low, high = self.recorded
+        known = values[np.isfinite(values)]
+        slack = np.maximum(low - known, known - high)
+        span = max(high - low, 1e-9 * max(abs(low), abs(high)), 1e-300)
+        return max(float(np.max(slack)) / span, 0.0), float(np.mean(slack > 0.0))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -261,13 +285,25 @@ def _real(value: Any, key: str, where: str) -> float:
 
 
 def _port(table: Mapping[str, Any], where: str) -> Port:
-    _known(table, {"unit", "offset", "hold"}, where)
+    _known(table, {"unit", "offset", "hold", "recorded"}, where)
     hold = table.get("hold", "zero")
     if hold not in get_args(Hold):
         raise InputError(f"hold = {_shown(hold)}", where=where, remedy='write "zero" (held command) or "linear"')
     return Port(
-        unit=_text(table, "unit", "", where), offset=_real(table.get("offset", 0.0), "offset", where), hold=hold
+        unit=_text(table, "unit", "", where),
+        offset=_real(table.get("offset", 0.0), "offset", where),
+        hold=hold,
+        recorded=_range(table["recorded"], where) if "recorded" in table else None,
     )
+
+
+def _range(values: Any, where: str) -> tuple[float, float]:
+    if not isinstance(values, list) or len(values) != 2:
+        raise InputError(f"recorded = {_shown(values)}", where=where, remedy="write [lowest, highest]")
+    low, high = (_real(value, "recorded", where) for value in values)
+    if low > high:
+        raise InputError(f"recorded = {_shown(values)}", where=where, remedy="write [lowest, highest]")
+    return low, high
 
 
 def _block(table: Mapping[str, Any], where: str) -> Block:
@@ -351,7 +387,8 @@ def model_content(model: Model, equations: Mapping[str, str] | None = None) -> d
 
 def _port_table(port: Port) -> dict[str, Any]:
     table: dict[str, Any] = {"unit": port.unit, "offset": port.offset}
-    return table | ({"hold": port.hold} if port.hold != "zero" else {})
+    table |= {"hold": port.hold} if port.hold != "zero" else {}
+    return table | ({"recorded": list(port.recorded)} if port.recorded is not None else {})
 
 
 def _block_table(block: Block) -> dict[str, Any]:

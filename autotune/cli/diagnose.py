@@ -14,9 +14,14 @@ from autotune.cli.recordings import R, T, U, Y, read_all, read_one, signal_names
 from autotune.errors import InputError
 from autotune.outputs import Output, OutputFolder
 
+#: Share of the recorded range by which a signal may leave it before that is said: noise does.
+OUTSIDE = 0.05
+
 if TYPE_CHECKING:
+    from autotune.arrays import FloatArray
     from autotune.equations import EquationModel
     from autotune.equations.black_box import BlackBox
+    from autotune.models import Model
     from autotune.recording import Recording
 
 
@@ -53,11 +58,27 @@ def simulate(
             f"the simulation leaves the range of numbers at t = {at:g} s", where=str(model),
             remedy="an unstable model is compared as forecasts: --horizon S",
         )  # fmt: skip
+    if isinstance(nominal, Model):
+        _warn_beyond(nominal, data, y_sim)
     rows = np.column_stack([data.t, y_sim])
     place.by(lambda part: np.savetxt(part, rows, fmt="%.10g", delimiter=",", header="t,y_sim", comments=""))
     known = np.isfinite(data.y)
     error = float(np.sqrt(np.mean((data.y - y_sim)[known] ** 2)) / max(float(np.std(data.y[known])), 1e-300))
     typer.echo(f"simulated {len(data)} rows, error {error:.4g} of the spread of y, in {out}")
+
+
+def _warn_beyond(model: Model, recording: Recording, y_sim: FloatArray) -> None:
+    """Say on stderr where a model runs outside what it was fitted to: its laws are extrapolated there."""
+    for name, port, values in (("u", model.input, recording.u), ("y", model.output, y_sim)):
+        beyond, share = port.beyond(values)
+        if port.recorded is not None and beyond > OUTSIDE:
+            low, high = port.recorded
+            typer.echo(
+                f"warning: {name} leaves what the model was fitted to ({low:.4g} to {high:.4g}) in"
+                f" {100.0 * share:.2g} % of the rows, by up to {beyond:.2g} of its span: laws are extrapolated there;"
+                " record that range",
+                err=True,
+            )
 
 
 @app.command()

@@ -9,6 +9,7 @@ from types import MappingProxyType
 
 import numpy as np
 
+from autotune.arrays import FloatArray
 from autotune.diagnosis.effects import kind_of
 from autotune.diagnosis.evidence.sample_gain import is_nearer
 from autotune.diagnosis.evidence.samples import SampleEffect
@@ -174,4 +175,16 @@ def extended_model(evidence: Evidence, verdict: Verdict, nominal: Model) -> Mode
         for s in evidence.samples
         if kind_of(s.name).late_stamps or is_nearer(s, use.fit, evidence.limits.rounding)
     ]
-    return replace(extended, effects=(*_with_uncertainty(use, extended.effects), *ends))
+    if extended is nominal and not ends:
+        return nominal
+    return replace(
+        extended,
+        effects=(*_with_uncertainty(use, extended.effects), *ends),
+        input=replace(extended.input, recorded=_span([r.u for r in found.data.recordings])),
+        output=replace(extended.output, recorded=_span([r.y for r in found.data.recordings])),
+    )
+
+
+def _span(signals: Sequence[FloatArray]) -> tuple[float, float]:
+    values = np.concatenate([v[np.isfinite(v)] for v in signals])
+    return float(values.min()), float(values.max())

@@ -99,7 +99,7 @@ def test_a_written_model_reads_back_equal(tmp_path: Path) -> None:
     model = Model(
         name="servo",
         input=Port(unit="V", offset=1.0, hold="linear"),
-        output=Port(unit="rad"),
+        output=Port(unit="rad", recorded=(-1.0, 2.5)),
         blocks=(Block(name="mass", place="plant", dynamics=TransferFunction(num=(2.0,), den=(1.0, 1.0), delay_s=0.1)),),
         effects=(friction,),
     )
@@ -116,6 +116,8 @@ def test_a_written_model_reads_back_equal(tmp_path: Path) -> None:
         (("delay = 0.02", "delay = -0.02"), "negative"),
         (("offset = 5.0", 'offset = "five"'), "offset = 'five'"),
         (('unit = "V/s"', 'units = "V/s"'), "unknown key 'units'"),
+        (("offset = 5.0", "recorded = [1.0]"), "recorded = "),
+        (("offset = 5.0", "recorded = [2.0, 1.0]"), "recorded = "),
     ],
 )
 def test_a_wrong_model_is_refused_with_its_table(tmp_path: Path, change: tuple[str, str], says: str) -> None:
@@ -124,3 +126,15 @@ def test_a_wrong_model_is_refused_with_its_table(tmp_path: Path, change: tuple[s
     with pytest.raises(InputError, match=says) as caught:
         read_model(path)
     assert str(path) in str(caught.value)
+
+
+@given(low=st.floats(-1e3, 1e3), span=st.floats(1e-3, 1e3), beyond=st.floats(0.0, 10.0))
+def test_how_far_a_signal_leaves_the_recorded_range_is_counted_in_its_spans(
+    low: float, span: float, beyond: float
+) -> None:
+    port = Port(recorded=(low, low + span))
+    above = np.array([low, low + span, low + span * (1.0 + beyond), np.nan])
+    found, share = port.beyond(above)
+    assert found == pytest.approx(beyond, abs=1e-6 * (1.0 + abs(low) / span))
+    assert share <= 1.0 / 3.0
+    assert port.beyond(2.0 * low + span - above)[0] == pytest.approx(found, abs=1e-6 * (1.0 + abs(low) / span))
