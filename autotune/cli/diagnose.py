@@ -142,7 +142,7 @@ def diagnose(
     nominal = read_any_model(model)
     data = read_all(recordings, signal_names(t, u, y, r))
     if not isinstance(nominal, Model):
-        _diagnose_equations(nominal, data, without or (), place, out, model)
+        _diagnose_equations(nominal, data, controller, without or (), place, out, model)
         return
     law = None if controller is None else read_controller(controller)
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
@@ -173,6 +173,7 @@ def diagnose(
 def _diagnose_equations(
     nominal: EquationModel | BlackBox,
     data: Sequence[Recording],
+    controller: Path | None,
     without: Sequence[str],
     place: OutputFolder,
     out: Path,
@@ -183,16 +184,25 @@ def _diagnose_equations(
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
     from threadpoolctl import threadpool_limits
 
+    from autotune.controller import read_controller
     from autotune.diagnosis.equations import diagnose_equations
     from autotune.equations.effects import equation_of
     from autotune.equations.files import write_any
+    from autotune.experiment_design.in_equations import with_next_experiment_in_equations
     from autotune.report.equations_page import write_equations_page
 
+    law = None if controller is None else read_controller(controller)
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
     with threadpool_limits(1), Progress(*columns, console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task("diagnosing", total=1.0)
-        found = diagnose_equations(
-            nominal, data, without, lambda what, share: progress.update(task, description=what, completed=share)
+        found = with_next_experiment_in_equations(
+            diagnose_equations(
+                nominal,
+                data,
+                without,
+                lambda what, share: progress.update(task, description=what, completed=share),
+                law,
+            )
         )
     with place.filled() as folder:
         found.write(folder / "diagnosis.json")

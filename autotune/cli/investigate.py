@@ -47,12 +47,19 @@ def investigate(
     """Run the experiments that tell apart what a model may leave out, until one hypothesis is left."""
     from autotune.cli.common import ProgressBar, new_folder, rig_of
     from autotune.config import load_config
-    from autotune.model_file import read_model
+    from autotune.errors import InputError
+    from autotune.model_file import read_any
+    from autotune.models import Model
     from autotune.pipeline.investigation import Budget, Listeners
     from autotune.pipeline.investigation import investigate as find_out
 
     content = load_config(config)
-    nominal = read_model(model)
+    nominal = read_any(model)
+    if not isinstance(nominal, Model):
+        raise InputError(
+            "investigate plans experiments for a chain of blocks, these are equations", where=str(model),
+            remedy="use autotune diagnose, which names the next experiment, or a chain of autotune model linearise",
+        )  # fmt: skip
     given = read_all(recordings or [], signal_names(t, u, y, r))
     rig = rig_of(content, dry_run)
     new_folder(out, (ROUNDS, "diagnosis.json", "extended_model.toml", "report.html"), (config, model))

@@ -4,18 +4,22 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
+from autotune.controller import Controller
 from autotune.diagnosis.effects import KINDS, kind_of
 from autotune.diagnosis.equations.bench import Bench, EquationBench, Outcome
 from autotune.diagnosis.equations.closed import ClosedBench
 from autotune.diagnosis.equations.search import Searched, search
+from autotune.diagnosis.evidence.law import law_effect
 from autotune.diagnosis.evidence.samples import SampleEffect, inspect
+from autotune.diagnosis.result import NextExperiment
 from autotune.diagnosis.selection.probability import Candidate, weighed
+from autotune.diagnosis.thresholds import IN_USE, Thresholds
 from autotune.equations.black_box import BlackBox
 from autotune.equations.effects import equation_of
 from autotune.equations.identifiability import undetermined
@@ -54,6 +58,8 @@ class EquationDiagnosis:
         All hypotheses.
     recordings : tuple of Recording
         What was measured.
+    next_experiment : NextExperiment, optional
+        What would decide between what is left.
     """
 
     verdict: Literal["none", "parameters", "effect", "unexplained"]
@@ -67,6 +73,7 @@ class EquationDiagnosis:
     sentences: tuple[str, ...]
     searched: Searched
     recordings: tuple[Recording, ...]
+    next_experiment: NextExperiment | None = None
 
     @property
     def equations(self) -> EquationModel:
@@ -96,7 +103,7 @@ class EquationDiagnosis:
                 )
             },
             "undetermined": [one.sentence for one in undetermined(self.searched.retuned.fitted)],
-            "next_experiment": None,
+            "next_experiment": None if self.next_experiment is None else asdict(self.next_experiment),
         }  # fmt: skip
 
     def write(self, path: Path) -> None:
@@ -118,7 +125,7 @@ def _effect_table(e: Effect, p: float, model: EquationModel, whole: list[list[fl
 
 def _sample_table(s: SampleEffect, whole: list[list[float]]) -> dict[str, Any]:
     return {
-        "name": s.name, "probability": 0.97, "places": ["sensor"],
+        "name": s.name, "probability": 0.97, "places": [kind_of(s.name).place],
         "parameters": {k: {"value": q.value, "sd": q.sd if np.isfinite(q.sd) else None, "unit": q.unit}
                        for k, q in s.parameters.items()},
         "state": None, "input": None, "port": None, "equation": s.equation,
@@ -135,6 +142,8 @@ def diagnose_equations(
     recordings: Sequence[Recording],
     without: Sequence[str] = (),
     progress: Progress = quiet,
+    controller: Controller | None = None,
+    thresholds: Thresholds = IN_USE,
 ) -> EquationDiagnosis:
     """Find where and why recordings differ from the simulation of equations.
 
@@ -148,6 +157,10 @@ def diagnose_equations(
         Effects that are left out.
     progress : callable
         Told what is being done and the share done, 0 to 1.
+    controller : Controller, optional
+        The law that u was computed by; the sidecars' ``[controller]`` by default.
+    thresholds : Thresholds
+        What decides between two findings.
 
     Returns
     -------
@@ -164,13 +177,16 @@ def diagnose_equations(
     for one in recordings:
         if np.isfinite(one.y).sum() < 100:
             raise InputError(f"{len(one)} rows", where=one.name, remedy="a diagnosis needs at least 100 readings")
-    good, seen = inspect(recordings, without)
-    own = {effect.name for effect in model.effects}
+    good, seen = inspect(recordings, without, thresholds)
+    law = law_effect(recordings, controller, thresholds)
+    if law is not None and law.evidence > thresholds.samples_sure:
+        seen.append(law)
+    own = {*without, *(effect.name for effect in model.effects)}
     seen = [one for one in seen if one.name not in own]
     bench: Bench = (
         ClosedBench(model, recordings, good) if isinstance(model, BlackBox) else EquationBench(model, recordings, good)
     )
-    found = search(bench, [*without, *(s.name for s in seen)], progress)
+    found = search(bench, [*without, *(s.name for s in seen)], progress, thresholds)
     progress("checking on held-out rows", 0.95)
     errors = _held_out(bench, found)
     return _judged(model, recordings, found, tuple(seen), errors)
@@ -196,7 +212,9 @@ def _judged(
         verdict = "none"
     candidates = _candidates(found, 1.0 if verdict == "unexplained" else limits.unknown_odds)
     named = tuple(added) if verdict == "effect" else ()
-    places = dict.fromkeys(p for e in named for p in _places(e.name)) | (dict.fromkeys(["sensor"]) if seen else {})
+    places = dict.fromkeys(p for e in named for p in _places(e.name)) | dict.fromkeys(
+        kind_of(s.name).place for s in seen
+    )
     if verdict == "unexplained":
         best = min(found.tried, key=found.score, default=None)
         places = dict.fromkeys(_places(best.effects[-1].name) if best else ("plant",))
