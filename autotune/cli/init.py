@@ -32,7 +32,7 @@ PLANTS: Mapping[Plant, Table] = {
         "limits": {"u_min": 0.0, "u_max": 10.0, "u_safe": 0.0, "u_rate": 200.0, "y_min": 1.0, "y_max": 9.0,
                    "swing": 3.0, "time_s": 180.0},
         "operating_point": {"y": 5.0, "u_guess": 5.0, "u_uncertainty": 0.5, "approach": "ramp"},
-        "experiment": {"gain_sd": 0.0035, "budget_s": 58.0},
+        "experiment": {"gain_sd": 0.0044, "budget_s": 58.0},
         "controller": {"K": -0.01, "Ti_s": 6.0},
     },
     "servo": {

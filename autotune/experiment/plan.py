@@ -19,6 +19,8 @@ PHASE_MARGIN = 0.13
 SMOOTHING_SHARE = 0.12
 #: hysteresis in standard deviations of the smoothed noise
 HYSTERESIS_SD = 2.5
+#: what it costs a point, as a factor of its standard deviation, that drift and transient are estimated beside it
+ESTIMATED_TOO = 1.08
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -242,9 +244,10 @@ def choose(
 def expected_sd(noise_sd: float, y_amplitude: float, samples: float) -> float:
     """Return the relative standard deviation of a gain (and of its phase [rad]) under white noise.
 
-    It is the Cramer-Rao bound of the fundamental of a periodic signal of this amplitude, the drift known.
+    It is the Cramer-Rao bound of the fundamental of a periodic signal of this amplitude, the drift known, times what it
+    costs that drift and transient are estimated with it.
     """
-    return noise_sd / y_amplitude * math.sqrt(2.0 / max(samples, 1.0))
+    return ESTIMATED_TOO * noise_sd / y_amplitude * math.sqrt(2.0 / max(samples, 1.0))
 
 
 def time_s(choice: Choice, periods: int) -> float:
@@ -252,7 +255,9 @@ def time_s(choice: Choice, periods: int) -> float:
     return (periods + 0.1) * 2.0 * math.pi / choice.omega_rad_s
 
 
-def allot(choices: Sequence[Choice], goal: Goal, gain_sd: float, least_periods: int, left_s: float) -> tuple[int, ...]:
+def allot(
+    choices: Sequence[Choice], goal: Goal, gain_sd: float, least_periods: int, left_s: float, sure: float = 1.0
+) -> tuple[int, ...]:
     """Share the remaining rig time among the points to come, in whole periods.
 
     Every point gets the least; then the point that would be known worst gets one more, until all are good enough or no
@@ -270,13 +275,16 @@ def allot(choices: Sequence[Choice], goal: Goal, gain_sd: float, least_periods: 
         Whole periods that an estimate needs.
     left_s : float
         Rig time that is left [s].
+    sure : float
+        Part of the foreseen amplitude that the first setting reaches for sure.
     """
     periods = [least_periods] * len(choices)
     left_s -= sum(time_s(choice, least_periods) for choice in choices)
 
     def sd(i: int) -> float:
         length_s = periods[i] * 2.0 * math.pi / choices[i].omega_rad_s
-        return expected_sd(goal.noise_sd, choices[i].y_amplitude, length_s / goal.sample_time_s)
+        amplitude = choices[i].y_amplitude * (sure if i == 0 else 1.0)
+        return expected_sd(goal.noise_sd, amplitude, length_s / goal.sample_time_s)
 
     while True:
         fits = [

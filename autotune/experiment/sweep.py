@@ -25,6 +25,8 @@ from autotune.identification.frequency.windows import Rows
 PEAK_SHARE = 0.87
 #: the same for the first point, whose gain is foreseen from a short look at the plant
 FIRST_PEAK_SHARE = 0.79
+#: part of the amplitude so foreseen that it reaches for sure
+FIRST_SURE = 0.9
 LEAST_PERIODS = 2
 #: asymmetry of the duty (part of the period, less one half) from which on the mid-point is corrected within a point
 LARGEST_ASYMMETRY = 0.12
@@ -80,7 +82,8 @@ def sweep(
         goal = _goal(loop.envelope, wanted.relay_amplitude, known)
         choices = [_choice(goal, point.y, known, one) for one in targets[i:]]
         left_s = end_s - loop.tick.t_s
-        periods = allot(choices, goal, wanted.gain_sd, LEAST_PERIODS, left_s)
+        sure = 1.0 if known.swept else FIRST_SURE
+        periods = allot(choices, goal, wanted.gain_sd, LEAST_PERIODS, left_s, sure)
         expected_s = sum(time_s(choice, count) for choice, count in zip(choices, periods, strict=True))
         show(
             f"point {count + i + 1} of {count + len(targets)}: {math.degrees(target):.0f} deg",
@@ -145,7 +148,7 @@ def sweep_warnings(segments: Sequence[Segment], experiment: ExperimentSettings, 
     return (
         *beyond,
         f"{len(coarse)} of {len(sds)} points are known to {100 * max(coarse):.2g} % at worst, {100 * wanted:.2g} % was"
-        f" wanted: set experiment.budget_s = {enough_s:.2g}",
+        f" wanted: set experiment.budget_s = {float(f'{enough_s:.2g}'):g}",
     )
 
 

@@ -25,6 +25,7 @@ from autotune.report.figures import (
     gain_phase,
     nichols_figure,
     nyquist_figure,
+    ratio_title,
     sensitivity_figure,
 )
 from autotune.report.page import BLUE, GREEN, GREY, ORANGE, PURPLE, RED, Figure, Section, Table
@@ -58,8 +59,8 @@ def analysis_sections(
     """
     return (
         _points_section(analysis, signals, experiment),
-        _model_section(analysis),
-        _loop_section(analysis),
+        _model_section(analysis, signals),
+        _loop_section(analysis, signals),
     )
 
 
@@ -161,7 +162,7 @@ def _wrapped(angle_rad: float) -> float:
     return (angle_rad + math.pi) % (2 * math.pi) - math.pi
 
 
-def _model_section(analysis: Analysis) -> Section:
+def _model_section(analysis: Analysis, signals: SignalSettings) -> Section:
     reduced, fit = analysis.reduced, analysis.fit
     fitted = (
         f"A transfer function was fitted through the {'points' if fit.source == 'points' else 'recording'}:"
@@ -186,7 +187,10 @@ def _model_section(analysis: Analysis) -> Section:
             Table(
                 header=("parameter", "value"),
                 rows=(
-                    ("gain G_r", f"{reduced.G_r:.4g}"),
+                    (
+                        ratio_title("gain G_r", signals.y_unit, signals.u_unit, "s" * reduced.integrating),
+                        f"{reduced.G_r:.4g}",
+                    ),
                     *lag,
                     ("delay frequency ω_d [rad/s]", f"{reduced.omega_d_rad_s:.4g}"),
                 ),
@@ -226,7 +230,7 @@ def _transfer_text(fit: PlantFit) -> str:
     return f"gain {gain:.4g}, {kind}, lags {lags or 'none'}, dead time {plant.delay_s:.3g} s"
 
 
-def _loop_section(analysis: Analysis) -> Section:
+def _loop_section(analysis: Analysis, signals: SignalSettings) -> Section:
     controller, spec = analysis.controller, analysis.design.specification
     omega = _grid(analysis, 1.3)
     loops = (
@@ -245,16 +249,16 @@ def _loop_section(analysis: Analysis) -> Section:
         ),
     )
     design, m, d = analysis.design, analysis.margins, analysis.design.margins
-    binding = ", ".join(design.binding) or "none"
+    binding, u, y = ", ".join(design.binding) or "none", signals.u_unit, signals.y_unit
     rows = (
-        ("K", f"{controller.K:.5g}", f"{controller.K:.5g}"),
+        (ratio_title("K", u, y), f"{controller.K:.5g}", f"{controller.K:.5g}"),
         ("T_I [s]", f"{controller.Ti_s:.5g}", f"{controller.Ti_s:.5g}"),
         ("modulus margin", f"{d.modulus:.4f}", f"{m.modulus:.4f}"),
         ("phase margin [deg]", f"{math.degrees(d.phase_rad):.2f}", f"{math.degrees(m.phase_rad):.2f}"),
-        ("noise gain", f"{d.noise_gain:.4g}", f"{m.noise_gain:.4g}"),
+        (ratio_title("noise gain", u, y), f"{d.noise_gain:.4g}", f"{m.noise_gain:.4g}"),
         ("delay margin [s]", f"{d.delay_s:.3g}", f"{m.delay_s:.3g}"),
         ("crossover [rad/s]", f"{d.crossover_rad_s:.4g}", f"{m.crossover_rad_s:.4g}"),
-        ("H2 norm under load", f"{d.h2:.4g}", f"{m.h2:.4g}"),
+        (ratio_title("H2 norm under load", f"{y} √s" if y else "", u), f"{d.h2:.4g}", f"{m.h2:.4g}"),
     )
     return Section(
         title="Controller and margins",
@@ -274,7 +278,7 @@ def _loop_section(analysis: Analysis) -> Section:
             ),
         ),
         details=(_certificate(analysis),),
-        detail_tables=(_price_table(analysis),),
+        detail_tables=(_price_table(analysis, signals),),
         figures=(
             Figure(
                 figure=nyquist_figure(loops, analysis.points, controller, omega, spec.modulus_margin),
@@ -301,7 +305,7 @@ _PROMISES = {
 }
 
 
-def _price_table(analysis: Analysis) -> Table:
+def _price_table(analysis: Analysis, signals: SignalSettings) -> Table:
     """Return what each guarantee costs: every design judged on the fitted plant."""
     source = analysis.source
     rows = []
@@ -323,7 +327,15 @@ def _price_table(analysis: Analysis) -> Table:
         )
     return Table(
         caption="The price of each guarantee: designs of the same specification, judged on the fitted plant",
-        header=("designed on", "what is promised", "K", "T_I [s]", "H2 norm", "modulus margin", "phase margin [deg]"),
+        header=(
+            "designed on",
+            "what is promised",
+            ratio_title("K", signals.u_unit, signals.y_unit),
+            "T_I [s]",
+            ratio_title("H2 norm", f"{signals.y_unit} √s" if signals.y_unit else "", signals.u_unit),
+            "modulus margin",
+            "phase margin [deg]",
+        ),
         rows=tuple(rows),
     )
 

@@ -258,6 +258,14 @@ def axis_title(name: str, unit: str) -> str:
     return f"{name} [{unit or 'unit not given'}]"
 
 
+def ratio_title(name: str, over: str, under: str, and_under: str = "") -> str:
+    """Return a name with the unit of a ratio, where both of its units are given."""
+    if not (over and under):
+        return name
+    below = f"{under} {and_under}".strip()
+    return f"{name} [{over}/{f'({below})' if ' ' in below or '/' in below else below}]"
+
+
 def gain_phase(response: ComplexArray) -> tuple[FloatArray, FloatArray]:
     """Return gain and continuous phase [deg] of a response, (N,) each; the first phase lies between -360 and 0."""
     phase_deg = np.degrees(np.unwrap(np.angle(response)))

@@ -18,7 +18,7 @@ from autotune.pipeline.deployment import Deployment
 from autotune.recording import Recording
 from autotune.report.analysis_sections import analysis_sections, gains_text, margins_sentence
 from autotune.report.chart import Chart, make_subplots
-from autotune.report.figures import axis_title, recording_figure
+from autotune.report.figures import axis_title, ratio_title, recording_figure
 from autotune.report.page import BLUE, GREEN, GREY, ORANGE, PURPLE, RED, Figure, Page, Section, Table, add_line, thinned
 
 
@@ -158,7 +158,14 @@ def deployment_page(name: str, signals: SignalSettings, done: Deployment) -> Pag
     else:
         verdict = f"Not kept: {new}; {verification.reason}. The old gains are in place again."
     gains = Table(
-        header=("", "K", "T_I [s]", "T_d [s]", "T_f [s]", "now"),
+        header=(
+            "",
+            ratio_title("K", signals.u_unit, signals.y_unit),
+            "T_I [s]",
+            "T_d [s]",
+            "T_f [s]",
+            "now",
+        ),
         rows=tuple(
             (label, *(f"{value:.5g}" for value in (c.K, c.Ti_s, c.Td_s, c.Tf_s)), "in the rig" if held else "")
             for label, c, held in (("old", done.old, not done.kept), ("new, as read back", done.new, done.kept))

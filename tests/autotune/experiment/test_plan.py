@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -82,6 +83,14 @@ def test_a_plant_that_does_not_lag_is_refused() -> None:
     leading = FrequencyPoint(omega_rad_s=1.0, response=1.0 + 0.1j, covariance=NO_DOUBT)
     with pytest.raises(IdentificationError, match="between -90 and -180"):
         predicted([leading], 1, math.radians(-120.0))
+
+
+def test_a_first_setting_that_may_swing_less_than_foreseen_gets_periods_for_that() -> None:
+    relay = RelaySettings(y_centre=0.0, midpoint=0.0, amplitude=1.0)
+    one = Choice(settings=relay, phase_rad=-2.0, omega_rad_s=4.0, y_amplitude=2.4, turning_s=0.2)
+    smaller = replace(one, y_amplitude=0.9 * 2.4)
+    assert allot([one, one], GOAL, 0.004, 2, 1e3, 0.9) == allot([smaller, one], GOAL, 0.004, 2, 1e3)
+    assert allot([one, one], GOAL, 0.004, 2, 1e3, 0.9)[0] > allot([one, one], GOAL, 0.004, 2, 1e3)[0]
 
 
 @given(
