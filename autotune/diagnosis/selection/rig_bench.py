@@ -83,10 +83,10 @@ class RigBench:
     def with_both_scales(self, one: Judged) -> Judged:
         """Return a hypothesis with those of its numbers, fitted to long or to short windows, that suit both.
 
-        Where they differ the model lacks something that one of the scales bends them for: those are taken that lose
-        the smaller share at the other one's scale.
+        What a plant that integrates lacks piles up in a long run and bends its numbers: where they differ from those of
+        short windows, those are taken that lose the smaller share at the other one's scale.
         """
-        if not self.two_scales:
+        if not self.two_scales or not one.fit.model.transfer_function().integrators:
             return one
         p, held = one.fit.parametrisation, np.zeros(one.fit.theta.size, dtype=bool)
         try:
