@@ -94,7 +94,7 @@ def forecast(step: Step, s: Sparse, lags: int, r: Recording, case: Case, limits:
     """Forecast of a recording at its own rows, window after window."""
     out = np.full(len(r), np.nan)
     spans = [(max(a, lags * s.every), b) for a, b in windows(r.t, case.horizon_s, case.score_from_s)]
-    begins = np.array([a // s.every for a, _ in spans])
+    begins = np.array([min(a // s.every, len(s.t) - 1) for a, _ in spans])  # the last rows may be no whole step
     length = max((b - 1) // s.every - a // s.every for a, b in spans) + 2
     runs = run(step, s, lags, begins, length, limits)
     for (a, b), begin, values in zip(spans, begins, runs, strict=True):
