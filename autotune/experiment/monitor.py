@@ -76,11 +76,12 @@ class ReadingMonitor:
             self._bad_run += 1
             blind_s = reading.t_s - self._usable_s
             if self._patience.is_over(blind_s, self._bad_run):
-                raise (LinkError if reading.suspect else ExperimentStopped)(
-                    f"{reason}, {self._bad_run} reading(s) in a row: nothing to go by for {blind_s:.3g} s",
-                    where="sensor",
-                    remedy="check the sensor, its wiring and its scaling in the configuration",
-                )
+                said = f"{reason}, {self._bad_run} reading(s) in a row: nothing to go by for {blind_s:.3g} s"
+                if reading.suspect:
+                    remedy = "check cable and load of the line; limits.blind_s says how long this may last"
+                    raise LinkError(said, where="link", remedy=remedy)
+                remedy = "check the sensor, its wiring and its scaling in the configuration"
+                raise ExperimentStopped(said, where="sensor", remedy=remedy)
             if len(self._usable) == 100 and self._usable.count(False) > 100 * GARBLED_SHARE:
                 raise ExperimentStopped(
                     f"garbled sensor: {self._usable.count(False)} of the last 100 readings were unusable"
