@@ -107,6 +107,7 @@ def design_command(
             seen = "; ".join(check.sentence for check in looked) or designed.certificate
             typer.echo(f"designed on the reduced model; checked: {seen}")
     else:
+        from autotune.design.robust import UNCERTAIN
         from autotune.identification.frequency.thinning import said, thinned
         from autotune.identification.parametric import fit_plant
         from autotune.pipeline.analysis import of_use, on_measured
@@ -120,6 +121,8 @@ def design_command(
         fit = fit_plant(measured)
         source, designed, looked = on_measured(measured, fit, asked(fit.plant, measured[-1].omega_rad_s), kind.value)
         typer.echo(f"designed on the {source}; checked: " + "; ".join(check.sentence for check in looked))
+        if UNCERTAIN in designed.certificate:
+            typer.echo(f"warning: {designed.certificate}")
     place.json(designed.to_json())
     if law is not None:
         law.by(lambda part: write_controller(designed.controller, part))

@@ -25,7 +25,8 @@ from autotune.models import TransferFunction
 
 PROBABILITY = 0.95
 _ROUNDS = 8
-_CONTRADICTED = 1e-3
+#: probability below which the points contradict a fit's structure
+CONTRADICTED = 1e-3
 #: a plant of the region that misses a constraint by less is not worth another round; the answer says what is kept
 _TOLERANCE = 2e-3
 
@@ -61,7 +62,7 @@ def design_on_fit(
     The guarantee is that of the structures: a plant that none of them can follow is not covered, which
     :func:`autotune.design.robust.design_on_points` is for.
     """
-    if fit.source == "points" and fit.p_value < _CONTRADICTED:
+    if fit.source == "points" and fit.p_value < CONTRADICTED:
         raise DesignError(
             f"no plant of lags, integrator and dead time follows the points (chi-square {fit.chi_square:.0f} with "
             f"{fit.degrees_of_freedom} degrees of freedom)",

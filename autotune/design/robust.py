@@ -25,6 +25,8 @@ from autotune.design.uncertain import UncertainPlant, guaranteed, uncertain_plan
 from autotune.errors import DesignError
 from autotune.points import FrequencyPoint
 
+#: what a certificate says of points that hardly agree with the class
+UNCERTAIN = "not certain:"
 #: the search begins on every so many-th frequency
 _THIN = 4
 #: from so many nodes of the coarse grid, apart from each other in log gains
@@ -264,7 +266,10 @@ def _answer(
         h2=math.exp(_norm(plant, p)),
     )
     grown = plant.processes.inflation
-    remark = f"; the regions had to be taken {grown:.2f} times as large to be consistent" if grown > 1.0 else ""
+    remark = (
+        f"; {UNCERTAIN} the regions had to be taken {grown:.2f} times as large before any such process passed through"
+    )
+    remark = f"{remark} them" if grown > 1.0 else ""
     return Design(
         kind=kind,
         controller=weighted(controller, specification),

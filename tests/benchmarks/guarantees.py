@@ -28,6 +28,7 @@ import numpy as np
 from autotune.controller import PIDController
 from autotune.design.margins import margins
 from autotune.design.on_reduced import design_on_reduced
+from autotune.design.robust import UNCERTAIN
 from autotune.design.specification import Kind, Specification
 from autotune.design.synthesis import design
 from autotune.errors import AutotuneError
@@ -146,7 +147,8 @@ def makers(plant: TransferFunction, seed: int, kind: Kind) -> dict[str, Callable
         return design_on_reduced(plant, _noise(plant), kind).controller, True
 
     def tuned(points: list[FrequencyPoint]) -> tuple[PIDController, bool]:
-        return on_measured(of_use(points), _fit(tuple(points)), _noise(plant), kind)[1].controller, True
+        found = on_measured(of_use(points), _fit(tuple(points)), _noise(plant), kind)[1]
+        return found.controller, UNCERTAIN not in found.certificate
 
     return {
         "model": lambda: (design(plant, _noise(plant), kind, certificate=False).controller, True),

@@ -18,7 +18,7 @@ from autotune.design.synthesis import design
 from autotune.errors import DesignError
 from autotune.models import TransferFunction
 from tests.autotune.design.plants import BALL, EIGHT_LAGS, REDUCED, measured
-from tests.benchmarks.guarantees import plants, slow_points
+from tests.benchmarks.guarantees import plants, relay_points, slow_points
 
 
 def _lags(constants: list[float], delay_s: float, integrator: bool) -> TransferFunction:
@@ -125,11 +125,18 @@ def test_a_plant_whose_gain_rises_is_refused_although_wider_regions_would_hold_a
         design_on_points(slow_points(plant, np.random.default_rng(7)), spec1(10.0))
 
 
+def test_a_plant_outside_the_class_by_five_in_a_thousand_is_refused_too() -> None:
+    """Its zero is slower than its two fast lags together: beyond the points it leaves the class by a tenth."""
+    plant = list(plants("non-minimum phase", 15))[14]
+    with pytest.raises(DesignError, match="contradict each other"):
+        design_on_points(relay_points(plant, np.random.default_rng(14)), spec1(30.0), "pid")
+
+
 @pytest.mark.parametrize("sd", [1e-4, 3e-4])
 def test_points_more_exact_than_the_class_is_fine_are_no_contradiction(sd: float) -> None:
-    """Two in a thousand off one point is many standard deviations, and nothing to a margin of one half."""
+    """One in a thousand off one point is many standard deviations, and nothing to a margin of one half."""
     points = list(measured(BALL, None, gain_sd=sd, phase_sd_deg=60.0 * sd))
-    points[2] = replace(points[2], response=points[2].response * 1.004)
+    points[2] = replace(points[2], response=points[2].response * 1.002)
     m = margins(BALL, design_on_points(points, spec1(0.1)).controller)
     assert m.modulus >= 0.495
 
