@@ -9,7 +9,6 @@ import typer
 
 from autotune.cli import app
 from autotune.cli.common import OVERWRITE
-from autotune.errors import InputError
 from autotune.outputs import Output
 
 if TYPE_CHECKING:
@@ -45,7 +44,8 @@ def relay(
     noise_gain: Annotated[float, typer.Option(help="N_max of the design and of (26) [u/y unit]")] = 0.1,
     overwrite: OVERWRITE = False,
 ) -> None:
-    """Tables I and II and figures 6 to 9 of Le & Mendes for a run's points, or for a known plant."""
+    """Tables I and II and figures 6 to 9 of Le & Mendes, for a run's points, a known plant, or the paper's ball."""
+    from autotune.api.examples import BALL
     from autotune.api.methods import reduce, tune, validate
     from autotune.api.plants import as_plant
     from autotune.api.points import Points
@@ -56,10 +56,8 @@ def relay(
     from autotune.report.relay_figures import relay_page
 
     place = Output(out, inputs=(points, plant, controller), overwrite=overwrite)
-    if points is None and plant is None:
-        raise InputError("give --points, --plant or both", where="autotune paper relay")
     measured = Points([] if points is None else read_points(points))
-    known = fit_plant(measured).plant if plant is None else as_plant(plant)
+    known = as_plant(plant) if plant is not None else fit_plant(measured).plant if measured else BALL
     reduced = reduce(measured if measured else known)
     law = tune(reduced, noise_gain=noise_gain, certificate=False).controller if controller is None else None
     first = law if law is not None else read_controller(controller or Path())
@@ -71,8 +69,43 @@ def relay(
         {"PI" if controller is None else controller.stem: first, **others},
         validate(known, reduced, first),
         noise_gain,
-        "the plant" if plant is not None else "the plant fitted to the points",
+        "the plant fitted to the points" if plant is None and measured else "the plant",
     )
+    place.by(lambda part: write_page(page, part))
+    typer.echo(f"{page.verdict} wrote {out}")
+
+
+@paper.command("delay")
+def delay(
+    out: Annotated[Path, typer.Option(help="page to write (HTML)")],
+    sets: Annotated[int, typer.Option(min=2, help="noisy recordings of each of the paper's examples")] = 40,
+    overwrite: OVERWRITE = False,
+) -> None:
+    """Tables 1 and 2 of Ollivier et al.: one delay and two by modulating functions, on the paper's examples."""
+    import numpy as np
+    from rich.progress import track
+
+    from autotune.api.examples import example
+    from autotune.identification.delay.modulated_delay import modulated_delay
+    from autotune.identification.delay.two_delays import two_delays
+    from autotune.recording import Recording
+    from autotune.report.delay_tables import delay_page
+    from autotune.report.page import write_page
+
+    place = Output(out, inputs=(), overwrite=overwrite)
+    single, double = (example(name, noise=0.0) for name in ("delay", "two delays"))
+    one, two = [], []
+    for seed in track(range(sets), description="recordings", transient=True):
+        rng = np.random.default_rng(seed)
+        noisy = [
+            Recording(t=clean.t, u=clean.u, y=clean.y + sd * rng.standard_normal(len(clean)))
+            for clean, sd in ((single, 5.0), (double, 0.1))
+        ]
+        found = modulated_delay(noisy[0], 2, [(10.0 * k, 10.0 * k + 15.0) for k in range(1, 10)])
+        one.append([found.a[1], found.a[0], found.b, found.delay_s])
+        intervals = [(15.0 + 2.0 * k, 25.0 + 2.0 * k) for k in range(20)]
+        two.append(two_delays(noisy[1], intervals, polish=False).values)
+    page = delay_page(np.array(one), np.array(two))
     place.by(lambda part: write_page(page, part))
     typer.echo(f"{page.verdict} wrote {out}")
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 
 import numpy as np
 import pytest
@@ -42,8 +43,22 @@ def test_the_page_of_measured_points_needs_no_plant(tmp_path):
     (tmp_path / "result.json").write_text(json.dumps({"points": points_to_json(points)}), encoding="utf-8")
     run("paper", "relay", "--points", tmp_path / "result.json", "--noise-gain", 10, "--out", tmp_path / "page.html")
     assert "the plant fitted to the points" in (tmp_path / "page.html").read_text(encoding="utf-8")
-    neither = CliRunner().invoke(app, ["paper", "relay", "--out", str(tmp_path / "none.html")])
-    assert "give --points, --plant or both" in str(neither.exception)
+
+
+def test_without_points_and_plant_the_page_is_that_of_the_papers_ball(tmp_path):
+    assert "Criterion (10) holds" in run("paper", "relay", "--out", tmp_path / "ball.html")
+    assert "5.214" in (tmp_path / "ball.html").read_text(encoding="utf-8")
+
+
+def test_the_tables_of_one_delay_and_of_two_are_beside_the_papers(tmp_path):
+    """Means of six recordings within five of the paper's standard deviations of a mean, and its bias of .05."""
+    printed = run("paper", "delay", "--sets", 6, "--out", tmp_path / "delay.html")
+    found = [float(value) for value in re.findall(r"(?:delays?|and) (\d\.\d+) s", printed)]
+    for value, true, sd in zip(found, (4.0, 2.0, 4.0), (0.065, 0.01, 0.017), strict=True):
+        assert abs(value - true) < 5.0 * sd / math.sqrt(6.0) + 0.05
+    page = (tmp_path / "delay.html").read_text(encoding="utf-8")
+    for printed_there in ("Table 1", "Table 2", "0.084", "0.017"):
+        assert printed_there in page
 
 
 def test_the_bandwidth_that_a_noise_gain_leaves():
