@@ -109,7 +109,9 @@ def indirect_subspace(
 
     Notes
     -----
-    Consistent, if n_cl is not below the loop's minimal order; exact without noise.
+    Consistent, if n_cl is not below the loop's minimal order; exact without noise. A mode of the loop that r hardly
+    excites is seen late: the ninth singular value of the paper's example lies below its noise up to some 1e8 samples,
+    and a loop order of 7 gives a third of the pole error that 9 gives with 400,000.
     Far from efficient in B and D with noise: on the paper's own example 22 of 100
     models are not stabilised by the true controller. Equations (7) to (11) of the paper.
     """
