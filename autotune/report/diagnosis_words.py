@@ -10,7 +10,7 @@ import numpy as np
 from autotune.diagnosis.effects import kind_of
 from autotune.diagnosis.evidence.missing_law import MissingLaw
 from autotune.diagnosis.evidence.unseen_run import UnseenRun
-from autotune.diagnosis.result import Diagnosis, FoundEffect
+from autotune.diagnosis.result import Diagnosis, FoundEffect, NextExperiment
 from autotune.report.effect_words import clause, in_short, joined, of_candidate, sentence, with_spread
 
 #: Probability from which a statement is called sure, likely, and what is below that a guess.
@@ -103,9 +103,15 @@ def _to_do(found: Diagnosis) -> str:
     }.get(found.verdict, "Look at the rig where the diagram is lit.")
     if following is None:
         return first
+    return f"{first} {next_in_words(following)}"
+
+
+def next_in_words(following: NextExperiment) -> str:
+    """Return what to record next, what for, and what it would show."""
     settings = "; ".join(_setting(key, value) for key, value in following.settings.items())
     return (
-        f"{first} To {following.purpose}, record next: {following.kind} ({settings}). Expected: {following.expected}."
+        f"To {following.purpose}, record next: {following.kind} ({settings}). "
+        f"Expected: {following.expected.rstrip('.')}."
     )
 
 

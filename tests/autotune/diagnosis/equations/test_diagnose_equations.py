@@ -92,7 +92,9 @@ def test_missing_physics_is_named_at_its_place_with_its_size(
     assert place in (effect["state"], effect["input"])
     assert effect["parameters"][key]["value"] == pytest.approx(value, rel=0.05)
     assert found["fit"]["extended"] < 0.3 * found["fit"]["retuned"]
-    assert (tmp_path / "out" / "report.html").stat().st_size > 1000
+    page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+    assert f"({name} at {place}, probability" in page
+    assert "rec1.csv: root mean square error" in page
     simulated = CliRunner().invoke(
         app,
         ["simulate", "--model", str(tmp_path / "out" / "extended_model.toml"), files[1], "--out", f"{files[3]}.csv"],
