@@ -156,7 +156,12 @@ def _unraisable(unraisable: Any) -> None:
     if isinstance(unraisable.exc_value, KeyboardInterrupt):
         _thread.interrupt_main()
         return
-    sys.__unraisablehook__(unraisable)
+    # the finaliser of an object that Ctrl-C kept from being made whole
+    of_half_made = isinstance(unraisable.exc_value, AttributeError) and (
+        getattr(unraisable.object, "__name__", "") == "__del__"
+    )
+    if not of_half_made:
+        sys.__unraisablehook__(unraisable)
 
 
 def _hear_no_more() -> None:

@@ -17,6 +17,14 @@ from autotune.cli.guard import GuardedCommand
 app = typer.Typer()
 
 
+class Half:
+    def __init__(self) -> None:
+        raise KeyboardInterrupt
+
+    def __del__(self) -> None:
+        self.never_set
+
+
 @app.command(cls=GuardedCommand)
 def work() -> None:
     {work}
@@ -32,6 +40,7 @@ cli.main()
     [
         "raise KeyboardInterrupt",
         "exec('raise KeyboardInterrupt')",  # while a dataclass is made: python -m would end by a signal
+        "Half()",  # in a constructor: the finaliser finds half an object
         "raise SystemError('returned a result with an exception set') from KeyboardInterrupt()",  # in a compiled one
     ],
 )
