@@ -95,8 +95,9 @@ def _number(value: float | None, form: str = ".4g") -> str:
     return "" if value is None else format(value, form)
 
 
-def _gains(K: float | None, Ti_s: float | None) -> str:
-    return "" if K is None else f"{K:.4g}, {_number(Ti_s)}\N{NO-BREAK SPACE}s"
+def _gains(row: Row, K: float | None, Ti_s: float | None) -> str:
+    unit = f"\N{NO-BREAK SPACE}{row.u_unit}/{row.y_unit}" if row.u_unit and row.y_unit else ""
+    return "" if K is None else f"{K:.4g}{unit}, {_number(Ti_s)}\N{NO-BREAK SPACE}s"
 
 
 def _margins(modulus: float | None, phase_deg: float | None) -> str:
@@ -159,9 +160,9 @@ _COLUMNS: dict[str, _Columns] = {
         "gain": _gain,
         "lags [s]": lambda row: (row.lags_s or "") + (", integrator" if row.integrators else ""),
         "dead time [s]": lambda row: _number(row.dead_time_s, ".3g"),
-        "new K, Ti": lambda row: _gains(row.K, row.Ti_s),
+        "new K, Ti": lambda row: _gains(row, row.K, row.Ti_s),
         "modulus, phase margin": lambda row: _margins(row.modulus, row.phase_deg),
-        "present K, Ti": lambda row: _gains(row.K_now, row.Ti_now_s),
+        "present K, Ti": lambda row: _gains(row, row.K_now, row.Ti_now_s),
         "present margins": _present,
         "record": _record,
     },

@@ -110,7 +110,8 @@ def _calibration(marks: Sequence[Content], interval: Interval) -> tuple[Section,
     )  # fmt: skip
     figure.update_xaxes(range=[0.0, 1.04])
     figure.update_yaxes(range=[0.0, 1.04])
-    caption = f"{len(said)} statements; on the dashed line nine in ten of those made with 0.9 are right."
+    count = f"{len(said)} statement{'s' * (len(said) != 1)}"
+    caption = f"{count}; on the dashed line nine in ten of those made with 0.9 are right."
     return (
         Section(title="Are the probabilities true?", figures=(Figure(figure=figure, caption=caption, square=True),)),
     )

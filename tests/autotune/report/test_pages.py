@@ -51,7 +51,13 @@ def test_a_campaigns_page_shows_every_loops_plant_and_says_what_to_do(tmp_path):
     write_page(campaign_page(CampaignSettings(name="boilers"), rows), tmp_path / "page.html")
     content = (tmp_path / "page.html").read_text(encoding="utf-8")
     assert content.count("<polyline") == 2
-    for said in ("0.8\N{NO-BREAK SPACE}degC/%", ">90<", ">20<", "Retune what needs action first"):
+    for said in (
+        "0.8\N{NO-BREAK SPACE}degC/%",
+        "1\N{NO-BREAK SPACE}%/degC, 90",
+        ">90<",
+        ">20<",
+        "Retune what needs action first",
+    ):
         assert said in content
 
 
