@@ -96,7 +96,8 @@ def trials(model: EquationModel, signals: Signals, without: Sequence[str] = (), 
     black_box : bool
         Whether only inputs and output can be reached.
     """
-    found = [*_on_command(model, signals), *_on_reading(signals)]
+    moves = float(np.ptp(signals.u)) > 0.0  # a free decay says nothing of its actuator
+    found = [*(_on_command(model, signals) if moves else ()), *_on_reading(signals)]
     if not black_box:
         places: list[tuple[str, str, str]] = [("port", port.name, port.kind) for port in model.ports]
         if not places:  # without ports effects act on a state's derivative
