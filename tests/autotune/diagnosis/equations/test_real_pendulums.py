@@ -1,0 +1,60 @@
+"""Real pendulums beside the checkout: gravity written into the equations, and equations without it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from autotune.diagnosis.equations import EquationDiagnosis, diagnose_equations
+from autotune.diagnosis.thresholds import IN_USE
+from autotune.equations.read import equations_of
+from autotune.recording import Recording, read_recording
+
+#: Case, squared frequency and damping that are believed, rows that are used, every third of them.
+SWINGS = {"m_03": (21.5, 0.06, 2400), "m_04": (40.0, 0.25, 2100)}
+
+
+def diagnosed(shared: Path, case: str, torque: str, effects: int) -> EquationDiagnosis:
+    believed, damping, rows = SWINGS[case]
+    file = shared / "real_cases" / case / "fit.csv"
+    if not file.exists():
+        pytest.skip("no real recordings beside the checkout")
+    r = read_recording(file)
+    few = Recording(t=r.t[:rows:3], u=r.u[:rows:3], y=r.y[:rows:3], name=case)
+    content = {
+        "name": "pendulum", "input": [{"column": "u"}], "output": {"value": "theta", "unit": "rad"},
+        "state": [
+            {"name": "theta", "unit": "rad", "kind": "position", "derivative": "omega"},
+            {"name": "omega", "kind": "speed", "of": "theta", "derivative": f"u - c*omega - k*{torque}"},
+        ],
+        "parameters": {"c": {"value": damping, "spread": 0.5}, "k": {"value": believed}},
+    }  # fmt: skip
+    model = equations_of(content, "pendulum.toml")
+    return diagnose_equations(model, [few], thresholds=replace(IN_USE, equation_effects=effects))
+
+
+def friction(found: EquationDiagnosis) -> float:
+    (level,) = (e.parameters["level"].value for e in found.effects if e.name == "plant.coulomb_friction")
+    return float(level)
+
+
+@pytest.mark.parametrize("case", ["m_04", pytest.param("m_03", marks=pytest.mark.slow)])
+def test_with_gravity_in_the_equations_dry_friction_is_what_is_left_out(shared: Path, case: str) -> None:
+    found = diagnosed(shared, case, "sin(theta)", IN_USE.equation_effects)
+    assert found.verdict == "effect"
+    assert found.effects[0].name == "plant.coulomb_friction"
+    assert found.effects[0].state == "omega"
+    nominal, retuned, extended, _ = found.errors
+    assert extended < 0.2 * min(nominal, retuned)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", SWINGS)
+def test_without_gravity_the_friction_is_the_same(shared: Path, case: str) -> None:
+    """A spring that softens stands for gravity, with what its swing leaves: four effects in all."""
+    with_gravity = friction(diagnosed(shared, case, "sin(theta)", IN_USE.equation_effects))
+    without = diagnosed(shared, case, "theta", 4)
+    assert {"plant.cubic_stiffness", "plant.sine_torque"} & {e.name for e in without.effects}
+    assert friction(without) == pytest.approx(with_gravity, rel=0.15)
