@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from pathlib import Path
 
 import numpy as np
 
@@ -31,8 +32,8 @@ _TONES: dict[str, Tone] = {
     "abstain": "warn",
 }  # fmt: skip
 _NAMES: dict[Family, str] = {"linear": "linear valve", "play": "play", "stiction": "stiction"}
-#: Rows that are drawn at once: some windows in the middle of the record, where every turn is seen.
-_ROWS = 600
+#: What is drawn at once, where every turn is seen: periods in the middle of the record, and rows at most.
+_PERIODS, _ROWS = 14, 600
 
 
 def write_routine_page(found: RoutineDiagnosis, path: str | os.PathLike[str]) -> None:
@@ -47,7 +48,7 @@ def write_routine_page(found: RoutineDiagnosis, path: str | os.PathLike[str]) ->
     """
     errors = " ".join(found.sentences[1:])
     page = Page(
-        title=f"Loop in operation: {', '.join(found.bench.of.names)}",
+        title=f"Loop in operation: {', '.join(Path(name).name for name in found.bench.of.names)}",
         verdict=found.sentences[0],
         tone=_TONES[found.verdict],
         answers=(("How sure", errors), ("What to do", found.following)),
@@ -76,9 +77,10 @@ def _left_out(found: RoutineDiagnosis, family: Family) -> tuple[FloatArray, Floa
 
 def _section_of(found: RoutineDiagnosis) -> slice:
     rows = found.bench.of.rows_of(0)
-    size = rows.stop - rows.start
-    first = rows.start + max(0, (size - _ROWS) // 2)
-    return slice(first, min(first + _ROWS, rows.stop))
+    size, period = rows.stop - rows.start, found.bench.of.period_rows
+    drawn = min(_ROWS, int(_PERIODS * period)) if np.isfinite(period) else _ROWS
+    first = rows.start + max(0, (size - drawn) // 2)
+    return slice(first, min(first + drawn, rows.stop))
 
 
 def _runs(found: RoutineDiagnosis) -> Section:

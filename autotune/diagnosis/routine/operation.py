@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -36,6 +36,10 @@ class Operation:
         Stretch that a window belongs to: stretches are left out whole.
     names : tuple of str
         Of the recordings.
+    u_unit : str
+        Unit of u, as the sidecar of the first recording has it; empty where it has none.
+    seen : float
+        Share of the recorded time that is looked at; less than 1 where the recordings are long.
     """
 
     dt_s: float
@@ -48,6 +52,8 @@ class Operation:
     windows: IntArray
     stretch_of: IntArray
     names: tuple[str, ...]
+    u_unit: str = ""
+    seen: float = 1.0
 
     @property
     def stretches(self) -> int:
@@ -85,8 +91,9 @@ def operation_of(recordings: Sequence[Recording], limits: RoutineThresholds) -> 
     followed = has_r and any(float(np.ptp(recording["r"])) > 0.0 for recording in even)
     period = _period([recording.u for recording in even], [recording.y for recording in even], followed)
     thin = max(1, int(period / limits.most_rows_per_period)) if np.isfinite(period) else 1
-    thin = max(thin, -(-sum(len(recording) for recording in even) // limits.most_rows))
     even = [_thinned(recording, thin) for recording in even]
+    spanned_s = sum(recording.duration_s for recording in even)
+    even = [_liveliest(recording, limits.most_rows // len(even)) for recording in even]
     period = period / thin
     u, y = (np.concatenate([recording[name] for recording in even]) for name in ("u", "y"))
     starts = np.cumsum([0, *(len(recording) for recording in even[:-1])]).astype(np.int64)
@@ -102,7 +109,15 @@ def operation_of(recordings: Sequence[Recording], limits: RoutineThresholds) -> 
         windows=windows,
         stretch_of=stretch_of,
         names=tuple(recording.name for recording in even),
+        u_unit=_unit_of_u(recordings[0]),
+        seen=sum(recording.duration_s for recording in even) / spanned_s,
     )
+
+
+def _unit_of_u(recording: Recording) -> str:
+    units = recording.metadata.get("units", {})
+    unit = units.get("u", "") if isinstance(units, Mapping) else ""
+    return unit if isinstance(unit, str) else ""
 
 
 def _even(recording: Recording, limits: RoutineThresholds) -> Recording:
@@ -128,6 +143,18 @@ def _even(recording: Recording, limits: RoutineThresholds) -> Recording:
 def _thinned(recording: Recording, every: int) -> Recording:
     """Return every so many-th row: a position that the valve passed between them is not seen any more."""
     return recording if every == 1 else recording.resampled(every * recording.sample_time_s)
+
+
+def _liveliest(recording: Recording, most: int) -> Recording:
+    """Return the part of at most so many rows in which the command travels furthest; thinner rows would miss turns."""
+    if len(recording) <= most:
+        return recording
+    travelled = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(recording.u)))])
+    firsts = np.arange(0, len(recording) - most + 1, max(1, most // 4))
+    first = int(firsts[np.argmax(travelled[firsts + most - 1] - travelled[firsts])])
+    return recording.between(
+        float(recording.t[first]), float(recording.t[first + most - 1]) + 0.5 * recording.sample_time_s
+    )
 
 
 def _period(us: Sequence[FloatArray], ys: Sequence[FloatArray], followed: bool) -> float:

@@ -170,8 +170,8 @@ class RoutineDiagnosis:
         if self.band is None or self.jump is None:
             return None
         return {
-            "band": self.band.as_json("{u}"),
-            "slip_jump": self.jump.as_json("{u}"),
+            "band": self.band.as_json(self.bench.of.u_unit),
+            "slip_jump": self.jump.as_json(self.bench.of.u_unit),
             "band_of_range": self.band.value / self.bench.span,
             "kinds_apart": self.kinds_apart,
             "runs_on": self.fits[self.family].at.runs_on,

@@ -29,20 +29,20 @@ def said(found: RoutineDiagnosis, limits: RoutineThresholds) -> tuple[str, ...]:
         case "none":
             first = "Nothing found: no regular oscillation, and no fault of the valve that the free runs would show."
         case _:
-            first = (
-                f"The loop oscillates with a period of {period}, and this record does not tell whether by its tuning,"
-                " its valve or from outside."
-            )
-    return (first, _runs(found), *_doubts(found, limits))
+            valve = "" if ruled_out(found, limits) else ", its valve"
+            first = f"The loop oscillates with a period of {period}, and this record does not tell whether"
+            first += f" by its tuning{valve} or from outside."
+    return (first, _runs(found), *_reservations(found, limits))
 
 
 def _valve(found: RoutineDiagnosis) -> str:
     assert found.band is not None
     assert found.jump is not None
     band, jump, span = found.band, found.jump, found.bench.span
+    unit = found.bench.of.u_unit or "unit of u"
     name = "Stiction" if found.verdict == "stiction" else "Play (backlash)"
     said = (
-        f"{name} in the valve: the command must turn by {band.value:.3g} ({band.low:.3g} to {band.high:.3g}, unit of u;"
+        f"{name} in the valve: the command must turn by {band.value:.3g} ({band.low:.3g} to {band.high:.3g}, {unit};"
         f" {band.value / span:.0%} of u's range) before the valve follows"
     )
     if found.verdict == "stiction":
@@ -59,7 +59,13 @@ def _runs(found: RoutineDiagnosis) -> str:
     )
 
 
-def _doubts(found: RoutineDiagnosis, limits: RoutineThresholds) -> tuple[str, ...]:
+def _reservations(found: RoutineDiagnosis, limits: RoutineThresholds) -> tuple[str, ...]:
+    part = found.bench.of.seen
+    said = (f"Looked at: the {part:.0%} of the recorded time in which u travels furthest.",) if part < 1.0 else ()
+    return (*_reasons(found, limits), *said)
+
+
+def _reasons(found: RoutineDiagnosis, limits: RoutineThresholds) -> tuple[str, ...]:
     seen = found.oscillation
     if found.verdict == "abstain":
         reasons = []
@@ -74,12 +80,17 @@ def _doubts(found: RoutineDiagnosis, limits: RoutineThresholds) -> tuple[str, ..
         best = max(found.wide.values(), key=lambda c: c.decrease)
         if best.decrease > 0.0:
             reasons.append("a faulty valve is better than a linear one, but not clearly")
-        elif all(c.decrease < 0.0 and c.chance > 1.0 - limits.unlikely for c in found.wide.values()):
+        elif ruled_out(found, limits):
             reasons.append("a valve with a wide band is clearly worse than a linear one, so it is not the valve")
         return (f"Why not: {'; '.join(reasons)}.",)
     if found.verdict in ("stiction", "backlash") and found.bench.of.stretches < 2 * limits.least_stretches:
         return (f"The record holds {found.bench.of.stretches} stretches only; a longer one narrows the interval.",)
     return ()
+
+
+def ruled_out(found: RoutineDiagnosis, limits: RoutineThresholds) -> bool:
+    """Return whether valves with a wide band are clearly worse than a linear one."""
+    return all(one.decrease < 0.0 and one.chance > 1.0 - limits.unlikely for one in found.wide.values())
 
 
 def following(found: RoutineDiagnosis) -> str:

@@ -203,6 +203,17 @@ def test_a_record_that_nothing_can_be_learnt_from_is_refused_with_its_reason():
         diagnose_routine([slow, replace(slow, t=2.0 * slow.t)])
 
 
+def test_a_long_record_is_looked_at_where_the_command_travels_furthest_and_says_so():
+    calm = loop_of("quiet", rows=9000)
+    u = calm.u.copy()
+    u[4000:] += 5.0 * np.sin(2.0 * np.pi * np.arange(5000) / 20.0)
+    operation = operation_of([replace(calm, u=u)], replace(LIMITS, most_rows=2000))
+    assert operation.dt_s == 1.0  # no coarser than the oscillation needs
+    assert operation.u.size == 2000
+    assert np.ptp(operation.u[:100]) > 8.0
+    assert operation.seen == pytest.approx(2000 / 9000, rel=0.01)
+
+
 def test_the_command_writes_what_was_found_and_a_page(tmp_path):
     write_recording(loop_of("stiction", valve="choudhury", S=6.0, J=4.0), tmp_path / "flow.csv")
     done = CliRunner().invoke(
