@@ -31,7 +31,7 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
-__version__ = "0.1.0"
+from autotune.version import __version__ as __version__
 
 if TYPE_CHECKING:
     from autotune.api.control_systems import from_control, to_control

@@ -14,12 +14,12 @@ from urllib.parse import quote
 import pyarrow as pa
 import pyarrow.parquet
 
-import autotune
 from autotune.batch.export import to_parquet
 from autotune.batch.loop import Finding, Row, Work
 from autotune.batch.settings import CampaignSettings, LoopSettings, matches
 from autotune.outputs import Output, write_whole
 from autotune.progress import Progress
+from autotune.version import __version__
 
 RESULTS = "results.parquet"
 
@@ -116,7 +116,7 @@ class Campaign:
         """Return a digest of all that a loop's result follows from."""
         files = [str(path) for path in matches(Path(loop.file))] + [loop.model, loop.controller]
         stamps = [_stamp(Path(file)) for file in files if file]
-        asked = [autotune.__version__, loop.model_dump(), self.settings.model_dump(exclude={"name"}), stamps]
+        asked = [__version__, loop.model_dump(), self.settings.model_dump(exclude={"name"}), stamps]
         return hashlib.sha256(json.dumps(asked, sort_keys=True, default=str).encode()).hexdigest()
 
 

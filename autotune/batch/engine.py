@@ -13,9 +13,9 @@ from dask.system import CPU_COUNT
 from distributed import Client, KilledWorker, LocalCluster, Worker, as_completed
 from distributed.security import Security
 
-import autotune
 from autotune.errors import InputError
 from autotune.interrupts import interrupt_held
+from autotune.version import __version__
 
 Given = TypeVar("Given")
 Answer = TypeVar("Answer")
@@ -129,7 +129,7 @@ def _check(client: Client, scheduler: str) -> None:
 
 
 def _version() -> str:
-    return autotune.__version__
+    return __version__
 
 
 def run_all(

@@ -35,7 +35,7 @@ app.add_typer(identify, name="identify")
 
 def _say_version(asked: bool) -> None:
     if asked:
-        from autotune import __version__
+        from autotune.version import __version__
 
         typer.echo(f"relay-autotune {__version__}")
         raise typer.Exit

@@ -12,7 +12,7 @@ from autotune.diagnosis.evidence.stretches import advantage, judged_rows
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import Fit
 from autotune.diagnosis.fitting.long_windows import spread_of
-from autotune.diagnosis.selection.hypothesis import Hypothesis
+from autotune.diagnosis.selection.hypothesis import Hypothesis, vanished
 from autotune.diagnosis.selection.probability import Candidate, weighed
 from autotune.diagnosis.selection.search import Search
 from autotune.diagnosis.thresholds import Thresholds
@@ -62,14 +62,15 @@ class Judged:
         return math.sqrt(float(self.long_squares.sum()) / judged_rows(self.data)) / spread_of(self.data)
 
     def is_better(self, other: Judged, share: float) -> bool:
-        """Whether it takes a share of another one's held-out error away, at one of the scales."""
-        ratios = [
-            float(mine.sum() / theirs.sum())
-            for mine, theirs in (
-                (self.long_squares, other.long_squares),
-                (self.short_squares, other.short_squares),
-            )
-        ]
+        """Whether it takes a share of another one's held-out error away, at one of the scales.
+
+        What it has beyond the other one may have come to nothing on long windows: then short ones do not speak for it.
+        """
+        extra = set(self.names) - set(other.names)
+        at_nothing = bool(extra) and extra <= vanished(Hypothesis(names=self.names, fit=self.fit))
+        ratios = [float(self.long_squares.sum() / other.long_squares.sum())]
+        if not at_nothing:
+            ratios.append(float(self.short_squares.sum() / other.short_squares.sum()))
         return math.sqrt(min(ratios)) < 1.0 - share
 
 
