@@ -19,6 +19,8 @@ from tests.benchmarks._rival_cases import Case
 #: Lags and degrees that are tried; weights of the ridge; points of the Gaussian process.
 LAGS, DEGREES, RIDGES, POINTS = (1, 2, 3, 4), (1, 2, 3), (1e-8, 1e-5, 1e-2), 400
 ROWS_PER_CONSTANT = 20
+#: Rows that are left of a recording at the least.
+LEAST_ROWS = 100
 #: A run that leaves the recorded range by this many spans is held there.
 FAR = 3.0
 
@@ -50,15 +52,15 @@ def nrmse(t: np.ndarray, y: np.ndarray, forecast: np.ndarray, score_from_s: floa
         return float(np.sqrt(np.mean((y - forecast)[late] ** 2)) / np.std(y[late]))
 
 
-def every(model: Model, dt: float, horizon_s: float | None) -> int:
-    """Every how many rows, from the plant's fastest time constant or period, and the horizon."""
+def every(model: Model, dt: float, horizon_s: float | None, rows: int) -> int:
+    """Every how many rows, from the plant's fastest time constant or period, the horizon, and the rows there are."""
     plant = [b for b in model.blocks if b.place == "plant"] or list(model.blocks)
     poles = np.concatenate([np.zeros(0), *(np.roots(b.dynamics.den) for b in plant)])
     poles = poles[np.abs(poles) > 1e-9]
     if not len(poles):
         return 1
     fastest = min(2.0 * np.pi / abs(p) if abs(p.imag) > 1e-9 else 3.0 / abs(p) for p in poles)
-    most = np.inf if horizon_s is None else horizon_s / (10.0 * dt)
+    most = rows / LEAST_ROWS if horizon_s is None else min(rows / LEAST_ROWS, horizon_s / (10.0 * dt))
     return max(1, int(min(fastest / (ROWS_PER_CONSTANT * dt), most)))
 
 
@@ -147,7 +149,7 @@ def _last_third(step: Step, s: Sparse, lags: int, steps: int, limits: tuple[floa
 def _prepared(case: Case, model: Model) -> tuple[list[Sparse], int, int, int, tuple[float, float]]:
     given = [read_recording(path) for path in case.given]
     dt = given[0].sample_time_s
-    q = every(model, dt, case.horizon_s)
+    q = every(model, dt, case.horizon_s, min(len(r) for r in given))
     late = round(sum(b.dynamics.delay_s for b in model.blocks) / dt)
     train = [sparse(r, q, late) for r in given]
     low, high = (f(np.concatenate([s.y for s in train])) for f in (np.min, np.max))
