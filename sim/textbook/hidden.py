@@ -112,7 +112,8 @@ def _sign(v: float, s: Scale) -> float:
 
 def _force(name: str, a: float, s: Scale, rng: np.random.Generator) -> Hidden:
     F, V, X = s.force, s.speed, max(s.position, 1e-12)
-    high, stiffness = s.middle + a * s.top, (0.4 / s.dt_s) ** 2
+    # a stop that is never met conceals nothing
+    high, stiffness = s.middle + min(a, 0.85) * s.top, (0.4 / s.dt_s) ** 2
     laws: dict[str, Callable[[float, float, float], float]] = {
         "plant.coulomb_friction": lambda t, v, x: -a * F * _sign(v, s),
         "plant.stribeck_friction": lambda t, v, x: -a * F * (0.5 + exp(-((v / (0.15 * V)) ** 2))) * _sign(v, s),
