@@ -83,7 +83,10 @@ def diagnose_routine(
     )  # fmt: skip
     if found.family != "linear":
         band, jump = _bands(bench, found.family, found.fits[found.family], limits)
-        found = replace(found, band=band, jump=jump)
+        if band.low < limits.least_band * bench.span:
+            found = replace(found, verdict="abstain", kinds_apart=False)
+        else:
+            found = replace(found, band=band, jump=jump)
     return replace(found, sentences=sentences.said(found, limits), following=sentences.following(found))
 
 

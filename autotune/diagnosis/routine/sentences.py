@@ -79,7 +79,7 @@ def _reasons(found: RoutineDiagnosis, limits: RoutineThresholds) -> tuple[str, .
             reasons.append("its phase does not last")
         best = max(found.wide.values(), key=lambda c: c.decrease)
         if best.decrease > 0.0:
-            reasons.append("a faulty valve is better than a linear one, but not clearly")
+            reasons.append("a faulty valve is better than a linear one, but not clearly, or its band may be narrow")
         elif ruled_out(found, limits):
             reasons.append("a valve with a wide band is clearly worse than a linear one, so it is not the valve")
         return (f"Why not: {'; '.join(reasons)}.",)

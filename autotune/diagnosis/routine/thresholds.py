@@ -34,6 +34,7 @@ class RoutineThresholds:
     least_decrease: float = _known(0.2, "ln of squared error", "mean over the stretches left out, that a valve's fault must bring", "counted")
     kinds_apart: float = _known(0.05, "probability", "of chance, up to which sticking and play are told apart", "convention")
     wide_band: float = _known(0.2, "of u's range", "from which on a band can keep a loop swinging; narrower ones are dead time at most", "convention")
+    least_band: float = _known(0.1, "of u's range", "that the interval of a band must exclude before a fault is named: half of a wide one", "counted")
     unlikely: float = _known(0.05, "probability", "of chance from which on wide bands are no better than a linear valve, before an oscillation is said to come from outside", "convention")
     whitening_order: int = _known(30, "rows", "order of the noise model at most, for the band's value", "cost")
     resamplings: int = _known(400, "resamplings", "of the stretches, for the interval of a band", "cost")
