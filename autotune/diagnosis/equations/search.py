@@ -1,4 +1,7 @@
-"""First order screens every effect at every place, fits decide, one effect after the other."""
+"""First order screens every effect at every place, fits decide, one effect after the other.
+
+The steps of one search: the file is a little longer than others.
+"""
 
 from __future__ import annotations
 

@@ -4,6 +4,8 @@ Where no explanation reaches the noise, the model's own error decides: there sho
 whatever bends easily, and a likelihood of white noise is sure of anything. So models run free for as long as the plant
 allows, numbers are fitted to all stretches but one and judged on that one, and what is usual in a rig of its kind
 needs less evidence than what is rare.
+
+The steps of one search: the file is a little longer than others.
 """
 
 from __future__ import annotations
@@ -53,16 +55,14 @@ def search_rig(
 
     Parameters
     ----------
-    model : Model
-        Nominal model.
-    recordings, good : sequences
-        What was measured, and which rows count.
+    model, recordings, good
+        Nominal model, what was measured, and which rows count.
     left_out : collection of str
         Effects that are not looked for.
     progress : callable
         Told what is being done and the share done, 0 to 1.
     limits : Thresholds
-        What decides between two findings.
+        What decides between findings.
     known : Fit, optional
         What the search beside the noise found to explain most: it is judged as well, and not as something rare.
 
@@ -79,8 +79,8 @@ def search_rig(
     Notes
     -----
     Forward search with a beam, then what is not needed is dropped. An effect must be usual in a rig of its kind or the
-    evidence must outweigh that it is not, it must take away a tenth of the held-out error, and stretches must agree on
-    it. What is excited in no stretch but one is found with less power.
+    evidence outweigh that it is not, it takes away a tenth of the held-out error, and stretches agree on it. What is
+    excited in no stretch but one is found with less power.
     """
     with threadpool_limits(1), ThreadPoolExecutor(2) as pool:
         progress("retuning on long windows", 0.0)
@@ -93,13 +93,12 @@ def search_rig(
             pool=pool,
         )
         bench, roots = _roots(model, bench)
-        nominal, retuned = roots[0], roots[1]
+        nominal, retuned = roots
         away = np.abs(retuned.fit.theta - retuned.fit.parametrisation.centre) / retuned.fit.parametrisation.spreads
-        beam = [retuned, *([nominal] if float(np.max(away)) > limits.nominal_too else [])]
+        beam = [retuned, nominal] if float(np.max(away)) > limits.nominal_too else [retuned]
         bench = replace(bench, lasting=tuple(_lasting(retuned, bench)))
         bench, found = _grown(retuned, beam, bench, progress, limits)
-        found += _known(known, bench)
-        found = _pruned(found, bench)
+        found = _pruned([*found, *_known(known, bench)], bench)
         chosen = bench.with_both_scales(simplest(found, limits.material))
         return RigSearch(nominal=nominal, retuned=retuned, judged=tuple(found), chosen=chosen)
 
