@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import _signal as signal  # type: ignore[import-not-found]  # signal itself makes enumerations first: too late
 import os
-import signal
 
 
 def main() -> None:
