@@ -1,8 +1,10 @@
 """Folders of rigs that exist: a model and recordings, read without the tool's own readers.
 
-DIR/NAME/model.toml     nominal chain
-DIR/NAME/*.csv          recordings, columns t,u,y and further ones; those named test* or unseen* are kept back
-DIR/NAME/*.toml         beside a recording: its sidecar
+::
+
+    DIR/NAME/model.toml     nominal chain
+    DIR/NAME/*.csv          recordings, columns t,u,y and further ones; those named test* or unseen* are kept back
+    DIR/NAME/*.toml         beside a recording: its sidecar
 """
 
 from __future__ import annotations
