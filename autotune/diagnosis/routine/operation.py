@@ -90,7 +90,8 @@ def operation_of(recordings: Sequence[Recording], limits: RoutineThresholds) -> 
     has_r = all("r" in recording.extra and np.isfinite(recording["r"]).all() for recording in even)
     followed = has_r and any(float(np.ptp(recording["r"])) > 0.0 for recording in even)
     period = _period([recording.u for recording in even], [recording.y for recording in even], followed)
-    thin = max(1, int(period / limits.most_rows_per_period)) if np.isfinite(period) else 1
+    few = sum(len(recording) for recording in even) <= limits.thinned_from or not np.isfinite(period)
+    thin = 1 if few else max(1, int(period / limits.most_rows_per_period))
     even = [_thinned(recording, thin) for recording in even]
     spanned_s = sum(recording.duration_s for recording in even)
     even = [_liveliest(recording, limits.most_rows // len(even)) for recording in even]

@@ -24,6 +24,7 @@ class RoutineThresholds:
     # records and windows
     least_rows: int = _known(100, "rows", "of a record", "convention")
     most_rows: int = _known(8000, "rows", "that are fitted; of a longer record the part in which u travels furthest", "cost")
+    thinned_from: int = _known(2500, "rows", "of all recordings, from which on they are thinned", "cost")
     most_rows_per_period: int = _known(40, "rows", "of the dominant oscillation; with more the record is thinned", "cost")
     periods_per_window: float = _known(3.0, "periods", "that a free run lasts", "convention")
     least_window_rows: int = _known(30, "rows", "that a free run lasts", "convention")
