@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from autotune.controller import Controller
-from autotune.diagnosis.effects import kind_of, require_known
+from autotune.diagnosis.effects import ALL, kind_of, require_known
 from autotune.diagnosis.evidence.adequacy import is_white, residual_tests
 from autotune.diagnosis.evidence.constancy import largest_variation
 from autotune.diagnosis.evidence.description import describe
@@ -132,7 +132,7 @@ def _gathered(
         samples=samples,
         residual=residual_tests(chosen, found.data, found.gained, uneven=uneven),
         quality=held_out(found.retuned.fit, chosen, found.data),
-        offset=offset_of(chosen, thresholds.offset_sigmas),
+        offset=None if _unmoved(recordings) else offset_of(chosen, thresholds.offset_sigmas),
         evened=late is not None,
     )
 
@@ -154,6 +154,13 @@ def _of_rig(evidence: Evidence, model: Model, without: Sequence[str], progress: 
     samples = tuple(s for s in evidence.samples if _stays(s, bool(rig.chosen.names)) or is_material(s, fit, data))
     quality = rig.quality(evidence.quality.noise_floor)
     return replace(evidence, search=rig.as_search(), samples=samples, quality=quality, offset=None, rig=rig)
+
+
+def _unmoved(recordings: Sequence[Recording]) -> tuple[str, ...]:
+    """Return the effects that act on a command, where none moves: there they are a constant, and say nothing."""
+    if any(float(np.ptp(r.u)) > 0.0 for r in recordings):
+        return ()
+    return tuple(k.name for k in ALL if k.place == "actuator" or k.name == "timing.dead_time")
 
 
 def _stays(sample: SampleEffect, beside_effects: bool) -> bool:

@@ -108,7 +108,7 @@ def odds_of_unknown(residual: ResidualTests, explains_most: bool, limits: Thresh
     the two weigh the same, but for effects that explain most of what retuning leaves.
     """
     if residual.is_noise:
-        excess = max(residual.reduced_chi2 - 1.0, 0.0) / (residual.allowed - 1.0)
+        excess = min(max(residual.reduced_chi2 - 1.0, 0.0) / (residual.allowed - 1.0), 1.0)
         return limits.unknown_odds + (1.0 - limits.unknown_odds) * excess**4
     return limits.half_explained_odds if explains_most else 1.0
 

@@ -1,0 +1,20 @@
+"""Recordings in which nobody moves the command tell nothing of what acts on a command."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from autotune.diagnosis import diagnose
+from autotune.models import Block, Model, Port, TransferFunction
+from autotune.recording import Recording
+
+
+def test_no_effect_of_the_actuator_is_named_where_the_command_stands() -> None:
+    t = 0.02 * np.arange(1200)
+    noise = 0.01 * np.random.default_rng(1).normal(size=t.size)
+    y = 0.4 + 0.01 * t + np.exp(-0.1 * t) * np.cos(np.sqrt(16.0 - 0.01) * t) + noise
+    y = 0.1 * np.round(y / 0.1)  # a drift behind a converter, about another centre than the model's
+    arm = Block(name="arm", place="plant", dynamics=TransferFunction(num=(1.0,), den=(1.0, 0.2, 16.0)))
+    model = Model(name="swing", input=Port(), output=Port(), blocks=(arm,))
+    found = diagnose(model, [Recording(t=t, u=np.zeros(t.size), y=y)])
+    assert not [e.name for e in found.effects if e.name.startswith("actuator.")]
