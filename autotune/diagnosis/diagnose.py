@@ -75,7 +75,7 @@ def diagnose(
     """
     require_known(model.effects, model.name)
     _require_rows(recordings)
-    without = [*without, *(effect.name for effect in model.effects)]
+    without = [*without, *(effect.name for effect in model.effects), *_unmoved(recordings)]
     evidence = _gathered(model, recordings, controller, without, progress, thresholds)
     evidence = _of_rig(evidence, model, without, progress)
     found, verdict = evidence.search, judged(evidence)
