@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import signal
 from pathlib import Path
 
 import pytest
@@ -12,6 +13,10 @@ from hypothesis import settings
 # one profile everywhere: the machine's load decides how long an example takes, so there is no deadline
 settings.register_profile("project", deadline=None, print_blob=True)
 settings.load_profile("project")
+
+# a shell has its background jobs ignore Ctrl-C, and tests that send it would not be heard
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 #: Recordings that lie beside a checkout and never in it; tests that use them are skipped elsewhere.
 SHARED = Path(__file__).resolve().parents[2] / "shared"

@@ -40,7 +40,7 @@ def test_counts_come_in_and_go_out_exactly(uno_elf: Path) -> None:
         return 1234
 
     uno = Uno(uno_elf, uno_elf.parent, plant)
-    assert uno.ask(Kind.HELLO).values == (2, 1000, 1023, U_FULL, 1)
+    assert uno.ask(Kind.HELLO).values == (3, 1000, 1023, U_FULL, 1)
     uno.ask(Kind.TAKE, 0, 0, U_FULL, 500)
     for u in (0, 1, 2, 7999, U_FULL - 1, U_FULL):
         uno.ask(Kind.EXCHANGE, u)

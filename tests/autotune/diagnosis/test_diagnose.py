@@ -170,7 +170,7 @@ def test_the_lift_that_falls_with_height_is_found_in_a_real_tube(shared: Path, n
     rate = leak.parameters["rate"]
     assert abs(rate.value - 0.12) < 2.0 * rate.sd
     assert {1: 0.05, 2: 0.07}[number] < rate.value < 0.15
-    assert rate.sd < {1: 0.04, 2: 0.02}[number]
+    assert rate.sd < {1: 0.04, 2: 0.025}[number]  # of the scale that the number is from, long free runs or short ones
     # on the half that no fit has seen; a linear model has 0.552 and 0.212 there
     unseen = read_recording(folder / f"test_{number}.csv")
     scored = unseen.t >= 3.0
