@@ -125,6 +125,7 @@ class Thresholds:
     ringing: float = _known(0.05, "damping", "below which long windows are some periods", "convention")
     ringing_periods: float = _known(8.0, "periods", "length of long windows of a plant that rings", "convention")
     swinging: float = _known(0.5, "damping", "below which a fit goes from short to long windows", "convention")
+    varies_more: float = _known(3.0, "of the gained", "of a rig's effects, from which on what varies beside them is what is missing; real rigs leave up to 1.3", "real rigs")
     rig_rows: int = _known(9000, "rows", "fitted at most", "cost")
     material: float = _known(0.1, "of the held-out error", "that one more effect must take away", "convention")
     material_numbers: float = _known(0.25, "of the held-out error", "that retuned numbers must take away to replace nominal ones where no effect is found", "convention")

@@ -87,6 +87,7 @@ class Evidence:
         holds = {
             "effects": bool(found.chosen.names),
             "rig": self.rig is not None,
+            "varies more": self.rig is not None and self.rig.varies_more(limits.varies_more),
             "late stamps": self.evened,
             "samples": bool(self.samples),
             "adequate": self.residual.is_noise or self.explains_most,
@@ -115,7 +116,7 @@ def odds_of_unknown(residual: ResidualTests, explains_most: bool, limits: Thresh
 
 #: Each row: what must hold, what must not, and the verdict. The first row that fits decides.
 TABLE: tuple[tuple[set[str], set[str], Verdict], ...] = (
-    ({"rig", "effects"}, set(), "effect"),
+    ({"rig", "effects"}, {"varies more"}, "effect"),
     ({"rig", "late stamps"}, set(), "effect"),
     ({"rig"}, {"jitter explains more"}, "unexplained"),
     ({"effects", "adequate"}, set(), "effect"),

@@ -7,8 +7,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from autotune.arrays import FloatArray
+from autotune.diagnosis.evidence.constancy import largest_variation
 from autotune.diagnosis.evidence.held_out import FitQuality
-from autotune.diagnosis.evidence.stretches import advantage, judged_rows
+from autotune.diagnosis.evidence.stretches import advantage, judged_rows, rms
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import Fit
 from autotune.diagnosis.fitting.long_windows import spread_of
@@ -126,6 +127,14 @@ class RigSearch:
             extended=self.chosen.error,
             noise_floor=noise_floor,
         )
+
+    def varies_more(self, times: float) -> bool:
+        """Whether what varies beside the chosen effects explains so many times more than they do."""
+        if not self.chosen.names:
+            return False
+        left, before = (rms(j.fit.residuals, j.data.good) for j in (self.chosen, self.retuned))
+        gained = (before**2 / left**2 - 1.0) * sum(int(g.sum()) for g in self.chosen.data.good)
+        return largest_variation(self.chosen.fit, self.chosen.data).gain > times * max(gained, 0.0)
 
     def keeps_nominal(self, share: float) -> bool:
         """Whether the nominal numbers predict about as well as those retuned, so that they stand."""

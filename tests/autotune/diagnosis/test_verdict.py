@@ -38,6 +38,11 @@ def test_what_samples_show_switches_no_test_off(samples: frozenset[str]) -> None
     assert verdict_of(samples | {"effects", "adequate", "constant"}) == "effect"
 
 
+def test_a_rigs_effects_are_not_named_where_what_varies_beside_them_explains_more() -> None:
+    assert verdict_of(frozenset({"rig", "effects"})) == "effect"
+    assert verdict_of(frozenset({"rig", "effects", "varies more"})) == "unexplained"
+
+
 def residual_with(reduced_chi2: float, *, uneven: bool = False, varies: float = 5.0) -> ResidualTests:
     return ResidualTests(
         reduced_chi2=reduced_chi2, reduced_chi2_chance=0.01, slow=1.0, slow_chance=0.02,

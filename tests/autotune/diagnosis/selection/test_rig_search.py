@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -86,3 +87,23 @@ def test_dry_friction_may_be_missing_where_a_speed_is_measured_and_not_where_a_l
         block = Block(name="x", place="plant", dynamics=TransferFunction(num=(1.0,), den=(2.0, 1.0)), output=output)
         model = Model(name="rig", input=Port(), output=Port(), blocks=(block,))
         assert friction.suits.holds(build_chain(model)) is may
+
+
+def test_an_effect_that_explains_less_than_what_swings_beside_it_is_not_all_that_is_missing():
+    """A gain that swings in time is in no catalogue; the lag of the sensor beside it is real, and the lesser part."""
+    rng = np.random.default_rng(8)
+    dt, t = 0.02, 0.02 * np.arange(3000)
+    u = np.repeat(rng.normal(size=120), 25)
+    y, state, read = np.empty(t.size), 0.0, 0.0
+    for k in range(t.size):
+        y[k] = read
+        drive = 2.0 * (1.0 + 0.5 * math.sin(2.0 * math.pi * t[k] / 9.0)) * u[k]
+        read = state + (read - state) * math.exp(-dt / 0.04)
+        state = drive + (state - drive) * math.exp(-dt / 0.4)
+    recording = Recording(t=t, u=u, y=y + 0.02 * rng.normal(size=t.size))
+    block = Block(name="drive", place="plant", dynamics=TransferFunction(num=(2.0,), den=(0.4, 1.0)), output="speed")
+    model = Model(name="drive", input=Port(), output=Port(), blocks=(block,))
+    found = search_rig(model, [recording], good(recording), left_out=[k.name for k in ALL if k.name != "sensor.lag"])
+    with_lag = next(j for j in found.judged if j.names == ("sensor.lag",))
+    assert replace(found, chosen=with_lag).varies_more(3.0)
+    assert not replace(found, chosen=found.retuned).varies_more(3.0)
