@@ -1,19 +1,13 @@
-"""The thresholds of the look at routine records: one frozen table."""
+"""The thresholds of the look at routine records: one frozen table; those ``counted`` on simulated loops.
+
+``python -m tests.benchmarks routine`` counts them again.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
-from typing import Any, Literal, TypeAlias, TypeVar
+from dataclasses import dataclass, fields
 
-#: Where a value comes from. ``counted``: on simulated loops, see ``tests/benchmarks/routine.py``. ``chance``: a
-#: quantile of what chance alone brings. ``convention``: usual in the field. ``cost``: a compromise with time.
-Origin: TypeAlias = Literal["counted", "chance", "convention", "cost"]
-_T = TypeVar("_T", int, float)
-
-
-def _known(value: _T, unit: str, meaning: str, origin: Origin) -> _T:
-    entry: Any = field(default=value, metadata={"unit": unit, "meaning": meaning, "origin": origin})
-    return entry  # type: ignore[no-any-return]  # a field stands for its value until the class is made
+from autotune.diagnosis.thresholds import Origin, known
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -22,31 +16,31 @@ class RoutineThresholds:
 
     # fmt: off
     # records and windows
-    least_rows: int = _known(100, "rows", "of a record", "convention")
-    most_rows: int = _known(8000, "rows", "that are fitted; of a longer record the part in which u travels furthest", "cost")
-    thinned_from: int = _known(2500, "rows", "of all recordings, from which on they are thinned", "cost")
-    most_rows_per_period: int = _known(40, "rows", "of the dominant oscillation; with more the record is thinned", "cost")
-    periods_per_window: float = _known(3.0, "periods", "that a free run lasts", "convention")
-    least_window_rows: int = _known(30, "rows", "that a free run lasts", "convention")
-    least_stretches: int = _known(6, "stretches", "in which a record is cut: five degrees of freedom", "chance")
-    most_stretches: int = _known(12, "stretches", "in which a record is cut", "cost")
+    least_rows: int = known(100, "rows", "of a record", "convention")
+    most_rows: int = known(8000, "rows", "that are fitted; of a longer record the part in which u travels furthest", "cost")
+    thinned_from: int = known(2500, "rows", "of all recordings, from which on they are thinned", "cost")
+    most_rows_per_period: int = known(40, "rows", "of the dominant oscillation; with more the record is thinned", "cost")
+    periods_per_window: float = known(3.0, "periods", "that a free run lasts", "convention")
+    least_window_rows: int = known(30, "rows", "that a free run lasts", "convention")
+    least_stretches: int = known(6, "stretches", "in which a record is cut: five degrees of freedom", "chance")
+    most_stretches: int = known(12, "stretches", "in which a record is cut", "cost")
     # a valve's fault
-    chance: float = _known(0.005, "probability", "that the free runs of a linear valve lose by chance as clearly: one-sided, for each of two faults", "chance")
-    least_decrease: float = _known(0.2, "ln of squared error", "mean over the stretches left out, that a valve's fault must bring", "counted")
-    kinds_apart: float = _known(0.05, "probability", "of chance, up to which sticking and play are told apart", "convention")
-    wide_band: float = _known(0.2, "of u's range", "from which on a band can keep a loop swinging; narrower ones are dead time at most", "convention")
-    least_band: float = _known(0.1, "of u's range", "that the interval of a band must exclude before a fault is named: half of a wide one", "counted")
-    unlikely: float = _known(0.05, "probability", "of chance from which on wide bands are no better than a linear valve, before an oscillation is said to come from outside", "convention")
-    whitening_order: int = _known(30, "rows", "order of the noise model at most, for the band's value", "cost")
-    resamplings: int = _known(400, "resamplings", "of the stretches, for the interval of a band", "cost")
+    chance: float = known(0.005, "probability", "that the free runs of a linear valve lose by chance as clearly: one-sided, for each of two faults", "chance")
+    least_decrease: float = known(0.2, "ln of squared error", "mean over the stretches left out, that a valve's fault must bring", "counted")
+    kinds_apart: float = known(0.05, "probability", "of chance, up to which sticking and play are told apart", "convention")
+    wide_band: float = known(0.2, "of u's range", "from which on a band can keep a loop swinging; narrower ones are dead time at most", "convention")
+    least_band: float = known(0.1, "of u's range", "that the interval of a band must exclude before a fault is named: half of a wide one", "counted")
+    unlikely: float = known(0.05, "probability", "of chance from which on wide bands are no better than a linear valve, before an oscillation is said to come from outside", "convention")
+    whitening_order: int = known(30, "rows", "order of the noise model at most, for the band's value", "cost")
+    resamplings: int = known(400, "resamplings", "of the stretches, for the interval of a band", "cost")
     # an oscillation
-    regular: float = _known(1.0, "1", "regularity from which on a signal oscillates (Thornhill et al. 2003)", "convention")
-    oscillating: float = _known(0.3, "of y's variance", "in one line, from which on an oscillation is worth a word", "convention")
-    least_phase: float = _known(0.8, "of y's variance", "on stretches left out that one sine predicts, before it is called persistent", "counted")
-    least_periods: float = _known(20.0, "periods", "through which a phase must last: a ringing loop of damping 0.01 has forgotten it by then", "convention")
+    regular: float = known(1.0, "1", "regularity from which on a signal oscillates (Thornhill et al. 2003)", "convention")
+    oscillating: float = known(0.3, "of y's variance", "in one line, from which on an oscillation is worth a word", "convention")
+    least_phase: float = known(0.8, "of y's variance", "on stretches left out that one sine predicts, before it is called persistent", "counted")
+    least_periods: float = known(20.0, "periods", "through which a phase must last: a ringing loop of damping 0.01 has forgotten it by then", "convention")
     # answers to the set-point
-    badly_damped: float = _known(0.1, "1", "damping ratio up to which a loop is tightly tuned: the overshoot of a step is 73 %", "convention")
-    least_answer: float = _known(0.3, "of y's variance", "on stretches left out that the set-point predicts, before its answer is read", "convention")
+    badly_damped: float = known(0.1, "1", "damping ratio up to which a loop is tightly tuned: the overshoot of a step is 73 %", "convention")
+    least_answer: float = known(0.3, "of y's variance", "on stretches left out that the set-point predicts, before its answer is read", "convention")
     # fmt: on
 
 
