@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from autotune.controller import Controller
-from autotune.diagnosis.effects import ALL, kind_of, require_known
+from autotune.diagnosis.effects import kind_of, require_known
 from autotune.diagnosis.evidence.adequacy import is_white, residual_tests
 from autotune.diagnosis.evidence.constancy import largest_variation
 from autotune.diagnosis.evidence.description import describe
@@ -23,7 +23,7 @@ from autotune.diagnosis.findings import extended_model, found_effects, offset_of
 from autotune.diagnosis.fitting.fit import RUNAWAY
 from autotune.diagnosis.fitting.retuning import reduced_chi2
 from autotune.diagnosis.result import Diagnosis
-from autotune.diagnosis.selection.rig_search import search_rig
+from autotune.diagnosis.selection.rig_search import search_rig, unmoved
 from autotune.diagnosis.selection.search import Search, search
 from autotune.diagnosis.thresholds import IN_USE, Thresholds
 from autotune.diagnosis.verdict import Evidence, judged, places_of, sentences_of
@@ -75,7 +75,7 @@ def diagnose(
     """
     require_known(model.effects, model.name)
     _require_rows(recordings)
-    without = [*without, *(effect.name for effect in model.effects), *_unmoved(recordings)]
+    without = [*without, *(effect.name for effect in model.effects), *unmoved(recordings)]
     evidence = _gathered(model, recordings, controller, without, progress, thresholds)
     evidence = _of_rig(evidence, model, without, progress)
     found, verdict = evidence.search, judged(evidence)
@@ -132,7 +132,7 @@ def _gathered(
         samples=samples,
         residual=residual_tests(chosen, found.data, found.gained, uneven=uneven),
         quality=held_out(found.retuned.fit, chosen, found.data),
-        offset=None if _unmoved(recordings) else offset_of(chosen, thresholds.offset_sigmas),
+        offset=None if unmoved(recordings) else offset_of(chosen, thresholds.offset_sigmas),
         evened=late is not None,
     )
 
@@ -154,13 +154,6 @@ def _of_rig(evidence: Evidence, model: Model, without: Sequence[str], progress: 
     samples = tuple(s for s in evidence.samples if _stays(s, bool(rig.chosen.names)) or is_material(s, fit, data))
     quality = rig.quality(evidence.quality.noise_floor)
     return replace(evidence, search=rig.as_search(), samples=samples, quality=quality, offset=None, rig=rig)
-
-
-def _unmoved(recordings: Sequence[Recording]) -> tuple[str, ...]:
-    """Return the effects that act on a command, where none moves: there they are a constant, and say nothing."""
-    if any(float(np.ptp(r.u)) > 0.0 for r in recordings):
-        return ()
-    return tuple(k.name for k in ALL if k.place == "actuator" or k.name == "timing.dead_time")
 
 
 def _stays(sample: SampleEffect, beside_effects: bool) -> bool:

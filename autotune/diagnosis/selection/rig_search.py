@@ -103,17 +103,20 @@ def search_rig(
         return RigSearch(nominal=nominal, retuned=retuned, judged=tuple(found), chosen=chosen)
 
 
+def unmoved(recordings: Sequence[Recording]) -> tuple[str, ...]:
+    """Return the effects that act on a command, where none moves: there they are a constant, and say nothing."""
+    if any(float(np.ptp(r.u)) > 0.0 for r in recordings):
+        return ()
+    return tuple(k.name for k in ALL if k.place == "actuator" or k.name == "timing.dead_time")
+
+
 def _odds(
     model: Model, recordings: Sequence[Recording], left_out: Collection[str]
 ) -> tuple[tuple[EffectKind, float], ...]:
     """Return the effects that a rig of the model's kind may lack, with their prior odds."""
     kind = rig_kind(model, build_chain(model))
-    moving = any(float(np.ptp(r.u)) > 0.0 for r in recordings)
-    odds = (
-        (k, k.odds.get(kind, k.odds.get("any", 0.0)))
-        for k in ALL
-        if k.odds and k.name not in left_out and (moving or k.place not in ("actuator", "timing"))
-    )
+    left_out = {*left_out, *unmoved(recordings)}
+    odds = ((k, k.odds.get(kind, k.odds.get("any", 0.0))) for k in ALL if k.odds and k.name not in left_out)
     return tuple(pair for pair in odds if pair[1] > 0.0)
 
 
