@@ -105,7 +105,8 @@ def _named(above: Sequence[Sequence[str]], first: int, width: int) -> Header:
     units = {name: unit for name in names if (unit := bare_and_unit(name)[1])}
     for row, kind in zip(above, kinds, strict=True):
         if kind == "units":
-            units |= {name: cell.strip("[]() ") for name, cell in zip(names, row, strict=True) if cell}
+            found = {name: cell.strip("[]() ") for name, cell in zip(names, row, strict=True)}
+            units |= {name: unit for name, unit in found.items() if unit and unit.lower() not in _TYPES}
     labels = {name: " ".join(filter(None, cells)) for name, *cells in zip(names, *texts, strict=True)}
     return Header(first_row=first, names=tuple(names), units=units, labels=labels, rows=len(above))
 

@@ -286,7 +286,7 @@ def parts_of(
     if (steps := np.diff(columns["t"][kept[0]])).size:
         usual = float(np.median(steps))
         if np.percentile(np.abs(steps - usual), 90) > 0.01 * usual:
-            notes.append(f"stamps are uneven, {usual:g} s apart as a rule; they are kept as they are")
+            notes.append(f"stamps are uneven, {usual:.4g} s apart as a rule; they are kept as they are")
     return [stretch(columns, at) for at in kept]
 
 

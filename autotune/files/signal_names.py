@@ -29,24 +29,26 @@ def _valued(terms: str, usual: str, often: str) -> dict[str, int]:
 
 _WORDS: Mapping[str, Mapping[str, int]] = {
     "u": _valued(
-        "u op command cmd controlleroutput stellgroesse stellgrosse stellwert stellgrad",
+        "u uk op command cmd controlleroutput stellgroesse stellgrosse stellwert stellgrad",
         "stellsignal stell manipulated mv lmn co cv out out1 input eingang actuator commande ctrl control drive demand"
         " controllerout controlsignal",
         "valve ventil pwm heater heizung heat power leistung pump pumpe duty voltage spannung fan motor current torque"
-        " output",
+        " throttle dac output",
     ),
     "y": _valued(
-        "y pv processvalue processvariable istwert regelgroesse regelgrosse mesure",
-        "measurement measured meas messwert actual act ist output ausgang feedback sensor response mess",
+        "y yk pv processvalue processvariable istwert regelgroesse regelgrosse mesure sensor",
+        "measurement measured meas messwert actual act ist output ausgang feedback response mess",
         "temperature temperatur temp level fuellstand fullstand flow durchfluss pressure druck speed drehzahl position"
-        " pos height angle winkel velocity concentration ph humidity feuchte niveau thermocouple",
+        " pos height angle winkel velocity concentration ph humidity feuchte niveau thermocouple encoder rpm adc",
     ),
     "r": _valued(
-        "r sp setpoint sollwert reference consigne fuehrungsgroesse fuhrungsgrosse",
+        "r rk sp setpoint sollwert reference consigne fuehrungsgroesse fuhrungsgrosse",
         "soll ref target setp setvalue sv w desired",
         "",
     ),
 }
+#: what a PLC's programmer writes before a name for its type: rActualValue is a REAL, not a set-point r
+_TYPE_PREFIX = re.compile(r"(?<![A-Za-z])(?:l?r|u?[dsl]?int|u?[dsl]?i|f|b|x|d?w|n)(?=[A-Z][a-z])")
 _WEAKEST_SURE = 2
 _STEM_BONUS = 2.0
 
@@ -118,7 +120,7 @@ def find_roles(table: Table, given: SignalNames) -> Roles:
         weak = [role for role, name in (("u", u), ("y", y)) if role not in named and not _stands(points, role, name)]
         if len(weak) == 1 and len([name for name in free if name != r]) == 1 + ("u" not in named) - ("u" in named):
             weak = []  # the other is known and no further column is left
-        if din := _of_din(table, numeric, named):
+        if din := _either_way(table, numeric, named):
             u, y, weak = *din, ["u", "y"]
         unsure += [role for role, name in (("u", u), ("y", y)) if role not in named and (tie or role in weak)]
     else:
@@ -130,14 +132,19 @@ def find_roles(table: Table, given: SignalNames) -> Roles:
     return Roles(time=time, names=names, unsure=tuple(unsure), others=tuple(n for n in numeric if n not in taken))
 
 
-def _of_din(table: Table, numeric: Sequence[str], named: Mapping[str, str]) -> tuple[str, str] | None:
+def _either_way(table: Table, numeric: Sequence[str], named: Mapping[str, str]) -> tuple[str, str] | None:
     """Return command and measurement where a file may write y for the command and x for what is controlled.
 
-    That is the notation of DIN 19226 and IEC 60050-351 with w for the set-point; elsewhere y is the measurement.
+    That is the notation of DIN 19226 and IEC 60050-351 with w for the set-point; elsewhere y is the measurement. In and
+    out alone, as ports of a block diagram are called, are the plant's or the controller's: the plant's are proposed.
     """
     letters = {table.bare(name).lower(): name for name in numeric}
-    both = "x" in letters and "y" in letters and "u" not in letters
-    return (letters["y"], letters["x"]) if both and not {"u", "y"} & set(named) else None
+    if {"u", "y"} & set(named) or "u" in letters:
+        return None
+    return next(
+        ((letters[u], letters[y]) for u, y in (("y", "x"), ("in", "out"), ("in1", "out1")) if {u, y} <= set(letters)),
+        None,
+    )
 
 
 def _time(table: Table, taken: set[str]) -> tuple[tuple[str, ...], bool]:
@@ -196,6 +203,7 @@ def _words(name: str, table: Table) -> set[str]:
     """Return the words of a column's name, and of what else the header says of it, in plain small letters."""
     found: set[str] = set()
     for text in {table.bare(name), table.labels.get(name, "")}:
+        text = _TYPE_PREFIX.sub("", text)
         plain = unicodedata.normalize("NFKD", text.replace("ß", "ss")).encode("ascii", "ignore").decode()
         german = text.lower().replace("ä", "ae").replace("ö", "oe").replace("ü", "ue").replace("ß", "ss")
         parted = re.sub(r"([a-z])([A-Z])", r"\1 \2", plain)

@@ -111,7 +111,7 @@ class Table:
     def described(self, name: str) -> str:
         """Return a column's name with its unit, for a person."""
         unit = self.units.get(name, "")
-        return f"{name} [{unit}]" if unit and unit not in name else name
+        return f"{name} [{unit}]" if unit and not bare_and_unit(name)[1] else name
 
 
 def bare_and_unit(name: str) -> tuple[str, str]:

@@ -66,6 +66,18 @@ def plc():
     return "\n".join(lines)
 
 
+def codesys():
+    """Two header rows; names have the prefix of their type, and the row of units names a type where there is none."""
+    lines = ["Time\tGVL.fbPid.rActualValue\tGVL.fbPid.rManipulatedValue\tGVL.fbPid.bManual", "ms\tdegC\tV\tBOOL"]
+    lines += [f"{1000 * t:.0f}\t{number(y)}\t{number(u)}\tTRUE" for t, u, y in zip(T, U, Y, strict=True)]
+    return "\n".join(lines)
+
+
+def own_names():
+    rows = (f"{t:g},{u:g},{number(y)}" for t, u, y in zip(T, U, Y, strict=True))
+    return "\n".join(["time,voltage_in,sensor_out", *rows])
+
+
 def logger():
     lines = ["Date\tTime\tms\tValve\tLevel"]
     for t, u, y in zip(T, U, Y, strict=True):
@@ -93,6 +105,8 @@ def no_header():
         ("historian.csv", historian(), "utf-8", {"u": "%", "y": "degC", "r": "degC", "FI200.PV": "m3/h"}),
         ("matlab.csv", matlab(), "utf-8", {}),
         ("trace.csv", plc(), "utf-8-sig", {"u": "%", "y": "°C"}),
+        ("trace.txt", codesys(), "utf-8", {"u": "V", "y": "degC"}),
+        ("own.csv", own_names(), "utf-8", {}),
         ("logger.txt", logger(), "utf-8", {}),
         ("hmi.csv", one_row_per_sample(), "utf-16", {}),
     ],
@@ -165,6 +179,7 @@ def test_every_way_to_write_a_table_says_the_same(tmp_path_factory, delimiter, d
         ("Zeit;w;x;y", SignalNames(u="y", y="x")),  # DIN writes y for the command; elsewhere it is the measurement
         ("Time;TIC1.PV;TIC1.OP;TIC2.PV;TIC2.OP", SignalNames(y="TIC1.PV")),
         ("a;b;c;d", SignalNames(u="c", y="b")),
+        ("Time;Out1;In1", SignalNames(u="In1", y="Out1")),  # of the plant, or of the controller
     ],
 )
 def test_what_names_leave_open_is_asked_for_and_never_guessed(tmp_path, header, named):

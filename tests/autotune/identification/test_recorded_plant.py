@@ -1,0 +1,96 @@
+"""Plants fitted to plain recordings: their regions hold what the record leaves possible, and little else."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from autotune.arrays import FloatArray
+from autotune.identification.delay.identify import identify_delay
+from autotune.identification.recorded_plant import fit_recordings
+from autotune.models import TransferFunction
+from autotune.recording import Recording
+
+#: when the command moves [s], and by how much
+BUMPS = ((300.0, 5.0), (700.0, -5.0), (1100.0, -5.0), (1500.0, 5.0))
+NOISE = 0.05
+T = np.arange(1900.0)
+#: a small lag beside a dead time: the record determines their sum
+PLANT = TransferFunction(num=(0.8,), den=tuple(np.polymul([90.0, 1.0], [6.0, 1.0])), delay_s=16.0)
+
+
+def answer(plant: TransferFunction) -> FloatArray:
+    """Response of a plant with two real poles, or one, to the bumps, exact at every row."""
+    poles = plant.poles
+    gain = plant.num[-1] / plant.den[-1]
+    shares = [np.prod([q / (q - p) for j, q in enumerate(poles) if j != i]) for i, p in enumerate(poles)]
+    y = np.zeros(T.size)
+    for at, size in BUMPS:
+        since = np.maximum(T - at - plant.delay_s, 0.0)
+        modes = sum(share * np.exp(pole * since) for share, pole in zip(shares, poles, strict=True))
+        y += size * gain * np.real(1.0 - modes)
+    return np.asarray(y, dtype=np.float64)
+
+
+def recorded(seed: int) -> Recording:
+    """The plant under the bumps, with white noise."""
+    u = np.sum([np.where(at <= T, size, 0.0) for at, size in BUMPS], axis=0)
+    y = answer(PLANT) + NOISE * np.random.default_rng(seed).standard_normal(T.size)
+    return Recording(t=T, u=u, y=y, name="two lags")
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_the_region_is_no_wider_than_the_record_where_a_controller_works(seed: int) -> None:
+    recording = recorded(seed)
+    y, fit = recording.y, fit_recordings([recording])
+    assert fit.parameters.size == 4
+    plants = fit.border(0.95)
+
+    def deviance(plant: TransferFunction) -> float:
+        error = y - answer(plant)
+        return float(np.sum((error - np.mean(error)) ** 2)) / NOISE**2
+
+    # a fast lag may be anything near its estimate, but then the dead time is what their sum, which is known, leaves
+    lags = np.array([1.0 / np.max(-plant.poles.real) for plant in plants])
+    sums = lags + np.array([plant.delay_s for plant in plants])
+    assert np.ptp(sums) < 0.5 * np.ptp(lags)
+    omega = np.array([0.03])  # crossover of a PI for this plant
+    turned = [float(np.angle(plant.response(omega) / fit.plant.response(omega), deg=True)[0]) for plant in plants]
+    assert np.max(np.abs(turned)) < 2.5
+    worst = max(deviance(plant) for plant in plants) - deviance(fit.plant)
+    assert worst < 20.0 * chi2.ppf(0.95, 4)  # the region is of first order; beyond that only its shape is wrong
+
+
+def test_parameters_say_the_same_plant_over_any_coefficient() -> None:
+    recording = recorded(0)
+    fit, model = fit_recordings([recording]), identify_delay(recording, 2)
+    omega = np.geomspace(1e-3, 1.0, 30)
+    np.testing.assert_allclose(fit.plant.response(omega), model.transfer_function().response(omega), rtol=1e-6)
+    # a change of parameters moves the scatter of no frequency response: both covariances give the same, to first order
+    for one in (omega[10], omega[20]):
+        spread = [
+            _spread(
+                lambda x, one=one: complex(fit.build(x).response(np.array([one]))[0]), fit.parameters, fit.covariance
+            ),
+            _spread(
+                lambda x, one=one: complex(_plant(x).response(np.array([one]))[0]),
+                model.values[:4],
+                model.covariance[:4, :4],
+            ),
+        ]
+        np.testing.assert_allclose(spread[0], spread[1], rtol=1e-4)
+
+
+def _plant(x: FloatArray) -> TransferFunction:
+    return TransferFunction(num=(x[2],), den=(1.0, -x[1], -x[0]), delay_s=x[3])
+
+
+def _spread(f: Callable[[FloatArray], complex], x: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Covariance of (re, im) of f to first order, by central differences."""
+    steps = 1e-4 * np.sqrt(np.diag(covariance))
+    columns = [(f(x + step) - f(x - step)) / (2.0 * size) for step, size in zip(np.diag(steps), steps, strict=True)]
+    J = np.array([[value.real for value in columns], [value.imag for value in columns]])
+    return np.asarray(J @ covariance @ J.T, dtype=np.float64)
