@@ -9,7 +9,7 @@ assumed of the swing's shape: a switch or a sweep has parts at those frequencies
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -17,6 +17,7 @@ import numpy as np
 
 from autotune.arrays import FloatArray
 from autotune.diagnosis.evidence.residual import NEW, FreedResidual, Place, filled
+from autotune.diagnosis.evidence.swings import Swinging, explained_by_swings
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import Fit
 from autotune.diagnosis.fitting.windows import model_lag_s
@@ -95,22 +96,35 @@ def largest_variation(result: Fit, data: Data) -> Variation:
     variance = float(e @ e) / left.rows
     lag, longest = model_lag_s(result.model), max(r.duration_s for r in data.recordings)
     count = int(min(FASTEST * longest / max(lag, 1e-12), MOST_FREQUENCIES))
-    entries = [(*signal, k / longest) for signal in _multiplied(left) for k in range(count + 1)]
-    entries += [(*signal, 0.0) for signal in (*_bends(left), *_paths(left, lag))]
-
-    def gained(entry: tuple[Place, str, Sequence[FloatArray], float]) -> float:
-        place, _, signals, frequency = entry
-        waves = (np.cos, np.sin) if frequency else (np.cos,)
-        columns = [left.shown(place, _swinging(data, signals, wave, frequency)) for wave in waves]
-        return _explained(np.column_stack(columns), e, left) / variance
-
+    multiplied, added = list(_multiplied(left)), [*_bends(left), *_paths(left, lag)]
+    swinging = [Swinging(place=place, signals=signals) for place, _, signals in multiplied]
+    gains = explained_by_swings(left, e, swinging, count) / variance
+    found = [
+        _Found(gain=float(gain), place=place, what=what, cycles=k)
+        for (place, what, _), row in zip(multiplied, gains, strict=True)
+        for k, gain in enumerate(row)
+    ]
     with ThreadPoolExecutor(2) as pool:
-        gains = list(pool.map(gained, entries))
-    ranked = sorted(zip(gains, entries, strict=True), key=lambda pair: -pair[0])
-    gain, (_, what, _, frequency) = ranked[0]
-    near = [entry for g, entry in ranked if entry[3] and g >= AS_MUCH * gain] if frequency else [ranked[0][1]]
-    places = dict.fromkeys(p for place, name, _, _ in near for p in _MAY_ENTER.get(name, (place,)))
-    return Variation(gain=gain, places=tuple(places), what=what, period_s=1.0 / frequency if frequency else np.inf)
+        shown = pool.map(lambda one: _explained(left.shown(one[0], one[2])[:, None], e, left) / variance, added)
+        found += [
+            _Found(gain=gain, place=place, what=what) for (place, what, _), gain in zip(added, shown, strict=True)
+        ]
+    found.sort(key=lambda one: -one.gain)
+    best = found[0]
+    near = [one for one in found if one.cycles and one.gain >= AS_MUCH * best.gain] if best.cycles else [best]
+    places = dict.fromkeys(p for one in near for p in _MAY_ENTER.get(one.what, (one.place,)))
+    period = longest / best.cycles if best.cycles else np.inf
+    return Variation(gain=best.gain, places=tuple(places), what=best.what, period_s=period)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Found:
+    """What one signal explains, at a number of cycles per longest recording; 0 for what does not swing."""
+
+    gain: float
+    place: Place
+    what: str
+    cycles: int = 0
 
 
 def _multiplied(left: FreedResidual) -> Iterator[tuple[Place, str, list[FloatArray]]]:
@@ -154,14 +168,6 @@ def _paths(left: FreedResidual, lag_s: float) -> Iterator[tuple[Place, str, list
     for delay in (d * lag_s for d in ECHOES):
         past = [np.interp(r.t - delay, r.t, y) for y, r in zip(readings, recordings, strict=True)]
         yield "sensor", f"the reading {delay:.2g} s before, as an echo would", past
-
-
-def _swinging(
-    data: Data, signals: Sequence[FloatArray], wave: Callable[[FloatArray], FloatArray], frequency_hz: float
-) -> list[FloatArray]:
-    """Return signals times a wave of every recording's own time."""
-    angles = [2.0 * np.pi * frequency_hz * (r.t - r.t[0]) for r in data.recordings]
-    return [s * wave(a) for s, a in zip(signals, angles, strict=True)]
 
 
 def _explained(X: FloatArray, e: FloatArray, left: FreedResidual) -> float:

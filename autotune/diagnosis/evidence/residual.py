@@ -14,6 +14,7 @@ from autotune.arrays import BoolArray, FloatArray, IntArray
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import Fit
 from autotune.diagnosis.fitting.noise import noise_from_differences
+from autotune.diagnosis.simulation.chain import Chain
 from autotune.diagnosis.simulation.simulator import Simulator
 
 Place: TypeAlias = Literal["actuator", "plant", "sensor"]
@@ -34,7 +35,8 @@ class FreedResidual:
         self.result, self.data = result, data
         self.e = self.freed(result.e)
         self.J = self.freed(result.jacobian[0])
-        self._own = np.linalg.svd(self.J / np.maximum(np.linalg.norm(self.J, axis=0), 1e-300), full_matrices=False)[0]
+        #: What the model's own numbers explain: (N, p), orthonormal
+        self.own = np.linalg.svd(self.J / np.maximum(np.linalg.norm(self.J, axis=0), 1e-300), full_matrices=False)[0]
         self.rows = data.rows
         # where the residual is so large that it was taken for noise, the floor is what changes from row to row alone
         jitter = (
@@ -81,6 +83,10 @@ class FreedResidual:
             rows.append(np.where(ok, out, 0.0))
         return self.freed(np.concatenate(self.data.whitened(rows)))
 
+    def chain(self, place: Literal["actuator", "plant"]) -> Chain:
+        """Return the linear chain from where something missing enters to the reading, in deviations."""
+        return self._ways[place].chain
+
     def is_new(self, column: FloatArray) -> bool:
         """Whether a direction is more than what the model's own numbers can do."""
         left = self.beyond_numbers(column)
@@ -88,7 +94,7 @@ class FreedResidual:
 
     def beyond_numbers(self, direction: FloatArray) -> FloatArray:
         """Return a freed direction, (N,) or (N, q), without what the model's own numbers explain."""
-        return np.asarray(direction - self._own @ (self._own.T @ direction))
+        return np.asarray(direction - self.own @ (self.own.T @ direction))
 
     def _signals(self) -> dict[Place, dict[str, list[FloatArray]]]:
         """Return the signals that something missing may depend on, per place and recording; silent ones left out.

@@ -263,7 +263,8 @@ def _finer(best: Hypothesis, stage: _Stage) -> _Stage:
         noise = Noise(sd=float(np.sqrt(np.mean(np.concatenate(best.fit.residuals) ** 2))))
     data = replace(data, noise=floored(noise, data.recordings))
     base = fit(base.parametrisation, data, base.theta, base.x0, iterations=20)
-    return replace(stage, data=data, base=base, few=_few(data, base))
+    # the same windows: what was screened on them goes on
+    return replace(stage, data=data, base=base, few=replace(stage.few, noise=data.noise))
 
 
 def _again(h: Hypothesis, data: Data) -> Hypothesis:

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from autotune.arrays import BoolArray
 from autotune.diagnosis.effects import CATALOGUE
 from autotune.diagnosis.evidence.samples import inspect
-from autotune.diagnosis.fitting.fit import fit
+from autotune.diagnosis.fitting.fit import Fit, fit
 from autotune.diagnosis.fitting.parameters import effect_with
 from autotune.diagnosis.fitting.restarts import realigned
 from autotune.diagnosis.fitting.retuning import prepare
@@ -18,6 +20,7 @@ from autotune.diagnosis.selection.hypothesis import Hypothesis, is_stand_in
 from autotune.diagnosis.selection.prediction import extended
 from autotune.diagnosis.selection.scan import searched
 from autotune.diagnosis.selection.search import search
+from autotune.diagnosis.thresholds import IN_USE
 from autotune.models import Block, Effect, Model, Port, TransferFunction
 from autotune.recording import Recording
 from tests.autotune.diagnosis.servo_rigs import GAIN, servo_model, servo_recording
@@ -165,3 +168,17 @@ def test_a_cogging_torque_that_was_travelled_over_is_no_stand_in() -> None:
     )
     assert found.chosen.names == ("plant.sine_torque",)
     assert found.chosen.fit.model.effects[0].parameters["period"].value == pytest.approx(1.0, rel=0.01)
+
+
+def test_windows_that_are_screened_on_stay_when_the_noise_is_estimated_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+    calls = iter(range(100))
+
+    def others_each_time(result: Fit, times: float) -> list[BoolArray]:
+        here = next(calls)
+        return [np.arange(len(starts)) == here for starts in result.starts]
+
+    monkeypatch.setattr("autotune.diagnosis.selection.search.standing_out", others_each_time)
+    limits = replace(IN_USE, screening_rows=300, coarse=1e-3)
+    without = [name for name in CATALOGUE if name not in ("actuator.lag", "sensor.lag")]
+    found = search(lag(10.0), [tank(0.4, 1, rows=1600)], [np.ones(1600, dtype=bool)], without, thresholds=limits)
+    assert found.singles
