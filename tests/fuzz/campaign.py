@@ -19,7 +19,7 @@ import traceback
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from multiprocessing.connection import Connection
+from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any
 
@@ -226,6 +226,7 @@ def campaign(
                 worker.give(order)
                 busy.append(worker)
         while busy:
+            wait([worker.line for worker in busy], timeout=0.1)
             for i, worker in enumerate(busy):
                 answer = _answer_of(worker)
                 if answer is None:
@@ -259,7 +260,7 @@ def answers(orders: Sequence[tuple[str, int]], seed: int, folder: Path) -> list[
         for order in orders:
             worker.give(order)
             while (answer := _answer_of(worker)) is None:
-                pass
+                wait([worker.line], timeout=0.1)
             found.append(answer)
     finally:
         worker.process.kill()
@@ -274,7 +275,7 @@ def _answer_of(worker: _Worker) -> Answer | None:
     name, number = worker.order
     fault = ""
     try:
-        if worker.line.poll(0.02):
+        if worker.line.poll():
             answer: Answer = worker.line.recv()
             return answer
     except (EOFError, ConnectionError):

@@ -18,6 +18,8 @@ OTHERS: tuple[Any, ...] = (
     "", "x", "1", "1_000", "nan", "[/foo]", "<img src=x onerror=alert(1)>", "\x1b[2J", "ä" * 5, "x" * 300, "a/b",
     "../a", "°C", "\u202e", True, False, [], [[]], {}, [1], [0.0], {"a": 1}, [{}], ["x"], None,
 )  # fmt: skip
+#: a value that is repeated takes no more than about so many characters; indented by depth it takes a hundred times more
+LARGEST = 100_000
 
 
 def places(content: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
@@ -54,7 +56,8 @@ def damaged_content(rng: random.Random, content: Any) -> Any:
         elif way < 0.85 and isinstance(table, dict):
             table[rng.choice((f"{key}_", "Td", "x", "", "ä", "\x1b", "x" * 300))] = table.pop(key)
         elif isinstance(table, list):
-            table[key:key] = [copy.deepcopy(table[key])] * rng.choice((1, 2, 60, 2000))
+            times, size = rng.choice((1, 2, 60, 2000)), len(repr(table[key]))
+            table[key:key] = [copy.deepcopy(table[key])] * min(times, max(1, LARGEST // size))
         else:
             value: Any = 1
             for _ in range(rng.choice((3, 40, 200))):
