@@ -2,14 +2,16 @@
 
 The prior is the class
 
-    H(s) = G s^-m exp(-s L) prod_k (1 + s T_k)^(-mu_k) prod_k ((1 - s a_k)/(1 + s a_k))^(nu_k),
-    0 <= m <= 1, L >= 0, mu_k >= 0, nu_k >= 0,
+    H(s) = G s^-m exp(-s L) prod_k (1 + s T_k)^(-mu_k) ((1 - s a_k)/(1 + s a_k))^(nu_k) (1 - s a_k)^(zeta_k),
+    0 <= m <= 1, L >= 0, mu_k >= 0, nu_k >= 0, zeta_k >= 0, sum zeta_k <= 1,
 
-any number of lags at any time constants, at most one integrator, dead time, and (if asked for) inverse response of
-unit gain. Integer exponents are the physical processes; real ones enlarge the class, which only makes a guarantee
-stricter, and make log H linear in (log G, m, L, mu, nu): what the points allow at another frequency is a linear
-program. All members fulfil (1) but for its strictness; the reduced models (8) and (24) are among them with inverse
-response. A process with lightly damped poles is not in the class; its points are refused as contradicting it.
+any number of lags at any time constants, at most one integrator, dead time, and (if asked for) inverse response: any
+number of all-pass factors of unit gain, and one zero in the right half plane, which no lag need be as slow as, so that
+the gain may rise before it falls. Integer exponents are the physical processes; real ones enlarge the class, which only
+makes a guarantee stricter, and make log H linear in (log G, m, L, mu, nu, zeta): what the points allow at another
+frequency is a linear program. The reduced models (8) and (24) are members with inverse response; members without a zero
+fulfil (1) but for its strictness. A process with lightly damped poles is not in the class; its points are refused as
+contradicting it.
 """
 
 from __future__ import annotations
@@ -22,7 +24,7 @@ import highspy
 import numpy as np
 from scipy.optimize import linprog, nnls
 
-from autotune.arrays import FloatArray
+from autotune.arrays import BoolArray, FloatArray
 from autotune.errors import DesignError
 from autotune.points import FrequencyPoint
 
@@ -49,11 +51,11 @@ class ConsistentProcesses:
     lags_s, inverse_s : (n,), (k,) array
         Time constants T_k and a_k of the grid [s].
     facets, limits : (F, V), (F,) array
-        facets x <= limits are the regions; x = (log G, m, L omega_0, mu, nu).
+        facets x <= limits are the regions, and the sum of zeta; x = (log G, m, L omega_0, mu, nu, zeta).
     omega_0 : float
         Unit of frequency [rad/s].
     nominal : (V,) array
-        The member closest to the points (weighted least squares).
+        Of the members without a zero the one closest to the points (weighted least squares).
     inflation : float
         Factor by which the regions had to be enlarged before any member passed through all of them; 1 where none.
     omega_points : (N,) array
@@ -96,8 +98,8 @@ class ConsistentProcesses:
         # by log omega: log gain 2 w^2/(1 + w^2)^2, phase w (1 - w^2)/(1 + w^2)^2, w = omega T: modulus w/(1 + w^2)
         lag, inverse = x * self.lags_s, x * self.inverse_s
         columns = [np.zeros_like(x), np.zeros_like(x), x / self.omega_0]
-        rows = np.hstack((*columns, lag / (1.0 + lag**2), 2.0 * inverse / (1.0 + inverse**2)))
-        return self._largest(rows, "curvature")
+        turns = inverse / (1.0 + inverse**2)
+        return self._largest(np.hstack((*columns, lag / (1.0 + lag**2), 2.0 * turns, turns)), "curvature")
 
     def _largest(self, costs: FloatArray, what: str) -> FloatArray:
         """Return max cost x over the members for every row of ``costs``; each program starts where the last ended."""
@@ -157,7 +159,7 @@ def consistent_processes(
     probability : float
         Of the joint region: each point's own is probability^(1/N), so that all N hold together with it.
     inverse_response : bool
-        Whether the class has all-pass factors besides dead time.
+        Whether the class has all-pass factors and a zero in the right half plane besides dead time.
 
     Raises
     ------
@@ -191,15 +193,17 @@ def consistent_processes(
         centre.append(normals @ measured)
         sd.append(math.sqrt(float(np.linalg.eigvalsh(covariance)[-1])))
     A, b = np.vstack(facets), np.concatenate(centre)
-    inflation = _inflation(A, b, omega, radius, np.array(sd))
+    zeta = np.arange(A.shape[1]) >= A.shape[1] - inverse.size
+    inflation = _inflation(A, b, zeta, omega, radius, np.array(sd))
+    nominal = _closest(np.vstack(whitened_rows)[:, ~zeta], np.concatenate(whitened))
     return ConsistentProcesses(
         sign=sign,
         lags_s=lags,
         inverse_s=inverse,
-        facets=A,
-        limits=b + inflation * radius,
+        facets=np.vstack((A, zeta)),
+        limits=np.append(b + inflation * radius, 1.0),
         omega_0=omega_0,
-        nominal=_closest(np.vstack(whitened_rows), np.concatenate(whitened)),
+        nominal=np.append(nominal, np.zeros(inverse.size)),
         inflation=inflation,
         omega_points=omega,
     )
@@ -216,8 +220,10 @@ def _bounds(count: int) -> list[tuple[float | None, float | None]]:
 def _rows(omega: FloatArray, lags: FloatArray, inverse: FloatArray, omega_0: float) -> tuple[FloatArray, FloatArray]:
     x = omega[:, None]
     one, none = np.ones_like(x), np.zeros((len(omega), len(inverse)))
-    gain = np.hstack((one, -np.log(x / omega_0), 0.0 * x, -0.5 * np.log1p((x * lags) ** 2), none))
-    phase = np.hstack((0.0 * x, -0.5 * np.pi * one, -x / omega_0, -np.arctan(x * lags), -2.0 * np.arctan(x * inverse)))
+    falls, rises = -0.5 * np.log1p((x * lags) ** 2), 0.5 * np.log1p((x * inverse) ** 2)
+    gain = np.hstack((one, -np.log(x / omega_0), 0.0 * x, falls, none, rises))
+    turns = np.arctan(x * inverse)
+    phase = np.hstack((0.0 * x, -0.5 * np.pi * one, -x / omega_0, -np.arctan(x * lags), -2.0 * turns, -turns))
     return gain, phase
 
 
@@ -238,7 +244,9 @@ def _log_covariance(point: FrequencyPoint) -> FloatArray:
     return np.asarray(J @ np.array(point.covariance) @ J.T)
 
 
-def _inflation(A: FloatArray, b: FloatArray, omega: FloatArray, radius: float, sd: FloatArray) -> float:
+def _inflation(
+    A: FloatArray, b: FloatArray, zeta: BoolArray, omega: FloatArray, radius: float, sd: FloatArray
+) -> float:
     """Return how far the regions must grow for one member to pass through all of them, with a tenth to spare.
 
     A class that passes by the points by more than chance allows is the wrong one, and what it says between and beyond
@@ -247,8 +255,8 @@ def _inflation(A: FloatArray, b: FloatArray, omega: FloatArray, radius: float, s
     V = A.shape[1]
     result = linprog(
         np.append(np.zeros(V), 1.0),
-        A_ub=np.hstack((A, -np.full((len(A), 1), radius))),
-        b_ub=b,
+        A_ub=np.block([[A, np.full((len(A), 1), -radius)], [zeta.astype(np.float64), 0.0]]),
+        b_ub=np.append(b, 1.0),
         bounds=[*_bounds(V), (0.0, None)],
         method="highs-ds",
     )
@@ -263,7 +271,7 @@ def _inflation(A: FloatArray, b: FloatArray, omega: FloatArray, radius: float, s
             "the points contradict each other as those of an aperiodic process with dead time: their regions would "
             f"have to be {least:.1f} times as large, the one at {omega[int(np.argmax(missed))]:.4g} rad/s first of all",
             where="points",
-            remedy="measure that point again, or design on a model if the plant resonates or its gain rises",
+            remedy="measure that point again, or design on a model if the plant resonates",
         )
     return max(1.0, 1.1 * least)
 

@@ -56,7 +56,8 @@ def design_on_points(
     probability : float
         Of the joint region of all points; it contains each point's own region of at least this probability.
     inverse_response : bool
-        Whether all-pass factors are among the plants to be guarded against.
+        Whether all-pass factors, and a zero in the right half plane that makes the gain rise first, are among the
+        plants to be guarded against.
 
     Returns
     -------
@@ -270,6 +271,7 @@ def _answer(
         f"; {UNCERTAIN} the regions had to be taken {grown:.2f} times as large before any such process passed through"
     )
     remark = f"{remark} them" if grown > 1.0 else ""
+    inverse = ", with or without inverse response," if plant.processes.inverse_s.size else ""
     return Design(
         kind=kind,
         controller=weighted(controller, specification),
@@ -279,8 +281,9 @@ def _answer(
         binding=specification.binding(m.figures),
         margins=m,
         certificate=(
-            f"margins hold for every aperiodic process with dead time through the joint {100 * probability:g} % region "
-            f"of the {len(plant.processes.omega_points)} points; no lower bound on the norm{remark}"
+            f"margins hold for every aperiodic process with dead time{inverse} through the joint "
+            f"{100 * probability:g} % region of the {len(plant.processes.omega_points)} points; no lower bound on the norm"
+            f"{remark}"
         ),
     )
 

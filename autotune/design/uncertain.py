@@ -31,7 +31,7 @@ class UncertainPlant:
     supports : (M, DIRECTIONS) array
         Support values of the set in (log gain, phase), slack for the way to the neighbouring frequencies included.
     nominal : SampledPlant
-        The member closest to the points, for the norm.
+        The member without a zero that is closest to the points, for the norm.
     processes : ConsistentProcesses
         Where it comes from.
     """
@@ -64,7 +64,8 @@ def uncertain_plant(
     probability : float
         Of the joint region of all points.
     inverse_response : bool
-        Whether the class has all-pass factors besides lags, one integrator and dead time.
+        Whether the class has all-pass factors and a zero in the right half plane besides lags, one integrator and
+        dead time.
 
     Raises
     ------

@@ -144,14 +144,14 @@ def makers(plant: TransferFunction, seed: int, kind: Kind) -> dict[str, Callable
     rng = np.random.default_rng(seed)
 
     def reduced() -> tuple[PIDController, bool]:
-        return design_on_reduced(plant, _noise(plant), kind).controller, True
+        return design_on_reduced(plant, asked_of(plant), kind).controller, True
 
     def tuned(points: list[FrequencyPoint]) -> tuple[PIDController, bool]:
-        found = on_measured(of_use(points), _fit(tuple(points)), _noise(plant), kind)[1]
+        found = on_measured(of_use(points), _fit(tuple(points)), asked_of(plant), kind)[1]
         return found.controller, UNCERTAIN not in found.certificate
 
     return {
-        "model": lambda: (design(plant, _noise(plant), kind, certificate=False).controller, True),
+        "model": lambda: (design(plant, asked_of(plant), kind, certificate=False).controller, True),
         "reduced from the model": reduced,
         "points": lambda: tuned(relay_points(plant, rng)),
         "points of a slow plant": lambda: tuned(slow_points(plant, rng)),
@@ -164,7 +164,7 @@ def _fit(points: tuple[FrequencyPoint, ...]) -> PlantFit:
 
 
 @lru_cache(maxsize=4)
-def _noise(plant: TransferFunction) -> Specification:
+def asked_of(plant: TransferFunction) -> Specification:
     """Return the specification with a noise gain that hardly binds: ten over the gain near -135 degrees."""
     omega = relay_points(plant, np.random.default_rng(0), -135.0)[-1].omega_rad_s
     gain = abs(plant.response(np.array([omega]))[0])

@@ -13,12 +13,12 @@ from hypothesis import strategies as st
 from autotune.design.margins import margins
 from autotune.design.process_class import DIRECTIONS, consistent_processes
 from autotune.design.robust import design_on_points
-from autotune.design.specification import Specification, spec1
+from autotune.design.specification import Kind, Specification, spec1
 from autotune.design.synthesis import design
 from autotune.errors import DesignError
 from autotune.models import TransferFunction
 from tests.autotune.design.plants import BALL, EIGHT_LAGS, REDUCED, measured
-from tests.benchmarks.guarantees import plants, relay_points, slow_points
+from tests.benchmarks.guarantees import asked_of, plants, relay_points, slow_points
 
 
 def _lags(constants: list[float], delay_s: float, integrator: bool) -> TransferFunction:
@@ -118,18 +118,24 @@ def test_a_resonant_plant_is_outside_the_class() -> None:
         design_on_points(points, spec1(0.1))
 
 
-def test_a_plant_whose_gain_rises_is_refused_although_wider_regions_would_hold_a_member_of_the_class() -> None:
-    """Its zero lies below its lags: regions of 1.9 times the size let the class pass, which then lost half the M_m."""
-    plant = list(plants("non-minimum phase", 8))[7]
-    with pytest.raises(DesignError, match="contradict each other"):
-        design_on_points(slow_points(plant, np.random.default_rng(7)), spec1(10.0))
+@pytest.mark.parametrize(("number", "kind"), [(7, "pi"), (19, "pi"), (29, "pi"), (29, "pid")])
+def test_margins_hold_on_plants_whose_gain_rises_before_it_falls(number: int, kind: Kind) -> None:
+    """Their zeros are slower than every lag, which the errors of the points, up to 9 %, hide or do not hide.
+
+    A class without such zeros refused the first, was not certain of the second, and left the third M_m .479.
+    """
+    plant = list(plants("non-minimum phase", number + 1))[number]
+    found = design_on_points(slow_points(plant, np.random.default_rng(number)), asked_of(plant), kind)
+    m = margins(plant, found.controller)
+    assert "not certain" not in found.certificate
+    assert m.modulus >= 0.495
+    assert m.phase_rad >= math.radians(44.5)
 
 
-def test_a_plant_outside_the_class_by_five_in_a_thousand_is_refused_too() -> None:
-    """Its zero is slower than its two fast lags together: beyond the points it leaves the class by a tenth."""
+def test_margins_hold_beyond_the_points_where_a_zero_is_slower_than_the_fast_lags() -> None:
     plant = list(plants("non-minimum phase", 15))[14]
-    with pytest.raises(DesignError, match="contradict each other"):
-        design_on_points(relay_points(plant, np.random.default_rng(14)), spec1(30.0), "pid")
+    m = margins(plant, design_on_points(relay_points(plant, np.random.default_rng(14)), spec1(30.0), "pid").controller)
+    assert m.modulus >= 0.495
 
 
 @pytest.mark.parametrize("sd", [1e-4, 3e-4])
