@@ -282,8 +282,8 @@ def _answer(
         margins=m,
         certificate=(
             f"margins hold for every aperiodic process with dead time{inverse} through the joint "
-            f"{100 * probability:g} % region of the {len(plant.processes.omega_points)} points; no lower bound on the norm"
-            f"{remark}"
+            f"{100 * probability:g} % region of the {len(plant.processes.omega_points)} points; no lower bound on the "
+            f"norm{remark}"
         ),
     )
 
