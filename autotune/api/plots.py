@@ -114,7 +114,8 @@ def _bode(results: Sequence[Any], ax: Any, names: Sequence[str]) -> Any:
         bars = np.array([gain_phase_bars(point) for point in points])
         values = gain_phase(np.array([sign * point.response for point in points]))
         for one, value, bar in zip(pair, values, (bars[:, 0], np.degrees(bars[:, 1])), strict=False):
-            one.errorbar(at, value, yerr=bar, fmt="o", color=colour, label=title)
+            known = any(curve.name == title for curve in curves)  # a model's own points need no second entry
+            one.errorbar(at, value, yerr=bar, fmt="o", color=colour, label=None if known else title)
     for one, title in zip(pair, ("gain", "phase [deg]"), strict=False):
         one.set(xscale="log", ylabel=title, xlabel="angular frequency [rad/s]")
     pair[0].set_yscale("log")

@@ -31,7 +31,7 @@ Row = Sequence[str]
 
 @singledispatch
 def rows_of(result: Any) -> tuple[str, Row, list[Row]]:
-    """Return the title, the header and the rows of a result's table."""
+    """Return the title, the header and the rows of a result's table; a row of one cell is a remark on all of it."""
     raise InputError(f"a {type(result).__name__} has no table", where="show")
 
 
@@ -66,7 +66,7 @@ def _(result: ReducedModel) -> tuple[str, Row, list[Row]]:
     if result.omega_0r_rad_s is not None:
         values.insert(1, ("w_0 [rad/s]", result.omega_0r_rad_s, result.sd[1]))
     rows = [(name, _number(value), f"{100 * sd:.2g} %" if sd else "exact") for name, value, sd in values]
-    return f"Reduced model {form}", ("", "value", "sd"), [*rows, *(("note", text, "") for text in result.warnings)]
+    return f"Reduced model {form}", ("", "value", "sd"), [*rows, *((text,) for text in result.warnings)]
 
 
 @rows_of.register
@@ -133,7 +133,7 @@ def _(result: TwoDelays) -> tuple[str, Row, list[Row]]:
 
 @rows_of.register
 def _(result: InnovationModel) -> tuple[str, Row, list[Row]]:
-    rows = [(f"{pole.real:.5g} {pole.imag:+.5g}i", _number(abs(pole))) for pole in result.poles]
+    rows = [(_pole(pole), _number(abs(pole))) for pole in result.poles]
     return (
         f"State space of order {result.order}, sample time {result.sample_time_s:g} s",
         ("pole", "magnitude"),
@@ -146,9 +146,10 @@ def _(result: ClosedLoopIdentification) -> tuple[str, Row, list[Row]]:
     rows = []
     for pole, covariance in zip(result.poles, result.pole_covariance, strict=True):
         sd = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-        rows.append((f"{pole.real:.5g} {pole.imag:+.5g}i", _number(sd[0]), _number(sd[1])))
-    title = f"Plant of order {result.estimate.model.order} from its loop: {result.excitation.sentence}"
-    return title, ("pole", "sd (real)", "sd (imaginary)"), [*rows, *((text, "", "") for text in result.warnings)]
+        rows.append((_pole(pole), _number(sd[0]), _number(sd[1]) if pole.imag else ""))
+    said = dict.fromkeys((result.excitation.sentence, *result.warnings))
+    title = f"Plant of order {result.estimate.model.order} from its loop"
+    return title, ("pole", "sd (real)", "sd (imaginary)"), [*rows, *((text,) for text in said)]
 
 
 @rows_of.register(TransferFunction)
@@ -187,8 +188,22 @@ def html(result: Any) -> str:
     title, header, rows = rows_of(result)
     esc = escaping.escape
     head = "".join(f"<th>{esc(cell)}</th>" for cell in header) if any(header) else ""
-    body = "".join("<tr>" + "".join(f"<td>{esc(str(cell))}</td>" for cell in row) + "</tr>" for row in rows)
-    return f"<table><caption><b>{esc(title)}</b></caption><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
+    body = "".join("<tr>" + "".join(_cells(row, len(header))) + "</tr>" for row in rows)
+    caption = f'<caption style="text-align: left; white-space: nowrap"><b>{esc(title)}</b></caption>'
+    return f"<table>{caption}<thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
+
+
+def _cells(row: Row, width: int) -> list[str]:
+    """Return the cells of a row: names to the left, numbers as the notebook has them, a remark over the whole width."""
+    first, *others = (escaping.escape(str(cell)) for cell in row)
+    if not others:
+        wide = "text-align: left; white-space: normal; max-width: 40em"
+        return [f'<td colspan="{width}" style="{wide}">{first}</td>']
+    return [f'<td style="text-align: left">{first}</td>', *(f"<td>{cell}</td>" for cell in others)]
+
+
+def _pole(pole: complex) -> str:
+    return f"{pole.real:.5g} {pole.imag:+.5g}i" if pole.imag else f"{pole.real:.5g}"
 
 
 def _number(value: Any) -> str:
@@ -246,7 +261,8 @@ def to_pandas(result: Any) -> Any:
             index=pd.Index([point.omega_rad_s for point in points], name="omega_rad_s"),
         )
     _, header, rows = rows_of(result)
-    return pd.DataFrame(rows, columns=[name or str(i) for i, name in enumerate(header)])
+    padded = [(*row, *[""] * (len(header) - len(row))) for row in rows]
+    return pd.DataFrame(padded, columns=[name or str(i) for i, name in enumerate(header)])
 
 
 for _shown in SHOWN:

@@ -138,7 +138,19 @@ def test_every_result_shows_itself_plots_and_becomes_a_frame(oven):
         figure, axes = plt.subplots(2, 1)
         assert at.plot(result, ax=axes) is axes
         assert all(axis.lines or axis.containers for axis in axes)
+        legend = axes[0].get_legend()
+        names = [text.get_text() for text in legend.get_texts()] if legend is not None else []
+        assert len(names) == len(set(names))
         plt.close(figure)
+
+
+def test_a_remark_stands_once_over_the_whole_width_and_a_real_pole_without_imaginary_part():
+    loop = at.closed_loop(at.example("loop"), order=5)
+    shown = loop._repr_html_()
+    assert shown.count("not excited enough") == 1
+    assert shown.count("<td colspan=") == len({loop.excitation.sentence, *loop.warnings})
+    assert "+0i" not in shown
+    assert len(at.to_pandas(loop).columns) == 3
 
 
 def test_each_papers_main_result_takes_a_few_lines():
