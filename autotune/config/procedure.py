@@ -159,9 +159,12 @@ class ControllerSettings(Section):
 class VerificationSettings(Section):
     """Set-point step and input-disturbance step on the rig with the new gains, compared with the prediction."""
 
-    setpoint_step: Annotated[Number | None, Field(description="step of the set-point [y unit]; default swing / 3")] = (
-        None
-    )
+    setpoint_step: Annotated[
+        Number | None,
+        Field(
+            description="step of the set-point [y unit]; default swing / 3, less where the command has no room for it"
+        ),
+    ] = None
     disturbance_step: Annotated[
         Number | None,
         Field(description="step added to the command [u unit]; chosen from the design when absent"),

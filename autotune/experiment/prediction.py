@@ -6,9 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 from scipy.linalg import expm
 from scipy.ndimage import uniform_filter1d
-from scipy.signal import lfilter, tf2ss
+from scipy.signal import tf2ss
 
 from autotune.arrays import FloatArray
 from autotune.design.law import PILaw
@@ -85,8 +86,10 @@ def predict(
     disturbance: FloatArray,
     noise_sd: float,
     rng: np.random.Generator,
+    *,
+    u_rest: float,
 ) -> Prediction:
-    """Predict the loop around its operating point, away from the limits of u.
+    """Predict the loop around its operating point, the limits of the command and of its rate included.
 
     Parameters
     ----------
@@ -95,59 +98,82 @@ def predict(
     draws : sequence of TransferFunction
         Plants drawn from the estimate's uncertainty; one noise sequence is drawn for each.
     law : PILaw
-        The law as it will run.
+        The law as it will run; its limits hold for its command and the disturbance together.
     setpoint, disturbance : (N,) array
         Departure of r from the operating point [y unit]; what is added to the command [u unit].
     noise_sd : float
         Standard deviation of the white measurement noise [y unit].
     rng : Generator
         Source of the noise.
+    u_rest : float
+        Command that holds the operating point [u unit], which the limits are counted from.
 
     Notes
     -----
     The loop runs on noise alone for N samples before the first one counts, so that the band holds the wander that the
-    noise itself causes. Limits and quantisation of u are not in it.
+    noise itself causes. Quantisation of u is not in it.
     """
-    y, u = _respond(plant, law, setpoint, disturbance, np.zeros_like(setpoint))
     count = setpoint.size
     quiet = np.zeros(count)
+    y, u = _respond(plant, law, setpoint, disturbance, quiet, u_rest)
+    whole_setpoint, whole_disturbance = np.concatenate([quiet, setpoint]), np.concatenate([quiet, disturbance])
     y_draws = np.empty((len(draws), count))
     for i, drawn in enumerate(draws):
         noise = noise_sd * rng.standard_normal(2 * count)
-        true, _ = _respond(drawn, law, np.concatenate([quiet, setpoint]), np.concatenate([quiet, disturbance]), noise)
+        true, _ = _respond(drawn, law, whole_setpoint, whole_disturbance, noise, u_rest)
         y_draws[i] = (true + noise)[count:]
     scatter = np.sqrt(uniform_filter1d(np.mean((y_draws - y) ** 2, axis=0), max(1, count // 60), mode="nearest"))
     return Prediction(y=y, low=y - 1.96 * scatter, high=y + 1.96 * scatter, u=u, y_draws=y_draws)
 
 
 def _respond(
-    plant: TransferFunction, law: PILaw, setpoint: FloatArray, disturbance: FloatArray, noise: FloatArray
+    plant: TransferFunction,
+    law: PILaw,
+    setpoint: FloatArray,
+    disturbance: FloatArray,
+    noise: FloatArray,
+    u_rest: float,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the plant's output and the law's command: u = C_r r - C (y + n), y = P (u + d)."""
-    B_p, A_p = sampled(plant, law.sample_time_s)
-    discrete = law.discrete()
-    B_c, A_c = np.array(discrete.num), np.array(discrete.den)
-    c = law.controller
-    integral = c.K * law.sample_time_s / c.Ti_s  # zero for an infinite T_I
-    B_r = np.array([c.K * c.setpoint_weight + integral, -c.K * c.setpoint_weight])
-    closed = np.convolve(A_p, A_c)
-    loop = np.convolve(B_p, B_c)
-    closed = np.pad(closed, (0, max(0, loop.size - closed.size)))
-    closed[: loop.size] += loop
-    filtered = np.convolve(_without_integrator(A_c), B_r) if integral else A_c * c.K * c.setpoint_weight
-    y = (
-        lfilter(np.convolve(B_p, filtered), closed, setpoint)
-        + lfilter(np.convolve(B_p, A_c), closed, disturbance)
-        - lfilter(np.convolve(B_p, B_c), closed, noise)
-    )
-    u = (
-        lfilter(np.convolve(A_p, filtered), closed, setpoint)
-        - lfilter(np.convolve(B_p, B_c), closed, disturbance)
-        - lfilter(np.convolve(A_p, B_c), closed, noise)
-    )
-    return np.asarray(y, dtype=np.float64), np.asarray(u, dtype=np.float64)
+    """Return the plant's output and the law's command, both from rest."""
+    num, den = sampled(plant, law.sample_time_s)
+    c, T_s = law.controller, law.sample_time_s
+    # an infinite T_I gives no integral
+    terms = (c.K, c.setpoint_weight, c.K * T_s / c.Ti_s, T_s / (c.Tf_s + T_s), c.K * c.Td_s / T_s, law.tracking_gain)
+    low, high = law.u_min - u_rest - disturbance, law.u_max - u_rest - disturbance
+    y, u = _stepped(num, den, terms, low, high, law.u_rate * T_s, setpoint, disturbance, noise)
+    return y, u
 
 
-def _without_integrator(A_c: FloatArray) -> FloatArray:
-    """Divide 1 - q^-1 out of the law's denominator."""
-    return np.cumsum(A_c)[:-1]
+@njit(cache=True)
+def _stepped(
+    num: FloatArray,
+    den: FloatArray,
+    terms: tuple[float, float, float, float, float, float],
+    low: FloatArray,
+    high: FloatArray,
+    move: float,
+    setpoint: FloatArray,
+    disturbance: FloatArray,
+    noise: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
+    """Step the law, as :meth:`PILaw.step` does, on the plant's difference equation."""
+    K, weight, slope, blend, lead, tracking = terms
+    count = setpoint.size
+    y, u, into = np.zeros(count), np.zeros(count), np.zeros(count)
+    y_filtered = integral = command = reached = 0.0
+    for k in range(count):
+        for i in range(1, min(num.size, k + 1)):
+            y[k] += num[i] * into[k - i]
+        for i in range(1, min(den.size, k + 1)):
+            y[k] -= den[i] * y[k - i]
+        moved = blend * (y[k] + noise[k] - y_filtered)
+        y_filtered += moved
+        integral += slope * (setpoint[k] - y_filtered)
+        wanted = K * (weight * setpoint[k] - y_filtered) + integral - lead * moved
+        command = min(max(wanted, command - move), command + move)
+        command = min(max(command, low[k]), high[k])
+        integral += tracking * (command - wanted)
+        # the load too comes no faster than the command may move
+        reached = min(max(command + disturbance[k], reached - move), reached + move)
+        u[k], into[k] = command, reached
+    return y, u

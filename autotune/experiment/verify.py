@@ -17,7 +17,7 @@ from autotune.config.procedure import LimitSettings
 from autotune.controller import PIDController
 from autotune.design.law import PILaw
 from autotune.design.margins import Margins, margins
-from autotune.errors import DesignError, InputError
+from autotune.errors import DesignError
 from autotune.experiment.device import try_on_device
 from autotune.experiment.limits import Watch
 from autotune.experiment.loop import ControlLoop
@@ -32,6 +32,7 @@ from autotune.experiment.run import (
     recording_metadata,
     wait_for_rest,
 )
+from autotune.experiment.step_test import StepTest, plan_test
 from autotune.identification.parametric import PlantFit
 from autotune.recording import RecordingWriter
 
@@ -39,35 +40,8 @@ from autotune.recording import RecordingWriter
 DRAWS = 60
 #: part of the predicted departure's rms that unmodelled dynamics may add before the loop counts as another one
 TOLERANCE = 0.15
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class StepTest:
-    """What is asked of the loop, sample by sample, around the operating point.
-
-    Attributes
-    ----------
-    t : (N,) array
-        Time [s]; the first sample is one sample time after the hand-over has settled.
-    setpoint, disturbance : (N,) array
-        Departure of r from the operating point [y unit]; what is added to the law's command [u unit].
-    settle : int
-        Samples of regulation before the test, not scored.
-    smoothing : int
-        Samples over which measured and predicted responses are averaged before they are compared: a third of the
-        crossover's radian, which hides noise and leaves the response.
-    """
-
-    t: FloatArray
-    setpoint: FloatArray
-    disturbance: FloatArray
-    settle: int
-    smoothing: int
-
-    @property
-    def disturbed_from(self) -> int:
-        """First sample of the load step."""
-        return int(np.argmax(self.disturbance != 0.0))
+#: share of the test with the command at a limit from which on it is told
+AT_LIMIT = 0.1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -130,49 +104,6 @@ class Verification:
     predicted_sd: StepFigures
 
 
-def plan_test(config: Config, law: PILaw, fit: PlantFit, crossover_rad_s: float) -> StepTest:
-    """Choose steps that show well above the noise and stay within half of the allowed swing, and of the command's room.
-
-    Parameters
-    ----------
-    config : Config
-        What is asked for and allowed.
-    law : PILaw
-        The law to be verified.
-    fit : PlantFit
-        Estimated plant.
-    crossover_rad_s : float
-        Gain crossover of the new loop [rad/s], which sets the duration.
-    """
-    settings, limits, u_guess = config.verification, config.limits, config.operating_point.u_guess
-    T_s = law.sample_time_s
-    c = law.controller
-    slow = 4.0 * c.Ti_s if math.isfinite(c.Ti_s) else 0.0
-    duration = settings.duration_s if settings.duration_s is not None else max(12.0 / crossover_rad_s, slow)
-    if 3.0 * duration > limits.time_s:
-        raise InputError(
-            f"the steps take {3.0 * duration:.4g} s on the rig, limits.time_s = {limits.time_s:g} allows less",
-            where="verification",
-            remedy="raise limits.time_s, or give verification.duration_s",
-        )
-    count = math.ceil(duration / T_s)
-    step = settings.setpoint_step if settings.setpoint_step is not None else limits.swing / 3.0
-    load = settings.disturbance_step
-    if load is None:
-        quiet, unit = np.zeros(count), np.ones(count)
-        unit_response = predict(fit.plant, [fit.plant], law, quiet, unit, 0.0, np.random.default_rng(0)).y
-        room = min(limits.u_max - u_guess, u_guess - limits.u_min)
-        load = min(0.4 * limits.swing / float(np.abs(unit_response).max()), 0.5 * room)
-    late = np.arange(2 * count) >= count
-    return StepTest(
-        t=np.arange(2 * count, dtype=np.float64) * T_s,
-        setpoint=np.full(2 * count, step),
-        disturbance=np.where(late, load, 0.0),
-        settle=count,
-        smoothing=max(1, round(1.0 / (3.0 * crossover_rad_s * T_s))),
-    )
-
-
 def run_test(
     loop: ControlLoop,
     law: PILaw,
@@ -233,7 +164,7 @@ def run_test(
         tell(k)
         y[k] = tick.y - operating_y if tick.usable else np.nan
         for missed in range(before + 1, k + 1):  # the law's time goes on where samples were missed
-            u[missed], state = law.step(state, float(setpoint[k]), tick.y)
+            u[missed], state = beside(law, float(load[k])).step(state, float(setpoint[k]), tick.y)
         loop.step(loop.nearest(u[k] + load[k]), extra={"r": float(setpoint[k])})
         before = k
     u[before + 1 :] = u[before]
@@ -300,8 +231,7 @@ def run_verification(
     crossover_rad_s = expected_margins(fit, controller).crossover_rad_s
     if isinstance(rig, Exchanges) and not isinstance(rig, RunsLaws):
         fit = _delayed(fit, config.signals.sample_time_s)  # its commands act one sample after what they come from
-    test = plan_test(config, law, fit, crossover_rad_s)
-    law = law_for(controller, config.limits, config.signals.sample_time_s, float(test.disturbance[-1]))
+    test = plan_test(config, law, fit, crossover_rad_s, u_rest)
     extra = ("r", *further_columns(rig))
     writer = RecordingWriter(recording, ("t", "u", "y", *extra), recording_metadata(config))
     with ControlLoop(rig=rig, envelope=envelope_of(config), writer=writer, extra=extra) as loop:
@@ -311,7 +241,10 @@ def run_verification(
         known = bring_to_operating_point(loop, config, u_rest=u_rest)
         loop.note(test_start_s=loop.tick.t_s)
         y, u = run_test(loop, law, test, config.operating_point.y, known.midpoint, on_status)
-    return judge(test, y, u, law, fit, known.noise_sd if noise_sd is None else noise_sd)
+    if isinstance(rig, RunsLaws):
+        law = replace(law, u_rate=math.inf)  # the device's own PI has no limit of the rate
+    noise_sd = known.noise_sd if noise_sd is None else noise_sd
+    return judge(test, y, u, law, fit, noise_sd, u_rest=known.midpoint)
 
 
 def _delayed(fit: PlantFit, delay_s: float) -> PlantFit:
@@ -322,7 +255,15 @@ def _delayed(fit: PlantFit, delay_s: float) -> PlantFit:
 
 
 def judge(
-    test: StepTest, y: FloatArray, u: FloatArray, law: PILaw, fit: PlantFit, noise_sd: float, seed: int = 0
+    test: StepTest,
+    y: FloatArray,
+    u: FloatArray,
+    law: PILaw,
+    fit: PlantFit,
+    noise_sd: float,
+    *,
+    u_rest: float,
+    seed: int = 0,
 ) -> Verification:
     """Compare the measured responses with the prediction.
 
@@ -338,6 +279,8 @@ def judge(
         Estimated plant with its uncertainty.
     noise_sd : float
         Standard deviation of the measurement noise [y unit].
+    u_rest : float
+        Command that holds the operating point, as it was known before the test [u unit].
     seed : int
         Of the draws.
 
@@ -348,22 +291,25 @@ def judge(
         predicted response's rms for dynamics that the fitted structure leaves out.
     """
     rng = np.random.default_rng(seed)
-    prediction = predict(fit.plant, fit.draws(DRAWS, rng), law, test.setpoint, test.disturbance, noise_sd, rng)
+    draws = fit.draws(DRAWS, rng)
+    prediction = predict(fit.plant, draws, law, test.setpoint, test.disturbance, noise_sd, rng, u_rest=u_rest)
     usable = np.isfinite(y)
     expected = smoothed(prediction.y, test)
     measured = smoothed(np.where(usable, y, np.interp(test.t, test.t[usable], y[usable])), test)
-    draws = [smoothed(draw, test) for draw in prediction.y_draws]
+    responses = [smoothed(draw, test) for draw in prediction.y_draws]
     rms_error = _rms(measured - expected)
-    explained = float(np.quantile([_rms(draw - expected) for draw in draws], 0.99))
+    explained = float(np.quantile([_rms(response - expected) for response in responses], 0.99))
     # the response counts from the set-point, where the loop is to bring it
     allowed = math.hypot(explained, TOLERANCE * _rms(expected - test.setpoint))
     accepted = rms_error <= allowed
-    drawn = [_figures(test, draw) for draw in draws]
+    drawn = [_figures(test, response) for response in responses]
     reason = (
         f"the loop behaves as predicted: rms error {rms_error:.3g}, up to {allowed:.3g} is explained"
         if accepted
         else f"the loop does not behave as predicted: rms error {rms_error:.3g}, only {allowed:.3g} is explained"
     )
+    if (at_limit := _share_at_limit(test, u, law)) > AT_LIMIT:
+        reason += f"; the command is at its limit for {100 * at_limit:.0f} % of the steps, where dead time hardly shows"
     return Verification(
         accepted=accepted,
         reason=reason,
@@ -374,23 +320,35 @@ def judge(
         rms_error=rms_error,
         allowed=allowed,
         measured=_figures(test, measured),
-        predicted=_over(drawn, np.nanmean),
-        predicted_sd=_over(drawn, np.nanstd),
+        predicted=_over(drawn, np.mean),
+        predicted_sd=_over(drawn, np.std),
     )
+
+
+def _share_at_limit(test: StepTest, u: FloatArray, law: PILaw) -> float:
+    """Return the share of the samples at which the command, the load included, ends at a limit."""
+    whole, slack = u + test.disturbance, 1e-3 * (law.u_max - law.u_min)
+    return float(np.mean((whole <= law.u_min + slack) | (whole >= law.u_max - slack)))
 
 
 def _over(drawn: Sequence[StepFigures], statistic: Callable[[list[float]], Any]) -> StepFigures:
     """Return a statistic of every figure over the draws."""
+    reached = [figure.rise_s for figure in drawn if math.isfinite(figure.rise_s)]
     return StepFigures(
         overshoot=float(statistic([figure.overshoot for figure in drawn])),
-        rise_s=float(statistic([figure.rise_s for figure in drawn])),
+        rise_s=float(statistic(reached)) if reached else math.nan,
         peak=float(statistic([figure.peak for figure in drawn])),
         h2=float(statistic([figure.h2 for figure in drawn])),
     )
 
 
+def beside(law: PILaw, load: float) -> PILaw:
+    """Return the law whose command stays within the limits together with a load that is added to it [u unit]."""
+    return law if load == 0.0 else replace(law, u_min=law.u_min - load, u_max=law.u_max - load)
+
+
 def law_for(controller: PIDController, limits: LimitSettings, sample_time_s: float, reserve: float = 0.0) -> PILaw:
-    """Return the law within the safety envelope; ``reserve`` [u unit] is kept for the load step."""
+    """Return the law within the safety envelope; ``reserve`` [u unit] is kept, both ways, for what is added to it."""
     return PILaw(
         controller=controller,
         sample_time_s=sample_time_s,
