@@ -109,9 +109,12 @@ def indirect_subspace(
 
     Notes
     -----
-    Consistent, if n_cl is not below the loop's minimal order; exact without noise. A mode of the loop that r hardly
-    excites is seen late: the ninth singular value of the paper's example lies below its noise up to some 1e8 samples,
-    and a loop order of 7 gives a third of the pole error that 9 gives with 400,000.
+    Consistent, if n_cl is not below the loop's minimal order; exact without noise. On the paper's example the root mean
+    square error of the poles is .77, .69, 1.46 and .78 over the root of 25,000, 100,000, 400,000 and 1,600,000 rows;
+    with n_cl = n it stays near .01. A mode of the loop that r hardly excites is seen late: the ninth singular value of
+    that example lies below its noise up to some 1e8 samples, and a loop order of 7 gives about half of the error there.
+    To leave out what is not yet seen is no remedy: over seven loops it costs up to two thirds more error in the
+    response (2.37 to 3.30 and .19 to .32 of it with 2,000 rows) where it rarely gains a fifth.
     Far from efficient in B and D with noise: on the paper's own example 22 of 100
     models are not stabilised by the true controller. Equations (7) to (11) of the paper.
     """
