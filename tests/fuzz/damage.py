@@ -19,7 +19,7 @@ OTHERS: tuple[Any, ...] = (
     "../a", "°C", "\u202e", True, False, [], [[]], {}, [1], [0.0], {"a": 1}, [{}], ["x"], None,
 )  # fmt: skip
 #: a value that is repeated takes no more than about so many characters; indented by depth it takes a hundred times more
-LARGEST = 100_000
+LARGEST = 20_000
 
 
 def places(content: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
@@ -57,7 +57,8 @@ def damaged_content(rng: random.Random, content: Any) -> Any:
             table[rng.choice((f"{key}_", "Td", "x", "", "ä", "\x1b", "x" * 300))] = table.pop(key)
         elif isinstance(table, list):
             times, size = rng.choice((1, 2, 60, 2000)), len(repr(table[key]))
-            table[key:key] = [copy.deepcopy(table[key])] * min(times, max(1, LARGEST // size))
+            # each a copy of its own: a later change in one that all share would multiply
+            table[key:key] = [copy.deepcopy(table[key]) for _ in range(min(times, max(1, LARGEST // size)))]
         else:
             value: Any = 1
             for _ in range(rng.choice((3, 40, 200))):
