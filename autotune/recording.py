@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 import tomli_w
+from scipy.optimize import minimize_scalar
 
 from autotune.arrays import FloatArray
 from autotune.errors import InputError
@@ -142,8 +143,29 @@ class Recording:
         return replace(self, t=t, u=self.u[held], y=np.interp(t, self.t, self.y), extra=MappingProxyType(extra))
 
     def at_even_times(self) -> Recording:
-        """Return the recording with its rows evenly spaced between its first stamp and its last one."""
-        return replace(self, t=np.linspace(self.t[0], self.t[-1], len(self)))
+        """Return the recording with its rows evenly spaced: where stamps were late, at the times they are late of.
+
+        Notes
+        -----
+        A row cannot arrive before it was taken: of all lines a + b k below the stamps that of least mean lateness is
+        taken. The first stamp and the last one alone would be wrong by how late these two happen to be.
+
+        References
+        ----------
+        Moon, Skelly and Towsley, Estimation and removal of clock skew from network delay measurements, Infocom 1999.
+        """
+        number = np.arange(len(self), dtype=float)
+        mean = (self.t[-1] - self.t[0]) / (len(self) - 1)
+
+        def earliest(b: float) -> float:
+            return float(np.min(self.t - b * mean * number))
+
+        def lateness(b: float) -> float:  # convex, with a kink at its minimum
+            return float(np.mean(self.t - b * mean * number)) - earliest(b)
+
+        found = minimize_scalar(lateness, bounds=(0.5, 2.0), method="bounded", options={"xatol": 1e-12})
+        b = 1.0 if lateness(1.0) <= found.fun else float(found.x)  # even ones stay as they are
+        return replace(self, t=earliest(b) + b * mean * number)
 
     def require_finite(self, columns: Iterable[str] = ("u", "y")) -> Recording:
         """Return self if the columns hold no NaN or infinity.

@@ -27,7 +27,7 @@ JITTER = "timing.jitter"
 
 def uneven_share(recording: Recording) -> float:
     """Return the spread of the stamps about even ones, in sample times."""
-    off = recording.t - recording.at_even_times().t
+    off = recording.t - np.linspace(recording.t[0], recording.t[-1], len(recording))
     return float(np.std(off) * (len(recording) - 1) / recording.duration_s)
 
 

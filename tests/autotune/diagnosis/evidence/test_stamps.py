@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from autotune.diagnosis.evidence.stamps import evened
 from autotune.diagnosis.thresholds import IN_USE
@@ -36,6 +37,18 @@ def test_rows_that_were_taken_evenly_and_stamped_on_arrival_are_simulated_at_eve
     assert jitter is not None
     assert jitter.name == "timing.jitter"
     assert np.ptp(np.diff(changed[0].t)) < 1e-9
+
+
+def test_even_times_are_those_that_stamps_are_late_of_whatever_the_first_and_the_last_are():
+    n, dt = 1400, 0.004
+    late = np.random.default_rng(3).exponential(0.02, n)
+    late[[0, -1]] = 0.0, 0.1
+    stamps = np.maximum.accumulate(dt * np.arange(n) + late) + 1e-7 * np.arange(n)
+    even = Recording(t=stamps, u=np.zeros(n), y=np.zeros(n)).at_even_times()
+    assert np.diff(even.t) == pytest.approx(dt, rel=1e-3)
+    assert np.all(even.t <= stamps + 1e-9)
+    exact = Recording(t=dt * np.arange(n), u=np.zeros(n), y=np.zeros(n)).at_even_times()
+    assert exact.t == pytest.approx(dt * np.arange(n), abs=1e-9)
 
 
 def test_rows_that_were_taken_when_their_stamps_say_keep_them():
