@@ -56,6 +56,8 @@ def found_effects(evidence: Evidence, verdict: Verdict) -> tuple[FoundEffect, ..
         effects.append((_lost_without(search, effect.name), _found_effect(effect, evidence, everywhere)))
     effects += [(s.evidence, _of_samples(s, everywhere, evidence.limits)) for s in evidence.samples]
     ranked = [e for _, e in sorted(effects, key=lambda pair: -pair[0])]
+    surest = max((e.probability for e in ranked), default=0.0)
+    ranked = [e for e in ranked if e.probability >= min(evidence.limits.least_named, surest)]
     if evidence.offset is not None and not any(e.name in kind_of(OFFSET).same for e in ranked):
         ranked.append(_of_offset(evidence.offset, evidence, everywhere))
     return tuple(ranked)

@@ -157,6 +157,14 @@ def places_of(evidence: Evidence, effects: Sequence[FoundEffect], description: D
     return tuple(places) or ("plant",)
 
 
+def beside(effects: Sequence[FoundEffect], evidence: Evidence) -> str:
+    """Return what is said of effects that predict, and are too improbable to be named."""
+    unnamed = [name for name in evidence.search.chosen.names if name not in {e.name for e in effects}]
+    if not unnamed:
+        return ""
+    return f" The extended model predicts with {' and '.join(unnamed)} as well, which may be something else."
+
+
 def sentences_of(
     verdict: Verdict, effects: Sequence[FoundEffect], evidence: Evidence, places: Sequence[str]
 ) -> tuple[str, ...]:
@@ -179,7 +187,7 @@ def sentences_of(
             names = " and ".join(f"{e.name} (probability {e.probability:.2f})" for e in effects)
             clean = residual.is_noise or q.comes_down_to_noise
             rest = "" if clean else " What is left is not noise: something smaller is missing as well."
-            first = f"Physics was left out: {names}.{rest}"
+            first = f"Physics was left out: {names}.{beside(effects, evidence)}{rest}"
         case _:
             first = f"Something is missing that no candidate explains to within noise; it shows at {', '.join(places)}."
     return (first, errors) if residual.is_constant else (first, residual.varies.sentence, errors)

@@ -44,6 +44,13 @@ def kind_of(name: str, where: str = "catalogue") -> EffectKind:
     return KINDS[name]
 
 
+def taken_by(names: Iterable[str]) -> set[str]:
+    """Return the effects that are not added beside others: these, what they include, and what includes them."""
+    given = set(names)
+    inner = {other for name in given for other in KINDS[name].includes}
+    return given | inner | {kind.name for kind in KINDS.values() if given & set(kind.includes)}
+
+
 def unknown(name: str, where: str, known: Iterable[str] = ()) -> InputError:
     """Return the error of an effect that no catalogue has: the name that may be meant, and all that there are."""
     names = sorted({*KINDS, *known})

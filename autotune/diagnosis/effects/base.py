@@ -306,6 +306,10 @@ class EffectKind:
     same : tuple of str
         Effects that cannot be told apart from it with command and measurement alone; itself not counted. Drifts of
         load and sensor are the same on a chain that settles; on others one of them simply explains nothing.
+    recoordinates : bool
+        Whether it is a change of the plant's coordinates: where no command moves, nothing tells it from the plant.
+    includes : tuple of str
+        Effects that are this one with numbers at their ends: neither is added beside the other.
     places : tuple of str
         Where it may sit, several where command and measurement cannot say; its own by default.
     odds : mapping
@@ -341,6 +345,8 @@ class EffectKind:
     excludes: tuple[str, ...] = ()
     confusable: tuple[str, ...] = ()
     same: tuple[str, ...] = ()
+    recoordinates: bool = False
+    includes: tuple[str, ...] = ()
     places: tuple[str, ...] = ()
     odds: Mapping[str, float] = field(default_factory=dict, hash=False, compare=False)
 

@@ -226,6 +226,7 @@ PLANT = (
         starts=lambda s: [(c * s.f, 2.0 * c * s.f, d * s.v) for c in (0.02, 0.1) for d in (0.05, 0.2)],
         nudge=0.06,
         confusable=("plant.coulomb_friction",),
+        includes=("plant.coulomb_friction",),
         odds={"arm": 0.15, "shaft": 0.2, "carriage": 0.2, "speed": 0.2, "lifted": 0.03, "oscillator": 0.05},
         reference=_OLSSON,
     ),

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from dataclasses import replace
 
-from autotune.diagnosis.effects import kind_of
+from autotune.diagnosis.effects import kind_of, taken_by
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import RUNAWAY, Fit, fit
 from autotune.diagnosis.selection.hypothesis import Hypothesis, hypothesis, is_stand_in, merged, penalised
@@ -41,7 +41,7 @@ def grown(base: Hypothesis, data: Data, bench: Bench, width: Width, lasting: Seq
     lasting : sequence of Effect
         What long searches found, where that is known; they are made anew otherwise.
     """
-    names = bench.names - set(base.names)
+    names = bench.names - taken_by(base.names)
     found = list(lasting)
     for kind in bench.kinds:
         if kind.name in names and not kind.lasting:

@@ -114,7 +114,8 @@ class RigSearch:
         scores: dict[str, float] = {}
         for one in self.judged:
             name = "+".join(one.names) if one.names else "none"
-            scores[name] = min(scores.get(name, math.inf), worst(one, self.judged))
+            rivals = [other for other in self.judged if set(other.names) != set(one.names)]
+            scores[name] = min(scores.get(name, math.inf), worst(one, rivals))
         chosen = "+".join(self.chosen.names) if self.chosen.names else "none"
         scores[chosen] = min(scores.values())  # what was more, and not material, speaks for it too
         return weighed(scores, limits.rig_temperature, limits.rig_unknown_odds)

@@ -18,8 +18,8 @@ from autotune.diagnosis.selection.judged import Judged
 from autotune.diagnosis.thresholds import Thresholds
 from autotune.models import Effect
 
-#: Gauss-Newton steps of a fit in the search.
-STEPS = 12
+#: Gauss-Newton steps of a fit in the search, and of the leading ones at its end.
+STEPS, LAST_STEPS = 12, 40
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -97,6 +97,18 @@ class RigBench:
         lost_far = rms(far.residuals, self.long.good) / rms(one.fit.residuals, self.long.good)
         lost_near = rms(near.residuals, self.few.good) / rms(one.short.residuals, self.few.good)
         return replace(one, fit=replace(far, covariance=one.short.covariance)) if lost_far < lost_near else one
+
+    def finished(self, one: Judged) -> Judged | None:
+        """Return a hypothesis fitted to the end, at the residual that the best one leaves; nothing if not better so."""
+        p, good = one.fit.parametrisation, self.long.good
+        try:
+            result = fit(p, self.long, one.fit.theta, one.fit.x0, iterations=LAST_STEPS)
+        except RUNAWAY:
+            return None
+        if rms(result.residuals, good) >= rms(one.fit.residuals, good):
+            return None
+        judged = self.judged(result, one.log_odds)
+        return judged if judged is not None and np.all(np.isfinite(judged.long_squares)) else None
 
     def again(self, one: Judged) -> Judged:
         """Return a hypothesis fitted again, to data with another residual."""

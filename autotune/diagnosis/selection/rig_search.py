@@ -19,7 +19,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from autotune.arrays import BoolArray
-from autotune.diagnosis.effects import ALL, kind_of
+from autotune.diagnosis.effects import ALL, kind_of, taken_by
 from autotune.diagnosis.effects.base import EffectKind
 from autotune.diagnosis.effects.rigs import rig_kind
 from autotune.diagnosis.evidence.stretches import correlation_rows, rms
@@ -98,16 +98,20 @@ def search_rig(
         beam = [retuned, nominal] if float(np.max(away)) > limits.nominal_too else [retuned]
         bench = replace(bench, lasting=tuple(_lasting(retuned, bench)))
         bench, found = _grown(retuned, beam, bench, progress, limits)
-        found = _pruned([*found, *_known(known, bench)], bench)
+        found = _finished(_pruned([*found, *_known(known, bench)], bench), bench)
         chosen = bench.with_both_scales(simplest(found, limits.material))
         return RigSearch(nominal=nominal, retuned=retuned, judged=tuple(found), chosen=chosen)
 
 
 def unmoved(recordings: Sequence[Recording]) -> tuple[str, ...]:
-    """Return the effects that act on a command, where none moves: there they are a constant, and say nothing."""
+    """Return the effects that are not told from others where no command moves.
+
+    Those that act on the command are a constant there, and what only bends or delays the reading is the plant in other
+    coordinates.
+    """
     if any(float(np.ptp(r.u)) > 0.0 for r in recordings):
         return ()
-    return tuple(k.name for k in ALL if k.place == "actuator" or k.name == "timing.dead_time")
+    return tuple(k.name for k in ALL if k.place == "actuator" or k.name == "timing.dead_time" or k.recoordinates)
 
 
 def _odds(
@@ -195,7 +199,8 @@ def _larger(beam: Sequence[Judged], bench: RigBench) -> list[Judged]:
     """Return hypotheses with one effect more than those of a beam, the most promising ones judged."""
     starts: list[_Start] = []
     for base in beam:
-        groups = [_starts(base, kind, odds, bench) for kind, odds in bench.odds if kind.name not in base.names]
+        taken = taken_by(base.names)
+        groups = [_starts(base, kind, odds, bench) for kind, odds in bench.odds if kind.name not in taken]
         found = [s for group in groups for s in group]
         found.sort(key=lambda s: -s.decrease - 2.0 * math.log(s.odds))
         starts += [s for rank, s in enumerate(found) if rank < bench.limits.rig_tried or s.odds >= bench.limits.usual]
@@ -291,6 +296,13 @@ def _pruned(found: Sequence[Judged], bench: RigBench) -> list[Judged]:
                 done.add(id(one))
                 result += _smaller(one, bench)
     return result
+
+
+def _finished(found: Sequence[Judged], bench: RigBench) -> list[Judged]:
+    """Return hypotheses and, beside them, the leading ones fitted to the end: the search leaves them before."""
+    leading = ranked(found)[: bench.limits.rig_pruned]
+    leading += [j for j in [simplest(found, bench.limits.material)] if j not in leading]
+    return [*found, *(j for j in bench.pool.map(bench.finished, leading) if j is not None)]
 
 
 def _smaller(best: Judged, bench: RigBench) -> list[Judged]:

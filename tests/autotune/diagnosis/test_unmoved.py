@@ -1,4 +1,4 @@
-"""Recordings in which nobody moves the command tell nothing of what acts on a command."""
+"""Recordings in which nobody moves the command tell nothing of what acts on a command, nor of what bends a reading."""
 
 from __future__ import annotations
 
@@ -18,3 +18,14 @@ def test_no_effect_of_the_actuator_is_named_where_the_command_stands() -> None:
     model = Model(name="swing", input=Port(), output=Port(), blocks=(arm,))
     found = diagnose(model, [Recording(t=t, u=np.zeros(t.size), y=y)])
     assert not [e.name for e in found.effects if e.name.startswith("actuator.")]
+
+
+def test_a_bent_reading_is_not_told_from_the_plant_where_the_command_stands() -> None:
+    """y = x + 0.2 x^2 of a free decay is as well the motion of another plant, in other coordinates."""
+    t = 0.02 * np.arange(1500)
+    x = np.exp(-0.1 * t) * np.cos(np.sqrt(16.0 - 0.01) * t)
+    y = x + 0.2 * x**2 + 0.005 * np.random.default_rng(1).normal(size=t.size)
+    arm = Block(name="arm", place="plant", dynamics=TransferFunction(num=(1.0,), den=(1.0, 0.2, 16.0)))
+    model = Model(name="swing", input=Port(), output=Port(), blocks=(arm,))
+    found = diagnose(model, [Recording(t=t, u=np.zeros(t.size), y=y)])
+    assert not [e.name for e in found.effects if e.name.startswith(("actuator.", "sensor."))]

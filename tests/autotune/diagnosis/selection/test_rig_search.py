@@ -8,10 +8,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from autotune.diagnosis.effects import ALL
+from autotune.diagnosis import diagnose
+from autotune.diagnosis.effects import ALL, taken_by
 from autotune.diagnosis.effects.rigs import rig_kind
 from autotune.diagnosis.selection.rig_search import search_rig
 from autotune.diagnosis.simulation.chain import build_chain
+from autotune.diagnosis.thresholds import IN_USE
 from autotune.models import Block, Model, Port, TransferFunction
 from autotune.recording import Recording
 
@@ -53,6 +55,23 @@ def test_gravity_and_dry_friction_of_a_pendulum_are_both_named_from_one_free_swi
     found = search_rig(pendulum(20.0, 0.1), [recording], good(recording))
     assert set(found.chosen.names) >= {"plant.sine_torque", "plant.coulomb_friction"}
     assert found.chosen.error < 0.05 * found.retuned.error
+
+
+def test_what_predicts_and_is_too_improbable_to_be_named_is_told():
+    recording = swing(gravity=22.0, friction=0.25, damping=0.02)
+    strict = replace(IN_USE, least_named=IN_USE.most_probable)
+    found = diagnose(pendulum(20.0, 0.1), [recording], thresholds=strict)
+    assert found.search is not None
+    (named,) = found.effects
+    (told,) = set(found.search.chosen.names) - {named.name}
+    assert f"predicts with {told} as well" in found.sentences[0]
+    assert told in {e.name for e in found.extended_model.effects}
+
+
+def test_dry_friction_that_drops_with_speed_is_not_added_beside_plain_dry_friction():
+    laws = {"plant.coulomb_friction", "plant.stribeck_friction"}
+    for law in laws:
+        assert taken_by([law, "actuator.lag"]) == {*laws, "actuator.lag"}
 
 
 def test_a_linear_oscillation_is_given_no_effect():
