@@ -34,7 +34,7 @@ from typing import TYPE_CHECKING, Any
 from autotune.version import __version__ as __version__
 
 if TYPE_CHECKING:
-    from autotune.api.control_systems import from_control, to_control
+    from autotune.api.control_systems import to_control
     from autotune.api.examples import example
     from autotune.api.methods import (
         closed_loop,
@@ -50,6 +50,7 @@ if TYPE_CHECKING:
     from autotune.api.models import Model
     from autotune.api.plots import plot
     from autotune.api.points import Points, frequency_points
+    from autotune.api.python_control import from_control
     from autotune.api.recordings import read
     from autotune.api.shown import to_pandas
     from autotune.controller import PIDController as PI  # noqa: N814 - as people write it
@@ -76,7 +77,7 @@ _HOMES = {
     "diagnose": "autotune.api.methods",
     "plot": "autotune.api.plots",
     "to_control": "autotune.api.control_systems",
-    "from_control": "autotune.api.control_systems",
+    "from_control": "autotune.api.python_control",
     "to_pandas": "autotune.api.shown",
     "PI": "autotune.controller:PIDController",
     "OnlineEstimator": "autotune.identification.delay.online_modulating",

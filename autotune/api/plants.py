@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from typing import TYPE_CHECKING, Any
 
+from autotune.api.python_control import from_control
 from autotune.controller import Controller, DiscreteController, PIDController, read_controller
 from autotune.errors import InputError
 from autotune.models import Model, TransferFunction, read_model
@@ -28,8 +29,6 @@ def as_plant(source: Any) -> TransferFunction:
     if isinstance(source, Model) or hasattr(source, "transfer_function"):
         return _checked(source.transfer_function())
     if hasattr(source, "dt"):  # python-control's mark of a system
-        from autotune.api.control_systems import from_control
-
         return _checked(from_control(source))
     raise InputError(
         f"a {type(source).__name__} is no plant",
@@ -63,8 +62,6 @@ def as_controller(source: Any) -> Controller:
     if hasattr(source, "controller"):
         return as_controller(source.controller)
     if hasattr(source, "dt"):
-        from autotune.api.control_systems import from_control
-
         made = from_control(source)
         if isinstance(made, TransferFunction | DiscreteController):
             return made

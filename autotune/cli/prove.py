@@ -12,16 +12,18 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
-from rich.progress import Progress, track
+from rich.progress import track
 from rich.table import Table
 
 from autotune.cli import app
+from autotune.cli.proof_steps import diagnose_all, print_confusion, print_table, publish
+from autotune.cli.prove_recorded import prove_recorded
 from autotune.errors import InputError, require_extra
 from autotune.outputs import write_whole
 
 if TYPE_CHECKING:
     from sim.proof import Campaign
-    from sim.score import Mark, Row
+    from sim.score import Mark
 
 #: Time under excitation of the experiment that decides a tie [s].
 TIE_DURATION_S = 16.0
@@ -60,8 +62,6 @@ def prove(
     if recordings is None:
         _prove_simulated(out, range(seed, seed + (cases or 600)), ties, workers, (without, most), scheduler)
         return
-    from autotune.cli.prove_recorded import prove_recorded
-
     if without:
         raise InputError("--without and --recordings", where="prove", remedy="give one of the two")
     prove_recorded(recordings, out, cases, seed, workers, scheduler)
@@ -120,24 +120,6 @@ def _write_page(campaign: Campaign, result: dict[str, Any], marks: Sequence[Mark
     write_page(proof_page(result, missed, confusion(marks), wilson), campaign.out / "report.html")
 
 
-def diagnose_all(console: Console, tasks: Sequence[tuple[Campaign, int]], workers: int, scheduler: str | None) -> None:
-    """Diagnose cases of campaigns; each diagnosis is a program of its own, so a thread is enough to start it."""
-    from autotune.batch.engine import cluster, run_all
-
-    with cluster(workers, scheduler, processes=False) as client, Progress(console=console) as progress:
-        task = progress.add_task("diagnosing", total=len(tasks))
-        for _, failure in run_all(client, _diagnose, {str(i): one for i, one in enumerate(tasks)}, retries=0):
-            if failure is not None:
-                raise failure
-            progress.advance(task)
-
-
-def _diagnose(task: tuple[Campaign, int]) -> None:
-    from sim.proof import diagnose
-
-    diagnose(*task)
-
-
 def tie_resolved(out: Path, seed: int) -> dict[str, Any]:
     """Give a rig that a gentle recording leaves open one round of ``investigate``.
 
@@ -186,13 +168,6 @@ def tie_resolved(out: Path, seed: int) -> dict[str, Any]:
     return answer
 
 
-def publish(path: Path, digest: str) -> None:
-    """Write the seal before anything is diagnosed; a continued campaign must have the same one."""
-    if path.exists() and path.read_text(encoding="utf-8").strip() != digest:
-        raise InputError(f"{path}: these answers are not the ones that were sealed; use another --out")
-    write_whole(path, digest + "\n")
-
-
 def _ablate(console: Console, campaign: Campaign, without: str, most: int, workers: int, scheduler: str | None) -> None:
     """Leave entries out of the catalogue in turn and try the singles that conceal them, one of each entry at a time.
 
@@ -215,28 +190,6 @@ def _ablate(console: Console, campaign: Campaign, without: str, most: int, worke
     finally:
         ablated = {name: replace(campaign, without=name, seeds=seeds) for name, seeds in chosen.items()}
         _print_ablation(console, {name: mark_all(one, one.finished) for name, one in ablated.items()})
-
-
-def print_confusion(console: Console, marks: Sequence[Mark]) -> None:
-    """Print what was said of what."""
-    from sim.score import confusion
-
-    view = Table("concealed", "cases", "right", "said instead", title="Confusion matrix, by rows")
-    for name, count, right, said in confusion(marks):
-        view.add_row(name, str(count), str(right), ", ".join(f"{word} {times}" for word, times in said))
-    console.print(view)
-
-
-def print_table(console: Console, rows: Sequence[Row]) -> None:
-    """Print the figures with what is asked of them."""
-    view = Table("figure", "asked", "measured", "95 % interval", "of", "met", title="Proof on concealed cases")
-    for row in rows:
-        share = row.interval is not None
-        value = f"{100 * row.value:.1f} %" if share else f"{row.value:.3f}"
-        interval = f"{100 * row.interval[0]:.1f} to {100 * row.interval[1]:.1f} %" if row.interval else ""
-        met = "" if row.met is None else ("yes" if row.met else "no")
-        view.add_row(row.figure, row.asked, value if row.count else "-", interval, str(row.count), met)
-    console.print(view)
 
 
 def _print_ablation(console: Console, ablated: Mapping[str, Sequence[Mark]]) -> None:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 from rich.progress import track
 
-from autotune.cli.prove import diagnose_all, print_confusion, print_table, publish
+from autotune.cli.proof_steps import diagnose_all, print_confusion, print_table, publish
 from autotune.errors import InputError
 from autotune.outputs import write_whole
 

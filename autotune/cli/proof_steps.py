@@ -1,0 +1,65 @@
+"""What every proof does: publish the seal, diagnose the cases, print what was said."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rich.console import Console
+from rich.progress import Progress
+from rich.table import Table
+
+from autotune.errors import InputError
+from autotune.outputs import write_whole
+
+if TYPE_CHECKING:
+    from sim.proof import Campaign
+    from sim.score import Mark, Row
+
+
+def publish(path: Path, digest: str) -> None:
+    """Write the seal before anything is diagnosed; a continued campaign must have the same one."""
+    if path.exists() and path.read_text(encoding="utf-8").strip() != digest:
+        raise InputError(f"{path}: these answers are not the ones that were sealed; use another --out")
+    write_whole(path, digest + "\n")
+
+
+def diagnose_all(console: Console, tasks: Sequence[tuple[Campaign, int]], workers: int, scheduler: str | None) -> None:
+    """Diagnose cases of campaigns; each diagnosis is a program of its own, so a thread is enough to start it."""
+    from autotune.batch.engine import cluster, run_all
+
+    with cluster(workers, scheduler, processes=False) as client, Progress(console=console) as progress:
+        task = progress.add_task("diagnosing", total=len(tasks))
+        for _, failure in run_all(client, _diagnose, {str(i): one for i, one in enumerate(tasks)}, retries=0):
+            if failure is not None:
+                raise failure
+            progress.advance(task)
+
+
+def _diagnose(task: tuple[Campaign, int]) -> None:
+    from sim.proof import diagnose
+
+    diagnose(*task)
+
+
+def print_confusion(console: Console, marks: Sequence[Mark]) -> None:
+    """Print what was said of what."""
+    from sim.score import confusion
+
+    view = Table("concealed", "cases", "right", "said instead", title="Confusion matrix, by rows")
+    for name, count, right, said in confusion(marks):
+        view.add_row(name, str(count), str(right), ", ".join(f"{word} {times}" for word, times in said))
+    console.print(view)
+
+
+def print_table(console: Console, rows: Sequence[Row]) -> None:
+    """Print the figures with what is asked of them."""
+    view = Table("figure", "asked", "measured", "95 % interval", "of", "met", title="Proof on concealed cases")
+    for row in rows:
+        share = row.interval is not None
+        value = f"{100 * row.value:.1f} %" if share else f"{row.value:.3f}"
+        interval = f"{100 * row.interval[0]:.1f} to {100 * row.interval[1]:.1f} %" if row.interval else ""
+        met = "" if row.met is None else ("yes" if row.met else "no")
+        view.add_row(row.figure, row.asked, value if row.count else "-", interval, str(row.count), met)
+    console.print(view)
