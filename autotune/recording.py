@@ -115,9 +115,10 @@ class Recording:
 
     def between(self, start_s: float, end_s: float) -> Recording:
         """Return the rows with ``start_s <= t < end_s``, time stamps unchanged."""
-        return self._rows((self.t >= start_s) & (self.t < end_s))
+        return self.only((self.t >= start_s) & (self.t < end_s))
 
-    def _rows(self, keep: Any) -> Recording:
+    def only(self, keep: Any) -> Recording:
+        """Return some of the rows, by number or by mask."""
         extra = {name: values[keep] for name, values in self.extra.items()}
         return replace(self, t=self.t[keep], u=self.u[keep], y=self.y[keep], extra=MappingProxyType(extra))
 

@@ -24,7 +24,8 @@ from autotune.diagnosis.fitting.fit import RUNAWAY
 from autotune.diagnosis.fitting.retuning import reduced_chi2
 from autotune.diagnosis.result import Diagnosis
 from autotune.diagnosis.selection.rig_search import search_rig, unmoved
-from autotune.diagnosis.selection.search import Search, search
+from autotune.diagnosis.selection.search import search
+from autotune.diagnosis.selection.searched import Search
 from autotune.diagnosis.thresholds import IN_USE, Thresholds
 from autotune.diagnosis.verdict import Evidence, judged, places_of, sentences_of
 from autotune.errors import InputError

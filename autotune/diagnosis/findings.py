@@ -17,7 +17,7 @@ from autotune.diagnosis.fitting.fit import Fit
 from autotune.diagnosis.result import FoundEffect, Offset, OperatingRange, Verdict
 from autotune.diagnosis.selection.hypothesis import Hypothesis
 from autotune.diagnosis.selection.probability import Candidate
-from autotune.diagnosis.selection.search import Search
+from autotune.diagnosis.selection.searched import Search
 from autotune.diagnosis.thresholds import Thresholds
 from autotune.diagnosis.verdict import Evidence
 from autotune.models import Effect, Model, Parameter

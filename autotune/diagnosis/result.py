@@ -14,7 +14,7 @@ from autotune.diagnosis.evidence.adequacy import ResidualTests
 from autotune.diagnosis.evidence.description import Description
 from autotune.diagnosis.evidence.held_out import FitQuality
 from autotune.diagnosis.selection.probability import Candidate
-from autotune.diagnosis.selection.search import Search
+from autotune.diagnosis.selection.searched import Search
 from autotune.models import Model, Parameter
 
 Verdict: TypeAlias = Literal["none", "parameters", "effect", "unexplained"]

@@ -16,7 +16,7 @@ from autotune.diagnosis.selection.hypothesis import penalised
 from autotune.diagnosis.selection.judged import RigSearch
 from autotune.diagnosis.selection.parsimony import worth_adding
 from autotune.diagnosis.selection.probability import Candidate, candidates_of
-from autotune.diagnosis.selection.search import Search
+from autotune.diagnosis.selection.searched import Search
 from autotune.diagnosis.thresholds import Thresholds
 
 

@@ -84,7 +84,7 @@ def held_out_squares(result: Fit, data: Data, tuned: bool = True) -> FloatArray:
     labels = np.concatenate(stretches_of(data))
     problem = Problem(result.parametrisation, data)
     problem.scales = result.sim.state_sizes(
-        [r.u for r in data.recordings], [r.y[g] for r, g in zip(data.recordings, data.good, strict=True)]
+        [r.u for r in data.driving], [r.y[g] for r, g in zip(data.recordings, data.good, strict=True)]
     )
     start = problem.iterate(result.theta, [x.copy() for x in result.x0])
     Jx = problem.jacobian(start, np.zeros(result.theta.size, dtype=bool))[1]

@@ -193,6 +193,6 @@ def _free_run(one: Fit, known: Data, heads: Data, given: bool) -> FloatArray:
 
 def _states(one: Fit, known: Data) -> tuple[FloatArray, ...] | None:
     """Return a fit's start states where the windows begin at rows that it had windows at."""
-    if all(np.all(np.isin(a, b)) for a, b in zip(known.starts, one.starts, strict=True)):
+    if all(np.all(np.isin(a, b)) for a, b in zip(known.first_rows, one.starts, strict=True)):
         return tuple(states_of(one, known))
     return None

@@ -15,6 +15,10 @@ from autotune.diagnosis.simulation.simulator import Windows
 from autotune.diagnosis.thresholds import Thresholds
 from autotune.recording import Recording
 
+#: Rows that stay between windows that are apart, as many as a noise model looks back; the share of rows above which
+#: data are left as they are.
+BETWEEN, MOST_PACKED = 2, 0.8
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Data:
@@ -36,6 +40,11 @@ class Data:
         What decides between two findings.
     numbers : tuple of int
         The recordings' numbers in the order given by the user.
+    whole : Data, optional
+        What these are a part of; nothing where all rows are here. Its recordings drive simulations all the same: what
+        a play or a dead time holds at a window's beginning was commanded before.
+    kept : tuple of (N,) int array
+        The rows' numbers there.
     """
 
     recordings: tuple[Recording, ...]
@@ -45,6 +54,8 @@ class Data:
     noise: Noise
     thresholds: Thresholds = field(default_factory=Thresholds)
     numbers: tuple[int, ...] = ()
+    whole: Data | None = None
+    kept: tuple[IntArray, ...] = ()
 
     def thinned(self, rows: int, informative: Sequence[BoolArray] | None = None) -> Data:
         """Return the data with windows left out evenly, until about as many rows count.
@@ -52,11 +63,25 @@ class Data:
         Windows in which u or y is largest or smallest stay, and those named as informative: a limit that is rarely
         reached acts only there.
         """
+        chosen = self._thinning(rows, informative)
+        return self if chosen is None else self.only(chosen)
+
+    def in_runs(self, rows: int, count: int) -> Data:
+        """Return the data thinned like :meth:`thinned`, by runs of so many windows, which can be joined still."""
+        chosen = self.joined(count)._thinning(rows)
+        if chosen is None:
+            return self
+        return self.only(
+            [np.isin(np.arange(len(a)) // count, runs) for a, runs in zip(self.starts, chosen, strict=True)]
+        )
+
+    def _thinning(self, rows: int, informative: Sequence[BoolArray] | None = None) -> list[IntArray] | None:
+        """Return the numbers of the windows that stay; nothing where all do."""
         share = max(1.0, self.rows / rows)
         if share < 1.5:
-            return self
+            return None
         if all(len(a) <= self.thresholds.least_windows for a in self.starts):
-            return self
+            return None
         chosen = []
         named = [np.zeros(len(a), dtype=bool) for a in self.starts] if informative is None else informative
         for r, a, ok, tells in zip(self.recordings, self.starts, self.good, named, strict=True):
@@ -65,7 +90,7 @@ class Data:
             extremes = np.clip(np.searchsorted(a, far, side="right") - 1, 0, len(a) - 1)
             evenly = np.linspace(0, len(a) - 1, count).round().astype(np.int64)
             chosen.append(np.unique(np.concatenate([evenly, extremes, np.flatnonzero(tells)])))
-        return self.only(chosen)
+        return chosen
 
     def only(self, chosen: Iterable[IntArray | BoolArray]) -> Data:
         """Return the data with the chosen windows of every recording, by number or by mask; no other row counts."""
@@ -77,12 +102,60 @@ class Data:
             starts.append(a[keep])
             stops.append(b[keep])
             good.append(ok & inside)
-        return replace(self, starts=tuple(starts), stops=tuple(stops), good=tuple(good))
+        some = replace(self, starts=tuple(starts), stops=tuple(stops), good=tuple(good))
+        return some._packed(self if self.whole is None else self.whole)
+
+    def _packed(self, whole: Data) -> Data:
+        """Return the data with the rows of the windows alone, where these are not most of all rows.
+
+        ``whole`` is what the windows were chosen from. Between windows that were apart two rows stay that do not count:
+        no difference reaches across them.
+        """
+        inside = [np.zeros(len(r), dtype=bool) for r in self.recordings]
+        for mask, starts, stops in zip(inside, self.starts, self.stops, strict=True):
+            for a, b in zip(starts, stops, strict=True):
+                mask[a : b + BETWEEN] = True
+        if sum(int(mask.sum()) for mask in inside) > MOST_PACKED * sum(mask.size for mask in inside):
+            return self
+        rows = [np.flatnonzero(mask) for mask in inside]
+        numbers = rows if self.whole is None else [known[k] for known, k in zip(self.kept, rows, strict=True)]
+        return replace(
+            self,
+            recordings=tuple(r.only(k) for r, k in zip(self.recordings, rows, strict=True)),
+            good=tuple(ok[k] for ok, k in zip(self.good, rows, strict=True)),
+            starts=tuple(np.searchsorted(k, a) for k, a in zip(rows, self.starts, strict=True)),
+            stops=tuple(np.searchsorted(k, b - 1) + 1 for k, b in zip(rows, self.stops, strict=True)),
+            whole=whole,
+            kept=tuple(numbers),
+        )
+
+    def spread_out(self) -> Data:
+        """Return the data with all rows of the recordings, those outside the windows not counting."""
+        if self.whole is None:
+            return self
+        good = [np.zeros(len(r), dtype=bool) for r in self.driving]
+        for mask, ok, k in zip(good, self.good, self.kept, strict=True):
+            mask[k] = ok
+        stops = tuple(k[b - 1] + 1 for k, b in zip(self.kept, self.stops, strict=True))
+        return replace(
+            self, recordings=self.driving, good=tuple(good), starts=self.first_rows, stops=stops, whole=None, kept=()
+        )
+
+    @property
+    def driving(self) -> tuple[Recording, ...]:
+        """The recordings with all their rows, whose commands drive simulations."""
+        return self.recordings if self.whole is None else self.whole.recordings
+
+    @cached_property
+    def first_rows(self) -> tuple[IntArray, ...]:
+        """The windows' first rows in the recordings with all their rows."""
+        if self.whole is None:
+            return self.starts
+        return tuple(k[a] for k, a in zip(self.kept, self.starts, strict=True))
 
     def joined(self, count: int) -> Data:
         """Return the data with that many windows, one after the other, made into one; the last may be of fewer."""
-        pairs = zip(self.starts, self.stops, strict=True)
-        stops = tuple(np.append(a[count::count], b[-1]).astype(np.int64) for a, b in pairs)
+        stops = tuple(np.append(b[count - 1 : -1 : count], b[-1]).astype(np.int64) for b in self.stops)
         return replace(self, starts=tuple(a[::count] for a in self.starts), stops=stops)
 
     @property
@@ -93,12 +166,17 @@ class Data:
     @cached_property
     def windows(self) -> tuple[Windows, ...]:
         """Every recording's windows, as a simulation takes them."""
-        return tuple(Windows(starts=a, stops=b) for a, b in zip(self.starts, self.stops, strict=True))
+        if self.whole is None:
+            return tuple(Windows(starts=a, stops=b) for a, b in zip(self.starts, self.stops, strict=True))
+        return tuple(
+            Windows(starts=k[a], stops=k[b - 1] + 1, places=a, rows=k.size)
+            for k, a, b in zip(self.kept, self.starts, self.stops, strict=True)
+        )
 
     @cached_property
     def sample_times(self) -> tuple[float, ...]:
         """Sample time of every recording [s]."""
-        return tuple(r.sample_time_s for r in self.recordings)
+        return tuple(r.sample_time_s for r in self.driving)
 
     def whitened(self, residuals: list[FloatArray]) -> list[FloatArray]:
         """Return the residuals whitened by the noise model, zero where a row or one that it needs does not count."""

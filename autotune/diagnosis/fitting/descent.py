@@ -40,7 +40,7 @@ def simulate(
 ) -> tuple[list[FloatArray], list[FloatArray]]:
     """Return every recording's reading, or all its signals, and the states that its windows end with."""
     result, ends = [], []
-    for i, (recording, x) in enumerate(zip(data.recordings, x0, strict=True)):
+    for i, (recording, x) in enumerate(zip(data.driving, x0, strict=True)):
         number = data.numbers[i] if data.numbers else i
         dt = data.sample_times[i]
         out, end = sim.run(recording, x, data.windows[i], number=number, sample_time_s=dt, signals=signals)
@@ -70,7 +70,7 @@ class Problem:
         self.nudge = np.array([1e-2 if f.kind == "effect" else 1e-3 for f in parametrisation.free])
         for i, f in enumerate(parametrisation.free):
             if f.turns:
-                angle = 2.0 * np.pi * np.exp(parametrisation.centre[i]) * max(r.duration_s for r in data.recordings)
+                angle = 2.0 * np.pi * np.exp(parametrisation.centre[i]) * max(r.duration_s for r in data.driving)
                 self.reach[i], self.nudge[i] = 1.0 / angle, 0.05 / angle
         lengths = [len(r) for r in data.recordings]
         edges = np.cumsum([0, *lengths])

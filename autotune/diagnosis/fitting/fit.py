@@ -67,7 +67,7 @@ class Fit:
     windows : tuple of (first, last)
         Rows of every window in the concatenated residual.
     starts : tuple of (W,) int array
-        The windows' first rows in their recordings.
+        The windows' first rows in the recordings with all their rows.
     rows : int
         Rows that count.
     sim : Simulator
@@ -124,19 +124,20 @@ class Fit:
 def start_states(sim: Simulator, data: Data) -> list[FloatArray]:
     """Return a first guess of every window's start state: rest at the row's command and reading."""
     result = []
-    for recording, good, starts in zip(data.recordings, data.good, data.starts, strict=True):
+    rows = zip(data.recordings, data.good, data.starts, data.driving, data.first_rows, strict=True)
+    for recording, good, starts, driving, first in rows:
         states = []
-        for s in starts:
+        for s, row in zip(starts, first, strict=True):
             near = np.flatnonzero(good[s : s + 20])
             y = recording.y[s + near[0]] if near.size else float(np.mean(recording.y[good]))
-            states.append(sim.rest_state(recording.u[max(s - 1, 0)], y))
+            states.append(sim.rest_state(driving.u[max(row - 1, 0)], y))
         result.append(np.array(states))
     return result
 
 
 def states_of(result: Fit, data: Data) -> list[FloatArray]:
     """Return a fit's start states of the windows that thinned data have."""
-    pairs = zip(result.x0, result.starts, data.starts, strict=True)
+    pairs = zip(result.x0, result.starts, data.first_rows, strict=True)
     return [x0[np.searchsorted(known, starts)] for x0, known, starts in pairs]
 
 
@@ -186,7 +187,7 @@ def fit(
     problem = Problem(parametrisation, data)
     sim = parametrisation.simulator(point)
     problem.scales = sim.state_sizes(
-        [r.u for r in data.recordings], [r.y[g] for r, g in zip(data.recordings, data.good, strict=True)]
+        [r.u for r in data.driving], [r.y[g] for r, g in zip(data.recordings, data.good, strict=True)]
     )
     fits_in = x0 is not None and x0[0].shape[1] == sim.order
     states = [x.copy() for x in x0] if x0 is not None and fits_in else start_states(sim, data)
@@ -257,7 +258,7 @@ def _finish(problem: Problem, iterate: Iterate, derivatives: Derivatives, may: B
         jacobian=derivatives,
         states_explain=tuple(_basis(derivatives[1][a:b]) for a, b in windows),
         windows=tuple(windows),
-        starts=problem.data.starts,
+        starts=problem.data.first_rows,
         rows=problem.data.rows,
         sim=iterate.sim,
     )

@@ -37,7 +37,7 @@ class Lengths:
 
 
 def lengths_of(model: Model, recordings: Sequence[Recording], limits: Thresholds) -> Lengths:
-    """Return how long windows are: whole recordings, but for what integrates or rings for long."""
+    """Return how long windows are: whole recordings, but for what integrates, rings for long, or has very many rows."""
     poles = np.linalg.eigvals(build_chain(model).A)
     settling = moving(poles)
     duration, dt = max(r.duration_s for r in recordings), recordings[0].sample_time_s
@@ -48,6 +48,9 @@ def lengths_of(model: Model, recordings: Sequence[Recording], limits: Thresholds
         long = max(limits.integrating_window * slowest, limits.least_window_rows * dt)
     elif damping < limits.ringing:
         long = max(limits.ringing_periods * 2.0 * math.pi * slowest, limits.least_window_rows * dt)
+    elif sum(len(r) for r in recordings) > limits.searched_rows:
+        # as many windows as are always kept, of all rows that are fitted
+        long = max(limits.integrating_window * slowest, limits.rig_rows / limits.least_windows * dt)
     long = min(long, duration)
     short = min(max(limits.short_window * slowest, limits.least_short_rows * dt), long)
     return Lengths(short=long if long < 1.5 * short else short, long=long, swings=damping < limits.swinging)

@@ -126,7 +126,7 @@ def realigned(result: Fit, data: Data) -> Fit:
     if moved is None:
         return result
     number = result.parametrisation.model.effects.index(moved)
-    kind, span = kind_of(moved.name), max(float(np.ptp(r.u)) for r in data.recordings)
+    kind, span = kind_of(moved.name), max(float(np.ptp(r.u)) for r in data.driving)
     at: Values = {key: q.value for key, q in result.model.effects[number].parameters.items()}
     before = best = _moved(result, data, kind, number, at)
     wide, turn = MOVES

@@ -47,7 +47,8 @@ def prepare(
     Returns
     -------
     data, retuned
-        Data with windows and noise, and the fit.
+        Data with windows and noise, and the fit. Of long recordings windows are left out evenly, in runs of
+        ``longer_windows``.
     """
     length = times * thresholds.lags_per_window * model_lag_s(model)
     largest = thresholds.largest_correlation
@@ -60,7 +61,7 @@ def prepare(
         stops=tuple(stops for _, stops in windows),
         noise=noise,
         thresholds=thresholds,
-    )
+    ).in_runs(thresholds.searched_rows, thresholds.longer_windows)
     size = float(np.std(np.concatenate([r.u for r in recordings]))) or 1.0
     p = parametrise(model, [], size, recordings[0].sample_time_s, thresholds.prior_spread)
     result = fit(p, data)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from autotune.arrays import FloatArray
 from autotune.diagnosis.evidence.constancy import largest_variation
@@ -13,9 +13,10 @@ from autotune.diagnosis.evidence.stretches import advantage, judged_rows, rms
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import Fit
 from autotune.diagnosis.fitting.long_windows import spread_of
+from autotune.diagnosis.fitting.spreading import spread_out
 from autotune.diagnosis.selection.hypothesis import Hypothesis, vanished
 from autotune.diagnosis.selection.probability import Candidate, weighed
-from autotune.diagnosis.selection.search import Search
+from autotune.diagnosis.selection.searched import Search
 from autotune.diagnosis.thresholds import Thresholds
 
 
@@ -56,6 +57,11 @@ class Judged:
         most = self.data.thresholds.most_evidence
         evidence = max(both) if sum(both) > 0.0 else min(both)
         return min(max(evidence, -most), most) - 2.0 * (self.log_odds - other.log_odds)
+
+    def spread_out(self) -> Judged:
+        """Return it with all rows of the recordings."""
+        result, data = spread_out(self.fit, self.data)
+        return replace(self, fit=result, data=data)
 
     @property
     def error(self) -> float:

@@ -55,7 +55,7 @@ def _timed(result: Fit, data: Data) -> Fit:
     if not found:
         return result
     number, key = found[0]
-    step, least = max(r.duration_s for r in data.recordings) / 16.0, 2.0 * max(data.sample_times)
+    step, least = max(r.duration_s for r in data.driving) / 16.0, 2.0 * max(data.sample_times)
     while step > least:
         tried = [_moved(result, number, key, step * side, data) for side in (-1.0, 1.0)]
         best = min((t for t in tried if t is not None), key=lambda t: t.cost, default=result)
@@ -80,11 +80,11 @@ def _moved(result: Fit, number: int, key: str, shift: float, data: Data) -> Fit 
         return None
 
 
-def states_for(result: Fit, data: Data, base: Fit) -> tuple[FloatArray, ...]:
-    """Return start states for all windows: a fit's own where it has the window, else the base's or rest."""
+def states_for(result: Fit, data: Data, base: Fit | None) -> tuple[FloatArray, ...]:
+    """Return start states for all windows: a fit's own where it has the window, else a base's or rest."""
     states = start_states(result.sim, data)
-    if states[0].shape == base.x0[0].shape:
+    if base is not None and states[0].shape == base.x0[0].shape:
         states = [x.copy() for x in base.x0]
-    for full, starts, x0, known in zip(states, data.starts, result.x0, result.starts, strict=True):
+    for full, starts, x0, known in zip(states, data.first_rows, result.x0, result.starts, strict=True):
         full[np.searchsorted(starts, known)] = x0
     return tuple(states)

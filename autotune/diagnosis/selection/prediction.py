@@ -39,7 +39,7 @@ class Prediction:
 def signal_sizes(base: Fit, data: Data) -> SignalSizes:
     """Return the sizes of the signals in the recordings under a fitted model."""
     sim = base.sim
-    w = np.concatenate([r.u for r in data.recordings]) - sim.u_offset
+    w = np.concatenate([r.u for r in data.driving]) - sim.u_offset
     y = np.concatenate([r.y[g] for r, g in zip(data.recordings, data.good, strict=True)])
     signals = np.concatenate(base.signals)
     rates = np.abs(np.linalg.eigvals(sim.chain.A))
@@ -67,8 +67,8 @@ def signal_sizes(base: Fit, data: Data) -> SignalSizes:
         f_peak=max(float(np.nanmax(np.abs(s[:, 3]))) for s in base.signals),
         gain=float(sim.chain.gains[0]),
         lag_s=1.0 / float(rates.min()),
-        dt_s=data.recordings[0].sample_time_s,
-        duration_s=max(r.duration_s for r in data.recordings),
+        dt_s=data.sample_times[0],
+        duration_s=max(r.duration_s for r in data.driving),
         levels=sim.chain.levels,
         turn=TURNS.get(base.parametrisation.model.output.unit, 0.0) if sim.chain.has_spring else 0.0,
         static=sim.chain.is_static,
@@ -93,10 +93,9 @@ def extended(base: Fit, effect: Effect, data: Data) -> tuple[Parametrisation, Fl
     """Return parametrisation, starting point and start states of a fit with one more effect."""
     old = base.parametrisation
     effects = (*base.model.effects, effect)
-    size = float(np.std(np.concatenate([r.u for r in data.recordings]))) or 1.0
+    size = float(np.std(np.concatenate([r.u for r in data.driving]))) or 1.0
     nominal = replace(old.model, effects=effects[: old.own])
-    dt_s = data.recordings[0].sample_time_s
-    p = parametrise(nominal, effects[old.own :], size, dt_s, data.thresholds.prior_spread)
+    p = parametrise(nominal, effects[old.own :], size, data.sample_times[0], data.thresholds.prior_spread)
     theta = p.centre.copy()
     theta[: base.theta.size] = base.theta
     # an effect's own centre is its starting value; those fitted already keep the scale of their search
@@ -113,7 +112,7 @@ def carried_states(base: Fit, effect: Effect, data: Data) -> tuple[FloatArray, .
         return base.x0
     values = {key: q.value for key, q in effect.parameters.items()}
     states = []
-    for r, starts, x in zip(data.recordings, data.starts, base.x0, strict=True):
+    for r, starts, x in zip(data.driving, data.first_rows, base.x0, strict=True):
         u, y = r.u[np.maximum(starts - 1, 0)] - base.sim.u_offset, x @ base.sim.chain.taps[3]
         added = part.start(u, y, values)
         states.append(np.column_stack([added, x] if part.at == "front" else [x, added]))

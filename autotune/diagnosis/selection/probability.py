@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from autotune.diagnosis.selection.hypothesis import penalised
 from autotune.diagnosis.selection.parsimony import charge, final_lead
-from autotune.diagnosis.selection.search import Search
+from autotune.diagnosis.selection.searched import Search
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -143,7 +143,7 @@ class RigBench:
 def _carried(result: Fit, before: Data, data: Data) -> tuple[FloatArray, ...]:
     """Return start states of windows: those of a fit where it had a window there, else rest."""
     states = start_states(result.sim, data)
-    for full, starts, known, x0 in zip(states, data.starts, before.starts, result.x0, strict=True):
+    for full, starts, known, x0 in zip(states, data.first_rows, before.first_rows, result.x0, strict=True):
         same = np.isin(starts, known)
         full[same] = x0[np.searchsorted(known, starts[same])]
     return tuple(states)

@@ -100,6 +100,7 @@ def search_rig(
         bench, found = _grown(retuned, beam, bench, progress, limits)
         found = _finished(_pruned([*found, *_known(known, bench)], bench), bench)
         chosen = bench.with_both_scales(simplest(found, limits.material))
+        nominal, retuned, chosen = (one.spread_out() for one in (nominal, retuned, chosen))
         return RigSearch(nominal=nominal, retuned=retuned, judged=tuple(found), chosen=chosen)
 
 
@@ -160,7 +161,7 @@ def _residual_sd(result: Fit, data: Data) -> float:
 
 def _roots(model: Model, bench: RigBench) -> tuple[RigBench, list[Judged]]:
     """Return the bench with the retuned model's residual, and that model at its nominal numbers and retuned."""
-    recordings = bench.long.recordings
+    recordings = bench.long.driving
     p = parametrise(model, [], input_size(model, recordings), recordings[0].sample_time_s)
     result = bench.settled(p, None)
     for _ in range(2):

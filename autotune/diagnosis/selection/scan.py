@@ -51,7 +51,7 @@ class FitScan:
     @property
     def durations_s(self) -> Sequence[float]:
         """Length of every recording [s]."""
-        return [r.duration_s for r in self.data.recordings]
+        return [r.duration_s for r in self.data.driving]
 
     @property
     def slowest_lag_s(self) -> float:
@@ -81,13 +81,15 @@ class FitScan:
         Phases count from each recording's start, so that one load swings through all of them coherently. Rows are
         taken as equidistant, which is good enough for a starting value.
         """
-        dt = self.data.recordings[0].sample_time_s
-        size = 4 * int(2 ** np.ceil(np.log2(max(len(r) for r in self.data.recordings))))
+        data = self.data
+        size = 4 * int(2 ** np.ceil(np.log2(max(len(r) for r in data.driving))))
         total = np.zeros(size // 2 + 1, dtype=np.complex128)
-        for e in self.base.whitened:
-            total += np.fft.rfft(e, size)
-        rows = sum(e.size for e in self.base.whitened)
-        return np.asarray(np.fft.rfftfreq(size, dt)), np.asarray(2.0 * np.abs(total) ** 2 / rows)
+        for i, e in enumerate(self.base.whitened):
+            at_its_time = np.zeros(size)
+            at_its_time[data.kept[i] if data.kept else slice(e.size)] = e
+            total += np.fft.rfft(at_its_time)
+        rows = sum(len(r) for r in data.driving)
+        return np.asarray(np.fft.rfftfreq(size, data.sample_times[0])), np.asarray(2.0 * np.abs(total) ** 2 / rows)
 
     def influence(self) -> tuple[FloatArray, FloatArray]:
         """Return the commands inside the windows, and how chi2 would fall with more of each: -0.5 d chi2/du.
@@ -98,7 +100,7 @@ class FitScan:
         longest = max(int(np.max(b - a)) for a, b in zip(data.starts, data.stops, strict=True))
         pulse = np.zeros(longest + 1)
         pulse[1] = 1.0  # what stands in the first row has stood before it
-        dt = data.recordings[0].sample_time_s
+        dt = data.sample_times[0]
         still = replace(sim.linear(), linear_hold=False)
         struck = Recording(t=dt * np.arange(longest + 1, dtype=np.float64), u=sim.u_offset + pulse, y=0.0 * pulse)
         answer = still.run(struck, np.zeros(sim.order))[0][1:, 0]

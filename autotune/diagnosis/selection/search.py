@@ -23,6 +23,7 @@ from autotune.diagnosis.fitting.retuning import (
     prepare,
     reduced_chi2,
 )
+from autotune.diagnosis.selection.confirmation import confirmed
 from autotune.diagnosis.selection.growth import exchanged, grown, larger, lasting_starts, polished, pruned
 from autotune.diagnosis.selection.hypothesis import Hypothesis, merged, penalised
 from autotune.diagnosis.selection.parsimony import (
@@ -34,54 +35,11 @@ from autotune.diagnosis.selection.parsimony import (
     worth_adding,
 )
 from autotune.diagnosis.selection.screening import Bench, Width
+from autotune.diagnosis.selection.searched import Search
 from autotune.diagnosis.thresholds import IN_USE, Thresholds
 from autotune.models import Model
 from autotune.progress import Progress, quiet
 from autotune.recording import Recording
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Search:
-    """Everything that the search found.
-
-    Attributes
-    ----------
-    data : Data
-        Recordings with windows and noise.
-    nominal : Fit
-        Nominal numbers, start states fitted.
-    retuned : Hypothesis
-        Nominal structure, numbers fitted.
-    singles, pairs, triples : tuple of Hypothesis
-        Hypotheses fitted, best first.
-    chosen : Hypothesis
-        The one that the data ask for; the retuned model where no effect is needed.
-    """
-
-    data: Data
-    nominal: Fit
-    retuned: Hypothesis
-    singles: tuple[Hypothesis, ...] = ()
-    pairs: tuple[Hypothesis, ...] = ()
-    triples: tuple[Hypothesis, ...] = ()
-    chosen: Hypothesis
-
-    @property
-    def all(self) -> tuple[Hypothesis, ...]:
-        """Every hypothesis, the retuned model first."""
-        return (self.retuned, *self.singles, *self.pairs, *self.triples)
-
-    def asking(self, least: float) -> Search:
-        """Return the search with a least decrease that effects must bring, for the choice and for the probabilities."""
-        thresholds = replace(self.data.thresholds, least_decrease=least, least_decrease_beyond=least)
-        keeps = worth_adding(self.retuned, self.chosen, thresholds)
-        chosen = self.chosen if keeps else self.retuned
-        return replace(self, data=replace(self.data, thresholds=thresholds), chosen=chosen)
-
-    @property
-    def gained(self) -> float:
-        """Decrease of the penalised chi-square that the chosen effects bring."""
-        return self.retuned.penalised_chi2 - self.chosen.penalised_chi2
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -130,7 +88,8 @@ def search(
     -----
     Forward search with a beam: pairs are built on the best four singles, whether or not these help alone, so that
     partners that only help together are found as long as one of them is among the four. What brings the residual to
-    noise must do so on longer windows too; else everything is searched again on those.
+    noise must do so on longer windows too; else everything is searched again on those. Long recordings are searched in
+    some of their windows, and what leads there is fitted to all of them.
     """
     kinds = tuple(kind for name, kind in (CATALOGUE | STRUCTURES).items() if name not in without)
     with threadpool_limits(1), ThreadPoolExecutor(2) as pool:
@@ -141,7 +100,7 @@ def search(
             progress("once more, on longer windows", 0.0)
             longer = prepare(model, recordings, good, thresholds.longer_windows, thresholds)
             found = _searched(*longer, bench, progress)
-        return found
+        return confirmed(found, pool)
 
 
 def _searched(data: Data, base: Fit, bench: Bench, progress: Progress) -> Search:

@@ -52,8 +52,8 @@ SIGNALS = 4
 #: Positions in the vector of integers, before those that say which effects act.
 (
     NUMBER, SIGNALS_ASKED, LINEAR_HOLD, DIRECTIONAL, ACTUATOR, SPEED_STATE, POSITION_STATE, FORCED, SMOOTH, RUBBING,
-    DRAINING, STOPPED, SENSING, PLAIN, REPLAYED, FLAGS
-) = range(16)  # fmt: skip
+    DRAINING, STOPPED, SENSING, PLAIN, REPLAYED, ROWS, FLAGS
+) = range(17)  # fmt: skip
 
 
 class _Linear(NamedTuple):
@@ -176,6 +176,14 @@ def _held(driven: FloatArray, j: int, begin_s: float, dt: float, linear: _Linear
     return float(value)
 
 
+@inlined
+def _arrival(t: FloatArray, k: int, linear: _Linear, effects: Effects) -> float:
+    """Return when a row's command arrives at the chain; never for the row after the last."""
+    if k >= t.size:
+        return math.inf
+    return float(t[0] + clock(t[k] - t[0], effects) + linear.numbers[DELAY])
+
+
 @njit(cache=True, nogil=True)
 def run(
     driven: FloatArray,
@@ -192,8 +200,9 @@ def run(
     ----------
     driven : (2, N) array
         Time stamps [s] and commands.
-    rows : (2, W) int array
-        Rows where windows start, increasing, and rows before which they end; rows outside all windows stay NaN.
+    rows : (3, W) int array
+        Rows where windows start, increasing, rows before which they end, and where in the output they begin; what lies
+        between them there stays NaN.
     states : (2, W, n) array
         State at the first of those rows; receives the state at the last of them.
     tables : (2, NODES+1, n, n+INPUTS) array
@@ -205,12 +214,12 @@ def run(
 
     Returns
     -------
-    (signals, N) array
+    (signals, rows) array
         Reading, speed, position and plant input at each row, or the reading alone.
     """
     t, u = driven[0], driven[1]
     N, n = t.size, states.shape[2]
-    out = np.full((flags[SIGNALS_ASKED], N), np.nan)
+    out = np.full((flags[SIGNALS_ASKED], flags[ROWS]), np.nan)
     linear = _Linear(np.empty((4, n, n + INPUTS)), np.full(4, -1.0), taps, numbers, flags)
     work = _Work(np.empty(n), np.empty(n), np.empty(n), np.empty(n))
     M, x, free = linear.M, work.x, work.free
@@ -220,47 +229,47 @@ def run(
     before = Effects(numbers[NUMBERS:], flags[FLAGS:], carried)
     u_offset, y_offset, step = numbers[U_OFFSET], numbers[Y_OFFSET], numbers[STEP]
     node_length = step / NODES
-    # when each command arrives at the chain
-    acts = np.empty(N)
-    for k in range(N):
-        acts[k] = t[0] + clock(t[k] - t[0], effects) + numbers[DELAY]
     past = 0
     for window in range(rows.shape[1]):
         first, last = rows[0, window], rows[1, window]
         x[:] = states[0, window]
-        # the command in force at the window's start, dead time counted
+        # the command in force at the window's start, dead time counted, and when the next one arrives
         j = first
-        while j > 0 and acts[j] > t[first] + 1e-9:
+        while j > 0 and _arrival(t, j, linear, effects) > t[first] + 1e-9:
             j -= 1
-        while j + 1 < N and acts[j + 1] <= t[first] + 1e-9:
+        comes = _arrival(t, j + 1, linear, effects)
+        while comes <= t[first] + 1e-9:
             j += 1
+            comes = _arrival(t, j + 1, linear, effects)
         w = u[j] - u_offset
         # some effects remember all commands before the window
         while flags[REPLAYED] and past <= j:
             command(converter(u[past], 0.0, before) - u_offset, u_offset, 0.0, 0.0, before)
             past += 1
         begin(w, window > 0 and rows[1, window - 1] == first, carried, effects)
+        at = rows[2, window] - first
         for k in range(first, last):
             z = _tap(taps, OUTPUT, x) + numbers[DIRECT_OUT] * w
             since = t[k] - t[0]
             if flags[SENSING]:
                 through = numbers[LAW] * (_tap(taps, PLANT_IN, x) + numbers[DIRECT_IN] * w)
-                out[0, k] = reading(sensor(z, since, through, effects) + y_offset, since, effects)
+                out[0, at + k] = reading(sensor(z, since, through, effects) + y_offset, since, effects)
             else:
-                out[0, k] = z + y_offset
+                out[0, at + k] = z + y_offset
             if out.shape[0] > 1:
-                out[1, k] = _tap(taps, SPEED, x)
-                out[2, k] = _tap(taps, POSITION, x)
-                out[3, k] = _tap(taps, PLANT_IN, x) + numbers[DIRECT_IN] * w
+                out[1, at + k] = _tap(taps, SPEED, x)
+                out[2, at + k] = _tap(taps, POSITION, x)
+                out[3, at + k] = _tap(taps, PLANT_IN, x) + numbers[DIRECT_IN] * w
             if k + 1 >= N:
                 break
             now = t[k]
             while now < t[k + 1] - 1e-9 * step:
-                while j + 1 < N and acts[j + 1] <= now + 1e-6 * step:
+                while comes <= now + 1e-6 * step:
                     j += 1
+                    comes = _arrival(t, j + 1, linear, effects)
                 until = t[k + 1]
-                if j + 1 < N and now < acts[j + 1] < until:
-                    until = acts[j + 1]
+                if now < comes < until:
+                    until = comes
                 pieces = max(1, math.ceil((until - now) / step - 1e-6))
                 dt = (until - now) / pieces
                 node = min(dt / node_length, float(NODES))

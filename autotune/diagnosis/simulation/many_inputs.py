@@ -40,15 +40,20 @@ def responses(chain: Chain, t: FloatArray, inputs: FloatArray, rows: tuple[int, 
         Deviations of the output: column by column what :meth:`Simulator.run` returns for the chain alone.
     """
     table = transition_table(chain.A, chain.B, step_s)
-    tap, direct = chain.taps[OUTPUT], float(chain.gains[3])
-    return np.asarray(_responses(t, inputs, *rows, table, tap, direct, step_s, chain.delay_s))
+    numbers = (float(chain.gains[3]), step_s, chain.delay_s)
+    return np.asarray(_responses(t, inputs, rows, table, chain.taps[OUTPUT], numbers))
 
 
 @njit(cache=True, nogil=True)
 def _responses(
-    t: FloatArray, inputs: FloatArray, base: int, first: int, last: int, table: FloatArray, tap: FloatArray,
-    direct: float, step: float, delay: float,
-) -> FloatArray:  # fmt: skip
+    t: FloatArray,
+    inputs: FloatArray,
+    rows: tuple[int, int, int],
+    table: FloatArray,
+    tap: FloatArray,
+    numbers: tuple[float, float, float],
+) -> FloatArray:
+    (base, first, last), (direct, step, delay) = rows, numbers
     n, many = tap.size, inputs.shape[1]
     out = np.empty((last - first, many))
     x, y = np.zeros((n, many)), np.empty((n, many))

@@ -29,10 +29,16 @@ ICE_K = 273.15
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Windows:
-    """Where a simulation starts anew and ends: rows, (W,) each, the last row excluded."""
+    """Where a simulation starts anew and ends: rows, (W,) each, the last row excluded.
+
+    ``places`` are the rows of the output where windows begin, and ``rows`` how many it has; by default it has a row for
+    each of the recording's.
+    """
 
     starts: IntArray
     stops: IntArray
+    places: IntArray | None = None
+    rows: int | None = None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -136,17 +142,17 @@ class Simulator:
         Returns
         -------
         signals : (N, signals) array
-            Reading, speed, position (or level) and plant input at each row; NaN outside the windows.
+            Reading, speed, position (or level) and plant input at each row of the output; NaN outside the windows.
         ends : (W, n) array
             The state that every window ends with.
         """
         step = self.step_s(recording.sample_time_s if sample_time_s is None else sample_time_s)
-        chain, rows = self.chain, _rows(windows, len(recording))
+        chain, (rows, count) = self.chain, _rows(windows, len(recording))
         states = np.empty((2, rows.shape[1], chain.order))
         states[0] = x0
         place = (step, chain.delay_s, self.u_offset, self.y_offset, self.kelvin, float(chain.is_static))
         numbers = np.concatenate([place, chain.gains, self.values])
-        flags = np.concatenate([(number, signals, *self._flags), self.acts])
+        flags = np.concatenate([(number, signals, *self._flags, count), self.acts])
         out = self.compiled(
             _driven(recording), rows, states, _tables(chain, self.falling, step), chain.taps, numbers, flags
         )
@@ -237,7 +243,10 @@ def _tables(chain: Chain, falling: Chain, step_s: float) -> FloatArray:
     return np.stack([transition_table(one.A, one.B, step_s) for one in (chain, falling)])
 
 
-def _rows(windows: Windows | None, count: int) -> IntArray:
+def _rows(windows: Windows | None, count: int) -> tuple[IntArray, int]:
+    """Return what the compiled simulation is told of windows, and how many rows it returns."""
     if windows is None:
-        return np.array([[0], [count]], dtype=np.int64)
-    return np.stack((windows.starts, windows.stops)).astype(np.int64)
+        return np.array([[0], [count], [0]], dtype=np.int64), count
+    places = windows.starts if windows.places is None else windows.places
+    rows = np.stack((windows.starts, windows.stops, places)).astype(np.int64)
+    return rows, count if windows.rows is None else windows.rows
