@@ -61,7 +61,7 @@ def test_thinned_data_keep_the_windows_where_a_limit_is_reached() -> None:
         noise=Noise(sd=1.0),
     )  # fmt: skip
     few = data.thinned(800)
-    assert 2300 in few.starts[0]
+    assert 2300 in few.first_rows[0]
     assert few.rows < 0.4 * data.rows
 
 
