@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import json
-import sys
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
@@ -14,6 +13,8 @@ from rich.console import Console
 
 from autotune.cli import app
 from autotune.cli.init_keys import REGISTER, Table, add_registers, register, set_keys
+from autotune.cli.init_model import EXAMPLE, ModelOfRig, model_of_rig
+from autotune.cli.init_questions import Questions, one_of, pair
 from autotune.errors import InputError
 
 if TYPE_CHECKING:
@@ -91,7 +92,14 @@ def init(
             " gains.PB_percent=holding:30,scale=0.1; may be given more than once",
         ),
     ] = None,
-    model: Annotated[str | None, typer.Option(help="model file of the twin, in place of --plant")] = None,
+    model: Annotated[
+        str | None,
+        typer.Option(
+            metavar="FILE|H(s)",
+            help=f"in place of --plant: a model file, or a transfer function as you write it, {EXAMPLE} or zpk([-1];"
+            " [-2, -3]; 4) or K=2 T=0.3,0.1 L=0.05, which becomes a model file beside the configuration",
+        ),
+    ] = None,
     keys: Annotated[
         list[str] | None,
         typer.Option(
@@ -124,15 +132,25 @@ def init(
 
     if config.exists():
         raise InputError("exists already", where=str(config), remedy="choose another name; nothing is overwritten")
-    questions = _Questions()
+    questions = Questions()
     kinds = {one.name: one for one in KINDS}
     question = f"how is the rig reached ({', '.join(kinds)})"
-    chosen: Kind = questions.ask("--kind", kind, question, lambda name: kinds[_one_of(name, kinds, "--kind")])
+    chosen: Kind = questions.ask("--kind", kind, question, lambda name: kinds[one_of(name, kinds, "--kind")])
     questions.require()  # the others hang on it
-    if chosen.settings is SimulatedRigSettings:
-        name: Plant = questions.ask("--plant", plant, f"which plant ({', '.join(PLANTS)})", _plant)
+    simulated = chosen.settings is SimulatedRigSettings
+    twin: Plant | ModelOfRig | None = plant if model is None else model_of_rig(model)
+    if simulated:
+        asked = f"which plant: {', '.join(PLANTS)}, a model file, or a transfer function such as {EXAMPLE}"
+        twin = questions.ask("--plant", twin, asked, _plant_or_model)
         questions.require()
-        content = _simulated(name)
+    elif "twin" in chosen.settings.model_fields:
+        asked = f"the rig for rehearsals: a transfer function such as {EXAMPLE}, a model file, or nothing"
+        twin = questions.ask("--model", twin, asked, _plant_or_model, "") or None
+    if isinstance(twin, ModelOfRig):
+        twin.place(config)  # refused before anything is asked in vain
+    answers: Table = {}
+    if simulated and isinstance(twin, str):
+        content = _simulated(twin)
     else:
         given = {"host": host, "device": device, "recording": recording, "y_span": y_span, "u_span": u_span}
         reached = _reached(questions, chosen, given | {"y": y_register, "u": u_register})
@@ -143,17 +161,19 @@ def init(
             "u_unit": questions.ask("--u-unit", u_unit, "unit of the command u", str, ""),
             "y_unit": questions.ask("--y-unit", y_unit, "unit of the measurement y", str, ""),
             "sample_time_s": questions.ask("--sample-time", sample_time, "control period [s]", float),
-            "u_range": questions.ask("--u-range", u_range, "lowest and highest command u the rig may see", _pair),
+            "u_range": questions.ask("--u-range", u_range, "lowest and highest command u the rig may see", pair),
             "u_safe": questions.ask("--u-safe", u_safe, "command at which the rig may be left alone", float),
-            "y_range": questions.ask("--y-range", y_range, "lowest and highest measurement y it may see", _pair),
+            "y_range": questions.ask("--y-range", y_range, "lowest and highest measurement y it may see", pair),
             "y": questions.ask("--y", y, "y of the operating point", float),
             "u": questions.ask("--u", u, "command that holds it there, about", float),
         }
         questions.require()
-        content = _real(reached, answers, plant, model)
+        played = _played(twin, config)
+        content = _real(reached | (played if simulated else {"twin": played} if played else {}), answers)
     content = {"name": config.stem, **content}
     set_keys(content, keys or ())
     validated(Config, content, str(config))
+    written = twin.write(config, answers) if isinstance(twin, ModelOfRig) else None
     try:
         with config.open("x", encoding="utf-8") as file:
             file.write(_text(content, config))
@@ -162,71 +182,32 @@ def init(
             f"cannot be written ({error.strerror})", where=str(config), remedy="check the folder"
         ) from None
     console = Console(highlight=False, soft_wrap=True)
-    console.print(f"wrote {config}", markup=False)
-    if chosen.settings is SimulatedRigSettings:
+    console.print(f"wrote {config}" + (f" and {written}" if written else ""), markup=False)
+    if simulated:
         console.print(f"next: autotune run {config} --out runs/{config.stem}", markup=False)
     else:
         console.print(f"next: read it through, then autotune doctor {config}, autotune probe {config}", markup=False)
 
 
-class _Questions:
-    """Take an answer from its flag, else ask; away from a terminal collect what is missing."""
-
-    def __init__(self) -> None:
-        self._missing: list[str] = []
-        self._asks = sys.stdin.isatty() and sys.stdout.isatty()
-
-    def ask(
-        self, flag: str, given: Any, question: str, convert: Callable[[str], Any], default: str | None = None
-    ) -> Any:
-        if given is not None:
-            return convert(given) if isinstance(given, str) else given
-        if not self._asks:
-            if default is None:
-                self._missing.append(flag)
-            return default
-        return typer.prompt(question, default=default, value_proc=_checked(convert))
-
-    def require(self) -> None:
-        """Refuse where an answer is missing.
-
-        Raises
-        ------
-        InputError
-            Names every flag that is missing.
-        """
-        if self._missing:
-            flags = ", ".join(self._missing)
-            raise InputError(f"{flags}: no answer", where="autotune init", remedy="give them, or call it at a terminal")
+def _plant_or_model(answer: str) -> str | ModelOfRig:
+    """Return the name of a simulated plant, a model, or nothing for no answer."""
+    if not answer or answer in PLANTS:
+        return answer
+    try:
+        return model_of_rig(answer)
+    except InputError as error:
+        raise InputError(
+            f"{answer!r} is none of {', '.join(PLANTS)}, no model file, and no transfer function: {error.what}",
+            where="--plant",
+            remedy=error.remedy,
+        ) from None
 
 
-def _checked(convert: Callable[[str], Any]) -> Callable[[str], Any]:
-    """Let a question be asked again where its answer is refused."""
-
-    def check(answer: str) -> Any:
-        try:
-            return convert(answer)
-        except ValueError as error:
-            raise typer.BadParameter(error.what if isinstance(error, InputError) else str(error)) from None
-
-    return check
-
-
-def _one_of(answer: str, known: Collection[str], flag: str) -> str:
-    if answer not in known:
-        raise InputError(f"{answer!r} is none of {', '.join(known)}", where=flag)
-    return answer
-
-
-def _plant(answer: str) -> str:
-    return _one_of(answer, PLANTS, "--plant")
-
-
-def _pair(answer: str) -> tuple[float, float]:
-    parts = answer.replace(",", " ").split()
-    if len(parts) != 2:
-        raise InputError(f"{answer!r}: two numbers are wanted", where="autotune init")
-    return float(parts[0]), float(parts[1])
+def _played(twin: Plant | ModelOfRig | None, config: Path) -> Table:
+    """Return what a simulated rig, or the twin of a real one, is to play."""
+    if isinstance(twin, ModelOfRig):
+        return {"model": twin.path(config)}
+    return {} if twin is None else {"plant": twin, **PLANTS[twin].get("rig", {})}
 
 
 #: what a kind may have to be told, in the order in which it is asked: its key, the question
@@ -242,13 +223,13 @@ _CUSTOM = {f"{which}_file": f"certificates/{name}" for which, name in
            {"ca": "ca.pem", "cert": "host.pem", "key": "host.key"}.items()}  # fmt: skip
 
 
-def _reached(questions: _Questions, kind: Kind, given: Mapping[str, Any]) -> Table:
+def _reached(questions: Questions, kind: Kind, given: Mapping[str, Any]) -> Table:
     """Return the table [rig] of a rig that is there: what the settings of its kind have keys for is asked."""
     keys = kind.settings.model_fields
     rig: Table = {"kind": kind.name} | {key: name for key, name in _CUSTOM.items() if key in keys}
     for key, question in _ASKED.items():
         if key in keys:
-            convert = _pair if key.endswith("_span") else str
+            convert = pair if key.endswith("_span") else str
             rig[key] = questions.ask(f"--{key.replace('_', '-')}", given[key], question, convert)
     if kind.has_registers:
         asked = "register of {}, TABLE:ADDRESS:TYPE, e.g. {}:0:int16"
@@ -263,7 +244,7 @@ def _simulated(plant: Plant) -> Table:
     return {"rig": {"kind": "simulated", "plant": plant, **known.pop("rig", {})}, **known}
 
 
-def _real(rig: Table, answers: Table, plant: Plant | None, model: str | None) -> Table:
+def _real(rig: Table, answers: Table) -> Table:
     """Return the configuration of a real rig: what was answered, and cautious values that follow from it."""
     u_min, u_max = answers["u_range"]
     y_min, y_max = answers["y_range"]
@@ -272,10 +253,6 @@ def _real(rig: Table, answers: Table, plant: Plant | None, model: str | None) ->
         raise InputError(f"y = {answers['y']:g} is not within {y_min:g}..{y_max:g}", where="operating_point.y")
     # a quarter of the room leaves the rest to overshoot; rounded to what a person would have written
     swing = _rounded(0.25 * room)
-    if model is not None:
-        rig = rig | {"twin": {"model": model}}
-    elif plant is not None:
-        rig = rig | {"twin": {"plant": plant, **PLANTS[plant].get("rig", {})}}
     T_s = answers["sample_time_s"]
     budget_s = max(60.0, _rounded(SWEEP_SAMPLES * T_s))
     return {

@@ -31,6 +31,8 @@ LEAST_PERIODS = 2
 #: residual of a limit cycle over that of the others (median) from which on something changed while it was measured;
 #: under noise alone the largest of 200 points was 1.05
 CHANGED = 1.1
+#: standard deviation of a point over what was wanted from which on it is said
+COARSE = 1.1
 #: asymmetry of the duty (part of the period, less one half) from which on the mid-point is corrected within a point
 LARGEST_ASYMMETRY = 0.12
 
@@ -149,10 +151,10 @@ def sweep_warnings(segments: Sequence[Segment], experiment: ExperimentSettings, 
         f"something changed while the point at {one.point.omega_rad_s:.3g} rad/s was measured, {one.start_s:.4g} to"
         f" {one.end_s:.4g} s: y departs {100 * (ratio - 1.0):.0f} % more from an even oscillation than at the other"
         " points; look for an actuator at its limit, a load or a loose sensor, and run again"
-        for one, ratio in zip(segments, more, strict=True)
-        if ratio > CHANGED
+        for one, ratio, sd in zip(segments, more, sds, strict=True)
+        if ratio > CHANGED and sd > COARSE * wanted
     )
-    coarse = [sd for sd in sds if sd > 1.1 * wanted]
+    coarse = [sd for sd in sds if sd > COARSE * wanted]
     if changed or not coarse:  # more time is no remedy for what changes
         return (*beyond, *changed)
     enough_s = experiment.budget_s * (max(coarse) / wanted) ** 2  # a variance falls as the time grows

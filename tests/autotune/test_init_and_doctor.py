@@ -11,14 +11,17 @@ import sys
 import tomllib
 from pathlib import Path
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 from autotune.cli import app
 from autotune.config import load_config
 from autotune.config.registers import RegisterMap
-from autotune.config.rig import ModbusTcpSettings, SerialSettings
+from autotune.config.rig import ModbusTcpSettings, SerialSettings, SimulatedRigSettings
+from autotune.equations.transfer_text import parse_transfer_function
 from autotune.errors import InputError
+from autotune.models import read_model
 from drivers.kinds import KINDS
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
@@ -26,6 +29,7 @@ REAL = [
     *("--sample-time", "0.1", "--u-unit", "V", "--y-unit", "cm"),
     *("--u-range", "0", "10", "--u-safe", "0", "--y-range", "10", "90", "--y", "50", "--u", "4"),
 ]
+SERIAL = ["--device", "/dev/ttyS9", "--y-span", "0", "100", "--u-span", "0", "10"]
 MODBUS = ["--y-register", "input:0:float32", "--u-register", "holding:0:float32"]
 
 
@@ -178,14 +182,15 @@ def test_a_file_that_exists_is_not_overwritten(tmp_path: Path) -> None:
     assert path.read_text() == "mine"
 
 
-def test_at_a_terminal_questions_are_asked_and_asked_again_after_a_wrong_answer(tmp_path: Path) -> None:
+def typed(arguments: list[str], answers: str, folder: Path) -> tuple[str, int]:
+    """Run the command for a person at a terminal; return what stood there and the exit status."""
     leader, follower = pty.openpty()
     child = subprocess.Popen(
-        [sys.executable, "-m", "autotune.cli", "init", "rig.toml"],
-        cwd=tmp_path, stdin=follower, stdout=follower, stderr=follower,
+        [sys.executable, "-m", "autotune.cli", *arguments],
+        cwd=folder, stdin=follower, stdout=follower, stderr=follower,
     )  # fmt: skip
     os.close(follower)
-    os.write(leader, b"simulated\nbowl\nball\n")
+    os.write(leader, answers.encode())
     said = b""
     while True:
         try:
@@ -193,9 +198,48 @@ def test_at_a_terminal_questions_are_asked_and_asked_again_after_a_wrong_answer(
         except OSError:  # the other end is closed
             break
     os.close(leader)
-    assert child.wait() == 0, said.decode()
-    assert b"'bowl' is none of ball, servo, two_tank, thermal" in said
+    return said.decode(), child.wait()
+
+
+def test_at_a_terminal_questions_are_asked_and_asked_again_after_a_wrong_answer(tmp_path: Path) -> None:
+    said, status = typed(["init", "rig.toml"], "simulated\nbowl\nball\n", tmp_path)
+    assert status == 0, said
+    assert "'bowl' is none of ball, servo, two_tank, thermal" in said
     assert load_config(tmp_path / "rig.toml").rig.kind == "simulated"
+
+
+def test_a_transfer_function_as_it_is_written_becomes_the_model_of_twin_or_simulated_rig(tmp_path: Path) -> None:
+    written = "-65.5/(s(0.36s+1)) e^-0.1s"
+    command("init", tmp_path / "oven.toml", "--kind", "simulated", "--model", "K=2 T=10,2 L=0.5", *REAL)
+    rig = load_config(tmp_path / "oven.toml").rig
+    assert isinstance(rig, SimulatedRigSettings)
+    oven = read_model(tmp_path / "oven_model.toml")
+    assert rig.model == str(tmp_path / "oven_model.toml")
+    assert oven.transfer_function().response(np.array([0.0]))[0] == pytest.approx(2.0)
+    assert (oven.input.offset, oven.output.offset) == (4.0, 50.0)  # around the operating point
+    command("init", tmp_path / "tube.toml", "--kind", "serial", *SERIAL, "--model", written, *REAL)
+    twin = load_config(tmp_path / "tube.toml").rig.twin  # type: ignore[union-attr]
+    assert twin is not None
+    assert twin.model == str(tmp_path / "tube_model.toml")
+    assert read_model(twin.model).blocks[0].dynamics == parse_transfer_function(written)
+    (tmp_path / "tube.toml").unlink()
+    with pytest.raises(InputError, match=r"tube_model.toml: exists already"):
+        command("init", tmp_path / "tube.toml", "--kind", "serial", *SERIAL, "--model", written, *REAL)
+    with pytest.raises(InputError, match=r"'f' has no meaning here; write it as"):
+        command("init", tmp_path / "x.toml", "--kind", "serial", *SERIAL, "--model", "foo(s", *REAL)
+    assert not (tmp_path / "x.toml").exists()
+
+
+def test_at_a_terminal_the_transfer_function_is_asked_for_until_it_can_be_read(tmp_path: Path) -> None:
+    answers = "K 1 s\nK=2 T=10 L=1\n"
+    said, status = typed(["init", "rig.toml", "--kind", "simulated", *REAL], answers, tmp_path)
+    assert status == 0, said
+    assert "no transfer function" in said
+    assert (tmp_path / "rig_model.toml").exists()
+    said, status = typed(["init", "real.toml", "--kind", "serial", *SERIAL, *REAL], "1/(s+1)\n", tmp_path)
+    assert status == 0, said
+    assert "the rig for rehearsals" in said
+    assert read_model(tmp_path / "real_model.toml").name == "real: 1/(s+1)"
 
 
 def test_a_computer_that_runs_these_tests_is_ready(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -94,6 +94,7 @@ def test_the_describing_function_is_shown_with_its_error(finished: Finished) -> 
 def test_without_noise_the_points_are_exact(tmp_path: Path) -> None:
     rig = ball_rig(noise=0.0)
     result = run_experiment(rig, ball_config(), tmp_path / "r.csv")
+    assert result.warnings == ()  # what little is left may differ between the points as it likes
     for point in result.points:
         ratio = point.response / rig.plant.response(np.array([point.omega_rad_s]))[0]
         assert abs(abs(ratio) - 1.0) < 1e-3

@@ -1,0 +1,84 @@
+"""Questions of ``autotune init``: an answer from its flag, or asked at a terminal."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Collection
+from typing import Any
+
+import typer
+
+from autotune.errors import InputError
+
+
+class Questions:
+    """Take an answer from its flag, else ask; away from a terminal collect what is missing."""
+
+    def __init__(self) -> None:
+        self._missing: list[str] = []
+        self._asks = sys.stdin.isatty() and sys.stdout.isatty()
+
+    def ask(
+        self, flag: str, given: Any, question: str, convert: Callable[[str], Any], default: str | None = None
+    ) -> Any:
+        """Return what is given, or the answer; without a terminal the default, else it is missing.
+
+        Parameters
+        ----------
+        flag : str
+            Option that gives the answer.
+        given : object
+            What the option said; None where it was not used.
+        question : str
+            What is asked.
+        convert : callable
+            From an answer's text to what it means; an answer that it refuses is asked for again.
+        default : str, optional
+            Answer where nothing is entered.
+        """
+        if given is not None:
+            return convert(given) if isinstance(given, str) else given
+        if not self._asks:
+            if default is None:
+                self._missing.append(flag)
+            return default
+        return typer.prompt(question, default=default, value_proc=_checked(convert))
+
+    def require(self) -> None:
+        """Refuse where an answer is missing.
+
+        Raises
+        ------
+        InputError
+            Names every flag that is missing.
+        """
+        if self._missing:
+            flags = ", ".join(self._missing)
+            raise InputError(f"{flags}: no answer", where="autotune init", remedy="give them, or call it at a terminal")
+
+
+def _checked(convert: Callable[[str], Any]) -> Callable[[str], Any]:
+    """Let a question be asked again where its answer is refused."""
+
+    def check(answer: str) -> Any:
+        try:
+            return convert(answer)
+        except ValueError as error:
+            raise typer.BadParameter(error.what if isinstance(error, InputError) else str(error)) from None
+
+    return check
+
+
+def one_of(answer: str, known: Collection[str], flag: str) -> str:
+    """Return an answer that is one of the known ones; refuse any other."""
+    if answer not in known:
+        raise InputError(f"{answer!r} is none of {', '.join(known)}", where=flag)
+    return answer
+
+
+def pair(answer: str) -> tuple[float, float]:
+    """Return the two numbers of an answer."""
+    parts = answer.replace(",", " ").split()
+    if len(parts) != 2:
+        raise InputError(f"{answer!r}: two numbers are wanted", where="autotune init")
+    return float(parts[0]), float(parts[1])
