@@ -34,6 +34,8 @@ class StepTest:
     smoothing : int
         Samples over which measured and predicted responses are averaged before they are compared: a third of the
         crossover's radian, which hides noise and leaves the response.
+    y_unit : str
+        Unit of y, for sentences; empty where nobody said it.
     """
 
     t: FloatArray
@@ -41,6 +43,7 @@ class StepTest:
     disturbance: FloatArray
     settle: int
     smoothing: int
+    y_unit: str = ""
 
     @property
     def disturbed_from(self) -> int:
@@ -77,6 +80,7 @@ def plan_test(
         disturbance=np.where(late, load, 0.0),
         settle=count,
         smoothing=max(1, round(1.0 / (3.0 * crossover_rad_s * law.sample_time_s))),
+        y_unit=config.signals.y_unit,
     )
 
 

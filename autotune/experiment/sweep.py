@@ -28,11 +28,9 @@ FIRST_PEAK_SHARE = 0.79
 #: part of the amplitude so foreseen that it reaches for sure
 FIRST_SURE = 0.9
 LEAST_PERIODS = 2
-#: residual of a limit cycle over that of the others (median) from which on something changed while it was measured;
-#: under noise alone the largest of 200 points was 1.05
-CHANGED = 1.1
-#: standard deviation of a point over what was wanted from which on it is said
-COARSE = 1.1
+#: residual of a limit cycle over that of the others (median) from which on it is said; under noise alone the largest of
+#: 200 points was 1.05
+UNEVEN = 1.1
 #: asymmetry of the duty (part of the period, less one half) from which on the mid-point is corrected within a point
 LARGEST_ASYMMETRY = 0.12
 
@@ -146,26 +144,26 @@ def sweep_warnings(segments: Sequence[Segment], experiment: ExperimentSettings, 
         for omega in (one.point.omega_rad_s for one in segments)
         if omega > link_rad_s
     )
-    more = _more_residual(segments)
-    changed = tuple(
-        f"something changed while the point at {one.point.omega_rad_s:.3g} rad/s was measured, {one.start_s:.4g} to"
-        f" {one.end_s:.4g} s: y departs {100 * (ratio - 1.0):.0f} % more from an even oscillation than at the other"
-        " points; look for an actuator at its limit, a load or a loose sensor, and run again"
-        for one, ratio, sd in zip(segments, more, sds, strict=True)
-        if ratio > CHANGED and sd > COARSE * wanted
-    )
-    coarse = [sd for sd in sds if sd > COARSE * wanted]
-    if changed or not coarse:  # more time is no remedy for what changes
-        return (*beyond, *changed)
-    enough_s = experiment.budget_s * (max(coarse) / wanted) ** 2  # a variance falls as the time grows
+    coarse = [sd > 1.1 * wanted for sd in sds]
+    if not any(coarse):
+        return beyond
+    enough_s = experiment.budget_s * (max(sds) / wanted) ** 2  # a variance falls as the time grows
+    residual = _over_others(segments)
+    worst = max((i for i, one in enumerate(coarse) if one), key=lambda i: residual[i])
+    at, first = segments[worst], ""
+    if residual[worst] > UNEVEN:
+        first = (
+            f"look for an actuator at its limit, a load, or a start that had not settled at {at.start_s:.4g} to"
+            f" {at.end_s:.4g} s, where y swings less evenly than elsewhere; else "
+        )
     return (
         *beyond,
-        f"{len(coarse)} of {len(sds)} points are known to {100 * max(coarse):.2g} % at worst, {100 * wanted:.2g} % was"
-        f" wanted: set experiment.budget_s = {float(f'{enough_s:.2g}'):g}",
+        f"{sum(coarse)} of {len(sds)} points are known to {100 * max(sds):.2g} % at worst, {100 * wanted:.2g} % was"
+        f" wanted: {first}set experiment.budget_s = {float(f'{enough_s:.2g}'):g}",
     )
 
 
-def _more_residual(segments: Sequence[Segment]) -> list[float]:
+def _over_others(segments: Sequence[Segment]) -> list[float]:
     """Return every cycle's residual over the median of the others; 1 where there are too few to compare."""
     noise = np.array([one.noise_sd for one in segments])
     if noise.size < 3:

@@ -303,10 +303,11 @@ def judge(
     allowed = math.hypot(explained, TOLERANCE * _rms(expected - test.setpoint))
     accepted = rms_error <= allowed
     drawn = [_figures(test, response) for response in responses]
+    error, limit = (f"{value:.3g} {test.y_unit}".strip() for value in (rms_error, allowed))
     reason = (
-        f"the loop behaves as predicted: rms error {rms_error:.3g}, up to {allowed:.3g} is explained"
+        f"the loop behaves as predicted: rms error {error}, up to {limit} is explained"
         if accepted
-        else f"the loop does not behave as predicted: rms error {rms_error:.3g}, only {allowed:.3g} is explained"
+        else f"the loop does not behave as predicted: rms error {error}, only {limit} is explained"
     )
     if (at_limit := _share_at_limit(test, u, law)) > AT_LIMIT:
         reason += f"; the command is at its limit for {100 * at_limit:.0f} % of the steps, where dead time hardly shows"

@@ -166,7 +166,13 @@ def _model_section(analysis: Analysis, signals: SignalSettings) -> Section:
     reduced, fit = analysis.reduced, analysis.fit
     fitted = (
         f"A transfer function was fitted through the {'points' if fit.source == 'points' else 'recording'}:"
-        f" {_transfer_text(fit)}; chi-square {fit.chi_square:.1f} with {fit.degrees_of_freedom} degrees of freedom."
+        f" {_transfer_text(fit, signals)}."
+        # of a recording the noise is estimated from the same residual: its chi-square would say nothing
+        + (
+            f" Chi-square {fit.chi_square:.1f} with {fit.degrees_of_freedom} degrees of freedom."
+            if fit.source == "points"
+            else ""
+        )
         + (f" {len(fit.others)} other structure(s) are not excluded by the data." if fit.others else "")
     )
     if reduced is None or analysis.unscaled is None or analysis.scaled is None:
@@ -218,7 +224,7 @@ def _validation_row(validation: Validation) -> tuple[str, str, str, str, str]:
     )
 
 
-def _transfer_text(fit: PlantFit) -> str:
+def _transfer_text(fit: PlantFit, signals: SignalSettings) -> str:
     plant = fit.plant
     slow = [p for p in plant.poles if p != 0.0 and p.imag >= 0.0]
     lags = ", ".join(
@@ -227,7 +233,8 @@ def _transfer_text(fit: PlantFit) -> str:
     )
     gain = plant.num[-1] / plant.den[-1 - plant.integrators]
     kind = "integrator" if plant.integrators else "no integrator"
-    return f"gain {gain:.4g}, {kind}, lags {lags or 'none'}, dead time {plant.delay_s:.3g} s"
+    size = _with_unit(gain, signals.y_unit, f"{signals.u_unit} s" if plant.integrators else signals.u_unit)
+    return f"gain {size}, {kind}, lags {lags or 'none'}, dead time {plant.delay_s:.3g} s"
 
 
 def _loop_section(analysis: Analysis, signals: SignalSettings) -> Section:
@@ -282,8 +289,7 @@ def _loop_section(analysis: Analysis, signals: SignalSettings) -> Section:
         figures=(
             Figure(
                 figure=nyquist_figure(loops, analysis.points, controller, omega, spec.modulus_margin),
-                caption="Nyquist: the loops stay outside the circle of the modulus margin; ellipses are the points'"
-                " 95 % regions times C.",
+                caption=f"Nyquist: {_outside(analysis)}; ellipses are the points' 95 % regions times C.",
                 square=True,
             ),
             Figure(
@@ -295,6 +301,18 @@ def _loop_section(analysis: Analysis, signals: SignalSettings) -> Section:
                 caption="Sensitivity: its peak is the inverse of the modulus margin.",
             ),
         ),
+    )
+
+
+def _outside(analysis: Analysis) -> str:
+    """Return which loops stay outside the circle of the modulus margin."""
+    if analysis.reduced is None:
+        return "the loop stays outside the circle of the modulus margin"
+    if analysis.source == "reduced model":
+        return "the loops stay outside the circle of the modulus margin"
+    return (
+        f"the plant's loop stays outside the circle of the modulus margin; the controller was {based_on(analysis)},"
+        " and the more cautious reduced model is shown beside it, whose loop may enter the circle"
     )
 
 
@@ -347,15 +365,32 @@ def _certificate(analysis: Analysis) -> str:
 
 def gains_text(controller: PIDController, signals: SignalSettings) -> str:
     """Return a controller's gains in words, with units."""
+    if controller.K == 0.0:
+        return "no controller (K = 0)"
     unit = f" {signals.u_unit}/{signals.y_unit}" if signals.u_unit and signals.y_unit else ""
     derivative = f", T_d = {controller.Td_s:.4g} s, T_f = {controller.Tf_s:.3g} s" if controller.kind == "pid" else ""
     return f"{controller.kind.upper()} with K = {controller.K:.4g}{unit}, T_I = {controller.Ti_s:.4g} s{derivative}"
 
 
-def margins_sentence(analysis: Analysis) -> str:
+def based_on(analysis: Analysis) -> str:
+    """Return in words what the controller was designed on."""
+    count = f"{len(analysis.points)} points"
+    if analysis.source == "points":
+        return f"designed on {count}"
+    if analysis.source == "fitted plant":
+        return "designed on the plant fitted to the " + ("recording" if analysis.fit.source == "recording" else count)
+    return f"designed on the reduced model of {count}"
+
+
+def margins_sentence(analysis: Analysis, signals: SignalSettings) -> str:
     """Return the margins on the fitted plant in a sentence."""
     m = analysis.margins
+    h2 = _with_unit(m.h2, f"{signals.y_unit} √s", signals.u_unit) if signals.y_unit else f"{m.h2:.4g}"
     return (
         f"On the fitted plant: modulus margin {m.modulus:.3f}, phase margin {math.degrees(m.phase_rad):.1f} deg,"
-        f" delay margin {m.delay_s:.3g} s, crossover {m.crossover_rad_s:.3g} rad/s, H2 norm {m.h2:.4g}."
+        f" delay margin {m.delay_s:.3g} s, crossover {m.crossover_rad_s:.3g} rad/s, H2 norm under load {h2}."
     )
+
+
+def _with_unit(value: float, over: str, under: str) -> str:
+    return ratio_title(f"{value:.4g}", over, under).translate({ord("["): None, ord("]"): None})

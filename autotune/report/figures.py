@@ -94,10 +94,11 @@ def bode_figure(
         Unit of the gain.
     """
     figure = make_subplots(rows=2, cols=1, shared_xaxes=True, vertical_spacing=0.05)
-    drawn = []
+    drawn, gains = [], []
     for curve in curves:
         gain, phase_deg = gain_phase(sign * curve.system.response(omega))
         drawn.append(phase_deg)
+        gains.append(gain)
         add_line(figure, omega, gain, curve.name, curve.colour, dash=curve.dash, row=1, col=1)
         add_line(figure, omega, phase_deg, curve.name, curve.colour, dash=curve.dash, row=2, col=1, showlegend=False)
     measured: list[FloatArray] = []
@@ -106,6 +107,7 @@ def bode_figure(
         gain, phase_deg = gain_phase(np.array([sign * point.response for point in points]))
         bars = np.array([gain_phase_bars(point) for point in points]).reshape(-1, 2)
         measured.append(phase_deg)
+        gains.append(gain)
         for row, values, bar in ((1, gain, bars[:, 0]), (2, phase_deg, np.degrees(bars[:, 1]))):
             figure.add_trace(
                 go.Scatter(
@@ -122,10 +124,17 @@ def bode_figure(
             )
     figure.update_xaxes(type="log")
     figure.update_xaxes(title="angular frequency [rad/s]", row=2, col=1)
-    figure.update_yaxes(type="log", title=axis_title("gain", gain_unit), row=1, col=1)
+    figure.update_yaxes(type="log", title=axis_title("gain", gain_unit), dtick=_log_ticks(gains), row=1, col=1)
     low, high, step = phase_axis(measured, drawn)
     figure.update_yaxes(title="phase [deg]", dtick=step, range=[low, high], row=2, col=1)
     return figure
+
+
+def _log_ticks(drawn: Sequence[FloatArray]) -> str | int:
+    """Return the ticks of a logarithmic axis over these values: 1, 2, 5 up to three decades, then powers of ten."""
+    values = np.concatenate([*drawn, np.empty(0)])
+    values = values[np.isfinite(values) & (values > 0.0)]
+    return "D2" if values.size and np.max(values) < 1e3 * np.min(values) else 1
 
 
 def phase_axis(measured: Sequence[FloatArray], drawn: Sequence[FloatArray]) -> tuple[float, float, float]:

@@ -16,7 +16,7 @@ from autotune.experiment.verify import Verification, smoothed
 from autotune.pipeline import Analysis, Tuning
 from autotune.pipeline.deployment import Deployment
 from autotune.recording import Recording
-from autotune.report.analysis_sections import analysis_sections, gains_text, margins_sentence
+from autotune.report.analysis_sections import analysis_sections, based_on, gains_text, margins_sentence
 from autotune.report.chart import Chart, make_subplots
 from autotune.report.figures import axis_title, ratio_title, recording_figure
 from autotune.report.page import BLUE, GREEN, GREY, ORANGE, PURPLE, RED, Figure, Page, Section, Table, add_line, thinned
@@ -98,8 +98,8 @@ def analysis_page(
         verdict=f"{gains_text(analysis.controller, signals)}: not yet tried on the rig.",
         tone="warn",
         answers=(
-            ("Found", f"{gains_text(analysis.controller, signals)}, from {len(analysis.points)} points."),
-            ("How sure", margins_sentence(analysis)),
+            ("Found", f"{gains_text(analysis.controller, signals)}, {based_on(analysis)}."),
+            ("How sure", margins_sentence(analysis, signals)),
             (
                 "What to do",
                 "Try it on the rig, or have autotune deploy and verify do so, before the loop is left to it.",
@@ -241,7 +241,7 @@ def _answers(tuning: Tuning, signals: SignalSettings, diagnosis: Diagnosis | Non
     if old is not None:
         new, before = gains_text(tuning.analysis.controller, signals), gains_text(old, signals)
         found += f" Before: {before}. Now: {new}." if tuning.deployed else f" The rig holds {before}; designed: {new}."
-    sure = margins_sentence(tuning.analysis)
+    sure = margins_sentence(tuning.analysis, signals)
     if tuning.verification is not None:
         sure += " The loop was tried on the rig: below, measured beside what was predicted."
     todo = (
@@ -326,7 +326,12 @@ def _verification_section(verification: Verification, signals: SignalSettings) -
         ("overshoot [%]", 100 * measured.overshoot, 100 * predicted.overshoot, 100 * sd.overshoot),
         ("rise to 90 % [s]", measured.rise_s, predicted.rise_s, sd.rise_s),
         (f"peak under load [{unit}]", measured.peak, predicted.peak, sd.peak),
-        ("H2 over the load step", measured.h2, predicted.h2, sd.h2),
+        (
+            ratio_title("H2 over the load step", f"{unit} √s" if unit else "", signals.u_unit),
+            measured.h2,
+            predicted.h2,
+            sd.h2,
+        ),
     )
     return Section(
         title="Verification on the rig",
