@@ -83,7 +83,7 @@ def test_poles_of_long_records_are_found_to_a_few_thousandths() -> None:
         return float(np.max(np.abs(PLANT.poles[:, None] - model.poles).min(axis=1)))
 
     with threadpool_limits(1):
-        assert np.mean([error(seed, None) for seed in range(2)]) < 0.004
+        assert np.median([error(seed, None) for seed in range(3)]) < 0.004
         assert error(0, 5) > 0.009
 
 
