@@ -66,8 +66,8 @@ def on_change(t: FloatArray, u: FloatArray, y: FloatArray) -> bool:
 
     Notes
     -----
-    Two signs: rows with u hardly ever have y and the other way round; or the steps between rows vary by a factor of four and
-    more, one in ten of them. Missing rows alone make few long steps among equal ones.
+    Two signs: rows with u hardly ever have y and the other way round; or the steps between rows vary by a factor of
+    four and more, one in ten of them. Missing rows alone make few long steps among equal ones.
     """
     if t.size < _FEWEST_STEPS:
         return False
