@@ -16,12 +16,12 @@ from autotune.diagnosis.evidence.description import describe
 from autotune.diagnosis.evidence.held_out import held_out
 from autotune.diagnosis.evidence.jitter import jitter_effect
 from autotune.diagnosis.evidence.law import law_effect
-from autotune.diagnosis.evidence.sample_gain import improves, is_material
-from autotune.diagnosis.evidence.samples import SampleEffect, inspect
+from autotune.diagnosis.evidence.sample_gain import is_material, supported
+from autotune.diagnosis.evidence.samples import SampleEffect, inspect, outliers_in, spared
 from autotune.diagnosis.evidence.stamps import evened
 from autotune.diagnosis.findings import extended_model, found_effects, offset_of
 from autotune.diagnosis.fitting.fit import RUNAWAY
-from autotune.diagnosis.fitting.retuning import reduced_chi2
+from autotune.diagnosis.fitting.retuning import prepare, reduced_chi2
 from autotune.diagnosis.result import Diagnosis
 from autotune.diagnosis.selection.rig_search import search_rig, unmoved
 from autotune.diagnosis.selection.search import search
@@ -114,9 +114,9 @@ def _gathered(
     else:
         recordings, late = evened(model, recordings, thresholds)
     own = {effect.name for effect in model.effects}
-    good, seen = inspect(recordings, [name for name in without if name not in own], thresholds)
+    seen = _seen(model, recordings, [name for name in without if name not in own], thresholds)
+    found, seen = _searched(model, recordings, seen, without, progress, thresholds)
     seen = [s for s in seen if s.name not in own]
-    found = search(model, recordings, good, [*without, *(effect.name for effect in seen)], progress, thresholds)
     others = [s for s in _others(found, recordings, controller, seen) if s.name not in without]
     others = others if late is None else [late, *(s for s in others if s.name != late.name)]
     # where single rows are disturbed, what is left beside them must explain more to be named; beside jitter nothing is
@@ -126,7 +126,7 @@ def _gathered(
         found = found.asking(thresholds.samples_sure)
     progress("checking on held-out rows", 0.9)
     chosen = found.chosen.fit
-    samples = (*(s for s in seen if improves(s, chosen, found.data)), *others)
+    samples = (*supported(seen, chosen, found.data), *others)
     uneven = any(kind_of(s.name).uneven for s in samples)
     return Evidence(
         search=found,
@@ -138,29 +138,82 @@ def _gathered(
     )
 
 
+def _seen(
+    model: Model, recordings: Sequence[Recording], without: Sequence[str], limits: Thresholds
+) -> list[SampleEffect]:
+    """Return what the samples show and the retuned model does not speak against.
+
+    Rows at rest and turning points at one level are readings like any other: what spoils none leaves them to the fits.
+    """
+    good, seen = inspect(recordings, without, limits)
+    if not any(s.rows for s in seen):
+        return seen
+    try:
+        data, retuned = prepare(model, recordings, good, 1, limits)
+    except RUNAWAY:
+        return seen
+    return supported(seen, retuned, data)
+
+
+def _searched(
+    model: Model,
+    recordings: Sequence[Recording],
+    seen: list[SampleEffect],
+    without: Sequence[str],
+    progress: Progress,
+    limits: Thresholds,
+) -> tuple[Search, list[SampleEffect]]:
+    """Return the search, and what the samples show; searched again without spikes that its residual alone shows."""
+
+    def searched() -> Search:
+        names = [*without, *(effect.name for effect in seen)]
+        return search(model, recordings, spared(recordings, seen), names, progress, limits)
+
+    found = searched()
+    if "sensor.outliers" in without or any(s.name == "sensor.outliers" for s in seen):
+        return found, seen
+    data, chosen = found.data, found.chosen.fit
+    left = [r.y - signals[:, 0] for r, signals in zip(data.recordings, chosen.signals, strict=True)]
+    good = [g & np.isfinite(e) for g, e in zip(data.good, left, strict=True)]
+    outliers = outliers_in(left, recordings, good, limits)
+    confirmed = [] if outliers is None else supported([outliers], chosen, data)
+    if not confirmed:
+        return found, seen
+    seen = [*seen, *confirmed]
+    return searched(), seen
+
+
 def _of_rig(evidence: Evidence, model: Model, without: Sequence[str], progress: Progress) -> Evidence:
     """Return the evidence of left-out stretches where the model's own error and not noise is what remains."""
     limits, recordings = evidence.limits, evidence.search.data.recordings
     if evidence.residual.is_noise:
         return evidence
-    # readings that are repeated are readings all the same for a free run
-    good, _ = inspect(recordings, ("sensor.dropout", "sensor.saturation"), limits)
+    good = spared(recordings, evidence.samples)
     seen = [s.name for s in evidence.samples]
     try:
         known = evidence.search.chosen.fit if evidence.explains_most and evidence.search.chosen.names else None
         rig = search_rig(model, recordings, good, [*without, *seen], progress, limits, known)
     except RUNAWAY:
         return evidence
+    if not rig.chosen.names and evidence.residual.has_no_slow_part:
+        return _without_effects(evidence)
     fit, data = rig.chosen.fit, rig.chosen.data
-    samples = tuple(s for s in evidence.samples if _stays(s, bool(rig.chosen.names)) or is_material(s, fit, data))
+    samples = tuple(s for s in supported(evidence.samples, fit, data) if is_material(s, fit, data))
     quality = rig.quality(evidence.quality.noise_floor)
     return replace(evidence, search=rig.as_search(), samples=samples, quality=quality, offset=None, rig=rig)
 
 
-def _stays(sample: SampleEffect, beside_effects: bool) -> bool:
-    """Whether what samples show is told whatever a free run leaves: jitter, and repeats where nothing is found."""
-    kind = kind_of(sample.name)
-    return kind.sought == "residual" or not (beside_effects or kind.is_simulated)
+def _without_effects(evidence: Evidence) -> Evidence:
+    """Return the evidence where stretches that were left out speak for no effect beside a line in the residual."""
+    found, limits = evidence.search.asking(math.inf), evidence.limits
+    retuned, uneven = found.retuned.fit, evidence.residual.uneven
+    return replace(
+        evidence,
+        search=found,
+        residual=residual_tests(retuned, found.data, 0.0, uneven=uneven),
+        quality=held_out(retuned, retuned, found.data),
+        offset=None if evidence.offset is None else offset_of(retuned, limits.offset_sigmas),
+    )
 
 
 def _require_rows(recordings: Sequence[Recording]) -> None:

@@ -11,6 +11,7 @@ import numpy as np
 
 from autotune.arrays import FloatArray
 from autotune.diagnosis.effects import kind_of
+from autotune.diagnosis.evidence.residual import shifts_by_window
 from autotune.diagnosis.evidence.sample_gain import is_nearer
 from autotune.diagnosis.evidence.samples import SampleEffect
 from autotune.diagnosis.fitting.fit import Fit
@@ -28,14 +29,27 @@ Window = tuple[int, float, float]
 
 
 def offset_of(result: Fit, sigmas: float = Thresholds.offset_sigmas) -> Offset | None:
-    """Return the operating point's shift where it is far outside its uncertainty."""
+    """Return the operating point's shift where it is far outside its uncertainty.
+
+    A shift that wanders from window to window is none that stands: its uncertainty is that of the windows' mean.
+    """
     for i, free in enumerate(result.parametrisation.free):
         if free.kind == "u_offset":
-            sd = math.sqrt(max(float(result.covariance[i, i]), 0.0)) * free.size
+            variance = max(float(result.covariance[i, i]), 0.0)
+            sd = math.sqrt(max(variance, _variance_of_mean(shifts_by_window(result, i)))) * free.size
             shift = result.theta[i] * free.size
             if sd > 0.0 and abs(shift) > sigmas * sd and abs(shift) > 1e-3 * free.size:
                 return Offset(value=-shift, sd=sd)
     return None
+
+
+def _variance_of_mean(x: FloatArray) -> float:
+    """Return the variance of the mean of values that follow one another, each like the one before."""
+    d = x - np.mean(x) if x.size > 3 else np.zeros(0)
+    if not np.any(d):
+        return 0.0
+    alike = float(np.clip(d[1:] @ d[:-1] / (d @ d), 0.0, 0.9))
+    return float(np.mean(d**2)) * (1.0 + alike) / (1.0 - alike) / x.size
 
 
 def probability_of(name: str, candidates: Sequence[Candidate], most: float = Thresholds.most_probable) -> float:
@@ -55,7 +69,8 @@ def found_effects(evidence: Evidence, verdict: Verdict) -> tuple[FoundEffect, ..
     for effect in _with_uncertainty(chosen, chosen.fit.model.effects)[chosen.fit.parametrisation.own :]:
         effects.append((_lost_without(search, effect.name), _found_effect(effect, evidence, everywhere)))
     effects += [(s.evidence, _of_samples(s, everywhere, evidence.limits)) for s in evidence.samples]
-    ranked = [e for _, e in sorted(effects, key=lambda pair: -pair[0])]
+    # what is surer comes first; about as sure ones by how much they explain
+    ranked = [e for _, e in sorted(effects, key=lambda pair: (-round(pair[1].probability, 1), -pair[0]))]
     surest = max((e.probability for e in ranked), default=0.0)
     ranked = [e for e in ranked if e.probability >= min(evidence.limits.least_named, surest)]
     if evidence.offset is not None and not any(e.name in kind_of(OFFSET).same for e in ranked):
@@ -64,10 +79,10 @@ def found_effects(evidence: Evidence, verdict: Verdict) -> tuple[FoundEffect, ..
 
 
 def _of_samples(s: SampleEffect, everywhere: tuple[Window, ...], limits: Thresholds) -> FoundEffect:
-    surely = 1.0 / (1.0 + limits.unknown_odds)
+    surely = 1.0 / (1.0 + limits.unknown_odds + math.exp(-0.5 * s.speaks))
     return FoundEffect(
         name=s.name,
-        probability=surely if s.evidence > limits.samples_sure else limits.samples_probable,
+        probability=surely if s.evidence > limits.samples_sure else min(surely, limits.samples_probable),
         places=(kind_of(s.name).place,),
         parameters=MappingProxyType(s.parameters),
         equation=s.equation,

@@ -16,7 +16,8 @@ from autotune.diagnosis.equations.bench import Bench, EquationBench, Outcome
 from autotune.diagnosis.equations.closed import ClosedBench
 from autotune.diagnosis.equations.search import Searched, search
 from autotune.diagnosis.evidence.law import law_effect
-from autotune.diagnosis.evidence.samples import SampleEffect, inspect
+from autotune.diagnosis.evidence.readings import converter_step
+from autotune.diagnosis.evidence.samples import SampleEffect, inspect, spared
 from autotune.diagnosis.result import NextExperiment
 from autotune.diagnosis.selection.probability import Candidate, weighed
 from autotune.diagnosis.thresholds import IN_USE, Thresholds
@@ -178,6 +179,9 @@ def diagnose_equations(
         if np.isfinite(one.y).sum() < 100:
             raise InputError(f"{len(one)} rows", where=one.name, remedy="a diagnosis needs at least 100 readings")
     good, seen = inspect(recordings, without, thresholds)
+    if converter_step(np.concatenate([r.y for r in recordings])) > 0.0:
+        # no simulation is asked here: behind a converter equal readings are no dropout, and a spike is measured in steps
+        good, seen = spared(recordings, ()), [one for one in seen if not one.rows]
     law = law_effect(recordings, controller, thresholds)
     if law is not None and law.evidence > thresholds.samples_sure:
         seen.append(law)

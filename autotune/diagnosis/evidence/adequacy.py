@@ -10,6 +10,8 @@ import math
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
+
 from autotune.diagnosis.evidence.constancy import Variation, largest_variation
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import Fit
@@ -47,6 +49,7 @@ class ResidualTests:
     slow_chance: float
     varies: Variation
     gained: float
+    line: float = 0.0
     uneven: bool = False
     limits: Thresholds = field(default_factory=Thresholds)
 
@@ -58,7 +61,12 @@ class ResidualTests:
 
     @property
     def is_noise(self) -> bool:
-        """Whether it is noise: no more variance than its jitter shows, no slow part, and nothing that varies."""
+        """Whether it is noise: no more variance than its jitter shows, no slow part, no line, nothing that varies."""
+        return self.has_no_slow_part and self.line < self.limits.line
+
+    @property
+    def has_no_slow_part(self) -> bool:
+        """Whether it is noise but for lines of its spectrum."""
         even = self.uneven or self.reduced_chi2 < self.allowed
         return even and self._is_white(self.limits.white) and self.is_constant
 
@@ -91,6 +99,7 @@ class ResidualTests:
             "slow": self.slow,
             "slow_chance": self.slow_chance,
             "gained": self.gained,
+            "line": self.line,
             "uneven": self.uneven,
             "varies": varies,
         }
@@ -117,9 +126,35 @@ def residual_tests(result: Fit, data: Data, gained: float, *, uneven: bool = Fal
         slow_chance=_slow_chance(result),
         varies=largest_variation(result, data),
         gained=gained,
+        line=strongest_line(result, data),
         uneven=uneven,
         limits=data.thresholds,
     )
+
+
+def strongest_line(result: Fit, data: Data) -> float:
+    """Return the logarithm of the odds against chance of the strongest line in a residual's spectrum.
+
+    Where a signal swings within some rows, what a model lacks swings as fast: differences from row to row take that for
+    noise, and blocks of rows do not see it. Noise has no line.
+
+    Notes
+    -----
+    Of N ordinates of a periodogram of white noise of mean 1 the largest is above x with probability N exp(-x). The
+    residual is whitened by the noise that fits assume; the mean is taken from the median, which a few lines do not
+    move.
+
+    References
+    ----------
+    Fisher, Proc. R. Soc. A 125, 1929: tests of significance in harmonic analysis.
+    """
+    odds = [0.0]
+    for e in data.whitened(list(result.residuals)):
+        power = np.abs(np.fft.rfft(e * np.hanning(e.size))[2:-1]) ** 2
+        middle = float(np.median(power)) / math.log(2.0) if power.size else 0.0
+        if middle > 0.0:
+            odds.append(float(np.max(power)) / middle - math.log(power.size))
+    return max(odds)
 
 
 def _slow_chance(result: Fit) -> float:

@@ -196,3 +196,16 @@ def ridge(X: FloatArray, e: FloatArray, P: FloatArray) -> tuple[FloatArray, Floa
     H = (X / scale).T @ (X / scale) + P / np.outer(scale, scale)
     inverse = np.linalg.pinv(H, rcond=1e-7, hermitian=True) / np.outer(scale, scale)
     return np.asarray(inverse @ (X.T @ e)), np.asarray(inverse)
+
+
+def shifts_by_window(result: Fit, i: int) -> FloatArray:
+    """Return what one more step of fitting would make of one free number in every window alone, start states freed.
+
+    Windows that do not feel it are left out.
+    """
+    J, shifts = result.jacobian[0][:, i], []
+    for (a, b), Q in zip(result.windows, result.states_explain, strict=True):
+        j, e = (d[a:b] - Q @ (Q.T @ d[a:b]) for d in (J, result.e))
+        if float(j @ j) > 0.0:
+            shifts.append(-float(j @ e) / float(j @ j))
+    return np.array(shifts)

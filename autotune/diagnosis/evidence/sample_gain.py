@@ -1,83 +1,156 @@
-"""Whether a simulation is nearer to the readings with what their samples show: only then is it named."""
+"""Whether a simulation is nearer to the readings with what their samples show: only then is it named.
+
+A reading that is spoiled is not seen by any fit, so what a simulation makes of it was not fitted. Every run of spoiled
+rows is a witness of its own; how consistently they speak is the evidence, as for effects of the chain it is how
+consistently stretches do.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
-from autotune.arrays import FloatArray
+from autotune.arrays import BoolArray, FloatArray
 from autotune.diagnosis.effects import kind_of
-from autotune.diagnosis.evidence.samples import ON_STEP, REGULAR, TINY, SampleEffect, converter_step
+from autotune.diagnosis.evidence.readings import (
+    CAUGHT_UP,
+    ON_STEP,
+    REGULAR,
+    TINY,
+    converter_step,
+    runs_of,
+    usual_change,
+)
+from autotune.diagnosis.evidence.samples import SampleEffect
+from autotune.diagnosis.evidence.stretches import STRETCHES, rms
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import Fit
-from autotune.diagnosis.thresholds import Thresholds
 
-_ENDS = (("low", -np.inf), ("high", np.inf))
-
-
-def is_material(effect: SampleEffect, result: Fit, data: Data) -> bool:
-    """Whether what single samples show matters beside what a free run leaves of a rig.
-
-    A converter's step does where its rounding is a tenth of the residual's variance, a spoiled reading where it is far
-    farther from the simulation than others: a plant at rest repeats its reading as well, and a slow converter does.
-    """
-    good = [g & np.isfinite(e) for g, e in zip(data.good, result.residuals, strict=True)]
-    squares = [np.square(r.y - s[:, 0]) for r, s in zip(data.recordings, result.signals, strict=True)]
-    usual = float(np.mean(np.concatenate([q[g] for q, g in zip(squares, good, strict=True)])))
-    if kind_of(effect.name).steps:
-        return effect.parameters["step"].value ** 2 / 12.0 > data.thresholds.material * usual
-    if not effect.rows or not any(rows.any() for rows in effect.rows):
-        return True
-    spoiled = np.concatenate([q[rows] for q, rows in zip(squares, effect.rows, strict=True)])
-    spoiled = spoiled[np.isfinite(spoiled)]
-    return bool(spoiled.size) and float(np.mean(spoiled)) > data.thresholds.spoiled * usual
+_ENDS = (("low", -1.0), ("high", 1.0))
 
 
-def improves(effect: SampleEffect, result: Fit, data: Data) -> bool:
-    """Whether a simulation is nearer to readings that were not fitted with what their samples show.
+def supported(effects: Sequence[SampleEffect], result: Fit, data: Data) -> list[SampleEffect]:
+    """Return the effects of single samples that runs of a simulation speak for, with how much they do.
 
     Parameters
     ----------
-    effect : SampleEffect
+    effects : sequence of SampleEffect
         What the samples show.
     result : Fit
-        The simulation, in which it does not act.
+        The simulation, in which they do not act.
     data : Data
-        What that was fitted to: rows that the effect spoils do not count there.
+        What that was fitted to: rows that an effect spoils do not count there.
 
     Notes
     -----
-    A reading that is repeated is the one before it, exactly. A clipped one is its limit. A spike stands out of
-    the residual too: the simulation does not explain it. A converter's step is found in one half
-    of the readings and predicts the values of the other.
+    Behind a limit the simulation goes on, beyond it. When lost readings are back, they have gone all the way that the
+    simulation went meanwhile, in one row. A spike stands far out of what the simulation leaves elsewhere. A converter's
+    step is found in one half of the readings and predicts the values of the other.
     """
-    limits, kind = data.thresholds, kind_of(effect.name)
-    simulated = [s[:, 0] for s in result.signals]
-    if kind.steps:
-        return _step_predicts(data)
+    found = []
+    for one in effects:
+        speaks = _speaks(one, result, data)
+        if speaks > 0.0:
+            found.append(replace(one, speaks=speaks))
+    return found
+
+
+def _speaks(effect: SampleEffect, result: Fit, data: Data) -> float:
+    if kind_of(effect.name).steps:
+        return math.inf if _step_predicts(data) else -math.inf
     if not effect.rows or not any(rows.any() for rows in effect.rows):
-        return True
-    left = [r.y[rows] - s[rows] for r, s, rows in zip(data.recordings, simulated, effect.rows, strict=True)]
-    off = np.concatenate(left)
-    off = off[np.isfinite(off)]
-    if kind.is_simulated:  # limits: the simulation goes beyond them, or noise does
-        low, high = (effect.parameters[key].value if key in effect.parameters else bound for key, bound in _ENDS)
-        ends = [np.clip(s[rows], low, high) for s, rows in zip(simulated, effect.rows, strict=True)]
-        clipped = np.concatenate([r.y[rows] - e for r, e, rows in zip(data.recordings, ends, effect.rows, strict=True)])
-        return float(np.nansum(clipped**2)) <= float(np.sum(off**2))
-    if kind.uneven:
-        return _stand_out(effect, [r.y - s for r, s in zip(data.recordings, simulated, strict=True)], limits)
-    return float(np.sum(off**2)) > 0.0
+        return math.inf
+    match effect.name:
+        case "sensor.saturation":
+            return _beyond(effect, result, data)
+        case "sensor.dropout":
+            return _caught_up(effect, result, data)
+        case _:
+            return _stand_out(effect, result, data)
 
 
-def _stand_out(effect: SampleEffect, residuals: Sequence[FloatArray], limits: Thresholds) -> bool:
-    """Whether spikes stand out of the residual too, beside their neighbours: what the simulation explains does not."""
+def _unspoiled(result: Fit, data: Data, rows: Sequence[BoolArray]) -> float:
+    """Return the root mean square error of the rows that count and are not spoiled."""
+    pairs = zip(data.recordings, result.signals, strict=True)
+    left = [r.y - s[:, 0] for r, s in pairs]
+    return rms(left, [g & ~m & np.isfinite(e) for g, m, e in zip(data.good, rows, left, strict=True)])
+
+
+def _beyond(effect: SampleEffect, result: Fit, data: Data) -> float:
+    """Return twice the log odds that the simulation is beyond the limits whenever readings stand at them.
+
+    Readings that are merely large are so because of their noise and of the model's error: then the simulation is
+    within. K runs whose mean distance is z times the usual error give K ln(1 + z^2), with the distance's sign.
+    """
+    usual, beyond = _unspoiled(result, data, effect.rows), []
+    for r, s, rows in zip(data.recordings, result.signals, effect.rows, strict=True):
+        for a, b in runs_of(rows):
+            for key, sign in _ENDS:
+                level = effect.parameters.get(key)
+                if level is not None and r.y[a] == level.value:
+                    beyond.append(sign * float(np.nanmean(s[a:b, 0] - level.value)))
+    return _consistent(np.array(beyond), usual)
+
+
+def _consistent(distances: FloatArray, usual: float) -> float:
+    """Return K ln(1 + z^2) of K mean distances over a usual one, with their sign; at most ``STRETCHES`` count."""
+    distances = distances[np.isfinite(distances)]
+    if not distances.size:
+        return -math.inf
+    z = float(np.mean(distances)) / max(usual, 1e-300)
+    return math.copysign(min(distances.size, STRETCHES) * math.log1p(z * z), z)
+
+
+def _caught_up(effect: SampleEffect, result: Fit, data: Data) -> float:
+    """Return twice the log odds that readings that come back have gone on meanwhile, as the plant did.
+
+    Without a loss they go on by what the simulation does in one row, and by no more than readings usually do: K losses
+    that leave a share q of those squared errors when the simulation's whole way is counted give -K ln q. Losses at rest
+    tell nothing.
+    """
+    jumps, squares = [], []
+    for r, s, rows, good in zip(data.recordings, result.signals, effect.rows, data.good, strict=True):
+        usual = CAUGHT_UP * usual_change(r.y)
+        for a, b in runs_of(rows):
+            if a == 0 or b >= len(r) - 1 or not good[b]:
+                continue
+            # a spike after rest jumps as well, but not for two rows
+            jump = min(r.y[b] - r.y[b - 1], r.y[b + 1] - r.y[b - 1], key=abs)
+            whole = s[b, 0] - s[a - 1, 0]
+            if abs(jump) > usual or abs(whole) > usual:
+                jumps.append(abs(jump) / usual - 1.0)
+                squares.append(((jump - (s[b, 0] - s[b - 1, 0])) ** 2, (jump - whole) ** 2))
+    pairs = np.array(squares, dtype=np.float64).reshape(-1, 2)
+    without, beside = pairs[np.all(np.isfinite(pairs), axis=1)].sum(axis=0)
+    simulated = min(len(pairs), STRETCHES) * math.log(without / beside) if without > 0.0 and beside > 0.0 else 0.0
+    return simulated + _consistent(np.array(jumps), 1.0)
+
+
+def _stand_out(effect: SampleEffect, result: Fit, data: Data) -> float:
+    """Return twice the log odds that spikes stand out of the residual: what the simulation explains does not.
+
+    Their distance from the mean of their neighbours counts beyond the least that is asked of it, over the usual one
+    where nothing is spoiled; they must stand out of all that the simulation leaves as well.
+    """
+    limits, usual = data.thresholds, _unspoiled(result, data, effect.rows)
+    residuals = [r.y - s[:, 0] for r, s in zip(data.recordings, result.signals, strict=True)]
     alone = [e[1:-1] - 0.5 * (e[:-2] + e[2:]) for e in residuals]
-    usual = np.concatenate([d[~rows[1:-1]] for d, rows in zip(alone, effect.rows, strict=True)])
-    spikes_of = np.concatenate([d[rows[1:-1]] for d, rows in zip(alone, effect.rows, strict=True)])
-    spread = 1.4826 * float(np.nanmedian(np.abs(usual)))
-    return bool(np.nanmedian(np.abs(spikes_of)) > limits.least_outlier * spread)
+    inner = [rows[1:-1] for rows in effect.rows]
+    others = np.concatenate([d[~rows] for d, rows in zip(alone, inner, strict=True)])
+    heights = np.abs(np.concatenate([d[rows] for d, rows in zip(alone, inner, strict=True)]))
+    spread = max(1.4826 * float(np.nanmedian(np.abs(others))), usual)
+    return _consistent(heights - limits.least_outlier * spread, spread)
+
+
+def is_material(effect: SampleEffect, result: Fit, data: Data) -> bool:
+    """Whether a converter's rounding is a tenth of the variance that a free run leaves of a rig."""
+    if not kind_of(effect.name).steps:
+        return True
+    step = effect.parameters["step"].value
+    return step**2 / 12.0 > data.thresholds.material * rms(result.residuals, data.good) ** 2
 
 
 def _step_predicts(data: Data) -> bool:

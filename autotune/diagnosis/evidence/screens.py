@@ -16,8 +16,8 @@ from scipy.signal import welch
 from autotune.arrays import FloatArray
 from autotune.controller import Controller
 from autotune.diagnosis.evidence.law import shown_law, stated_law
+from autotune.diagnosis.evidence.readings import converter_step, frozen_rows
 from autotune.diagnosis.evidence.residual import filled
-from autotune.diagnosis.evidence.samples import converter_step, frozen_rows
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import Fit
 from autotune.recording import Recording

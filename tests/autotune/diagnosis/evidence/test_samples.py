@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from autotune.diagnosis.evidence.samples import converter_step, frozen_rows, inspect, spikes
+from autotune.diagnosis.evidence.readings import converter_step, frozen_rows, spikes
+from autotune.diagnosis.evidence.samples import inspect
 from autotune.diagnosis.fitting.noise import autoregressive, noise_from_differences
 from autotune.recording import Recording
 
