@@ -180,7 +180,7 @@ def diagnose_equations(
             raise InputError(f"{len(one)} rows", where=one.name, remedy="a diagnosis needs at least 100 readings")
     good, seen = inspect(recordings, without, thresholds)
     if converter_step(np.concatenate([r.y for r in recordings])) > 0.0:
-        # no simulation is asked here: behind a converter equal readings are no dropout, and a spike is measured in steps
+        # no simulation is asked here, and behind a converter equal readings are no dropout
         good, seen = spared(recordings, ()), [one for one in seen if not one.rows]
     law = law_effect(recordings, controller, thresholds)
     if law is not None and law.evidence > thresholds.samples_sure:
