@@ -141,7 +141,7 @@ def _gathered(
 def _seen(
     model: Model, recordings: Sequence[Recording], without: Sequence[str], limits: Thresholds
 ) -> list[SampleEffect]:
-    """Return what the samples show and the retuned model does not speak against.
+    """Return what the samples show where the retuned model speaks for it clearly.
 
     Rows at rest and turning points at one level are readings like any other: what spoils none leaves them to the fits.
     """
@@ -152,7 +152,7 @@ def _seen(
         data, retuned = prepare(model, recordings, good, 1, limits)
     except RUNAWAY:
         return seen
-    return supported(seen, retuned, data)
+    return [s for s in supported(seen, retuned, data) if s.speaks > limits.samples_clear]
 
 
 def _searched(

@@ -25,7 +25,7 @@ from autotune.diagnosis.evidence.readings import (
     usual_change,
 )
 from autotune.diagnosis.evidence.samples import SampleEffect
-from autotune.diagnosis.evidence.stretches import STRETCHES, rms
+from autotune.diagnosis.evidence.stretches import LEAST_HEAD, STRETCHES, rms
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import Fit
 
@@ -82,21 +82,51 @@ def _unspoiled(result: Fit, data: Data, rows: Sequence[BoolArray]) -> float:
 def _beyond(effect: SampleEffect, result: Fit, data: Data) -> float:
     """Return twice the log odds that the simulation is beyond the limits whenever readings stand at them.
 
-    Readings that are merely large are so because of their noise and of the model's error: then the simulation is
-    within. K runs whose mean distance is z times the usual error give K ln(1 + z^2), with the distance's sign.
+    Readings that are merely large are so because of their noise and of the model's error, or because the plant came to
+    rest there: then the simulation is within, or as near as its mean error over as many rows is elsewhere, or as half
+    of the distance to the next reading that occurs.
     """
-    usual, beyond = _unspoiled(result, data, effect.rows), []
-    for r, s, rows in zip(data.recordings, result.signals, effect.rows, strict=True):
+    beyond, lengths = [], []
+    values = np.unique(np.concatenate([r.y[np.isfinite(r.y)] for r in data.recordings]))
+    half_step = 0.5 * usual_change(values)
+    for r, s, rows, told in zip(data.recordings, result.signals, effect.rows, _told(data), strict=True):
         for a, b in runs_of(rows):
             for key, sign in _ENDS:
                 level = effect.parameters.get(key)
-                if level is not None and r.y[a] == level.value:
-                    beyond.append(sign * float(np.nanmean(s[a:b, 0] - level.value)))
-    return _consistent(np.array(beyond), usual)
+                past = s[a:b, 0][told[a:b] & np.isfinite(s[a:b, 0])]
+                if level is not None and r.y[a] == level.value and past.size:
+                    beyond.append(sign * float(np.mean(past - level.value)) - half_step)
+                    lengths.append(b - a)
+    if not beyond:
+        return -math.inf
+    usual = _usual_mean(result, data, effect.rows, max(1, int(np.median(lengths))))
+    return _consistent(np.array(beyond) - usual, usual)
+
+
+def _told(data: Data) -> list[BoolArray]:
+    """Return the rows before which enough readings of their window count to tell its start state."""
+    told = []
+    for good, starts, stops in zip(data.good, data.starts, data.stops, strict=True):
+        mark = np.zeros(good.size, dtype=bool)
+        for a, b in zip(starts, stops, strict=True):
+            mark[a:b] = np.cumsum(good[a:b]) >= LEAST_HEAD
+        told.append(mark)
+    return told
+
+
+def _usual_mean(result: Fit, data: Data, rows: Sequence[BoolArray], length: int) -> float:
+    """Return the root mean square of the mean error of so many rows that count and are not spoiled."""
+    means = []
+    for r, s, m, good in zip(data.recordings, result.signals, rows, data.good, strict=True):
+        left = (r.y - s[:, 0])[good & ~m]
+        left = left[np.isfinite(left)]
+        means.append(left[: left.size // length * length].reshape(-1, length).mean(axis=1))
+    every = np.concatenate(means)
+    return float(np.sqrt(np.mean(every**2))) if every.size else _unspoiled(result, data, rows)
 
 
 def _consistent(distances: FloatArray, usual: float) -> float:
-    """Return K ln(1 + z^2) of K mean distances over a usual one, with their sign; at most ``STRETCHES`` count."""
+    """Return K ln(1 + z^2) for K distances whose mean is z usual ones, with its sign; ``STRETCHES`` count at most."""
     distances = distances[np.isfinite(distances)]
     if not distances.size:
         return -math.inf
