@@ -107,6 +107,7 @@ class Thresholds:
     quick: float = known(1.0, "slow power", "of the residual over the noise's up to which it has no slow part", "counted")
     white: float = known(1.10, "slow power", "up to which a residual is white, beside two sd of chance", "counted")
     line: float = known(6.0, "log odds", "against chance of the strongest line in the spectrum of noise: one in four hundred", "chance")
+    line_share: float = known(0.01, "of the gained", "chi2 of a line beside effects: right ones leave four thousandths, wrong ones three hundredths", "counted")
     inconstant: float = known(25.0, "chi2", "of the largest of some hundred score tests; right models leave up to 15", "counted")
     inconstant_share: float = known(0.1, "of the gained", "the same beside effects: right ones leave two hundredths, wrong ones a third", "counted")
     lesser_share: float = known(0.5, "of the gained", "from which on what varies weighs as much as the effects; real rigs leave a quarter", "real rigs")

@@ -50,6 +50,7 @@ class ResidualTests:
     varies: Variation
     gained: float
     line: float = 0.0
+    line_gain: float = 0.0
     uneven: bool = False
     limits: Thresholds = field(default_factory=Thresholds)
 
@@ -62,7 +63,12 @@ class ResidualTests:
     @property
     def is_noise(self) -> bool:
         """Whether it is noise: no more variance than its jitter shows, no slow part, no line, nothing that varies."""
-        return self.has_no_slow_part and self.line < self.limits.line
+        return self.has_no_slow_part and not self.has_line
+
+    @property
+    def has_line(self) -> bool:
+        """Whether it swings with a frequency more than noise does, and than what effects explain is simulated wrong."""
+        return self.line > self.limits.line and self.line_gain > self.limits.line_share * self.gained
 
     @property
     def has_no_slow_part(self) -> bool:
@@ -100,6 +106,7 @@ class ResidualTests:
             "slow_chance": self.slow_chance,
             "gained": self.gained,
             "line": self.line,
+            "line_gain": self.line_gain,
             "uneven": self.uneven,
             "varies": varies,
         }
@@ -119,6 +126,7 @@ def residual_tests(result: Fit, data: Data, gained: float, *, uneven: bool = Fal
     uneven : bool
         Whether samples show that some rows' noise is larger than others'.
     """
+    line, line_gain = strongest_line(result, data)
     return ResidualTests(
         reduced_chi2=reduced_chi2(result, data),
         reduced_chi2_chance=math.sqrt(2.0 / result.rows),
@@ -126,14 +134,15 @@ def residual_tests(result: Fit, data: Data, gained: float, *, uneven: bool = Fal
         slow_chance=_slow_chance(result),
         varies=largest_variation(result, data),
         gained=gained,
-        line=strongest_line(result, data),
+        line=line,
+        line_gain=line_gain,
         uneven=uneven,
         limits=data.thresholds,
     )
 
 
-def strongest_line(result: Fit, data: Data) -> float:
-    """Return the logarithm of the odds against chance of the strongest line in a residual's spectrum.
+def strongest_line(result: Fit, data: Data) -> tuple[float, float]:
+    """Return the logarithm of the odds against chance of the strongest line in a residual's spectrum, and its chi2.
 
     Where a signal swings within some rows, what a model lacks swings as fast: differences from row to row take that for
     noise, and blocks of rows do not see it. Noise has no line.
@@ -148,12 +157,13 @@ def strongest_line(result: Fit, data: Data) -> float:
     ----------
     Fisher, Proc. R. Soc. A 125, 1929: tests of significance in harmonic analysis.
     """
-    odds = [0.0]
+    odds = [(0.0, 0.0)]
     for e in data.whitened(list(result.residuals)):
         power = np.abs(np.fft.rfft(e * np.hanning(e.size))[2:-1]) ** 2
         middle = float(np.median(power)) / math.log(2.0) if power.size else 0.0
         if middle > 0.0:
-            odds.append(float(np.max(power)) / middle - math.log(power.size))
+            largest = float(np.max(power)) / middle
+            odds.append((largest - math.log(power.size), 2.0 * largest))
     return max(odds)
 
 
