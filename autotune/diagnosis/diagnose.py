@@ -186,7 +186,8 @@ def _searched(
 def _of_rig(evidence: Evidence, model: Model, without: Sequence[str], progress: Progress) -> Evidence:
     """Return the evidence of left-out stretches where the model's own error and not noise is what remains."""
     limits, recordings = evidence.limits, evidence.search.data.recordings
-    if evidence.residual.is_noise:
+    barely = bool(evidence.search.chosen.names) and evidence.unknown_odds > limits.barely_noise
+    if evidence.residual.is_noise and not barely:
         return evidence
     good = spared(recordings, evidence.samples)
     seen = [s.name for s in evidence.samples]

@@ -132,6 +132,7 @@ class Thresholds:
     ringing_periods: float = known(8.0, "periods", "length of long windows of a plant that rings", "convention")
     swinging: float = known(0.5, "damping", "below which a fit goes from short to long windows", "convention")
     varies_more: float = known(3.0, "of the gained", "of a rig's effects, from which on what varies beside them is what is missing; real rigs leave up to 1.3", "real rigs")
+    barely_noise: float = known(0.1, "prior odds", "of what is in no catalogue, from which on stretches are asked about effects that leave little more than noise", "convention")
     rig_rows: int = known(9000, "rows", "fitted at most", "cost")
     material: float = known(0.1, "of the held-out error", "that one more effect must take away", "convention")
     material_numbers: float = known(0.25, "of the held-out error", "that retuned numbers must take away to replace nominal ones where no effect is found", "convention")

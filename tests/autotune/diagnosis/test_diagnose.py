@@ -183,3 +183,22 @@ def test_what_a_blow_makes_of_the_least_change_is_no_second_effect(shared: Path)
     found = diagnose(read_model(case / "model.toml"), [read_recording(case / f"rec{k}.csv") for k in (1, 2)])
     assert [e.name for e in found.effects] == ["plant.hard_stop"]
     assert found.effects[0].parameters["high"].value == pytest.approx(6.8958, abs=0.01)
+
+
+def test_play_of_a_real_valve_is_named_where_the_noise_alone_leaves_it_open(shared: Path) -> None:
+    """A flow loop with stiction: beside white noise hysteresis and play tie, stretches tell them apart."""
+    case = shared / "real_cases" / "p_07"
+    found = diagnose(read_model(case / "model.toml"), [read_recording(case / "fit.csv")])
+    assert found.effects[0].name == "actuator.backlash"
+    assert found.effects[0].probability < 0.9
+
+
+def test_a_real_swing_whose_rows_were_stamped_on_arrival_is_forecast_at_even_times(shared: Path) -> None:
+    case = shared / "real_cases" / "m_18"
+    found = diagnose(read_model(case / "model.toml"), [read_recording(case / "fit.csv")])
+    assert [e.name for e in found.effects] == ["timing.jitter"]
+    unseen = read_recording(case / "test.csv")
+    scored = unseen.t >= 1.6
+    error = (forecast(found.extended_model, unseen, 1.5) - unseen.y)[scored]
+    # 0.25 with even times from the first stamp to the last; a linear model whose stamps were right leaves 0.097
+    assert float(np.sqrt(np.mean(error**2)) / np.std(unseen.y[scored])) < 0.1
