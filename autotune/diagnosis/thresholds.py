@@ -160,7 +160,7 @@ class Thresholds:
     equation_behind: float = known(300.0, "chi2", "behind one that leaves noise with which a fit is not finished", "cost")
     equation_fitted: int = known(6, "effects", "fitted of those that predict most", "cost")
     equation_further: int = known(4, "effects", "the same beside other effects", "cost")
-    equation_effects: int = known(2, "effects", "in one hypothesis at most", "cost")
+    equation_effects: int = known(4, "effects", "in one hypothesis at most", "cost")
     equation_faint: float = known(0.02, "of the best", "predicted decrease, below which an effect is not fitted", "cost")
     equation_explained: float = known(1.25, "times the noise", "variance up to which chosen effects explain recordings", "counted")
     equation_most: float = known(0.85, "of the excess variance", "that effects must explain to be named otherwise", "counted")

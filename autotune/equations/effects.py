@@ -17,7 +17,7 @@ from autotune.arrays import FloatArray
 from autotune.equations.expressions import Expression, Name, parse, substituted, to_text
 from autotune.equations.model import EquationModel, Extension, ModelParameter, State
 from autotune.equations.samples import BEFORE, quantised
-from autotune.equations.simulate import Drive
+from autotune.equations.simulate import Compiled, Drive, Held, compile_model
 from autotune.errors import InputError
 from autotune.models import Effect, Parameter
 
@@ -170,6 +170,44 @@ def apply(model: EquationModel, effects: Sequence[Effect] | None = None) -> Appl
         return y
 
     return Applied(extensions=tuple(extensions), delays=delays, before=on_drive, after=on_reading)
+
+
+def compile_with(model: EquationModel, effects: Sequence[Effect], signals: Sequence[str] = ()) -> Compiled:
+    """Translate a model with effects, every number of theirs among its parameters; takes about a millisecond.
+
+    Parameters
+    ----------
+    model : EquationModel
+        The model; its own ``effects`` are not looked at.
+    effects : sequence of Effect
+        What acts, in the order in which a signal meets it; a converter of the reading is left to :func:`apply`.
+    signals : sequence of str
+        Expressions that are wanted at the rows beside y.
+
+    Returns
+    -------
+    Compiled
+        With dead times and what happens to held commands: a drive needs no preparation.
+
+    Raises
+    ------
+    InputError
+        As :func:`apply` and :func:`~autotune.equations.simulate.compile_model`.
+    """
+    held = []
+    for number, effect in enumerate(effects):
+        late = effect.name == "timing.dead_time"
+        if not late and effect.name not in BEFORE:
+            continue
+        (key,), transform = (("delay",), None) if late else BEFORE[effect.name]
+        unit = effect.parameters[key].unit if key in effect.parameters else ""
+        parameter = ModelParameter(
+            name=f"{effect.name.split('.')[1]}_{number}_{key}", value=_value(effect, key, model), unit=unit,
+            spread=EFFECT_SPREAD,
+        )  # fmt: skip
+        column = int(np.argmax(_acts_on(model, effect)))
+        held.append(Held(column=column, parameter=parameter, transform=transform))
+    return compile_model(model, apply(model, effects).extensions, signals, held)
 
 
 def extension_of(model: EquationModel, effect: Effect, number: int = 0) -> Extension:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TypeAlias
 
 import numpy as np
 
@@ -24,8 +25,12 @@ from autotune.recording import Recording
 _SMALL = 1e-4
 #: Windows that a recording is cut into, one fit after the other, each with this many rows at least.
 SHORT_TO_LONG, LEAST_ROWS = (32, 8, 2, 1), 24
+#: Share of a window by which windows may be longer than what was asked for, so that no short rest is left.
+LONGER = 0.1
 #: Rows per state, and one more, that a window has at least where a horizon is stated: the plant runs away.
 ROWS_PER_STATE = 4
+#: Moves with the derivatives of one point at most, and the share of the decrease before that one more must bring.
+MOVES, WORTH_MOVING = 4, 0.1
 #: A longer window that leaves this many times the error of the shorter ones has lost its way.
 LOST = 30.0
 
@@ -51,7 +56,8 @@ class Fitted:
     noise_sd : float
         Root mean square of the residuals [y unit].
     jacobian : (rows, P) array
-        dy/dz over the noise, start states projected out; see :mod:`autotune.equations.identifiability`.
+        dy/dz over the noise where the last step began, start states projected out; see
+        :mod:`autotune.equations.identifiability`.
     converged : bool
         Whether the last step changed next to nothing.
     """
@@ -69,7 +75,7 @@ class Fitted:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _Data:
+class FitData:
     """A recording prepared for a fit."""
 
     drive: Drive
@@ -79,11 +85,15 @@ class _Data:
 
 
 def window_rows(t: FloatArray, horizon_s: float | None) -> tuple[IntArray, IntArray]:
-    """Return the first rows of windows of a length, and the rows before which they end; one window without it."""
+    """Return the first rows of windows of about a length, and the rows before which they end; one window without it.
+
+    All are as long as one another: in a longer one an unstable plant would run away.
+    """
     if horizon_s is None:
         return np.zeros(1, dtype=np.int64), np.array([t.size], dtype=np.int64)
-    count = max(int(np.floor((t[-1] - t[0]) / horizon_s + 1e-9)), 1)
-    edges = np.searchsorted(t, t[0] + horizon_s * np.arange(count) - 1e-9 * horizon_s).astype(np.int64)
+    span = float(t[-1] - t[0])
+    count = max(int(np.ceil(span / horizon_s - LONGER)), 1)
+    edges = np.searchsorted(t, t[0] + span / count * np.arange(count) - 1e-9 * horizon_s).astype(np.int64)
     edges = np.unique(edges)
     return edges, np.append(edges[1:], t.size)
 
@@ -143,9 +153,9 @@ def fit(
     length = compiled.model.horizon_s if horizon_s is None else horizon_s
     p = values_of(compiled, z)
     data = [
-        _data(compiled, one, p, length, None if windows is None else windows[k]) for k, one in enumerate(recordings)
+        data_of(compiled, one, p, length, None if windows is None else windows[k]) for k, one in enumerate(recordings)
     ]
-    state = _Descent(compiled, data, which, z)
+    state = Descent(compiled, data, which, z)
     converged = False
     for k in range(iterations):
         progress("fitting", k / iterations)
@@ -213,35 +223,52 @@ def retune(
     return found
 
 
-def _data(
+def data_of(
     compiled: Compiled, recording: Recording, parameters: FloatArray, length_s: float | None, windows: Windows | None
-) -> _Data:
+) -> FitData:
+    """Return a recording prepared for a fit, on given windows or on ones of a length.
+
+    Raises
+    ------
+    InputError
+        Fewer than 8 readings that count.
+    """
     drive, good = drive_of(compiled.model, recording), np.isfinite(recording.y)
     if good.sum() < 8:
         raise InputError("fewer than 8 finite readings", where=recording.name, remedy="record longer")
     if windows is None:
         starts, stops = window_rows(recording.t, length_s)
         windows = fitted_starts(compiled, parameters, drive, recording.y, good, starts, stops)
-    return _Data(drive=drive, y=recording.y, good=good, windows=windows)
+    return FitData(drive=drive, y=recording.y, good=good, windows=windows)
 
 
-class _Descent:
+#: J to z with the start states projected out, and per window what gives those back.
+_Derivatives: TypeAlias = tuple[FloatArray, list[tuple[FloatArray, IntArray, FloatArray]]]
+
+
+class Descent:
     """The iterate of one fit."""
 
-    def __init__(self, compiled: Compiled, data: Sequence[_Data], which: IntArray, z: FloatArray) -> None:
+    def __init__(
+        self, compiled: Compiled, data: Sequence[FitData], which: IntArray, z: FloatArray,
+        known: Sequence[Sensitivities] | None = None,
+    ) -> None:  # fmt: skip
         self._compiled, self._data, self._which, self._z = compiled, list(data), which, z
+        self._known = known  # derivatives at every row of every recording where the descent begins
         self._free_first = np.flatnonzero(~np.isfinite(given_starts(compiled)))
         start = values_of(compiled, z)
         scales = [state_scales(compiled, start, one.drive, one.windows.states[0]) for one in data]
         self._scales = np.max(scales, axis=0)
         self._damping = 1e-3
-        self._errors = self._simulated(z, [one.windows for one in data])
-        if self._errors is None:
+        self._last: FloatArray | None = None
+        errors = self._simulated(z, [one.windows for one in data])
+        if errors is None:
             raise InputError(
                 "the simulation runs away from every start", where=compiled.model.name,
                 remedy="check signs and units, or give horizon_s: an unstable plant is compared as forecasts",
             )  # fmt: skip
-        self._sd = self._noise(self._errors)
+        self._errors = errors
+        self._sd = self._noise(errors)
 
     def _simulated(self, z: FloatArray, windows: Sequence[Windows]) -> list[FloatArray] | None:
         """Return reading less simulation at the rows that count, None where a run does not reach its end."""
@@ -259,25 +286,39 @@ class _Descent:
     def _noise(errors: Sequence[FloatArray]) -> float:
         return float(np.sqrt(np.mean(np.concatenate(list(errors)) ** 2))) + 1e-300
 
-    def _derivatives(self) -> list[tuple[FloatArray, list[tuple[FloatArray, IntArray, FloatArray]]]]:
+    def _derivatives(self) -> list[_Derivatives]:
         """Return per recording J to z with the start states projected out, and per window what gives those back."""
-        z, compiled = self._z, self._compiled
-        p = values_of(compiled, z)
+        p = values_of(self._compiled, self._z)
+        spread = np.array([q.spread for q in self._compiled.parameters])
+        per_z = np.where(_linear(self._compiled), spread, p * spread)
+        known, self._known = self._known or self.sensitivities(), None
+        return [self._projected(one, s, per_z) for one, s in zip(self._data, known, strict=True)]
+
+    def sensitivities(self) -> list[Sensitivities]:
+        """Return the derivatives of every recording's readings at the iterate."""
+        compiled = self._compiled
+        p = values_of(compiled, self._z)
         spread = np.array([q.spread for q in compiled.parameters])
-        per_z = np.where(_linear(compiled), spread, p * spread)
-        steps = STEP * np.maximum(np.abs(p), np.abs(per_z))
+        steps = STEP * np.maximum(np.abs(p), np.abs(np.where(_linear(compiled), spread, p * spread)))
         steps = np.where(steps > 0.0, steps, STEP)
-        found = []
-        for one in self._data:
-            s = sensitivities(
+        return [
+            sensitivities(
                 compiled, p, one.drive, one.windows, parameter_steps=steps, state_steps=STEP * self._scales,
                 which=self._which.tolist(),
-            )  # fmt: skip
-            found.append(self._projected(one, s, per_z))
-        return found
+            )
+            for one in self._data
+        ]  # fmt: skip
+
+    def simulated(self) -> list[FloatArray]:
+        """Return y at every row of every recording; NaN from where a simulation runs away."""
+        p = values_of(self._compiled, self._z)
+        return [
+            simulate(self._compiled, p, one.drive, w.states, starts=w.starts, stops=w.stops).y
+            for one in self._data for w in (one.windows,)
+        ]  # fmt: skip
 
     def _projected(
-        self, one: _Data, s: Sensitivities, per_z: FloatArray
+        self, one: FitData, s: Sensitivities, per_z: FloatArray
     ) -> tuple[FloatArray, list[tuple[FloatArray, IntArray, FloatArray]]]:
         J = (s.to_parameters * per_z)[:, self._which]
         X = s.to_states * self._scales
@@ -294,38 +335,58 @@ class _Descent:
             back.append((np.nan_to_num(X[rows][:, free]), free, Jw))
         return np.vstack(parts), back
 
-    def step(self) -> bool:
-        """Take one step that lowers the penalised sum of squares; returns whether there was next to none to take."""
-        assert self._errors is not None
+    def step(self, most: int = MOVES) -> bool:
+        """Move while the derivatives of one point lower the cost, and return whether there was next to none to take.
+
+        Derivatives cost a simulation for each number and each state, a move one.
+        """
         derivatives = self._derivatives()
+        self._last = np.vstack([part for part, _ in derivatives])
+        before = cost = self._cost()
+        gained = 0.0
+        for k in range(most):
+            damping = self._damping
+            if not self._attempted(derivatives, 12 if k == 0 else 1):
+                self._damping = damping if k else self._damping
+                break
+            cost, previous = self._cost(), cost
+            if previous - cost < max(WORTH_MOVING * gained, _SMALL * previous):
+                break
+            gained = previous - cost
+        self._sd = self._noise(self._errors)
+        return bool(before - cost < _SMALL * before)
+
+    def _attempted(self, derivatives: Sequence[_Derivatives], tries: int) -> bool:
+        """Take a move that lowers the penalised sum of squares, shorter ones where the first does not."""
         J = np.vstack([part for part, _ in derivatives]) / self._sd
         each = list(zip(self._data, (back for _, back in derivatives), self._errors, strict=True))
         e = np.concatenate([_projected_error(back, error) for _, back, error in each])
         z = self._z[self._which]
         H, g = J.T @ J + np.eye(z.size), J.T @ (e / self._sd) - z
-        before = self._cost(self._errors, self._z)
-        for _ in range(12):
+        before = self._cost()
+        for _ in range(tries):
             move = np.linalg.solve(H + self._damping * np.diag(np.diag(H)), g) if z.size else np.zeros(0)
             new_z = self._z.copy()
             new_z[self._which] += np.clip(move, -3.0, 3.0)
             windows = [self._moved(one, back, error, new_z[self._which] - z) for one, back, error in each]
             errors = self._simulated(new_z, windows)
-            after = np.inf if errors is None else self._cost(errors, new_z)
-            if errors is not None and after < before:
+            if errors is not None and self._cost_of(errors, new_z) < before:
                 self._z, self._errors = new_z, errors
                 self._data = [replace(one, windows=w) for one, w in zip(self._data, windows, strict=True)]
                 self._damping = max(self._damping * 0.2, 1e-9)
-                self._sd = self._noise(errors)
-                return bool(before - after < _SMALL * before)
+                return True
             self._damping *= 10.0
-        return True
+        return False
 
-    def _cost(self, errors: Sequence[FloatArray], z: FloatArray) -> float:
+    def _cost(self) -> float:
+        return self._cost_of(self._errors, self._z)
+
+    def _cost_of(self, errors: Sequence[FloatArray], z: FloatArray) -> float:
         e = np.concatenate(list(errors)) / self._sd
         return float(e @ e + z[self._which] @ z[self._which])
 
     def _moved(
-        self, one: _Data, back: list[tuple[FloatArray, IntArray, FloatArray]], error: FloatArray, move: FloatArray
+        self, one: FitData, back: list[tuple[FloatArray, IntArray, FloatArray]], error: FloatArray, move: FloatArray
     ) -> Windows:
         """Return windows whose start states take up what the parameters' move leaves."""
         states, at = one.windows.states.copy(), 0
@@ -341,7 +402,9 @@ class _Descent:
     def fitted(self, converged: bool) -> Fitted:
         """Return what was found."""
         compiled, p = self._compiled, values_of(self._compiled, self._z)
-        J = np.vstack([part for part, _ in self._derivatives()]) / self._sd
+        if self._last is None:
+            self._last = np.vstack([part for part, _ in self._derivatives()])
+        J = self._last / self._sd
         covariance = np.linalg.inv(J.T @ J + np.eye(self._which.size))
         spread = np.array([q.spread for q in compiled.parameters])
         per_z = np.where(_linear(compiled), spread, np.abs(p) * spread)

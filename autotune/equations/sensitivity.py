@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import TypeVar
 
 import numpy as np
 
@@ -19,6 +20,10 @@ STEP = 3e-4
 THREADS = 2
 #: Rows from which on a thread saves more than it costs.
 WORTH_A_THREAD = 500
+
+
+_A = TypeVar("_A")
+_B = TypeVar("_B")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -52,6 +57,11 @@ class Sensitivities:
 @lru_cache(maxsize=1)
 def _pool() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(THREADS, thread_name_prefix="simulation")
+
+
+def side_by_side(one: Callable[[_A], _B], found: Iterable[_A]) -> Iterator[_B]:
+    """Return what a function that simulates makes of each of its arguments, in order, several at a time."""
+    return _pool().map(one, found)
 
 
 def sensitivities(

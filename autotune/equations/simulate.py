@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -19,6 +19,25 @@ TOLERANCE = 1e-6
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class Held:
+    """What an effect does to an input before it drives the equations.
+
+    Attributes
+    ----------
+    column : int
+        Which of the model's inputs.
+    parameter : ModelParameter
+        The effect's number, which a fit may move like those of the equations.
+    transform : callable of time stamps, held values and the number, optional
+        What becomes of the held values; without it the number is a dead time [s].
+    """
+
+    column: int
+    parameter: ModelParameter
+    transform: Callable[[FloatArray, FloatArray, float], FloatArray] | None = None
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Compiled:
     """A model with its extensions, ready to be driven.
 
@@ -31,9 +50,12 @@ class Compiled:
     program : Program
         The tape.
     parameters : tuple of ModelParameter
-        Parameters of the model, then those of the extensions: the order of every parameter vector.
+        Parameters of the model, then those of the extensions, then those of what is done to inputs: the order of every
+        parameter vector.
     signals : tuple of str
         Outputs beside y.
+    held : tuple of Held
+        What is done to inputs before they drive the equations, in this order.
     """
 
     model: EquationModel
@@ -41,6 +63,7 @@ class Compiled:
     program: Program
     parameters: tuple[ModelParameter, ...]
     signals: tuple[str, ...] = ()
+    held: tuple[Held, ...] = ()
 
     @property
     def states(self) -> tuple[str, ...]:
@@ -98,7 +121,9 @@ class Run:
         return bool(np.all(self.reasons == kernel.DONE))
 
 
-def compile_model(model: EquationModel, extensions: Sequence[Extension] = (), signals: Sequence[str] = ()) -> Compiled:
+def compile_model(
+    model: EquationModel, extensions: Sequence[Extension] = (), signals: Sequence[str] = (), held: Sequence[Held] = ()
+) -> Compiled:
     """Translate a model with what is added to it; takes about a millisecond.
 
     Parameters
@@ -109,6 +134,8 @@ def compile_model(model: EquationModel, extensions: Sequence[Extension] = (), si
         What is added, in the order in which a signal meets it.
     signals : sequence of str
         Expressions that are wanted at the rows beside y.
+    held : sequence of Held
+        What is done to inputs before they drive the equations.
 
     Returns
     -------
@@ -121,10 +148,11 @@ def compile_model(model: EquationModel, extensions: Sequence[Extension] = (), si
         An extension that does not fit, or an unknown name.
     """
     program = translate(model, extensions, signals)
-    parameters = (*model.parameters, *(p for e in extensions for p in e.parameters))
+    parameters = (*model.parameters, *(p for e in extensions for p in e.parameters), *(one.parameter for one in held))
     return Compiled(
-        model=model, extensions=tuple(extensions), program=program, parameters=parameters, signals=tuple(signals)
-    )
+        model=model, extensions=tuple(extensions), program=program, parameters=parameters, signals=tuple(signals),
+        held=tuple(held),
+    )  # fmt: skip
 
 
 def drive_of(model: EquationModel, recording: Recording) -> Drive:
@@ -167,7 +195,7 @@ def simulate(
     starts, stops : (W,) int arrays, optional
         Rows where windows start and before which they end; by default one window over all rows, or each to the next.
     delays : (m,) array, optional
-        Dead time of each input [s], in place of the model's.
+        Dead time of each input [s], in place of the model's and of what is done to inputs.
     tolerance : float
         Local error of a step relative to the largest magnitude that a state has had; crossings of switched terms are
         located to 1e-9 of the time between rows.
@@ -181,6 +209,7 @@ def simulate(
     -----
     y at a row sees the inputs as they were before that row's command acts. ``t`` counts from the drive's first row.
     """
+    parameters, drive, late = _arriving(compiled, parameters, drive)
     program, rows = compiled.program, drive.t.size
     states = np.ascontiguousarray(np.atleast_2d(np.asarray(start_states, dtype=np.float64)))
     first = np.zeros(1, dtype=np.int64) if starts is None else np.asarray(starts, dtype=np.int64)
@@ -194,10 +223,25 @@ def simulate(
     ends, status = np.full(states.shape, np.nan), np.zeros((first.size, 2))
     kernel.run(
         program.tape, program.registers, np.ascontiguousarray(parameters, dtype=np.float64), drive.t, drive.inputs,
-        compiled.delays if delays is None else np.asarray(delays, dtype=np.float64),
+        late if delays is None else np.asarray(delays, dtype=np.float64),
         first, last, states, tolerance, outputs, ends, status,
     )  # fmt: skip
     return Run(outputs=outputs.T, ends=ends, reasons=status[:, 0].astype(np.int64), until_s=status[:, 1])
+
+
+def _arriving(compiled: Compiled, parameters: FloatArray, drive: Drive) -> tuple[FloatArray, Drive, FloatArray]:
+    """Return the equations' own parameters, the inputs that reach them, and the dead times of these."""
+    delays = compiled.delays
+    if not compiled.held:
+        return parameters, drive, delays
+    own = parameters.size - len(compiled.held)
+    inputs = drive.inputs.copy()
+    for one, value in zip(compiled.held, parameters[own:], strict=True):
+        if one.transform is None:
+            delays[one.column] += value
+        else:
+            inputs[:, one.column] = one.transform(drive.t, inputs[:, one.column], float(value))
+    return parameters[:own], replace(drive, inputs=inputs), delays
 
 
 def derivatives(
@@ -224,7 +268,7 @@ def derivatives(
     found: tuple[FloatArray, FloatArray] = kernel.look(
         compiled.program.tape,
         compiled.program.registers,
-        np.ascontiguousarray(parameters, dtype=np.float64),
+        np.ascontiguousarray(parameters[: parameters.size - len(compiled.held)], dtype=np.float64),
         np.ascontiguousarray(np.atleast_2d(states), dtype=np.float64),
         np.ascontiguousarray(np.atleast_2d(inputs), dtype=np.float64),
         t_s,

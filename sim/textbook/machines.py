@@ -383,6 +383,7 @@ MAGLEV = Plant(
     noise=0.005,
     columns=lambda rng, rows: {"u": 1.0 + steps(rng, rows, 10, 40, -0.15, 0.15)},
     law=_lead,
+    within=(1.0, 20.0),
     effects=(
         ("actuator.lag", "u", 1.5), ("timing.dead_time", "u", 1.0), ("actuator.saturation", "u", 0.8),
         ("actuator.nonlinear_gain", "u", 0.15), ("environment.step_load", "v", 0.4),

@@ -63,6 +63,8 @@ class Plant:
         The inputs' columns from a generator and the number of rows, the command first.
     law : callable, optional
         For a plant that needs feedback: what is added to the command.
+    within : (low, high)
+        Readings of a rig that works: an effect that drives it out is concealed in a smaller size.
     effects : tuple of (name, place, size)
         What it conceals in turn.
     outside : callable
@@ -83,6 +85,7 @@ class Plant:
     outside: Slopes
     rows: int = 900
     law: Law | None = None
+    within: tuple[float, float] = (-float("inf"), float("inf"))
 
     @property
     def nominal(self) -> dict[str, float]:

@@ -72,7 +72,22 @@ def pair(plant: Plant, seed: int, effect: tuple[str, str, float] | None, is_outs
         What is concealed.
     is_outside : bool
         Whether what acts is in no catalogue.
+
+    Raises
+    ------
+    ValueError
+        The plant leaves its working range however small the effect.
     """
+    low, high = plant.within
+    for smaller in (1.0, 0.6, 0.35, 0.2):
+        less = None if effect is None else (*effect[:2], smaller * effect[2])
+        made = _pair(plant, seed, less, is_outside)
+        if all(low < one.y.min() and one.y.max() < high for one in made):
+            return made
+    raise ValueError(f"{plant.name} does not stay between {low} and {high}")
+
+
+def _pair(plant: Plant, seed: int, effect: tuple[str, str, float] | None, is_outside: bool) -> list[Made]:
     rng = np.random.default_rng(seed)
     numbers = truth(plant, rng)
     used = replace(plant, slopes=plant.outside) if is_outside else plant

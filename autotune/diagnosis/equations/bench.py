@@ -5,7 +5,7 @@ The questions, and equations that answer all of them on their recordings: the fi
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Protocol
@@ -14,11 +14,13 @@ import numpy as np
 
 from autotune.arrays import BoolArray, FloatArray
 from autotune.diagnosis.equations.candidates import Signals, Trial
-from autotune.equations.effects import Applied, apply, with_values
+from autotune.diagnosis.evidence.stretches import stretches_in
+from autotune.equations.effects import compile_with, with_values
 from autotune.equations.expressions import Expression, to_text
 from autotune.equations.fit import LEAST_ROWS, Fitted, fit, retune, values_of, window_rows
+from autotune.equations.left_out import left_out_squares
 from autotune.equations.model import EquationModel, ModelParameter
-from autotune.equations.sensitivity import Windows
+from autotune.equations.sensitivity import Windows, side_by_side
 from autotune.equations.simulate import Compiled, Drive, compile_model, drive_of, simulate
 from autotune.equations.starts import fitted_starts
 from autotune.errors import InputError
@@ -30,13 +32,19 @@ SIGNED = frozenset({"high", "low", "second_order", "third_order", "offset", "pha
                     "amplitude", "fold"})  # fmt: skip
 SIGNED_RATES = frozenset({"actuator.gain_drift", "sensor.drift", "environment.drifting_load", "plant.leak",
                           "plant.cubic_stiffness"})  # fmt: skip
-GIVEN = frozenset({"origin", "zero", "surroundings", "end"})
-#: Parameters that act on samples or delays: sought from outside, by direct search.
-OUTER = frozenset({("actuator.backlash", "width"), ("actuator.stiction", "band"), ("timing.dead_time", "delay")})
+GIVEN = frozenset({"zero", "end"})
+#: Parameters whose change moves nothing or makes a jump: sought from outside, by direct search.
+OUTER = frozenset({("actuator.stiction", "band")})
+#: How far surroundings may be from the coldest that was met [K].
+SURROUNDINGS_SD = 15.0
+#: Iterations of a fit from which on such a parameter is sought: fewer only show whether more are worth it.
+LEAST_SOUGHT = 3
 #: Windows per recording that a search works on: long enough to tell, short enough to converge.
 WINDOWS = 3
 #: How many times as long as short windows long ones are.
 SHORTER = 8
+#: Spreads of y that an error counts at most: a simulation that runs away is that wrong.
+FAR_OFF = 10.0
 #: Share of the recording that is kept for judging, and of that the share that a start state is found from.
 HELD_OUT, SETTLED = 1.0 / 3.0, 0.15
 
@@ -114,6 +122,10 @@ class Bench(Protocol):
         """Return how the readings change at the rows that count with one more effect, None where it runs away."""
         ...
 
+    def each(self, one: Callable[[Trial], FloatArray | None], found: Sequence[Trial]) -> Iterable[FloatArray | None]:
+        """Return what a function makes of every trial, several at a time where simulations can run beside another."""
+        ...
+
     def explained(self, outcome: Outcome) -> FloatArray:
         """Return an orthonormal basis of what numbers can explain at the rows that count."""
         ...
@@ -132,6 +144,10 @@ class Bench(Protocol):
 
     def held_out_error(self, outcome: Outcome, refits: bool) -> float:
         """Return the rms error on the last third of every recording, the numbers fitted to the rest."""
+        ...
+
+    def left_out_squares(self, outcome: Outcome) -> FloatArray:
+        """Return squared errors on stretches, the numbers fitted to the other ones."""
         ...
 
 
@@ -175,13 +191,13 @@ class EquationBench:
 
     def retuned(self) -> Outcome:
         """Return the model with its own numbers retuned, on windows of the search's length."""
-        compiled, _ = self._compiled(self.model.effects, {})
+        compiled = self._compiled(self.model.effects, {})
         found = retune(compiled, self.recordings, longest_s=self.length_s)
         return self._outcome(tuple(self.model.effects), found)
 
     def as_it_is(self, retuned: Outcome) -> Outcome:
         """Return the model with its nominal numbers, only start states fitted."""
-        compiled, _ = self._compiled(self.model.effects, {})
+        compiled = self._compiled(self.model.effects, {})
         none = np.zeros(len(compiled.parameters), dtype=bool)
         try:
             found = fit(compiled, self.recordings, free=none, windows=retuned.fitted.windows, iterations=4)
@@ -191,7 +207,7 @@ class EquationBench:
 
     def held_out_error(self, outcome: Outcome, refits: bool) -> float:
         """Return the rms error on the last third of every recording, the numbers fitted to the rest."""
-        compiled, applied = self._compiled(outcome.effects, self._spreads())
+        compiled = self._compiled(outcome.effects, self._spreads())
         cuts = [int((1.0 - HELD_OUT) * len(r)) for r in self.recordings]
         z = np.zeros(len(compiled.parameters))
         own = len(self.model.parameters)
@@ -202,22 +218,28 @@ class EquationBench:
             windows = [_until(w, k) for _, k, w in each]
             if refits:
                 first = [replace(r, y=np.where(np.arange(len(r)) < k, r.y, np.nan)) for r, k, _ in each]
-                driven = [_driven(r, self.model, applied) for r in first]
-                found = fit(compiled, driven, z=z, windows=windows, iterations=8)
+                found = fit(compiled, first, z=z, windows=windows, iterations=8)
                 z, windows = found.z, list(found.windows)
             p = values_of(compiled, z)
-            for (r, k, _), w in zip(each, windows, strict=True):
-                drive = applied.before(drive_of(self.model, r))
+            for (r, k, _), drive, w in zip(each, self._drives, windows, strict=True):
                 if self.model.horizon_s is not None:
                     errors.append(_forecast_errors(compiled, p, drive, r.y, k, self.model.horizon_s))
                     continue
                 at, end = _continued(compiled, p, drive, r.y, w, k), np.array([len(r)])
-                y = applied.after(simulate(compiled, p, drive, at.states, starts=at.starts, stops=end).y)
-                errors.append((r.y - np.nan_to_num(y, nan=1e150))[k + int(SETTLED * (len(r) - k)) :])
+                y = simulate(compiled, p, drive, at.states, starts=at.starts, stops=end).y
+                judged = slice(k + int(SETTLED * (len(r) - k)), None)
+                errors.append(_bounded((r.y - y)[judged], r.y[judged], FAR_OFF * float(np.nanstd(r.y))))
         except InputError:
             return float("inf")
         e = np.concatenate(errors)
         return float(np.sqrt(np.nanmean(e**2)))
+
+    def left_out_squares(self, outcome: Outcome) -> FloatArray:
+        """Return squared errors on stretches, the numbers fitted to the other ones."""
+        windows = outcome.fitted.windows
+        rows = [len(r) for r in self.recordings]
+        labels = stretches_in(rows, [w.starts for w in windows], [w.stops for w in windows])
+        return left_out_squares(outcome.fitted, self.recordings, labels)
 
     def periodic(self, outcome: Outcome, signals: Signals) -> list[Trial]:
         """Return loads at the frequencies that stand out of a residual."""
@@ -240,25 +262,24 @@ class EquationBench:
                     found.append(Trial(effect=effect, scaled=(key,)))
         return found
 
-    def _compiled(self, effects: Sequence[Effect], spreads: Mapping[str, float]) -> tuple[Compiled, Applied]:
-        applied = apply(self.model, effects)
-        late = tuple(replace(one, delay_s=float(d)) for one, d in zip(self.model.inputs, applied.delays, strict=True))
-        compiled = compile_model(replace(self.model, inputs=late), applied.extensions)
-        own = len(self.model.parameters)
+    def _compiled(self, effects: Sequence[Effect], spreads: Mapping[str, float]) -> Compiled:
+        compiled, own = compile_with(self.model, effects), len(self.model.parameters)
         scaled_for_search = tuple(sought(p, effects, spreads) for p in compiled.parameters[own:])
-        return replace(compiled, parameters=(*compiled.parameters[:own], *scaled_for_search)), applied
+        return replace(compiled, parameters=(*compiled.parameters[:own], *scaled_for_search))
 
     def _spreads(self) -> dict[str, float]:
         u = np.concatenate([r[self.model.columns[0]] for r in self.recordings])
         span = max(float(r.t[-1] - r.t[0]) for r in self.recordings)
-        size = {"high": float(np.std(u)), "low": float(np.std(u)), "time": 0.2 * span, "phase": 1.0}
+        y = np.concatenate([r.y for r in self.recordings])
+        size = {"high": float(np.std(u)), "low": float(np.std(u)), "time": 0.2 * span, "phase": 1.0,
+                "origin of y": float(np.nanstd(y)), "origin of u": float(np.std(u))}  # fmt: skip
         spread = max(float(np.max(s)) for s in self._sizes.values()) if self._sizes else 0.0
         return size | ({"in_phase": spread, "quadrature": spread} if spread else {})
 
     def fitted(self, effects: Sequence[Effect], start: Outcome, iterations: int = 15) -> Outcome:
-        """Return the model fitted with effects; what acts on samples is sought by a direct search around."""
+        """Return the model fitted with effects; what moves by jumps is sought by a direct search around."""
         outer = [(i, key) for i, e in enumerate(effects) for key in e.parameters if (e.name, key) in OUTER]
-        if not outer or iterations < 5:
+        if not outer or iterations < LEAST_SOUGHT:
             return self._inner(effects, start, iterations)
         i, key = outer[-1]
         best, tried = None, float(effects[i].parameters[key].value)
@@ -279,7 +300,7 @@ class EquationBench:
         return best or self._inner(effects, start, iterations)
 
     def _inner(self, effects: Sequence[Effect], start: Outcome, iterations: int) -> Outcome:
-        compiled, applied = self._compiled(effects, self._spreads())
+        compiled = self._compiled(effects, self._spreads())
         z = np.zeros(len(compiled.parameters))
         own = len(self.model.parameters)
         z[:own] = start.fitted.z[:own]
@@ -287,20 +308,18 @@ class EquationBench:
             Windows(starts=w.starts, stops=w.stops, states=self._states(compiled, start, w, k))
             for k, w in enumerate(start.fitted.windows)
         ]
-        recordings = [_driven(r, self.model, applied) for r in self.recordings]
-        found = fit(compiled, recordings, z=z, windows=windows, iterations=iterations)
+        found = fit(compiled, self.recordings, z=z, windows=windows, iterations=iterations)
         return self._outcome(tuple(effects), found)
 
     def shortened(self, outcome: Outcome) -> Outcome | None:
         """Return the same effects on short windows, from the nominal numbers; nothing where there are none."""
-        compiled, applied = self._compiled(outcome.effects, self._spreads())
+        compiled = self._compiled(outcome.effects, self._spreads())
         length = self.length_s / SHORTER
         dt = max(float(np.median(np.diff(r.t))) for r in self.recordings)
         if length / dt < LEAST_ROWS:
             return None
-        driven = [_driven(r, self.model, applied) for r in self.recordings]
         try:
-            return self._outcome(outcome.effects, retune(compiled, driven, longest_s=length))
+            return self._outcome(outcome.effects, retune(compiled, self.recordings, longest_s=length))
         except InputError:
             return None
 
@@ -308,11 +327,11 @@ class EquationBench:
         """Return a fit to short windows carried on to long ones."""
         own = len(self.model.parameters)
         for length in (0.5 * self.length_s, self.length_s):
-            compiled, applied = self._compiled(outcome.effects, self._spreads())
+            compiled = self._compiled(outcome.effects, self._spreads())
             z = np.zeros(len(compiled.parameters))
             z[:own] = outcome.fitted.z[:own]
-            driven = [_driven(r, self.model, applied) for r in self.recordings]
-            outcome = self._outcome(outcome.effects, fit(compiled, driven, z=z, horizon_s=length, iterations=12))
+            found = fit(compiled, self.recordings, z=z, horizon_s=length, iterations=12)
+            outcome = self._outcome(outcome.effects, found)
         return outcome
 
     def is_sought_outside(self, effect: Effect) -> bool:
@@ -344,7 +363,7 @@ class EquationBench:
         count = sum(p.spread > 0.0 for p in found.compiled.parameters) + outer
         return Outcome(effects=with_values(effects, values), fitted=found, count=count, residual=residual)
 
-    def _simulated(self, compiled: Compiled, applied: Applied, outcome: Outcome) -> FloatArray | None:
+    def _simulated(self, compiled: Compiled, outcome: Outcome) -> FloatArray | None:
         """Return readings at the rows that count, the outcome's numbers and start states given."""
         own = len(self.model.parameters)
         p = compiled.parameter_vector
@@ -352,7 +371,7 @@ class EquationBench:
         parts = []
         for k, (drive, w) in enumerate(zip(self._drives, outcome.fitted.windows, strict=True)):
             x = self._states(compiled, outcome, w, k)
-            run = simulate(compiled, p, applied.before(drive), x, starts=w.starts, stops=w.stops)
+            run = simulate(compiled, p, drive, x, starts=w.starts, stops=w.stops)
             parts.append(run.y[self._rows[k]])
         y = np.concatenate(parts)
         return y if np.all(np.isfinite(y)) else None
@@ -360,10 +379,14 @@ class EquationBench:
     def with_trial(self, outcome: Outcome, effect: Effect) -> FloatArray | None:
         """Return how the readings change with one more effect, everything else as it is."""
         if self._base_of is not outcome:
-            self._base_of, self._base = outcome, self._simulated(*self._compiled(outcome.effects, {}), outcome)
+            self._base_of, self._base = outcome, self._simulated(self._compiled(outcome.effects, {}), outcome)
         base = self._base
-        new = self._simulated(*self._compiled((*outcome.effects, effect), {}), outcome)
+        new = self._simulated(self._compiled((*outcome.effects, effect), {}), outcome)
         return None if base is None or new is None else new - base
+
+    def each(self, one: Callable[[Trial], FloatArray | None], found: Sequence[Trial]) -> Iterable[FloatArray | None]:
+        """Return what a function makes of every trial, several at a time."""
+        return side_by_side(one, found)
 
     def explained(self, outcome: Outcome) -> FloatArray:
         """Return an orthonormal basis of what the numbers of a fit can explain, start states projected out."""
@@ -398,8 +421,7 @@ class EquationBench:
 
         f = outcome.fitted
         w = f.windows[k]
-        applied = apply(self.model, outcome.effects)
-        drive = applied.before(self._drives[k])
+        drive = self._drives[k]
         scales = state_scales(f.compiled, f.parameters, drive, w.states[0])
         s = sensitivities(
             f.compiled, f.parameters, drive, w, parameter_steps=np.ones(f.parameters.size), state_steps=STEP * scales,
@@ -423,7 +445,7 @@ class EquationBench:
         wanted = {name: name for name in model.state_names}
         wanted |= {one.name: to_text(one.across) for one in model.ports if one.across is not None}
         wanted |= {f"{name}:position": text for name, text in positions.items() if text}
-        compiled = compile_model(model, apply(model, outcome.effects).extensions, list(wanted.values()))
+        compiled = compile_with(model, outcome.effects, list(wanted.values()))
         p = outcome.fitted.parameters
         runs: list[FloatArray] = []
         for drive, w in zip(self._drives, outcome.fitted.windows, strict=True):
@@ -458,17 +480,15 @@ class EquationBench:
         return max(ratios, default=1.0)
 
 
-def counted(recordings: Sequence[Recording], good: Sequence[BoolArray]) -> tuple[Recording, ...]:
-    """Return recordings whose readings that do not count are no numbers."""
-    return tuple(replace(r, y=np.where(ok, r.y, np.nan)) for r, ok in zip(recordings, good, strict=True))
+def jumping(compiled: Compiled, effects: Sequence[Effect]) -> tuple[ModelParameter, ...]:
+    """Return the parameters whose change moves nothing or makes a jump."""
+    found = (one.parameter for one in compiled.held)
+    return tuple(p for p in found if _in_outer(p, effects))
 
 
-def _driven(recording: Recording, model: EquationModel, applied: Applied) -> Recording:
-    """Return a recording with its inputs as effects on samples leave them."""
-    drive = applied.before(Drive(t=recording.t, inputs=np.column_stack([recording[c] for c in model.columns])))
-    changed = dict(zip(model.columns, drive.inputs.T, strict=True))
-    extra = {name: changed.get(name, values) for name, values in recording.extra.items()}
-    return replace(recording, u=np.ascontiguousarray(changed.get("u", recording.u)), extra=extra)
+def _in_outer(p: ModelParameter, effects: Sequence[Effect]) -> bool:
+    number, key = _number_and_key(p.name, effects)
+    return (effects[number].name, key) in OUTER
 
 
 def _changed(effects: Sequence[Effect], i: int, key: str, value: float) -> tuple[Effect, ...]:
@@ -490,9 +510,15 @@ def scaled(trial: Trial, factor: float) -> Effect:
 def sought(p: ModelParameter, effects: Sequence[Effect], spreads: Mapping[str, float]) -> ModelParameter:
     """Return an effect's parameter with the scale that it is sought on."""
     number, key = _number_and_key(p.name, effects)
-    if key in GIVEN or p.spread == 0.0:
+    name = effects[number].name
+    if key in GIVEN or p.spread == 0.0 or (name, key) in OUTER:
         return replace(p, spread=0.0)
-    if key in SIGNED or (key in ("rate", "coefficient") and effects[number].name in SIGNED_RATES):
+    if key == "surroundings":
+        return replace(p, linear=True, spread=SURROUNDINGS_SD)
+    if key == "origin":
+        size = spreads.get("origin of y" if name.startswith("sensor.") else "origin of u", 0.0)
+        return replace(p, linear=True, spread=size)
+    if key in SIGNED or (key in ("rate", "coefficient") and name in SIGNED_RATES):
         return replace(p, linear=True, spread=spreads.get(key, 3.0 * abs(p.value) + 1e-300))
     return p
 
@@ -540,17 +566,25 @@ def _forecast_errors(
     """Return the errors from a row on of forecasts, each from a state that the horizon before it tells."""
     edges, _ = window_rows(drive.t, horizon_s)
     edges = np.append(edges, y.size)
-    errors = []
+    errors, most, guess = [], FAR_OFF * float(np.nanstd(y)), None
     for before, a, b in zip(edges, edges[1:], edges[2:], strict=False):
         if a < row:
             continue
         w = fitted_starts(
             compiled, p, drive, y, np.isfinite(y), np.array([before]), np.array([b]), share=(a - before) / (b - before),
-            least=int(a - before),
+            least=int(a - before), guess=guess,
         )  # fmt: skip
         run = simulate(compiled, p, drive, w.states, starts=w.starts, stops=w.stops)
-        errors.append((y - np.nan_to_num(run.y, nan=1e150))[a:b])
+        now = simulate(compiled, p, drive, w.states, starts=w.starts, stops=np.array([a])).ends[0]
+        guess = now if np.all(np.isfinite(now)) else None
+        errors.append(_bounded((y - run.y)[a:b], y[a:b], most))
     return np.concatenate(errors) if errors else np.full(1, np.inf)
+
+
+def _bounded(e: FloatArray, y: FloatArray, most: float) -> FloatArray:
+    """Return errors no larger than a bound: where a simulation runs away, how far does not matter."""
+    away = np.isfinite(y) & ~np.isfinite(e)
+    return np.clip(np.where(away, most, e), -most, most)
 
 
 def _until(w: Windows, row: int) -> Windows:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 import numpy as np
@@ -53,6 +53,23 @@ class Trial:
 def place_of(effect: Effect) -> str:
     """Return the state, port or input that an effect acts on; nothing for the reading."""
     return effect.state or effect.port or effect.input
+
+
+def plainer(effect: Effect) -> Effect | None:
+    """Return the effect of fewer numbers that another one comes down to in a limit; nothing where there is none."""
+    level = {"plant.stribeck_friction": "level", "plant.hysteresis": "amplitude"}.get(effect.name)
+    if level is None:
+        return None
+    size = effect.parameters[level]
+    parameters = MappingProxyType({"level": replace(size, value=abs(size.value))})
+    return replace(effect, name="plant.coulomb_friction", parameters=parameters)
+
+
+def is_plainer(effect: Effect) -> bool:
+    """Whether an effect came to where it is one of fewer numbers: what breaks away at no more force than slides on."""
+    if effect.name != "plant.stribeck_friction":
+        return False
+    return effect.parameters["breakaway"].value <= effect.parameters["level"].value
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -178,9 +195,11 @@ def _on_position(key: str, name: str, effect: str, force: float, x: FloatArray, 
                 values = {"amplitude": force, "width": share * span}
                 yield Trial(effect=_effect(effect, key, name, **values), scaled=("amplitude",))
         case "plant.hard_stop":
-            stiffness = (0.5 / s.dt_s) ** 2
+            # at a port a force, which an inertia turns into an acceleration
+            rate = float(np.std(np.diff(s.values[name]) / s.dt_s)) if key == "port" else 0.0
+            stiffness = (0.5 / s.dt_s) ** 2 * (s.sizes[name] / rate if rate > 0.0 else 1.0)
             for side, level in (("high", np.quantile(x, 0.97)), ("low", np.quantile(x, 0.03))):
-                values = {side: float(level), "stiffness": stiffness, "damping": np.sqrt(stiffness)}
+                values = {side: float(level), "stiffness": stiffness, "damping": 2.0 * s.dt_s * stiffness}
                 yield Trial(effect=_effect(effect, key, name, **values))
 
 
@@ -214,7 +233,9 @@ def _on_command(model: EquationModel, s: Signals) -> Iterator[Trial]:
     for factor in (2.0, 8.0, 30.0):
         yield Trial(effect=_effect("actuator.lag", *at, time_constant=min(factor * s.dt_s, s.slow_s)))
         yield Trial(effect=_effect("timing.dead_time", *at, delay=min(factor * s.dt_s, s.slow_s)))
-    step = float(np.quantile(np.abs(np.diff(u)), 0.98)) + 1e-9 * size
+    moves = np.abs(np.diff(u))
+    moves = moves[moves > 1e-6 * size]  # between its steps a held command says nothing of how fast it may move
+    step = float(np.quantile(moves, 0.9)) if moves.size else size
     for rows in (3.0, 10.0, 30.0):
         yield Trial(effect=_effect("actuator.rate_limit", *at, rate=step / (rows * s.dt_s)))
     for share in (0.2, 0.6):

@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from autotune.arrays import BoolArray, FloatArray, IntArray
-from autotune.diagnosis.equations.bench import HELD_OUT, OUTER, Outcome, sought
+from autotune.diagnosis.equations.bench import HELD_OUT, Outcome, jumping, sought
 from autotune.diagnosis.equations.candidates import Signals, Trial
+from autotune.diagnosis.evidence.stretches import stretches_in
 from autotune.equations.black_box import BlackBox, driven, read_out
-from autotune.equations.effects import OUTPUTS, apply, with_values
+from autotune.equations.effects import OUTPUTS, apply, compile_with, with_values
 from autotune.equations.fit import Fitted, values_of
-from autotune.equations.model import EquationModel, ModelParameter
-from autotune.equations.simulate import Compiled, Drive, compile_model
+from autotune.equations.model import EquationModel
+from autotune.equations.simulate import Compiled, Drive
 from autotune.errors import InputError
 from autotune.models import Effect
 from autotune.recording import Recording
@@ -64,16 +65,17 @@ class ClosedBench:
 
     def _compiled(self, effects: Sequence[Effect]) -> Compiled:
         """Return the shell with the model's parameters and those of effects, dead times among them."""
-        compiled = compile_model(self._shell, apply(self._shell, effects).extensions)
+        compiled = compile_with(self._shell, effects)
         u = np.concatenate([d.inputs[:, 0] for d in self._drives])
+        y = np.concatenate([r.y for r in self._recordings])
         span = max(float(d.t[-1] - d.t[0]) for d in self._drives)
-        spreads = {"high": float(np.std(u)), "low": float(np.std(u)), "time": 0.2 * span, "phase": 1.0}
-        inside = tuple(sought(p, effects, spreads) for p in compiled.parameters)
-        outside = tuple(
-            ModelParameter(name=f"{e.name.split('.')[1]}_{i}_{key}", value=e.parameters[key].value, spread=1.0)
-            for i, e in enumerate(effects) for key in e.parameters if (e.name, key) in OUTER
-        )  # fmt: skip
-        return replace(compiled, parameters=(*self._box.parameters, *inside, *outside))
+        size = float(np.std(u))
+        spreads = {"high": size, "low": size, "time": 0.2 * span, "phase": 1.0, "origin of u": size,
+                   "origin of y": float(np.nanstd(y))}  # fmt: skip
+        # a step of the finite differences is wide enough for what moves by jumps
+        inside = tuple(p if p in jumping(compiled, effects) else sought(p, effects, spreads)
+                       for p in compiled.parameters)  # fmt: skip
+        return replace(compiled, parameters=(*self._box.parameters, *inside))
 
     def _simulated(self, compiled: Compiled, effects: Sequence[Effect], z: FloatArray) -> list[FloatArray]:
         """Return y at every row of every recording."""
@@ -206,6 +208,10 @@ class ClosedBench:
         ])  # fmt: skip
         return d if np.all(np.isfinite(d)) else None
 
+    def each(self, one: Callable[[Trial], FloatArray | None], found: Sequence[Trial]) -> Iterable[FloatArray | None]:
+        """Return what a function makes of every trial, one after the other: there is one model."""
+        return map(one, found)
+
     def explained(self, outcome: Outcome) -> FloatArray:
         """Return an orthonormal basis of what numbers can explain at the rows that count."""
         U, s, _ = np.linalg.svd(outcome.fitted.jacobian, full_matrices=False)
@@ -227,6 +233,18 @@ class ClosedBench:
     def periodic(self, outcome: Outcome, signals: Signals) -> list[Trial]:
         """Return none: a load of free frequency needs a place inside."""
         return []
+
+    def left_out_squares(self, outcome: Outcome) -> FloatArray:
+        """Return squared errors on stretches, the numbers fitted to the other ones."""
+        rows = [len(r) for r in self._recordings]
+        labels = stretches_in(rows, [np.zeros(1, np.int64) for _ in rows], [np.array([n]) for n in rows])
+        squares = np.zeros(1 + max(int(label.max(initial=-1)) for label in labels))
+        for k in range(squares.size):
+            kept = [ok & (label != k) for ok, label in zip(self._rows, labels, strict=True)]
+            there = self._fit(outcome.effects, self._start(self._compiled(outcome.effects), outcome), 1, True, kept)
+            for e, label in zip(there.fitted.residuals, labels, strict=True):
+                squares[k] += float(np.nansum(e[label == k] ** 2))
+        return squares
 
     def held_out_error(self, outcome: Outcome, refits: bool) -> float:
         """Return the rms error on the last third of every recording, the numbers fitted to the rest."""

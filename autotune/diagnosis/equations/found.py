@@ -247,8 +247,14 @@ def _candidates(found: Searched, unknown: float) -> tuple[Candidate, ...]:
     base = len(found.retuned.effects)
     for one in (found.retuned, *found.tried):
         name = "+".join(e.name for e in one.effects[base:]) or "none"
-        scores[name] = min(scores.get(name, np.inf), found.score(one))
+        scores[name] = min(scores.get(name, np.inf), found.score(one) + _charge(one, found))
     return weighed(scores, found.limits.temperature * max(1.0, found.variance_ratio(found.chosen)), unknown)
+
+
+def _charge(one: Outcome, found: Searched) -> float:
+    """Return what a larger hypothesis that is not needed pays: what it is ahead of the chosen one, and more."""
+    ahead = found.score(found.chosen) - found.score(one)
+    return ahead + found.limits.equation_decrease if one.count > found.chosen.count and ahead > 0.0 else 0.0
 
 
 def _probability(effect: Effect, candidates: Sequence[Candidate]) -> float:

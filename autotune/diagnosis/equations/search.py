@@ -12,7 +12,8 @@ import numpy as np
 
 from autotune.arrays import FloatArray
 from autotune.diagnosis.equations.bench import Bench, Outcome, scaled
-from autotune.diagnosis.equations.candidates import Trial, place_of, trials
+from autotune.diagnosis.equations.candidates import Trial, is_plainer, place_of, plainer, trials
+from autotune.diagnosis.evidence.stretches import advantage
 from autotune.diagnosis.fitting.noise import Noise, noise_from_differences
 from autotune.diagnosis.thresholds import IN_USE, Thresholds
 from autotune.errors import InputError
@@ -20,7 +21,7 @@ from autotune.models import Effect
 from autotune.progress import Progress
 
 #: Iterations of a fit that shows whether more are worth it, of a first fit, and of the best ones.
-LOOK, FIRST, LAST = 3, 6, 12
+LOOK, FIRST, LAST = 2, 4, 8
 #: Fits to short windows that go on to long ones.
 CARRIED = 3
 
@@ -101,8 +102,11 @@ def search(bench: Bench, without: Sequence[str], progress: Progress, limits: Thr
         tried += new
         noise = _noise(bench, min([chosen, *new], key=lambda one: one.rss))
         rows = _independent(retuned, noise)
-        best = min(new, key=lambda one: penalised(one, rows, limits), default=None)
-        if best is None or not _worth(chosen, best, rows, limits):
+        # a load of free timing explains a part of everything: others come first unless it leaves noise alone
+        new.sort(key=lambda one: (_is_partial_load(bench, one, limits), penalised(one, rows, limits)))
+        best = next((one for one in new if _worth(chosen, one, rows, limits)), new[0] if new else None)
+        best = best and _plainest(bench, best, tried, rows, limits)
+        if best is None or not _is_needed(bench, chosen, best, len(retuned.effects), rows, limits):
             break
         chosen = best
     chosen = _pruned(bench, chosen, len(retuned.effects), tried, rows, limits)
@@ -196,11 +200,62 @@ def _pruned(
             one = _attempt(bench, (*chosen.effects[:i], *chosen.effects[i + 1 :]), chosen, LAST)
             smaller += [] if one is None else [one]
         tried += smaller
-        best = min(smaller, key=lambda one: penalised(one, rows, limits), default=None)
-        if best is None or _worth(best, chosen, rows, limits):
+        smaller.sort(key=lambda one: penalised(one, rows, limits))
+        less = next((one for one in smaller if not _is_needed(bench, one, chosen, own, rows, limits)), None)
+        if less is None:
             break
-        chosen = best
+        chosen = less
     return chosen
+
+
+def _is_needed(bench: Bench, before: Outcome, after: Outcome, own: int, rows: float, limits: Thresholds) -> bool:
+    """Whether the larger of two hypotheses is worth its numbers; beside other effects left-out stretches must agree.
+
+    A second effect may make up for a first one that is not quite the right one, or not quite fitted: on rows that were
+    fitted something is always gained. A load of free timing explains a part of everything: beside other effects it must
+    leave noise alone. Where the model's error and not noise is left, rows are no witnesses and stretches decide alone.
+    """
+    worth = _worth(before, after, rows, limits)
+    if len(before.effects) <= own and (worth or _is_noise(bench, after, limits.equation_astray, limits)):
+        return worth
+    had = {(e.name, place_of(e)) for e in before.effects}
+    loads = any(e.name.startswith("environment.") and (e.name, place_of(e)) not in had for e in after.effects)
+    if loads and before.effects[own:] and not _is_noise(bench, after, limits.equation_noise, limits):
+        return False
+    if not worth and _ratio(after, _noise(bench, after)) < limits.equation_astray:
+        return False
+    return _is_earned(bench, before, after, limits)
+
+
+def _is_partial_load(bench: Bench, one: Outcome, limits: Thresholds) -> bool:
+    """Whether the last effect is a load, and more than noise is left beside it."""
+    load = one.effects[-1].name.startswith("environment.")
+    return load and not _is_noise(bench, one, limits.equation_noise, limits)
+
+
+def _is_earned(bench: Bench, before: Outcome, after: Outcome, limits: Thresholds) -> bool:
+    """Whether left-out stretches speak for the larger of two hypotheses, and it takes a share of their error away."""
+    squares, fewer = bench.left_out_squares(before), bench.left_out_squares(after)
+    if not np.all(np.isfinite(squares)):
+        return bool(np.all(np.isfinite(fewer)))
+    left = float(np.sqrt(fewer.sum() / max(float(squares.sum()), 1e-300)))
+    return left < 1.0 - limits.material and advantage(squares, fewer) > 0.0
+
+
+def _plainest(bench: Bench, best: Outcome, tried: list[Outcome], rows: float, limits: Thresholds) -> Outcome:
+    """Return a hypothesis with its last effect in its plainest form, unless more numbers are worth it."""
+    last = best.effects[-1]
+    less = plainer(last)
+    if less is None:
+        return best
+    one = _attempt(bench, (*best.effects[:-1], less), best, LAST)
+    if one is None:
+        return best
+    tried.append(one)
+    if is_plainer(last):
+        tried[:] = [other for other in tried if not (other.effects and is_plainer(other.effects[-1]))]
+        return one
+    return best if _worth(one, best, rows, limits) and _is_earned(bench, one, best, limits) else one
 
 
 def _attempt(bench: Bench, effects: Sequence[Effect], start: Outcome, iterations: int) -> Outcome | None:
@@ -262,9 +317,9 @@ def screened(
     basis, e = bench.explained(base), bench.without_starts(base, base.residual)
     e = e - basis @ (basis.T @ e)
     best: dict[tuple[str, str], tuple[float, Effect]] = {}
-    for k, trial in enumerate(all_trials):
+    directions = bench.each(lambda trial: _direction(bench, base, trial, basis), all_trials)
+    for k, (trial, d) in enumerate(zip(all_trials, directions, strict=True)):
         progress("trying every effect", k / len(all_trials))
-        d = _direction(bench, base, trial, basis)
         if d is None:
             continue
         gain, factor = predicted(e, d, trial)

@@ -33,17 +33,22 @@ TINY = 1e-300
 
 def stretches_of(data: Data) -> list[IntArray]:
     """Return the number of the stretch that every row belongs to, per recording; -1 for what is never judged."""
+    return stretches_in([len(r) for r in data.recordings], data.starts, data.stops)
+
+
+def stretches_in(rows: Sequence[int], firsts: Sequence[IntArray], ends: Sequence[IntArray]) -> list[IntArray]:
+    """Return the same from the rows of each recording and its windows: first rows, and rows before which they end."""
     labels = []
-    windows = sum(len(a) for a in data.starts)
+    windows = sum(len(a) for a in firsts)
     share = LARGE_HEAD if windows >= STRETCHES else HEAD
-    for r, starts, stops in zip(data.recordings, data.starts, data.stops, strict=True):
-        label = np.full(len(r), -1, dtype=np.int64)
+    for count, starts, stops in zip(rows, firsts, ends, strict=True):
+        label = np.full(count, -1, dtype=np.int64)
         for a, b in zip(starts, stops, strict=True):
             label[a + max(LEAST_HEAD, int(share * (b - a))) : b] = 0
         labels.append(label)
     if windows >= STRETCHES:
         number = 0
-        for label, starts, stops in zip(labels, data.starts, data.stops, strict=True):
+        for label, starts, stops in zip(labels, firsts, ends, strict=True):
             for a, b in zip(starts, stops, strict=True):
                 part = label[a:b]
                 part[part >= 0] = number * STRETCHES // windows

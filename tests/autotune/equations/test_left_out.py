@@ -1,0 +1,63 @@
+"""Errors on stretches that a fit has not seen: what is right predicts them to within noise, what makes up does not."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from autotune.diagnosis.evidence.stretches import STRETCHES, advantage, stretches_in
+from autotune.equations import Drive, EquationModel, compile_model, fit, simulate
+from autotune.equations.left_out import left_out_squares
+from autotune.recording import Recording
+from tests.autotune.equations.models import one_state
+
+DT, ROWS, SD = 0.05, 900, 0.01
+LINEAR = one_state("b*u - a*x", {"a": 0.8, "b": 2.0})
+ROOT = one_state("b*u - a*sqrt(max(x, 0))", {"a": 0.8, "b": 2.0})
+
+
+def recorded(truth: EquationModel, seed: int) -> Recording:
+    rng = np.random.default_rng(seed)
+    u = np.repeat(rng.uniform(0.2, 1.0, ROWS // 30), 30)
+    compiled = compile_model(truth)
+    drive = Drive(t=DT * np.arange(ROWS), inputs=u[:, None])
+    y = simulate(compiled, 1.1 * compiled.parameter_vector, drive, np.ones((1, 1))).y
+    return Recording(t=drive.t, u=u, y=y + SD * rng.normal(size=ROWS))
+
+
+def squares(model: EquationModel, pair: list[Recording]) -> tuple[np.ndarray, int]:
+    found = fit(compile_model(model), pair, horizon_s=15.0)
+    labels = stretches_in([ROWS] * 2, [w.starts for w in found.windows], [w.stops for w in found.windows])
+    return left_out_squares(found, pair, labels), sum(int((label >= 0).sum()) for label in labels)
+
+
+@pytest.fixture(scope="module")
+def pair() -> list[Recording]:
+    return [recorded(ROOT, 1), recorded(ROOT, 2)]
+
+
+def test_the_true_model_leaves_the_noise_where_it_was_not_fitted(pair: list[Recording]) -> None:
+    left, rows = squares(ROOT, pair)
+    assert left.size == STRETCHES
+    # chi-square of 1580 rows, two sd, and the few numbers that were fitted
+    assert left.sum() / rows == pytest.approx(SD**2, rel=0.1)
+
+
+def test_stretches_speak_for_the_true_model(pair: list[Recording]) -> None:
+    assert advantage(squares(LINEAR, pair)[0], squares(ROOT, pair)[0]) > 6.0
+
+
+def test_what_tells_of_nothing_else_is_judged_as_unseen() -> None:
+    """A load that acts in one stretch alone is not known from the others: there the retuned model misses it."""
+    model = one_state("b*u - a*x + if(t >= 30, d, 0)", {"a": 0.8, "b": 2.0, "d": {"value": 0.01, "spread": 300.0}})
+    rng = np.random.default_rng(5)
+    u = np.repeat(rng.uniform(0.2, 1.0, ROWS // 30), 30)
+    compiled = compile_model(model)
+    drive = Drive(t=DT * np.arange(ROWS), inputs=u[:, None])
+    y = simulate(compiled, np.array([0.8, 2.0, 0.3]), drive, np.ones((1, 1))).y
+    r = Recording(t=drive.t, u=u, y=y + SD * rng.normal(size=ROWS))
+    found = fit(compiled, [r])
+    assert found.parameters[2] == pytest.approx(0.3, rel=0.05)
+    label = np.where(r.t >= 30.0, 0, -1)
+    left = left_out_squares(found, [r], [label])
+    assert left[0] / (label == 0).sum() > 10.0 * SD**2
