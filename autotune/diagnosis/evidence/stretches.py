@@ -56,9 +56,9 @@ def stretches_in(rows: Sequence[int], firsts: Sequence[IntArray], ends: Sequence
         return labels
     total, before = sum(int((label >= 0).sum()) for label in labels), 0
     for label in labels:
-        rows = np.flatnonzero(label >= 0)
-        label[rows] = (before + np.arange(rows.size)) * STRETCHES // max(total, 1)
-        before += rows.size
+        judged = np.flatnonzero(label >= 0)
+        label[judged] = (before + np.arange(judged.size)) * STRETCHES // max(total, 1)
+        before += judged.size
     return labels
 
 
