@@ -193,7 +193,10 @@ def _grown(
 def _pruned(
     bench: Bench, chosen: Outcome, own: int, tried: list[Outcome], rows: float, limits: Thresholds
 ) -> Outcome:  # fmt: skip
-    """Drop added effects that buy nothing once the others have their numbers; what is fitted so joins those tried."""
+    """Drop added effects that buy nothing once the others have their numbers, or predict nothing.
+
+    What is fitted so joins those tried.
+    """
     while len(chosen.effects) - own > 1:
         smaller = []
         for i in range(own, len(chosen.effects)):
@@ -201,7 +204,9 @@ def _pruned(
             smaller += [] if one is None else [one]
         tried += smaller
         smaller.sort(key=lambda one: penalised(one, rows, limits))
-        less = next((one for one in smaller if not _is_needed(bench, one, chosen, own, rows, limits)), None)
+        whole = bench.held_out_error(chosen, True)
+        less = next((one for one in smaller if not (_predicts(bench, one, whole, limits)
+                     and _is_needed(bench, one, chosen, own, rows, limits))), None)  # fmt: skip
         if less is None:
             break
         chosen = less
@@ -225,6 +230,15 @@ def _is_needed(bench: Bench, before: Outcome, after: Outcome, own: int, rows: fl
     if not worth and _ratio(after, _noise(bench, after)) < limits.equation_astray:
         return False
     return _is_earned(bench, before, after, limits)
+
+
+def _predicts(bench: Bench, smaller: Outcome, error: float, limits: Thresholds) -> bool:
+    """Whether a held-out error of a free run is less than a smaller hypothesis's by a share that matters.
+
+    Stretches are short, and the rows about them tell their states: what bends them a little may predict nothing.
+    """
+    before = bench.held_out_error(smaller, True)
+    return not np.isfinite(before) or error < (1.0 - limits.material) * before
 
 
 def _is_partial_load(bench: Bench, one: Outcome, limits: Thresholds) -> bool:
