@@ -167,7 +167,7 @@ def _check_at_rest(loop: ControlLoop, first_row: int, first: tuple[float, ...]) 
         raise ExperimentStopped(
             f"wrong sign, or the plant moves where it should rest: y went by {moved:.3g} at u = {loop.tick.u:.4g}",
             where="preflight",
-            remedy="check the wiring and scaling of the actuator, and limits.u_safe",
+            remedy="wait until it is at rest; check limits.u_safe, and the wiring and scaling of the actuator",
         )
 
 

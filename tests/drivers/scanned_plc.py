@@ -98,10 +98,10 @@ class ScannedPlc:
         """Return a located variable."""
         return float(self._at(name).value)
 
-    def until(self, holds: Callable[[], bool], what: str) -> None:
+    def until(self, holds: Callable[[], bool], what: str, limit_s: float = LIMIT_S) -> None:
         """Wait until something holds after a scan."""
         with self._scanned:
-            assert self._scanned.wait_for(holds, LIMIT_S), what
+            assert self._scanned.wait_for(holds, limit_s), what
 
     def _run(self) -> None:
         deadline_s = time.perf_counter()

@@ -112,13 +112,16 @@ def test_a_loop_on_a_scanned_plc_is_commissioned(tmp_path: Path, scan_s: float) 
         for command in (["verify"], ["deploy", "--yes"]):
             done = autotune(command[0], config, "--run", first, *command[1:])
             assert done.returncode == 0, done.stdout + done.stderr
+        rests = 1.1  # a run is refused while the plant still moves at the safe output
+        plc.until(lambda: plc.written("MD0") < rests, "the plant comes to rest")
         second = tmp_path / "second"
         command = [sys.executable, "-m", "autotune.cli", "run", str(config), "--out", str(second)]
         killed = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-        plc.until(lambda: plc.output > 3.0, "the run is on its way")
+        plc.until(lambda: plc.output > 3.0, "the run is on its way", limit_s=4.0 * LIMIT_S)
         killed.kill()
         killed.wait(LIMIT_S)
         plc.until(lambda: plc.output == pytest.approx(1.0, abs=1e-3), "the dead-man acts")
+        plc.until(lambda: plc.written("MD0") < rests, "the plant comes to rest")
         done = autotune("run", config, "--out", tmp_path / "third")
         assert done.returncode == 0, done.stderr
         assert plc.output == pytest.approx(1.0, abs=1e-3)
