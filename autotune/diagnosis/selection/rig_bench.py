@@ -61,6 +61,11 @@ class RigBench:
         """Whether hypotheses are judged on short windows too: what swings tells of itself on long ones alone."""
         return len(self.cuts) == 1 and self.few.starts[0].size > self.long.starts[0].size
 
+    @property
+    def near(self) -> Data:
+        """What hypotheses are judged on beside long windows: short ones, or the same where one scale is enough."""
+        return self.few if self.two_scales else self.long
+
     def with_sd(self, long: float, short: float) -> RigBench:
         """Return the bench with other standard deviations of the residual."""
         return replace(self, cuts=tuple(as_white(d, long) for d in self.cuts), few=as_white(self.few, short))
@@ -117,7 +122,7 @@ class RigBench:
             short = self.shortened(result) if self.two_scales else result
         except RUNAWAY:
             return one
-        return replace(one, fit=result, short=short, data=self.long, few=self.few)
+        return replace(one, fit=result, short=short, data=self.long, few=self.near)
 
     def judged(self, result: Fit, log_odds: float) -> Judged | None:
         """Return a fit to long windows with its errors on left-out stretches; nothing where it runs away."""
@@ -131,7 +136,7 @@ class RigBench:
                 fit=result,
                 short=short,
                 data=self.long,
-                few=self.few,
+                few=self.near,
                 long_squares=squares,
                 short_squares=held_out_squares(short, self.few) if self.two_scales else squares,
                 log_odds=log_odds,

@@ -168,7 +168,7 @@ def _roots(model: Model, bench: RigBench) -> tuple[RigBench, list[Judged]]:
         bench = bench.with_sd(_residual_sd(result, bench.long), bench.few.noise.sd)
         result = bench.settled(p, result.theta)
     short = bench.shortened(result) if bench.two_scales else result
-    bench = bench.with_sd(bench.long.noise.sd, _residual_sd(short, bench.few))
+    bench = bench.with_sd(bench.long.noise.sd, _residual_sd(short, bench.near))
     retuned = bench.judged(result, 0.0)
     offset = np.array([f.kind == "u_offset" for f in p.free])
     at_prior = fit(p, bench.long, result.theta * offset + p.centre * ~offset, free=offset)
@@ -180,7 +180,7 @@ def _roots(model: Model, bench: RigBench) -> tuple[RigBench, list[Judged]]:
 
 def _lasting(root: Judged, bench: RigBench) -> list[Effect]:
     names = [k.name for k, _ in bench.odds if k.lasting]
-    return [e for name in names for e in searched(name, root.short, bench.few, bench.pool)]
+    return [e for name in names for e in searched(name, root.short, root.few, bench.pool)]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

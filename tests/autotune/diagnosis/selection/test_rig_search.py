@@ -100,6 +100,24 @@ def test_a_model_says_what_kind_of_rig_it_is(unit, den, output, kind):
     assert rig_kind(model, build_chain(model)) == kind
 
 
+def test_a_long_record_of_what_swings_is_searched_in_windows_that_differ_from_scale_to_scale():
+    """More rows than are fitted: those that stay are others in long windows than in short ones."""
+    rng, dt, n = np.random.default_rng(4), 0.002, 22000
+    u = np.repeat(rng.normal(size=n // 10), 10)
+    y, (position, speed) = np.empty(n), (0.0, 0.0)
+    for k in range(n):
+        y[k] = position
+        for _ in range(4):
+            speed += dt / 4 * (400.0 * (u[k] - position - 0.4 * position**3) - 6.0 * speed)
+            position += dt / 4 * speed
+    recording = Recording(t=dt * np.arange(n), u=u, y=y + 0.02 * rng.normal(size=n))
+    block = Block(name="plant", place="plant", dynamics=TransferFunction(num=(400.0,), den=(1.0, 6.0, 400.0)))
+    model = Model(name="oscillator", input=Port(), output=Port(), blocks=(block,))
+    names = [k.name for k in ALL if k.name != "plant.cubic_stiffness"]
+    found = search_rig(model, [recording], good(recording), left_out=names)
+    assert found.chosen.names == ("plant.cubic_stiffness",)
+
+
 def test_dry_friction_may_be_missing_where_a_speed_is_measured_and_not_where_a_level_is():
     friction = next(kind for kind in ALL if kind.name == "plant.coulomb_friction")
     for output, may in (("speed", True), ("level", False)):
