@@ -168,6 +168,11 @@ def _dry_starts(s: SignalSizes) -> list[tuple[float, ...]]:
     return [(c * s.f,) for c in (0.003, 0.015, 0.06, 0.2)]
 
 
+def _is_two_lags(fitted: Fitted) -> bool:
+    """Whether a mode does not ring: it is two lags by another name."""
+    return fitted.values["damping"] >= 1.0
+
+
 def _with_resonance(blocks: Blocks, values: Values) -> Blocks:
     omega = 2.0 * math.pi * values["frequency"]
     den = (1.0 / omega**2, 2.0 * values["damping"] / omega, 1.0)
@@ -305,6 +310,7 @@ PLANT = (
         ),
         linear=LinearPart(blocks=_with_resonance, states=2, start=_resting_mode),
         starts=_peaks,
+        stand_in=_is_two_lags,
         confusable=("sensor.lag", "timing.dead_time"),
         places=("plant", "sensor"),
         reference=_KHALIL,
