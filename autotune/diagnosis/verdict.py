@@ -189,5 +189,7 @@ def sentences_of(
             rest = "" if clean else " What is left is not noise: something smaller is missing as well."
             first = f"Physics was left out: {names}.{beside(effects, evidence)}{rest}"
         case _:
-            first = f"Something is missing that no candidate explains to within noise; it shows at {', '.join(places)}."
+            first = (
+                f"Something is missing that no candidate explains to within noise; it shows at the {', '.join(places)}."
+            )
     return (first, errors) if residual.is_constant else (first, residual.varies.sentence, errors)

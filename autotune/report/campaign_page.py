@@ -80,7 +80,7 @@ def _answers(counts: Counter[Attention]) -> tuple[tuple[str, str], ...]:
 def _section(settings: CampaignSettings, attention: Attention, rows: Sequence[Row]) -> Section:
     columns: _Columns = {"loop": lambda row: row.loop}
     if attention != "fine":
-        columns["why"] = lambda row: row.reason
+        columns["why"] = lambda row: row.reason.removeprefix(f"{row.loop}: ")
     columns |= _FAILED if attention == "failed" else _COLUMNS[settings.task]
     chosen = [row for row in rows if row.attention == attention]
     cells = [tuple(cell(row) for cell in columns.values()) for row in chosen]

@@ -222,7 +222,8 @@ def _against(known: _Evidence) -> Section:
     rows = [(of_candidate(c.name), f"{c.probability:.3f}") for c in found.candidates if c.probability >= _LEAST]
     odds = Table(
         header=("explanation", "probability"), rows=tuple(rows[:_RIVALS]),
-        caption="All explanations that were weighed, the likeliest first.",
+        caption="All explanations that were weighed, the likeliest first. An effect's own probability is the sum of"
+        " those that have it.",
     )  # fmt: skip
     base = penalised(s.retuned)
     # pruning and exchanging fit some combinations more than once

@@ -55,7 +55,9 @@ def _found(found: Diagnosis) -> str:
         return {
             "none": "Nothing: neither the structure nor the numbers need a change.",
             "parameters": "Other numbers, no other structure: they are below, by block.",
-        }.get(found.verdict, f"Something at {joined(list(found.places))}, which no effect of the catalogue is.")
+        }.get(
+            found.verdict, f"Something at the {joined(list(found.places))} that no effect of the catalogue describes."
+        )
     said = []
     for effect in found.effects:
         values = [f"{key.replace('_', ' ')} {with_spread(p, 3)}" for key, p in effect.parameters.items()]

@@ -146,7 +146,8 @@ def _against(found: EquationDiagnosis) -> Section:
     odds = Table(
         header=("explanation", "probability"),
         rows=tuple((of_candidate(c.name), f"{c.probability:.3f}") for c in found.candidates if c.probability > _LEAST),
-        caption="All explanations that were weighed, the likeliest first.",
+        caption="All explanations that were weighed, the likeliest first. An effect's own probability is the sum of"
+        " those that have it.",
     )
     once = ("There is one recording: what is the rig's and what is that day's cannot be told apart.",)
     return Section(

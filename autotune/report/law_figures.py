@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from scipy.ndimage import median_filter
 
 from autotune.arrays import FloatArray
 from autotune.diagnosis.evidence.missing_law import Branch, MissingLaw
@@ -138,7 +139,15 @@ def acting_figure(law: MissingLaw, recordings: Sequence[Recording], names: Seque
     figure = lines_figure("t, one recording after the other [s]", with_unit("added", law.value_unit))
     at, marks = 0.0, []
     for r, rows, added, name in zip(recordings, law.rows, law.acts, names, strict=True):
-        add_line(figure, *thinned(at + r.t[rows] - r.t[0], added), "", BLUE, width=1.2, showlegend=False)
+        # where windows begin, a speed may be far off for a row or two
+        add_line(
+            figure,
+            *thinned(at + r.t[rows] - r.t[0], median_filter(added, 5, mode="nearest")),
+            "",
+            BLUE,
+            width=1.2,
+            showlegend=False,
+        )
         marks.append((at, name))
         at += r.duration_s
     for begin, name in marks if len(marks) > 1 else []:
@@ -146,8 +155,8 @@ def acting_figure(law: MissingLaw, recordings: Sequence[Recording], names: Seque
         figure.add_annotation(
             x=begin, y=1.0, yref="paper", text=name, showarrow=False, xanchor="left", yanchor="bottom"
         )
-    every = np.concatenate(law.acts)
-    low, high = np.quantile(every, [0.001, 0.999])  # where windows begin, a speed may be far off for a row
+    every = np.concatenate([median_filter(added, 5, mode="nearest") for added in law.acts])
+    low, high = np.quantile(every, [0.001, 0.999])
     room = 0.08 * ((high - low) or 1.0)
     figure.update_yaxes(range=[low - room, high + room])
     active = float(np.mean(np.abs(every) > 0.05 * max(abs(low), abs(high), 1e-300)))

@@ -329,7 +329,8 @@ details { margin: 0.8rem 0; } summary { cursor: pointer; color: var(--faint); fo
 .legend svg { width: 26px; height: 10px; margin-right: 0.4rem; fill: none; }
 figure { margin: 1.1rem 0 1.6rem; } figcaption { color: var(--faint); font-size: 0.9rem; max-width: 84ch; }
 @media (max-width: 760px) { .lying { display: none; } .upright { display: block; } }
-@media (max-width: 520px) { body { font-size: 15px; } h1 { font-size: 1.35rem; } td, th { padding-right: 0.6rem; } }
+@media (max-width: 520px) { body { font-size: 15px; } h1 { font-size: 1.35rem; } table { font-size: 0.85rem; }
+  td, th { padding-right: 0.45rem; } }
 </style>
 </head>
 <body><main>

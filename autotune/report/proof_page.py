@@ -18,6 +18,9 @@ Interval: TypeAlias = Callable[[int, int], tuple[float, float]]
 _BINS = (0.0, 0.5, 0.7, 0.8, 0.9, 0.95, 0.99, 1.0 + 1e-9)
 _MOST_MISSES = 200
 
+#: cases below which no share is known to a tenth
+_FEW = 100
+
 
 def proof_page(
     result: Content,
@@ -49,6 +52,8 @@ def proof_page(
     tone: Tone = "warn" if short else "good"
     verdict = f"{count - len(missed)} of {count} concealed cases are right in all that is asked of them."
     todo = f"Not reached: {', '.join(short)}." if short else "Every figure that has a bound keeps it."
+    if count < _FEW:
+        todo += f" {count} cases leave wide intervals: prove more of them (--cases) before anything is concluded."
     return Page(
         title="Proof of the diagnosis on concealed effects",
         verdict=verdict,

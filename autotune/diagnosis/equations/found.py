@@ -280,7 +280,9 @@ def _sentences(
                     f"{_probability(e, candidates):.2f})" for e in named]  # fmt: skip
             first = f"Physics was left out: {' and '.join([*told, *(s.name for s in seen)])}."
         case _:
-            first = f"Something is missing that no candidate explains to within noise; it shows at {', '.join(places)}."
+            first = (
+                f"Something is missing that no candidate explains to within noise; it shows at the {', '.join(places)}."
+            )
     return (first, *unknown, numbers)
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from autotune.arrays import ComplexArray, FloatArray
+from autotune.arrays import BoolArray, ComplexArray, FloatArray
 from autotune.errors import IdentificationError
 
 #: Part of y that may be missing or wild before the record is refused.
@@ -53,15 +53,13 @@ def clean_measurement(t: FloatArray, y: FloatArray, name: str) -> tuple[FloatArr
 
     Notes
     -----
-    Wild is a sample that is eight robust standard deviations off the mean of its two neighbours on either side.
+    Wild is a sample that lies eight robust standard deviations outside what the middle two of its four nearest
+    neighbours span. One spike or two in a row do; the corner at which a fast plant begins to answer a step does not,
+    however little noise there is.
     """
     good = np.isfinite(y)
     filled = np.interp(t, t[good], y[good]) if good.sum() > 8 else y
-    neighbours = np.zeros_like(filled)
-    neighbours[2:-2] = filled[2:-2] - np.median(np.stack([filled[:-4], filled[1:-3], filled[3:-1], filled[4:]]), axis=0)
-    scale = 1.4826 * float(np.median(np.abs(neighbours[2:-2]))) if y.size > 8 else 0.0
-    wild = good & (np.abs(neighbours) > _OUTLIER_SD * scale) if scale > 0.0 else np.zeros_like(good)
-    good = good & ~wild
+    good = good & ~_wild(filled)
     bad = int(y.size - good.sum())
     if bad > _LARGEST_BAD_PART * y.size:
         raise IdentificationError(
@@ -70,6 +68,19 @@ def clean_measurement(t: FloatArray, y: FloatArray, name: str) -> tuple[FloatArr
             remedy="repair the sensor or its wiring and record again",
         )
     return (np.interp(t, t[good], y[good]) if bad else y), bad
+
+
+def _wild(y: FloatArray) -> BoolArray:
+    """Return which samples of (N,) are spikes."""
+    wild = np.zeros(y.size, dtype=bool)
+    if y.size <= 8:
+        return wild
+    _, low, high, _ = np.sort(np.stack([y[:-4], y[1:-3], y[3:-1], y[4:]]), axis=0)
+    inner = y[2:-2]
+    scale = 1.4826 * float(np.median(np.abs(inner - 0.5 * (low + high))))
+    outside = np.maximum(low - inner, inner - high)
+    wild[2:-2] = (outside > _OUTLIER_SD * scale) & (scale > 0.0)
+    return wild
 
 
 def record_spectra(

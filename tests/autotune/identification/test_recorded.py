@@ -10,6 +10,7 @@ from typer.testing import CliRunner
 from autotune.cli import app
 from autotune.errors import IdentificationError
 from autotune.identification.frequency.recorded import FrequencyEstimate, combine, frequency_points
+from autotune.identification.frequency.spectra import clean_measurement
 from autotune.models import TransferFunction, read_model
 from autotune.points import read_points
 from autotune.recording import Recording, read_recording, write_recording
@@ -145,6 +146,29 @@ def test_gaps_and_spikes_in_y_are_filled_and_said() -> None:
     estimate = frequency_points(Recording(t=recording.t, u=recording.u, y=y))
     assert any("5 wild or missing" in note for note in estimate.notes)
     assert coverage([estimate]) >= 0.8
+
+
+def test_corners_of_a_fast_answer_to_steps_are_no_spikes() -> None:
+    """A flow of 4 s that is sampled each second, 2000 rows, a step in every tenth at most, little noise."""
+    rng = np.random.default_rng(1)
+    u = np.repeat(rng.choice([40.0, 60.0], 200), 10)
+    y = np.zeros(u.size)
+    for k in range(u.size - 1):
+        y[k + 1] = y[k] + (0.5 * u[max(0, k - 1)] - y[k]) * (1.0 - np.exp(-0.25))
+    noisy = y + rng.normal(0.0, 0.05, y.size)
+    t = np.arange(float(u.size))
+    cleaned, bad = clean_measurement(t, noisy, "flow")
+    assert bad == 0
+    np.testing.assert_array_equal(cleaned, noisy)
+    settled = np.flatnonzero(np.abs(np.convolve(np.diff(y), np.ones(8), "same")) < 0.05)
+    at = np.array([settled[20], settled[60], settled[60] + 1])  # also two in a row
+    spiked = noisy.copy()
+    spiked[at] += 30.0
+    cleaned, bad = clean_measurement(t, spiked, "flow")
+    assert bad == at.size
+    np.testing.assert_allclose(cleaned, noisy, atol=0.4)
+    found = frequency_points(Recording(t=t, u=u, y=noisy, name="flow"))
+    assert len(found.points) >= 3
 
 
 def test_a_broken_sensor_and_a_dead_command_are_refused() -> None:
