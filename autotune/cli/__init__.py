@@ -27,7 +27,7 @@ app = typer.Typer(
     no_args_is_help=True,
     add_completion=True,
     pretty_exceptions_enable=False,
-    rich_markup_mode="rich",
+    rich_markup_mode="markdown",  # rich would take the units in brackets for styles, and show none
 )
 identify = typer.Typer(help="Identify the plant from a recording.", no_args_is_help=True)
 app.add_typer(identify, name="identify")

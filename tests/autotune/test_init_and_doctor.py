@@ -242,6 +242,15 @@ def test_at_a_terminal_the_transfer_function_is_asked_for_until_it_can_be_read(t
     assert read_model(tmp_path / "real_model.toml").name == "real: 1/(s+1)"
 
 
+@pytest.mark.parametrize(
+    ("name", "units"),
+    [("init", ["[s]", "[u unit]", "[y unit]"]), ("tune", ["[deg]", "[rad/s]"]), ("reference", ["[u unit/s]", "[s]"])],
+)
+def test_help_shows_the_units_of_what_is_asked_for(name: str, units: list[str]) -> None:
+    shown = CliRunner().invoke(app, [name, "--help"], env={"COLUMNS": "300", "TERMINAL_WIDTH": "300"}).output
+    assert [unit for unit in units if unit not in shown] == []
+
+
 def test_a_computer_that_runs_these_tests_is_ready(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     said = command("doctor", CONFIGS / "ball_sim.toml")
