@@ -1,4 +1,4 @@
-"""Whether what a fitted model holds constant is: score tests against what swings, bends, or goes past its chain.
+"""Whether what a fitted model holds constant is: score tests against what swings, bends, enters, or passes its chain.
 
 A parameter that swings in time adds to the chain what it multiplies, times the swing: a gain the command, a stiffness
 the position, a lag or delay the rate of the reading. Each of these signals, times cos and sin of every frequency that
@@ -32,6 +32,9 @@ AS_MUCH = 0.9
 _LOAD, _GAIN = "a load", "the command, as a gain that changes would"
 _STIFFNESS = "the position or level, as a stiffness or leak that changes would"
 _LAG = "the rate of the reading, as a lag or delay that changes would"
+#: Columns of a recording that drive nothing but the loop, and where any other may enter a model that lacks it.
+NO_INPUTS = frozenset({"r", "u_applied", "dither"})
+_COLUMN_ENTERS: tuple[Place, ...] = ("plant", "sensor")
 #: Where something may enter that one place of the chain cannot tell from another.
 _MAY_ENTER = {
     _LOAD: ("environment", "actuator", "plant"),
@@ -96,7 +99,9 @@ def largest_variation(result: Fit, data: Data) -> Variation:
     variance = float(e @ e) / left.rows
     lag, longest = model_lag_s(result.model), max(r.duration_s for r in data.recordings)
     count = int(min(FASTEST * longest / max(lag, 1e-12), MOST_FREQUENCIES))
-    multiplied, added = list(_multiplied(left)), [*_bends(left), *_paths(left, lag)]
+    columns = list(_columns(left))
+    multiplied, added = list(_multiplied(left)), [*_bends(left), *_paths(left, lag), *columns]
+    may_enter = _MAY_ENTER | {what: ("environment",) for _, what, _ in columns}
     swinging = [Swinging(place=place, signals=signals) for place, _, signals in multiplied]
     gains = explained_by_swings(left, e, swinging, count) / variance
     found = [
@@ -112,7 +117,7 @@ def largest_variation(result: Fit, data: Data) -> Variation:
     found.sort(key=lambda one: -one.gain)
     best = found[0]
     near = [one for one in found if one.cycles and one.gain >= AS_MUCH * best.gain] if best.cycles else [best]
-    places = dict.fromkeys(p for one in near for p in _MAY_ENTER.get(one.what, (one.place,)))
+    places = dict.fromkeys(p for one in near for p in may_enter.get(one.what, (one.place,)))
     period = longest / best.cycles if best.cycles else np.inf
     return Variation(gain=best.gain, places=tuple(places), what=best.what, period_s=period)
 
@@ -168,6 +173,25 @@ def _paths(left: FreedResidual, lag_s: float) -> Iterator[tuple[Place, str, list
     for delay in (d * lag_s for d in ECHOES):
         past = [np.interp(r.t - delay, r.t, y) for y, r in zip(readings, recordings, strict=True)]
         yield "sensor", f"the reading {delay:.2g} s before, as an echo would", past
+
+
+def _columns(left: FreedResidual) -> Iterator[tuple[Place, str, list[FloatArray]]]:
+    """Yield further recorded columns, that the model may lack as an input to the plant or in the reading."""
+    recordings = left.data.recordings
+    for name in sorted(set.intersection(*(set(r.extra) for r in recordings)) - NO_INPUTS):
+        values = [_without_gaps(r.extra[name]) for r in recordings]
+        if all(np.all(np.isfinite(v)) for v in values):
+            centre = float(np.mean(np.concatenate(values)))
+            for place in _COLUMN_ENTERS:
+                yield place, f"the column {name!r}, as a further input would", [v - centre for v in values]
+
+
+def _without_gaps(values: FloatArray) -> FloatArray:
+    """Return values with those that are missing held from the last one known; NaN where none is."""
+    known = np.isfinite(values)
+    last = np.maximum.accumulate(np.where(known, np.arange(values.size), -1))
+    first = int(np.argmax(known))
+    return np.asarray(values[np.where(last < 0, first, last)])
 
 
 def _explained(X: FloatArray, e: FloatArray, left: FreedResidual) -> float:

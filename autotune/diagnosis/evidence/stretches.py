@@ -29,6 +29,8 @@ FAR_OFF = 10.0
 #: Scatter of the differences, as a share of the mean error, that is assumed at least: stretches are never that alike.
 LEAST_SCATTER = 0.05
 TINY = 1e-300
+#: Product of two agreeing evidences that rounding alone makes of differences whose mean is 0.
+ROUNDING = 1e-20
 
 
 def stretches_of(data: Data) -> list[IntArray]:
@@ -157,7 +159,7 @@ def advantage(squares: FloatArray, other: FloatArray) -> float:
     differences = (errors[0] - errors[1]) / float(np.mean(errors) + TINY)
     logarithms = np.log(errors[0] + TINY) - np.log(errors[1] + TINY)
     first, second = (_speaks(d) for d in (differences, logarithms))
-    return max((first, second), key=abs) if first * second > 0.0 else 0.0
+    return max((first, second), key=abs) if first * second > ROUNDING else 0.0
 
 
 def _speaks(differences: FloatArray) -> float:
