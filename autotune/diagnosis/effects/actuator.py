@@ -57,7 +57,11 @@ def _steps_over_command(scan: Scan) -> list[tuple[float, ...]]:
     per_step = np.arange(1.0 / (largest * spread), 1.0 / (smallest * spread), _LINE_SHARE / span)
     values, where = np.unique(u - middle, return_inverse=True)
     weights = np.bincount(where, influence)
-    lines = np.array([weights @ np.exp(2j * np.pi * f * values) for f in per_step])
+    lines, turned = np.empty(per_step.size, dtype=np.complex128), np.exp(2j * np.pi * per_step[0] * values)
+    turn = np.exp(2j * np.pi * _LINE_SHARE / span * values)
+    for i in range(per_step.size):  # evenly spaced: from one to the next every value turns on by the same angle
+        lines[i] = weights @ turned
+        turned *= turn
     power = np.abs(lines)
     inner = np.flatnonzero((power >= np.append(power[1:], 0.0)) & (power >= np.append(0.0, power[:-1])))
     best_lines = inner[np.argsort(-power[inner])][:_LINES_TRIED]

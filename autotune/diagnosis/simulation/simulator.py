@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache, lru_cache
+from functools import cache, cached_property, lru_cache
 
 import numpy as np
 from scipy.linalg import expm
@@ -158,7 +158,7 @@ class Simulator:
         )
         return out.T, states[1]
 
-    @property
+    @cached_property
     def _flags(self) -> tuple[int, ...]:
         """Return what the compiled simulation may leave out, see the positions in its body."""
         directional = self.falling is not self.chain
