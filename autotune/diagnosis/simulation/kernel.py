@@ -44,7 +44,6 @@ INPUTS = 3
 PLANT_IN, SPEED, POSITION, OUTPUT, FIRST_LEVEL = range(5)
 #: Columns of the returned signals: reading, speed, position (or level), plant input.
 SIGNALS = 4
-
 #: Positions in the vector of numbers, before the effects' values.
 (
     STEP, DELAY, U_OFFSET, Y_OFFSET, KELVIN, LAW, GAIN, GAIN_LAST, DIRECT_IN, DIRECT_OUT, NUMBERS

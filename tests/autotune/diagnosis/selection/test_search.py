@@ -182,3 +182,23 @@ def test_windows_that_are_screened_on_stay_when_the_noise_is_estimated_anew(monk
     without = [name for name in CATALOGUE if name not in ("actuator.lag", "sensor.lag")]
     found = search(lag(10.0), [tank(0.4, 1, rows=1600)], [np.ones(1600, dtype=bool)], without, thresholds=limits)
     assert found.singles
+
+
+def test_a_long_recording_is_searched_in_some_windows_and_confirmed_on_all() -> None:
+    rows, decay = 3000, float(np.exp(-0.1))
+    rng = np.random.default_rng(2)
+    u = np.repeat(rng.uniform(-1.0, 1.0, rows // 40), 40)
+    y = np.zeros(rows)
+    for k in range(rows - 1):
+        y[k + 1] = decay * y[k] + (1.0 - decay) * min(max(u[k], -0.6), 0.6)
+    recording = Recording(t=0.1 * np.arange(rows), u=u, y=y + 0.01 * rng.standard_normal(rows))
+    every = [np.ones(rows, dtype=bool)]
+    few = ("actuator.saturation", "actuator.nonlinear_gain", "actuator.lag")
+    without = [name for name in CATALOGUE if name not in few]
+    found = search(lag(1.0), [recording], every, without, thresholds=replace(IN_USE, searched_rows=600))
+    whole = search(lag(1.0), [recording], every, without)
+    assert found.chosen.names == whole.chosen.names == ("actuator.saturation",)
+    assert found.data.rows == whole.data.rows
+    assert found.chosen.fit.residuals[0].size == rows
+    np.testing.assert_allclose(found.chosen.fit.theta, whole.chosen.fit.theta, rtol=1e-2, atol=1e-2)
+    assert found.chosen.fit.cost < whole.chosen.fit.cost + 1.0
