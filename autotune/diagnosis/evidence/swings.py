@@ -56,7 +56,8 @@ def explained_by_swings(left: FreedResidual, e: FloatArray, swinging: Sequence[S
     Returns
     -------
     (signals, count + 1) array
-        Decrease of |e|^2 by cos and sin together, at 0 to ``count`` cycles, as far as free numbers cannot imitate them.
+        Decrease of the sum of e^2 by cos and sin together, at 0 to ``count`` cycles, as far as free numbers cannot
+        imitate them.
 
     Notes
     -----
