@@ -74,7 +74,7 @@ class Thresholds:
     linear_share: float = known(0.3, "of chi2", "that an effect's direction may have before it is too large to be linear", "convention")
     impact_decrease: float = known(20.0, "chi2", "predicted at least of an effect that makes impacts and acts", "counted")
     least_predicted: float = known(3.0, "chi2", "predicted of an effect before it is fitted", "cost")
-    searched_rows: int = known(30_000, "rows", "that a search works on at most; what leads is fitted to all", "cost")
+    searched_rows: int = known(30_000, "rows", "that a search works on at most; the best hypotheses are fitted to all", "cost")
     confirmed: int = known(3, "hypotheses", "leading, that are fitted to all rows where a search worked on some", "cost")
     screening_rows: int = known(4500, "rows", "on which hypotheses are screened", "cost")
     screened_effects: int = known(7, "effects", "fitted of those that predict most", "cost")

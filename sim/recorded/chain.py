@@ -158,7 +158,7 @@ def start_states(steps: Steps, length: int) -> Floats:
     return np.asarray(rows / np.where(scale > 0.0, scale, 1.0), dtype=np.float64)
 
 
-def misfit(chain: Chain, u: Floats, y: Floats, Ts: float, window: int) -> Floats:
+def residuals(chain: Chain, u: Floats, y: Floats, Ts: float, window: int) -> Floats:
     """Residuals of free runs over whole windows of ``window`` rows, each window's starting state fitted."""
     steps = discretise(chain, Ts)
     count = len(y) // window
@@ -226,7 +226,7 @@ def retune(
 
     def residual(at: Floats) -> Floats:
         with np.errstate(all="ignore"):
-            e = np.concatenate([misfit(moved(chain, at), u, y, Ts, window) for u, y in records])
+            e = np.concatenate([residuals(moved(chain, at), u, y, Ts, window) for u, y in records])
         return np.asarray(np.nan_to_num(np.clip(e, -1e9, 1e9), nan=1e9), dtype=np.float64)
 
     begin = np.zeros(len(bound)) if start is None else np.clip(start, -0.999 * bound, 0.999 * bound)

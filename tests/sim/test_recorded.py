@@ -11,7 +11,7 @@ from scipy.signal import lfilter, lsim
 from sim.conceal.retune import Chain as OwnChain
 from sim.conceal.retune import discretise as own_discretise
 from sim.recorded import cases, commands, readings
-from sim.recorded.chain import Block, Chain, discretise, forecast_error, free_runs, misfit, moved, retune
+from sim.recorded.chain import Block, Chain, discretise, forecast_error, free_runs, moved, residuals, retune
 from sim.recorded.effects import BY_NAME, EFFECTS, require_exact, require_no_converter
 from sim.recorded.readings import Scale
 from sim.recorded.rigs import Record, RefusedError, find, read
@@ -184,7 +184,7 @@ def test_a_refit_finds_numbers_that_are_wrong_and_leaves_the_noise():
     assert rms == pytest.approx(0.1, rel=0.05)
     e = forecast_error(true, *records[0], 1.0, 150)
     assert np.std(e) == pytest.approx(np.std(noise[0, 300:]), rel=0.02)
-    assert np.sqrt(np.mean(misfit(true, *records[0], 1.0, 600) ** 2)) == pytest.approx(0.1, rel=0.06)
+    assert np.sqrt(np.mean(residuals(true, *records[0], 1.0, 600) ** 2)) == pytest.approx(0.1, rel=0.06)
 
 
 @pytest.fixture(scope="module")

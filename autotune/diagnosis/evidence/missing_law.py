@@ -24,7 +24,7 @@ from autotune.diagnosis.fitting.fit import Fit
 #: Bins over the signal: as many of these as the data tell apart; rows of a bin at least; points of the curve.
 BINS, LEAST_ROWS, POINTS = (12, 8, 5, 3, 2), 20, 161
 #: Share of the bins that must tell something.
-TELLING = 0.7
+INFORMATIVE = 0.7
 #: Share of the signal's rows left out at either end of the curve.
 TAIL = 0.002
 #: 1-sigma of a bin, in sizes of the law: up to which it tells something, and beyond which it is not shown.
@@ -232,7 +232,7 @@ def _bins(
         members = list(_members(signal, counts, _edges(signal[counts], bins, line.line.stage == "friction")))
         deviation, error = _traced_back(line, [np.where(m, factor, 0.0) for m in members])
         tried.append((members, deviation, error))
-        if np.mean(error < TELLS * size) >= TELLING:
+        if np.mean(error < TELLS * size) >= INFORMATIVE:
             break
     else:
         members, deviation, error = min(tried, key=lambda one: float(np.median(one[2])))

@@ -21,7 +21,7 @@ STEPS = 6
 
 
 def confirmed(found: Search, pool: Executor) -> Search:
-    """Return a search in some windows with what leads there fitted to all rows.
+    """Return a search in some windows with its best hypotheses fitted to all rows.
 
     Parameters
     ----------
@@ -32,7 +32,7 @@ def confirmed(found: Search, pool: Executor) -> Search:
 
     Notes
     -----
-    Nothing is searched again: among what leads, the hypothesis is chosen that all rows ask for. Where some windows
+    Nothing is searched again: among the best hypotheses the one is chosen that all rows ask for. Where some windows
     asked for no effect, all rows name none either.
     """
     if found.data.whole is None:

@@ -89,7 +89,7 @@ def search(
     Forward search with a beam: pairs are built on the best four singles, whether or not these help alone, so that
     partners that only help together are found as long as one of them is among the four. What brings the residual to
     noise must do so on longer windows too; else everything is searched again on those. Long recordings are searched in
-    some of their windows, and what leads there is fitted to all of them.
+    some of their windows, and the best hypotheses are fitted to all of them.
     """
     kinds = tuple(kind for name, kind in (CATALOGUE | STRUCTURES).items() if name not in without)
     with threadpool_limits(1), ThreadPoolExecutor(2) as pool:
