@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
@@ -48,6 +48,12 @@ class FoundEffect:
     equation: str
     windows: tuple[tuple[int, float, float], ...]
     operating_range: OperatingRange | None = None
+
+
+def told_apart(hypotheses: Sequence[str]) -> str:
+    """Return the purpose of an experiment between hypotheses, each with its effects joined by a plus sign."""
+    *others, last = (name.replace("+", " with ") for name in hypotheses)
+    return f"tell {', '.join(others)} from {last}" if len(others) == 1 else f"tell {', '.join(others)} and {last} apart"
 
 
 @dataclass(frozen=True, kw_only=True)

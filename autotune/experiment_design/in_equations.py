@@ -12,7 +12,7 @@ from autotune.diagnosis.effects import KINDS as EFFECTS
 from autotune.diagnosis.effects import kind_of
 from autotune.diagnosis.equations import EquationDiagnosis
 from autotune.diagnosis.equations.bench import Outcome
-from autotune.diagnosis.result import NextExperiment
+from autotune.diagnosis.result import NextExperiment, told_apart
 from autotune.equations.effects import apply
 from autotune.equations.model import EquationModel
 from autotune.equations.simulate import Drive, simulate
@@ -96,7 +96,7 @@ def _planned(found: EquationDiagnosis, model: EquationModel) -> NextExperiment |
         return None
     settings = {k: float(f"{v:.4g}") if isinstance(v, float) else v for k, v in best.settings().items()}
     return NextExperiment(
-        purpose="tell " + " from ".join(alive), kind=best.kind, settings=settings,
+        purpose=told_apart(alive), kind=best.kind, settings=settings,
         expected=f"as fitted, where one is true the others miss it by {most:.3g} noise variances on average",
     )  # fmt: skip
 

@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from autotune.diagnosis.effects import kind_of
-from autotune.diagnosis.result import Diagnosis, FoundEffect, NextExperiment
+from autotune.diagnosis.result import Diagnosis, FoundEffect, NextExperiment, told_apart
 from autotune.errors import InputError
 from autotune.experiment_design.conditions import as_recorded, is_driven
 from autotune.experiment_design.open_hypotheses import open_hypotheses
@@ -58,7 +58,7 @@ def _planned(found: Diagnosis) -> NextExperiment | None:
     if plan is None or plan.discrimination < found.search.data.thresholds.least_discrimination:
         return None
     return NextExperiment(
-        purpose="tell " + " from ".join(plan.between),
+        purpose=told_apart(plan.between),
         kind=plan.excitation.kind,
         settings={k: float(f"{v:.4g}") if isinstance(v, float) else v for k, v in plan.excitation.settings().items()},
         expected=f"where one is true the others miss it by {plan.discrimination:.3g} noise variances on average",

@@ -315,7 +315,7 @@ th { font-weight: 600; }
 .answers { display: grid; gap: 0.8rem; margin: 1rem 0; }
 .answers { grid-template-columns: repeat(auto-fit, minmax(min(17rem, 100%), 1fr)); }
 .answers div { background: var(--card); padding: 0.6rem 0.9rem; border-radius: 6px; }
-.answers dt { color: var(--faint); font-size: 0.86rem; } .answers dd { margin: 0.15rem 0 0; }
+.answers dt { color: var(--faint); font-size: 0.86rem; } .answers dd { margin: 0.15rem 0 0; overflow-wrap: anywhere; }
 .square { width: min(100%, 560px); aspect-ratio: 1; } .small { width: 100px; height: 28px; }
 .chain { margin: 1.1rem 0; } .chain svg { width: 100%; height: auto; display: block; } .upright { display: none; }
 .chain rect { fill: var(--card); stroke: var(--line); stroke-width: 1.5; } .chain text { fill: var(--ink); }
