@@ -21,6 +21,8 @@ from sim.score import Mark, mark
 
 Json = dict[str, Any]
 ALARMS = ("unexplained", "failed")
+#: Cases in which the command's operating point alone was moved.
+OFFSET_PUT_IN = "numbers: offset"
 #: Said where the diagnosis of a case or of the recording as it is ended without a file.
 NOTHING: Json = {"verdict": "failed", "effects": [], "places": []}
 
@@ -133,6 +135,8 @@ def _marked(campaign: Campaign, seed: int, before: Json, reached: float) -> Reco
     answer, said = _answer(campaign, seed), _said(campaign, seed)
     own = {name for effect in answer["effects"] for name in effect["accept"]}
     names = tuple(str(effect["name"]) for effect in before["effects"])
+    if answer["sub"] == OFFSET_PUT_IN:  # to say so is right, and no effect
+        before = {**before, "effects": [*before["effects"], {"name": "actuator.offset"}]}
     not_counted = "already named of the recording as it is" if own & set(names) else ""
     if before["verdict"] == "failed":
         not_counted = "the recording as it is was not diagnosed"
@@ -145,7 +149,9 @@ def _marked(campaign: Campaign, seed: int, before: Json, reached: float) -> Reco
     elif answer["kind"] == "clean" and not raises_alarm(said, before):
         said = {**said, "verdict": "parameters", "effects": []}
     error = _error(campaign, seed, answer) if answer["improvable"] else None
-    marked = mark(f"case_{seed:06d}", {**answer, "nuisance": list(names)}, said, error)
+    marked = mark(
+        f"case_{seed:06d}", {**answer, "nuisance": [str(effect["name"]) for effect in before["effects"]]}, said, error
+    )
     return RecordedMark(mark=marked, before=names, not_counted=not_counted)
 
 

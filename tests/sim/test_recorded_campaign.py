@@ -79,6 +79,22 @@ def test_only_what_is_new_against_the_recording_as_it_is_counts(rigs, tmp_path):
     }
 
 
+@pytest.mark.parametrize(("put_in", "is_right"), [("numbers: offset", True), ("numbers: gain", False)])
+def test_an_operating_point_that_was_moved_may_be_called_so(rigs, tmp_path, put_in, is_right):
+    campaign = begun(rigs, tmp_path / "out", count=2)
+    seed = campaign.cases.seeds[0]
+    answer = {**answered(campaign, seed), "kind": "clean", "sub": put_in, "verdict": "parameters", "effects": []}
+    campaign.cases.answer(seed).write_text(json.dumps({**answer, "places": [], "improvable": False}))
+    (campaign.cases.case(seed) / "says").write_text("actuator.offset")
+    diagnose(campaign.cases, seed)
+    for i in campaign.as_recorded.seeds:
+        diagnose(campaign.as_recorded, i)
+    marked = mark_all(campaign)[0]
+    assert marked.before == ("actuator.lag",)
+    assert marked.mark.verdict_right is is_right
+    assert marked.mark.named == (() if is_right else ("actuator.offset",))
+
+
 def test_a_campaign_goes_on_with_the_same_answers_and_not_with_other_recordings(rigs, tmp_path):
     first = seal(begun(rigs, tmp_path / "out").cases)
     assert seal(begun(rigs, tmp_path / "out").cases) == first
