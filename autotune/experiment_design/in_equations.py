@@ -96,7 +96,7 @@ def _planned(found: EquationDiagnosis, model: EquationModel) -> NextExperiment |
         return None
     settings = {k: float(f"{v:.4g}") if isinstance(v, float) else v for k, v in best.settings().items()}
     return NextExperiment(
-        purpose=told_apart(alive), kind=best.kind, settings=settings,
+        purpose=told_apart(list(alive)), kind=best.kind, settings=settings,
         expected=f"as fitted, where one is true the others miss it by {most:.3g} noise variances on average",
     )  # fmt: skip
 
