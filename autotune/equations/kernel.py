@@ -29,6 +29,7 @@ from autotune.equations.tape_ops import evaluate, solve, tangents
 #: Why a window ended: as asked; a derivative that is no number; more steps or a larger state than is sensible.
 DONE, NOT_A_NUMBER, TOO_MANY_STEPS = 0, 1, 2
 MOST_STEPS = 20_000  # between two rows
+MOST_ON_AVERAGE = 200  # between two rows, over a window: else one fit of a chattering model would take hours
 MOST_CROSSINGS = 100  # located between two rows; further ones are taken at the end of their steps
 _SURFACE = 1e-11  # of a switching function's largest value: as good as zero
 _NEAR = 1e-6  # likewise, for a state that slides already
@@ -502,6 +503,7 @@ def run(
         _inputs(p, w, times, columns, delays, at, t - 3.0 * close, close)
         _settle(p, w, x, t - times[0])
         status[window, 0], status[window, 1] = DONE, t
+        spare = 20.0 * MOST_STEPS  # a few hard places are carried through
         for row in range(starts[window], stops[window]):
             evaluate(p.code, p.dynamic, p.code.shape[0], w.r, False)
             for q in range(p.outputs.size):
@@ -509,6 +511,9 @@ def run(
             if row + 1 >= times.size:
                 break
             ended, t = _to_next_row(p, w, x, times, columns, delays, at, row, close, tolerance)
+            spare += MOST_ON_AVERAGE - w.memory[_STEPS]
+            if ended == DONE and spare < 0.0:
+                ended = TOO_MANY_STEPS
             if ended != DONE:
                 status[window, 0], status[window, 1] = ended, t
                 break

@@ -292,6 +292,7 @@ def require_complete(run: Run, compiled: Compiled, where: str) -> Run:
         what = f"the simulation of {compiled.model.name!r} runs away or a term is no number {at}"
         remedy = "check signs and units, and roots and logarithms of what may become negative: sqrt(max(h, 0))"
     else:
-        what = f"the simulation of {compiled.model.name!r} needs more than {kernel.MOST_STEPS} steps between rows {at}"
+        most = f"{kernel.MOST_STEPS} steps between two rows, or {kernel.MOST_ON_AVERAGE} on average,"
+        what = f"the simulation of {compiled.model.name!r} needs more than {most} {at}"
         remedy = "check time constants that are far shorter than the rows' distance"
     raise InputError(what, where=where, remedy=remedy)

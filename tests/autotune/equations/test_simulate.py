@@ -20,6 +20,7 @@ from autotune.equations import (
     require_complete,
     simulate,
 )
+from autotune.equations.kernel import TOO_MANY_STEPS
 from autotune.equations.model import ModelParameter, State
 from autotune.errors import InputError
 from autotune.recording import Recording
@@ -215,3 +216,13 @@ def test_a_level_may_fall_through_the_edge_of_a_root() -> None:
 def test_a_root_of_what_is_negative_is_no_number_and_not_something_else() -> None:
     result = run(compile_model(one_state("-1 - sqrt(x)")), np.arange(20) * 0.1, np.zeros(20), [1.0])
     assert not result.is_complete
+
+
+def test_what_chatters_between_all_rows_ends_with_a_reason() -> None:
+    """An oscillator of 200 Hz seen every .5 s: 100 turns from row to row say nothing, and one fit would take hours."""
+    fast = one_state(
+        "v", {"w": 1257.0}, state=[{"name": "x", "derivative": "v"}, {"name": "v", "derivative": "-w^2*x"}]
+    )
+    result = run(compile_model(fast), np.arange(200) * 10.0, np.zeros(200), [1.0, 0.0])
+    assert result.reasons[0] == TOO_MANY_STEPS
+    assert result.until_s[0] < 100.0
