@@ -67,8 +67,12 @@ class ResidualTests:
 
     @property
     def has_line(self) -> bool:
-        """Whether it swings with a frequency more than noise does, and than what effects explain is simulated wrong."""
-        return self.line > self.limits.line and self.line_gain > self.limits.line_share * self.gained
+        """Whether it swings with a frequency more than noise does, and than what effects explain is simulated wrong.
+
+        Beside effects alone: coloured noise has lines beyond chance too, and without effects the other tests decide.
+        """
+        gained = self.gained
+        return gained > 0.0 and self.line > self.limits.line and self.line_gain > self.limits.line_share * gained
 
     @property
     def has_no_slow_part(self) -> bool:
