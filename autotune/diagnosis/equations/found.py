@@ -20,7 +20,6 @@ from autotune.diagnosis.evidence.readings import converter_step
 from autotune.diagnosis.evidence.samples import SampleEffect, inspect, spared
 from autotune.diagnosis.result import NextExperiment
 from autotune.diagnosis.selection.probability import Candidate, weighed
-from autotune.diagnosis.selection.rig_search import unmoved
 from autotune.diagnosis.thresholds import IN_USE, Thresholds
 from autotune.equations.black_box import BlackBox
 from autotune.equations.effects import equation_of
@@ -191,9 +190,7 @@ def diagnose_equations(
     bench: Bench = (
         ClosedBench(model, recordings, good) if isinstance(model, BlackBox) else EquationBench(model, recordings, good)
     )
-    # where no input moves, what acts on one is a constant, and what bends the reading is the plant in other coordinates
-    without = [*without, *unmoved(recordings, model.columns), *(s.name for s in seen)]
-    found = search(bench, without, progress, thresholds)
+    found = search(bench, [*without, *(s.name for s in seen)], progress, thresholds)
     progress("checking on held-out rows", 0.95)
     errors = _held_out(bench, found)
     return _judged(model, recordings, found, tuple(seen), errors)

@@ -104,13 +104,13 @@ def search_rig(
         return RigSearch(nominal=nominal, retuned=retuned, judged=tuple(found), chosen=chosen)
 
 
-def unmoved(recordings: Sequence[Recording], inputs: Collection[str] = ("u",)) -> tuple[str, ...]:
+def unmoved(recordings: Sequence[Recording]) -> tuple[str, ...]:
     """Return the effects that are not told from others where no command moves.
 
     Those that act on the command are a constant there, and what only bends or delays the reading is the plant in other
     coordinates.
     """
-    if any(float(np.ptp(r[name])) > 0.0 for r in recordings for name in inputs):
+    if any(float(np.ptp(r.u)) > 0.0 for r in recordings):
         return ()
     return tuple(k.name for k in ALL if k.place == "actuator" or k.name == "timing.dead_time" or k.recoordinates)
 
