@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from autotune.arrays import FloatArray
-from autotune.diagnosis.evidence.residual import NEW, FreedResidual, Place, filled
+from autotune.diagnosis.evidence.residual import NEW, FreedResidual, Place, filled, last_known
 from autotune.diagnosis.evidence.swings import Swinging, explained_by_swings
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import Fit
@@ -179,19 +179,11 @@ def _columns(left: FreedResidual) -> Iterator[tuple[Place, str, list[FloatArray]
     """Yield further recorded columns, that the model may lack as an input to the plant or in the reading."""
     recordings = left.data.recordings
     for name in sorted(set.intersection(*(set(r.extra) for r in recordings)) - NO_INPUTS):
-        values = [_without_gaps(r.extra[name]) for r in recordings]
+        values = [r.extra[name][last_known(np.isfinite(r.extra[name]))] for r in recordings]
         if all(np.all(np.isfinite(v)) for v in values):
             centre = float(np.mean(np.concatenate(values)))
             for place in _COLUMN_ENTERS:
                 yield place, f"the column {name!r}, as a further input would", [v - centre for v in values]
-
-
-def _without_gaps(values: FloatArray) -> FloatArray:
-    """Return values with those that are missing held from the last one known; NaN where none is."""
-    known = np.isfinite(values)
-    last = np.maximum.accumulate(np.where(known, np.arange(values.size), -1))
-    first = int(np.argmax(known))
-    return np.asarray(values[np.where(last < 0, first, last)])
 
 
 def _explained(X: FloatArray, e: FloatArray, left: FreedResidual) -> float:

@@ -167,9 +167,12 @@ class FreedResidual:
 
 def filled(signals: FloatArray) -> FloatArray:
     """Return simulated signals, (N, 4), rows outside all windows with what the nearest row before has, or the first."""
-    known = np.isfinite(signals[:, 0])
-    nearest = np.maximum.accumulate(np.where(known, np.arange(known.size), int(np.argmax(known))))
-    return np.asarray(np.nan_to_num(signals[nearest]))
+    return np.asarray(np.nan_to_num(signals[last_known(np.isfinite(signals[:, 0]))]))
+
+
+def last_known(known: BoolArray) -> IntArray:
+    """Return for every row the number of the nearest known one before, itself included, or of the first one."""
+    return np.asarray(np.maximum.accumulate(np.where(known, np.arange(known.size), int(np.argmax(known)))))
 
 
 def _smoothed(e: FloatArray, starts: IntArray, stops: IntArray, rows: int) -> FloatArray:

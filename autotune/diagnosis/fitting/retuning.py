@@ -22,6 +22,18 @@ from autotune.recording import Recording
 BLOCKS = 24
 
 
+def at_nominal(base: Fit, data: Data, iterations: int = 10) -> Fit:
+    """Fit the start states alone at a retuned model's nominal numbers.
+
+    Numbers that run away have no error that could be told: the retuned model stands for them.
+    """
+    held = np.zeros(base.theta.size, dtype=bool)
+    try:
+        return fit(base.parametrisation, data, x0=base.x0, free=held, iterations=iterations)
+    except RUNAWAY:
+        return base
+
+
 def prepare(
     model: Model,
     recordings: Sequence[Recording],

@@ -11,6 +11,7 @@ import numpy as np
 from autotune.diagnosis.effects import STRUCTURES
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import RUNAWAY, Fit, fit
+from autotune.diagnosis.fitting.retuning import at_nominal
 from autotune.diagnosis.selection.hypothesis import Hypothesis, penalised
 from autotune.diagnosis.selection.parsimony import settled
 from autotune.diagnosis.selection.polishing import states_for
@@ -48,18 +49,9 @@ def confirmed(found: Search, pool: Executor) -> Search:
         able = [h for h in whole if not STRUCTURES.keys() & set(h.names)]
         chosen = settled(chosen, (retuned, *able), data, base)
     return replace(
-        found, data=data, nominal=_nominal(base, data), retuned=retuned, chosen=chosen,
+        found, data=data, nominal=at_nominal(base, data, STEPS), retuned=retuned, chosen=chosen,
         singles=_of_size(1, whole), pairs=_of_size(2, whole), triples=_of_size(3, whole),
     )  # fmt: skip
-
-
-def _nominal(base: Fit, data: Data) -> Fit:
-    """Fit the start states alone at the nominal numbers; where they run away the retuned model stands for them."""
-    p, held = base.parametrisation, np.zeros(base.theta.size, dtype=bool)
-    try:
-        return fit(p, data, p.centre, base.x0, free=held, iterations=STEPS)
-    except RUNAWAY:
-        return base
 
 
 def _of_size(size: int, found: Sequence[Hypothesis]) -> tuple[Hypothesis, ...]:

@@ -16,6 +16,7 @@ from autotune.diagnosis.fitting.fit import RUNAWAY, Fit, fit, states_of
 from autotune.diagnosis.fitting.noise import Noise, noise_from_differences
 from autotune.diagnosis.fitting.restarts import standing_out
 from autotune.diagnosis.fitting.retuning import (
+    at_nominal,
     at_operating_point,
     far_from_prior,
     floored,
@@ -105,10 +106,7 @@ def search(
 
 def _searched(data: Data, base: Fit, bench: Bench, progress: Progress) -> Search:
     """Search beside a retuned model."""
-    try:
-        nominal = fit(base.parametrisation, data, x0=base.x0, free=np.zeros(base.theta.size, dtype=bool))
-    except RUNAWAY:
-        nominal = base  # nominal numbers that run away have no error that could be told
+    nominal = at_nominal(base, data)
     try:
         return _extended(data, base, nominal, bench, progress)
     except RUNAWAY:
