@@ -101,7 +101,10 @@ def window_rows(t: FloatArray, horizon_s: float | None) -> tuple[IntArray, IntAr
 def values_of(compiled: Compiled, z: FloatArray) -> FloatArray:
     """Return the parameters at distances z from their nominal values, in prior standard deviations."""
     value, spread = compiled.parameter_vector, np.array([p.spread for p in compiled.parameters])
-    moved = np.where(_linear(compiled), value + spread * z, value * np.exp(np.clip(spread * z, -50.0, 50.0)))
+    scaled = value * np.exp(np.clip(spread * z, -50.0, 50.0))
+    least = np.array([p.least for p in compiled.parameters])
+    scaled = np.where(np.abs(scaled) < least, np.copysign(least, value), scaled)
+    moved = np.where(_linear(compiled), value + spread * z, scaled)
     return np.asarray(np.where(spread > 0.0, moved, value), dtype=np.float64)
 
 

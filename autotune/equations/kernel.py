@@ -30,6 +30,7 @@ from autotune.equations.tape_ops import evaluate, solve, tangents
 DONE, NOT_A_NUMBER, TOO_MANY_STEPS = 0, 1, 2
 MOST_STEPS = 20_000  # between two rows
 MOST_ON_AVERAGE = 200  # between two rows, over a window: else one fit of a chattering model would take hours
+SPARE_ROWS = 2000  # so many rows' steps may be taken ahead: a few hard places are carried through
 MOST_CROSSINGS = 100  # located between two rows; further ones are taken at the end of their steps
 _SURFACE = 1e-11  # of a switching function's largest value: as good as zero
 _NEAR = 1e-6  # likewise, for a state that slides already
@@ -78,7 +79,8 @@ class Work(NamedTuple):
     """What an integration writes on.
 
     ``r`` registers, ``d`` their tangents; inputs are ``base + ramp (t - since[0])``; switches: whether ``sliding`` or
-    ``crossed``, speed ``g_dot``, offset ``zero``, ``largest`` value; ``A b`` and ``J W`` linear systems; ``K`` fields
+    ``crossed``, how far ``over`` the edge of its mode, and that ``before`` and ``beyond`` a crossing that is located,
+    speed ``g_dot``, offset ``zero``, ``largest`` value; ``A b`` and ``J W`` linear systems; ``K`` fields
     at the stages, ``y`` the new state, ``e`` its error, ``seen`` the largest magnitudes; ``memory`` from step to step.
     """
 
@@ -89,6 +91,9 @@ class Work(NamedTuple):
     since: FloatArray
     sliding: IntArray
     crossed: IntArray
+    over: FloatArray
+    before: FloatArray
+    beyond: FloatArray
     g_dot: FloatArray
     zero: FloatArray
     largest: FloatArray
@@ -113,8 +118,9 @@ def _work(p: Tape, template: FloatArray, parameters: FloatArray) -> Work:
     evaluate(p.code, 0, p.still, r, False)
     return Work(
         r, np.zeros(r.size), np.zeros(m), np.zeros(m), np.zeros(1), np.zeros(s, dtype=np.int64),
-        np.zeros(s, dtype=np.int64), np.zeros(s), np.zeros(s), np.zeros(s), np.zeros((s, s)), np.zeros(s),
-        np.zeros((n, n)), np.zeros((n, n)), np.zeros((8, n)), np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(6),
+        np.zeros(s, dtype=np.int64), np.zeros(s), np.zeros(s), np.zeros(s), np.zeros(s), np.zeros(s), np.zeros(s),
+        np.zeros((s, s)), np.zeros(s), np.zeros((n, n)), np.zeros((n, n)), np.zeros((8, n)), np.zeros(n), np.zeros(n),
+        np.zeros(n), np.zeros(6),
     )  # fmt: skip
 
 
@@ -262,13 +268,44 @@ def _crossing(p: Tape, w: Work) -> bool:
     for k in range(p.switches.size):
         mode = w.r[p.modes[k]]
         if w.sliding[k]:
-            out = abs(mode) > 1.0 + 1e-9
+            w.over[k] = abs(mode) - 1.0
+            out = w.over[k] > 1e-9
         else:
             g = w.r[p.switches[k]] - w.zero[k]
-            out = abs(g) > _SURFACE * w.largest[k] and (g < 0.0 if mode == 1.0 else (g > 0.0 or mode == 0.0))
+            w.over[k] = abs(g) if mode == 0.0 else -g if mode == 1.0 else g
+            out = w.over[k] > _SURFACE * w.largest[k]
         w.crossed[k] = 1 if out else 0
         found = found or out
     return found
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _begin_locating(p: Tape, w: Work, x: FloatArray, t: float) -> None:
+    """Remember how far modes are over their edges where a step ends beyond a crossing, and where it began."""
+    w.beyond[:] = w.over
+    w.memory[_ROW] = 5.0
+    _field_in_row(p, w, x, t)
+    _crossing(p, w)
+    w.before[:] = w.over
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _located(w: Work, low: float, high: float, close: float, side: int, halve: bool) -> float:
+    """Return the step to try next between one before a crossing and one beyond it: false position, or half way.
+
+    ``side`` says whether the last one tried lay beyond (1) or before (-1): the next is put a little to the other side
+    of the estimate, so that the bracket closes from both ends.
+    """
+    found = 2.0 * high
+    for k in range(w.over.size):
+        a, b = w.before[k], w.beyond[k]
+        if b > 0.0 and -a > 1e-6 * b:
+            found = min(found, low - (high - low) * a / (b - a))
+        elif b > 0.0 or np.isnan(b):
+            halve = True
+    if halve or not found < high:
+        return 0.5 * (low + high)
+    return min(max(found - 0.4 * side * close, low + 0.2 * close), high - 0.2 * close)
 
 
 @njit(cache=True, error_model="numpy", nogil=True, inline="always")
@@ -388,12 +425,15 @@ def _advance(p: Tape, w: Work, x: FloatArray, t: float, end: float, span: float,
         _field_in_row(p, w, x, t)
     new_point = True
     locating, low, high = False, 0.0, 0.0  # while a crossing is located: a step before it and one beyond it
+    side, slow, width = 0, 0, 0.0  # where the last one tried lay, how often the bracket did not halve, and from what
+    close = _LOCATED * span
     while end - t > 1e-12 * span:
         h = min(w.memory[_STEP], end - t) if w.memory[_STEP] > 0.0 else end - t
         if end - t - h < 0.1 * h:
             h = end - t
         if locating:
-            h = 0.5 * (low + high) if high - low > _LOCATED * span else high
+            h = _located(w, low, high, close, side, slow >= 2) if high - low > close else high
+            slow = 0 if slow >= 2 else slow
         w.memory[_STEPS] += 1.0
         if w.memory[_STEPS] > MOST_STEPS:
             return TOO_MANY_STEPS
@@ -408,13 +448,28 @@ def _advance(p: Tape, w: Work, x: FloatArray, t: float, end: float, span: float,
                 return NOT_A_NUMBER
             continue
         if switched:
-            if crossed:
-                low, high, locating = (low if locating else 0.0), h, True
-                if high - low > _LOCATED * span:
+            if crossed and not locating:
+                low, high, locating, side, slow = 0.0, h, True, 0, 0
+                if high - low > close:
+                    _begin_locating(p, w, x, t)
                     continue
             elif locating and h < high:
-                low = h
-                continue
+                # false position with Illinois' remedy: the end that stays counts half
+                width = high - low
+                if crossed:
+                    high = h
+                    w.beyond[:] = w.over
+                    if side == 1:
+                        w.before[:] *= 0.5
+                else:
+                    low = h
+                    w.before[:] = w.over
+                    if side == -1:
+                        w.beyond[:] *= 0.5
+                side = 1 if crossed else -1
+                slow = slow + 1 if high - low > 0.5 * width else 0
+                if not crossed or high - low > close:
+                    continue
         t += h
         for i in range(p.n):
             x[i], w.K[0, i] = w.y[i], w.K[6, i]
@@ -480,13 +535,13 @@ def _to_next_row(
 @njit(cache=True, error_model="numpy", nogil=True)
 def run(
     p: Tape, template: FloatArray, parameters: FloatArray, times: FloatArray, columns: FloatArray, delays: FloatArray,
-    starts: IntArray, stops: IntArray, x0: FloatArray, tolerance: float, out: FloatArray, ends: FloatArray,
-    status: FloatArray,
+    starts: IntArray, stops: IntArray, x0: FloatArray, tolerance: float, most: float, out: FloatArray,
+    ends: FloatArray, status: FloatArray,
 ) -> None:  # fmt: skip
     """Integrate every window and write outputs at its rows, its end state, and how it ended.
 
-    ``out`` is (q, N); ``ends`` (W, n) receives the state at each window's stop row (or at the last row);
-    ``status`` (W, 2) the reason and the time of the end.
+    ``most`` bounds the steps between two rows on average. ``out`` is (q, N); ``ends`` (W, n) receives the state at each
+    window's stop row (or at the last row); ``status`` (W, 3) the reason and the time of the end, and the steps taken.
     """
     w = _work(p, template, parameters)
     x, at = np.zeros(p.n), np.zeros(p.linear.size, dtype=np.int64)
@@ -503,7 +558,7 @@ def run(
         _inputs(p, w, times, columns, delays, at, t - 3.0 * close, close)
         _settle(p, w, x, t - times[0])
         status[window, 0], status[window, 1] = DONE, t
-        spare = 20.0 * MOST_STEPS  # a few hard places are carried through
+        spare = most * SPARE_ROWS
         for row in range(starts[window], stops[window]):
             evaluate(p.code, p.dynamic, p.code.shape[0], w.r, False)
             for q in range(p.outputs.size):
@@ -511,7 +566,8 @@ def run(
             if row + 1 >= times.size:
                 break
             ended, t = _to_next_row(p, w, x, times, columns, delays, at, row, close, tolerance)
-            spare += MOST_ON_AVERAGE - w.memory[_STEPS]
+            status[window, 2] += w.memory[_STEPS]
+            spare += most - w.memory[_STEPS]
             if ended == DONE and spare < 0.0:
                 ended = TOO_MANY_STEPS
             if ended != DONE:

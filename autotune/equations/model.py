@@ -92,6 +92,8 @@ class ModelParameter:
         Relative prior standard deviation (absolute where the value is 0); 0: it is not retuned.
     linear: bool
         Whether it may change its sign: it is sought as ``value + spread z``, and the spread is absolute.
+    least: float
+        Magnitude below which a fit does not take it, where it keeps its sign.
     """
 
     name: str
@@ -99,6 +101,7 @@ class ModelParameter:
     unit: str = ""
     spread: float = SPREAD
     linear: bool = False
+    least: float = 0.0
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -56,6 +56,8 @@ class Compiled:
         Outputs beside y.
     held : tuple of Held
         What is done to inputs before they drive the equations, in this order.
+    most_steps : float
+        Steps between two rows, on average, that a simulation may take.
     """
 
     model: EquationModel
@@ -64,6 +66,7 @@ class Compiled:
     parameters: tuple[ModelParameter, ...]
     signals: tuple[str, ...] = ()
     held: tuple[Held, ...] = ()
+    most_steps: float = kernel.MOST_ON_AVERAGE
 
     @property
     def states(self) -> tuple[str, ...]:
@@ -103,12 +106,15 @@ class Run:
         ``kernel.DONE``, ``NOT_A_NUMBER`` or ``TOO_MANY_STEPS``.
     until_s : (W,) array
         Time stamp up to which a window ran, where it ended early.
+    steps : (W,) array
+        Steps that a window took, those that were tried in vain too.
     """
 
     outputs: FloatArray
     ends: FloatArray
     reasons: IntArray
     until_s: FloatArray
+    steps: FloatArray
 
     @property
     def y(self) -> FloatArray:
@@ -220,13 +226,14 @@ def simulate(
             where="simulate",
         )
     outputs = np.full((program.outputs.size, rows), np.nan)
-    ends, status = np.full(states.shape, np.nan), np.zeros((first.size, 2))
+    ends, status = np.full(states.shape, np.nan), np.zeros((first.size, 3))
     kernel.run(
         program.tape, program.registers, np.ascontiguousarray(parameters, dtype=np.float64), drive.t, drive.inputs,
         late if delays is None else np.asarray(delays, dtype=np.float64),
-        first, last, states, tolerance, outputs, ends, status,
+        first, last, states, tolerance, float(compiled.most_steps), outputs, ends, status,
     )  # fmt: skip
-    return Run(outputs=outputs.T, ends=ends, reasons=status[:, 0].astype(np.int64), until_s=status[:, 1])
+    reasons = status[:, 0].astype(np.int64)
+    return Run(outputs=outputs.T, ends=ends, reasons=reasons, until_s=status[:, 1], steps=status[:, 2])
 
 
 def _arriving(compiled: Compiled, parameters: FloatArray, drive: Drive) -> tuple[FloatArray, Drive, FloatArray]:
@@ -292,7 +299,7 @@ def require_complete(run: Run, compiled: Compiled, where: str) -> Run:
         what = f"the simulation of {compiled.model.name!r} runs away or a term is no number {at}"
         remedy = "check signs and units, and roots and logarithms of what may become negative: sqrt(max(h, 0))"
     else:
-        most = f"{kernel.MOST_STEPS} steps between two rows, or {kernel.MOST_ON_AVERAGE} on average,"
+        most = f"{kernel.MOST_STEPS} steps between two rows, or {compiled.most_steps:g} on average,"
         what = f"the simulation of {compiled.model.name!r} needs more than {most} {at}"
         remedy = "check time constants that are far shorter than the rows' distance"
     raise InputError(what, where=where, remedy=remedy)

@@ -13,7 +13,7 @@ from typing import Protocol
 import numpy as np
 
 from autotune.arrays import BoolArray, FloatArray
-from autotune.diagnosis.equations.candidates import Signals, Trial
+from autotune.diagnosis.equations.candidates import Signals, Trial, place_of
 from autotune.diagnosis.evidence.stretches import stretches_in
 from autotune.equations.effects import compile_with, with_values
 from autotune.equations.expressions import Expression, to_text
@@ -35,6 +35,11 @@ SIGNED_RATES = frozenset({"actuator.gain_drift", "sensor.drift", "environment.dr
 GIVEN = frozenset({"zero", "end"})
 #: Parameters whose change moves nothing or makes a jump: sought from outside, by direct search.
 OUTER = frozenset({("actuator.stiction", "band")})
+#: Width of a hysteresis, of what the position moves through, below which it is dry friction, which has no width: its
+#: springs would swing the faster the narrower it is, and a simulation would follow them.
+LEAST_WIDTH = 1.0 / 300.0
+#: Steps between two rows, on average, that a simulation with effects may take, and times those of the model without.
+STEPS, TIMES_STEPS = 20.0, 5.0
 #: How far surroundings may be from the coldest that was met [K].
 SURROUNDINGS_SD = 15.0
 #: Iterations of a fit from which on such a parameter is sought: fewer only show whether more are worth it.
@@ -193,7 +198,15 @@ class EquationBench:
         """Return the model with its own numbers retuned, on windows of the search's length."""
         compiled = self._compiled(self.model.effects, {})
         found = retune(compiled, self.recordings, longest_s=self.length_s)
+        self._most_steps = max(STEPS, TIMES_STEPS * self._steps(found))
         return self._outcome(tuple(self.model.effects), found)
+
+    def _steps(self, found: Fitted) -> float:
+        """Return how many steps the simulation of a fit takes between two rows."""
+        each = zip(self._drives, found.windows, strict=True)
+        runs = [simulate(found.compiled, found.parameters, d, w.states, starts=w.starts, stops=w.stops)
+                for d, w in each]  # fmt: skip
+        return float(sum(run.steps.sum() for run in runs)) / sum(len(r) for r in self.recordings)
 
     def as_it_is(self, retuned: Outcome) -> Outcome:
         """Return the model with its nominal numbers, only start states fitted."""
@@ -265,7 +278,8 @@ class EquationBench:
     def _compiled(self, effects: Sequence[Effect], spreads: Mapping[str, float]) -> Compiled:
         compiled, own = compile_with(self.model, effects), len(self.model.parameters)
         scaled_for_search = tuple(sought(p, effects, spreads) for p in compiled.parameters[own:])
-        return replace(compiled, parameters=(*compiled.parameters[:own], *scaled_for_search))
+        parameters = (*compiled.parameters[:own], *scaled_for_search)
+        return replace(compiled, parameters=parameters, most_steps=min(self._most_steps, compiled.most_steps))
 
     def _spreads(self) -> dict[str, float]:
         u = np.concatenate([r[self.model.columns[0]] for r in self.recordings])
@@ -274,6 +288,7 @@ class EquationBench:
         size = {"high": float(np.std(u)), "low": float(np.std(u)), "time": 0.2 * span, "phase": 1.0,
                 "origin of y": float(np.nanstd(y)), "origin of u": float(np.std(u))}  # fmt: skip
         spread = max(float(np.max(s)) for s in self._sizes.values()) if self._sizes else 0.0
+        size |= {f"width at {place}": LEAST_WIDTH * span for place, span in self._spans.items()}
         return size | ({"in_phase": spread, "quadrature": spread} if spread else {})
 
     def fitted(self, effects: Sequence[Effect], start: Outcome, iterations: int = 15) -> Outcome:
@@ -437,6 +452,8 @@ class EquationBench:
     _base_of: Outcome | None = None
     _base: FloatArray | None = None
     _sizes: Mapping[str, float] = MappingProxyType({})
+    _spans: Mapping[str, float] = MappingProxyType({})
+    _most_steps = np.inf
 
     def signals(self, outcome: Outcome) -> Signals:
         """Return states, differences across ports, and sizes of derivatives under a fit."""
@@ -459,6 +476,8 @@ class EquationBench:
         for port in model.ports:
             sizes[port.name] = self._force_size(outcome, port.name, sizes)
         self._sizes = sizes
+        under = {s.name: s.of for s in model.states} | {one.name: f"{one.name}:position" for one in model.ports}
+        self._spans = {place: float(np.ptp(values[name])) for place, name in under.items() if name in values}
         duration = max(float(r.t[-1] - r.t[0]) for r in self.recordings)
         u = np.concatenate([d.inputs[:, 0] for d in self._drives])
         return Signals(u=u, y=columns[:, 0], values=values, sizes=sizes, dt_s=dt, duration_s=duration,
@@ -513,6 +532,8 @@ def sought(p: ModelParameter, effects: Sequence[Effect], spreads: Mapping[str, f
     name = effects[number].name
     if key in GIVEN or p.spread == 0.0 or (name, key) in OUTER:
         return replace(p, spread=0.0)
+    if (name, key) == ("plant.hysteresis", "width"):
+        return replace(p, least=spreads.get(f"width at {place_of(effects[number])}", 0.0))
     if key == "surroundings":
         return replace(p, linear=True, spread=SURROUNDINGS_SD)
     if key == "origin":

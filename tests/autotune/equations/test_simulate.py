@@ -226,3 +226,15 @@ def test_what_chatters_between_all_rows_ends_with_a_reason() -> None:
     result = run(compile_model(fast), np.arange(200) * 10.0, np.zeros(200), [1.0, 0.0])
     assert result.reasons[0] == TOO_MANY_STEPS
     assert result.until_s[0] < 100.0
+
+
+@given(level=st.floats(0.02, 0.3), seed=st.integers(0, 99))
+@settings(max_examples=20, deadline=None)
+def test_a_crossing_is_located_in_a_dozen_trials(level: float, seed: int) -> None:
+    """Halving the step takes 30 trials to 1e-9 of a row, and a mass with dry friction stops at every turn."""
+    states = [{"name": "x", "derivative": "v"}, {"name": "v", "derivative": "u - x - level*sign(v)"}]
+    t, u = np.arange(400) * 0.1, steps(seed, 400, 9)
+    rubbed = run(compile_model(one_state("v", {"level": level}, state=states)), t, u, [0.0, 0.0])
+    turns = int(np.sum(np.sign(rubbed.y[1:]) != np.sign(rubbed.y[:-1])))
+    assert turns > 5
+    assert rubbed.steps[0] < 399 + 16 * turns
