@@ -38,6 +38,8 @@ _CONTRADICTED = 1e-3
 #: the critical point, a hundredth moves a modulus margin of one half by one per cent, and beyond the highest point what
 #: is missed grows several times (a plant that was missed by .005 lost 1.8 %)
 _MATERIAL = 0.002
+#: HiGHS's numbers for its simplex methods
+_DUAL, _PRIMAL = 1, 4
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -108,15 +110,30 @@ class ConsistentProcesses:
         values = np.empty(len(costs))
         for k, cost in enumerate(costs):
             program.changeColsCost(len(columns), columns, cost)
-            program.run()
-            if program.getModelStatus() != highspy.HighsModelStatus.kOptimal:
-                raise DesignError(
-                    f"the points do not bound the {what} at every frequency",
-                    where="points",
-                    remedy="add points, or points with smaller regions",
-                )
-            values[k] = program.getInfo().objective_function_value
+            values[k] = _maximum(program, what)
         return values
+
+
+def _maximum(program: highspy.Highs, what: str) -> float:
+    """Return the maximum of a program, solved from the last vertex or, where that stays undecided, from the beginning.
+
+    Neighbouring lags are so nearly alike that now and then the last vertex's basis is too ill conditioned for the
+    solver to decide anything, which says nothing about the points: their regions bound every member.
+    """
+    program.run()
+    if program.getModelStatus() != highspy.HighsModelStatus.kOptimal:
+        program.clearSolver()
+        program.setOptionValue("simplex_strategy", _DUAL)
+        program.run()
+        program.setOptionValue("simplex_strategy", _PRIMAL)
+    status = program.getModelStatus()
+    if status != highspy.HighsModelStatus.kOptimal:
+        raise DesignError(
+            f"what the points allow of the {what} was not found: a linear program ended with {status.name}",
+            where="points",
+            remedy="leave out points that are close together, or add some that are apart",
+        )
+    return float(program.getInfo().objective_function_value)
 
 
 def _program(A: FloatArray, b: FloatArray) -> highspy.Highs:
@@ -138,7 +155,7 @@ def _program(A: FloatArray, b: FloatArray) -> highspy.Highs:
     solver.setOptionValue("threads", 1)
     solver.setOptionValue("presolve", "off")
     solver.setOptionValue("solver", "simplex")
-    solver.setOptionValue("simplex_strategy", 4)  # primal: a changed cost leaves the last vertex feasible
+    solver.setOptionValue("simplex_strategy", _PRIMAL)  # a changed cost leaves the last vertex feasible
     solver.passModel(program)
     return solver
 

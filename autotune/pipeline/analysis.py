@@ -283,7 +283,8 @@ def _first_kept(
         looked = _checks(name, points, fit, found.controller, found.specification)
         missed = [check for check in looked if not check.kept]
         if not missed:
-            return name, found, looked
+            refused = reason if fit.source == "points" else None
+            return name, found if refused is None else _less_certain(found, name, refused), looked
         reason = reason or DesignError(
             f"the controller designed on the {name} misses the margins: " + "; ".join(one.sentence for one in missed),
             where="last check",
@@ -291,6 +292,12 @@ def _first_kept(
         )
     assert reason is not None
     raise reason
+
+
+def _less_certain(design: Design, source: Source, refused: AutotuneError) -> Design:
+    """Return a design on less than all plants through the points, with what it leaves open in its certificate."""
+    said = f"{UNCERTAIN} the points allow more plants than the {source} does, and a design on all of them was refused"
+    return replace(design, certificate=f"{design.certificate}; {said} ({refused.what})")
 
 
 def _checks(

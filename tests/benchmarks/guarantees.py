@@ -135,7 +135,7 @@ def outcome(plant: TransferFunction, make: Callable[[], tuple[PIDController, boo
     m = margins(plant, controller)
     share = min(m.modulus / ASKED.modulus_margin, m.phase_rad / ASKED.phase_margin_rad) - 1.0 if m.stable else -1.0
     if share >= -TOLERANCE:
-        return "kept", "", share
+        return "kept", "" if claimed else "not certain", share
     return ("FAILED" if claimed else "said"), f"K {controller.K:.4g} Ti {controller.Ti_s:.4g}", share
 
 

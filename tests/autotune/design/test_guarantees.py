@@ -52,6 +52,15 @@ def test_no_result_claims_a_margin_that_the_true_plant_misses_by_more_than_a_hun
     assert sum(row.what == "kept" for row in rows) >= len(rows) // 2  # what is refused claims nothing
 
 
+def test_a_design_on_less_than_all_plants_through_the_points_says_so() -> None:
+    """No PI keeps these margins on all of them; one does on the fitted plant's region, which is no more than that."""
+    points = measured(FOPDT, None, gain_sd=0.05, phase_sd_deg=4.0)
+    asked = DesignSettings(specification="Spec2", noise_gain=5.0)
+    found = analyse(points, asked, compare=False)
+    assert found.source == "fitted plant"
+    assert any("not certain: the points allow more plants" in said and "no PI keeps" in said for said in found.warnings)
+
+
 @given(ratio=st.one_of(st.floats(0.5, 10.0), st.floats(31.0, 200.0)), lag=st.floats(0.1, 10.0))
 @settings(max_examples=8, deadline=None)
 def test_a_reduced_model_of_a_known_plant_keeps_the_plants_margins_or_is_refused(ratio: float, lag: float) -> None:

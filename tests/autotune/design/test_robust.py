@@ -132,6 +132,16 @@ def test_margins_hold_on_plants_whose_gain_rises_before_it_falls(number: int, ki
     assert m.phase_rad >= math.radians(44.5)
 
 
+@pytest.mark.parametrize(("number", "kind"), [(87, "pid"), (133, "pi")])
+def test_a_program_that_its_last_vertex_leaves_undecided_is_solved_from_the_beginning(number: int, kind: Kind) -> None:
+    """Such points were said not to bound the plant; the fit that was designed on instead left the first M_m .492."""
+    plant = list(plants("non-minimum phase", number + 1))[number]
+    found = design_on_points(slow_points(plant, np.random.default_rng(number)), asked_of(plant), kind)
+    m = margins(plant, found.controller)
+    assert m.modulus >= 0.5
+    assert m.phase_rad >= math.radians(45.0)
+
+
 def test_margins_hold_beyond_the_points_where_a_zero_is_slower_than_the_fast_lags() -> None:
     plant = list(plants("non-minimum phase", 15))[14]
     m = margins(plant, design_on_points(relay_points(plant, np.random.default_rng(14)), spec1(30.0), "pid").controller)
