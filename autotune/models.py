@@ -6,6 +6,7 @@ where a diagnosis added physics. ``y = last block's output + output.offset``, dr
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -61,7 +62,7 @@ class TransferFunction:
     delay_s: float = 0.0
 
     def __post_init__(self) -> None:
-        if not self.num or not self.den or not np.all(np.isfinite((*self.num, *self.den, self.delay_s))):
+        if not self.num or not self.den or not all(map(math.isfinite, (*self.num, *self.den, self.delay_s))):
             raise InputError("num, den and delay must be finite numbers", where="transfer function")
         object.__setattr__(self, "num", _trimmed(self.num))
         object.__setattr__(self, "den", _trimmed(self.den))

@@ -12,10 +12,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Literal, Protocol, TypeAlias
 
 from autotune.arrays import FloatArray
-from autotune.diagnosis.effects.stages import Line, LinearPart, Memory, Values
+from autotune.diagnosis.effects.stages import Line, LinearPart, Memory, StageName, Values
 from autotune.models import Model, Parameter
 
 #: What a parameter is to a search.
@@ -370,12 +371,17 @@ class EffectKind:
         """Whether thresholds make the criterion rough."""
         return self.nudge > 0.0
 
-    @property
+    @cached_property
     def is_signed(self) -> bool:
         """Whether it may act in either direction: a number that is fitted has either sign."""
         return any(q.sign == "real" for q in self.parameters if q.is_fitted)
 
-    @property
+    @cached_property
+    def stages(self) -> frozenset[StageName]:
+        """Stages at which its lines act."""
+        return frozenset(line.stage for line in self.lines)
+
+    @cached_property
     def amplitudes(self) -> frozenset[str]:
         """Parameters that it is about proportional to."""
         return frozenset(q.name for q in self.parameters if q.role == "amplitude")

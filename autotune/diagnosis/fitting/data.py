@@ -174,6 +174,18 @@ class Data:
         )
 
     @cached_property
+    def edges(self) -> tuple[IntArray, IntArray]:
+        """First row of every window and the row after its last, all recordings one after the other."""
+        before = np.cumsum([0, *(len(r) for r in self.recordings[:-1])])
+        first = np.concatenate([n + a for n, a in zip(before, self.starts, strict=True)])
+        return first, np.concatenate([n + b for n, b in zip(before, self.stops, strict=True)])
+
+    @cached_property
+    def command_spread(self) -> float:
+        """Standard deviation of all commands, 1 where none moves."""
+        return float(np.std(np.concatenate([r.u for r in self.driving]))) or 1.0
+
+    @cached_property
     def sample_times(self) -> tuple[float, ...]:
         """Sample time of every recording [s]."""
         return tuple(r.sample_time_s for r in self.driving)

@@ -72,11 +72,8 @@ class Problem:
             if f.turns:
                 angle = 2.0 * np.pi * np.exp(parametrisation.centre[i]) * max(r.duration_s for r in data.driving)
                 self.reach[i], self.nudge[i] = 1.0 / angle, 0.05 / angle
-        lengths = [len(r) for r in data.recordings]
-        edges = np.cumsum([0, *lengths])
         #: First row of every window and the row after its last, in the concatenated residual
-        self.first = np.concatenate([e + a for e, a in zip(edges, data.starts, strict=False)])
-        self.last = np.concatenate([e + b for e, b in zip(edges, data.stops, strict=False)])
+        self.first, self.last = data.edges
         #: How many windows every recording has
         self.counts = [len(a) for a in data.starts]
 
@@ -182,6 +179,21 @@ def _freed(left: FloatArray, Jx: FloatArray, first: IntArray, last: IntArray, da
         gains[w] = np.linalg.solve(G, X.T @ Y)
         Y -= X @ gains[w]
     return gains
+
+
+@njit(cache=True, nogil=True)
+def freed_of(direction: FloatArray, Q: FloatArray, windows: IntArray) -> FloatArray:
+    """Return a direction without what orthonormal columns (N, n) explain of it within each window's rows (W, 2)."""
+    left = direction.copy()
+    for w in range(windows.shape[0]):
+        first, last = windows[w]
+        for column in range(Q.shape[1]):
+            share = 0.0
+            for k in range(first, last):
+                share += Q[k, column] * direction[k]
+            for k in range(first, last):
+                left[k] -= share * Q[k, column]
+    return left
 
 
 def descend(

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
@@ -23,6 +24,7 @@ from autotune.diagnosis.fitting.descent import (
     continued,
     descend,
     eliminate,
+    freed_of,
     simulate,
 )
 from autotune.diagnosis.fitting.parameters import Parametrisation
@@ -96,17 +98,23 @@ class Fit:
         """All whitened residuals, one recording after the other."""
         return np.concatenate(self.whitened)
 
-    @property
+    @cached_property
     def model(self) -> Model:
         """The fitted model."""
         return self.parametrisation.with_values(self.theta)
 
     def without_states(self, direction: FloatArray) -> FloatArray:
         """Return what is left of a whitened direction when all start states may move against it."""
-        left = direction.copy()
+        windows = np.array(self.windows, dtype=np.int64)
+        return np.asarray(freed_of(direction, self._states_together, windows))
+
+    @cached_property
+    def _states_together(self) -> FloatArray:
+        """What start states explain, all windows in one (N, n) array: columns of 0 where a window has fewer."""
+        together = np.zeros((self.jacobian[1].shape[0], max((Q.shape[1] for Q in self.states_explain), default=0)))
         for (a, b), Q in zip(self.windows, self.states_explain, strict=True):
-            left[a:b] -= Q @ (Q.T @ left[a:b])
-        return left
+            together[a:b, : Q.shape[1]] = Q
+        return together
 
     def without_numbers(self, direction: FloatArray) -> FloatArray:
         """Return what is left of a direction freed of start states when the free numbers may move against it too.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from types import MappingProxyType
 from typing import Literal, TypeAlias
 
@@ -110,7 +111,7 @@ class Parametrisation:
     def with_values(self, theta: FloatArray) -> Model:
         """Return the model at a point of the search."""
         gain, u_offset, delay = 1.0, self.model.input.offset, None
-        factors: dict[tuple[str, int, int], float] = {}
+        factors: list[tuple[tuple[str, int, int], float]] = []
         effects: dict[tuple[int, int], float] = {}
         for i, f in enumerate(self.free):
             value = self.value(i, theta)
@@ -123,8 +124,8 @@ class Parametrisation:
             elif f.kind == "effect":
                 effects[f.index] = value
             else:
-                factors[(f.kind, *f.index)] = value
-        blocks = _scaled(self.model.blocks, gain, factors, delay)
+                factors.append(((f.kind, *f.index), value))
+        blocks = _scaled(self.model.blocks, gain, tuple(factors), delay)
         return replace(
             self.model,
             input=replace(self.model.input, offset=u_offset),
@@ -137,18 +138,25 @@ def _set_effects(effects: tuple[Effect, ...], values: dict[tuple[int, int], floa
     result = []
     for number, effect in enumerate(effects):
         parameters = {
-            key: replace(parameter, value=values.get((number, j), parameter.value))
+            key: replace(parameter, value=values[number, j]) if (number, j) in values else parameter
             for j, (key, parameter) in enumerate(effect.parameters.items())
         }
         result.append(replace(effect, parameters=MappingProxyType(parameters)))
     return tuple(result)
 
 
+@lru_cache(maxsize=64)
 def _scaled(
-    blocks: tuple[Block, ...], gain: float, factors: dict[tuple[str, int, int], float], delay: float | None
+    blocks: tuple[Block, ...],
+    gain: float,
+    multiplied: tuple[tuple[tuple[str, int, int], float], ...],
+    delay: float | None,
 ) -> tuple[Block, ...]:
-    """Return the blocks with their coefficients multiplied, the whole gain put on the gain's block."""
-    target = gain_block(blocks)
+    """Return the blocks with their coefficients multiplied, the whole gain put on the gain's block.
+
+    Effects are tried on the same chain again and again.
+    """
+    target, factors = gain_block(blocks), dict(multiplied)
     result = []
     for i, block in enumerate(blocks):
         dynamics = block.dynamics
@@ -168,15 +176,16 @@ def gain_block(blocks: Sequence[Block]) -> int:
     return (plant or dynamic or [0])[0]
 
 
+@lru_cache(maxsize=16)
 def chain_parameters(
-    model: Model, input_size: float, sample_time_s: float, prior_spread: float = Thresholds.prior_spread
-) -> tuple[list[Free], list[float]]:
-    """Return the chain's free numbers and their centres.
+    blocks: tuple[Block, ...], input_size: float, sample_time_s: float, prior_spread: float = Thresholds.prior_spread
+) -> tuple[tuple[Free, ...], tuple[float, ...]]:
+    """Return the chain's free numbers and their centres; a search asks for the same ones with every effect it tries.
 
     Parameters
     ----------
-    model : Model
-        Nominal model.
+    blocks : tuple of Block
+        Nominal chain.
     input_size : float
         Size of the command's deviations, the step of its offset.
     sample_time_s : float
@@ -192,7 +201,7 @@ def chain_parameters(
     """
     free = [Free(name="gain", kind="gain", spread=prior_spread)]
     centre = [0.0]
-    for i, block in enumerate(model.blocks):
+    for i, block in enumerate(blocks):
         den, num = block.dynamics.den, block.dynamics.num
         for j in range(len(den) - 1):
             if den[j] != 0.0 and den[-1] != 0.0:
@@ -203,7 +212,7 @@ def chain_parameters(
             if num[j] != 0.0:
                 free.append(Free(name=f"{block.name} num[{j}]", kind="num", index=(i, j), spread=prior_spread))
                 centre.append(0.0)
-    delay = sum(block.dynamics.delay_s for block in model.blocks)
+    delay = sum(block.dynamics.delay_s for block in blocks)
     if delay > 0.0:
         # searched in units of the dead time itself: a logarithm would never reach zero
         spread = max(prior_spread, 0.5 * sample_time_s / delay)
@@ -211,7 +220,7 @@ def chain_parameters(
         centre.append(1.0)
     free.append(Free(name="input offset", kind="u_offset", positive=False, size=input_size))
     centre.append(0.0)
-    return free, centre
+    return tuple(free), tuple(centre)
 
 
 def _is_damping(den: Sequence[float], j: int) -> bool:
@@ -242,7 +251,8 @@ def parametrise(
     Parametrisation
         Chain and effects, ready to be fitted.
     """
-    free, centre = chain_parameters(model, input_size, sample_time_s, prior_spread)
+    numbers = chain_parameters(model.blocks, input_size, sample_time_s, prior_spread)
+    free, centre = list(numbers[0]), list(numbers[1])
     own, effects = len(model.effects), (*model.effects, *effects)
     for number, effect in enumerate(effects):
         kind = kind_of(effect.name)

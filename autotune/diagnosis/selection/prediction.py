@@ -93,16 +93,18 @@ def extended(base: Fit, effect: Effect, data: Data) -> tuple[Parametrisation, Fl
     """Return parametrisation, starting point and start states of a fit with one more effect."""
     old = base.parametrisation
     effects = (*base.model.effects, effect)
-    size = float(np.std(np.concatenate([r.u for r in data.driving]))) or 1.0
     nominal = replace(old.model, effects=effects[: old.own])
-    p = parametrise(nominal, effects[old.own :], size, data.sample_times[0], data.thresholds.prior_spread)
+    spread = data.thresholds.prior_spread
+    p = parametrise(nominal, effects[old.own :], data.command_spread, data.sample_times[0], spread)
     theta = p.centre.copy()
     theta[: base.theta.size] = base.theta
     # an effect's own centre is its starting value; those fitted already keep the scale of their search
     free = (*old.free, *p.free[len(old.free) :])
     p = replace(p, free=free, centre=np.concatenate([old.centre, p.centre[len(old.free) :]]))
-    grows = p.simulator(theta).order > base.sim.order  # a lag may be one that the chain has already
-    return p, theta, carried_states(base, effect, data) if grows else base.x0
+    part = kind_of(effect.name).linear
+    if part is None or part.start is None or p.simulator(theta).order <= base.sim.order:
+        return p, theta, base.x0  # a lag may be one that the chain has already
+    return p, theta, carried_states(base, effect, data)
 
 
 def carried_states(base: Fit, effect: Effect, data: Data) -> tuple[FloatArray, ...]:

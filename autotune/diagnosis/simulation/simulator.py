@@ -40,6 +40,12 @@ class Windows:
     places: IntArray | None = None
     rows: int | None = None
 
+    @cached_property
+    def table(self) -> IntArray:
+        """First rows, rows after the last, and where each window begins in the output, (3, W)."""
+        places = self.starts if self.places is None else self.places
+        return np.stack((self.starts, self.stops, places)).astype(np.int64)
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Simulator:
@@ -223,7 +229,7 @@ _TOLD: tuple[StageName, ...] = ("force", "friction", "outflow", "stop")
 
 
 def _acts_at(kind: EffectKind, *names: StageName) -> bool:
-    return any(line.stage in names for line in kind.lines)
+    return not kind.stages.isdisjoint(names)
 
 
 @cache
@@ -247,6 +253,4 @@ def _rows(windows: Windows | None, count: int) -> tuple[IntArray, int]:
     """Return what the compiled simulation is told of windows, and how many rows it returns."""
     if windows is None:
         return np.array([[0], [count], [0]], dtype=np.int64), count
-    places = windows.starts if windows.places is None else windows.places
-    rows = np.stack((windows.starts, windows.stops, places)).astype(np.int64)
-    return rows, count if windows.rows is None else windows.rows
+    return windows.table, count if windows.rows is None else windows.rows
