@@ -7,13 +7,14 @@ this process), and ``probe_kind(settings, expected)``, which reads everything on
 
 from __future__ import annotations
 
-import re
+import ast
+import inspect
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 from autotune.config.rig import (
     RIG_SETTINGS,
@@ -23,6 +24,7 @@ from autotune.config.rig import (
     ReplaySettings,
     SerialSettings,
     SimulatedRigSettings,
+    rig_kind_of,
 )
 from autotune.controller import PIDController
 from autotune.errors import InputError
@@ -92,7 +94,7 @@ class Kind:
     @property
     def name(self) -> str:
         """What ``kind`` says in ``[rig]``."""
-        return str(get_args(self.settings.model_fields["kind"].annotation)[0])
+        return rig_kind_of(self.settings)
 
     def open(self, settings: Section, session: Session) -> Rig:
         """Return the rig, not yet opened."""
@@ -164,8 +166,40 @@ def require_complete(kinds: Sequence[Kind], known: Sequence[type[Section]] = RIG
         found = find_spec(kind.driver)
         if found is None or found.origin is None:
             _refuse(f"{name} is reached by {kind.driver}, which does not exist", "correct its name, or write it")
-        elif not re.search(r"^def open_kind\(", Path(found.origin).read_text(encoding="utf-8"), re.MULTILINE):
-            _refuse(f"{kind.driver} has no open_kind", "add def open_kind(settings, session), which returns the rig")
+    for driver in dict.fromkeys(kind.driver for kind in kinds):
+        _require_rig(driver)
+
+
+def _require_rig(driver: str) -> None:
+    """Refuse a driver's file that opens no rig, as it is written; a class that inherits is not looked into."""
+    spec = find_spec(driver)
+    body = ast.parse(Path(str(spec and spec.origin)).read_text(encoding="utf-8")).body
+    opener = next((node for node in body if isinstance(node, ast.FunctionDef) and node.name == "open_kind"), None)
+    if opener is None:
+        _refuse(f"{driver} has no open_kind", "add def open_kind(settings, session), which returns the rig")
+        return
+    if len(opener.args.args) != 2:
+        _refuse(f"open_kind of {driver} takes {ast.unparse(opener.args)}", "write def open_kind(settings, session)")
+    for made in (node for node in body if isinstance(node, ast.ClassDef)):
+        if opener.returns is None or made.name != ast.unparse(opener.returns) or made.bases:
+            continue
+        has = {node.name for node in made.body if isinstance(node, ast.FunctionDef)}
+        has |= {node.attr for node in ast.walk(made) if isinstance(node, ast.Attribute) and _is_set(node)}
+        lacks = [name for name in _PARTS if name not in has]
+        if lacks:
+            _refuse(f"{made.name} of {driver} has no {lacks[0]}", f"a rig has {', '.join(_PARTS)}")
+
+
+#: What every rig has.
+_PARTS = tuple(
+    name
+    for name, part in vars(Rig).items()
+    if not name.startswith("_") and (inspect.isfunction(part) or isinstance(part, property))
+)
+
+
+def _is_set(node: ast.Attribute) -> bool:
+    return isinstance(node.ctx, ast.Store) and isinstance(node.value, ast.Name) and node.value.id == "self"
 
 
 def _refuse(what: str, remedy: str) -> None:

@@ -8,6 +8,7 @@ from typing import Annotated, Literal, TypeAlias, get_args
 from pydantic import Field, model_validator
 
 from autotune.config.registers import RegisterMap, RegisterSettings
+from autotune.errors import InputError
 from autotune.schema import Number, Section
 
 
@@ -185,4 +186,22 @@ RigSettings: TypeAlias = Annotated[
 ]
 
 RIG_SETTINGS: tuple[type[Section], ...] = get_args(get_args(RigSettings)[0])
-RIG_KINDS = frozenset(get_args(model.model_fields["kind"].annotation)[0] for model in RIG_SETTINGS)
+
+
+def rig_kind_of(settings: type[Section]) -> str:
+    """Return what ``kind`` says in ``[rig]`` for settings.
+
+    Raises
+    ------
+    InputError
+        Settings without a ``kind``.
+    """
+    kind = settings.model_fields.get("kind")
+    if kind is None:
+        raise InputError(
+            f"{settings.__name__} has no kind", where="autotune/config/rig.py", remedy='add kind: Literal["NAME"]'
+        )
+    return str(get_args(kind.annotation)[0])
+
+
+RIG_KINDS = frozenset(rig_kind_of(model) for model in RIG_SETTINGS)

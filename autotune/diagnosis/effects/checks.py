@@ -57,6 +57,8 @@ def _of(kind: EffectKind) -> Iterator[tuple[str, str]]:
         yield "nothing would be simulated", "add lines=(Line(stage=..., does=...),) or linear=LinearPart(...)"
     if kind.sought in ("hypothesis", "rig", "structure") and not _has_starts(kind):
         yield "no fit would ever start", "give starts=lambda sizes: [...] or search=..."
+    if kind.sought in ("hypothesis", "rig") and not kind.confusable:
+        yield "no effect that it can be taken for", "give confusable=(...,) the names of those that can look alike"
     for rig in kind.odds:
         if rig not in (*get_args(RigKind), "any"):
             yield (

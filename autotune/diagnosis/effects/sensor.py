@@ -97,6 +97,7 @@ SENSOR = (
         parameters=(Quantity(name="fold", unit="{y}", role="threshold", sign="real"),),
         lines=(Line(stage="reading", does=folded),),
         starts=lambda s: [(s.y_low + c * (s.y_high - s.y_low),) for c in (0.005, 0.03, 0.1)],
+        confusable=("sensor.nonlinear_gain",),
         reference="a sensor that cannot tell the sign, as an encoder without direction",
     ),
     EffectKind(

@@ -137,7 +137,6 @@ class Problem:
         return column if bounded(column) else np.zeros_like(column)
 
     scales: FloatArray
-    reach: FloatArray
 
 
 def eliminate(
