@@ -117,7 +117,8 @@ def _bode(results: Sequence[Any], ax: Any, names: Sequence[str]) -> Any:
             known = any(curve.name == title for curve in curves)  # a model's own points need no second entry
             one.errorbar(at, value, yerr=bar, fmt="o", color=colour, label=None if known else title)
     for one, title in zip(pair, ("gain", "phase [deg]"), strict=False):
-        one.set(xscale="log", ylabel=title, xlabel="angular frequency [rad/s]")
+        one.set(xscale="log", ylabel=title)
+    pair[-1].set(xlabel="angular frequency [rad/s]")
     pair[0].set_yscale("log")
     pair[0].legend()
     return ax

@@ -15,7 +15,7 @@ from autotune.controller import DiscreteController, PIDController
 from autotune.design.margins import Margins
 from autotune.design.nugap import Validation
 from autotune.design.reference import Trajectory
-from autotune.design.specification import Design
+from autotune.design.specification import UNCERTAIN, Design
 from autotune.errors import InputError
 from autotune.identification.closed_loop.identify import ClosedLoopIdentification
 from autotune.identification.closed_loop.state_space import InnovationModel
@@ -101,6 +101,8 @@ def _(result: Design) -> tuple[str, Row, list[Row]]:
     rows.append(("binding", ", ".join(result.binding) or "none", ""))
     if result.h2_lower_bound is not None:
         rows.append(("least possible H2", _number(result.h2_lower_bound), ""))
+    if UNCERTAIN in result.certificate:
+        rows.append((result.certificate[result.certificate.index(UNCERTAIN) :],))
     return f"Design: {result.kind.upper()}", ("", "", "unit"), [*rows]
 
 
@@ -119,7 +121,8 @@ def _(result: Validation) -> tuple[str, Row, list[Row]]:
 def _(result: DelayModel) -> tuple[str, Row, list[Row]]:
     n, sd = result.order, result.standard_deviations
     names = [*(f"a{i}" for i in range(n)), "b", "delay [s]", "constant"]
-    rows = [(name, _number(v), _number(s)) for name, v, s in zip(names, result.values, sd, strict=False)]
+    # what a method estimates without a standard deviation has 0 there, which is not one
+    rows = [(name, _number(v), _number(s) if s else "") for name, v, s in zip(names, result.values, sd, strict=False)]
     rows.append(("noise sd", _number(result.noise_sd), ""))
     return f"x^({n}) = sum a_i x^(i) + b u(t - h)", ("", "value", "sd"), [*rows]
 
@@ -187,10 +190,16 @@ def html(result: Any) -> str:
     """Return a result's table for a notebook."""
     title, header, rows = rows_of(result)
     esc = escaping.escape
-    head = "".join(f"<th>{esc(cell)}</th>" for cell in header) if any(header) else ""
+    head = "".join(_head(header)) if any(header) else ""
     body = "".join("<tr>" + "".join(_cells(row, len(header))) + "</tr>" for row in rows)
     caption = f'<caption style="text-align: left; white-space: nowrap"><b>{esc(title)}</b></caption>'
     return f"<table>{caption}<thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
+
+
+def _head(header: Row) -> list[str]:
+    """Return the cells of the header, each above what it names."""
+    first, *others = (escaping.escape(cell) for cell in header)
+    return [f'<th style="text-align: left">{first}</th>', *(f"<th>{cell}</th>" for cell in others)]
 
 
 def _cells(row: Row, width: int) -> list[str]:

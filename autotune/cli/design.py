@@ -107,7 +107,7 @@ def design_command(
             seen = "; ".join(check.sentence for check in looked) or designed.certificate
             typer.echo(f"designed on the reduced model; checked: {seen}")
     else:
-        from autotune.design.robust import UNCERTAIN
+        from autotune.design.specification import UNCERTAIN
         from autotune.identification.frequency.thinning import said, thinned
         from autotune.identification.parametric import fit_plant
         from autotune.pipeline.analysis import of_use, on_measured

@@ -20,13 +20,11 @@ from autotune.design.kernels import evaluate, evaluate_grid
 from autotune.design.load_error import least_error, load_step
 from autotune.design.margins import Margins
 from autotune.design.search import minimised
-from autotune.design.specification import Design, Kind, Specification
+from autotune.design.specification import UNCERTAIN, Design, Kind, Specification
 from autotune.design.uncertain import UncertainPlant, guaranteed, uncertain_plant
 from autotune.errors import DesignError
 from autotune.points import FrequencyPoint
 
-#: what a certificate says of points that hardly agree with the class
-UNCERTAIN = "not certain:"
 #: the search begins on every so many-th frequency
 _THIN = 4
 #: from so many nodes of the coarse grid, apart from each other in log gains

@@ -17,6 +17,8 @@ from autotune.errors import DesignError
 Kind: TypeAlias = Literal["pi", "pid"]
 #: relative slack below which a constraint counts as binding
 _EQUAL = {"h2": 1e-4, "iae": 3e-3}
+#: what a certificate says of margins that need not hold on every plant that the measurements allow
+UNCERTAIN = "not certain:"
 
 
 @dataclass(frozen=True, kw_only=True)

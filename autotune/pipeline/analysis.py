@@ -18,8 +18,8 @@ from autotune.design.nugap import Validation, loop_scaling, validate
 from autotune.design.on_fit import CONTRADICTED, PROBABILITY, design_on_fit
 from autotune.design.on_reduced import design_on_reduced
 from autotune.design.plausibility import implausible
-from autotune.design.robust import UNCERTAIN, design_on_points
-from autotune.design.specification import Design, Kind, Specification
+from autotune.design.robust import design_on_points
+from autotune.design.specification import UNCERTAIN, Design, Kind, Specification
 from autotune.errors import AutotuneError, DesignError
 from autotune.identification.parametric import PlantFit, fit_plant
 from autotune.identification.reduction import ReducedModel, reduce_points

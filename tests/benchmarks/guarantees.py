@@ -28,8 +28,7 @@ import numpy as np
 from autotune.controller import PIDController
 from autotune.design.margins import margins
 from autotune.design.on_reduced import design_on_reduced
-from autotune.design.robust import UNCERTAIN
-from autotune.design.specification import Kind, Specification
+from autotune.design.specification import UNCERTAIN, Kind, Specification
 from autotune.design.synthesis import design
 from autotune.errors import AutotuneError
 from autotune.identification.parametric import PlantFit, fit_plant

@@ -7,6 +7,7 @@ import importlib
 import pkgutil
 import subprocess
 import sys
+from dataclasses import replace
 
 import control
 import matplotlib as mpl
@@ -141,7 +142,22 @@ def test_every_result_shows_itself_plots_and_becomes_a_frame(oven):
         legend = axes[0].get_legend()
         names = [text.get_text() for text in legend.get_texts()] if legend is not None else []
         assert len(names) == len(set(names))
+        assert [bool(axis.get_xlabel()) for axis in axes] == [False, True]
         plt.close(figure)
+
+
+def test_a_design_that_is_not_certain_shows_it():
+    design = at.tune(at.reduce(at.example("ball")), noise_gain=0.1, certificate=False)
+    said = "not certain: the points allow more plants than the fitted plant does"
+    assert "not certain" not in design._repr_html_()
+    assert said in replace(design, certificate=f"margins hold; {said}")._repr_html_()
+
+
+def test_what_has_no_standard_deviation_shows_none():
+    algebraic = at.delay(at.example("delay"), method="algebraic")
+    rows = {row[0]: row[2] for row in at.to_pandas(algebraic).to_numpy()}
+    assert rows["constant"] == ""
+    assert float(rows["b"]) > 0.0
 
 
 def test_a_remark_stands_once_over_the_whole_width_and_a_real_pole_without_imaginary_part():
