@@ -113,7 +113,8 @@ class Output:
     Parameters
     ----------
     out : Path
-        Place of the file; its folder is made where it is missing. A device such as ``/dev/stdout`` is written to.
+        Place of the file; a folder that is missing is made when it is written. A device such as ``/dev/stdout`` is
+        written to.
     inputs : sequence of Path or None
         Files that the command reads; their sidecars count as well.
     overwrite : bool
@@ -129,8 +130,7 @@ class Output:
         _claim(out, inputs, overwrite)
         self.path, self._overwrite = out, overwrite
         if not _is_special(out):
-            with _beside(_folder(out.parent)):
-                pass
+            _prove(out.parent)
 
     def by(self, write: Callable[[Path], object]) -> None:
         """Have a function write the file at the path that it is given; then move it to its place.
@@ -141,7 +141,7 @@ class Output:
             It cannot be written; what was there before still is.
         """
         special = _is_special(self.path)
-        with _beside(Path(tempfile.gettempdir()) if special else self.path.parent) as folder:
+        with _beside(Path(tempfile.gettempdir()) if special else _folder(self.path.parent)) as folder:
             write(folder / self.path.name)
             if special:
                 with _told(self.path):
@@ -164,7 +164,7 @@ class OutputFolder:
     Parameters
     ----------
     out : Path
-        Folder; made where it is missing. Other files in it stay as they are.
+        Folder; where it is missing it is made when it is filled. Other files in it stay as they are.
     names : sequence of str
         The files.
     inputs, overwrite
@@ -182,13 +182,12 @@ class OutputFolder:
         for name in names:
             _claim(out / name, inputs, overwrite)
         self.path, self._names, self._overwrite = out, tuple(names), overwrite
-        with _beside(_folder(out)):
-            pass
+        _prove(out)
 
     @contextmanager
     def filled(self) -> Iterator[Path]:
         """Yield a folder in which to write the files; they are moved to their places when the block ends well."""
-        with _beside(self.path) as folder:
+        with _beside(_folder(self.path)) as folder:
             yield folder
             for name in self._names:
                 if (folder / name).exists():
@@ -252,6 +251,20 @@ def _folder(folder: Path) -> Path:
     with _told(folder):
         folder.mkdir(parents=True, exist_ok=True)
     return folder
+
+
+def _prove(folder: Path) -> None:
+    """Show that a folder can be made and written to, and leave nothing of it: what is refused later leaves none."""
+    missing = []
+    with _told(folder):
+        missing = [one for one in (folder, *folder.parents) if not one.exists()]
+    try:
+        with _beside(_folder(folder)):
+            pass
+    finally:
+        for one in missing:
+            with contextlib.suppress(OSError):  # somebody else may have begun to use it
+                one.rmdir()
 
 
 @contextmanager

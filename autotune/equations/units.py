@@ -86,7 +86,8 @@ def check_units(model: EquationModel) -> None:
     given: dict[str, str] = {one.column: one.unit for one in model.inputs}
     given |= {one.name: one.unit for one in model.states}
     given |= {one.name: one.unit for one in model.parameters} | {one.name: one.unit for one in model.ports}
-    if not any(given.values()):
+    _check_effects(model)
+    if not any(given.values()) and not model.output_unit:
         return
     known: dict[str, Unit | None] = {"pi": _ONE, "t": _parsed("s")}
     for name, text in given.items():
@@ -105,6 +106,13 @@ def check_units(model: EquationModel) -> None:
     where = f"{model.name}: [output] value"
     wanted = parse_unit(model.output_unit, where) if model.output_unit else None
     _compare(_Walk(known, where).unit(model.output), wanted, where)
+
+
+def _check_effects(model: EquationModel) -> None:
+    """Refuse a unit of an effect's parameter that is not known; what it should be, the effect's equation says."""
+    for effect in model.effects:
+        for key, one in effect.parameters.items():
+            parse_unit(one.unit, f"{model.name}: {effect.name} {key}")
 
 
 def _compare(found: Unit | None, wanted: Unit | None, where: str) -> None:

@@ -75,6 +75,17 @@ def test_the_files_of_a_folder_come_together_or_not_at_all(tmp_path: Path) -> No
         OutputFolder(tmp_path / "out", ("a.json", "b.html"))
 
 
+def test_what_is_refused_after_its_place_was_claimed_leaves_no_folder(tmp_path: Path) -> None:
+    (tmp_path / "there").mkdir()
+    one, several = Output(tmp_path / "new" / "deep" / "a.json"), OutputFolder(tmp_path / "there" / "out", ("b.json",))
+    assert [file.name for file in tmp_path.rglob("*")] == ["there"]
+    one.json({})
+    with several.filled() as folder:
+        (folder / "b.json").write_text("1")
+    assert (tmp_path / "new" / "deep" / "a.json").exists()
+    assert (tmp_path / "there" / "out" / "b.json").exists()
+
+
 def test_a_result_that_is_not_finite_is_no_result(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="not finite"):
         write_json(tmp_path / "a.json", {"K": float("nan")})

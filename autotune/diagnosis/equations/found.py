@@ -10,14 +10,15 @@ from typing import Any, Literal
 
 import numpy as np
 
+from autotune.arrays import BoolArray
 from autotune.controller import Controller
 from autotune.diagnosis.effects import KINDS, kind_of
 from autotune.diagnosis.equations.bench import Bench, EquationBench, Outcome
 from autotune.diagnosis.equations.closed import ClosedBench
 from autotune.diagnosis.equations.search import Searched, search
 from autotune.diagnosis.evidence.law import law_effect
-from autotune.diagnosis.evidence.readings import converter_step
-from autotune.diagnosis.evidence.samples import SampleEffect, inspect, spared
+from autotune.diagnosis.evidence.readings import converter_step, struck
+from autotune.diagnosis.evidence.samples import SampleEffect, inspect, outliers_in, spared, together
 from autotune.diagnosis.result import NextExperiment
 from autotune.diagnosis.selection.probability import Candidate, weighed
 from autotune.diagnosis.thresholds import IN_USE, Thresholds
@@ -90,7 +91,8 @@ class EquationDiagnosis:
             "schema": 1,
             "verdict": self.verdict,
             "effects": [
-                _effect_table(e, p, model, whole) for e, p in zip(self.effects, self.probabilities, strict=True)
+                _effect_table(e, p, _sits(e, self.searched), model, whole)
+                for e, p in zip(self.effects, self.probabilities, strict=True)
             ] + [_sample_table(s, whole) for s in self.samples],
             "candidates": [{"name": c.name, "probability": round(c.probability, 4)} for c in self.candidates],
             "places": list(self.places),
@@ -112,10 +114,12 @@ class EquationDiagnosis:
         path.write_text(json.dumps(self.as_json(), indent=2) + "\n", encoding="utf-8")
 
 
-def _effect_table(e: Effect, p: float, model: EquationModel, whole: list[list[float]]) -> dict[str, Any]:
+def _effect_table(
+    e: Effect, p: float, places: tuple[str, ...], model: EquationModel, whole: list[list[float]]
+) -> dict[str, Any]:  # fmt: skip
     shown = {k: q for k, q in e.parameters.items() if np.isfinite(q.sd) and q.sd != 0.0} or dict(e.parameters)
     return {
-        "name": e.name, "probability": round(p, 4), "places": list(_places(e.name)),
+        "name": e.name, "probability": round(p, 4), "places": list(places),
         "parameters": {
             k: {"value": q.value, "sd": q.sd if np.isfinite(q.sd) else None, "unit": q.unit} for k, q in shown.items()
         },
@@ -136,6 +140,16 @@ def _sample_table(s: SampleEffect, whole: list[list[float]]) -> dict[str, Any]:
 
 def _places(name: str) -> tuple[str, ...]:
     return kind_of(name).may_sit if name in KINDS else (name.split(".")[0],)
+
+
+def _sits(effect: Effect, found: Searched) -> tuple[str, ...]:
+    """Return where an effect may sit, and where one does that is the same as it on these recordings."""
+    places, best = dict.fromkeys(_places(effect.name)), found.score(found.chosen)
+    same = kind_of(effect.name).same if effect.name in KINDS else ()
+    for one in found.tried:
+        if one.effects and one.effects[-1].name in same and found.score(one) - best < found.limits.equation_lead:
+            places |= dict.fromkeys(_places(one.effects[-1].name))
+    return tuple(places)
 
 
 def diagnose_equations(
@@ -187,13 +201,40 @@ def diagnose_equations(
         seen.append(law)
     own = {*without, *(effect.name for effect in model.effects)}
     seen = [one for one in seen if one.name not in own]
-    bench: Bench = (
-        ClosedBench(model, recordings, good) if isinstance(model, BlackBox) else EquationBench(model, recordings, good)
-    )
-    found = search(bench, [*without, *(s.name for s in seen)], progress, thresholds)
+    bench, found, seen = _searched(model, recordings, good, seen, without, progress, thresholds)
     progress("checking on held-out rows", 0.95)
     errors = _held_out(bench, found)
     return _judged(model, recordings, found, tuple(seen), errors)
+
+
+def _searched(
+    model: EquationModel | BlackBox, recordings: Sequence[Recording], good: list[BoolArray], seen: list[SampleEffect],
+    without: Sequence[str], progress: Progress, limits: Thresholds,
+) -> tuple[Bench, Searched, list[SampleEffect]]:  # fmt: skip
+    """Return the search, and what the samples show; searched again without spikes that its residual alone shows.
+
+    Where the reading moves from row to row by as much as its spikes, it shows only the largest of them, or none.
+    """
+
+    def searched() -> tuple[Bench, Searched]:
+        closed = isinstance(model, BlackBox)
+        bench: Bench = ClosedBench(model, recordings, good) if closed else EquationBench(model, recordings, good)
+        return bench, search(bench, [*without, *(s.name for s in seen)], progress, limits)
+
+    bench, found = searched()
+    if "sensor.outliers" in (*without, *(effect.name for effect in model.effects)):
+        return bench, found, seen
+    left = found.chosen.fitted.residuals
+    known = [ok & np.isfinite(e) for ok, e in zip(good, left, strict=True)]
+    outliers = outliers_in(left, recordings, known, limits)
+    if outliers is None:
+        return bench, found, seen
+    beside = [struck(e, ok, limits.spike) for e, ok in zip(left, known, strict=True)]
+    outliers = replace(outliers, rows=tuple(a | b for a, b in zip(outliers.rows, beside, strict=True)))
+    good = [ok & ~rows for ok, rows in zip(good, outliers.rows, strict=True)]
+    before = [one for one in seen if one.name == outliers.name]
+    seen = [*(one for one in seen if one.name != outliers.name), together([*before, outliers])]
+    return (*searched(), seen)
 
 
 def _judged(
@@ -216,7 +257,7 @@ def _judged(
         verdict = "none"
     candidates = _candidates(found, 1.0 if verdict == "unexplained" else limits.unknown_odds)
     named = tuple(added) if verdict == "effect" else ()
-    places = dict.fromkeys(p for e in named for p in _places(e.name)) | dict.fromkeys(
+    places = dict.fromkeys(p for e in named for p in _sits(e, found)) | dict.fromkeys(
         kind_of(s.name).place for s in seen
     )
     if verdict == "unexplained":

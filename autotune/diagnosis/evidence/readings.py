@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.ndimage import median_filter
 
 from autotune.arrays import BoolArray, FloatArray, IntArray
 from autotune.diagnosis.thresholds import Thresholds
@@ -125,6 +126,33 @@ def spikes(y: FloatArray, good: BoolArray, sds: float = Thresholds.spike, least_
     peak = (size > sds * spread) & (size >= np.roll(size, 1)) & (size >= np.roll(size, -1))
     opposed = np.minimum(-np.roll(d, 1) * np.sign(d), -np.roll(d, -1) * np.sign(d)) > 0.2 * size
     found[peak & opposed & good] = True
+    return found
+
+
+def struck(residual: FloatArray, good: BoolArray, sds: float = Thresholds.spike) -> BoolArray:
+    """Return the rows, one or two in a row, that stand out of the median of the seven around them.
+
+    For what a simulation leaves where lone spikes are known: two beside each other are not alone. Of readings that
+    move, a corner would stand out as well.
+
+    Parameters
+    ----------
+    residual : (N,) array
+        Reading less simulation.
+    good : (N,) bool array
+        Rows that count.
+    sds : float
+        Robust standard deviations.
+    """
+    found = np.zeros(residual.size, dtype=bool)
+    if residual.size < 8 or good.sum() < 8:
+        return found
+    filled = np.interp(np.arange(residual.size), np.flatnonzero(good), residual[good])
+    d = np.abs(filled - median_filter(filled, size=7, mode="nearest"))
+    spread = 1.4826 * float(np.median(d))
+    out = good & (d > sds * spread) if spread > 0.0 else found
+    for a, b in runs_of(out):
+        found[a:b] = b - a <= 2
     return found
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -126,6 +126,20 @@ def outliers_in(
     heights = np.concatenate([np.abs(v - _neighbours(v, g))[s] for (v, g), s in zip(pairs, lone, strict=True)])
     unit = str(recordings[0].metadata.get("units", {}).get("y", ""))
     return _outliers(recordings, lone, count / total, float(np.median(heights)), unit)
+
+
+def together(found: Sequence[SampleEffect]) -> SampleEffect:
+    """Return outliers that were found one after the other as one effect; the last ones' size, all their shares."""
+    last = found[-1]
+    share = sum(one.parameters["share"].value for one in found)
+    sd = float(np.sqrt(sum(one.parameters["share"].sd ** 2 for one in found)))
+    return replace(
+        last,
+        parameters={**last.parameters, "share": replace(last.parameters["share"], value=share, sd=sd)},
+        evidence=sum(one.evidence for one in found),
+        windows=tuple(sorted(window for one in found for window in one.windows)),
+        rows=tuple(np.logical_or.reduce(rows) for rows in zip(*(one.rows for one in found), strict=True)),
+    )
 
 
 def spared(recordings: Sequence[Recording], effects: Sequence[SampleEffect]) -> list[BoolArray]:

@@ -26,6 +26,13 @@ def parameter(name: str, **entries: Any) -> dict[str, Any]:
     return PENDULUM["parameters"] | {name: PENDULUM["parameters"][name] | entries}
 
 
+def without_units(**tables: Any) -> dict[str, Any]:
+    """Return the pendulum with no unit but those of the tables that are replaced."""
+    bare = [{key: value for key, value in one.items() if key != "unit"} for one in PENDULUM["state"]]
+    numbers = {name: one["value"] for name, one in PENDULUM["parameters"].items()}
+    return {**PENDULUM, "input": [{"column": "u"}], "state": bare, "parameters": numbers, **tables}
+
+
 @pytest.mark.parametrize(
     ("content", "says"),
     [
@@ -43,6 +50,19 @@ def parameter(name: str, **entries: Any) -> dict[str, Any]:
         (changed(state=states("(u + theta)/J")), "only like units can be added"),
         (changed(output={"value": "theta", "unit": "deg"}), "times the one that is wanted"),
         (changed(output={"unit": "rad"}), "value is missing"),
+        (without_units(output={"value": "theta", "unit": "fulrong"}), "the unit 'fulrong' is not known"),
+        (
+            changed(
+                effect=[
+                    {
+                        "name": "plant.coulomb_friction",
+                        "state": "omega",
+                        "parameters": {"level": {"value": 0.1, "unit": "fulrong"}},
+                    }
+                ]
+            ),
+            "plant.coulomb_friction level: the unit 'fulrong' is not known",
+        ),
         (changed(parameters=parameter("J", value="big")), "value = 'big'"),
         (changed(parameters=parameter("J", spread=-1.0)), "spread = -1"),
         (changed(parameters=PENDULUM["parameters"] | {"u": 1.0}), "'u' is both input and parameter"),

@@ -86,3 +86,22 @@ def test_investigate_says_that_it_plans_for_chains(tmp_path: Path) -> None:
     assert isinstance(run.exception, InputError)
     assert "these are equations" in str(run.exception)
     assert "\n" not in str(run.exception)
+
+
+def test_spikes_smaller_than_the_reading_moves_are_found_in_what_a_simulation_leaves(tmp_path: Path) -> None:
+    """Two beside each other as well: half of the variance that is left is theirs."""
+    rng = np.random.default_rng(8)
+    quick = one_state("b*u - a*x", {"a": 8.0, "b": 8.0})
+    t, u = DT * np.arange(900), np.repeat(rng.uniform(-1.0, 1.0, 300), 3)
+    x, y, kept = 0.0, np.empty(900), np.exp(-8.0 * DT)
+    for k in range(900):
+        y[k] = x + 0.005 * rng.normal()
+        x = kept * x + (1.0 - kept) * u[k]
+    struck = np.array([80, 200, 201, 333, 460, 461, 590, 742, 811])
+    y[struck] += 0.09 * rng.choice([-1.0, 1.0], struck.size)
+    found = diagnose_equations(quick, [Recording(t=t, u=u, y=y)])
+    assert found.verdict == "effect"
+    (outliers,) = found.samples
+    assert outliers.name == "sensor.outliers"
+    assert set(np.flatnonzero(outliers.rows[0])) == set(struck)
+    assert found.effects == ()
