@@ -217,8 +217,11 @@ def _searched(
     """
 
     def searched() -> tuple[Bench, Searched]:
-        closed = isinstance(model, BlackBox)
-        bench: Bench = ClosedBench(model, recordings, good) if closed else EquationBench(model, recordings, good)
+        bench: Bench = (
+            ClosedBench(model, recordings, good)
+            if isinstance(model, BlackBox)
+            else EquationBench(model, recordings, good)
+        )
         return bench, search(bench, [*without, *(s.name for s in seen)], progress, limits)
 
     bench, found = searched()
