@@ -10,20 +10,19 @@ import numpy as np
 
 from autotune.controller import Controller
 from autotune.diagnosis.effects import kind_of, require_known
-from autotune.diagnosis.evidence.adequacy import is_white, residual_tests
-from autotune.diagnosis.evidence.constancy import largest_variation
+from autotune.diagnosis.evidence.adequacy import residual_tests
+from autotune.diagnosis.evidence.beside_chain import beside_chain
 from autotune.diagnosis.evidence.description import describe
 from autotune.diagnosis.evidence.held_out import held_out
-from autotune.diagnosis.evidence.jitter import jitter_effect
-from autotune.diagnosis.evidence.law import law_effect
+from autotune.diagnosis.evidence.operating_point import offset_of, unmoved
 from autotune.diagnosis.evidence.sample_gain import is_material, supported
 from autotune.diagnosis.evidence.samples import SampleEffect, inspect, outliers_in, spared
 from autotune.diagnosis.evidence.stamps import evened
-from autotune.diagnosis.findings import extended_model, found_effects, offset_of
+from autotune.diagnosis.findings import extended_model, found_effects
 from autotune.diagnosis.fitting.fit import RUNAWAY
-from autotune.diagnosis.fitting.retuning import prepare, reduced_chi2
+from autotune.diagnosis.fitting.retuning import prepare
 from autotune.diagnosis.result import Diagnosis
-from autotune.diagnosis.selection.rig_search import search_rig, unmoved
+from autotune.diagnosis.selection.rig_search import search_rig
 from autotune.diagnosis.selection.search import search
 from autotune.diagnosis.selection.searched import Search
 from autotune.diagnosis.thresholds import IN_USE, Thresholds
@@ -117,7 +116,8 @@ def _gathered(
     seen = _seen(model, recordings, [name for name in without if name not in own], thresholds)
     found, seen = _searched(model, recordings, seen, without, progress, thresholds)
     seen = [s for s in seen if s.name not in own]
-    others = [s for s in _others(found, recordings, controller, seen) if s.name not in without]
+    beside = beside_chain(found.retuned.fit, found.data, found.gained, recordings, controller, seen)
+    others = [s for s in beside if s.name not in without]
     others = others if late is None else [late, *(s for s in others if s.name != late.name)]
     # where single rows are disturbed, what is left beside them must explain more to be named; beside jitter nothing is
     if any(kind_of(s.name).sought == "residual" for s in others if s is not late):
@@ -224,27 +224,3 @@ def _require_rows(recordings: Sequence[Recording]) -> None:
         r.require_finite(("u",))
         if len(r) < LEAST_ROWS or np.isfinite(r.y).sum() < LEAST_ROWS:
             raise InputError(f"{len(r)} rows", where=r.name, remedy="a diagnosis needs at least 100 finite readings")
-
-
-def _others(
-    found: Search, recordings: Sequence[Recording], controller: Controller | None, seen: Sequence[SampleEffect]
-) -> list[SampleEffect]:
-    """Return what is no effect of the chain and explains the residual better than one: jitter, another control law."""
-    limits = found.data.thresholds
-    excluded = {name for s in seen for name in kind_of(s.name).excludes}
-    jitter = (
-        None if "timing.jitter" in excluded else jitter_effect(found.retuned.fit, recordings, limits.jitter_decrease)
-    )
-    if jitter is not None and largest_variation(found.retuned.fit, found.data).gain > jitter.evidence:
-        jitter = None  # what is left goes with a signal, and that grows with the slope too
-    both = [s for s in (jitter, law_effect(recordings, controller, limits)) if s is not None]
-    quick = not found.data.noise.ar or found.data.noise.ar[0] < limits.slow_noise
-    near = reduced_chi2(found.retuned.fit, found.data) < limits.coarse
-    # a stamp that is wrong disturbs single rows: effects of the chain would leave something slow as well
-    fast = is_white(found.retuned.fit, found.data) and quick and near
-    return [
-        s
-        for s in both
-        if (s.evidence > max(limits.samples_share * found.gained, limits.samples_sure) and fast)
-        or (s.evidence > found.gained and (s.name != "timing.jitter" or (quick and near)))
-    ]

@@ -11,11 +11,10 @@ import numpy as np
 
 from autotune.arrays import FloatArray
 from autotune.diagnosis.effects import kind_of
-from autotune.diagnosis.evidence.residual import shifts_by_window
+from autotune.diagnosis.evidence.operating_point import Offset
 from autotune.diagnosis.evidence.sample_gain import is_nearer
 from autotune.diagnosis.evidence.samples import SampleEffect
-from autotune.diagnosis.fitting.fit import Fit
-from autotune.diagnosis.result import FoundEffect, Offset, OperatingRange, Verdict
+from autotune.diagnosis.result import FoundEffect, OperatingRange, Verdict
 from autotune.diagnosis.selection.hypothesis import Hypothesis
 from autotune.diagnosis.selection.probability import Candidate
 from autotune.diagnosis.selection.searched import Search
@@ -26,30 +25,6 @@ from autotune.models import Effect, Model, Parameter
 #: The effect that every fit has as a free number.
 OFFSET = "actuator.offset"
 Window = tuple[int, float, float]
-
-
-def offset_of(result: Fit, sigmas: float = Thresholds.offset_sigmas) -> Offset | None:
-    """Return the operating point's shift where it is far outside its uncertainty.
-
-    A shift that wanders from window to window is none that stands: its uncertainty is that of the windows' mean.
-    """
-    for i, free in enumerate(result.parametrisation.free):
-        if free.kind == "u_offset":
-            variance = max(float(result.covariance[i, i]), 0.0)
-            sd = math.sqrt(max(variance, _variance_of_mean(shifts_by_window(result, i)))) * free.size
-            shift = result.theta[i] * free.size
-            if sd > 0.0 and abs(shift) > sigmas * sd and abs(shift) > 1e-3 * free.size:
-                return Offset(value=-shift, sd=sd)
-    return None
-
-
-def _variance_of_mean(x: FloatArray) -> float:
-    """Return the variance of the mean of values that follow one another, each like the one before."""
-    d = x - np.mean(x) if x.size > 3 else np.zeros(0)
-    if not np.any(d):
-        return 0.0
-    alike = float(np.clip(d[1:] @ d[:-1] / (d @ d), 0.0, 0.9))
-    return float(np.mean(d**2)) * (1.0 + alike) / (1.0 - alike) / x.size
 
 
 def probability_of(name: str, candidates: Sequence[Candidate], most: float = Thresholds.most_probable) -> float:

@@ -30,14 +30,6 @@ class OperatingRange:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Offset:
-    """A shift of the operating point with its 1-sigma [u]."""
-
-    value: float
-    sd: float
-
-
-@dataclass(frozen=True, kw_only=True)
 class FoundEffect:
     """An effect that was added to the model."""
 

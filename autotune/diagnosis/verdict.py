@@ -10,8 +10,9 @@ from autotune.diagnosis.effects import STRUCTURES, kind_of
 from autotune.diagnosis.evidence.adequacy import ResidualTests
 from autotune.diagnosis.evidence.description import Description
 from autotune.diagnosis.evidence.held_out import FitQuality, dominates
+from autotune.diagnosis.evidence.operating_point import Offset
 from autotune.diagnosis.evidence.samples import SampleEffect
-from autotune.diagnosis.result import FoundEffect, Offset, Verdict
+from autotune.diagnosis.result import FoundEffect, Verdict
 from autotune.diagnosis.selection.hypothesis import penalised
 from autotune.diagnosis.selection.judged import RigSearch
 from autotune.diagnosis.selection.parsimony import worth_adding

@@ -22,6 +22,7 @@ from autotune.arrays import BoolArray
 from autotune.diagnosis.effects import ALL, kind_of, taken_by
 from autotune.diagnosis.effects.base import EffectKind
 from autotune.diagnosis.effects.rigs import rig_kind
+from autotune.diagnosis.evidence.operating_point import unmoved
 from autotune.diagnosis.evidence.stretches import correlation_rows, rms
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import RUNAWAY, Fit, fit
@@ -102,17 +103,6 @@ def search_rig(
         chosen = bench.with_both_scales(simplest(found, limits.material))
         nominal, retuned, chosen = (one.spread_out() for one in (nominal, retuned, chosen))
         return RigSearch(nominal=nominal, retuned=retuned, judged=tuple(found), chosen=chosen)
-
-
-def unmoved(recordings: Sequence[Recording]) -> tuple[str, ...]:
-    """Return the effects that are not told from others where no command moves.
-
-    Those that act on the command are a constant there, and what only bends or delays the reading is the plant in other
-    coordinates.
-    """
-    if any(float(np.ptp(r.u)) > 0.0 for r in recordings):
-        return ()
-    return tuple(k.name for k in ALL if k.place == "actuator" or k.name == "timing.dead_time" or k.recoordinates)
 
 
 def _odds(

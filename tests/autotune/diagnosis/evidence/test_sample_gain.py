@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from autotune.diagnosis.evidence.adequacy import strongest_line
+from autotune.diagnosis.evidence.operating_point import offset_of
 from autotune.diagnosis.evidence.sample_gain import supported
 from autotune.diagnosis.evidence.samples import SampleEffect, inspect, outliers_in, spared
-from autotune.diagnosis.findings import offset_of
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import Fit
 from autotune.diagnosis.fitting.retuning import prepare
