@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from autotune.diagnosis.effects import CATALOGUE
 from autotune.diagnosis.evidence.samples import inspect
+from autotune.diagnosis.fitting.descent import freed_of
 from autotune.diagnosis.fitting.fit import fit
 from autotune.diagnosis.fitting.parameters import effect_with
 from autotune.diagnosis.fitting.retuning import holds, prepare, reduced_chi2
@@ -57,3 +60,23 @@ def test_a_spring_that_short_windows_forgive_is_found_on_longer_ones() -> None:
     assert found.chosen.names == ("plant.leak",)
     assert found.chosen.fit.model.effects[0].parameters["rate"].value == pytest.approx(0.00032 * GAIN, rel=0.2)
     assert len(found.data.starts[0]) < 12
+
+
+@given(st.integers(0, 2**32 - 1), st.lists(st.integers(4, 30), min_size=1, max_size=6), st.integers(0, 3))
+def test_what_is_freed_of_start_states_is_orthogonal_to_what_they_explain_in_every_window(
+    seed: int, lengths: list[int], states: int
+) -> None:
+    random = np.random.default_rng(seed)
+    edges = np.cumsum([2, *(n + 1 for n in lengths)])  # a row between windows belongs to none
+    windows = np.column_stack([edges[:-1], edges[:-1] + lengths])
+    direction, Q = random.normal(size=int(edges[-1])), np.zeros((int(edges[-1]), states))
+    for number, (a, b) in enumerate(windows):
+        felt = states if number % 2 == 0 else states // 2  # some windows feel fewer of their states
+        Q[a:b, :felt] = np.linalg.qr(random.normal(size=(b - a, felt)))[0]
+    left = freed_of(direction, Q, windows)
+    inside = np.zeros(direction.size, dtype=bool)
+    for a, b in windows:
+        inside[a:b] = True
+        assert np.abs(Q[a:b].T @ left[a:b]).max(initial=0.0) < 1e-12
+        assert left[a:b] == pytest.approx(direction[a:b] - Q[a:b] @ (Q[a:b].T @ direction[a:b]))
+    assert np.array_equal(left[~inside], direction[~inside])
