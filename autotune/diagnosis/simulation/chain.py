@@ -201,11 +201,11 @@ def _arranged(
             direct[1] = 1.0
         if number == plant[-1] and number != plant[0]:
             direct[2] = 1.0
-        before = row.copy(), direct[0]
-        states = slice(at, at + n)
-        A[states, states] = a
-        A[states] += np.outer(b, row)
-        B[states] += np.outer(b, direct)
+        before, states = (row, direct[0]), slice(at, at + n)
+        if n:
+            A[states, states] = a
+            A[states] += b[:, None] * row
+            B[states] += b[:, None] * direct
         row = d * row
         row[states] += c
         direct = d * direct

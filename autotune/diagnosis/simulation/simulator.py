@@ -246,7 +246,8 @@ def _driven(recording: Recording) -> FloatArray:
 @lru_cache(maxsize=64)
 def _tables(chain: Chain, falling: Chain, step_s: float) -> FloatArray:
     """Return chains' transitions for a step: the same for all recordings, and for all effects that add no block."""
-    return np.stack([transition_table(one.A, one.B, step_s) for one in (chain, falling)])
+    rising = transition_table(chain.A, chain.B, step_s)
+    return np.stack((rising, rising if falling is chain else transition_table(falling.A, falling.B, step_s)))
 
 
 def _rows(windows: Windows | None, count: int) -> tuple[IntArray, int]:
