@@ -11,14 +11,20 @@ from dataclasses import replace
 import numpy as np
 
 from autotune.arrays import FloatArray
-from autotune.diagnosis.effects.base import ACTUATOR_LAG, EffectKind, Quantity, Scan, SignalSizes
+from autotune.diagnosis.effects.base import (
+    ACTUATOR_LAG,
+    NEVER,
+    EffectKind,
+    Quantity,
+    Scan,
+    SignalSizes,
+    ends,
+)
 from autotune.diagnosis.effects.stages import Blocks, Line, LinearPart, Memory, Values
 from autotune.models import Block, TransferFunction
 
 _LJUNG = "Ljung, System Identification, 2nd ed., sec. 5.1"
 _ASTROM = "Astrom and Hagglund, Advanced PID Control, 2006, ch. 9"
-#: A limit that nothing reaches.
-NEVER = 1e18
 #: Steps of a converter that are tried, as shares of the standard deviation of u; how closely, as a share of a line's
 #: width over u; lines that are looked at, and followed.
 _STEPS_TRIED, _LINE_SHARE, _LINES_TRIED, _LINES_KEPT = (0.02, 3.0), 0.3, 24, 2
@@ -131,11 +137,18 @@ def without_zone(w: float, half_width: float) -> float:
     return w - min(max(w, -half_width), half_width)
 
 
-def curved(w: float, second_order: float, third_order: float) -> float:
-    """Return a command through a curved characteristic."""
-    w += second_order * w * w
-    w += third_order * w * w * w
-    return w
+def curved(w: float, second_order: float, third_order: float, low: float, high: float) -> float:
+    """Return a command through a curved characteristic, which runs straight on beyond its ends."""
+    c = min(max(w, low), high)
+    bent = c + second_order * c * c
+    bent += third_order * bent * bent * bent
+    return w + (bent - c)
+
+
+def _rises(values: Values, w: float) -> bool:
+    """Whether a curved characteristic still rises."""
+    bent = w + values["second_order"] * w * w
+    return (1.0 + 2.0 * values["second_order"] * w) * (1.0 + 3.0 * values["third_order"] * bent * bent) > 0.0
 
 
 def limited(w: float, offset: float, low: float, high: float) -> float:
@@ -242,8 +255,10 @@ ACTUATOR = (
         parameters=(
             Quantity(name="second_order", unit="1/{u}", role="amplitude", sign="real", neutral=0.0),
             Quantity(name="third_order", unit="1/{u}^2", role="amplitude", sign="real", neutral=0.0),
+            *ends("{u}"),
         ),
         lines=(Line(stage="command", does=curved),),
+        goes_on=_rises,
         starts=lambda s: [(0.05 / s.w, 1e-3 / s.w**2), (1e-3 / s.w, 0.05 / s.w**2)],
         confusable=("actuator.saturation", "sensor.nonlinear_gain"),
         odds={"any": 0.1, "arm": 0.5, "speed": 0.15, "carriage": 0.03, "thermal": 0.05, "shaft": 0.05, "valve": 0.05},

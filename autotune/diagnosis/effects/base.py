@@ -236,6 +236,18 @@ class Fitted:
     mechanical: bool
 
 
+#: A limit that nothing reaches.
+NEVER = 1e18
+
+
+def ends(unit: str) -> tuple[Quantity, Quantity]:
+    """Return the two marks beyond which a law adds what it adds there."""
+    return (
+        Quantity(name="low", unit=unit, role="mark", sign="real", neutral=-NEVER),
+        Quantity(name="high", unit=unit, role="mark", sign="real", neutral=NEVER),
+    )
+
+
 Starts: TypeAlias = Callable[[SignalSizes], list[tuple[float, ...]]]
 
 
@@ -313,6 +325,10 @@ class EffectKind:
         Effects that are this one with numbers at their ends: neither is added beside the other.
     places : tuple of str
         Where it may sit, several where command and measurement cannot say; its own by default.
+    goes_on : callable, optional
+        Given values, the plant's ``gain`` among them, and how far its signal is from the operating point, whether its
+        law goes on there beyond what was recorded: it neither turns back nor feeds what it acts on. Its last two
+        parameters are then :func:`ends`, marks of an extended model beyond which it adds what it adds there.
     odds : mapping
         Prior odds that a rig of a kind (:mod:`autotune.diagnosis.effects.rigs`; ``any`` for all others) has it and its
         model lacks it. They count where model error and not noise decides; without odds it is not considered there.
@@ -349,6 +365,7 @@ class EffectKind:
     recoordinates: bool = False
     includes: tuple[str, ...] = ()
     places: tuple[str, ...] = ()
+    goes_on: Callable[[Values, float], bool] | None = None
     odds: Mapping[str, float] = field(default_factory=dict, hash=False, compare=False)
 
     @property

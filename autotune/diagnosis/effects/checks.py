@@ -50,6 +50,8 @@ def _of(kind: EffectKind) -> Iterator[tuple[str, str]]:
         if q.role not in get_args(Role):
             yield f"parameter {q.name!r} has no role {q.role!r}", f"its role is one of {', '.join(get_args(Role))}"
     yield from _units(kind)
+    if (kind.goes_on is not None) is not ([q.name for q in kind.parameters[-2:]] == ["low", "high"] and _marks(kind)):
+        yield "goes_on and ends() go together", "end parameters with *ends(UNIT) and give goes_on, or give neither"
     observed = all(q.role == "observed" for q in kind.parameters)
     if observed and kind.is_simulated:
         yield "a simulated effect has observed parameters", "give its parameters the roles that a search needs"
@@ -68,6 +70,11 @@ def _of(kind: EffectKind) -> Iterator[tuple[str, str]]:
     if kind.is_simulated:
         yield from _simulated(kind)
     yield from _starts(kind)
+
+
+def _marks(kind: EffectKind) -> bool:
+    """Whether the last two parameters are marks, not limits that a fit moves."""
+    return all(q.role == "mark" for q in kind.parameters[-2:])
 
 
 def _units(kind: EffectKind) -> Iterator[tuple[str, str]]:

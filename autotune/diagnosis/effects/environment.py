@@ -7,8 +7,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from autotune.diagnosis.effects.actuator import NEVER
-from autotune.diagnosis.effects.base import EffectKind, Quantity, Scan
+from autotune.diagnosis.effects.base import NEVER, EffectKind, Quantity, Scan
 from autotune.diagnosis.effects.stages import Line, Values
 from autotune.models import Parameter
 

@@ -10,11 +10,12 @@ import math
 import numpy as np
 
 from autotune.arrays import FloatArray
-from autotune.diagnosis.effects.actuator import NEVER, limit_starts
+from autotune.diagnosis.effects.actuator import limit_starts
 from autotune.diagnosis.effects.base import (
     INTEGRATING,
     LEVEL,
     MECHANICAL,
+    NEVER,
     POSITION_STATE,
     RUBBING,
     TRAVEL,
@@ -22,6 +23,7 @@ from autotune.diagnosis.effects.base import (
     Fitted,
     Quantity,
     SignalSizes,
+    ends,
 )
 from autotune.diagnosis.effects.stages import Blocks, Line, LinearPart, Memory, Values
 from autotune.models import Block, Model, TransferFunction
@@ -55,14 +57,15 @@ def dragged(v: float, gain: float, coefficient: float) -> float:
     return -(coefficient * v * abs(v) / gain)
 
 
-def hardened(x: float, coefficient: float) -> float:
+def hardened(x: float, coefficient: float, low: float, high: float) -> float:
     """Return the force of a spring that grows with the cube of the travel."""
-    return -(coefficient * x * x * x)
+    c = min(max(x, low), high)
+    return -(coefficient * c * c * c)
 
 
-def weighed(w: float, x: float, slope: float) -> float:
+def weighed(w: float, x: float, slope: float, low: float, high: float) -> float:
     """Return what a gain over position adds to the plant's input."""
-    return slope * x * w
+    return slope * min(max(x, low), high) * w
 
 
 def cogging(
@@ -97,9 +100,9 @@ def radiated(x: float, gain: float, kelvin: float, coefficient: float) -> float:
     return -(coefficient * ((kelvin + x) ** 4 - kelvin**4 - 4.0 * kelvin**3 * x) / gain)
 
 
-def leaked(x: float, gain: float, rate: float) -> float:
+def leaked(x: float, gain: float, rate: float, low: float, high: float) -> float:
     """Return a leak as a force at the plant's input."""
-    return -(rate * x / gain)
+    return -(rate * min(max(x, low), high) / gain)
 
 
 def _excess(x: float, level: float) -> float:
@@ -250,8 +253,9 @@ PLANT = (
     EffectKind(
         name="plant.cubic_stiffness",
         equation="force = -coefficient x^3",
-        parameters=(Quantity(name="coefficient", unit="{f}/{y}^3", role="amplitude", sign="real"),),
+        parameters=(Quantity(name="coefficient", unit="{f}/{y}^3", role="amplitude", sign="real"), *ends("{y}")),
         lines=(Line(stage="force", does=hardened),),
+        goes_on=lambda values, x: values["coefficient"] * values["gain"] > 0.0,
         needs=TRAVEL,
         suits=TRAVEL,
         starts=lambda s: [(0.02 * s.f / s.x**3,), (0.3 * s.f / s.x**3,)],
@@ -262,8 +266,9 @@ PLANT = (
     EffectKind(
         name="plant.position_dependent_gain",
         equation="w -> w (1 + slope x)",
-        parameters=(Quantity(name="slope", unit="1/{y}", role="amplitude", sign="real"),),
+        parameters=(Quantity(name="slope", unit="1/{y}", role="amplitude", sign="real"), *ends("{y}")),
         lines=(Line(stage="force", does=weighed),),
+        goes_on=lambda values, x: 1.0 + values["slope"] * x > 0.0,
         starts=lambda s: [(0.02 / s.x,), (-0.02 / s.x,)],
         confusable=("plant.leak", "actuator.nonlinear_gain", "sensor.nonlinear_gain"),
         odds={"lifted": 0.2, "level": 0.02, "carriage": 0.003, "arm": 0.003, "shaft": 0.003},
@@ -358,8 +363,9 @@ PLANT = (
     EffectKind(
         name="plant.leak",
         equation="force = -rate x / gain: the plant loses what it has stored",
-        parameters=(Quantity(name="rate", unit="{v}/({y})", role="amplitude", sign="real"),),
+        parameters=(Quantity(name="rate", unit="{v}/({y})", role="amplitude", sign="real"), *ends("{y}")),
         lines=(Line(stage="force", does=leaked),),
+        goes_on=lambda values, x: values["rate"] > 0.0,
         suits=INTEGRATING,
         starts=lambda s: [(0.02 * abs(s.f * s.gain) / s.x,)],
         confusable=("plant.position_dependent_gain", "plant.cubic_stiffness"),

@@ -5,19 +5,26 @@ from __future__ import annotations
 import math
 
 from autotune.arrays import FloatArray
-from autotune.diagnosis.effects.actuator import NEVER, limit_starts
-from autotune.diagnosis.effects.base import EffectKind, Quantity
+from autotune.diagnosis.effects.actuator import limit_starts
+from autotune.diagnosis.effects.base import NEVER, EffectKind, Quantity, ends
 from autotune.diagnosis.effects.stages import Blocks, Line, LinearPart, Values
 from autotune.models import Block, TransferFunction
 
 _LJUNG = "Ljung, System Identification, 2nd ed., sec. 5.1"
 
 
-def curved(z: float, second_order: float, third_order: float) -> float:
-    """Return a reading through a curved characteristic."""
-    z += second_order * z * z
-    z += third_order * z * z * z
-    return z
+def curved(z: float, second_order: float, third_order: float, low: float, high: float) -> float:
+    """Return a reading through a curved characteristic, which runs straight on beyond its ends."""
+    c = min(max(z, low), high)
+    bent = c + second_order * c * c
+    bent += third_order * bent * bent * bent
+    return z + (bent - c)
+
+
+def _rises(values: Values, z: float) -> bool:
+    """Whether a curved characteristic still rises."""
+    bent = z + values["second_order"] * z * z
+    return (1.0 + 2.0 * values["second_order"] * z) * (1.0 + 3.0 * values["third_order"] * bent * bent) > 0.0
 
 
 def drifted(z: float, t: float, rate: float) -> float:
@@ -71,8 +78,10 @@ SENSOR = (
         parameters=(
             Quantity(name="second_order", unit="1/{y}", role="amplitude", sign="real", neutral=0.0),
             Quantity(name="third_order", unit="1/{y}^2", role="amplitude", sign="real", neutral=0.0),
+            *ends("{y}"),
         ),
         lines=(Line(stage="sensor", does=curved),),
+        goes_on=_rises,
         starts=lambda s: [(0.05 / s.x, 1e-3 / s.x**2), (1e-3 / s.x, 0.05 / s.x**2)],
         confusable=("actuator.nonlinear_gain", "plant.position_dependent_gain"),
         recoordinates=True,

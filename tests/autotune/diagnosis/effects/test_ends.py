@@ -1,0 +1,58 @@
+"""Laws of extended models beyond what was recorded: they go on for one span at most, and nothing runs away."""
+
+from __future__ import annotations
+
+from types import MappingProxyType
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from autotune.diagnosis import diagnose
+from autotune.diagnosis.effects import ALL
+from autotune.diagnosis.simulation.assembly import assemble
+from autotune.models import Block, Effect, Model, Parameter, Port, TransferFunction
+from autotune.recording import Recording
+
+ENDED = [kind.name for kind in ALL if kind.goes_on is not None]
+T = 0.02 * np.arange(3000)
+
+
+def plant(name: str, sizes: tuple[float, ...]) -> Model:
+    """Return a servo whose spring pulls back, with an effect that ends at -1 and 1."""
+    kind = next(k for k in ALL if k.name == name)
+    values = dict(zip([q.name for q in kind.parameters], (*sizes, -1.0, 1.0), strict=True))
+    effect = Effect(name=name, parameters=MappingProxyType({key: Parameter(value=v) for key, v in values.items()}))
+    spring = TransferFunction(num=(4.0,), den=(1.0, 1.2, 4.0))
+    speed = Block(name="servo", place="plant", dynamics=spring)
+    return Model(name="servo", input=Port(), output=Port(), blocks=(speed,), effects=(effect,))
+
+
+@pytest.mark.parametrize("name", ENDED)
+@given(first=st.floats(-0.8, 0.8), second=st.floats(-0.8, 0.8))
+def test_a_law_is_bounded_wherever_the_linear_model_is(name: str, first: float, second: float) -> None:
+    kind = next(k for k in ALL if k.name == name)
+    simulator = assemble(plant(name, (first, second)[: len(kind.parameters) - 2]))
+    u = 20.0 * np.sign(np.sin(0.9 * T))
+    drive, rest = Recording(t=T, u=u, y=0.0 * T, name="r"), np.zeros(simulator.order)
+    y, linear = (one.run(drive, rest)[0][:, 0] for one in (simulator, simulator.linear()))
+    assert float(np.abs(y).max()) < 4.0 * float(np.abs(linear).max())
+
+
+def test_the_ends_are_one_span_beyond_what_was_recorded_and_not_beyond_where_the_law_turns() -> None:
+    """tau dy/dt = -y + u - .15 u^2, solved exactly between samples, u in -2..2: the curve turns at u = 3.3."""
+    rng = np.random.default_rng(5)
+    u = np.repeat(rng.uniform(-2.0, 2.0, 60), 25)
+    keeps, y = np.exp(-0.05 / 0.4), np.zeros(u.size)
+    for k in range(u.size - 1):
+        y[k + 1] = keeps * y[k] + (1.0 - keeps) * (u[k] - 0.15 * u[k] ** 2)
+    recording = Recording(t=0.05 * np.arange(u.size), u=u, y=y + 0.01 * rng.normal(size=u.size), name="r")
+    lag = Block(name="lag", place="plant", dynamics=TransferFunction(num=(1.0,), den=(0.4, 1.0)))
+    found = diagnose(Model(name="process", input=Port(), output=Port(), blocks=(lag,)), [recording])
+    assert [e.name for e in found.effects] == ["actuator.nonlinear_gain"]
+    assert not {"low", "high"} & set(found.effects[0].parameters)
+    law = found.extended_model.effects[0].parameters
+    centre, span = found.extended_model.input.offset, float(np.ptp(u))
+    assert law["low"].value == pytest.approx(u.min() - span - centre, abs=0.05 * span)
+    assert law["high"].value == pytest.approx(1.0 / 0.3, rel=0.1)
