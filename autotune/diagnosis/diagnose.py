@@ -15,6 +15,7 @@ from autotune.diagnosis.evidence.beside_chain import beside_chain
 from autotune.diagnosis.evidence.description import describe
 from autotune.diagnosis.evidence.held_out import held_out
 from autotune.diagnosis.evidence.operating_point import offset_of, unmoved
+from autotune.diagnosis.evidence.own_noise import OwnNoise, own_noise
 from autotune.diagnosis.evidence.sample_gain import is_material, supported
 from autotune.diagnosis.evidence.samples import SampleEffect, inspect, outliers_in, spared
 from autotune.diagnosis.evidence.stamps import evened
@@ -185,17 +186,21 @@ def _searched(
 
 def _of_rig(evidence: Evidence, model: Model, without: Sequence[str], progress: Progress) -> Evidence:
     """Return the evidence of left-out stretches where the model's own error and not noise is what remains."""
-    limits, recordings = evidence.limits, evidence.search.data.recordings
-    barely = bool(evidence.search.chosen.names) and evidence.unknown_odds > limits.barely_noise
+    limits, recordings, found = evidence.limits, evidence.search.data.recordings, evidence.search
+    barely = bool(found.chosen.names) and evidence.unknown_odds > limits.barely_noise
     if evidence.residual.is_noise and not barely:
         return evidence
+    own = own_noise(found.retuned.fit, found.data)
     good = spared(recordings, evidence.samples)
     seen = [s.name for s in evidence.samples]
     try:
-        known = evidence.search.chosen.fit if evidence.explains_most and evidence.search.chosen.names else None
+        # a likelihood of noise that is nearly white says nothing beside a disturbance
+        known = found.chosen.fit if own is None and evidence.explains_most and found.chosen.names else None
         rig = search_rig(model, recordings, good, [*without, *seen], progress, limits, known)
     except RUNAWAY:
         return evidence
+    if not rig.chosen.names and own is not None:
+        return _disturbed(evidence, own)
     if not rig.chosen.names and evidence.residual.has_no_slow_part:
         return _without_effects(evidence)
     fit, data = rig.chosen.fit, rig.chosen.data
@@ -215,6 +220,13 @@ def _without_effects(evidence: Evidence) -> Evidence:
         quality=held_out(retuned, retuned, found.data),
         offset=None if evidence.offset is None else offset_of(retuned, limits.offset_sigmas),
     )
+
+
+def _disturbed(evidence: Evidence, own: OwnNoise) -> Evidence:
+    """Return the evidence where what is left is noise of its own, and stretches that were left out show no effect."""
+    plain = _without_effects(evidence)
+    offset = None if plain.offset is None else offset_of(own.fit, plain.limits.offset_sigmas)
+    return replace(plain, residual=own.residual, offset=offset, own=own)
 
 
 def _require_rows(recordings: Sequence[Recording]) -> None:

@@ -11,6 +11,7 @@ from autotune.diagnosis.evidence.adequacy import ResidualTests
 from autotune.diagnosis.evidence.description import Description
 from autotune.diagnosis.evidence.held_out import FitQuality, dominates
 from autotune.diagnosis.evidence.operating_point import Offset
+from autotune.diagnosis.evidence.own_noise import OwnNoise
 from autotune.diagnosis.evidence.samples import SampleEffect
 from autotune.diagnosis.result import FoundEffect, Verdict
 from autotune.diagnosis.selection.hypothesis import penalised
@@ -41,6 +42,8 @@ class Evidence:
         What stretches that were left out say, where the model's error and not noise decides.
     evened : bool
         Whether stamps were late, so that everything runs at even times.
+    own : OwnNoise, optional
+        What is left, where it is noise of its own colour.
     """
 
     search: Search
@@ -50,6 +53,7 @@ class Evidence:
     offset: Offset | None
     rig: RigSearch | None = None
     evened: bool = False
+    own: OwnNoise | None = None
 
     @property
     def limits(self) -> Thresholds:
@@ -77,12 +81,19 @@ class Evidence:
             return self.rig.candidates(self.limits)
         return candidates_of(self.search, self.unknown_odds)
 
+    @property
+    def numbers(self) -> float:
+        """Decrease of chi-square that retuning brings beside the nominal numbers."""
+        if self.own is not None:
+            return self.own.numbers
+        retuned = self.search.retuned.fit
+        return self.search.nominal.chi2 - retuned.chi2 - retuned.penalty
+
     @cached_property
     def facts(self) -> frozenset[str]:
         """What holds, in the words of the table."""
         found = self.search
-        best = min(found.all, key=penalised)
-        retuned, limits = found.retuned.fit, self.limits
+        best, limits = min(found.all, key=penalised), self.limits
         # a clock that jitters disturbs commands too, which leaves something slow: what varies is weighed against it
         jitter = sum(s.evidence for s in self.samples if kind_of(s.name).sought == "residual")
         holds = {
@@ -93,12 +104,13 @@ class Evidence:
             "samples": bool(self.samples),
             "adequate": self.residual.is_noise or self.explains_most,
             "constant": self.residual.is_constant,
-            "another structure": bool(STRUCTURES.keys() & set(best.names))
+            "another structure": self.own is None
+            and bool(STRUCTURES.keys() & set(best.names))
             and worth_adding(found.retuned, best, limits),
             "offset": self.offset is not None,
             "missing": self.residual.is_missing,
             "jitter explains more": self.residual.varies.gain < limits.lesser_share * jitter,
-            "wrong numbers": found.nominal.chi2 - retuned.chi2 - retuned.penalty > limits.numbers_decrease,
+            "wrong numbers": self.numbers > limits.numbers_decrease,
         }
         return frozenset(name for name, one in holds.items() if one)
 
@@ -193,4 +205,6 @@ def sentences_of(
             first = (
                 f"Something is missing that no candidate explains to within noise; it shows at the {', '.join(places)}."
             )
+    if evidence.own is not None:
+        return (first, evidence.own.sentence, errors)
     return (first, errors) if residual.is_constant else (first, residual.varies.sentence, errors)

@@ -49,6 +49,8 @@ WORDS: Mapping[str, tuple[str, str]] = {
     "environment.step_load": ("a load", "a load comes at a time and stays"),
     "environment.periodic_load": ("periodic load", "a load swings at a frequency of its own"),
     "environment.drifting_load": ("drifting load", "a load grows with time"),
+    "environment.gain_step": ("a switched gain", "from a time on a command does more, or less, than before"),
+    "environment.loss_step": ("a switched loss", "from a time on the plant loses more, or less, of what it has stored"),
     "environment.measured_input": ("another input", "a recorded column acts on the plant"),
     "controller.law": ("control law", "the command was computed by another law than the stated one"),
 }

@@ -384,6 +384,11 @@ class EffectKind:
         return bool(self.lines) or self.linear is not None
 
     @property
+    def is_event(self) -> bool:
+        """Whether it happens at a time that is searched."""
+        return any(q.is_time_of_change for q in self.parameters)
+
+    @property
     def is_rough(self) -> bool:
         """Whether thresholds make the criterion rough."""
         return self.nudge > 0.0

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from autotune.diagnosis.effects.base import NEVER, EffectKind, Quantity, Scan
+from autotune.diagnosis.effects.base import LEVEL, NEVER, EffectKind, Quantity, Scan
 from autotune.diagnosis.effects.stages import Line, Values
 from autotune.models import Parameter
 
@@ -29,6 +29,25 @@ def stepped(t: float, number: float, amplitude: float, time: float, end: float, 
     return amplitude if (recording < 0.0 or number == recording) and time <= t < end else 0.0
 
 
+def regained(w: float, t: float, number: float, change: float, time: float, end: float, recording: float) -> float:
+    """Return a command whose gain is another one from a time on."""
+    return w + stepped(t, number, change, time, end, recording) * w
+
+
+def opened(
+    x: float,
+    gain: float,
+    t: float,
+    number: float,
+    change: float,
+    time: float,
+    end: float,
+    recording: float,
+) -> float:
+    """Return what a loss that is larger from a time on takes, as a force at the plant's input."""
+    return -(stepped(t, number, change, time, end, recording) * x / gain)
+
+
 def swinging(t: float, in_phase: float, quadrature: float, frequency: float) -> float:
     """Return a sinusoidal load."""
     angle = 2.0 * math.pi * frequency * t
@@ -41,11 +60,20 @@ def growing(t: float, rate: float) -> float:
 
 
 def _step_times(scan: Scan) -> list[tuple[float, ...]]:
-    """Return the best step load: its time is searched on a grid, then around the best.
+    """Return the best step load."""
+    return _best_step(scan, _TRIED * scan.sizes.f_peak or 1.0)
+
+
+def _switch_times(scan: Scan) -> list[tuple[float, ...]]:
+    """Return the best step of a share."""
+    return _best_step(scan, _TRIED)
+
+
+def _best_step(scan: Scan, size: float) -> list[tuple[float, ...]]:
+    """Return the best step of a size: its time is searched on a grid, then around the best.
 
     It comes in one of the recordings, or in all at the same time (number -1), as a test that is repeated brings it.
     """
-    size = _TRIED * scan.sizes.f_peak or 1.0
 
     def best_of(times: list[tuple[int, float]]) -> tuple[float, tuple[float, ...]]:
         return max(scan.predicted([(size, t, NEVER, float(i)) for i, t in times]), key=lambda one: one[0])
@@ -103,16 +131,21 @@ def _as_amplitude(parameters: Mapping[str, Parameter]) -> dict[str, Parameter]:
     return shown
 
 
+def _step_of(name: str, unit: str) -> tuple[Quantity, ...]:
+    """Return the parameters of what changes at a time."""
+    return (
+        Quantity(name=name, unit=unit, role="amplitude", sign="real"),
+        Quantity(name="time", unit="s", role="location", sign="real", neutral=0.0),
+        Quantity(name="end", unit="s", role="mark", sign="real", neutral=math.inf),
+        Quantity(name="recording", unit="", role="mark", sign="real", neutral=-1.0),
+    )
+
+
 ENVIRONMENT = (
     EffectKind(
         name="environment.step_load",
         equation="force + amplitude from the time on",
-        parameters=(
-            Quantity(name="amplitude", unit="{f}", role="amplitude", sign="real"),
-            Quantity(name="time", unit="s", role="location", sign="real", neutral=0.0),
-            Quantity(name="end", unit="s", role="mark", sign="real", neutral=math.inf),
-            Quantity(name="recording", unit="", role="mark", sign="real", neutral=-1.0),
-        ),
+        parameters=_step_of("amplitude", "{f}"),
         lines=(Line(stage="load", does=stepped),),
         search=_step_times,
         acts_in=_acts_in,
@@ -153,5 +186,34 @@ ENVIRONMENT = (
         at_a_time=True,
         odds={"any": 0.03, "damper": 0},
         reference=_ASTROM,
+    ),
+    EffectKind(
+        name="environment.gain_step",
+        equation="w = (u - u0) (1 + change) from the time on: a pump, a voltage, another mode of working",
+        parameters=_step_of("change", ""),
+        lines=(Line(stage="command", does=regained),),
+        sought="rig",
+        search=_switch_times,
+        acts_in=_acts_in,
+        confusable=("environment.step_load", "actuator.gain_drift"),
+        places=_PLACES,
+        at_a_time=True,
+        odds={"any": 0.02, "thermal": 0.07, "level": 0.07, "speed": 0.04, "damper": 0.0},
+        reference=_ASTROM,
+    ),
+    EffectKind(
+        name="environment.loss_step",
+        equation="tau dx/dt = -(1 + change) x + gain w from the time on: a lid opened, a valve, water added",
+        parameters=_step_of("change", ""),
+        lines=(Line(stage="force", does=opened),),
+        sought="rig",
+        suits=LEVEL,
+        search=_switch_times,
+        acts_in=_acts_in,
+        confusable=("environment.step_load", "environment.gain_step"),
+        places=_PLACES,
+        at_a_time=True,
+        odds={"any": 0.02, "thermal": 0.07, "level": 0.07},
+        reference="Incropera and DeWitt, Fundamentals of Heat and Mass Transfer, ch. 5",
     ),
 )

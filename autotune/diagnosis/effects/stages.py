@@ -41,13 +41,13 @@ STAGES: Mapping[StageName, Stage] = {
     "clock": Stage(value=("elapsed",)),
     # the absolute command
     "converter": Stage(value=("u",), signals=("t",)),
-    # the command from the operating point on; ``offset`` is the command there
-    "command": Stage(value=("w",), signals=("offset", "dt", "t")),
-    # forces at the plant's input that no state changes; ``number`` is the recording's
+    # the command from the operating point on; ``offset`` is the command there, ``number`` the recording's
+    "command": Stage(value=("w",), signals=("offset", "dt", "t", "number")),
+    # forces at the plant's input that no state changes
     "load": Stage(signals=("t", "number"), is_force=True),
     # forces that go with plant input w, speed v, position or level x, first level, gain from force to speed or level;
     # ``kelvin`` is the absolute temperature at the operating point, were y one
-    "force": Stage(signals=("w", "v", "x", "level", "y_offset", "gain", "kelvin"), is_force=True),
+    "force": Stage(signals=("w", "v", "x", "level", "y_offset", "gain", "kelvin", "t", "number"), is_force=True),
     # what is remembered of a travel dx of the position, after every sub-step's first trial
     "travel": Stage(signals=("dx", "dt"), is_force=True),
     # level of a dry friction, which at most stops the motion

@@ -39,6 +39,8 @@ class ResidualTests:
         Penalised chi-square that the effects gained beside the retuned model.
     uneven : bool
         Whether samples show that some rows' noise is larger than others': the variance then says nothing.
+    of_its_own : bool
+        Whether it is noise of its own colour, that no signal of the rig is in; its variance then says nothing either.
     limits : Thresholds
         What decides between two findings.
     """
@@ -52,6 +54,7 @@ class ResidualTests:
     line: float = 0.0
     line_gain: float = 0.0
     uneven: bool = False
+    of_its_own: bool = False
     limits: Thresholds = field(default_factory=Thresholds)
 
     @property
@@ -77,13 +80,18 @@ class ResidualTests:
     @property
     def has_no_slow_part(self) -> bool:
         """Whether it is noise but for lines of its spectrum."""
-        even = self.uneven or self.reduced_chi2 < self.allowed
-        return even and self._is_white(self.limits.white) and self.is_constant
+        even = self.uneven or self.of_its_own or self.reduced_chi2 < self.allowed
+        return even and self.is_slowly_white and self.is_constant
+
+    @property
+    def is_slowly_white(self) -> bool:
+        """Whether it has no slow part beyond what chance brings."""
+        return self._is_white(self.limits.white)
 
     @property
     def is_missing(self) -> bool:
         """Whether its variance alone shows that something is missing."""
-        return not self.uneven and self.reduced_chi2 > self.limits.missing
+        return not (self.uneven or self.of_its_own) and self.reduced_chi2 > self.limits.missing
 
     @property
     def is_constant(self) -> bool:
@@ -112,6 +120,7 @@ class ResidualTests:
             "line": self.line,
             "line_gain": self.line_gain,
             "uneven": self.uneven,
+            "of_its_own": self.of_its_own,
             "varies": varies,
         }
 

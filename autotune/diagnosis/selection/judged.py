@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from autotune.arrays import FloatArray
+from autotune.diagnosis.effects import kind_of
 from autotune.diagnosis.evidence.constancy import largest_variation
 from autotune.diagnosis.evidence.held_out import FitQuality
 from autotune.diagnosis.evidence.stretches import advantage, judged_rows, rms
@@ -72,8 +73,11 @@ class Judged:
         """Whether it takes a share of another one's held-out error away, at one of the scales.
 
         What it has beyond the other one may have come to nothing on long windows: then short ones do not speak for it.
+        What happens at a time of its own explains a part of everything: it must take away more.
         """
         extra = set(self.names) - set(other.names)
+        if any(kind_of(name).is_event for name in extra):
+            share = max(share, self.data.thresholds.material_event)
         at_nothing = bool(extra) and extra <= vanished(Hypothesis(names=self.names, fit=self.fit))
         ratios = [float(self.long_squares.sum() / other.long_squares.sum())]
         if not at_nothing:

@@ -16,6 +16,10 @@ from autotune.diagnosis.fitting.retuning import far_from_prior
 from autotune.diagnosis.selection.hypothesis import Hypothesis, is_stand_in
 from autotune.diagnosis.selection.screening import freed
 
+#: Decrease of the cost for which a time of change is moved: of chi-square, or as a share of it where model error and
+#: not noise is its unit.
+LEAST_GAIN, LEAST_SHARE = 1.0, 0.02
+
 
 def polish(h: Hypothesis, data: Data, base: Fit, rounds: int = 4) -> Hypothesis | None:
     """Fit a hypothesis of the screening to all data; nothing where its simulation runs away on rows not screened."""
@@ -45,10 +49,10 @@ def _polish(h: Hypothesis, data: Data, base: Fit, rounds: int) -> Hypothesis:
         # thresholds make the criterion rough: a nudge brings a fit out of a local minimum
         again = fit(p, data, best.theta + shift * positive, best.x0, iterations=8, rounds=1, inherit=best)
         best = again if again.cost < best.cost else best
-    return replace(h, fit=_timed(best, data))
+    return replace(h, fit=timed(best, data))
 
 
-def _timed(result: Fit, data: Data) -> Fit:
+def timed(result: Fit, data: Data) -> Fit:
     """Move a time of change where a fit of everything else is better; a first-order look may take one far from it."""
     effects = result.parametrisation.model.effects
     found = [(i, q.name) for i, e in enumerate(effects) for q in kind_of(e.name).parameters if q.is_time_of_change]
@@ -59,7 +63,7 @@ def _timed(result: Fit, data: Data) -> Fit:
     while step > least:
         tried = [_moved(result, number, key, step * side, data) for side in (-1.0, 1.0)]
         best = min((t for t in tried if t is not None), key=lambda t: t.cost, default=result)
-        if best.cost < result.cost - 1.0:
+        if best.cost < result.cost - min(LEAST_GAIN, LEAST_SHARE * result.cost):
             result = best
         else:
             step /= 2.5

@@ -31,6 +31,7 @@ from autotune.diagnosis.fitting.parameters import parametrise
 from autotune.diagnosis.selection.growth import without
 from autotune.diagnosis.selection.hypothesis import hypothesis, is_stand_in
 from autotune.diagnosis.selection.judged import Judged, RigSearch, ranked, simplest
+from autotune.diagnosis.selection.polishing import timed
 from autotune.diagnosis.selection.prediction import extended, predictions, signal_sizes, starting_effects
 from autotune.diagnosis.selection.rig_bench import STEPS, RigBench
 from autotune.diagnosis.selection.scan import searched
@@ -245,6 +246,7 @@ def _added(start: _Start, bench: RigBench) -> Fit | None:
             result = fit(p, start.data, theta, states, iterations=steps, inherit=start.near)
             if start.data is not bench.long:
                 result = bench.settled(p, result.theta)
+            result = timed(result, bench.long)
         except RUNAWAY:
             continue
         if not is_stand_in(hypothesis(result), start.data):

@@ -109,12 +109,13 @@ def _tap(taps: FloatArray, row: int, x: FloatArray) -> float:
 
 
 @inlined
-def _state_force(x: FloatArray, w: float, linear: _Linear, effects: Effects) -> float:
+def _state_force(x: FloatArray, w: float, t: float, linear: _Linear, effects: Effects) -> float:
     """Return the state-dependent force for a state."""
     taps, numbers = linear.taps, linear.numbers
     plant_in = _tap(taps, PLANT_IN, x) + numbers[DIRECT_IN] * w
     v, position, level = _tap(taps, SPEED, x), _tap(taps, POSITION, x), _tap(taps, FIRST_LEVEL, x)
-    return float(force(plant_in, v, position, level, numbers[Y_OFFSET], numbers[GAIN], numbers[KELVIN], effects))
+    place = numbers[Y_OFFSET], numbers[GAIN], numbers[KELVIN]
+    return float(force(plant_in, v, position, level, place[0], place[1], place[2], t, linear.flags[NUMBER], effects))
 
 
 @inlined
@@ -129,20 +130,21 @@ def _rubbed(work: _Work, taps: FloatArray, effects: Effects) -> float:
 
 
 @inlined
-def _push(slot: int, w: float, push: float, dt: float, linear: _Linear, work: _Work, effects: Effects) -> None:
+def _push(slot: int, w: float, t: float, dt: float, linear: _Linear, work: _Work, effects: Effects) -> None:
     """Add to the force-free step what the forces do: Heun for smooth ones, implicit for dry friction."""
     M, taps, flags = linear.M, linear.taps, linear.flags
     x, free, column, end = work.x, work.free, work.column, work.end
     n = x.size
+    push = load(t + 0.5 * dt, flags[NUMBER], effects)
     total = push
     for i in range(n):
         column[i] = M[slot, i, n + 1]
     if flags[SMOOTH]:
-        before = _state_force(x, w, linear, effects)
+        before = _state_force(x, w, t, linear, effects)
         for i in range(n):
             end[i] = free[i] + column[i] * (before + push)
         travel(_tap(taps, POSITION, end) - _tap(taps, POSITION, x), dt, effects)
-        after = _state_force(end, w, linear, effects)
+        after = _state_force(end, w, t, linear, effects)
         total += 0.5 * (before + after)
     for i in range(n):
         free[i] += column[i] * total
@@ -243,7 +245,7 @@ def run(
         w = u[j] - u_offset
         # some effects remember all commands before the window
         while flags[REPLAYED] and past <= j:
-            command(converter(u[past], 0.0, before) - u_offset, u_offset, 0.0, 0.0, before)
+            command(converter(u[past], 0.0, before) - u_offset, u_offset, 0.0, 0.0, flags[NUMBER], before)
             past += 1
         begin(w, window > 0 and rows[1, window - 1] == first, carried, effects)
         at = rows[2, window] - first
@@ -286,12 +288,11 @@ def run(
                 for piece in range(pieces):
                     begin_s = now + piece * dt
                     absolute = converter(_held(driven, j, begin_s, dt, linear), begin_s - t[0], effects)
-                    w = command(absolute - u_offset, u_offset, dt, begin_s - t[0], effects)
+                    w = command(absolute - u_offset, u_offset, dt, begin_s - t[0], flags[NUMBER], effects)
                     use = slot + 2 if flags[DIRECTIONAL] and w < x[flags[ACTUATOR]] else slot
                     _advance(M, use, x, w, free)
                     if flags[FORCED]:
-                        push = load(begin_s + 0.5 * dt - t[0], flags[NUMBER], effects)
-                        _push(use, w, push, dt, linear, work, effects)
+                        _push(use, w, begin_s - t[0], dt, linear, work, effects)
                     x[:] = free
                     if flags[STOPPED]:
                         _stop(x, linear, effects)

@@ -47,7 +47,7 @@ def converter(u: float, t: float, effects: Effects) -> float:
 
 
 @inlined
-def command(w: float, offset: float, dt: float, t: float, effects: Effects) -> float:
+def command(w: float, offset: float, dt: float, t: float, number: int, effects: Effects) -> float:
     """Return what the first block receives."""
     return w
 
@@ -60,7 +60,16 @@ def load(t: float, number: int, effects: Effects) -> float:
 
 @inlined
 def force(
-    w: float, v: float, x: float, level: float, y_offset: float, gain: float, kelvin: float, effects: Effects
+    w: float,
+    v: float,
+    x: float,
+    level: float,
+    y_offset: float,
+    gain: float,
+    kelvin: float,
+    t: float,
+    number: int,
+    effects: Effects,
 ) -> float:
     """Return the state-dependent force at the plant's input, in that input's unit."""
     return 0.0
