@@ -14,7 +14,9 @@ from autotune.diagnosis.evidence.adequacy import residual_tests
 from autotune.diagnosis.evidence.beside_chain import beside_chain
 from autotune.diagnosis.evidence.description import describe
 from autotune.diagnosis.evidence.held_out import held_out
+from autotune.diagnosis.evidence.late_rows import JITTER, late_rows
 from autotune.diagnosis.evidence.operating_point import offset_of, unmoved
+from autotune.diagnosis.evidence.own_noise import OwnNoise, own_noise
 from autotune.diagnosis.evidence.own_noise import OwnNoise, own_noise
 from autotune.diagnosis.evidence.sample_gain import is_material, supported
 from autotune.diagnosis.evidence.samples import SampleEffect, inspect, outliers_in, spared
@@ -190,6 +192,9 @@ def _of_rig(evidence: Evidence, model: Model, without: Sequence[str], progress: 
     barely = bool(found.chosen.names) and evidence.unknown_odds > limits.barely_noise
     if evidence.residual.is_noise and not barely:
         return evidence
+    late = _late_rows(evidence, without)
+    if late is not None:
+        return late
     own = own_noise(found.retuned.fit, found.data)
     good = spared(recordings, evidence.samples)
     seen = [s.name for s in evidence.samples]
@@ -222,11 +227,25 @@ def _without_effects(evidence: Evidence) -> Evidence:
     )
 
 
-def _disturbed(evidence: Evidence, own: OwnNoise) -> Evidence:
-    """Return the evidence where what is left is noise of its own, and stretches that were left out show no effect."""
+def _late_rows(evidence: Evidence, without: Sequence[str]) -> Evidence | None:
+    """Return the evidence where rows that are late, and their commands with them, leave noise alone."""
+    found, excluded = evidence.search, {name for s in evidence.samples for name in kind_of(s.name).excludes}
+    if evidence.evened or JITTER in (*without, *excluded):
+        return None
+    late = late_rows(found.retuned.fit, found.data)
+    if late is None or late.evidence < found.gained:
+        return None
     plain = _without_effects(evidence)
-    offset = None if plain.offset is None else offset_of(own.fit, plain.limits.offset_sigmas)
-    return replace(plain, residual=own.residual, offset=offset, own=own)
+    samples = (*(s for s in evidence.samples if s.name != JITTER), late)
+    return replace(plain, samples=samples, residual=replace(plain.residual, accounted=True), offset=None)
+
+
+def _disturbed(evidence: Evidence, own: OwnNoise) -> Evidence:
+    """Return the evidence where what is left is noise of its own, and stretches that were left out show no effect.
+
+    Such a disturbance has a mean of its own in every recording: it is no offset.
+    """
+    return replace(_without_effects(evidence), residual=own.residual, offset=None, own=own)
 
 
 def _require_rows(recordings: Sequence[Recording]) -> None:

@@ -52,6 +52,8 @@ class Thresholds:
     least_equal_share: float = known(0.02, "of the rows", "that equal the one before, before rounding is named", "counted")
     least_rounding: float = known(0.05, "of the noise", "variance of a converter's rounding that matters", "convention")
     jitter_decrease: float = known(30.0, "chi2", "that the slope explains of the residual's size before jitter is named", "chance")
+    late_rows: float = known(30.0, "chi2", "that rows which are late with their commands explain before jitter is named", "chance")
+    late_rows_beside_load: float = known(10.0, "chi2", "the same beside a load that is noise: right ones bring 60 on, others less than none", "counted")
     samples_clear: float = known(4.0, "2 ln odds", "that runs of spoiled rows give, from which on no fit sees these rows", "convention")
     samples_sure: float = known(60.0, "chi2", "from which on what samples show is sure", "counted")
     samples_share: float = known(0.2, "of the gained", "that evidence of jitter or law must reach beside effects of the chain", "counted")

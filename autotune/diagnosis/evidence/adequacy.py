@@ -7,11 +7,13 @@ swings, bends or goes past the chain. The bounds stand where nothing that is rig
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
+from autotune.arrays import FloatArray
 from autotune.diagnosis.evidence.constancy import Variation, largest_variation
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import Fit
@@ -39,8 +41,8 @@ class ResidualTests:
         Penalised chi-square that the effects gained beside the retuned model.
     uneven : bool
         Whether samples show that some rows' noise is larger than others': the variance then says nothing.
-    of_its_own : bool
-        Whether it is noise of its own colour, that no signal of the rig is in; its variance then says nothing either.
+    accounted : bool
+        Whether a noise that is not white accounts for it: one of its own colour, or that of rows which are late.
     limits : Thresholds
         What decides between two findings.
     """
@@ -54,7 +56,7 @@ class ResidualTests:
     line: float = 0.0
     line_gain: float = 0.0
     uneven: bool = False
-    of_its_own: bool = False
+    accounted: bool = False
     limits: Thresholds = field(default_factory=Thresholds)
 
     @property
@@ -80,8 +82,8 @@ class ResidualTests:
     @property
     def has_no_slow_part(self) -> bool:
         """Whether it is noise but for lines of its spectrum."""
-        even = self.uneven or self.of_its_own or self.reduced_chi2 < self.allowed
-        return even and self.is_slowly_white and self.is_constant
+        even = self.uneven or self.reduced_chi2 < self.allowed
+        return self.accounted or (even and self.is_slowly_white and self.is_constant)
 
     @property
     def is_slowly_white(self) -> bool:
@@ -91,12 +93,14 @@ class ResidualTests:
     @property
     def is_missing(self) -> bool:
         """Whether its variance alone shows that something is missing."""
-        return not (self.uneven or self.of_its_own) and self.reduced_chi2 > self.limits.missing
+        return not (self.uneven or self.accounted) and self.reduced_chi2 > self.limits.missing
 
     @property
     def is_constant(self) -> bool:
         """Whether nothing swings, bends or goes past the chain in it, beside what the effects gained."""
-        return self.varies.gain < max(self.limits.inconstant, self.limits.inconstant_share * self.gained)
+        return self.accounted or self.varies.gain < max(
+            self.limits.inconstant, self.limits.inconstant_share * self.gained
+        )
 
     @property
     def is_lesser(self) -> bool:
@@ -120,7 +124,7 @@ class ResidualTests:
             "line": self.line,
             "line_gain": self.line_gain,
             "uneven": self.uneven,
-            "of_its_own": self.of_its_own,
+            "accounted": self.accounted,
             "varies": varies,
         }
 
@@ -170,8 +174,13 @@ def strongest_line(result: Fit, data: Data) -> tuple[float, float]:
     ----------
     Fisher, Proc. R. Soc. A 125, 1929: tests of significance in harmonic analysis.
     """
+    return line_in(data.whitened(list(result.residuals)))
+
+
+def line_in(parts: Sequence[FloatArray]) -> tuple[float, float]:
+    """Return the logarithm of the odds against chance, and chi2, of the strongest line in parts that are whitened."""
     odds = [(0.0, 0.0)]
-    for e in data.whitened(list(result.residuals)):
+    for e in parts:
         power = np.abs(np.fft.rfft(e * np.hanning(e.size))[2:-1]) ** 2
         middle = float(np.median(power)) / math.log(2.0) if power.size else 0.0
         if middle > 0.0:

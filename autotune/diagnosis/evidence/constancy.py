@@ -9,11 +9,13 @@ assumed of the swing's shape: a switch or a sweep has parts at those frequencies
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.signal import lfilter
 
 from autotune.arrays import FloatArray
 from autotune.diagnosis.evidence.residual import NEW, FreedResidual, Place, filled, last_known
@@ -21,11 +23,14 @@ from autotune.diagnosis.evidence.swings import Swinging, explained_by_swings
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import Fit
 from autotune.diagnosis.fitting.windows import model_lag_s
+from autotune.recording import Recording
 
 #: Fastest swing that is looked for, in cycles per slowest lag, and the most frequencies.
 FASTEST, MOST_FREQUENCIES = 0.3, 120
 #: Delays of an echo that is looked for, in slowest lags.
 ECHOES = (0.5, 0.75, 1.0, 1.35, 1.8, 2.4)
+#: Time constants of a linear path that is looked for.
+LAGS = 8
 #: A swing that explains this share of what the best one explains cannot be told from it: a slow one of the gain is the
 #: command's or the reading's.
 AS_MUCH = 0.9
@@ -173,6 +178,27 @@ def _paths(left: FreedResidual, lag_s: float) -> Iterator[tuple[Place, str, list
     for delay in (d * lag_s for d in ECHOES):
         past = [np.interp(r.t - delay, r.t, y) for y, r in zip(readings, recordings, strict=True)]
         yield "sensor", f"the reading {delay:.2g} s before, as an echo would", past
+
+
+def linear_gain(result: Fit, data: Data) -> float:
+    """Return the decrease of chi2 that any linear path from the command to the reading would bring, at most.
+
+    Lags from the sample time to the records' length, all at once: the largest of what they and the paths of a chain
+    explain is no more than chance where the model's linear dynamics are right.
+    """
+    left = FreedResidual(result, data)
+    e = left.beyond_numbers(left.e)
+    longest = max(r.duration_s for r in data.recordings)
+    lags = np.geomspace(2.0 * data.sample_times[0], longest / 4.0, LAGS)
+    columns = [left.shown("sensor", [_lagged(r, lag, result.sim.u_offset) for r in data.recordings]) for lag in lags]
+    return _explained(np.column_stack(columns), e, left) / (float(e @ e) / left.rows)
+
+
+def _lagged(r: Recording, lag_s: float, centre: float) -> FloatArray:
+    """Return the command through a lag, at rest before; the row's own command is not in it."""
+    keeps = math.exp(-r.sample_time_s / lag_s)
+    held = np.concatenate([r.u[:1], r.u[:-1]]) - centre
+    return np.asarray(lfilter([1.0 - keeps], [1.0, -keeps], held, zi=[keeps * held[0]])[0])
 
 
 def _columns(left: FreedResidual) -> Iterator[tuple[Place, str, list[FloatArray]]]:

@@ -15,10 +15,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from autotune.arrays import BoolArray, FloatArray
-from autotune.diagnosis.evidence.adequacy import ResidualTests, residual_tests
+from autotune.diagnosis.evidence.adequacy import ResidualTests, line_in, residual_tests
+from autotune.diagnosis.evidence.constancy import linear_gain
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import Fit, fit
 from autotune.diagnosis.fitting.noise import Noise, autoregressive
+from autotune.diagnosis.thresholds import Thresholds
 
 #: Highest order of the noise that is tried, times that noise and numbers are fitted in turn, and Gauss-Newton steps.
 ORDERS, TURNS, STEPS = 20, 2, 15
@@ -85,15 +87,16 @@ def own_noise(retuned: Fit, data: Data) -> OwnNoise | None:
         coloured = replace(coloured, noise=noise)
         result = fit(result.parametrisation, coloured, result.theta, result.x0, iterations=STEPS)
     left = residual_tests(result, coloured, 0.0)
-    shown = left.varies.gain > limits.inconstant or left.line > limits.line or not left.is_slowly_white
-    if shown or _uneven(coloured.whitened(list(result.residuals))) > limits.uneven_noise:
+    innovations = coloured.whitened(list(result.residuals))
+    shown = left.varies.gain > limits.inconstant or linear_gain(result, coloured) > limits.inconstant
+    if shown or left.line > limits.line or not left.is_slowly_white or not _is_steady(innovations, limits):
         return None
     offset = np.array([f.kind == "u_offset" for f in result.parametrisation.free])
     start = np.where(offset, result.theta, result.parametrisation.centre)
     nominal = fit(result.parametrisation, coloured, start, result.x0, iterations=STEPS, free=offset)
     return OwnNoise(
         fit=result,
-        residual=replace(left, of_its_own=True),
+        residual=replace(left, accounted=True),
         numbers=nominal.chi2 - result.chi2 - result.penalty,
         memory_s=_memory_rows(noise) * data.sample_times[0],
     )
@@ -118,9 +121,14 @@ def _memory_rows(noise: Noise) -> float:
     return max((slow / total) ** 2, 1.0) if total > 0.0 else 1.0
 
 
-def _uneven(innovations: Sequence[FloatArray]) -> float:
-    """Return the ratio of the largest to the smallest variance of innovations in parts of the recordings."""
-    parts = [part[part != 0.0] for e in innovations for part in np.array_split(e, PARTS)]
+def _is_steady(innovations: Sequence[FloatArray], limits: Thresholds) -> bool:
+    """Whether innovations are as large everywhere in the recordings, and no line stands in a part of them.
+
+    A load that sweeps has a line at every moment, and none in the whole.
+    """
+    parts = [part for e in innovations for part in np.array_split(e[e != 0.0], PARTS) if part.size >= LEAST_PART]
+    if line_in(parts)[0] > limits.line + math.log(max(len(parts), 1)):
+        return False
     # single rows far off are no louder part: the middle of the sizes is taken
-    sizes = [float(np.median(np.abs(part))) ** 2 for part in parts if part.size >= LEAST_PART]
-    return max(sizes) / max(min(sizes), 1e-300) if sizes else 1.0
+    sizes = [float(np.median(np.abs(part))) ** 2 for part in parts]
+    return not sizes or max(sizes) < limits.uneven_noise * min(sizes)
