@@ -17,7 +17,6 @@ from autotune.diagnosis.evidence.held_out import held_out
 from autotune.diagnosis.evidence.late_rows import JITTER, late_rows
 from autotune.diagnosis.evidence.operating_point import offset_of, unmoved
 from autotune.diagnosis.evidence.own_noise import OwnNoise, own_noise
-from autotune.diagnosis.evidence.own_noise import OwnNoise, own_noise
 from autotune.diagnosis.evidence.sample_gain import is_material, supported
 from autotune.diagnosis.evidence.samples import SampleEffect, inspect, outliers_in, spared
 from autotune.diagnosis.evidence.stamps import evened
