@@ -12,8 +12,8 @@ A recording passes the room in this order:
     what samples, the control law, the residual and rows that were not fitted say
 ``selection``
     hypotheses: predicted, screened, fitted, compared
-``verdict``, ``findings``, ``result``
-    the table from evidence to a verdict, and what is said
+``verdict``, ``findings``, ``extended``, ``result``
+    the table from evidence to a verdict, what is said, and the model to go on with
 
 :func:`diagnose` walks through it.
 """

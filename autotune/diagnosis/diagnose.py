@@ -20,7 +20,8 @@ from autotune.diagnosis.evidence.own_noise import OwnNoise, own_noise
 from autotune.diagnosis.evidence.sample_gain import is_material, supported
 from autotune.diagnosis.evidence.samples import SampleEffect, inspect, outliers_in, spared
 from autotune.diagnosis.evidence.stamps import evened
-from autotune.diagnosis.findings import extended_model, found_effects
+from autotune.diagnosis.extended import extended_model
+from autotune.diagnosis.findings import found_effects, places_of, sentences_of
 from autotune.diagnosis.fitting.fit import RUNAWAY
 from autotune.diagnosis.fitting.retuning import prepare
 from autotune.diagnosis.result import Diagnosis
@@ -28,7 +29,7 @@ from autotune.diagnosis.selection.rig_search import search_rig
 from autotune.diagnosis.selection.search import search
 from autotune.diagnosis.selection.searched import Search
 from autotune.diagnosis.thresholds import IN_USE, Thresholds
-from autotune.diagnosis.verdict import Evidence, judged, places_of, sentences_of
+from autotune.diagnosis.verdict import Evidence, judged
 from autotune.errors import InputError
 from autotune.models import Model
 from autotune.progress import Progress, quiet
@@ -81,10 +82,10 @@ def diagnose(
     evidence = _gathered(model, recordings, controller, without, progress, thresholds)
     evidence = _of_rig(evidence, model, without, progress)
     found, verdict = evidence.search, judged(evidence)
-    effects = found_effects(evidence, verdict)
-    plain = replace(found.data, thresholds=thresholds)
+    effects, plain = found_effects(evidence, verdict), replace(found.data, thresholds=thresholds)
     description = describe(found.retuned.fit, plain) if verdict == "unexplained" else None
     places = places_of(evidence, effects, description)
+    sentences = sentences_of(verdict, effects, evidence, places)
     return Diagnosis(
         verdict=verdict,
         effects=effects,
@@ -93,7 +94,7 @@ def diagnose(
         fit=evidence.quality,
         next_experiment=None,
         extended_model=extended_model(evidence, verdict, model),
-        sentences=sentences_of(verdict, effects, evidence, places),
+        sentences=sentences,
         residual=evidence.residual,
         description=description,
         search=found,

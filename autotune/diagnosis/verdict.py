@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 from autotune.diagnosis.effects import STRUCTURES, kind_of
 from autotune.diagnosis.evidence.adequacy import ResidualTests
-from autotune.diagnosis.evidence.description import Description
 from autotune.diagnosis.evidence.held_out import FitQuality, dominates
 from autotune.diagnosis.evidence.operating_point import Offset
 from autotune.diagnosis.evidence.own_noise import OwnNoise
 from autotune.diagnosis.evidence.samples import SampleEffect
-from autotune.diagnosis.result import FoundEffect, Verdict
+from autotune.diagnosis.result import Verdict
 from autotune.diagnosis.selection.hypothesis import penalised
 from autotune.diagnosis.selection.judged import RigSearch
 from autotune.diagnosis.selection.parsimony import worth_adding
@@ -153,58 +151,3 @@ def judged(evidence: Evidence) -> Verdict:
 def verdict_of(facts: frozenset[str]) -> Verdict:
     """Return the verdict of the first row of the table that fits."""
     return next(verdict for holds, lacks, verdict in TABLE if holds <= facts and not lacks & facts)
-
-
-def places_of(evidence: Evidence, effects: Sequence[FoundEffect], description: Description | None) -> tuple[str, ...]:
-    """Return where the mismatch sits: where its effects may, else where what is missing shows."""
-    if description is None:
-        return tuple(dict.fromkeys(place for e in effects for place in e.places))
-    known: dict[str, None] = {description.place: None} if description.terms else {}
-    if not evidence.residual.is_constant:
-        informative = known if description.explained > evidence.limits.informative else {}
-        return tuple(dict.fromkeys(evidence.residual.varies.places) | informative)
-    places: dict[str, None] = dict(known)
-    for h in sorted((*evidence.search.singles, *evidence.search.pairs), key=penalised)[:3]:
-        for kind in h.kinds:
-            places |= dict.fromkeys(kind.may_sit)
-    return tuple(places) or ("plant",)
-
-
-def beside(effects: Sequence[FoundEffect], evidence: Evidence) -> str:
-    """Return what is said of effects that predict, and are too improbable to be named."""
-    unnamed = [name for name in evidence.search.chosen.names if name not in {e.name for e in effects}]
-    if not unnamed:
-        return ""
-    return f" The extended model predicts with {' and '.join(unnamed)} as well, which may be something else."
-
-
-def sentences_of(
-    verdict: Verdict, effects: Sequence[FoundEffect], evidence: Evidence, places: Sequence[str]
-) -> tuple[str, ...]:
-    """Return the finding in words."""
-    q, residual = evidence.quality, evidence.residual
-    errors = (
-        f"Held-out error, as a share of the spread of y: nominal {q.nominal:.3g}, retuned {q.retuned:.3g}, "
-        f"extended {q.extended:.3g}, noise {q.noise_floor:.3g}."
-    )
-    match verdict:
-        case "none":
-            first = "The simulation explains the recordings to within noise."
-        case "parameters":
-            first = (
-                "The numbers are not right: retuned, the simulation is nearer to the recordings, but not down to noise."
-            )
-            if residual.is_noise or q.comes_down_to_noise:
-                first = "The structure is right, its numbers are not: retuned, the simulation explains the recordings."
-        case "effect":
-            names = " and ".join(f"{e.name} (probability {e.probability:.2f})" for e in effects)
-            clean = residual.is_noise or q.comes_down_to_noise
-            rest = "" if clean else " What is left is not noise: something smaller is missing as well."
-            first = f"Physics was left out: {names}.{beside(effects, evidence)}{rest}"
-        case _:
-            first = (
-                f"Something is missing that no candidate explains to within noise; it shows at the {', '.join(places)}."
-            )
-    if evidence.own is not None:
-        return (first, evidence.own.sentence, errors)
-    return (first, errors) if residual.is_constant else (first, residual.varies.sentence, errors)

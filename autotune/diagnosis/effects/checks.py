@@ -138,7 +138,7 @@ def _line(kind: EffectKind, line: Line) -> Iterator[tuple[str, str]]:
     stage, memory = STAGES[line.stage], () if kind.memory is None else (kind.memory.name,)
     own = {q.name for q in kind.parameters}
     taken = tuple(inspect.signature(line.does).parameters)
-    known = (*stage.value, *stage.signals, *memory)
+    known = (*stage.value, *stage.signals, *stage.held, *memory)
     for name in taken:
         if name in own and name in known:
             yield f"{name!r} is a parameter and a signal of stage {line.stage}", "give the parameter another name"

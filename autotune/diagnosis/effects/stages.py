@@ -26,12 +26,15 @@ class Stage:
         What passes through and comes back changed; empty where contributions are added up.
     signals : tuple of str
         What a line may ask for besides.
+    held : tuple of str
+        What it may ask for that stays as it is through a run.
     is_force : bool
         Whether it acts at the plant within a sub-step.
     """
 
     value: tuple[str, ...] = ()
     signals: tuple[str, ...] = ()
+    held: tuple[str, ...] = ()
     is_force: bool = False
 
 
@@ -47,15 +50,15 @@ STAGES: Mapping[StageName, Stage] = {
     "load": Stage(signals=("t", "number"), is_force=True),
     # forces that go with plant input w, speed v, position or level x, first level, gain from force to speed or level;
     # ``kelvin`` is the absolute temperature at the operating point, were y one
-    "force": Stage(signals=("w", "v", "x", "level", "y_offset", "gain", "kelvin", "t", "number"), is_force=True),
+    "force": Stage(signals=("w", "v", "x", "level", "t", "number"), held=("y_offset", "gain", "kelvin"), is_force=True),
     # what is remembered of a travel dx of the position, after every sub-step's first trial
     "travel": Stage(signals=("dx", "dt"), is_force=True),
     # level of a dry friction, which at most stops the motion
     "friction": Stage(signals=("v",), is_force=True),
     # what is added at the input of the plant's last block, whose gain is ``gain_last``
-    "outflow": Stage(signals=("x", "level", "gain_last"), is_force=True),
+    "outflow": Stage(signals=("x", "level"), held=("gain_last",), is_force=True),
     # position and speed after a sub-step; ``y_offset`` is the reading at position 0
-    "stop": Stage(value=("x", "v"), signals=("y_offset",)),
+    "stop": Stage(value=("x", "v"), held=("y_offset",)),
     # the last block's output; ``through`` is the input of a plant that is a law without dynamics, 0 of any other
     "sensor": Stage(value=("z",), signals=("t", "through")),
     # the absolute reading

@@ -1,4 +1,7 @@
-"""What a diagnosis of equations says: verdict, effects with probabilities, sentences, diagnosis.json."""
+"""What a diagnosis of equations says: verdict, effects with probabilities, sentences, diagnosis.json.
+
+The steps from what a search found to what is said, and the records of it: the file is a little longer than others.
+"""
 
 from __future__ import annotations
 

@@ -161,7 +161,9 @@ def _arguments(kind: EffectKind, line: Line, layout: Layout) -> Iterator[str]:
         if kind.memory is not None and name == kind.memory.name:
             yield f"effects.memory[{layout.memories[kind.name]}]"
         elif (kind.name, name) in layout.slots:
-            yield f"effects.values[{layout.slots[kind.name, name]}]"
+            yield f"effects.numbers[{kernel.NUMBERS + layout.slots[kind.name, name]}]"
+        elif name in STAGES[line.stage].held:
+            yield f"effects.numbers[{getattr(kernel, name.upper())}]"
         else:
             yield name
 

@@ -114,8 +114,7 @@ def _state_force(x: FloatArray, w: float, t: float, linear: _Linear, effects: Ef
     taps, numbers = linear.taps, linear.numbers
     plant_in = _tap(taps, PLANT_IN, x) + numbers[DIRECT_IN] * w
     v, position, level = _tap(taps, SPEED, x), _tap(taps, POSITION, x), _tap(taps, FIRST_LEVEL, x)
-    place = numbers[Y_OFFSET], numbers[GAIN], numbers[KELVIN]
-    return float(force(plant_in, v, position, level, place[0], place[1], place[2], t, linear.flags[NUMBER], effects))
+    return float(force(plant_in, v, position, level, t, linear.flags[NUMBER], effects))
 
 
 @inlined
@@ -153,7 +152,7 @@ def _push(slot: int, w: float, t: float, dt: float, linear: _Linear, work: _Work
         for i in range(n):
             free[i] += column[i] * rubbed
     if flags[DRAINING]:
-        added = outflow(_tap(taps, POSITION, x), _tap(taps, FIRST_LEVEL, x), linear.numbers[GAIN_LAST], effects)
+        added = outflow(_tap(taps, POSITION, x), _tap(taps, FIRST_LEVEL, x), effects)
         for row in range(n):
             free[row] += M[slot, row, n + 2] * added
 
@@ -162,7 +161,7 @@ def _push(slot: int, w: float, t: float, dt: float, linear: _Linear, work: _Work
 def _stop(x: FloatArray, linear: _Linear, effects: Effects) -> None:
     """Hold the position where a stop holds it."""
     p, v = linear.flags[POSITION_STATE], linear.flags[SPEED_STATE]
-    x[p], speed = stop(x[p], x[v] if v >= 0 else 0.0, linear.numbers[Y_OFFSET], effects)
+    x[p], speed = stop(x[p], x[v] if v >= 0 else 0.0, effects)
     if v >= 0:
         x[v] = speed
 
@@ -226,8 +225,8 @@ def run(
     M, x, free = linear.M, work.x, work.free
     memory = np.zeros(MEMORIES + 1)
     carried = np.full(MEMORIES + 1, u[0] - numbers[U_OFFSET])
-    effects = Effects(numbers[NUMBERS:], flags[FLAGS:], memory)
-    before = Effects(numbers[NUMBERS:], flags[FLAGS:], carried)
+    effects = Effects(numbers, flags[FLAGS:], memory)
+    before = Effects(numbers, flags[FLAGS:], carried)
     u_offset, y_offset, step = numbers[U_OFFSET], numbers[Y_OFFSET], numbers[STEP]
     node_length = step / NODES
     past = 0

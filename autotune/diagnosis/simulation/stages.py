@@ -18,9 +18,9 @@ inlined = njit(cache=True, nogil=True, forceinline=True, _nrt=False)
 
 
 class Effects(NamedTuple):
-    """Values of the effects' parameters, which effects act, and what they remember."""
+    """Numbers of the run and of the effects' parameters, which effects act, and what they remember."""
 
-    values: FloatArray
+    numbers: FloatArray
     acts: IntArray
     memory: FloatArray
 
@@ -59,18 +59,7 @@ def load(t: float, number: int, effects: Effects) -> float:
 
 
 @inlined
-def force(
-    w: float,
-    v: float,
-    x: float,
-    level: float,
-    y_offset: float,
-    gain: float,
-    kelvin: float,
-    t: float,
-    number: int,
-    effects: Effects,
-) -> float:
+def force(w: float, v: float, x: float, level: float, t: float, number: int, effects: Effects) -> float:
     """Return the state-dependent force at the plant's input, in that input's unit."""
     return 0.0
 
@@ -87,13 +76,13 @@ def friction(v: float, effects: Effects) -> float:
 
 
 @inlined
-def outflow(x: float, level: float, gain_last: float, effects: Effects) -> float:
+def outflow(x: float, level: float, effects: Effects) -> float:
     """Return what is added at the input of the plant's last block."""
     return 0.0
 
 
 @inlined
-def stop(x: float, v: float, y_offset: float, effects: Effects) -> tuple[float, float]:
+def stop(x: float, v: float, effects: Effects) -> tuple[float, float]:
     """Return position and speed after a sub-step."""
     return x, v
 
