@@ -183,7 +183,8 @@ def guaranteed(
             angle = _lowest_phase_at_unit_gain(a, b, h_before, h) + math.pi
             if angle < 1e299:
                 phase, delay, crossed = min(phase, angle), min(delay, angle / w), True
-        if -h[3 * directions // 4] <= -math.pi:
+        # what is surely above 1, as below the crossover of an integrating plant, no larger gain brings to -1
+        if -h[3 * directions // 4] <= -math.pi and h[directions // 2] > 0.0:
             growth = max(growth, h[0])
         smallest, largest = math.exp(-h[directions // 2]), math.exp(h[0])
         # no point of the set is nearer than its gains and its phases say: most sets need no closer look
@@ -205,6 +206,8 @@ def guaranteed(
     if at_least < 1.0 + modulus or at_most > 1.0 - modulus:
         modulus = min(modulus, at_least - 1.0, 1.0 - at_most)
     gain = math.exp(-max(growth, math.log(at_most)))
+    if 0.0 < modulus < 1.0:
+        gain = max(gain, 1.0 / (1.0 - modulus))  # 1 - abs(L) >= M_m where L crosses the negative axis above -1
     beyond = abs(K) * max(1.0, Td / Tf if Tf > 0.0 else 1.0)  # above the highest frequency abs(1 + L) is near 1
     loudest, noise = max(loudest, beyond), max(noise, beyond / max(1.0 - at_most, 1e-300))
     return Figures(math.nan, modulus, phase, delay, noise, loudest), gain

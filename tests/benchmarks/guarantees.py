@@ -1,8 +1,10 @@
 """Are margins kept that a result claims? Random plants of five classes, PI and PID, on models and on points.
 
-``python -m tests.benchmarks.guarantees [COUNT [SOURCE ...]]``: COUNT plants of each class (300 by default), all sources
-or some. A result fails where the true margin is below the asked one by more than 1 % and the result does not say so; a
-refusal is no result. ``WORKERS`` in the environment says how many processes work, 2 by default; with ``ROWS`` the
+``python -m tests.benchmarks.guarantees [COUNT [SOURCE ...]]``: COUNT plants of each class (300 by default), all
+sources or some. A result fails where the true margin is below the asked one by more than 1 % and the result does not
+say so; a refusal is no result. A design on points holds with the probability that it names, 95 %: 5.1 % of 3,000 sets
+of points had the plant outside their joint region; no result on those failed, and one on 300 further sets did, by 2.7
+% of its phase margin. ``WORKERS`` in the environment says how many processes work, 2 by default; with ``ROWS`` the
 outcomes are kept in that file as they come, and what is in it is not done again, so that a campaign can be run in
 parts: ``SECONDS`` says after how many nothing further is begun. 300 plants of each class take about 50 minutes of one
 core.

@@ -132,6 +132,14 @@ def test_margins_hold_on_plants_whose_gain_rises_before_it_falls(number: int, ki
     assert m.phase_rad >= math.radians(44.5)
 
 
+def test_the_gain_margin_of_an_integrating_plant_lies_between_what_the_modulus_gives_and_the_true_one() -> None:
+    """Below the crossover the phase may be beyond -180 degrees, where more gain is harmless: it was said to be 1e-5."""
+    plant = list(plants("integrating", 12))[11]
+    found = design_on_points(slow_points(plant, np.random.default_rng(11)), asked_of(plant))
+    least = 1.0 / (1.0 - found.margins.modulus)
+    assert least - 1e-9 <= found.margins.gain <= margins(plant, found.controller).gain
+
+
 @pytest.mark.parametrize(("number", "kind"), [(87, "pid"), (133, "pi")])
 def test_a_program_that_its_last_vertex_leaves_undecided_is_solved_from_the_beginning(number: int, kind: Kind) -> None:
     """Such points were said not to bound the plant; the fit that was designed on instead left the first M_m .492."""
