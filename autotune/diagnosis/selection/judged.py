@@ -20,6 +20,9 @@ from autotune.diagnosis.selection.probability import Candidate, weighed
 from autotune.diagnosis.selection.searched import Search
 from autotune.diagnosis.thresholds import Thresholds
 
+#: Leading hypotheses that are compared as what is material in them.
+LEADING = 4
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Judged:
@@ -164,9 +167,16 @@ def ranked(found: Sequence[Judged]) -> list[Judged]:
 
 
 def simplest(found: Sequence[Judged], material: float) -> Judged:
-    """Return the hypothesis that stretches speak for most, priors counted, without what is not material in it."""
+    """Return the hypothesis that stretches speak for most, priors counted, without what is not material in any.
+
+    Each of the leading ones is first freed of what is not material in it, and they are compared as what they then are.
+    """
     order = ranked(found)
-    best = order[0]
+    return min((_freed(one, order, material) for one in order[:LEADING]), key=lambda one: worst(one, found))
+
+
+def _freed(best: Judged, order: Sequence[Judged], material: float) -> Judged:
+    """Return a hypothesis without what is not material in it: one of those that were judged."""
     while best.names:
         lesser = [j for j in order if set(j.names) < set(best.names) and not best.is_better(j, material)]
         if not lesser:

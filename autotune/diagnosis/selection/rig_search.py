@@ -33,7 +33,7 @@ from autotune.diagnosis.selection.hypothesis import hypothesis, is_stand_in
 from autotune.diagnosis.selection.judged import Judged, RigSearch, ranked, simplest
 from autotune.diagnosis.selection.polishing import timed
 from autotune.diagnosis.selection.prediction import extended, predictions, signal_sizes, starting_effects
-from autotune.diagnosis.selection.rig_bench import STEPS, RigBench
+from autotune.diagnosis.selection.rig_bench import LAST_STEPS, STEPS, RigBench
 from autotune.diagnosis.selection.scan import searched
 from autotune.diagnosis.selection.screening import distinct
 from autotune.diagnosis.simulation.assembly import input_size
@@ -101,6 +101,7 @@ def search_rig(
         bench = replace(bench, lasting=tuple(_lasting(retuned, bench)))
         bench, found = _grown(retuned, beam, bench, progress, limits)
         found = _finished(_pruned([*found, *_known(known, bench)], bench), bench)
+        found = _regrown(found, bench)
         chosen = bench.with_both_scales(simplest(found, limits.material))
         nominal, retuned, chosen = (one.spread_out() for one in (nominal, retuned, chosen))
         return RigSearch(nominal=nominal, retuned=retuned, judged=tuple(found), chosen=chosen)
@@ -296,6 +297,32 @@ def _finished(found: Sequence[Judged], bench: RigBench) -> list[Judged]:
     leading = ranked(found)[: bench.limits.rig_pruned]
     leading += [j for j in [simplest(found, bench.limits.material)] if j not in leading]
     return [*found, *(j for j in bench.pool.map(bench.finished, leading) if j is not None)]
+
+
+def _regrown(found: Sequence[Judged], bench: RigBench) -> list[Judged]:
+    """Return hypotheses with those that have one effect more than the chosen one, fitted on from where that came to.
+
+    Fits under dry friction end in local minima: what is larger is compared with what is smaller from the same place.
+    """
+    best = simplest(found, bench.limits.material)
+    larger = [j for j in ranked(found) if set(j.names) > set(best.names) and len(j.names) == len(best.names) + 1]
+    once = {frozenset(j.names): j for j in reversed(larger)}
+    chosen = sorted(once.values(), key=larger.index)[: bench.limits.rig_pruned]
+    return [*found, *(j for j in bench.pool.map(lambda j: _on_from(best, j, bench), chosen) if j is not None)]
+
+
+def _on_from(best: Judged, larger: Judged, bench: RigBench) -> Judged | None:
+    """Return a hypothesis fitted from another one's numbers, with the effect that it has besides as it was found."""
+    effect = next(e for e in larger.fit.model.effects if e.name in set(larger.names) - set(best.names))
+    try:
+        p, theta, states = extended(best.fit, effect, bench.long)
+        result = fit(p, bench.long, theta, states, iterations=LAST_STEPS, inherit=best.fit)
+    except RUNAWAY:
+        return None
+    if is_stand_in(hypothesis(result), bench.long) or result.cost >= larger.fit.cost:
+        return None
+    judged = bench.judged(result, larger.log_odds)
+    return judged if judged is not None and np.all(np.isfinite(judged.long_squares)) else None
 
 
 def _smaller(best: Judged, bench: RigBench) -> list[Judged]:
