@@ -58,7 +58,7 @@ def timed(result: Fit, data: Data) -> Fit:
     found = [(i, q.name) for i, e in enumerate(effects) for q in kind_of(e.name).parameters if q.is_time_of_change]
     if not found:
         return result
-    number, key = found[0]
+    number, key = found[-1]  # the one that was added last
     step, least = max(r.duration_s for r in data.driving) / 16.0, 2.0 * max(data.sample_times)
     while step > least:
         tried = [_moved(result, number, key, step * side, data) for side in (-1.0, 1.0)]

@@ -247,12 +247,12 @@ def _added(start: _Start, bench: RigBench) -> Fit | None:
             result = fit(p, start.data, theta, states, iterations=steps, inherit=start.near)
             if start.data is not bench.long:
                 result = bench.settled(p, result.theta)
-            result = timed(result, bench.long)
         except RUNAWAY:
             continue
         if not is_stand_in(hypothesis(result), start.data):
             done.append(result)
-    return min(done, key=lambda f: f.cost, default=None)
+    best = min(done, key=lambda f: f.cost, default=None)
+    return timed(best, bench.long) if best is not None and start.kind.is_event else best
 
 
 def _known(known: Fit | None, bench: RigBench) -> list[Judged]:
