@@ -3,6 +3,11 @@
 Gauss-Newton with Levenberg's damping on the readings' errors over the noise and on the parameters' distance from
 the prior of them; the start states of all windows are eliminated by projection. A parameter with a nonzero
 value is sought on a logarithmic scale, so that it keeps its sign: ``p = value exp(spread z)`` with z standard normal.
+
+References
+----------
+M. K. Transtrum, J. P. Sethna, Improvements to the Levenberg-Marquardt algorithm for nonlinear least-squares
+minimization, arXiv:1201.5885, 2012, section 3: along a narrow curved valley straight moves alone are short.
 """
 
 from __future__ import annotations
@@ -245,8 +250,19 @@ def data_of(
     return FitData(drive=drive, y=recording.y, good=good, windows=windows)
 
 
+#: Per window of a recording: derivatives to start states, which of these are free, and derivatives to z.
+_Back: TypeAlias = list[tuple[FloatArray, IntArray, FloatArray]]
 #: J to z with the start states projected out, and per window what gives those back.
-_Derivatives: TypeAlias = tuple[FloatArray, list[tuple[FloatArray, IntArray, FloatArray]]]
+_Derivatives: TypeAlias = tuple[FloatArray, _Back]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Iterate:
+    """Parameters, start states, and the errors that they leave."""
+
+    z: FloatArray
+    windows: list[Windows]
+    errors: list[FloatArray]
 
 
 class Descent:
@@ -320,9 +336,7 @@ class Descent:
             for one in self._data for w in (one.windows,)
         ]  # fmt: skip
 
-    def _projected(
-        self, one: FitData, s: Sensitivities, per_z: FloatArray
-    ) -> tuple[FloatArray, list[tuple[FloatArray, IntArray, FloatArray]]]:
+    def _projected(self, one: FitData, s: Sensitivities, per_z: FloatArray) -> _Derivatives:
         J = (s.to_parameters * per_z)[:, self._which]
         X = s.to_states * self._scales
         parts, back = [], []
@@ -360,26 +374,48 @@ class Descent:
         return bool(before - cost < _SMALL * before)
 
     def _attempted(self, derivatives: Sequence[_Derivatives], tries: int) -> bool:
-        """Take a move that lowers the penalised sum of squares, shorter ones where the first does not."""
+        """Take a move that lowers the penalised sum of squares, shorter ones where the first does not.
+
+        Where a move ends too high, what its derivatives did not foresee is taken back by one more with the same ones:
+        to second order that leads back to the bottom of a curved valley.
+        """
         J = np.vstack([part for part, _ in derivatives]) / self._sd
-        each = list(zip(self._data, (back for _, back in derivatives), self._errors, strict=True))
-        e = np.concatenate([_projected_error(back, error) for _, back, error in each])
-        z = self._z[self._which]
-        H, g = J.T @ J + np.eye(z.size), J.T @ (e / self._sd) - z
-        before = self._cost()
+        H = J.T @ J + np.eye(self._which.size)
+        backs, before = [back for _, back in derivatives], self._cost()
         for _ in range(tries):
-            move = np.linalg.solve(H + self._damping * np.diag(np.diag(H)), g) if z.size else np.zeros(0)
-            new_z = self._z.copy()
-            new_z[self._which] += np.clip(move, -3.0, 3.0)
-            windows = [self._moved(one, back, error, new_z[self._which] - z) for one, back, error in each]
-            errors = self._simulated(new_z, windows)
-            if errors is not None and self._cost_of(errors, new_z) < before:
-                self._z, self._errors = new_z, errors
-                self._data = [replace(one, windows=w) for one, w in zip(self._data, windows, strict=True)]
-                self._damping = max(self._damping * 0.2, 1e-9)
-                return True
+            damping = self._damping * np.diag(np.diag(H))
+            at = _Iterate(z=self._z, windows=[one.windows for one in self._data], errors=self._errors)
+            foreseen = np.zeros(self._which.size)
+            for _ in range(2):
+                new = self._next(at, J, H + damping, backs, foreseen)
+                if new is None:
+                    break
+                if self._cost_of(new.errors, new.z) < before:
+                    self._z, self._errors = new.z, new.errors
+                    self._data = [replace(one, windows=w) for one, w in zip(self._data, new.windows, strict=True)]
+                    self._damping = max(self._damping * 0.2, 1e-9)
+                    return True
+                foreseen = damping @ (new.z - at.z)[self._which]
+                at = new
             self._damping *= 10.0
         return False
+
+    def _next(
+        self, at: _Iterate, J: FloatArray, damped: FloatArray, backs: Sequence[_Back], foreseen: FloatArray
+    ) -> _Iterate | None:
+        """Return what a damped move from an iterate leads to, the gradient that was foreseen there left as it is.
+
+        None where the simulation runs away.
+        """
+        z = at.z[self._which]
+        e = np.concatenate([_projected_error(back, error) for back, error in zip(backs, at.errors, strict=True)])
+        move = np.linalg.solve(damped, J.T @ (e / self._sd) - z - foreseen) if z.size else np.zeros(0)
+        new_z = at.z.copy()
+        new_z[self._which] += np.clip(move, -3.0, 3.0)
+        each = zip(at.windows, backs, at.errors, strict=True)
+        windows = [self._moved(w, back, error, new_z[self._which] - z) for w, back, error in each]
+        errors = self._simulated(new_z, windows)
+        return None if errors is None else _Iterate(z=new_z, windows=windows, errors=errors)
 
     def _cost(self) -> float:
         return self._cost_of(self._errors, self._z)
@@ -388,19 +424,16 @@ class Descent:
         e = np.concatenate(list(errors)) / self._sd
         return float(e @ e + z[self._which] @ z[self._which])
 
-    def _moved(
-        self, one: FitData, back: list[tuple[FloatArray, IntArray, FloatArray]], error: FloatArray, move: FloatArray
-    ) -> Windows:
+    def _moved(self, windows: Windows, back: _Back, error: FloatArray, move: FloatArray) -> Windows:
         """Return windows whose start states take up what the parameters' move leaves."""
-        states, at = one.windows.states.copy(), 0
+        states, at = windows.states.copy(), 0
         for k, (X, free, J) in enumerate(back):
             wanted = error[at : at + X.shape[0]] - J @ move
             at += X.shape[0]
             # a weak belief that the state is where it was keeps what the readings do not tell
             H = X.T @ X + 1e-9 * np.eye(free.size) * max(float(np.trace(X.T @ X)), 1e-300)
-            H += self._damping * np.diag(np.diag(H))
             states[k, free] += self._scales[free] * np.linalg.solve(H, X.T @ wanted)
-        return replace(one.windows, states=states)
+        return replace(windows, states=states)
 
     def fitted(self, converged: bool) -> Fitted:
         """Return what was found."""
@@ -437,7 +470,7 @@ def _covered(rows: int, windows: Windows) -> BoolArray:
     return covered
 
 
-def _projected_error(back: list[tuple[FloatArray, IntArray, FloatArray]], error: FloatArray) -> FloatArray:
+def _projected_error(back: _Back, error: FloatArray) -> FloatArray:
     """Return the errors without what start states explain."""
     parts, at = [], 0
     for X, _, _ in back:

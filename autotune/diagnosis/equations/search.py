@@ -283,9 +283,15 @@ def _attempt(bench: Bench, effects: Sequence[Effect], start: Outcome, iterations
 def _fitted(
     bench: Bench, base: Outcome, effects: Sequence[Effect], told: Callable[[str], None], limits: Thresholds
 ) -> list[Outcome]:
-    """Fit single effects for a few steps, and go on with those that are not far behind one that leaves noise."""
+    """Fit single effects for a few steps, and go on with those that are not far behind one that leaves noise.
+
+    Effects that come down to a plainer one come after it, and only where that leaves more than noise.
+    """
     found: list[Outcome] = []
-    for effect in effects:
+    for effect in sorted(effects, key=lambda one: plainer(one) is not None):
+        less = plainer(effect)
+        if less is not None and any(_leaves_nothing(bench, one, less, limits) for one in found):
+            continue
         told(f"fitting {effect.name}")
         whole = (*base.effects, effect)
         outer = bench.is_sought_outside(effect)
@@ -300,6 +306,14 @@ def _fitted(
             one = further if further is not None and further.rss < one.rss else one
         found.append(one)
     return found
+
+
+def _leaves_nothing(bench: Bench, one: Outcome, effect: Effect, limits: Thresholds) -> bool:
+    """Whether an outcome's last effect is a given one and leaves less beside noise than an effect must bring."""
+    last = one.effects[-1]
+    if (last.name, place_of(last)) != (effect.name, place_of(effect)):
+        return False
+    return (1.0 - limits.equation_share) * _ratio(one, _noise(bench, one)) < 1.0
 
 
 def _lengthened(bench: Bench, fits: Sequence[Outcome]) -> list[Outcome]:
