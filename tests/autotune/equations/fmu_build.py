@@ -1,4 +1,4 @@
-"""An FMU of FMI 2.0 that is built from its C source: the compiler of this machine, the headers that FMPy brings."""
+"""FMUs of FMI 2.0 and 3.0 built from C source: the compiler of this machine, the headers that FMPy brings."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 
 import fmpy
 
-SOURCE = Path(__file__).parent / "rig_fmu.c"
+HERE = Path(__file__).parent
 NAMES = ("u", "load", "phi", "w", "J", "c", "k", "der(phi)", "der(w)")
 CAUSALITY = {
     "u": 'causality="input"', "load": 'causality="input"', "phi": 'causality="output"',
@@ -41,16 +41,37 @@ def description(kinds: tuple[str, ...]) -> str:
     )
 
 
-def build(folder: Path, *kinds: str) -> Path:
-    """Return an FMU that was compiled into a folder."""
-    headers = Path(fmpy.__file__).parent / "c-code"
+def description_3() -> str:
+    """Return the model description of FMI 3.0, for co-simulation."""
+    variables = []
+    for reference, name in enumerate(NAMES):
+        derivative = {"der(phi)": ' derivative="2"', "der(w)": ' derivative="3"'}.get(name, "")
+        is_state = name in ("phi", "w")
+        start = f' start="{START.get(name, 0.0)}"' if name in START or is_state else ""
+        says = CAUSALITY.get(name, "") + (' initial="exact"' if is_state else "")
+        variables.append(f'<Float64 name="{name}" valueReference="{reference}" {says}{start}{derivative}/>')
+    return (
+        '<?xml version="1.0" encoding="UTF-8"?><fmiModelDescription fmiVersion="3.0" modelName="rig" '
+        'instantiationToken="{rig}"><CoSimulation modelIdentifier="rig" '
+        'canHandleVariableCommunicationStepSize="true"/>'
+        f'<ModelVariables>{"".join(variables)}</ModelVariables><ModelStructure><Output valueReference="2"/>'
+        '<ContinuousStateDerivative valueReference="7"/><ContinuousStateDerivative valueReference="8"/>'
+        "</ModelStructure></fmiModelDescription>"
+    )
+
+
+def build(folder: Path, *kinds: str, fmi: int = 2) -> Path:
+    """Return an FMU of FMI 2.0 or 3.0 that was compiled into a folder."""
+    headers, source = Path(fmpy.__file__).parent / "c-code", HERE / ("rig_fmu3.c" if fmi == 3 else "rig_fmu.c")
     library = folder / f"rig{fmpy.sharedLibraryExtension}"
     compiler = shutil.which("cc") or shutil.which("gcc") or "cc"
     subprocess.run(
-        [compiler, "-shared", "-fPIC", "-O2", "-w", f"-I{headers}", str(SOURCE), "-lm", "-o", str(library)], check=True
+        [compiler, "-shared", "-fPIC", "-O2", "-w", f"-I{headers}", str(source), "-lm", "-o", str(library)], check=True
     )
     fmu = folder / "rig.fmu"
     with zipfile.ZipFile(fmu, "w") as archive:
-        archive.writestr("modelDescription.xml", description(kinds or ("CoSimulation",)))
-        archive.write(library, f"binaries/{fmpy.platform}/{library.name}")
+        archive.writestr(
+            "modelDescription.xml", description_3() if fmi == 3 else description(kinds or ("CoSimulation",))
+        )
+        archive.write(library, f"binaries/{fmpy.platform_tuple if fmi == 3 else fmpy.platform}/{library.name}")
     return fmu

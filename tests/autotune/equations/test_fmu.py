@@ -59,9 +59,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return place
 
 
-@pytest.mark.parametrize("kind", ["CoSimulation", "ModelExchange"])
-def test_an_fmu_runs_as_its_equations_say(tmp_path: Path, kind: str) -> None:
-    build(tmp_path, kind)
+@pytest.mark.parametrize(("kind", "fmi"), [("CoSimulation", 2), ("ModelExchange", 2), ("CoSimulation", 3)])
+def test_an_fmu_runs_as_its_equations_say(tmp_path: Path, kind: str, fmi: int) -> None:
+    build(tmp_path, kind, fmi=fmi)
     (tmp_path / "m.toml").write_text(MODEL)
     box = read_any_model(tmp_path / "m.toml")
     assert isinstance(box, BlackBox)
@@ -73,7 +73,12 @@ def test_an_fmu_runs_as_its_equations_say(tmp_path: Path, kind: str) -> None:
         np.testing.assert_allclose(box.simulation(values, drive), wanted, atol=2e-4)
 
 
-def test_an_fmu_is_diagnosed_from_the_command_line(folder: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("fmi", [2, pytest.param(3, marks=pytest.mark.slow)])
+def test_an_fmu_is_diagnosed_from_the_command_line(tmp_path: Path, fmi: int) -> None:
+    folder = tmp_path / "fmu"
+    folder.mkdir()
+    build(folder, fmi=fmi)
+    (folder / "m.toml").write_text(MODEL)
     for seed in (2, 3):
         write_recording(recorded(seed, J=0.06, high=0.6), tmp_path / f"rec{seed}.csv")
     run = CliRunner().invoke(
