@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from autotune.equations import Drive, EquationModel, combinations, compile_model, retune, simulate, undetermined
+from autotune.equations.fit import fit
 from autotune.equations.forecast import forecast
 from autotune.equations.starts import rest_state
 from autotune.errors import InputError
@@ -97,3 +98,23 @@ def test_simulate_takes_equations(tmp_path: Path) -> None:
     y_sim = np.loadtxt(tmp_path / "s.csv", delimiter=",", skiprows=1)[:, 1]
     y = np.loadtxt(tmp_path / "rec.csv", delimiter=",", skiprows=1)[:, 2]
     assert np.std(y - y_sim) < 0.05
+
+
+def test_a_fit_follows_a_curved_valley() -> None:
+    """A spring and a sine beside it share a pendulum's gravity: straight moves end in the walls after a hundredth."""
+    swing = [{"name": "x", "kind": "position", "derivative": "v"}]
+    truth = one_state("x", {}, state=[*swing, {"name": "v", "derivative": "u - 0.05*v - 30.8*sin(x)"}])
+    shared = one_state(
+        "x", {"k": {"value": 21.5, "spread": 0.2}, "A": {"value": 20.0, "spread": 1.0},
+              "w": {"value": 1.1, "spread": 1.0}},
+        state=[*swing, {"name": "v", "derivative": "u - 0.05*v - k*x - A*sin(w*x)"}],
+    )  # fmt: skip
+    t = 0.02 * np.arange(800)
+    compiled = compile_model(truth)
+    drive = Drive(t=t, inputs=np.zeros((t.size, 1)))
+    y = simulate(compiled, compiled.parameter_vector, drive, np.array([[2.0, 0.0]])).y
+    swung = Recording(t=t, u=np.zeros(t.size), y=y + np.random.default_rng(6).normal(0.0, 1e-3, t.size))
+    model_of_both = compile_model(shared)
+    begun = fit(model_of_both, [swung], z=np.array([-4.0, 0.0, 0.1]), horizon_s=0.7, iterations=12)
+    found = fit(model_of_both, [swung], z=begun.z, horizon_s=5.4, iterations=12)
+    assert found.noise_sd < 2e-3
