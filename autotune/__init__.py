@@ -28,10 +28,20 @@ themselves in a notebook. The rooms below (``autotune.identification``, ``autotu
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any
+import sys
 
-from autotune.version import __version__ as __version__
+_started = sys.argv[0] if sys.argv else ""
+if _started.endswith(("/autotune", "\\autotune", "autotune.exe")) or (
+    _started == "-m" and any(word.startswith("autotune") for word in sys.orig_argv)
+):
+    from autotune.entry import hear  # the command line, and what is imported below takes its time
+
+    hear()
+
+import importlib  # noqa: E402 - heard before it is imported
+from typing import TYPE_CHECKING, Any  # noqa: E402
+
+from autotune.version import __version__ as __version__  # noqa: E402
 
 if TYPE_CHECKING:
     from autotune.api.control_systems import to_control

@@ -6,10 +6,15 @@ import _signal as signal  # type: ignore[import-not-found]  # signal itself make
 import os
 
 
-def main() -> None:
-    """Run the command line; Ctrl-C before the command has begun is one line and exit status 130 as well."""
+def hear() -> None:
+    """Let Ctrl-C before the command has begun be one line and exit status 130 as well."""
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # else a parent wants it ignored
         signal.signal(signal.SIGINT, _leave)
+
+
+def main() -> None:
+    """Run the command line; Ctrl-C is heard from its first line on."""
+    hear()
     from autotune.cli import main as command_line
 
     command_line()

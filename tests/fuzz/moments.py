@@ -83,7 +83,8 @@ def interrupted(name: str, after_s: float) -> str:
             return "over before"
         lines = [line for line in said.splitlines() if line.startswith("autotune: ")]
         noise = [line for line in said.splitlines() if "Traceback" in line or "Exception ignored" in line]
-        if "KeyboardInterrupt" in said and "autotune" not in said:
+        unheard = process.returncode == -signal.SIGINT and not said.strip()  # no handler but the system's yet
+        if unheard or ("KeyboardInterrupt" in said and "autotune" not in said):
             return "before its first line"  # the interpreter's own start, which is not the tool's to say anything of
         if process.returncode != 130:
             return f"exit {process.returncode}: {said.strip()[-300:]}"

@@ -1,0 +1,37 @@
+"""Ctrl-C while the tool is still being imported: one line, and the exit status of an interrupt."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+#: Interrupts the process when a module is about to be imported, as an operator may at that moment.
+CUSTOM = """
+import os, signal, sys
+
+class Interrupting:
+    def find_spec(self, name, path=None, target=None):
+        if name == {name!r}:
+            sys.meta_path.remove(self)
+            os.kill(os.getpid(), signal.SIGINT)
+
+sys.meta_path.insert(0, Interrupting())
+"""
+
+
+@pytest.mark.parametrize("name", ["autotune.version", "autotune.cli", "numpy"])
+@pytest.mark.parametrize("script", [True, False])
+def test_an_interrupt_during_the_import_is_one_line(name: str, script: bool, tmp_path: Path) -> None:
+    (tmp_path / "sitecustomize.py").write_text(CUSTOM.format(name=name), encoding="utf-8")
+    installed = tmp_path / "autotune"
+    installed.write_text("from autotune.entry import main\nmain()\n", encoding="utf-8")
+    root = str(Path(__file__).parents[2])
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join((str(tmp_path), root))}
+    given = [sys.executable, *([str(installed)] if script else ["-m", "autotune"]), "--version"]
+    ended = subprocess.run(given, capture_output=True, text=True, env=environment, timeout=120, check=False)
+    assert ended.returncode == 130
+    assert ended.stderr.splitlines() == ["autotune: stopped by the operator; nothing was begun"]
