@@ -87,7 +87,15 @@ def _links(model: Model, named: Mapping[str, Sequence[str]], possible: Sequence[
     for place in ("plant", "sensor", "environment"):
         if place in left or (place in possible and place not in places and place == "sensor"):
             links.append(_added(place, left.pop(place, ()), place in possible))
-    return [*links, Link(label="reading y", below=model.output.unit, place="reading")][: _MOST + 2]
+    return _shortened([*links, Link(label="reading y", below=model.output.unit, place="reading")])
+
+
+def _shortened(links: list[Link]) -> list[Link]:
+    """Return at most so many boxes, what is lit and both ends among them; the others give way from the back."""
+    plain = [i for i, one in enumerate(links[1:-1], 1) if not (one.missing or one.may_be)]
+    surplus = max(len(links) - _MOST - 2, 0)
+    left_out = set(plain[len(plain) - min(surplus, len(plain)) :])
+    return [one for i, one in enumerate(links) if i not in left_out]
 
 
 def _added(place: str, words: Sequence[str], possible: bool) -> Link:

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from autotune.cli import app
 from autotune.config import Config, load_config
 from autotune.diagnosis.diagnose import diagnose
-from autotune.diagnosis.effects import CATALOGUE
+from autotune.diagnosis.effects import CATALOGUE, KINDS
 from autotune.diagnosis.simulation.assembly import assemble
 from autotune.errors import ExperimentStopped, InputError
 from autotune.experiment.excitation import Excitation
@@ -111,7 +111,7 @@ def test_effects_that_command_and_reading_cannot_tell_apart_count_as_one() -> No
     planned = planned_recording(sim, config, steps)
     assert planned is not None
     recording = replace(planned, y=planned.y + 0.02 * rng.normal(size=len(planned)))
-    rest = [name for name in CATALOGUE if name not in ("actuator.lag", "sensor.lag")]
+    rest = [name for name in KINDS if name not in ("actuator.lag", "sensor.lag")]
     short = replace(lagged, blocks=lagged.blocks[1:-1])
     found = diagnose(short, [recording], without=rest)
     named = {name for candidate in found.candidates for name in candidate.name.split("+")}

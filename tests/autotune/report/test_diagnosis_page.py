@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from autotune.diagnosis.diagnose import diagnose
@@ -47,6 +47,7 @@ def test_a_unit_that_is_none_is_not_written() -> None:
     assert with_spread(Parameter(value=0.25, unit="-/s")) == "0.25 1/s"
 
 
+@example(blocks=[("0", "actuator")] * 7, named={key: ["x"] for key in PLACES}, possible=[])
 @given(
     blocks=st.lists(st.tuples(TEXT.filter(str.strip), st.sampled_from(PLACES[2:5])), min_size=1, max_size=7),
     named=st.dictionaries(st.sampled_from(PLACES), st.lists(TEXT, min_size=1, max_size=3)),
