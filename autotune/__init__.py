@@ -34,7 +34,7 @@ _started = sys.argv[0] if sys.argv else ""
 if _started.endswith(("/autotune", "\\autotune", "autotune.exe")) or (
     _started == "-m" and any(word.startswith("autotune") for word in sys.orig_argv)
 ):
-    from autotune.entry import hear  # the command line, and what is imported below takes its time
+    from autotune.early import hear  # the command line, and what is imported below takes its time
 
     hear()
 

@@ -2,25 +2,12 @@
 
 from __future__ import annotations
 
-import _signal as signal  # type: ignore[import-not-found]  # signal itself makes enumerations first: too late
-import os
-
-
-def hear() -> None:
-    """Let Ctrl-C before the command has begun be one line and exit status 130 as well."""
-    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # else a parent wants it ignored
-        signal.signal(signal.SIGINT, _leave)
+from autotune.early import hear
 
 
 def main() -> None:
-    """Run the command line; Ctrl-C is heard from its first line on."""
+    """Run the command line; Ctrl-C before the command has begun is one line and exit status 130 as well."""
     hear()
     from autotune.cli import main as command_line
 
     command_line()
-
-
-def _leave(*_: object) -> None:
-    """Leave at once: nothing has been begun, and an exception in the middle of an import would be a traceback."""
-    os.write(2, b"autotune: stopped by the operator; nothing was begun\n")
-    os._exit(130)
