@@ -145,7 +145,7 @@ def curved(w: float, second_order: float, third_order: float, low: float, high: 
     return w + (bent - c)
 
 
-def _rises(values: Values, w: float) -> bool:
+def rises(values: Values, w: float) -> bool:
     """Whether a curved characteristic still rises."""
     bent = w + values["second_order"] * w * w
     return (1.0 + 2.0 * values["second_order"] * w) * (1.0 + 3.0 * values["third_order"] * bent * bent) > 0.0
@@ -258,7 +258,7 @@ ACTUATOR = (
             *ends("{u}"),
         ),
         lines=(Line(stage="command", does=curved),),
-        goes_on=_rises,
+        goes_on=rises,
         starts=lambda s: [(0.05 / s.w, 1e-3 / s.w**2), (1e-3 / s.w, 0.05 / s.w**2)],
         confusable=("actuator.saturation", "sensor.nonlinear_gain"),
         odds={"any": 0.1, "arm": 0.5, "speed": 0.15, "carriage": 0.03, "thermal": 0.05, "shaft": 0.05, "valve": 0.05},

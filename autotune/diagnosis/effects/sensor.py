@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from autotune.arrays import FloatArray
-from autotune.diagnosis.effects.actuator import limit_starts
+from autotune.diagnosis.effects.actuator import limit_starts, rises
 from autotune.diagnosis.effects.base import NEVER, EffectKind, Quantity, ends
 from autotune.diagnosis.effects.stages import Blocks, Line, LinearPart, Values
 from autotune.models import Block, TransferFunction
@@ -19,12 +19,6 @@ def curved(z: float, second_order: float, third_order: float, low: float, high: 
     bent = c + second_order * c * c
     bent += third_order * bent * bent * bent
     return z + (bent - c)
-
-
-def _rises(values: Values, z: float) -> bool:
-    """Whether a curved characteristic still rises."""
-    bent = z + values["second_order"] * z * z
-    return (1.0 + 2.0 * values["second_order"] * z) * (1.0 + 3.0 * values["third_order"] * bent * bent) > 0.0
 
 
 def drifted(z: float, t: float, rate: float) -> float:
@@ -81,7 +75,7 @@ SENSOR = (
             *ends("{y}"),
         ),
         lines=(Line(stage="sensor", does=curved),),
-        goes_on=_rises,
+        goes_on=rises,
         starts=lambda s: [(0.05 / s.x, 1e-3 / s.x**2), (1e-3 / s.x, 0.05 / s.x**2)],
         confusable=("actuator.nonlinear_gain", "plant.position_dependent_gain"),
         recoordinates=True,

@@ -1,7 +1,7 @@
 """Whether what is left is noise of its own colour: a disturbance that goes with no signal of the rig.
 
 A plant that is stirred, heated by the sun or fed by a pump that surges is not where its command alone puts it. That
-misfit is slow, as missing physics is, but nothing of the command's is in it. It is taken for what it may be, an
+difference is slow, as missing physics is, but nothing of the command's is in it. It is taken for what it may be, an
 autoregressive noise of any order that the recordings bear, the numbers are fitted under it, and the same score tests as
 everywhere ask for what swings, bends or goes past the chain: under the right noise they are chi-square again.
 """
