@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import signal
 from collections.abc import Callable, Iterator, Mapping
@@ -11,6 +12,7 @@ from typing import Any, TypeVar
 import dask
 from dask.system import CPU_COUNT
 from distributed import Client, KilledWorker, LocalCluster, Worker, as_completed
+from distributed.comm import connect
 from distributed.security import Security
 
 from autotune.errors import InputError
@@ -65,6 +67,7 @@ def cluster(workers: int | None = None, scheduler: str | None = None, *, process
             yield client
         return
     try:
+        asyncio.run(_reached(scheduler))
         client = Client(scheduler, timeout=_PATIENCE_S)
     except (OSError, ValueError) as error:
         raise InputError(f"no scheduler answers ({error})", where=scheduler, remedy="start dask scheduler") from None
@@ -74,6 +77,16 @@ def cluster(workers: int | None = None, scheduler: str | None = None, *, process
     with client:
         _check(client, scheduler)
         yield client
+
+
+async def _reached(scheduler: str) -> None:
+    """Ask whether a scheduler answers, before a client is made.
+
+    A client whose making failed closes itself when it is collected; where that happens in the thread of the next one's
+    event loop, it waits for itself without end.
+    """
+    comm = await connect(scheduler, timeout=_PATIENCE_S, **Security().get_connection_args("client"))
+    await comm.close()
 
 
 def _embedded(tasks: int, processes: bool) -> LocalCluster:
