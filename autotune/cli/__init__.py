@@ -134,6 +134,8 @@ def main() -> None:
         warnings.simplefilter("ignore")  # numpy's remarks are not for the user: results are checked for what they are
     try:
         status = app(standalone_mode=False)
+        if status == OperatorStop.exit_status:  # typer's silent answer to Ctrl-C while it reads the call
+            _leave("stopped by the operator; nothing was begun", OperatorStop.exit_status)
         sys.stdout.flush()
     except AutotuneError as error:
         _leave(printable(str(error)), error.exit_status)

@@ -35,3 +35,20 @@ def test_an_interrupt_during_the_import_is_one_line(name: str, script: bool, tmp
     ended = subprocess.run(given, capture_output=True, text=True, env=environment, timeout=120, check=False)
     assert ended.returncode == 130
     assert ended.stderr.splitlines() == ["autotune: stopped by the operator; nothing was begun"]
+
+
+def test_an_interrupt_while_the_call_is_read_is_one_line() -> None:
+    program = """
+import os, signal, typer.core
+read = typer.core.TyperGroup.parse_args
+def interrupted(*given):
+    os.kill(os.getpid(), signal.SIGINT)
+    return read(*given)
+typer.core.TyperGroup.parse_args = interrupted
+from autotune.entry import main
+main()
+"""
+    given = [sys.executable, "-c", program, "--version"]
+    ended = subprocess.run(given, capture_output=True, text=True, timeout=120, check=False)
+    assert ended.returncode == 130
+    assert ended.stderr.splitlines() == ["autotune: stopped by the operator; nothing was begun"]

@@ -69,7 +69,7 @@ def interrupted(name: str, after_s: float) -> str:
         inputs(folder)
         process = subprocess.Popen(
             [*COMMAND, *LONG[name]], cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-            start_new_session=True,
+            start_new_session=True, env=os.environ | {"PYTHONFAULTHANDLER": "1"},
         )  # fmt: skip
         time.sleep(after_s)
         with contextlib.suppress(ProcessLookupError):
@@ -87,9 +87,9 @@ def interrupted(name: str, after_s: float) -> str:
         if unheard or ("KeyboardInterrupt" in said and "autotune" not in said):
             return "before its first line"  # the interpreter's own start, which is not the tool's to say anything of
         if process.returncode != 130:
-            return f"exit {process.returncode}: {said.strip()[-300:]}"
+            return f"exit {process.returncode} after {after_s:.2f} s: {said.strip()[:3000]}"
         if len(lines) != 1 or noise:
-            return f"not one line: {said.strip()[-300:]}"
+            return f"not one line after {after_s:.2f} s: {said.strip()[-300:]}"
         return half_written(folder / "out") or "one line"
 
 
