@@ -2,11 +2,49 @@
 
 from __future__ import annotations
 
+import _thread
 import signal
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from multiprocessing import resource_tracker
+from types import FrameType
+
+#: where compiled code that is about to return calls Python to make its result
+_RETURNING = "numba.core.serialize"
+#: time after which a signal that came there is tried again [s]
+_AGAIN_S = 0.01
+
+
+def raise_interrupt(number: int, frame: FrameType | None) -> None:
+    """Raise KeyboardInterrupt, as Python's own handler does, but never where compiled code makes its result.
+
+    That code takes no notice of an exception there: it goes on with what it did not get, and the command ends by
+    ``SystemError`` or a segmentation fault. The signal is given again when the result stands.
+
+    Parameters
+    ----------
+    number : int
+        The signal.
+    frame : frame, optional
+        Where Python was.
+    """
+    while frame is not None:
+        if frame.f_globals.get("__name__") == _RETURNING:
+            again = threading.Timer(_AGAIN_S, _give, (number,))
+            again.daemon = True
+            again.start()
+            return
+        frame = frame.f_back
+    raise KeyboardInterrupt
+
+
+def _give(number: int) -> None:
+    main = threading.main_thread().ident
+    if hasattr(signal, "pthread_kill") and main is not None:  # wakes a main thread that waits, too
+        signal.pthread_kill(main, number)
+    else:
+        _thread.interrupt_main(signal.Signals(number))
 
 
 @contextmanager

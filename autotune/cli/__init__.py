@@ -15,6 +15,7 @@ from rich.console import Console
 
 from autotune.cli.guard import GuardedCommand, without_stdout
 from autotune.errors import AutotuneError, InputError, OperatorStop
+from autotune.interrupts import raise_interrupt
 from autotune.text_files import printable
 
 # typer brings click under a name that differs between its versions; its exported exception leads to the base classes
@@ -128,7 +129,7 @@ _guard()
 def main() -> None:
     """Run the command line; whatever ends it is one line on stderr and its exit status."""
     if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
+        signal.signal(signal.SIGINT, raise_interrupt)
     sys.unraisablehook = _unraisable
     if not sys.warnoptions:
         warnings.simplefilter("ignore")  # numpy's remarks are not for the user: results are checked for what they are

@@ -21,6 +21,7 @@ from rich.console import Console
 
 from autotune.errors import InputError, require_extra
 from autotune.experiment.loop import ABORT
+from autotune.interrupts import raise_interrupt
 
 #: what the page may ask; anything else on the pipe is no action
 ACTIONS = ("abort", "keep", "restore")
@@ -80,7 +81,7 @@ class LivePage:
                 "did not start, its reason is above", where="live page", remedy="give another --listen or --port"
             )
         # outside the control loop, which has a handler of its own, Abort ends the command as Ctrl-C does
-        self._handler = signal.signal(ABORT, signal.default_int_handler)
+        self._handler = signal.signal(ABORT, raise_interrupt)
         self._hearing = threading.Thread(target=self._hear, daemon=True)
         self._hearing.start()
         self._console.print(f"live page: {self.url}", markup=False)

@@ -52,3 +52,34 @@ main()
     ended = subprocess.run(given, capture_output=True, text=True, timeout=120, check=False)
     assert ended.returncode == 130
     assert ended.stderr.splitlines() == ["autotune: stopped by the operator; nothing was begun"]
+
+
+def test_an_interrupt_where_compiled_code_makes_its_result_is_raised_after_it() -> None:
+    program = """
+import ctypes, signal
+import numpy as np
+from numba import njit
+from autotune.interrupts import raise_interrupt
+
+kill = getattr(ctypes.CDLL(None), "raise")
+kill.argtypes, kill.restype = [ctypes.c_int], ctypes.c_int
+
+@njit
+def interrupted(number):
+    values = np.ones(3)
+    if number:
+        kill(number)
+    return values, values > 0.5
+
+interrupted(0)
+signal.signal(signal.SIGINT, raise_interrupt)
+try:
+    made = interrupted(int(signal.SIGINT))
+    while True:
+        pass
+except KeyboardInterrupt:
+    print(made)
+"""
+    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120, check=False)
+    assert (ended.returncode, ended.stderr) == (0, "")
+    assert ended.stdout == "(array([1., 1., 1.]), array([ True,  True,  True]))\n"

@@ -20,6 +20,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from itertools import cycle, islice
 from pathlib import Path
 
 import numpy as np
@@ -91,6 +92,15 @@ def interrupted(name: str, after_s: float) -> str:
         if len(lines) != 1 or noise:
             return f"not one line after {after_s:.2f} s: {said.strip()[-300:]}"
         return half_written(folder / "out") or "one line"
+
+
+def lasts_s(name: str) -> float:
+    """Return how long a command takes when nobody interrupts it."""
+    with tempfile.TemporaryDirectory(prefix="autotune-moments-") as place:
+        inputs(Path(place))
+        began_s = time.monotonic()
+        subprocess.run([*COMMAND, *LONG[name]], cwd=place, capture_output=True, check=True)
+        return time.monotonic() - began_s
 
 
 def half_written(out: Path) -> str:
@@ -174,7 +184,6 @@ def main() -> int:
     parser.add_argument("--times", type=int, default=200, help="moments of Ctrl-C, and of the disk")
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--longest", type=float, default=12.0, help="latest moment [s]")
     parser.add_argument("--seconds", type=float, default=1e9, help="time after which no further trial begins")
     parser.add_argument("--without-disk", action="store_true")
     given = parser.parse_args()
@@ -182,7 +191,8 @@ def main() -> int:
     rng, ends = random.Random(given.seed), Counter[tuple[str, str]]()
     until_s = time.monotonic() + given.seconds
     names = [*LONG, *([] if given.without_disk else ["disk"] * 3)]
-    trials = [(names[i % len(names)], rng.uniform(0.0, given.longest), rng.random()) for i in range(given.times)]
+    latest_s = {name: lasts_s(name) for name in LONG} | {"disk": 0.0}
+    trials = [(name, rng.uniform(0.0, latest_s[name]), rng.random()) for name in islice(cycle(names), given.times)]
     trials += [] if given.without_disk else [("small disk", 0.0, 0.0)]
 
     def one(trial: tuple[str, float, float]) -> tuple[str, str]:
