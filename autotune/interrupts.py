@@ -5,22 +5,26 @@ from __future__ import annotations
 import _thread
 import signal
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from multiprocessing import resource_tracker
 from types import FrameType
 
-#: where compiled code that is about to return calls Python to make its result
-_RETURNING = "numba.core.serialize"
-#: time after which a signal that came there is tried again [s]
-_AGAIN_S = 0.01
+#: where an exception is lost: compiled code that calls Python to make its result, and a module that is half imported
+_DEAF = ("numba.core.serialize", "importlib._bootstrap")
+#: time after which a signal that came there is given again [s], and time it may wait in all [s]: a model's file may
+#: compute without end while it is imported
+_AGAIN_S, _LONGEST_S = 0.01, 3.0
+_waits_since: list[float] = []
 
 
 def raise_interrupt(number: int, frame: FrameType | None) -> None:
-    """Raise KeyboardInterrupt, as Python's own handler does, but never where compiled code makes its result.
+    """Raise KeyboardInterrupt, as Python's own handler does, but never where nobody would take it for one.
 
-    That code takes no notice of an exception there: it goes on with what it did not get, and the command ends by
-    ``SystemError`` or a segmentation fault. The signal is given again when the result stands.
+    Compiled code that makes its result takes no notice of an exception, goes on with what it did not get, and ends by
+    ``SystemError`` or a segmentation fault; a compiled module that is being imported says that it cannot be. There the
+    signal is given again a little later.
 
     Parameters
     ----------
@@ -30,13 +34,21 @@ def raise_interrupt(number: int, frame: FrameType | None) -> None:
         Where Python was.
     """
     while frame is not None:
-        if frame.f_globals.get("__name__") == _RETURNING:
+        if frame.f_globals.get("__name__") in _DEAF and _may_wait():
             again = threading.Timer(_AGAIN_S, _give, (number,))
             again.daemon = True
             again.start()
             return
         frame = frame.f_back
+    _waits_since.clear()
     raise KeyboardInterrupt
+
+
+def _may_wait() -> bool:
+    now = time.monotonic()
+    if not _waits_since:
+        _waits_since.append(now)
+    return now - _waits_since[0] < _LONGEST_S
 
 
 def _give(number: int) -> None:

@@ -83,3 +83,30 @@ except KeyboardInterrupt:
     ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120, check=False)
     assert (ended.returncode, ended.stderr) == (0, "")
     assert ended.stdout == "(array([1., 1., 1.]), array([ True,  True,  True]))\n"
+
+
+@pytest.mark.parametrize("lasts_s", [0.0, 60.0])
+def test_an_interrupt_in_an_import_is_raised_after_it_unless_it_lasts(tmp_path: Path, lasts_s: float) -> None:
+    (tmp_path / "imported.py").write_text(
+        "import os, signal, time\n"
+        "os.kill(os.getpid(), signal.SIGINT)\n"
+        f"end = time.monotonic() + {lasts_s}\n"
+        "while time.monotonic() < end:\n    pass\n"
+        "whole = True\n",
+        encoding="utf-8",
+    )
+    program = """
+import signal, sys
+from autotune.interrupts import raise_interrupt
+signal.signal(signal.SIGINT, raise_interrupt)
+try:
+    import imported
+    while True:
+        pass
+except KeyboardInterrupt:
+    print("imported" in sys.modules)
+"""
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join((str(tmp_path), str(Path(__file__).parents[2])))}
+    given = [sys.executable, "-c", program]
+    ended = subprocess.run(given, capture_output=True, text=True, env=environment, timeout=40, check=False)
+    assert (ended.returncode, ended.stderr, ended.stdout) == (0, "", f"{lasts_s == 0.0}\n")
