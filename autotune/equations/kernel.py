@@ -24,6 +24,7 @@ import numpy as np
 from numba import njit
 
 from autotune.arrays import FloatArray, IntArray
+from autotune.equations.in_place import COMPILED, in_place
 from autotune.equations.tape_ops import evaluate, solve, tangents
 
 #: Why a window ended: as asked; a derivative that is no number; more steps or a larger state than is sensible.
@@ -108,7 +109,7 @@ class Work(NamedTuple):
     memory: FloatArray
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@njit(**COMPILED)
 def _work(p: Tape, template: FloatArray, parameters: FloatArray) -> Work:
     """Return room for an integration, with everything that depends on parameters alone computed."""
     n, m, s = p.n, p.linear.size, p.switches.size
@@ -124,7 +125,7 @@ def _work(p: Tape, template: FloatArray, parameters: FloatArray) -> Work:
     )  # fmt: skip
 
 
-@njit(cache=True, error_model="numpy", nogil=True, inline="always")
+@in_place(inline="always")
 def _evaluate_slopes(p: Tape, w: Work, row: int) -> None:
     r, K, slopes = w.r, w.K, p.slopes
     evaluate(p.code, p.still, p.dynamic, r, 0 < row < 6)  # rows 0 and 6 of K are ends of steps, the others stages
@@ -132,11 +133,12 @@ def _evaluate_slopes(p: Tape, w: Work, row: int) -> None:
         K[row, i] = r[slopes[i]]
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@in_place
 def _speeds_of_switches(p: Tape, w: Work) -> None:
     """Find how fast each switching function runs along the field in the filled row of K, modes fixed."""
     row = int(w.memory[_ROW])
-    w.d[:] = 0.0
+    for i in range(w.d.size):
+        w.d[i] = 0.0
     w.d[0] = 1.0
     for i in range(p.n):
         w.d[1 + i] = w.K[row, i]
@@ -147,7 +149,7 @@ def _speeds_of_switches(p: Tape, w: Work) -> None:
         w.g_dot[k] = w.d[p.switches[k]]
 
 
-@njit(cache=True, error_model="numpy", nogil=True, inline="always")
+@in_place(inline="always")
 def _field(p: Tape, w: Work, x: FloatArray, t: float, row: int) -> None:
     """Evaluate the derivatives into a row of K; modes of sliding switches keep the state on the surface."""
     r, base, ramp, n = w.r, w.base, w.ramp, p.n
@@ -168,13 +170,13 @@ def _field(p: Tape, w: Work, x: FloatArray, t: float, row: int) -> None:
         _slide(p, w, count)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@in_place
 def _field_in_row(p: Tape, w: Work, x: FloatArray, t: float) -> None:
     """Do as :func:`_field`, into the row that the memory names: a call, where time does not count."""
     _field(p, w, x, t, int(w.memory[_ROW]))
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@in_place
 def _slide(p: Tape, w: Work, count: int) -> None:
     """Find the modes that keep sliding switches still: their speeds are linear in the modes."""
     at = int(w.memory[_ROW])
@@ -207,7 +209,7 @@ def _slide(p: Tape, w: Work, count: int) -> None:
     _evaluate_slopes(p, w, at)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@in_place
 def _settle(p: Tape, w: Work, x: FloatArray, t: float) -> None:
     """Set every switch's mode for the state and inputs of now, one side or sliding, and the field in K[0]."""
     for _ in range(3):
@@ -235,7 +237,7 @@ def _settle(p: Tape, w: Work, x: FloatArray, t: float) -> None:
     _field_in_row(p, w, x, t)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@in_place
 def _choose(p: Tape, w: Work, x: FloatArray, t: float, k: int, before: float, g: float) -> None:
     """Set the mode of a switch whose function is at zero by where the fields of both sides lead."""
     mode = p.modes[k]
@@ -261,7 +263,7 @@ def _choose(p: Tape, w: Work, x: FloatArray, t: float, k: int, before: float, g:
         w.r[mode] = before if abs(before) == 1.0 else 1.0
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@in_place
 def _crossing(p: Tape, w: Work) -> bool:
     """Return whether a mode no longer fits the registers of now, and mark which."""
     found = False
@@ -279,17 +281,29 @@ def _crossing(p: Tape, w: Work) -> bool:
     return found
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@in_place
+def _copy(a: FloatArray, b: FloatArray) -> None:
+    for i in range(a.size):
+        b[i] = a[i]
+
+
+@in_place
+def _halve(a: FloatArray) -> None:
+    for i in range(a.size):
+        a[i] *= 0.5
+
+
+@in_place
 def _begin_locating(p: Tape, w: Work, x: FloatArray, t: float) -> None:
     """Remember how far modes are over their edges where a step ends beyond a crossing, and where it began."""
-    w.beyond[:] = w.over
+    _copy(w.over, w.beyond)
     w.memory[_ROW] = 5.0
     _field_in_row(p, w, x, t)
     _crossing(p, w)
-    w.before[:] = w.over
+    _copy(w.over, w.before)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@in_place
 def _located(w: Work, low: float, high: float, close: float, side: int, halve: bool) -> float:
     """Return the step to try next between one before a crossing and one beyond it: false position, or half way.
 
@@ -308,7 +322,7 @@ def _located(w: Work, low: float, high: float, close: float, side: int, halve: b
     return min(max(found - 0.4 * side * close, low + 0.2 * close), high - 0.2 * close)
 
 
-@njit(cache=True, error_model="numpy", nogil=True, inline="always")
+@in_place(inline="always")
 def _size(p: Tape, w: Work, x: FloatArray, tolerance: float) -> float:
     """Return the error in units of what is allowed; NaN where it is no number."""
     worst = 0.0
@@ -319,7 +333,7 @@ def _size(p: Tape, w: Work, x: FloatArray, tolerance: float) -> float:
     return worst
 
 
-@njit(cache=True, error_model="numpy", nogil=True, inline="always")
+@in_place(inline="always")
 def _explicit(p: Tape, w: Work, x: FloatArray, t: float, h: float) -> float:
     """Take one Dormand-Prince step into y with its error in e; returns Hairer's h times the fastest rate."""
     K, y, e, seen, n = w.K, w.y, w.e, w.seen, p.n
@@ -343,7 +357,7 @@ def _explicit(p: Tape, w: Work, x: FloatArray, t: float, h: float) -> float:
     return h * change / far if far > 1e-14 else 0.0
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@in_place
 def _implicit(p: Tape, w: Work, x: FloatArray, t: float, h: float) -> None:
     """Take one Rosenbrock step into y with its error in e; J and K[7] hold the Jacobian and the time derivative."""
     n, K = p.n, w.K
@@ -368,7 +382,7 @@ def _implicit(p: Tape, w: Work, x: FloatArray, t: float, h: float) -> None:
         w.e[i] = h / 6.0 * (K[1, i] - 2.0 * K[2, i] + K[3, i])
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@in_place
 def _jacobian(p: Tape, w: Work, x: FloatArray, t: float, h: float) -> None:
     """Fill the Jacobian and the time derivative of the field at x, which is in K[0], by differences."""
     for j in range(p.n + 1):
@@ -387,7 +401,7 @@ def _jacobian(p: Tape, w: Work, x: FloatArray, t: float, h: float) -> None:
                 w.K[7, i] = (w.K[6, i] - w.K[0, i]) / step
 
 
-@njit(cache=True, error_model="numpy", nogil=True, inline="always")
+@in_place(inline="always")
 def _trial(p: Tape, w: Work, x: FloatArray, t: float, h: float, tolerance: float, new_point: bool) -> float:
     """Try a step into y and return its error in units of what is allowed."""
     if w.memory[_IS_STIFF] > 0.0:
@@ -402,7 +416,7 @@ def _trial(p: Tape, w: Work, x: FloatArray, t: float, h: float, tolerance: float
     return float(_size(p, w, x, tolerance))
 
 
-@njit(cache=True, error_model="numpy", nogil=True, inline="always")
+@in_place(inline="always")
 def _next_step(w: Work, error: float, h: float) -> None:
     """Remember the step that the error allows; one that was cut short leaves a longer one as it was."""
     power = -1.0 / 3.0 if w.memory[_IS_STIFF] > 0.0 else -0.2
@@ -415,7 +429,7 @@ def _next_step(w: Work, error: float, h: float) -> None:
         w.memory[_STEP] = grown if grown < h else max(w.memory[_STEP], grown)
 
 
-@njit(cache=True, error_model="numpy", nogil=True, inline="always")
+@in_place(inline="always")
 def _advance(p: Tape, w: Work, x: FloatArray, t: float, end: float, span: float, tolerance: float) -> int:
     """Carry x from t to end, in place; span is the time between rows. Returns why it ended."""
     if p.switches.size > 0:
@@ -458,14 +472,14 @@ def _advance(p: Tape, w: Work, x: FloatArray, t: float, end: float, span: float,
                 width = high - low
                 if crossed:
                     high = h
-                    w.beyond[:] = w.over
+                    _copy(w.over, w.beyond)
                     if side == 1:
-                        w.before[:] *= 0.5
+                        _halve(w.before)
                 else:
                     low = h
-                    w.before[:] = w.over
+                    _copy(w.over, w.before)
                     if side == -1:
-                        w.beyond[:] *= 0.5
+                        _halve(w.beyond)
                 side = 1 if crossed else -1
                 slow = slow + 1 if high - low > 0.5 * width else 0
                 if not crossed or high - low > close:
@@ -487,7 +501,7 @@ def _advance(p: Tape, w: Work, x: FloatArray, t: float, end: float, span: float,
     return DONE
 
 
-@njit(cache=True, error_model="numpy", nogil=True, inline="always")
+@in_place(inline="always")
 def _inputs(
     p: Tape, w: Work, times: FloatArray, columns: FloatArray, delays: FloatArray, at: IntArray, now: float, close: float
 ) -> float:
@@ -511,7 +525,7 @@ def _inputs(
     return following
 
 
-@njit(cache=True, error_model="numpy", nogil=True, inline="always")
+@in_place(inline="always")
 def _to_next_row(
     p: Tape, w: Work, x: FloatArray, times: FloatArray, columns: FloatArray, delays: FloatArray, at: IntArray,
     row: int, close: float, tolerance: float,
@@ -532,7 +546,68 @@ def _to_next_row(
     return DONE, following
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@in_place
+def _begin(p: Tape, w: Work, x0: FloatArray, number: int, x: FloatArray) -> None:
+    """Bring the state to a row of ``x0``, with nothing known yet of steps and switches."""
+    for i in range(p.n):
+        x[i] = x0[number, i]
+        w.seen[i] = abs(x[i])
+    for k in range(p.switches.size):
+        w.sliding[k] = w.crossed[k] = 0
+        w.zero[k] = w.largest[k] = 0.0
+    for i in range(w.memory.size):
+        w.memory[i] = 0.0
+
+
+@in_place
+def _row_before(times: FloatArray, t: float) -> int:
+    """Return the last row that comes before a time, -1 where there is none."""
+    low, high = 0, times.size
+    while low < high:
+        middle = (low + high) // 2
+        if times[middle] < t:
+            low = middle + 1
+        else:
+            high = middle
+    return low - 1
+
+
+@in_place
+def _integrate(
+    p: Tape, w: Work, times: FloatArray, columns: FloatArray, delays: FloatArray, start: int, stop: int, x0: FloatArray,
+    tolerance: float, most: float, out: FloatArray, ends: FloatArray, status: FloatArray, window: int, x: FloatArray,
+    at: IntArray,
+) -> None:  # fmt: skip
+    """Integrate one window; ``x`` and ``at`` are room for the state and for every input's row."""
+    close = 1e-9 * (times[-1] - times[0]) / max(times.size - 1, 1)
+    _begin(p, w, x0, window, x)
+    t = times[start]
+    for j in range(p.linear.size):
+        at[j] = max(_row_before(times, t - delays[j] - close), 0)
+    # a row's reading sees the inputs as they were before its command acts
+    _inputs(p, w, times, columns, delays, at, t - 3.0 * close, close)
+    _settle(p, w, x, t - times[0])
+    status[window, 0], status[window, 1] = DONE, t
+    spare = most * SPARE_ROWS
+    for row in range(start, stop):
+        evaluate(p.code, p.dynamic, p.code.shape[0], w.r, False)
+        for q in range(p.outputs.size):
+            out[q, row] = w.r[p.outputs[q]]
+        if row + 1 >= times.size:
+            break
+        ended, t = _to_next_row(p, w, x, times, columns, delays, at, row, close, tolerance)
+        status[window, 2] += w.memory[_STEPS]
+        spare += most - w.memory[_STEPS]
+        if ended == DONE and spare < 0.0:
+            ended = TOO_MANY_STEPS
+        if ended != DONE:
+            status[window, 0], status[window, 1] = ended, t
+            break
+    for i in range(p.n):
+        ends[window, i] = x[i]
+
+
+@njit(**COMPILED)
 def run(
     p: Tape, template: FloatArray, parameters: FloatArray, times: FloatArray, columns: FloatArray, delays: FloatArray,
     starts: IntArray, stops: IntArray, x0: FloatArray, tolerance: float, most: float, out: FloatArray,
@@ -545,51 +620,26 @@ def run(
     """
     w = _work(p, template, parameters)
     x, at = np.zeros(p.n), np.zeros(p.linear.size, dtype=np.int64)
-    close = 1e-9 * (times[-1] - times[0]) / max(times.size - 1, 1)
     for window in range(starts.size):
-        for i in range(p.n):
-            x[i] = x0[window, i]
-            w.seen[i] = abs(x[i])
-        w.sliding[:], w.crossed[:], w.zero[:], w.largest[:], w.memory[:] = 0, 0, 0.0, 0.0, 0.0
-        t = times[starts[window]]
-        for j in range(p.linear.size):
-            at[j] = max(np.searchsorted(times, t - delays[j] - close) - 1, 0)
-        # a row's reading sees the inputs as they were before its command acts
-        _inputs(p, w, times, columns, delays, at, t - 3.0 * close, close)
-        _settle(p, w, x, t - times[0])
-        status[window, 0], status[window, 1] = DONE, t
-        spare = most * SPARE_ROWS
-        for row in range(starts[window], stops[window]):
-            evaluate(p.code, p.dynamic, p.code.shape[0], w.r, False)
-            for q in range(p.outputs.size):
-                out[q, row] = w.r[p.outputs[q]]
-            if row + 1 >= times.size:
-                break
-            ended, t = _to_next_row(p, w, x, times, columns, delays, at, row, close, tolerance)
-            status[window, 2] += w.memory[_STEPS]
-            spare += most - w.memory[_STEPS]
-            if ended == DONE and spare < 0.0:
-                ended = TOO_MANY_STEPS
-            if ended != DONE:
-                status[window, 0], status[window, 1] = ended, t
-                break
-        for i in range(p.n):
-            ends[window, i] = x[i]
+        _integrate(
+            p, w, times, columns, delays, starts[window], stops[window], x0, tolerance, most, out, ends, status, window,
+            x, at,
+        )  # fmt: skip
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@njit(**COMPILED)
 def look(
     p: Tape, template: FloatArray, parameters: FloatArray, states: FloatArray, inputs: FloatArray, t: float
 ) -> tuple[FloatArray, FloatArray]:
     """Return derivatives (P, n) and outputs (P, q) at P points of states (P, n) and inputs (P, m) at time t."""
     w = _work(p, template, parameters)
     points = states.shape[0]
-    found, y = np.zeros((points, p.n)), np.zeros((points, p.outputs.size))
+    found, y, x = np.zeros((points, p.n)), np.zeros((points, p.outputs.size)), np.zeros(p.n)
     for i in range(points):
-        w.sliding[:], w.crossed[:], w.zero[:], w.largest[:] = 0, 0, 0.0, 0.0
+        _begin(p, w, states, i, x)
         for j in range(p.linear.size):
             w.base[j] = inputs[i, j]
-        _settle(p, w, states[i], t)
+        _settle(p, w, x, t)
         evaluate(p.code, p.dynamic, p.code.shape[0], w.r, False)
         for j in range(p.n):
             found[i, j] = w.K[0, j]

@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
 from autotune.arrays import FloatArray, IntArray
+from autotune.equations.in_place import in_place
 from autotune.equations.opcodes import (
     ACOS,
     ADD,
@@ -34,7 +34,7 @@ from autotune.equations.opcodes import (
 )  # fmt: skip
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@in_place
 def evaluate(code: IntArray, first: int, last: int, r: FloatArray, extended: bool) -> None:
     """Run operations ``first`` to ``last`` on the registers.
 
@@ -102,7 +102,7 @@ def evaluate(code: IntArray, first: int, last: int, r: FloatArray, extended: boo
         r[code[k, 1]] = v
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@in_place
 def tangents(code: IntArray, first: int, last: int, r: FloatArray, d: FloatArray) -> None:
     """Carry a direction ``d`` of the registers through operations whose values are in ``r``; modes stay fixed."""
     for k in range(first, last):
@@ -161,7 +161,7 @@ def tangents(code: IntArray, first: int, last: int, r: FloatArray, d: FloatArray
         d[code[k, 1]] = w
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@in_place
 def solve(A: FloatArray, b: FloatArray, n: int) -> None:
     """Solve the leading n by n system in place by elimination with row pivots; b becomes the solution."""
     for i in range(n):
