@@ -84,7 +84,10 @@ def interrupt_held() -> Iterator[None]:
 
 @contextmanager
 def interrupt_deferred() -> Iterator[None]:
-    """Let the block come to its end: a Ctrl-C meanwhile is raised after it, unless the block raises something else."""
+    """Let the block come to its end: a Ctrl-C meanwhile is given after it, unless the block raises something itself.
+
+    It then goes to whoever hears Ctrl-C outside of the block: a control loop ends its experiment by it.
+    """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -95,4 +98,4 @@ def interrupt_deferred() -> Iterator[None]:
     finally:
         signal.signal(signal.SIGINT, handler)
     if came:
-        raise KeyboardInterrupt
+        signal.raise_signal(signal.SIGINT)

@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from autotune.errors import InputError
+from autotune.interrupts import interrupt_deferred
 from autotune.text_files import reason
 
 #: Errors of a file system that has no hard links.
@@ -50,6 +51,11 @@ def write_whole(path: str | os.PathLike[str], content: str | bytes, *, sync: boo
     if place.exists() and not place.is_file():  # a device or a pipe has no place beside it
         place.write_bytes(data)
         return
+    with interrupt_deferred():
+        _write_beside(place, data, sync)
+
+
+def _write_beside(place: Path, data: bytes, sync: bool) -> None:
     handle, part = tempfile.mkstemp(prefix=".part-", dir=place.parent)
     try:
         with os.fdopen(handle, "wb") as file:
@@ -262,24 +268,36 @@ def _prove(folder: Path) -> None:
         with _beside(_folder(folder)):
             pass
     finally:
-        for one in missing:
-            with contextlib.suppress(OSError):  # somebody else may have begun to use it
-                one.rmdir()
+        with interrupt_deferred():
+            for one in missing:
+                with contextlib.suppress(OSError):  # somebody else may have begun to use it
+                    one.rmdir()
 
 
 @contextmanager
 def _beside(folder: Path) -> Iterator[Path]:
     """Yield a new folder in the folder, which proves that it can be written, and leave nothing of it behind."""
-    with _told(folder):
-        part = Path(tempfile.mkdtemp(prefix=".part-", dir=folder))
+    part: Path | None = None
     try:
+        with _told(folder), interrupt_deferred():
+            part = Path(tempfile.mkdtemp(prefix=".part-", dir=folder))
         yield part
     except OSError as error:
         named = error.filename
-        if error.errno == errno.EPIPE or not (named is None or str(named).startswith(str(part))):
+        if part is None or error.errno == errno.EPIPE or not (named is None or str(named).startswith(str(part))):
             raise  # of standard output, or of a file that has nothing to do with this place
         raise unwritable(error, folder) from None
     finally:
+        try:
+            with interrupt_deferred():
+                _remove(part)
+        except KeyboardInterrupt:  # it may have come just before
+            _remove(part)
+            raise
+
+
+def _remove(part: Path | None) -> None:
+    if part is not None:
         shutil.rmtree(part, ignore_errors=True)
 
 

@@ -1,14 +1,19 @@
 from __future__ import annotations
 
+import itertools
+import json
 import os
 import shutil
+import signal
 import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from types import FrameType
 
 import pytest
 
+from autotune import outputs
 from autotune.errors import InputError
 from autotune.outputs import Output, OutputFolder, append_whole, claim, write_json, write_whole
 from autotune.recording import RecordingWriter, read_recording
@@ -197,3 +202,46 @@ def test_a_run_keeps_the_comments_of_a_configuration_that_lies_in_its_folder(tmp
     store_config(other, tmp_path)  # as a resumed run may
     assert (tmp_path / "config-2.toml").read_text() == before
     assert load_config(tmp_path / "config.toml") == other
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # a file just opened is closed later
+@pytest.mark.parametrize("way", ["file", "folder", "whole"])
+def test_an_interrupt_at_any_call_leaves_a_whole_file_or_none(tmp_path: Path, way: str) -> None:
+    def writes(place: Path) -> None:
+        if way == "file":
+            Output(place / "new" / "a.json").json({"a": 1})
+        elif way == "whole":
+            write_json(place / "a.json", {"a": 1})
+        else:
+            with OutputFolder(place / "new", ["a.json"]).filled() as part:
+                (part / "a.json").write_text('{"a": 1}')
+
+    def interrupted_at(number: int, place: Path) -> bool:
+        """Give the process a Ctrl-C before or after the numbered call, where Python hears it; say whether it came."""
+        calls = itertools.count()
+
+        def heard(frame: FrameType, event: str, _: object) -> None:
+            if event != "return" and frame.f_code.co_filename == outputs.__file__ and next(calls) == number:
+                signal.raise_signal(signal.SIGINT)
+
+        sys.setprofile(heard)
+        try:
+            writes(place)
+        except KeyboardInterrupt:
+            pass
+        finally:
+            sys.setprofile(None)
+        return next(calls) > number
+
+    for number in itertools.count():
+        place = tmp_path / str(number)
+        place.mkdir()
+        came = interrupted_at(number, place)
+        files = [file for file in place.rglob("*") if not file.is_dir()]
+        assert [file.name for file in files] in ([], ["a.json"]), number
+        assert all(json.loads(file.read_text()) == {"a": 1} for file in files)
+        assert not list(place.rglob(".part-*")), number
+        if not came:
+            assert number > 10
+            assert files
+            break
