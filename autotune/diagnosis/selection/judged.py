@@ -76,16 +76,18 @@ class Judged:
         """Whether it takes a share of another one's held-out error away, at one of the scales.
 
         What it has beyond the other one may have come to nothing on long windows: then short ones do not speak for it.
-        What happens at a time of its own explains a part of everything: it must take away more.
+        What happens at a time of its own explains a part of everything: it must take away more, and since it lasts,
+        at both scales.
         """
         extra = set(self.names) - set(other.names)
-        if any(kind_of(name).is_event for name in extra):
-            share = max(share, self.data.thresholds.material_event)
         at_nothing = bool(extra) and extra <= vanished(Hypothesis(names=self.names, fit=self.fit))
-        ratios = [float(self.long_squares.sum() / other.long_squares.sum())]
-        if not at_nothing:
-            ratios.append(float(self.short_squares.sum() / other.short_squares.sum()))
-        return math.sqrt(min(ratios)) < 1.0 - share
+        long, short = (
+            math.sqrt(float(mine.sum() / its.sum()))
+            for mine, its in ((self.long_squares, other.long_squares), (self.short_squares, other.short_squares))
+        )
+        if any(kind_of(name).is_event for name in extra):
+            return max(long, short) < 1.0 - max(share, self.data.thresholds.material_event)
+        return (long if at_nothing else min(long, short)) < 1.0 - share
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
