@@ -41,8 +41,10 @@ def description(kinds: tuple[str, ...]) -> str:
     )
 
 
-def description_3() -> str:
-    """Return the model description of FMI 3.0, for co-simulation."""
+def description_3(kinds: tuple[str, ...]) -> str:
+    """Return the model description of FMI 3.0 for co-simulation, model exchange or both."""
+    attributes = {"CoSimulation": ' canHandleVariableCommunicationStepSize="true"', "ModelExchange": ""}
+    offered = "".join(f'<{kind} modelIdentifier="rig"{attributes[kind]}/>' for kind in kinds)
     variables = []
     for reference, name in enumerate(NAMES):
         derivative = {"der(phi)": ' derivative="2"', "der(w)": ' derivative="3"'}.get(name, "")
@@ -52,9 +54,8 @@ def description_3() -> str:
         variables.append(f'<Float64 name="{name}" valueReference="{reference}" {says}{start}{derivative}/>')
     return (
         '<?xml version="1.0" encoding="UTF-8"?><fmiModelDescription fmiVersion="3.0" modelName="rig" '
-        'instantiationToken="{rig}"><CoSimulation modelIdentifier="rig" '
-        'canHandleVariableCommunicationStepSize="true"/>'
-        f'<ModelVariables>{"".join(variables)}</ModelVariables><ModelStructure><Output valueReference="2"/>'
+        f'instantiationToken="{{rig}}">{offered}<ModelVariables>{"".join(variables)}</ModelVariables>'
+        '<ModelStructure><Output valueReference="2"/>'
         '<ContinuousStateDerivative valueReference="7"/><ContinuousStateDerivative valueReference="8"/>'
         "</ModelStructure></fmiModelDescription>"
     )
@@ -70,8 +71,7 @@ def build(folder: Path, *kinds: str, fmi: int = 2) -> Path:
     )
     fmu = folder / "rig.fmu"
     with zipfile.ZipFile(fmu, "w") as archive:
-        archive.writestr(
-            "modelDescription.xml", description_3() if fmi == 3 else description(kinds or ("CoSimulation",))
-        )
+        offered = kinds or ("CoSimulation",)
+        archive.writestr("modelDescription.xml", description_3(offered) if fmi == 3 else description(offered))
         archive.write(library, f"binaries/{fmpy.platform_tuple if fmi == 3 else fmpy.platform}/{library.name}")
     return fmu
