@@ -45,6 +45,8 @@ class Data:
         a play or a dead time holds at a window's beginning was commanded before.
     kept : tuple of (N,) int array
         The rows' numbers there.
+    weights : tuple of float, optional
+        What each recording's whitened residuals are multiplied by; nothing where all count alike.
     """
 
     recordings: tuple[Recording, ...]
@@ -56,6 +58,7 @@ class Data:
     numbers: tuple[int, ...] = ()
     whole: Data | None = None
     kept: tuple[IntArray, ...] = ()
+    weights: tuple[float, ...] = ()
 
     def thinned(self, rows: int, informative: Sequence[BoolArray] | None = None) -> Data:
         """Return the data with windows left out evenly, until about as many rows count.
@@ -193,8 +196,30 @@ class Data:
     def whitened(self, residuals: list[FloatArray]) -> list[FloatArray]:
         """Return the residuals whitened by the noise model, zero where a row or one that it needs does not count."""
         ar, sd = np.array(self.noise.ar), self.noise.sd
-        rows = zip(residuals, self.good, self.starts, strict=True)
-        return [_innovations(r, good, starts, ar, sd) for r, good, starts in rows]
+        weights = self.weights or (1.0,) * len(self.recordings)
+        rows = zip(residuals, self.good, self.starts, weights, strict=True)
+        return [_innovations(r, good, starts, ar, sd / weight) for r, good, starts, weight in rows]
+
+    def beside(self, other: Data) -> Data:
+        """Return the same rows in two divisions into windows, each with its own noise, as one."""
+        if self.whole is None or other.whole is None:
+            mine, its = self.spread_out(), other.spread_out()
+            whole: Data | None = None
+            kept: tuple[IntArray, ...] = ()
+        else:
+            mine, its, kept = self, other, self.kept + other.kept
+            whole = self.whole.beside(other.whole)
+        return replace(
+            mine,
+            recordings=mine.recordings + its.recordings,
+            good=mine.good + its.good,
+            starts=mine.starts + its.starts,
+            stops=mine.stops + its.stops,
+            numbers=2 * (mine.numbers or tuple(range(len(mine.good)))),
+            whole=whole,
+            kept=kept,
+            weights=(1.0,) * len(mine.good) + (mine.noise.sd / its.noise.sd,) * len(its.good),
+        )
 
 
 def as_white(data: Data, sd: float) -> Data:

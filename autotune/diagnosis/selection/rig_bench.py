@@ -86,22 +86,24 @@ class RigBench:
         return fit(p, self.few, begun.theta, begun.x0, iterations=STEPS)
 
     def with_both_scales(self, one: Judged) -> Judged:
-        """Return a hypothesis with those of its numbers, fitted to long or to short windows, that suit both.
+        """Return a hypothesis with the numbers that suit long and short windows together.
 
-        What a plant that integrates lacks piles up in a long run and bends its numbers: where they differ from those of
-        short windows, those are taken that lose the smaller share at the other one's scale.
+        What a plant that integrates lacks piles up in a long run and bends its numbers along a valley that the long run
+        hardly sees; short windows see it, and are bent otherwise. So both are fitted at once, each in units of its own
+        residual, from those numbers of either that suit both better.
         """
         if not self.two_scales or not one.fit.model.transfer_function().integrators:
             return one
         p, held = one.fit.parametrisation, np.zeros(one.fit.theta.size, dtype=bool)
+        both = self.long.beside(self.few)
         try:
-            far = fit(p, self.long, one.short.theta, free=held, iterations=STEPS)
-            near = fit(p, self.few, one.fit.theta, free=held, iterations=STEPS)
+            begun = [fit(p, both, theta, free=held, iterations=STEPS) for theta in (one.fit.theta, one.short.theta)]
+            start = min(begun, key=lambda each: each.cost)
+            joint = fit(p, both, start.theta, start.x0, iterations=LAST_STEPS)
+            far = fit(p, self.long, joint.theta, free=held, iterations=STEPS)
         except RUNAWAY:
             return one
-        lost_far = rms(far.residuals, self.long.good) / rms(one.fit.residuals, self.long.good)
-        lost_near = rms(near.residuals, self.few.good) / rms(one.short.residuals, self.few.good)
-        return replace(one, fit=replace(far, covariance=one.short.covariance)) if lost_far < lost_near else one
+        return replace(one, fit=replace(far, covariance=joint.covariance))
 
     def finished(self, one: Judged) -> Judged | None:
         """Return a hypothesis fitted to the end, at the residual that the best one leaves; nothing if not better so."""

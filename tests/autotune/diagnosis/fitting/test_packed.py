@@ -97,3 +97,22 @@ def test_start_states_are_known_by_the_rows_of_the_whole_recordings() -> None:
     fewer = packed.only([np.array([0, 3]), np.array([2, 5])])
     for x0, known, number in zip(states_of(result, fewer), result.x0, ((0, 3), (2, 5)), strict=True):
         np.testing.assert_array_equal(x0, known[list(number)])
+
+
+@pytest.mark.parametrize("packed", [True, False])
+def test_a_fit_to_two_divisions_counts_each_by_its_own_noise(packed: bool) -> None:
+    effect = effect_of("environment.step_load")
+    some = some_windows(effect, 9)
+    assert some.whole is not None
+    every_other = np.arange(10) % 2 == 0
+    long = replace(some.whole.joined(2).only((every_other, every_other)), noise=Noise(sd=0.03))
+    short = replace(some, noise=Noise(sd=0.01))
+    both = long.beside(short) if packed else long.beside(short.spread_out())
+    assert (both.whole is not None) == packed
+    p = parametrise(model(), [effect], 1.0, 0.1)
+    held = np.zeros(len(p.free), dtype=bool)
+    theta = fit(p, short).theta
+    apart = [fit(p, data, theta, free=held) for data in (long, short)]
+    joint = fit(p, both, theta, free=held)
+    assert joint.chi2 == pytest.approx(sum(each.chi2 for each in apart), rel=1e-6)
+    assert fit(p, both, theta).chi2 < joint.chi2
