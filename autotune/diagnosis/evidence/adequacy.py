@@ -74,10 +74,12 @@ class ResidualTests:
     def has_line(self) -> bool:
         """Whether it swings with a frequency more than noise does, and than what effects explain is simulated wrong.
 
-        Beside effects alone: coloured noise has lines beyond chance too, and without effects the other tests decide.
+        Beside effects alone: coloured noise has lines beyond chance too, and without effects the other tests decide. A
+        line that explains less of the variance than chance does (sqrt(2 / N) for N rows) is a disturbance beside.
         """
-        gained = self.gained
-        return gained > 0.0 and self.line > self.limits.line and self.line_gain > self.limits.line_share * gained
+        gained, by_chance = self.gained, 2.0 / self.reduced_chi2_chance
+        is_line = gained > 0.0 and self.line > self.limits.line
+        return is_line and self.line_gain > max(self.limits.line_share * gained, by_chance)
 
     @property
     def has_no_slow_part(self) -> bool:
