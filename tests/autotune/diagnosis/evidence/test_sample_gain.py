@@ -132,7 +132,7 @@ def test_a_residual_of_noise_has_no_line_and_one_that_swings_with_the_signal_has
         assert (strongest_line(retuned, data)[0] > IN_USE.line) is has_line
 
 
-@pytest.mark.parametrize(("amplitude", "objects"), [(0.0025, False), (0.006, True)])
+@pytest.mark.parametrize(("amplitude", "objects"), [(0.003, False), (0.006, True)])
 def test_a_hum_that_explains_less_than_chance_does_is_no_objection_to_effects(amplitude: float, objects: bool) -> None:
     quiet, hum = recorded(lambda y: y), amplitude * np.sin(2.0 * np.pi * np.arange(ROWS) / 14.0)
     data, retuned = fitted(replace(quiet, y=quiet.y + hum))
