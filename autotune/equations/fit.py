@@ -2,7 +2,8 @@
 
 Gauss-Newton with Levenberg's damping on the readings' errors over the noise and on the parameters' distance from
 the prior of them; the start states of all windows are eliminated by projection. A parameter with a nonzero
-value is sought on a logarithmic scale, so that it keeps its sign: ``p = value exp(spread z)`` with z standard normal.
+value is sought on a logarithmic scale, so that it keeps its sign: ``p = value exp(spread z)`` with z standard normal,
+and in a straight line towards nothing where it comes below ``value / e``.
 
 References
 ----------
@@ -38,6 +39,11 @@ ROWS_PER_STATE = 4
 MOVES, WORTH_MOVING = 4, 0.1
 #: A longer window that leaves this many times the error of the shorter ones has lost its way.
 LOST = 30.0
+#: Weight of the belief that a start state is where it was, of what the readings tell of all, and by what it grows
+#: where a move fails: a state that readings hardly feel would jump, and hold up every number beside it.
+FIRMNESS, FIRMER = 1e-9, 10.0
+#: Part of a third of a value below which the straight scale is exponential again.
+LAST_SHARE = 0.02
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -106,11 +112,32 @@ def window_rows(t: FloatArray, horizon_s: float | None) -> tuple[IntArray, IntAr
 def values_of(compiled: Compiled, z: FloatArray) -> FloatArray:
     """Return the parameters at distances z from their nominal values, in prior standard deviations."""
     value, spread = compiled.parameter_vector, np.array([p.spread for p in compiled.parameters])
-    scaled = value * np.exp(np.clip(spread * z, -50.0, 50.0))
+    scaled = value * _factors(spread * z)[0]
     least = np.array([p.least for p in compiled.parameters])
     scaled = np.where(np.abs(scaled) < least, np.copysign(least, value), scaled)
     moved = np.where(_linear(compiled), value + spread * z, scaled)
     return np.asarray(np.where(spread > 0.0, moved, value), dtype=np.float64)
+
+
+def slopes_of(compiled: Compiled, z: FloatArray) -> FloatArray:
+    """Return how fast the parameters change with their distances z, (P,)."""
+    value, spread = compiled.parameter_vector, np.array([p.spread for p in compiled.parameters])
+    return np.asarray(np.where(_linear(compiled), spread, value * spread * _factors(spread * z)[1]))
+
+
+def _factors(x: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return by what values are multiplied at a distance x on the logarithmic scale, and how fast that changes.
+
+    Below 1/e the scale goes on in a straight line, so that a number whose part an effect takes comes to nothing at a
+    finite distance from what is believed of it; the last 2 % are exponential again: it keeps its sign.
+    """
+    least, foot = LAST_SHARE, LAST_SHARE - 2.0
+    grown = np.exp(np.clip(x, -1.0, 50.0))
+    last = np.exp(np.clip((x - foot) / least, -50.0, 0.0))
+    straight = x < -1.0
+    factor = np.where(straight, np.where(x < foot, least * last, 2.0 + x) / np.e, grown)
+    slope = np.where(straight, np.where(x < foot, last, 1.0) / np.e, grown)
+    return factor, slope
 
 
 def fit(
@@ -278,7 +305,7 @@ class Descent:
         start = values_of(compiled, z)
         scales = [state_scales(compiled, start, one.drive, one.windows.states[0]) for one in data]
         self._scales = np.max(scales, axis=0)
-        self._damping = 1e-3
+        self._damping, self._firmness = 1e-3, FIRMNESS
         self._last: FloatArray | None = None
         errors = self._simulated(z, [one.windows for one in data])
         if errors is None:
@@ -307,9 +334,7 @@ class Descent:
 
     def _derivatives(self) -> list[_Derivatives]:
         """Return per recording J to z with the start states projected out, and per window what gives those back."""
-        p = values_of(self._compiled, self._z)
-        spread = np.array([q.spread for q in self._compiled.parameters])
-        per_z = np.where(_linear(self._compiled), spread, p * spread)
+        per_z = slopes_of(self._compiled, self._z)
         known, self._known = self._known or self.sensitivities(), None
         return [self._projected(one, s, per_z) for one, s in zip(self._data, known, strict=True)]
 
@@ -382,7 +407,7 @@ class Descent:
         J = np.vstack([part for part, _ in derivatives]) / self._sd
         H = J.T @ J + np.eye(self._which.size)
         backs, before = [back for _, back in derivatives], self._cost()
-        for _ in range(tries):
+        for k in range(tries):
             damping = self._damping * np.diag(np.diag(H))
             at = _Iterate(z=self._z, windows=[one.windows for one in self._data], errors=self._errors)
             foreseen = np.zeros(self._which.size)
@@ -394,10 +419,12 @@ class Descent:
                     self._z, self._errors = new.z, new.errors
                     self._data = [replace(one, windows=w) for one, w in zip(self._data, new.windows, strict=True)]
                     self._damping = max(self._damping * 0.2, 1e-9)
+                    self._firmness = max(self._firmness / FIRMER, FIRMNESS)
                     return True
                 foreseen = damping @ (new.z - at.z)[self._which]
                 at = new
-            self._damping *= 10.0
+            self._firmness = min(self._firmness * FIRMER**2, 1.0)
+            self._damping *= 10.0 if k % 2 else 1.0
         return False
 
     def _next(
@@ -431,7 +458,7 @@ class Descent:
             wanted = error[at : at + X.shape[0]] - J @ move
             at += X.shape[0]
             # a weak belief that the state is where it was keeps what the readings do not tell
-            H = X.T @ X + 1e-9 * np.eye(free.size) * max(float(np.trace(X.T @ X)), 1e-300)
+            H = X.T @ X + self._firmness * np.eye(free.size) * max(float(np.trace(X.T @ X)), 1e-300)
             states[k, free] += self._scales[free] * np.linalg.solve(H, X.T @ wanted)
         return replace(windows, states=states)
 
@@ -442,8 +469,7 @@ class Descent:
             self._last = np.vstack([part for part, _ in self._derivatives()])
         J = self._last / self._sd
         covariance = np.linalg.inv(J.T @ J + np.eye(self._which.size))
-        spread = np.array([q.spread for q in compiled.parameters])
-        per_z = np.where(_linear(compiled), spread, np.abs(p) * spread)
+        per_z = np.abs(slopes_of(compiled, self._z))
         sd, whole = np.zeros(p.size), np.zeros((J.shape[0], p.size))
         sd[self._which] = np.sqrt(np.diag(covariance)) * per_z[self._which]
         whole[:, self._which] = J

@@ -289,6 +289,8 @@ class EquationBench:
                 "origin of y": float(np.nanstd(y)), "origin of u": float(np.std(u))}  # fmt: skip
         spread = max(float(np.max(s)) for s in self._sizes.values()) if self._sizes else 0.0
         size |= {f"width at {place}": LEAST_WIDTH * span for place, span in self._spans.items()}
+        size |= {f"stiffness at {place}": self._sizes.get(place, 0.0) / max(span, 1e-300)
+                 for place, span in self._spans.items()}  # fmt: skip
         return size | ({"in_phase": spread, "quadrature": spread} if spread else {})
 
     def fitted(self, effects: Sequence[Effect], start: Outcome, iterations: int = 15) -> Outcome:
@@ -534,6 +536,9 @@ def sought(p: ModelParameter, effects: Sequence[Effect], spreads: Mapping[str, f
         return replace(p, spread=0.0)
     if (name, key) == ("plant.hysteresis", "width"):
         return replace(p, least=spreads.get(f"width at {place_of(effects[number])}", 0.0))
+    if (name, key) == ("plant.hard_stop", "stiffness"):
+        # softer than what it turns round moves by itself it would be no stop, and its damping a loss of free place
+        return replace(p, least=spreads.get(f"stiffness at {place_of(effects[number])}", 0.0))
     if key == "surroundings":
         return replace(p, linear=True, spread=SURROUNDINGS_SD)
     if key == "origin":

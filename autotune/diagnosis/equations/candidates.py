@@ -23,6 +23,8 @@ ON_COMMAND = (
     "actuator.lag", "actuator.rate_limit", "actuator.backlash", "actuator.stiction", "timing.dead_time",
 )  # fmt: skip
 ON_READING = ("sensor.lag", "sensor.nonlinear_gain", "sensor.drift")
+#: What nearly every machine has, and models leave out: tried beside a large effect whatever others predict.
+USUAL = frozenset({"plant.coulomb_friction"})
 BY_KIND = {
     "speed": ON_SPEED, "level": ON_LEVEL, "temperature": ON_TEMPERATURE, "pressure": ON_LEVEL, "current": (),
     "force": (*ON_SPEED, *ON_POSITION), "torque": (*ON_SPEED, *ON_POSITION), "flow": ON_LEVEL, "heat": ON_TEMPERATURE,

@@ -13,7 +13,7 @@ from autotune.diagnosis.equations.candidates import Signals, Trial
 from autotune.diagnosis.evidence.stretches import stretches_in
 from autotune.equations.black_box import BlackBox, driven, read_out
 from autotune.equations.effects import OUTPUTS, apply, compile_with, with_values
-from autotune.equations.fit import Fitted, values_of
+from autotune.equations.fit import Fitted, slopes_of, values_of
 from autotune.equations.model import EquationModel
 from autotune.equations.simulate import Compiled, Drive
 from autotune.errors import InputError
@@ -146,13 +146,11 @@ class ClosedBench:
         which: IntArray,
     ) -> Outcome:  # fmt: skip
         sd = float(np.sqrt(np.mean(e**2))) + 1e-300
-        p, spread = values_of(compiled, z), np.array([q.spread for q in compiled.parameters])
-        linear = np.array([q.linear or q.value == 0.0 for q in compiled.parameters], dtype=bool)
+        p = values_of(compiled, z)
         deviation = np.zeros(p.size)
         if which.size:
             covariance = np.linalg.inv(J.T @ J / sd**2 + np.eye(which.size))
-            per_z = np.where(linear, spread, np.abs(p) * spread)
-            deviation[which] = np.sqrt(np.diag(covariance)) * per_z[which]
+            deviation[which] = np.sqrt(np.diag(covariance)) * np.abs(slopes_of(compiled, z))[which]
         whole = np.zeros((e.size, p.size))
         whole[:, which] = J / sd
         runs = self._simulated(compiled, effects, z)

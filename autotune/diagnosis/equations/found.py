@@ -18,12 +18,13 @@ from autotune.controller import Controller
 from autotune.diagnosis.effects import KINDS, kind_of
 from autotune.diagnosis.equations.bench import Bench, EquationBench, Outcome
 from autotune.diagnosis.equations.closed import ClosedBench
+from autotune.diagnosis.equations.probable import candidates_of, probability_of, without_improbable
 from autotune.diagnosis.equations.search import Searched, search
 from autotune.diagnosis.evidence.law import law_effect
 from autotune.diagnosis.evidence.readings import converter_step, struck
 from autotune.diagnosis.evidence.samples import SampleEffect, inspect, outliers_in, spared, together
 from autotune.diagnosis.result import NextExperiment
-from autotune.diagnosis.selection.probability import Candidate, weighed
+from autotune.diagnosis.selection.probability import Candidate
 from autotune.diagnosis.thresholds import IN_USE, Thresholds
 from autotune.equations.black_box import BlackBox
 from autotune.equations.effects import equation_of
@@ -225,7 +226,7 @@ def _searched(
             if isinstance(model, BlackBox)
             else EquationBench(model, recordings, good)
         )
-        return bench, search(bench, [*without, *(s.name for s in seen)], progress, limits)
+        return bench, without_improbable(search(bench, [*without, *(s.name for s in seen)], progress, limits))
 
     bench, found = searched()
     if "sensor.outliers" in (*without, *(effect.name for effect in model.effects)):
@@ -261,7 +262,7 @@ def _judged(
         verdict = "parameters"
     else:
         verdict = "none"
-    candidates = _candidates(found, 1.0 if verdict == "unexplained" else limits.unknown_odds)
+    candidates = candidates_of(found, 1.0 if verdict == "unexplained" else limits.unknown_odds)
     named = tuple(added) if verdict == "effect" else ()
     places = dict.fromkeys(p for e in named for p in _sits(e, found)) | dict.fromkeys(
         kind_of(s.name).place for s in seen
@@ -272,7 +273,7 @@ def _judged(
     use = found.chosen if verdict in ("effect", "unexplained") and better else found.retuned
     extended = model if verdict == "none" else _with_numbers(model, use)
     return EquationDiagnosis(
-        verdict=verdict, effects=named, probabilities=tuple(_probability(e, candidates) for e in named),
+        verdict=verdict, effects=named, probabilities=tuple(probability_of(e, candidates) for e in named),
         samples=seen if verdict == "effect" else (), candidates=candidates, places=tuple(places), errors=errors,
         extended_model=extended, searched=found, recordings=tuple(recordings),
         sentences=_sentences(verdict, named, seen, candidates, tuple(places), errors, found),
@@ -289,27 +290,6 @@ def _with_numbers(model: EquationModel | BlackBox, outcome: Outcome) -> Equation
     return replace(model.with_parameters(values), effects=outcome.effects)
 
 
-def _candidates(found: Searched, unknown: float) -> tuple[Candidate, ...]:
-    scores: dict[str, float] = {}
-    base = len(found.retuned.effects)
-    for one in (found.retuned, *found.tried):
-        name = "+".join(e.name for e in one.effects[base:]) or "none"
-        scores[name] = min(scores.get(name, np.inf), found.score(one) + _charge(one, found))
-    return weighed(scores, found.limits.temperature * max(1.0, found.variance_ratio(found.chosen)), unknown)
-
-
-def _charge(one: Outcome, found: Searched) -> float:
-    """Return what a larger hypothesis that is not needed pays: what it is ahead of the chosen one, and more."""
-    ahead = found.score(found.chosen) - found.score(one)
-    return ahead + found.limits.equation_decrease if one.count > found.chosen.count and ahead > 0.0 else 0.0
-
-
-def _probability(effect: Effect, candidates: Sequence[Candidate]) -> float:
-    same = set(kind_of(effect.name).same) if effect.name in KINDS else set()
-    total = sum(c.probability for c in candidates if {effect.name, *same} & set(c.name.split("+")))
-    return float(min(max(total, 0.0), 0.99))
-
-
 def _sentences(
     verdict: str, named: Sequence[Effect], seen: Sequence[SampleEffect], candidates: Sequence[Candidate],
     places: Sequence[str], errors: tuple[float, float, float, float], found: Searched,
@@ -324,7 +304,7 @@ def _sentences(
             first = "The structure is right, its numbers are not: retuned, the simulation explains the recordings."
         case "effect":
             told = [f"{e.name} at {e.state or e.port or e.input or 'the reading'} (probability "
-                    f"{_probability(e, candidates):.2f})" for e in named]  # fmt: skip
+                    f"{probability_of(e, candidates):.2f})" for e in named]  # fmt: skip
             first = f"Physics was left out: {' and '.join([*told, *(s.name for s in seen)])}."
         case _:
             first = (

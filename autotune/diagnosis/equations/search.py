@@ -12,7 +12,7 @@ import numpy as np
 
 from autotune.arrays import FloatArray
 from autotune.diagnosis.equations.bench import Bench, Outcome, scaled
-from autotune.diagnosis.equations.candidates import Trial, is_plainer, place_of, plainer, trials
+from autotune.diagnosis.equations.candidates import USUAL, Trial, is_plainer, place_of, plainer, trials
 from autotune.diagnosis.evidence.stretches import advantage
 from autotune.diagnosis.fitting.noise import Noise, noise_from_differences
 from autotune.diagnosis.thresholds import IN_USE, Thresholds
@@ -166,14 +166,15 @@ def _round(
     def told(what: str, done: float) -> None:
         progress(what, share + 0.35 * done)
 
-    found = _grown(bench, base, without, told, limits, count)
+    beside = further and not _is_noise(bench, base, limits.equation_astray, limits)
+    found = _grown(bench, base, without, told, limits, count, beside)
     best = min(found, key=lambda one: one.rss, default=base)
     if not _is_noise(bench, best, limits.equation_astray, limits):
         short = bench.shortened(base)
         if short is not None:
             # the base itself goes on as well: its effects may have been fitted in a wrong minimum
             again = [short] if further else []
-            found += _lengthened(bench, [*again, *_grown(bench, short, without, told, limits, count)])
+            found += _lengthened(bench, [*again, *_grown(bench, short, without, told, limits, count, beside)])
     found.sort(key=lambda one: one.rss)
     for k, one in enumerate(found[:2]):
         progress(f"fitting {one.effects[-1].name}", share + 0.35 + 0.04 * k)
@@ -183,11 +184,15 @@ def _round(
 
 
 def _grown(
-    bench: Bench, base: Outcome, without: Sequence[str], told: Progress, limits: Thresholds, count: int
+    bench: Bench, base: Outcome, without: Sequence[str], told: Progress, limits: Thresholds, count: int, usual: bool
 ) -> list[Outcome]:
-    """Return fits of a base with each of the effects that predict most."""
-    ranked = screened(bench, base, without, lambda what, done: told(what, 0.4 * done), limits)[:count]
-    return _fitted(bench, base, [effect for _, effect in ranked], lambda what: told(what, 0.6), limits)
+    """Return fits of a base with each of the effects that predict most, and with usual ones that predict anything.
+
+    Beside a large effect whose own numbers are not right yet, what these leave looks like more than the next effect.
+    """
+    ranked = screened(bench, base, without, lambda what, done: told(what, 0.4 * done), limits)
+    tried = [e for k, (_, e) in enumerate(ranked) if k < count or (usual and e.name in USUAL)]
+    return _fitted(bench, base, tried, lambda what: told(what, 0.6), limits)
 
 
 def _pruned(
@@ -316,10 +321,16 @@ def _leaves_nothing(bench: Bench, one: Outcome, effect: Effect, limits: Threshol
     return (1.0 - limits.equation_share) * _ratio(one, _noise(bench, one)) < 1.0
 
 
+def _ends_usual(one: Outcome) -> bool:
+    """Whether the last effect is a usual one beside others."""
+    return len(one.effects) > 1 and one.effects[-1].name in USUAL
+
+
 def _lengthened(bench: Bench, fits: Sequence[Outcome]) -> list[Outcome]:
-    """Return the best fits to short windows carried on to long ones."""
+    """Return the best fits to short windows carried on to long ones, and those with usual effects."""
     found = []
-    for one in sorted(fits, key=lambda one: one.rss)[:CARRIED]:
+    ranked = sorted(fits, key=lambda one: one.rss)
+    for one in [*ranked[:CARRIED], *(one for one in ranked[CARRIED:] if _ends_usual(one))]:
         try:
             found.append(bench.lengthened(one))
         except InputError:

@@ -6,9 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from autotune.equations import Drive, EquationModel, combinations, compile_model, retune, simulate, undetermined
-from autotune.equations.fit import fit
+from autotune.equations.fit import fit, slopes_of, values_of
 from autotune.equations.forecast import forecast
 from autotune.equations.starts import rest_state
 from autotune.errors import InputError
@@ -100,6 +102,23 @@ def test_simulate_takes_equations(tmp_path: Path) -> None:
     assert np.std(y - y_sim) < 0.05
 
 
+@given(value=st.sampled_from([-40.0, 1e-3, 21.5]), spread=st.sampled_from([0.2, 0.5]), z=st.floats(-40.0, 8.0))
+def test_a_number_keeps_its_sign_and_comes_to_nothing_at_a_finite_distance(
+    value: float, spread: float, z: float
+) -> None:
+    compiled = compile_model(one_state("u - K*x", {"K": {"value": value, "spread": spread}}))
+    (at,), (near,) = (values_of(compiled, np.array([z + dz])) for dz in (0.0, 1e-5))
+    assert at / value > 0.0
+    (slope,) = slopes_of(compiled, np.array([z]))
+    # the scale is curved by 1 over its last 2 % at most
+    assert (near - at) / 1e-5 == pytest.approx(slope, rel=3e-4, abs=1e-9 * abs(value))
+    assert slope / value >= 0.0
+    if z > -1.0 / spread:
+        assert at == pytest.approx(value * np.exp(spread * z))
+    if z < -2.1 / spread:
+        assert at / value < 1e-3
+
+
 def test_a_fit_follows_a_curved_valley() -> None:
     """A spring and a sine beside it share a pendulum's gravity: straight moves end in the walls after a hundredth."""
     swing = [{"name": "x", "kind": "position", "derivative": "v"}]
@@ -118,3 +137,29 @@ def test_a_fit_follows_a_curved_valley() -> None:
     begun = fit(model_of_both, [swung], z=np.array([-4.0, 0.0, 0.1]), horizon_s=0.7, iterations=12)
     found = fit(model_of_both, [swung], z=begun.z, horizon_s=5.4, iterations=12)
     assert found.noise_sd < 2e-3
+    whole = fit(model_of_both, [swung], z=found.z, iterations=20)
+    spring, gravity, _ = whole.parameters
+    assert whole.noise_sd < 1.1e-3
+    assert spring < 0.3  # of 21.5 that are believed: on a logarithmic scale alone 3.0 were left
+    assert gravity == pytest.approx(30.8, rel=0.01)
+
+
+def _fan(k: float, T: float, c: float) -> EquationModel:
+    """Return an arm that a fan lifts: at rest its speed n stands at zero, where the thrust k n^2 does not feel it."""
+    return one_state(
+        "x", {"k": k, "T": T, "c": c},
+        state=[{"name": "n", "derivative": "(u - n)/T"}, {"name": "x", "derivative": "w"},
+               {"name": "w", "derivative": "k*n^2 - c*w - 25*sin(x)"}],
+    )  # fmt: skip
+
+
+def test_a_start_that_the_readings_hardly_feel_holds_up_no_number() -> None:
+    rng = np.random.default_rng(3)
+    t, u = 0.02 * np.arange(900), np.repeat(rng.uniform(0.0, 2.6, 18), 50)
+    u[:200], u[500:650] = 0.0, 0.0
+    truth = compile_model(_fan(3.0, 0.1, 1.5))
+    y = simulate(truth, truth.parameter_vector, Drive(t=t, inputs=u[:, None]), np.zeros((1, 3))).y
+    swung = Recording(t=t, u=u, y=y + rng.normal(0.0, 0.002, t.size))
+    found = fit(compile_model(_fan(3.6, 0.12, 1.2)), [swung], horizon_s=1.0, iterations=15)
+    assert found.noise_sd < 2.2e-3
+    np.testing.assert_allclose(found.parameters, [3.0, 0.1, 1.5], rtol=0.02)

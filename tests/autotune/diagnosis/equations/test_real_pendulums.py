@@ -48,13 +48,10 @@ def test_with_gravity_in_the_equations_dry_friction_is_what_is_left_out(shared: 
     assert extended < 0.2 * min(nominal, retuned)
 
 
-UNTOLD = pytest.mark.xfail(reason="without gravity the sine torque takes the friction's place", strict=True)
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("case", ["m_04", pytest.param("m_03", marks=UNTOLD)])
+@pytest.mark.parametrize("case", SWINGS)
 def test_without_gravity_the_friction_is_the_same(shared: Path, case: str) -> None:
-    """A spring that softens, a sine, or both, stand for gravity; on m_04 a bend of the reading is named beside them."""
+    """A spring that softens, a sine, or both, stand for gravity; on m_03 a bend of the reading is named beside them."""
     with_gravity = friction(diagnosed(shared, case, "sin(theta)"))
     without = diagnosed(shared, case, "theta")
     names = {e.name for e in without.effects}
