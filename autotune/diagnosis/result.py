@@ -44,7 +44,7 @@ class FoundEffect:
 
 def told_apart(hypotheses: Sequence[str]) -> str:
     """Return the purpose of an experiment between hypotheses, each with its effects joined by a plus sign."""
-    *others, last = (name.replace("+", " with ") for name in hypotheses)
+    *others, last = (name.replace("+", " + ") for name in hypotheses)
     return f"tell {', '.join(others)} from {last}" if len(others) == 1 else f"tell {', '.join(others)} and {last} apart"
 
 

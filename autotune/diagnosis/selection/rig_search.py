@@ -100,8 +100,7 @@ def search_rig(
         beam = [retuned, nominal] if float(np.max(away)) > limits.nominal_too else [retuned]
         bench = replace(bench, lasting=tuple(_lasting(retuned, bench)))
         bench, found = _grown(retuned, beam, bench, progress, limits)
-        found = _finished(_pruned([*found, *_known(known, bench)], bench), bench)
-        found = _regrown(found, bench)
+        found = _regrown(_finished(_pruned([*found, *_known(known, bench)], bench), bench), bench)
         chosen = bench.with_both_scales(simplest(found, limits.material))
         nominal, retuned, chosen = (one.spread_out() for one in (nominal, retuned, chosen))
         return RigSearch(nominal=nominal, retuned=retuned, judged=tuple(found), chosen=chosen)
