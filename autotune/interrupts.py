@@ -12,10 +12,10 @@ from multiprocessing import resource_tracker
 from types import FrameType
 
 #: where an exception is lost: compiled code that calls Python to make its result, and a module that is half imported
-_DEAF = ("numba.core.serialize", "importlib._bootstrap")
-#: time after which a signal that came there is given again [s], and time it may wait in all [s]: a model's file may
-#: compute without end while it is imported
-_AGAIN_S, _LONGEST_S = 0.01, 3.0
+_RETURNING, _IMPORTING = "numba.core.serialize", "importlib._bootstrap"
+#: time after which a signal that came there is given again [s]; time it may wait for an import in all [s], since a
+#: model's file may compute without end while it is imported; time after which that begins anew [s]
+_AGAIN_S, _LONGEST_S, _ANEW_S = 0.01, 3.0, 60.0
 _waits_since: list[float] = []
 
 
@@ -34,7 +34,8 @@ def raise_interrupt(number: int, frame: FrameType | None) -> None:
         Where Python was.
     """
     while frame is not None:
-        if frame.f_globals.get("__name__") in _DEAF and _may_wait():
+        where = frame.f_globals.get("__name__")
+        if where == _RETURNING or (where == _IMPORTING and _may_wait()):
             again = threading.Timer(_AGAIN_S, _give, (number,))
             again.daemon = True
             again.start()
@@ -46,8 +47,8 @@ def raise_interrupt(number: int, frame: FrameType | None) -> None:
 
 def _may_wait() -> bool:
     now = time.monotonic()
-    if not _waits_since:
-        _waits_since.append(now)
+    if not _waits_since or now - _waits_since[0] > _ANEW_S:  # whoever heard an earlier one did not say so here
+        _waits_since[:] = [now]
     return now - _waits_since[0] < _LONGEST_S
 
 
