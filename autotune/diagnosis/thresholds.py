@@ -168,6 +168,7 @@ class Thresholds:
     equation_faint: float = known(0.02, "of the best", "predicted decrease, below which an effect is not fitted", "cost")
     equation_explained: float = known(1.25, "times the noise", "variance up to which chosen effects explain recordings", "counted")
     equation_most: float = known(0.85, "of the excess variance", "that effects must explain to be named otherwise", "counted")
+    equation_small: float = known(0.1, "of the spread of y", "held-out error up to which effects that take their share of it are named where more than noise is left", "real rigs")
     equation_missing: float = known(1.26, "times the noise", "variance from which on something is missing", "counted")
     equation_held_out: float = known(1.1, "times the noise", "held-out error that is as good as retuning's", "convention")
     # what to record next

@@ -20,8 +20,15 @@ from typing import TypeAlias
 import numpy as np
 
 from autotune.arrays import BoolArray, FloatArray, IntArray
-from autotune.equations.sensitivity import STEP, Sensitivities, Windows, sensitivities
-from autotune.equations.simulate import Compiled, Drive, drive_of, simulate
+from autotune.equations.sensitivity import (
+    STEP,
+    WORTH_A_THREAD,
+    Sensitivities,
+    Windows,
+    sensitivities,
+    side_by_side,
+)
+from autotune.equations.simulate import Compiled, Drive, Run, drive_of, simulate
 from autotune.equations.starts import fitted_starts, given_starts, state_scales
 from autotune.errors import InputError
 from autotune.progress import Progress, quiet
@@ -318,10 +325,16 @@ class Descent:
 
     def _simulated(self, z: FloatArray, windows: Sequence[Windows]) -> list[FloatArray] | None:
         """Return reading less simulation at the rows that count, None where a run does not reach its end."""
-        found = []
-        for one, w in zip(self._data, windows, strict=True):
-            p = values_of(self._compiled, z)
-            run = simulate(self._compiled, p, one.drive, w.states, starts=w.starts, stops=w.stops)
+        found, p = [], values_of(self._compiled, z)
+        each = list(zip(self._data, windows, strict=True))
+
+        def run_of(pair: tuple[FitData, Windows]) -> Run:
+            one, w = pair
+            return simulate(self._compiled, p, one.drive, w.states, starts=w.starts, stops=w.stops)
+
+        rows = sum(int(np.sum(w.stops - w.starts)) for w in windows)
+        runs = side_by_side(run_of, each) if len(each) > 1 and rows > WORTH_A_THREAD else map(run_of, each)
+        for (one, w), run in zip(each, runs, strict=True):
             error = (one.y - run.y)[one.good & _covered(one.y.size, w)]
             if not np.all(np.isfinite(error)):
                 return None

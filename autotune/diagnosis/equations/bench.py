@@ -46,6 +46,8 @@ SURROUNDINGS_SD = 15.0
 LEAST_SOUGHT = 3
 #: Windows per recording that a search works on: long enough to tell, short enough to converge.
 WINDOWS = 3
+#: Rows of such a window at most: in longer ones fits take more steps, and say no more.
+MOST_ROWS = 500
 #: How many times as long as short windows long ones are.
 SHORTER = 8
 #: Spreads of y that an error counts at most: a simulation that runs away is that wrong.
@@ -177,7 +179,8 @@ class EquationBench:
         self._rows = [np.isfinite(r.y) for r in self.recordings]
         self._drives = [drive_of(model, r) for r in self.recordings]
         span = max(float(r.t[-1] - r.t[0]) for r in recordings)
-        self.length_s = model.horizon_s or span / WINDOWS
+        dt = max(float(np.median(np.diff(r.t))) for r in recordings)
+        self.length_s = model.horizon_s or min(span / WINDOWS, MOST_ROWS * dt)
 
     @property
     def model(self) -> EquationModel:

@@ -253,8 +253,9 @@ def _judged(
     limits = found.limits
     explains = left < limits.equation_explained - 1.0 or left < (1.0 - limits.equation_most) * before
     better = errors[2] < errors[1] or errors[2] < limits.equation_held_out * errors[3]
+    mostly = not explains and _explains_most(errors, limits)
     verdict: Literal["none", "parameters", "effect", "unexplained"]
-    if (added and explains and better) or (seen and left < 1.0):
+    if (added and (explains or mostly) and better) or (seen and left < 1.0):
         verdict = "effect"
     elif added or left > limits.equation_missing - 1.0:
         verdict = "unexplained"
@@ -262,7 +263,8 @@ def _judged(
         verdict = "parameters"
     else:
         verdict = "none"
-    candidates = candidates_of(found, 1.0 if verdict == "unexplained" else limits.unknown_odds)
+    odds = limits.half_explained_odds if mostly else limits.unknown_odds
+    candidates = candidates_of(found, 1.0 if verdict == "unexplained" else odds)
     named = tuple(added) if verdict == "effect" else ()
     places = dict.fromkeys(p for e in named for p in _sits(e, found)) | dict.fromkeys(
         kind_of(s.name).place for s in seen
@@ -278,6 +280,16 @@ def _judged(
         extended_model=extended, searched=found, recordings=tuple(recordings),
         sentences=_sentences(verdict, named, seen, candidates, tuple(places), errors, found),
     )  # fmt: skip
+
+
+def _explains_most(errors: tuple[float, float, float, float], limits: Thresholds) -> bool:
+    """Whether effects take a share of the held-out error away and leave one that is small beside what y does.
+
+    On real rigs more than noise is left by every model; what is far from right there explains nothing.
+    """
+    _, retuned, extended, noise = errors
+    gained = retuned**2 - extended**2 > limits.dominant * (retuned**2 - noise**2)
+    return gained and extended < limits.equation_small
 
 
 def _with_numbers(model: EquationModel | BlackBox, outcome: Outcome) -> EquationModel | BlackBox:
