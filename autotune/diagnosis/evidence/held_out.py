@@ -32,6 +32,11 @@ class FitQuality:
         """Whether nothing larger than the noise is left where the extended model was not fitted."""
         return self.extended <= self.noise_floor
 
+    def gains(self, share: float) -> bool:
+        """Whether the extended model takes a share of the variance away that retuning leaves above the noise."""
+        retuned = self.retuned**2
+        return retuned - self.extended**2 > share * (retuned - self.noise_floor**2)
+
 
 def dominates(quality: FitQuality, limits: Thresholds) -> bool:
     """Whether the chosen effects explain most of a residual that nothing explains whole.
@@ -39,9 +44,8 @@ def dominates(quality: FitQuality, limits: Thresholds) -> bool:
     On real rigs something always remains; an effect is named all the same when on rows that were not fitted it takes
     away a share of the variance that retuning leaves above the noise, where that is many times the noise's.
     """
-    retuned, noise = quality.retuned**2, quality.noise_floor**2
-    gained = retuned - quality.extended**2
-    return retuned > limits.far_from_noise * noise and gained > limits.dominant * (retuned - noise)
+    far = quality.retuned**2 > limits.far_from_noise * quality.noise_floor**2
+    return far and quality.gains(limits.dominant)
 
 
 def held_out(retuned: Fit, chosen: Fit, data: Data) -> FitQuality:

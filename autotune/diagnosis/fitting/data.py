@@ -201,7 +201,7 @@ class Data:
         return [_innovations(r, good, starts, ar, sd / weight) for r, good, starts, weight in rows]
 
     def beside(self, other: Data) -> Data:
-        """Return the same rows in two divisions into windows, each with its own noise, as one."""
+        """Return the same rows in two divisions into windows as one, each by its own noise's standard deviation."""
         if self.whole is None or other.whole is None:
             mine, its = self.spread_out(), other.spread_out()
             whole: Data | None = None

@@ -114,8 +114,7 @@ class RigBench:
             return None
         if rms(result.residuals, good) >= rms(one.fit.residuals, good):
             return None
-        judged = self.judged(result, one.log_odds)
-        return judged if judged is not None and np.all(np.isfinite(judged.long_squares)) else None
+        return self.finite(result, one.log_odds)
 
     def again(self, one: Judged) -> Judged:
         """Return a hypothesis fitted again, to data with another residual."""
@@ -145,6 +144,11 @@ class RigBench:
             )
         except RUNAWAY:
             return None
+
+    def finite(self, result: Fit, log_odds: float) -> Judged | None:
+        """Return a fit judged like :meth:`judged`; nothing where its errors on left-out stretches are not finite."""
+        judged = self.judged(result, log_odds)
+        return judged if judged is not None and np.all(np.isfinite(judged.long_squares)) else None
 
 
 def _carried(result: Fit, before: Data, data: Data) -> tuple[FloatArray, ...]:

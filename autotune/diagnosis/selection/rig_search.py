@@ -269,8 +269,8 @@ def _known(known: Fit | None, bench: RigBench) -> list[Judged]:
         result = bench.settled(known.parametrisation, known.theta)
     except RUNAWAY:
         return []
-    judged = bench.judged(result, math.log(odds))
-    return [judged] if judged is not None and np.all(np.isfinite(judged.long_squares)) else []
+    judged = bench.finite(result, math.log(odds))
+    return [] if judged is None else [judged]
 
 
 def _pruned(found: Sequence[Judged], bench: RigBench) -> list[Judged]:
@@ -320,8 +320,7 @@ def _on_from(best: Judged, larger: Judged, bench: RigBench) -> Judged | None:
         return None
     if is_stand_in(hypothesis(result), bench.long) or result.cost >= larger.fit.cost:
         return None
-    judged = bench.judged(result, larger.log_odds)
-    return judged if judged is not None and np.all(np.isfinite(judged.long_squares)) else None
+    return bench.finite(result, larger.log_odds)
 
 
 def _smaller(best: Judged, bench: RigBench) -> list[Judged]:

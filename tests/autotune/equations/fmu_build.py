@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 import subprocess
 import zipfile
+from collections.abc import Iterator
 from pathlib import Path
 
 import fmpy
@@ -18,24 +19,28 @@ CAUSALITY = {
 START = {"u": 0.0, "load": 0.0, "J": 0.05, "c": 0.1, "k": 1.0}
 
 
+def variables_of(**states: int) -> Iterator[tuple[str, str]]:
+    """Yield what every variable is, and its start and derivative; each state's index is as its derivative names it."""
+    for reference, name in enumerate(NAMES):
+        derived = {f"der({state})": f' derivative="{index}"' for state, index in states.items()}.get(name, "")
+        start = f' start="{START.get(name, 0.0)}"' if name in START or name in states else ""
+        says = CAUSALITY.get(name, "") + (' initial="exact"' if name in states else "")
+        yield f'name="{name}" valueReference="{reference}" {says}', start + derived
+
+
+def offered_as(kinds: tuple[str, ...]) -> str:
+    """Return the elements that say by which interfaces the model is offered."""
+    attributes = {"CoSimulation": ' canHandleVariableCommunicationStepSize="true"', "ModelExchange": ""}
+    return "".join(f'<{kind} modelIdentifier="rig"{attributes[kind]}/>' for kind in kinds)
+
+
 def description(kinds: tuple[str, ...]) -> str:
     """Return the model description for co-simulation, model exchange or both."""
-    variables = []
-    for reference, name in enumerate(NAMES):
-        derivative = {"der(phi)": ' derivative="3"', "der(w)": ' derivative="4"'}.get(name, "")
-        is_state = name in ("phi", "w")
-        start = f' start="{START.get(name, 0.0)}"' if name in START or is_state else ""
-        says = CAUSALITY.get(name, "") + (' initial="exact"' if is_state else "")
-        variables.append(
-            f'<ScalarVariable name="{name}" valueReference="{reference}" {says}><Real{start}{derivative}/>'
-            "</ScalarVariable>"
-        )
-    attributes = {"CoSimulation": ' canHandleVariableCommunicationStepSize="true"', "ModelExchange": ""}
-    offered = "".join(f'<{kind} modelIdentifier="rig"{attributes[kind]}/>' for kind in kinds)
+    variables = [f"<ScalarVariable {says}><Real{value}/></ScalarVariable>" for says, value in variables_of(phi=3, w=4)]
     unknown = '<Unknown index="8"/><Unknown index="9"/>'
     return (
         '<?xml version="1.0" encoding="UTF-8"?><fmiModelDescription fmiVersion="2.0" modelName="rig" guid="{rig}" '
-        f'numberOfEventIndicators="0">{offered}<ModelVariables>{"".join(variables)}</ModelVariables><ModelStructure>'
+        f'numberOfEventIndicators="0">{offered_as(kinds)}<ModelVariables>{"".join(variables)}</ModelVariables><ModelStructure>'
         f'<Outputs><Unknown index="3"/></Outputs><Derivatives>{unknown}</Derivatives></ModelStructure>'
         "</fmiModelDescription>"
     )
@@ -43,18 +48,10 @@ def description(kinds: tuple[str, ...]) -> str:
 
 def description_3(kinds: tuple[str, ...]) -> str:
     """Return the model description of FMI 3.0 for co-simulation, model exchange or both."""
-    attributes = {"CoSimulation": ' canHandleVariableCommunicationStepSize="true"', "ModelExchange": ""}
-    offered = "".join(f'<{kind} modelIdentifier="rig"{attributes[kind]}/>' for kind in kinds)
-    variables = []
-    for reference, name in enumerate(NAMES):
-        derivative = {"der(phi)": ' derivative="2"', "der(w)": ' derivative="3"'}.get(name, "")
-        is_state = name in ("phi", "w")
-        start = f' start="{START.get(name, 0.0)}"' if name in START or is_state else ""
-        says = CAUSALITY.get(name, "") + (' initial="exact"' if is_state else "")
-        variables.append(f'<Float64 name="{name}" valueReference="{reference}" {says}{start}{derivative}/>')
+    variables = [f"<Float64 {says}{value}/>" for says, value in variables_of(phi=2, w=3)]
     return (
         '<?xml version="1.0" encoding="UTF-8"?><fmiModelDescription fmiVersion="3.0" modelName="rig" '
-        f'instantiationToken="{{rig}}">{offered}<ModelVariables>{"".join(variables)}</ModelVariables>'
+        f'instantiationToken="{{rig}}">{offered_as(kinds)}<ModelVariables>{"".join(variables)}</ModelVariables>'
         '<ModelStructure><Output valueReference="2"/>'
         '<ContinuousStateDerivative valueReference="7"/><ContinuousStateDerivative valueReference="8"/>'
         "</ModelStructure></fmiModelDescription>"
