@@ -41,6 +41,8 @@ def found_effects(evidence: Evidence, verdict: Verdict) -> tuple[FoundEffect, ..
         return tuple(_of_samples(s, everywhere, evidence.limits) for s in evidence.samples)
     effects: list[tuple[float, FoundEffect]] = []
     for effect in with_uncertainty(chosen, chosen.fit.model.effects)[chosen.fit.parametrisation.own :]:
+        if effect.name in evidence.contradicted:
+            continue
         effects.append((_lost_without(search, effect.name), _found_effect(effect, evidence, everywhere)))
     effects += [(s.evidence, _of_samples(s, everywhere, evidence.limits)) for s in evidence.samples]
     # what is surer comes first; about as sure ones by how much they explain
@@ -136,11 +138,13 @@ def places_of(evidence: Evidence, effects: Sequence[FoundEffect], description: D
 
 
 def beside(effects: Sequence[FoundEffect], evidence: Evidence) -> str:
-    """Return what is said of effects that predict, and are too improbable to be named."""
+    """Return what is said of effects that predict, and are too improbable or contradicted to be named."""
     unnamed = [name for name in evidence.search.chosen.names if name not in {e.name for e in effects}]
     if not unnamed:
         return ""
-    return f" The extended model predicts with {' and '.join(unnamed)} as well, which may be something else."
+    why = "may be" if not evidence.contradicted & set(unnamed) else "must be"
+    scatter = "" if why == "may be" else ": readings scatter on where it would hold them still"
+    return f" The extended model predicts with {' and '.join(unnamed)} as well, which {why} something else{scatter}."
 
 
 def sentences_of(

@@ -141,6 +141,7 @@ class Thresholds:
     material_event: float = known(0.3, "of the held-out error", "that something which happens at a found time must take away", "real rigs")
     material_numbers: float = known(0.25, "of the held-out error", "that retuned numbers must take away to replace nominal ones where no effect is found", "convention")
     most_held: float = known(0.5, "of the values", "that stay for more than a row: more of them are a slow converter, no dropout", "convention")
+    most_scatter: float = known(0.5, "of the residual's", "variance from row to row that readings may have where a limit of the sensor holds them: a rig's noise is mostly the sensor's, in front of it", "convention")
     known_odds: float = known(0.3, "prior odds", "at least, of what the search beside the noise found to explain most", "real rigs")
     rig_effects: int = known(4, "effects", "in one hypothesis at most", "cost")
     rig_beam: int = known(2, "hypotheses", "that are built on", "cost")

@@ -12,7 +12,7 @@ from autotune.diagnosis.evidence.operating_point import Offset
 from autotune.diagnosis.evidence.own_noise import OwnNoise
 from autotune.diagnosis.evidence.samples import SampleEffect
 from autotune.diagnosis.result import Verdict
-from autotune.diagnosis.selection.hypothesis import penalised
+from autotune.diagnosis.selection.hypothesis import contradicted, penalised
 from autotune.diagnosis.selection.judged import RigSearch
 from autotune.diagnosis.selection.parsimony import worth_adding
 from autotune.diagnosis.selection.probability import Candidate, candidates_of
@@ -79,6 +79,11 @@ class Evidence:
             return self.rig.candidates(self.limits)
         return candidates_of(self.search, self.unknown_odds)
 
+    @cached_property
+    def contradicted(self) -> frozenset[str]:
+        """Chosen effects by whose name readings do not behave; asked where the model's error and not noise decides."""
+        return frozenset() if self.rig is None else contradicted(self.search.chosen, self.search.data)
+
     @property
     def numbers(self) -> float:
         """Decrease of chi-square that retuning brings beside the nominal numbers."""
@@ -95,7 +100,7 @@ class Evidence:
         # a clock that jitters disturbs commands too, which leaves something slow: what varies is weighed against it
         jitter = sum(s.evidence for s in self.samples if kind_of(s.name).sought == "residual")
         holds = {
-            "effects": bool(found.chosen.names),
+            "effects": bool(set(found.chosen.names) - self.contradicted),
             "rig": self.rig is not None,
             "varies more": self.rig is not None and self.rig.varies_more(limits.varies_more),
             "late stamps": self.evened,

@@ -308,6 +308,8 @@ class EffectKind:
         Whether it counts from a recording's beginning: seen once, it is nothing that the next recording has too.
     steps : bool
         Whether it makes steps of the readings that no derivative of a start state leads through.
+    flattens : bool
+        Whether readings stand still where it acts: what scatters in front of it is cut off with the rest.
     uneven : bool
         Whether it makes some rows' noise larger than others': then the residual's variance says nothing of a model.
     late_stamps : bool
@@ -357,6 +359,7 @@ class EffectKind:
     readable: Callable[[Mapping[str, Parameter]], dict[str, Parameter]] | None = None
     at_a_time: bool = False
     steps: bool = False
+    flattens: bool = False
     uneven: bool = False
     late_stamps: bool = False
     excludes: tuple[str, ...] = ()

@@ -113,6 +113,7 @@ SENSOR = (
         lines=(Line(stage="reading", does=limited),),
         starts=lambda s: limit_starts(s.y_low, s.y_high, (0.02, 0.1)),
         confusable=("plant.hard_stop",),
+        flattens=True,
         odds={"any": 0.03, "lifted": 0.01},
         reference=_LJUNG,
     ),

@@ -91,3 +91,29 @@ def is_stand_in(h: Hypothesis, data: Data) -> bool:
         if kind.stand_in is not None and kind.stand_in(fitted):
             return True
     return False
+
+
+def contradicted(h: Hypothesis, data: Data) -> frozenset[str]:
+    """Return its effects that would hold readings still where these scatter on.
+
+    Notes
+    -----
+    Squared differences of neighbouring readings where the simulated one stands still are compared with those of the
+    residual elsewhere; the share must be beyond ``most_scatter`` by two standard deviations. A limit in front of most
+    of the noise (a transmitter at its end, read through a noisy line) looks the same: ask only where a rig's noise is
+    known to be in front of it, or where model error rules and a limit may stand for what it is not.
+    """
+    able = frozenset(kind.name for kind in h.kinds if kind.flattens)
+    if not able:
+        return able
+    held, moving = [np.zeros(0)], [np.zeros(0)]
+    for r, signals, good in zip(data.recordings, h.fit.signals, data.good, strict=True):
+        simulated = signals[:, 0]
+        both, still = good[1:] & good[:-1], np.diff(simulated) == 0.0
+        held.append(np.diff(r.y)[both & still] ** 2)
+        moving.append(np.diff(r.y - simulated)[both & ~still] ** 2)
+    at, elsewhere = (found[np.isfinite(found)] for found in (np.concatenate(held), np.concatenate(moving)))
+    if not at.size or not elsewhere.size:
+        return frozenset()
+    surely = (1.0 - 2.0 * np.sqrt(2.0 / at.size)) * np.mean(at)
+    return able if surely > data.thresholds.most_scatter * np.mean(elsewhere) else frozenset()
