@@ -18,6 +18,7 @@ from autotune.recording import Recording
 #: Rows that stay between windows that are apart, as many as a noise model looks back; the share of rows above which
 #: data are left as they are.
 BETWEEN, MOST_PACKED = 2, 0.8
+_NOTHING = np.empty(0)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -195,10 +196,22 @@ class Data:
 
     def whitened(self, residuals: list[FloatArray]) -> list[FloatArray]:
         """Return the residuals whitened by the noise model, zero where a row or one that it needs does not count."""
+        return np.split(self._innovations(residuals, None), np.cumsum([len(r) for r in residuals])[:-1])
+
+    def whitened_runs(self, signals: list[FloatArray]) -> FloatArray:
+        """Return the whitened residuals of simulated signals, (N, at least 1) each, one recording after the other."""
+        return self._innovations([r.y for r in self.recordings], [out[:, 0] for out in signals])
+
+    def _innovations(self, values: list[FloatArray], simulated: list[FloatArray] | None) -> FloatArray:
+        """Return what the noise model leaves of values, less those simulated, one recording after the other."""
         ar, sd = np.array(self.noise.ar), self.noise.sd
         weights = self.weights or (1.0,) * len(self.recordings)
-        rows = zip(residuals, self.good, self.starts, weights, strict=True)
-        return [_innovations(r, good, starts, ar, sd / weight) for r, good, starts, weight in rows]
+        e, at = np.zeros(sum(len(r) for r in values)), 0
+        for k, (r, good, starts, weight) in enumerate(zip(values, self.good, self.starts, weights, strict=True)):
+            run = _NOTHING if simulated is None else simulated[k]
+            _innovations(r, run, good, starts, ar, sd / weight, e[at : at + len(r)])
+            at += len(r)
+        return e
 
     def beside(self, other: Data) -> Data:
         """Return the same rows in two divisions into windows as one, each by its own noise's standard deviation."""
@@ -228,9 +241,11 @@ def as_white(data: Data, sd: float) -> Data:
 
 
 @njit(cache=True, nogil=True)
-def _innovations(r: FloatArray, good: BoolArray, starts: IntArray, ar: FloatArray, sd: float) -> FloatArray:
-    """Return e_k = (r_k - a1 r_{k-1} - ...) / sd, r before a start taken for zero."""
-    e = np.zeros(r.size)
+def _innovations(
+    y: FloatArray, run: FloatArray, good: BoolArray, starts: IntArray, ar: FloatArray, sd: float, e: FloatArray
+) -> None:
+    """Write e_k = (r_k - a1 r_{k-1} - ...) / sd of r = y - run, r before a start taken for zero, into zeros."""
+    r = y - run if run.size else y
     for w in range(starts.size):
         for k in range(starts[w], starts[w + 1] if w + 1 < starts.size else r.size):
             counts, total = good[k], r[k]
@@ -239,4 +254,3 @@ def _innovations(r: FloatArray, good: BoolArray, starts: IntArray, ar: FloatArra
                 total -= ar[lag - 1] * r[k - lag]
             if counts:
                 e[k] = total / sd
-    return e

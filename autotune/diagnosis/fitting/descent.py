@@ -51,7 +51,7 @@ def simulate(
 
 def whiten(signals: list[FloatArray], data: Data) -> FloatArray:
     """Return the whitened residuals of all recordings, one after the other."""
-    return np.concatenate(data.whitened([r.y - out[:, 0] for r, out in zip(data.recordings, signals, strict=True)]))
+    return data.whitened_runs(signals)
 
 
 AnyArray: TypeAlias = NDArray[Any]

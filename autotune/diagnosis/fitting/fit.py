@@ -15,6 +15,7 @@ from functools import cached_property
 import numpy as np
 
 from autotune.arrays import BoolArray, FloatArray, IntArray
+from autotune.diagnosis.fitting.bases import basis, state_bases
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.descent import (
     Derivatives,
@@ -134,12 +135,11 @@ def start_states(sim: Simulator, data: Data) -> list[FloatArray]:
     result = []
     rows = zip(data.recordings, data.good, data.starts, data.driving, data.first_rows, strict=True)
     for recording, good, starts, driving, first in rows:
-        states = []
-        for s, row in zip(starts, first, strict=True):
-            near = np.flatnonzero(good[s : s + 20])
-            y = recording.y[s + near[0]] if near.size else float(np.mean(recording.y[good]))
-            states.append(sim.rest_state(driving.u[max(row - 1, 0)], y))
-        result.append(np.array(states))
+        y = np.empty(starts.size)
+        for k, s in enumerate(starts):
+            near = good[s : s + 20]
+            y[k] = recording.y[s + int(near.argmax())] if near.any() else float(np.mean(recording.y[good]))
+        result.append(sim.rest_states(driving.u[np.maximum(first - 1, 0)], y))
     return result
 
 
@@ -239,7 +239,6 @@ def residual_at(
 
 
 def _finish(problem: Problem, iterate: Iterate, derivatives: Derivatives, may: BoolArray) -> Fit:
-    windows = [(int(a), int(b)) for a, b in zip(problem.first, problem.last, strict=True)]
     _, J_left, _, _ = eliminate(problem, derivatives, iterate.e)
     chi2 = float(iterate.e @ iterate.e)
     prior = problem.prior(iterate.e, may)
@@ -262,26 +261,11 @@ def _finish(problem: Problem, iterate: Iterate, derivatives: Derivatives, may: B
         residuals=tuple(np.where(good, r.y - out[:, 0], 0.0) for r, out, good in rows),
         whitened=tuple(np.split(iterate.e, edges)),
         signals=tuple(signals),
-        explained=_basis(J_left, prior),
+        explained=basis(J_left, prior),
         jacobian=derivatives,
-        states_explain=tuple(_basis(derivatives[1][a:b]) for a, b in windows),
-        windows=tuple(windows),
+        states_explain=state_bases(derivatives[1], problem.first, problem.last),
+        windows=tuple(zip(problem.first.tolist(), problem.last.tolist(), strict=True)),
         starts=problem.data.first_rows,
         rows=problem.data.rows,
         sim=iterate.sim,
     )
-
-
-def _basis(J: FloatArray, prior: FloatArray | None = None) -> FloatArray:
-    """Return columns that span the well-determined part of J's columns: orthonormal with the rows of the prior."""
-    norms = np.linalg.norm(J, axis=0)
-    felt = norms > 1e-9
-    scaled = J[:, felt] / norms[felt]
-    if scaled.shape[1] == 0:
-        return np.zeros((J.shape[0], 0))
-    H = scaled.T @ scaled
-    if prior is not None:
-        H += np.diag((prior[felt] / norms[felt]) ** 2)
-    values, vectors = np.linalg.eigh(H)
-    keep = values > 1e-8 * values[-1]
-    return np.asarray(scaled @ (vectors[:, keep] / np.sqrt(values[keep])))

@@ -12,7 +12,7 @@ from autotune.diagnosis.selection.hypothesis import Hypothesis, hypothesis, is_s
 from autotune.diagnosis.selection.parsimony import needed, simplest, simplicity_lead
 from autotune.diagnosis.selection.polishing import polish
 from autotune.diagnosis.selection.scan import searched
-from autotune.diagnosis.selection.screening import Bench, Width, extend
+from autotune.diagnosis.selection.screening import Bench, Width, at_once, extend
 from autotune.diagnosis.simulation.assembly import states_that_stay
 from autotune.diagnosis.thresholds import Thresholds
 from autotune.models import Effect
@@ -42,10 +42,9 @@ def grown(base: Hypothesis, data: Data, bench: Bench, width: Width, lasting: Seq
         What long searches found, where that is known; they are made anew otherwise.
     """
     names = bench.names - taken_by(base.names)
-    found = list(lasting)
-    for kind in bench.kinds:
-        if kind.name in names and not kind.lasting:
-            found += searched(kind.name, base.fit, data, bench.pool)
+    kinds = [k for k in bench.kinds if k.name in names and not k.lasting and k.search is not None]
+    groups = at_once(lambda k: searched(k.name, base.fit, data, bench.pool), kinds)
+    found = [*lasting, *(e for group in groups for e in group)]
     found += [] if lasting else lasting_starts(base, data, bench, names)
     return extend(base, data, bench, width, found)
 
@@ -54,7 +53,7 @@ def larger(bases: Sequence[Hypothesis], data: Data, bench: Bench) -> list[Hypoth
     """Return fits with one effect more than bases have, best first."""
     limits = data.thresholds
     width = Width(effects=limits.further_effects, starts=1, least=0.5 * limits.least_decrease)
-    return merged([h for base in bases for h in grown(base, data, bench, width)])
+    return merged([h for group in at_once(lambda base: grown(base, data, bench, width), bases) for h in group])
 
 
 def pruned(
@@ -80,14 +79,17 @@ def exchanged(chosen: Hypothesis, data: Data, base: Fit, bench: Bench) -> list[H
 
     Effects are added one by one: what was taken for another while its partner was missing would stay.
     """
-    found: list[Hypothesis] = []
-    for index, name in enumerate(chosen.names):
-        smaller = without(chosen, index, data)
+
+    def other(index: int) -> list[Hypothesis]:
+        name, smaller = chosen.names[index], without(chosen, index, data)
         confusable = {*kind_of(name).confusable} - {*chosen.names, *kind_of(name).same}
         others = tuple(kind for kind in bench.kinds if kind.name in confusable)
-        if smaller is not None and others:
-            width = Width(effects=len(others), starts=2, least=data.thresholds.least_predicted)
-            found += grown(smaller, data, replace(bench, kinds=others), width)[:1]
+        if smaller is None or not others:
+            return []
+        width = Width(effects=len(others), starts=2, least=data.thresholds.least_predicted)
+        return grown(smaller, data, replace(bench, kinds=others), width)[:1]
+
+    found = [h for group in at_once(other, range(len(chosen.names))) for h in group]
     return [h for h in bench.pool.map(lambda h: polish(h, data, base), found) if h is not None]
 
 

@@ -20,7 +20,7 @@ from threadpoolctl import threadpool_limits
 
 from autotune.arrays import BoolArray
 from autotune.diagnosis.effects import ALL, kind_of, taken_by
-from autotune.diagnosis.effects.base import EffectKind
+from autotune.diagnosis.effects.base import EffectKind, SignalSizes
 from autotune.diagnosis.effects.rigs import rig_kind
 from autotune.diagnosis.evidence.operating_point import unmoved
 from autotune.diagnosis.evidence.stretches import correlation_rows, rms
@@ -35,7 +35,7 @@ from autotune.diagnosis.selection.polishing import timed
 from autotune.diagnosis.selection.prediction import extended, predictions, signal_sizes, starting_effects
 from autotune.diagnosis.selection.rig_bench import LAST_STEPS, STEPS, RigBench
 from autotune.diagnosis.selection.scan import searched
-from autotune.diagnosis.selection.screening import distinct
+from autotune.diagnosis.selection.screening import at_once, distinct
 from autotune.diagnosis.simulation.assembly import input_size
 from autotune.diagnosis.simulation.chain import build_chain
 from autotune.diagnosis.thresholds import IN_USE, Thresholds
@@ -191,9 +191,7 @@ def _larger(beam: Sequence[Judged], bench: RigBench) -> list[Judged]:
     """Return hypotheses with one effect more than those of a beam, the most promising ones judged."""
     starts: list[_Start] = []
     for base in beam:
-        taken = taken_by(base.names)
-        groups = [_starts(base, kind, odds, bench) for kind, odds in bench.odds if kind.name not in taken]
-        found = [s for group in groups for s in group]
+        found = _starts(base, bench)
         found.sort(key=lambda s: -s.decrease - 2.0 * math.log(s.odds))
         starts += [s for rank, s in enumerate(found) if rank < bench.limits.rig_tried or s.odds >= bench.limits.usual]
     fits = bench.pool.map(lambda s: _added(s, bench), starts)
@@ -209,31 +207,42 @@ def _larger(beam: Sequence[Judged], bench: RigBench) -> list[Judged]:
     return [j for j in done if j is not None and np.all(np.isfinite(j.long_squares + j.short_squares))]
 
 
-def _starts(base: Judged, kind: EffectKind, odds: float, bench: RigBench) -> list[_Start]:
-    """Return the starting points of an effect from which the first order predicts most, at each scale that helps.
+def _starts(base: Judged, bench: RigBench) -> list[_Start]:
+    """Return every effect's starting points from which the first order predicts most, at each scale that helps.
 
     Where the free run through long windows is out of phase, no derivative there leads anywhere: short ones do.
     """
     scales = [(base.fit, bench.long)]
     if len(bench.cuts) > 1 and base.error > bench.limits.out_of_phase:
         scales.append((bench.shortened(base.fit), bench.few))
+    taken = taken_by(base.names)
+    tried = [
+        (kind, odds, near, data)
+        for kind, odds in bench.odds
+        for near, data in scales
+        if kind.name not in taken and kind.suits.holds(near.sim.chain)
+    ]
+    sizes = {id(data): signal_sizes(near, data) for near, data in scales}
+    effects = at_once(lambda t: _tried(t[0], t[2], t[3], sizes[id(t[3])], bench), tried)
+    each = [(near, data, e) for (_, _, near, data), group in zip(tried, effects, strict=True) for e in group]
+    predicted = iter(list(bench.pool.map(lambda t: predictions(t[0], t[2], t[1]), each)))
     found = []
-    for near, data in scales:
-        if not kind.suits.holds(near.sim.chain):
-            continue
-        tried = starting_effects(kind, near, signal_sizes(near, data))
-        if kind.lasting:
-            tried += [e for e in bench.lasting if e.name == kind.name]
-        elif kind.search is not None:
-            tried += searched(kind.name, near, data, bench.pool)
-        predicted = bench.pool.map(lambda e, near=near, data=data: predictions(near, e, data), tried)
-        order = sorted((p for group in predicted for p in group), key=lambda p: -p.decrease)
+    for (kind, odds, near, data), group in zip(tried, effects, strict=True):
+        order = sorted((p for _ in group for p in next(predicted)), key=lambda p: -p.decrease)
         few = tuple(distinct(order)[: bench.limits.rig_starts])
         if few:
             found.append(
                 _Start(base=base, kind=kind, odds=odds, effects=few, near=near, data=data, decrease=order[0].decrease)
             )
     return found
+
+
+def _tried(kind: EffectKind, near: Fit, data: Data, sizes: SignalSizes, bench: RigBench) -> list[Effect]:
+    """Return an effect's starting points: those of its record, and those that a direct search finds."""
+    tried = starting_effects(kind, near, sizes)
+    if kind.lasting:
+        return tried + [e for e in bench.lasting if e.name == kind.name]
+    return tried + (searched(kind.name, near, data, bench.pool) if kind.search is not None else [])
 
 
 def _added(start: _Start, bench: RigBench) -> Fit | None:
@@ -284,10 +293,9 @@ def _pruned(found: Sequence[Judged], bench: RigBench) -> list[Judged]:
         fresh = [j for j in (*leading, simplest(result, bench.limits.material)) if id(j) not in done]
         if not fresh:
             break
-        for one in fresh:
-            if id(one) not in done:
-                done.add(id(one))
-                result += _smaller(one, bench)
+        once = list({id(j): j for j in fresh}.values())
+        done |= {id(j) for j in once}
+        result += [j for group in at_once(lambda j: _smaller(j, bench), once) for j in group]
     return result
 
 
@@ -325,11 +333,12 @@ def _on_from(best: Judged, larger: Judged, bench: RigBench) -> Judged | None:
 
 def _smaller(best: Judged, bench: RigBench) -> list[Judged]:
     """Return a hypothesis with each of its effects left out: built one by one, one may have stood for another."""
-    found: list[Judged] = []
     given = {k.name: math.log(o) for k, o in bench.odds}
-    for index in range(len(best.names) if len(best.names) > 1 else 0):
+
+    def left(index: int) -> Judged | None:
         h = without(hypothesis(best.fit), index, best.data)
         own = sum(given.get(n, -math.inf) for i, n in enumerate(best.names) if i != index)
-        judged = None if h is None else bench.judged(h.fit, max(own, best.log_odds))
-        found += [judged] if judged is not None else []
-    return found
+        return None if h is None else bench.judged(h.fit, max(own, best.log_odds))
+
+    indices = range(len(best.names) if len(best.names) > 1 else 0)
+    return [j for j in bench.pool.map(left, indices) if j is not None]

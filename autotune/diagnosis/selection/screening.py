@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from concurrent.futures import Executor
+from collections.abc import Callable, Sequence
+from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 
@@ -26,6 +27,10 @@ from autotune.models import Effect
 
 #: Steps of a fit after which it is decided whether it goes on.
 FIRST_STEPS = 3
+#: Tasks side by side at most.
+SIDE_BY_SIDE = 4
+_T = TypeVar("_T")
+_R = TypeVar("_R")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,6 +52,17 @@ class Bench:
     def names(self) -> frozenset[str]:
         """Names of what is looked for."""
         return frozenset(kind.name for kind in self.kinds)
+
+
+def at_once(task: Callable[[_T], _R], over: Sequence[_T]) -> list[_R]:
+    """Return a task's results, in order; the tasks go on side by side and leave what takes long to a pool.
+
+    A pool that waits for one task's slowest simulation works on the next task's meanwhile.
+    """
+    if len(over) < 2:
+        return [task(one) for one in over]
+    with ThreadPoolExecutor(min(len(over), SIDE_BY_SIDE)) as threads:
+        return list(threads.map(task, over))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -35,7 +35,7 @@ from autotune.diagnosis.selection.parsimony import (
     simplicity_lead,
     worth_adding,
 )
-from autotune.diagnosis.selection.screening import Bench, Width
+from autotune.diagnosis.selection.screening import Bench, Width, at_once
 from autotune.diagnosis.selection.searched import Search
 from autotune.diagnosis.thresholds import IN_USE, Thresholds
 from autotune.models import Model
@@ -170,12 +170,14 @@ def _screened(stage: _Stage) -> list[Hypothesis]:
     p, limits = base.parametrisation, data.thresholds
     wide = Width(effects=limits.screened_effects, starts=4, least=limits.least_predicted)
     start = Hypothesis(names=(), fit=base if few is data else fit(p, few, base.theta, states_of(base, few)))
-    found = grown(start, few, bench, wide, lasting_starts(start, few, bench, bench.names))
+
+    def beside(one: tuple[Hypothesis, Width]) -> list[Hypothesis]:
+        return grown(one[0], few, bench, one[1], lasting_starts(one[0], few, bench, bench.names))
+
     if not far_from_prior(base, limits.far_from_prior):
-        return found
+        return beside((start, wide))
     at_prior = Hypothesis(names=(), fit=at_operating_point(p, few))
-    lasting = lasting_starts(at_prior, few, bench, bench.names)
-    return merged(found, grown(at_prior, few, bench, replace(wide, starts=2), lasting))
+    return merged(*at_once(beside, [(start, wide), (at_prior, replace(wide, starts=2))]))
 
 
 def _combined(

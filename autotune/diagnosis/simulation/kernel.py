@@ -91,8 +91,13 @@ def _blend(table: FloatArray, node: float, slot: int, linear: _Linear) -> None:
 
 @inlined
 def _advance(M: FloatArray, slot: int, x: FloatArray, w: float, out: FloatArray) -> None:
-    """Write the state after one step under the command alone."""
+    """Write the state after one step under the command alone; two states, which most plants have, without a loop."""
     n = x.size
+    if n == 2:
+        first, second = x[0], x[1]
+        out[0] = M[slot, 0, 2] * w + M[slot, 0, 0] * first + M[slot, 0, 1] * second
+        out[1] = M[slot, 1, 2] * w + M[slot, 1, 0] * first + M[slot, 1, 1] * second
+        return
     for row in range(n):
         total = M[slot, row, n] * w
         for k in range(n):
@@ -102,6 +107,8 @@ def _advance(M: FloatArray, slot: int, x: FloatArray, w: float, out: FloatArray)
 
 @inlined
 def _tap(taps: FloatArray, row: int, x: FloatArray) -> float:
+    if x.size == 2:
+        return float(taps[row, 0] * x[0] + taps[row, 1] * x[1])
     total = 0.0
     for k in range(x.size):
         total += taps[row, k] * x[k]

@@ -191,14 +191,17 @@ class Simulator:
         (n,) array
             For an integrating chain at rest but for its reading; else the linear equilibrium, shifted to the reading.
         """
+        return np.asarray(self.rest_states(np.array([u]), np.array([y]))[0])
+
+    def rest_states(self, u: FloatArray, y: FloatArray) -> FloatArray:
+        """Return the states, (W, n), nearest to rest under commands, (W,), that give readings, (W,)."""
         chain = self.chain
-        aim = y - self.y_offset
         # least squares of: A x = -B w (weighted), output = aim
         weight = 1e3
         scale = np.maximum(np.abs(chain.A).max(axis=1), 1e-12)
         lhs = np.vstack([chain.A / scale[:, None], weight * chain.taps[kernel.OUTPUT]])
-        rhs = np.append(-chain.B[:, 0] / scale * (u - self.u_offset), weight * aim)
-        return np.asarray(np.linalg.lstsq(lhs, rhs, rcond=1e-12)[0]).reshape(chain.order)
+        rhs = np.vstack([np.outer(-chain.B[:, 0] / scale, u - self.u_offset), weight * (y - self.y_offset)])
+        return np.ascontiguousarray(np.linalg.lstsq(lhs, rhs, rcond=1e-12)[0].T)
 
     def state_sizes(self, commands: Sequence[FloatArray], readings: Sequence[FloatArray]) -> FloatArray:
         """Return a size for every state: what the command's span makes of it, bounded by what the readings show.
