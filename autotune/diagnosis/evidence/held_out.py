@@ -67,7 +67,7 @@ def held_out(retuned: Fit, chosen: Fit, data: Data) -> FitQuality:
     def error(result: Fit, tune: bool) -> float:
         fits = [_tested(result, tune, *pair) for pair in (halves, halves[::-1])]
         squares = sum(float(e @ e) for f in fits for e in f.residuals)
-        freedom = sum(f.rows - sum(Q.shape[1] for Q in f.states_explain) for f in fits)
+        freedom = sum(f.rows - f.states_told for f in fits)
         return math.sqrt(squares / max(freedom, 1)) / spread
 
     nominal, tuned = error(retuned, tune=False), error(retuned, tune=True)

@@ -61,11 +61,12 @@ class Data:
     kept: tuple[IntArray, ...] = ()
     weights: tuple[float, ...] = ()
 
-    def thinned(self, rows: int, informative: Sequence[BoolArray] | None = None) -> Data:
+    def thinned(self, rows: int, informative: Sequence[FloatArray] | None = None) -> Data:
         """Return the data with windows left out evenly, until about as many rows count.
 
-        Windows in which u or y is largest or smallest stay, and those named as informative: a limit that is rarely
-        reached acts only there.
+        Windows in which u or y is largest or smallest stay, and the most informative of those that have something to
+        tell, up to half of all: a limit that is rarely reached acts only there. ``informative`` says how much each
+        window has to tell, 0 for nothing.
         """
         chosen = self._thinning(rows, informative)
         return self if chosen is None else self.only(chosen)
@@ -79,7 +80,7 @@ class Data:
             [np.isin(np.arange(len(a)) // count, runs) for a, runs in zip(self.starts, chosen, strict=True)]
         )
 
-    def _thinning(self, rows: int, informative: Sequence[BoolArray] | None = None) -> list[IntArray] | None:
+    def _thinning(self, rows: int, informative: Sequence[FloatArray] | None = None) -> list[IntArray] | None:
         """Return the numbers of the windows that stay; nothing where all do."""
         share = max(1.0, self.rows / rows)
         if share < 1.5:
@@ -87,13 +88,15 @@ class Data:
         if all(len(a) <= self.thresholds.least_windows for a in self.starts):
             return None
         chosen = []
-        named = [np.zeros(len(a), dtype=bool) for a in self.starts] if informative is None else informative
-        for r, a, ok, tells in zip(self.recordings, self.starts, self.good, named, strict=True):
+        told = [np.zeros(len(a)) for a in self.starts] if informative is None else informative
+        for r, a, ok, tells in zip(self.recordings, self.starts, self.good, told, strict=True):
             count = min(len(a), max(self.thresholds.least_windows, round(len(a) / share)))
             far = [extreme(np.where(ok, x, np.median(x[ok]))) for x in (r.u, r.y) for extreme in (np.argmin, np.argmax)]
             extremes = np.clip(np.searchsorted(a, far, side="right") - 1, 0, len(a) - 1)
-            evenly = np.linspace(0, len(a) - 1, count).round().astype(np.int64)
-            chosen.append(np.unique(np.concatenate([evenly, extremes, np.flatnonzero(tells)])))
+            most = np.argsort(-tells, kind="stable")[: min(count // 2, np.count_nonzero(tells))]
+            count = max(self.thresholds.least_windows, count - most.size)
+            evenly = np.linspace(0, len(a) - 1, min(len(a), count)).round().astype(np.int64)
+            chosen.append(np.unique(np.concatenate([evenly, extremes, most])))
         return chosen
 
     def only(self, chosen: Iterable[IntArray | BoolArray]) -> Data:

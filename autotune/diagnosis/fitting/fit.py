@@ -15,7 +15,7 @@ from functools import cached_property
 import numpy as np
 
 from autotune.arrays import BoolArray, FloatArray, IntArray
-from autotune.diagnosis.fitting.bases import basis, state_bases
+from autotune.diagnosis.fitting.bases import basis, determined
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.descent import (
     Derivatives,
@@ -63,8 +63,6 @@ class Fit:
     explained : (N, q) array
         What moving the free numbers can explain of a residual beyond the start states: columns that are orthonormal
         together with the rows of the numbers' prior.
-    states_explain : tuple of (L, m) array
-        The same for the start state of every window.
     jacobian : (N, p) and (N, n) array
         Derivatives of the whitened residual to the free numbers and to every window's start state.
     windows : tuple of (first, last)
@@ -87,7 +85,6 @@ class Fit:
     whitened: tuple[FloatArray, ...]
     signals: tuple[FloatArray, ...]
     explained: FloatArray = field(repr=False)
-    states_explain: tuple[FloatArray, ...] = field(repr=False)
     windows: tuple[tuple[int, int], ...]
     starts: tuple[IntArray, ...]
     rows: int
@@ -103,6 +100,16 @@ class Fit:
     def model(self) -> Model:
         """The fitted model."""
         return self.parametrisation.with_values(self.theta)
+
+    @cached_property
+    def states_explain(self) -> tuple[FloatArray, ...]:
+        """The same as ``explained`` for the start state of every window: (L, m) arrays."""
+        return tuple(basis(self.jacobian[1][a:b]) for a, b in self.windows)
+
+    @cached_property
+    def states_told(self) -> int:
+        """How many of all windows' start states the residual tells, as many as ``states_explain`` has columns."""
+        return int(determined(self.jacobian[1], np.array(self.windows, dtype=np.int64)))
 
     def without_states(self, direction: FloatArray) -> FloatArray:
         """Return what is left of a whitened direction when all start states may move against it."""
@@ -263,7 +270,6 @@ def _finish(problem: Problem, iterate: Iterate, derivatives: Derivatives, may: B
         signals=tuple(signals),
         explained=basis(J_left, prior),
         jacobian=derivatives,
-        states_explain=state_bases(derivatives[1], problem.first, problem.last),
         windows=tuple(zip(problem.first.tolist(), problem.last.tolist(), strict=True)),
         starts=problem.data.first_rows,
         rows=problem.data.rows,

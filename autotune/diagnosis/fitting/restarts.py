@@ -46,7 +46,7 @@ def restarted(result: Fit, data: Data) -> Fit:
     Those that then explain their window better replace the old ones, and everything is fitted again.
     """
     before = _mean_squares(result)
-    out = np.concatenate(standing_out(result, data.thresholds.stands_out))
+    out = np.concatenate(standing_out(result, data.thresholds.stands_out)) > 0.0
     if not out.any():
         return result
     p, held = result.parametrisation, np.zeros(result.theta.size, dtype=bool)
@@ -94,11 +94,11 @@ def renewed(result: Fit, data: Data) -> Fit:
     return result
 
 
-def standing_out(result: Fit, times: float = Thresholds.stands_out) -> list[BoolArray]:
-    """Return which windows of every recording a fit explains far worse than the median window."""
+def standing_out(result: Fit, times: float = Thresholds.stands_out) -> list[FloatArray]:
+    """Return the mean squares of windows that a fit explains far worse than the median window; 0 for the others."""
     sizes = _mean_squares(result)
     cuts = np.cumsum([len(starts) for starts in result.starts])[:-1]
-    return np.split(sizes > times * np.median(sizes), cuts)
+    return np.split(np.where(sizes > times * np.median(sizes), sizes, 0.0), cuts)
 
 
 def realigned(result: Fit, data: Data) -> Fit:

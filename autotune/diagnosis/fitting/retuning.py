@@ -143,8 +143,7 @@ def reduced_chi2(result: Fit, data: Data) -> float:
         noise_from_differences(result.residuals, data.good, data.thresholds.largest_correlation), data.recordings
     )
     e = np.concatenate(replace(data, noise=noise).whitened(list(result.residuals)))
-    states = sum(Q.shape[1] for Q in result.states_explain)
-    freedom = max(data.rows - states - result.theta.size, 1)
+    freedom = max(data.rows - result.states_told - result.theta.size, 1)
     return float(e @ e / freedom)
 
 

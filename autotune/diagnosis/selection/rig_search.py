@@ -23,10 +23,11 @@ from autotune.diagnosis.effects import ALL, kind_of, taken_by
 from autotune.diagnosis.effects.base import EffectKind, SignalSizes
 from autotune.diagnosis.effects.rigs import rig_kind
 from autotune.diagnosis.evidence.operating_point import unmoved
-from autotune.diagnosis.evidence.stretches import correlation_rows, rms
+from autotune.diagnosis.evidence.stretches import correlation_rows, judged_rows, rms
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import RUNAWAY, Fit, fit
 from autotune.diagnosis.fitting.long_windows import cut, lengths_of, spread_of
+from autotune.diagnosis.fitting.noise import noise_from_differences
 from autotune.diagnosis.fitting.parameters import parametrise
 from autotune.diagnosis.selection.growth import without
 from autotune.diagnosis.selection.hypothesis import hypothesis, is_stand_in
@@ -134,10 +135,24 @@ def _grown(
         if leads and larger[0].is_better(best, limits.material):
             best = larger[0]
             bench = bench.with_sd(*_scales(best))
+            if _is_at_noise(best, limits):
+                break
             beam = [bench.again(j) for j in beam]
         elif size > 0:
             break
     return bench, found
+
+
+def _is_at_noise(one: Judged, limits: Thresholds) -> bool:
+    """Whether its errors on left-out stretches are so near to the noise that nothing material can be left in them.
+
+    The noise is what no row tells of the next one: a correlated residual may be the model's own error.
+    """
+    for result, data, squares in ((one.fit, one.data, one.long_squares), (one.short, one.few, one.short_squares)):
+        noise = noise_from_differences(result.residuals, data.good, limits.largest_correlation).sd
+        if (1.0 - limits.material) * math.sqrt(float(squares.sum()) / judged_rows(data)) > noise:
+            return False
+    return True
 
 
 def _scales(one: Judged) -> tuple[float, float]:
