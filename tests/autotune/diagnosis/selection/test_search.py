@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from autotune.arrays import BoolArray
+from autotune.arrays import FloatArray
 from autotune.diagnosis.effects import CATALOGUE
 from autotune.diagnosis.evidence.samples import inspect
 from autotune.diagnosis.fitting.fit import Fit, fit
@@ -173,9 +173,9 @@ def test_a_cogging_torque_that_was_travelled_over_is_no_stand_in() -> None:
 def test_windows_that_are_screened_on_stay_when_the_noise_is_estimated_anew(monkeypatch: pytest.MonkeyPatch) -> None:
     calls = iter(range(100))
 
-    def others_each_time(result: Fit, times: float) -> list[BoolArray]:
+    def others_each_time(result: Fit, times: float) -> list[FloatArray]:
         here = next(calls)
-        return [np.arange(len(starts)) == here for starts in result.starts]
+        return [1.0 * (np.arange(len(starts)) == here) for starts in result.starts]
 
     monkeypatch.setattr("autotune.diagnosis.selection.search.standing_out", others_each_time)
     limits = replace(IN_USE, screening_rows=300, coarse=1e-3)
