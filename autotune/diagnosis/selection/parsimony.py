@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import Fit
+from autotune.diagnosis.fitting.noise import noise_from_differences
 from autotune.diagnosis.fitting.retuning import far_from_prior, reduced_chi2
 from autotune.diagnosis.selection.hypothesis import Hypothesis, penalised
 from autotune.diagnosis.thresholds import Thresholds
+
+#: Standard deviations that chance may reach.
+CHANCE = 3.0
 
 
 def simplest(ranked: Sequence[Hypothesis], lead: float) -> Hypothesis:
@@ -54,6 +59,20 @@ def needed(smaller: Hypothesis, larger: Hypothesis, data: Data, base: Fit) -> bo
     more = penalised(smaller) - penalised(larger) > _inexact(larger, limits) * (base.cost - larger.fit.cost)
     enough = after < limits.noise_left or after < limits.half_left * before
     return more and worth_adding(smaller, larger, limits) and enough
+
+
+def may_be_needed(smaller: Hypothesis, data: Data, base: Fit) -> bool:
+    """Whether any further effect could be :func:`needed`: it can explain no more than what is left above the noise.
+
+    Half the variance of a residual's differences is the noise that no model takes away, to within the scatter of its
+    correlation from row to row: what is slow may be the model's own error.
+    """
+    limits, rows = data.thresholds, data.rows
+    noise = noise_from_differences(smaller.fit.residuals, data.good, limits.largest_correlation)
+    whitened = 1.0 + sum(a * a for a in data.noise.ar)  # what whitening makes of noise that is white
+    alone = rows * whitened * (noise.sd / data.noise.sd) ** 2 / (1.0 + sum(noise.ar))
+    left = smaller.fit.cost - alone + CHANCE * math.sqrt(rows)
+    return left > limits.simulation_error * (base.cost - smaller.fit.cost)
 
 
 def charge(h: Hypothesis, chosen: Hypothesis, lead: float, data: Data, base: Fit) -> float:

@@ -29,6 +29,7 @@ from autotune.diagnosis.selection.growth import exchanged, grown, larger, lastin
 from autotune.diagnosis.selection.hypothesis import Hypothesis, merged, penalised
 from autotune.diagnosis.selection.parsimony import (
     final_lead,
+    may_be_needed,
     needed,
     settled,
     simplest,
@@ -96,33 +97,34 @@ def search(
     with threadpool_limits(1), ThreadPoolExecutor(2) as pool:
         bench = Bench(pool=pool, kinds=kinds)
         progress("retuning", 0.0)
-        found = _searched(*prepare(model, recordings, good, 1, thresholds), bench, progress)
+        found = _searched(*prepare(model, recordings, good, 1, thresholds), bench, progress, again=False)
         if not holds(found.chosen.fit, found.data):
             progress("once more, on longer windows", 0.0)
             longer = prepare(model, recordings, good, thresholds.longer_windows, thresholds)
-            found = _searched(*longer, bench, progress)
+            found = _searched(*longer, bench, progress, again=True)
         return confirmed(found, pool)
 
 
-def _searched(data: Data, base: Fit, bench: Bench, progress: Progress) -> Search:
-    """Search beside a retuned model."""
+def _searched(data: Data, base: Fit, bench: Bench, progress: Progress, *, again: bool) -> Search:
+    """Search beside a retuned model; what does not hold on longer windows is not built on, but on these ``again``."""
     nominal = at_nominal(base, data)
     try:
-        return _extended(data, base, nominal, bench, progress)
+        return _extended(data, base, nominal, bench, progress, again)
     except RUNAWAY:
         # what breaks off explains nothing: the retuned model stands, and is judged by its residual
         retuned = Hypothesis(names=(), fit=base)
         return Search(data=data, nominal=nominal, retuned=retuned, chosen=retuned)
 
 
-def _extended(data: Data, base: Fit, nominal: Fit, bench: Bench, progress: Progress) -> Search:
+def _extended(data: Data, base: Fit, nominal: Fit, bench: Bench, progress: Progress, again: bool) -> Search:
     """Add effects in ones, twos and threes as far as the residual asks for them."""
     progress("single effects", 0.1)
     limits = data.thresholds
     stage = _Stage(data=data, few=_few(data, base), base=base, bench=bench)
     candidates = _screened(stage)
-    singles = stage.polished(candidates, 3)
-    if singles and reduced_chi2(base, data) > limits.coarse:
+    coarse = reduced_chi2(base, data) > limits.coarse
+    singles = (stage.polished(candidates, 1) if coarse else []) or stage.polished(candidates, 3)
+    if singles and coarse:  # of these the noise alone is taken
         stage = _finer(singles[0], stage)
         candidates = [_again(h, stage.few) for h in candidates[:3]]
         singles = stage.polished(candidates, 3)
@@ -132,8 +134,12 @@ def _extended(data: Data, base: Fit, nominal: Fit, bench: Bench, progress: Progr
         return Search(data=stage.data, nominal=nominal, retuned=retuned, singles=tuple(singles), chosen=retuned)
     if is_worth:
         chosen = singles[0]
+        if not again and not holds(chosen.fit, stage.data):
+            return Search(data=stage.data, nominal=nominal, retuned=retuned, singles=tuple(singles), chosen=chosen)
     progress("pairs of effects", 0.4)
-    chosen, pairs, triples = _combined(chosen, singles, candidates, stage, progress)
+    pairs, triples = list[Hypothesis](), list[Hypothesis]()
+    if not is_worth or may_be_needed(chosen, stage.data, stage.base):
+        chosen, pairs, triples = _combined(chosen, singles, candidates, stage, progress)
     if len(chosen.names) > 1:
         progress("dropping what is not needed", 0.85)
         chosen, singles = pruned(chosen, singles, stage.data, stage.base, bench)
