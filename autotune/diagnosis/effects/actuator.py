@@ -20,14 +20,12 @@ from autotune.diagnosis.effects.base import (
     SignalSizes,
     ends,
 )
+from autotune.diagnosis.effects.converter import converter_steps
 from autotune.diagnosis.effects.stages import Blocks, Line, LinearPart, Memory, Values
 from autotune.models import Block, TransferFunction
 
 _LJUNG = "Ljung, System Identification, 2nd ed., sec. 5.1"
 _ASTROM = "Astrom and Hagglund, Advanced PID Control, 2006, ch. 9"
-#: Steps of a converter that are tried, as shares of the standard deviation of u; how closely, as a share of a line's
-#: width over u; lines that are looked at, and followed.
-_STEPS_TRIED, _LINE_SHARE, _LINES_TRIED, _LINES_KEPT = (0.02, 3.0), 0.3, 24, 2
 #: Bands of stiction that are tried: the smallest and the largest as a share of the command's size, count.
 _BANDS_TRIED = (0.002, 0.6, 75)
 
@@ -46,49 +44,6 @@ def limit_starts(low: float, high: float, cuts: tuple[float, ...]) -> list[tuple
 def converted(u: float, step: float, origin: float) -> float:
     """Return a converter's level for a command."""
     return origin + step * math.floor((u - origin) / step + 0.5)
-
-
-def _steps_over_command(scan: Scan) -> list[tuple[float, ...]]:
-    """Return the best step and origin of a converter: lines of the residual over u, then around them.
-
-    A converter adds a saw-tooth of u, whose period is its step: its fundamental is a line of the influence's
-    periodogram over the command, as a periodic load's is one over time. The origin is the level nearest to the middle
-    of u, so that a small error of the step does not move the levels away.
-    """
-    u, influence = scan.influence()
-    middle, spread, span = float(np.median(u)), float(np.std(u)), float(np.ptp(u))
-    if spread == 0.0:
-        return []
-    smallest, largest = _STEPS_TRIED
-    per_step = np.arange(1.0 / (largest * spread), 1.0 / (smallest * spread), _LINE_SHARE / span)
-    values, where = np.unique(u - middle, return_inverse=True)
-    weights = np.bincount(where, influence)
-    lines, turned = np.empty(per_step.size, dtype=np.complex128), np.exp(2j * np.pi * per_step[0] * values)
-    turn = np.exp(2j * np.pi * _LINE_SHARE / span * values)
-    for i in range(per_step.size):  # evenly spaced: from one to the next every value turns on by the same angle
-        lines[i] = weights @ turned
-        turned *= turn
-    power = np.abs(lines)
-    inner = np.flatnonzero((power >= np.append(power[1:], 0.0)) & (power >= np.append(0.0, power[:-1])))
-    best_lines = inner[np.argsort(-power[inner])][:_LINES_TRIED]
-
-    def tried(levels: list[tuple[float, float]]) -> list[tuple[float, tuple[float, ...]]]:
-        found = scan.predicted([(step, middle + step * phase) for step, phase in levels])
-        return sorted(found, key=lambda one: -one[0])
-
-    # round(x) - x = -sin(2 pi x)/pi + ...: where the line's phase puts the fall through zero there is a level
-    turns = (np.angle(lines) / (2.0 * np.pi) + 0.25 + 0.5) % 1.0 - 0.5
-    best = tried([(1.0 / per_step[i], turns[i]) for i in best_lines])[:_LINES_KEPT]
-    width, turn = _LINE_SHARE, 0.1
-    for _ in range(4):
-        near = []
-        for _, (step, origin) in best:
-            phase = (origin - middle) / step
-            beside = [step / (1.0 + i * width * step / span) for i in (-1, 0, 1)]
-            near += [(h, phase + turn * k) for i, h in enumerate(beside) for k in (-1, 0, 1) if i != 1 or k]
-        best = sorted((*best, *tried(near)), key=lambda one: -one[0])[:_LINES_KEPT]
-        width, turn = 0.5 * width, 0.5 * turn
-    return [best[0][1]] if best and best[0][0] > 0.0 else []
 
 
 def _levels_around(values: Values, span: float, wide: float, turn: float) -> list[Values]:
@@ -202,7 +157,7 @@ ACTUATOR = (
             Quantity(name="origin", unit="{u}", role="location", sign="real", neutral=0.0),
         ),
         lines=(Line(stage="converter", does=converted),),
-        search=_steps_over_command,
+        search=converter_steps,
         lasting=True,
         moves=_levels_around,
         nudge=0.06,

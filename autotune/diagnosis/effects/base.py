@@ -213,6 +213,17 @@ class Scan(Protocol):
     def influence(self) -> tuple[FloatArray, FloatArray]:
         """Return the commands, and how chi-square would fall with more of each."""
 
+    @property
+    def commands(self) -> FloatArray:
+        """Commands in the recordings."""
+
+    @property
+    def operating_command(self) -> float:
+        """Command at the nominal operating point."""
+
+    def commanded(self, changes: FloatArray) -> FloatArray:
+        """Return the decrease that each row of (K, L) changes of the L different commands predicts, smallest first."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Fitted:

@@ -8,9 +8,10 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from scipy.fft import irfft, next_fast_len, rfft
 from scipy.signal import fftconvolve, lfilter
 
-from autotune.arrays import FloatArray
+from autotune.arrays import FloatArray, IntArray
 from autotune.diagnosis.effects import kind_of
 from autotune.diagnosis.effects.base import SignalSizes
 from autotune.diagnosis.fitting.data import Data
@@ -20,6 +21,9 @@ from autotune.diagnosis.fitting.windows import model_lag_s
 from autotune.diagnosis.selection.prediction import direction, predictions, signal_sizes
 from autotune.models import Effect
 from autotune.recording import Recording
+
+#: Different commands up to which the answers to each are kept; largest factor of a change that is predicted.
+FEW_LEVELS, LARGEST_SCALE = 100, 4.0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -91,8 +95,9 @@ class FitScan:
         rows = sum(len(r) for r in data.driving)
         return np.asarray(np.fft.rfftfreq(size, data.sample_times[0])), np.asarray(2.0 * np.abs(total) ** 2 / rows)
 
-    def influence(self) -> tuple[FloatArray, FloatArray]:
-        """Return the commands inside the windows, and how chi2 would fall with more of each: -0.5 d chi2/du.
+    @cached_property
+    def _answer(self) -> FloatArray:
+        """Whitened answer of the chain to a command of one row, as long as the longest window.
 
         The chain alone answers, its effects left aside, and rows are taken as equidistant: good enough to start from.
         """
@@ -104,13 +109,77 @@ class FitScan:
         still = replace(sim.linear(), linear_hold=False)
         struck = Recording(t=dt * np.arange(longest + 1, dtype=np.float64), u=sim.u_offset + pulse, y=0.0 * pulse)
         answer = still.run(struck, np.zeros(sim.order))[0][1:, 0]
-        answer = lfilter([1.0, *(-a for a in data.noise.ar)], [1.0], answer - sim.y_offset) / data.noise.sd
+        return np.asarray(lfilter([1.0, *(-a for a in data.noise.ar)], [1.0], answer - sim.y_offset) / data.noise.sd)
+
+    def influence(self) -> tuple[FloatArray, FloatArray]:
+        """Return the commands inside the windows, and how chi2 would fall with more of each: -0.5 d chi2/du."""
+        data, answer = self.data, self._answer
         commands, influence = [], []
         for r, e, starts, stops in zip(data.recordings, self.base.whitened, data.starts, data.stops, strict=True):
             for a, b in zip(starts, stops, strict=True):
                 commands.append(r.u[a:b])
                 influence.append(fftconvolve(e[a:b], answer[: b - a][::-1])[b - a - 1 :])
         return np.concatenate(commands), np.concatenate(influence)
+
+    @cached_property
+    def commands(self) -> FloatArray:
+        """Commands in the recordings."""
+        return np.concatenate([r.u for r in self.data.recordings])
+
+    @property
+    def operating_command(self) -> float:
+        """Command at the nominal operating point."""
+        return self.base.parametrisation.model.input.offset
+
+    def commanded(self, changes: FloatArray) -> FloatArray:
+        """Return the decrease of chi2 that changes of the commands predict.
+
+        Parameters
+        ----------
+        changes : (K, L) array
+            What is added to each of the L different commands, smallest first, in each of K trials.
+
+        Returns
+        -------
+        (K,) array
+            Decrease of |e + a d|^2 over 0 <= a <= 4, with d freed of what start states and numbers explain. Linear in
+            the chain: first order in the change.
+        """
+        few = self._few_levels
+        if few is not None:
+            slope, curvature = changes @ few[0], np.einsum("ij,ij->i", changes @ few[1], changes)
+        else:
+            moved = self._moved(changes[:, self._levels[1]])
+            left = moved - (moved @ self.base.explained) @ self.base.explained.T
+            slope, curvature = moved @ self.base.e, np.einsum("ij,ij->i", moved, left)
+        a = np.clip(slope / np.maximum(curvature, 1e-300), 0.0, LARGEST_SCALE)
+        return np.asarray(2.0 * a * slope - a * a * curvature)
+
+    @cached_property
+    def _levels(self) -> tuple[FloatArray, IntArray]:
+        """Different commands, smallest first, and each row's number among them."""
+        values, numbers = np.unique(self.commands, return_inverse=True)
+        return values, numbers
+
+    @cached_property
+    def _few_levels(self) -> tuple[FloatArray, FloatArray] | None:
+        """Slope and curvature of chi2 over the levels of a command that takes few values; nothing of one with many."""
+        values, numbers = self._levels
+        if values.size > FEW_LEVELS:
+            return None
+        moved = self._moved((numbers == np.arange(values.size)[:, None]).astype(np.float64))
+        left = moved - (moved @ self.base.explained) @ self.base.explained.T
+        return moved @ self.base.e, moved @ left.T
+
+    def _moved(self, commands: FloatArray) -> FloatArray:
+        """Return how added (K, N) commands take from the whitened residual, freed of what start states explain."""
+        result = np.zeros_like(commands)
+        size = next_fast_len(2 * self._answer.size, real=True)
+        answer = rfft(self._answer, size)
+        for (a, b), Q in zip(self.base.windows, self.base.states_explain, strict=True):
+            moved = irfft(rfft(commands[:, a:b], size) * answer, size)[:, : b - a]
+            result[:, a:b] = moved - (moved @ Q) @ Q.T
+        return result
 
 
 def searched(name: str, base: Fit, data: Data, pool: Executor) -> list[Effect]:

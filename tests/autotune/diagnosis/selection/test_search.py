@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from autotune.arrays import FloatArray
 from autotune.diagnosis.effects import CATALOGUE
@@ -50,6 +51,16 @@ def converted(step: float, origin: float, seed: int, rows: int = 2000) -> Record
         w = origin + step * np.floor((u[k] - origin) / step + 0.5)
         x = w + (x - w) * np.exp(-dt / 2.0)
     return Recording(t=np.arange(rows, dtype=np.float64) * dt, u=u, y=y + 0.04 * step * rng.normal(size=rows))
+
+
+def stepped(step: float, origin: float, seed: int, held: int = 80, rows: int = 4000) -> Recording:
+    """Lag of 2 s behind a converter of a command that takes few values, each held for a while; noise of .3 steps."""
+    rng = np.random.default_rng(seed)
+    u = 50.0 + np.repeat(np.round(rng.uniform(-12.0, 12.0, rows // held), 3), held)
+    w = origin + step * np.floor((u - origin) / step + 0.5)
+    a = np.exp(-0.1 / 2.0)
+    y = lfilter([0.0, 1.0 - a], [1.0, -a], w - 50.0, zi=[0.0])[0]
+    return Recording(t=0.1 * np.arange(rows), u=u, y=y + 0.3 * step * rng.normal(size=rows))
 
 
 def tank(share: float, seed: int, rows: int = 800) -> Recording:
@@ -111,6 +122,17 @@ def test_a_converters_step_is_a_line_of_the_residual_over_the_command(step: floa
     # so near that the levels are a tenth of a step off at most where u, within 1 V of its middle, is farthest
     assert found["step"].value == pytest.approx(step, rel=0.1 * step)
     assert levels == pytest.approx(round(levels), abs=0.1)
+
+
+@pytest.mark.parametrize(("step", "origin"), [(0.12, 50.0), (0.164, 50.0), (0.164, 0.0), (0.91, 50.0), (0.31, 0.0)])
+def test_a_converters_step_is_found_where_a_command_takes_few_values(step: float, origin: float) -> None:
+    # counted from zero or from the operating point; lines over fifty values are many and as strong
+    r = [stepped(step, origin, 11), stepped(step, origin, 12)]
+    model = replace(lag(2.0), input=Port(unit="%", offset=50.0))
+    data, base = prepare(model, r, inspect(r)[0])
+    with ThreadPoolExecutor(1) as pool:
+        found = searched("actuator.quantisation", base, data, pool)[0].parameters
+    assert found["step"].value == pytest.approx(step, rel=2e-3)
 
 
 def test_a_converter_that_is_off_its_levels_is_moved_onto_them() -> None:
