@@ -163,6 +163,8 @@ class Thresholds:
     equation_slow: float = known(1.6, "times the noise", "variance of block means from which on a residual is slow", "chance")
     equation_astray: float = known(2.0, "times the noise", "variance from which on fits begin anew from short windows", "cost")
     equation_behind: float = known(300.0, "chi2", "behind one that leaves noise with which a fit is not finished", "cost")
+    equation_rows: int = known(2000, "rows", "that a search works on; the leading effects are fitted to all", "cost")
+    equation_near: float = known(0.5, "of the best decrease", "of the logarithm of the squared error, from which on others are fitted to all rows too", "cost")
     equation_fitted: int = known(6, "effects", "fitted of those that predict most", "cost")
     equation_further: int = known(4, "effects", "the same beside other effects", "cost")
     equation_effects: int = known(4, "effects", "in one hypothesis at most", "cost")

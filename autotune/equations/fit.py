@@ -29,7 +29,7 @@ from autotune.equations.sensitivity import (
     side_by_side,
 )
 from autotune.equations.simulate import Compiled, Drive, Run, drive_of, simulate
-from autotune.equations.starts import fitted_starts, given_starts, state_scales
+from autotune.equations.starts import fitted_starts, given_starts, refined_start, state_scales
 from autotune.errors import InputError
 from autotune.progress import Progress, quiet
 from autotune.recording import Recording
@@ -49,6 +49,11 @@ LOST = 30.0
 #: Weight of the belief that a start state is where it was, of what the readings tell of all, and by what it grows
 #: where a move fails: a state that readings hardly feel would jump, and hold up every number beside it.
 FIRMNESS, FIRMER = 1e-9, 10.0
+#: Times the median window's mean square from which on a window stands out and is started anew, and the shares of its
+#: rows that its start is fitted to, one after the other: wrong numbers lead the rest astray.
+STANDS_OUT, ANEW = 4.0, (0.1, 0.3, 1.0)
+#: Windows at least of which one may stand out, and what of its mean square a new start may leave to be taken.
+LEAST_WINDOWS, RESTARTED = 4, 0.7
 #: Part of a third of a value below which the straight scale is exponential again.
 LAST_SHARE = 0.02
 
@@ -202,6 +207,8 @@ def fit(
     for k in range(iterations):
         progress("fitting", k / iterations)
         converged = state.step()
+        if (converged or k % 2) and k + 1 < iterations and state.restarted():
+            converged = False
         if converged:
             break
     progress("fitting", 1.0)
@@ -280,12 +287,15 @@ def data_of(
         raise InputError("fewer than 8 finite readings", where=recording.name, remedy="record longer")
     if windows is None:
         starts, stops = window_rows(recording.t, length_s)
+        read = np.add.reduceat(good, starts) > 0  # a window without a reading tells nothing
+        starts, stops = starts[read], stops[read]
         windows = fitted_starts(compiled, parameters, drive, recording.y, good, starts, stops)
     return FitData(drive=drive, y=recording.y, good=good, windows=windows)
 
 
-#: Per window of a recording: derivatives to start states, which of these are free, and derivatives to z.
-_Back: TypeAlias = list[tuple[FloatArray, IntArray, FloatArray]]
+#: Per window of a recording: derivatives to start states, which of these are free, derivatives to z, and a basis of
+#: what the start states explain.
+_Back: TypeAlias = list[tuple[FloatArray, IntArray, FloatArray, FloatArray]]
 #: J to z with the start states projected out, and per window what gives those back.
 _Derivatives: TypeAlias = tuple[FloatArray, _Back]
 
@@ -387,7 +397,7 @@ class Descent:
             Q = Q[:, keep]
             Jw = np.nan_to_num(J[rows])
             parts.append(Jw - Q @ (Q.T @ Jw))
-            back.append((np.nan_to_num(X[rows][:, free]), free, Jw))
+            back.append((np.nan_to_num(X[rows][:, free]), free, Jw, Q))
         return np.vstack(parts), back
 
     def step(self, most: int = MOVES) -> bool:
@@ -467,13 +477,48 @@ class Descent:
     def _moved(self, windows: Windows, back: _Back, error: FloatArray, move: FloatArray) -> Windows:
         """Return windows whose start states take up what the parameters' move leaves."""
         states, at = windows.states.copy(), 0
-        for k, (X, free, J) in enumerate(back):
+        for k, (X, free, J, _) in enumerate(back):
             wanted = error[at : at + X.shape[0]] - J @ move
             at += X.shape[0]
             # a weak belief that the state is where it was keeps what the readings do not tell
             H = X.T @ X + self._firmness * np.eye(free.size) * max(float(np.trace(X.T @ X)), 1e-300)
             states[k, free] += self._scales[free] * np.linalg.solve(H, X.T @ wanted)
         return replace(windows, states=states)
+
+    def restarted(self) -> bool:
+        """Start windows that stand out anew, from where the one before ends; return whether that explains any better.
+
+        A start state that made up for wrong numbers may lead to another swing than the right one, for good.
+        """
+        p, before = values_of(self._compiled, self._z), self._mean_squares([one.windows for one in self._data])
+        known = np.concatenate(before)
+        if known.size < LEAST_WINDOWS or not np.any(known > STANDS_OUT * np.median(known)):
+            return False
+        most = STANDS_OUT * float(np.median(known))
+        windows = [
+            _anew(self._compiled, p, one, np.flatnonzero(size > most), self._scales)
+            for one, size in zip(self._data, before, strict=True)
+        ]
+        found = False
+        for i, (one, new, old) in enumerate(zip(self._data, windows, before, strict=True)):
+            better = self._mean_squares_of(one, new) < RESTARTED * old
+            states = np.where(better[:, None], new.states, one.windows.states)
+            self._data[i] = replace(one, windows=replace(one.windows, states=states))
+            found = found or bool(better.any())
+        errors = self._simulated(self._z, [one.windows for one in self._data]) if found else None
+        self._errors = self._errors if errors is None else errors
+        return found
+
+    def _mean_squares(self, windows: Sequence[Windows]) -> list[FloatArray]:
+        return [self._mean_squares_of(one, w) for one, w in zip(self._data, windows, strict=True)]
+
+    def _mean_squares_of(self, one: FitData, w: Windows) -> FloatArray:
+        """Return the mean square that each window leaves; infinite where it runs away."""
+        p = values_of(self._compiled, self._z)
+        e = one.y - simulate(self._compiled, p, one.drive, w.states, starts=w.starts, stops=w.stops).y
+        parts = (e[a:b][one.good[a:b]] for a, b in zip(w.starts, w.stops, strict=True))
+        found = [float(np.mean(part**2)) if part.size else 0.0 for part in parts]
+        return np.where(np.isfinite(found), found, np.inf)
 
     def fitted(self, converged: bool) -> Fitted:
         """Return what was found."""
@@ -497,6 +542,18 @@ class Descent:
         )  # fmt: skip
 
 
+def _anew(compiled: Compiled, p: FloatArray, one: FitData, which: IntArray, scales: FloatArray) -> Windows:
+    """Return windows, some of them started anew: from where the one before them ends, or from where they start."""
+    w, states = one.windows, one.windows.states.copy()
+    for k in which:
+        single = Windows(starts=w.starts[k : k + 1], stops=w.stops[k : k + 1], states=states[k : k + 1].copy())
+        if k and w.stops[k - 1] == w.starts[k]:
+            end = simulate(compiled, p, one.drive, states[k - 1 : k], starts=w.starts[k - 1 : k], stops=single.starts)
+            single = replace(single, states=end.ends) if np.all(np.isfinite(end.ends)) else single
+        states[k] = refined_start(compiled, p, one.drive, one.y, one.good, single, scales, shares=ANEW)
+    return replace(w, states=states)
+
+
 def _linear(compiled: Compiled) -> BoolArray:
     """Return which parameters are sought on a linear scale."""
     return np.array([p.linear or p.value == 0.0 for p in compiled.parameters], dtype=bool)
@@ -512,10 +569,8 @@ def _covered(rows: int, windows: Windows) -> BoolArray:
 def _projected_error(back: _Back, error: FloatArray) -> FloatArray:
     """Return the errors without what start states explain."""
     parts, at = [], 0
-    for X, _, _ in back:
-        e = error[at : at + X.shape[0]]
-        at += X.shape[0]
-        Q, R = np.linalg.qr(X)
-        keep = np.abs(np.diag(R)) > 1e-6 * max(float(np.max(np.abs(np.diag(R)), initial=0.0)), 1e-300)
-        parts.append(e - Q[:, keep] @ (Q[:, keep].T @ e))
+    for *_, Q in back:
+        e = error[at : at + Q.shape[0]]
+        at += Q.shape[0]
+        parts.append(e - Q @ (Q.T @ e))
     return np.concatenate(parts)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -144,6 +145,20 @@ def fitted_starts(
             run = simulate(compiled, parameters, drive, window.states, starts=np.array([a]), stops=np.array([b]))
             x = run.ends[0] if np.all(np.isfinite(run.ends)) else x
     return Windows(starts=starts, stops=stops, states=np.array(found))
+
+
+def refined_start(
+    compiled: Compiled, parameters: FloatArray, drive: Drive, y: FloatArray, good: BoolArray, window: Windows,
+    scales: FloatArray, *, shares: Sequence[float], iterations: int = 4,
+) -> FloatArray:  # fmt: skip
+    """Return the start state of one window fitted to growing shares of its rows, (n,)."""
+    a, b = int(window.starts[0]), int(window.stops[0])
+    free = np.flatnonzero(~np.isfinite(given_starts(compiled))) if a == 0 else np.arange(scales.size)
+    for share in shares:
+        until = min(max(int(a + share * (b - a)), a + LEAST), b)
+        window = replace(window, stops=np.array([until]))
+        window = _fitted(compiled, parameters, drive, y, good, window, scales, free, iterations)
+    return np.asarray(window.states[0])
 
 
 def _ends(compiled: Compiled, parameters: FloatArray, drive: Drive, window: Windows) -> list[int]:

@@ -2,8 +2,8 @@
 
 ``python -m tests.benchmarks textbook`` makes the recordings by ``sim.textbook`` (integrators of its own) and gives them
 with the nominal equations to ``diagnose_equations``. TEXTBOOK_PLANTS names some (separated by commas), TEXTBOOK_SEED is
-the first seed (61), TEXTBOOK_OUT the folder that holds one JSON file a case: what is there is not run again. WORKERS
-processes at once (1).
+the first seed (61), TEXTBOOK_OUT the folder that holds one JSON file a case: what is there is not run again,
+TEXTBOOK_ROWS the length of each recording where it is not the plant's own. WORKERS processes at once (1).
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import sys
 import tempfile
 import time
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,9 @@ from sim.textbook.record import pair
 
 #: Laws that are the same curve over what a plant moves through: a T^4 and a T |T| about room temperature.
 SAME = ({"plant.radiation_loss", "plant.nonlinear_loss"}, {"plant.quadratic_drag", "plant.nonlinear_loss"})
+
+#: Rows of each recording; 0 for as many as the plant's own.
+ROWS = int(os.environ.get("TEXTBOOK_ROWS", "0"))
 
 Case = tuple[str, str, str, float, int]
 
@@ -56,7 +60,7 @@ def diagnosed(plant: Plant, case: Case, folder: Path) -> dict[str, Any]:
     for k, made in enumerate(pair(plant, seed, concealed, is_outside=name == "outside")):
         (folder / f"rec{k}.csv").write_text(made.csv(), encoding="utf-8")
     recordings = [read_recording(folder / f"rec{k}.csv") for k in range(2)]
-    begin = time.process_time()
+    begin, cpu = time.perf_counter(), time.process_time()
     with threadpool_limits(1):
         found = diagnose_equations(read_equations(folder / "model.toml"), recordings)
     said = found.as_json()
@@ -65,7 +69,8 @@ def diagnosed(plant: Plant, case: Case, folder: Path) -> dict[str, Any]:
         "effects": [[e["name"], where_of(e), e["probability"]] for e in said["effects"]],
         "candidates": said["candidates"][:4],
         "fit": said["fit"],
-        "cpu_s": time.process_time() - begin,
+        "cpu_s": time.process_time() - cpu,
+        "wall_s": time.perf_counter() - begin,
     }
 
 
@@ -95,7 +100,7 @@ def run(job: tuple[Case, str]) -> tuple[Case, dict[str, Any]]:
         return case, json.loads(file.read_text(encoding="utf-8"))
     with tempfile.TemporaryDirectory() as folder:
         try:
-            said = diagnosed(PLANTS[name], case, Path(folder))
+            said = diagnosed(replace(PLANTS[name], rows=ROWS or PLANTS[name].rows), case, Path(folder))
         except Exception as error:  # a campaign goes on, and the table says what broke
             said = {"verdict": f"{type(error).__name__}: {error}", "effects": [], "fit": {}, "cpu_s": 0.0}
     file.write_text(json.dumps(said), encoding="utf-8")
@@ -121,7 +126,7 @@ def line(case: Case, said: dict[str, Any]) -> str:
     names = " + ".join(f"{n}@{w or 'y'} {p:.2f}" for n, w, p in said["effects"])
     fit = " ".join(f"{key} {value:.3g}" for key, value in said["fit"].items() if isinstance(value, float))
     concealed = f"{case[0]:18s} {case[1]:26s} {case[2]:6s}"
-    return f"{concealed} -> {said['verdict'][:60]:12s} {names:40s} {fit} {said['cpu_s']:.0f} s"
+    return f"{concealed} -> {said['verdict'][:60]:12s} {names:40s} {fit} {said['cpu_s']:.1f} s"
 
 
 def report(found: list[tuple[Case, dict[str, Any]]], out: str) -> None:
@@ -140,7 +145,9 @@ def report(found: list[tuple[Case, dict[str, Any]]], out: str) -> None:
         share = 100.0 * right[key] / total[key]
         print(f"{key:34s} {right[key]:4d} of {total[key]:4d}  {share:5.1f} % ({low:.0f}-{high:.0f})")
     cpu = sum(said["cpu_s"] for _, said in found)
+    slowest, case = max((said.get("wall_s", 0.0), case) for case, said in found)
     print(f"right: name and place first; clean, outside: nothing named. {cpu:.0f} s of processor; files in {out}")
+    print(f"the longest took {slowest:.1f} s: {case[0]}, {case[1]}")
 
 
 if __name__ == "__main__":

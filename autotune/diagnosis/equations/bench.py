@@ -48,6 +48,10 @@ LEAST_SOUGHT = 3
 WINDOWS = 3
 #: Rows of such a window at most: in longer ones fits take more steps, and say no more.
 MOST_ROWS = 500
+#: How far a position may go beyond a hard stop, of what it moves through: what gives way by more is no stop.
+BEYOND = 0.15
+#: A search works on a part of the rows where there are this many times as many.
+PARTED = 1.5
 #: How many times as long as short windows long ones are.
 SHORTER = 8
 #: Spreads of y that an error counts at most: a simulation that runs away is that wrong.
@@ -119,6 +123,18 @@ class Bench(Protocol):
 
     def lengthened(self, outcome: Outcome) -> Outcome:
         """Return a fit to short windows carried on to long ones."""
+        ...
+
+    def part(self, outcome: Outcome, rows: int) -> tuple[Bench, Outcome] | None:
+        """Return a bench on the windows that say most, with a fit there; nothing where there are hardly more rows."""
+        ...
+
+    def carried(self, outcome: Outcome, iterations: int) -> Outcome:
+        """Return a fit to a part of the rows carried on to all of them."""
+        ...
+
+    def is_stand_in(self, outcome: Outcome) -> bool:
+        """Whether one of the effects is no longer what its name says."""
         ...
 
     def is_sought_outside(self, effect: Effect) -> bool:
@@ -354,6 +370,34 @@ class EquationBench:
             outcome = self._outcome(outcome.effects, found)
         return outcome
 
+    def part(self, outcome: Outcome, rows: int) -> tuple[Bench, Outcome] | None:
+        """Return a bench on the windows that say most, with a fit there; nothing where there are hardly more rows."""
+        if sum(int(ok.sum()) for ok in self._rows) < PARTED * rows:
+            return None
+        kept = telling_windows(outcome.fitted, rows)
+        good, windows = [], []
+        for ok, w, keep in zip(self._rows, outcome.fitted.windows, kept, strict=True):
+            mask = np.zeros(ok.size, dtype=bool)
+            for a, b in zip(w.starts[keep], w.stops[keep], strict=True):
+                mask[a:b] = True
+            good.append(ok & mask)
+            windows.append(Windows(starts=w.starts[keep], stops=w.stops[keep], states=w.states[keep]))
+        small = EquationBench(self.model, self.recordings, good)
+        self.signals(outcome)  # sizes and spans, for fits on all rows too
+        small.length_s, small._most_steps = self.length_s, self._most_steps
+        there = replace(outcome, fitted=replace(outcome.fitted, windows=tuple(windows)))
+        return small, small._inner(outcome.effects, there, LEAST_SOUGHT)
+
+    def carried(self, outcome: Outcome, iterations: int) -> Outcome:
+        """Return a fit to a part of the rows carried on to all of them."""
+        own = len(self.model.parameters)
+        compiled = self._compiled(outcome.effects, self._spreads())
+        z = np.zeros(len(compiled.parameters))
+        z[:own] = outcome.fitted.z[:own]
+        return self._outcome(
+            outcome.effects, fit(compiled, self.recordings, z=z, horizon_s=self.length_s, iterations=iterations)
+        )
+
     def is_sought_outside(self, effect: Effect) -> bool:
         """Whether a direct search around the fits seeks one of the effect's numbers."""
         return any((effect.name, key) in OUTER for key in effect.parameters)
@@ -430,9 +474,8 @@ class EquationBench:
         return np.concatenate(parts)
 
     def _start_bases(self, outcome: Outcome) -> list[list[FloatArray]]:
-        key = id(outcome)
-        if getattr(self, "_bases_of", None) != key:
-            self._bases_of, self._bases = key, [self._basis(outcome, k) for k in range(len(self.recordings))]
+        if self._bases_of is not outcome:
+            self._bases_of, self._bases = outcome, [self._basis(outcome, k) for k in range(len(self.recordings))]
         return self._bases
 
     def _basis(self, outcome: Outcome, k: int) -> list[FloatArray]:
@@ -455,13 +498,14 @@ class EquationBench:
         return found
 
     _base_of: Outcome | None = None
+    _bases_of: Outcome | None = None
     _base: FloatArray | None = None
     _sizes: Mapping[str, float] = MappingProxyType({})
     _spans: Mapping[str, float] = MappingProxyType({})
     _most_steps = np.inf
 
-    def signals(self, outcome: Outcome) -> Signals:
-        """Return states, differences across ports, and sizes of derivatives under a fit."""
+    def _signals(self, outcome: Outcome) -> tuple[FloatArray, dict[str, FloatArray]]:
+        """Return the simulated reading, and states and differences across ports by name, where a simulation goes on."""
         model = self.model
         positions = {one.name: _position_text(model, one.across) for one in model.ports}
         wanted = {name: name for name in model.state_names}
@@ -475,17 +519,42 @@ class EquationBench:
             runs.append(simulate(compiled, p, drive, states, starts=w.starts, stops=w.stops).outputs)
         columns = np.concatenate(runs)
         columns = columns[np.all(np.isfinite(columns), axis=1)]
-        values = {name: columns[:, 1 + i] for i, name in enumerate(wanted)}
+        return columns[:, 0], {name: columns[:, 1 + i] for i, name in enumerate(wanted)}
+
+    @property
+    def _positions(self) -> dict[str, str]:
+        """The name of the position that goes with each state and port."""
+        return {s.name: s.of or s.name for s in self.model.states} | {
+            one.name: f"{one.name}:position" for one in self.model.ports
+        }
+
+    def is_stand_in(self, outcome: Outcome) -> bool:
+        """Whether one of the effects is no longer what its name says: a stop that the position goes far beyond."""
+        stops = [e for e in outcome.effects[len(self.model.effects) :] if e.name == "plant.hard_stop"]
+        if not stops:
+            return False
+        values = self._signals(outcome)[1]
+        return any(
+            _beyond(values[self._positions[place_of(e)]], e) > BEYOND for e in stops
+            if self._positions[place_of(e)] in values
+        )  # fmt: skip
+
+    def signals(self, outcome: Outcome) -> Signals:
+        """Return states, differences across ports, and sizes of derivatives under a fit."""
+        model = self.model
+        y, values = self._signals(outcome)
         dt = float(np.median(np.concatenate([np.diff(r.t) for r in self.recordings])))
         sizes = {n: float(np.std(np.diff(values[n]) / dt)) + 1e-12 for n in model.state_names}
         for port in model.ports:
             sizes[port.name] = self._force_size(outcome, port.name, sizes)
         self._sizes = sizes
-        under = {s.name: s.of for s in model.states} | {one.name: f"{one.name}:position" for one in model.ports}
-        self._spans = {place: float(np.ptp(values[name])) for place, name in under.items() if name in values}
+        self._spans = {
+            place: float(np.ptp(values[name])) for place, name in self._positions.items()
+            if name in values and name != place
+        }  # fmt: skip
         duration = max(float(r.t[-1] - r.t[0]) for r in self.recordings)
         u = np.concatenate([d.inputs[:, 0] for d in self._drives])
-        return Signals(u=u, y=columns[:, 0], values=values, sizes=sizes, dt_s=dt, duration_s=duration,
+        return Signals(u=u, y=y, values=values, sizes=sizes, dt_s=dt, duration_s=duration,
                        slow_s=0.05 * duration)  # fmt: skip
 
     def _force_size(self, outcome: Outcome, port: str, sizes: Mapping[str, float]) -> float:
@@ -502,6 +571,29 @@ class EquationBench:
         change = np.abs(derivatives(compile_model(self.model, [one]), p, x, u)[0] - none)[0]
         ratios = [sizes[n] / c for n, c in zip(self.model.state_names, change, strict=True) if c > 0.0]
         return max(ratios, default=1.0)
+
+
+def _beyond(x: FloatArray, stop: Effect) -> float:
+    """Return how far a position goes beyond a stop, as a share of what it moves through."""
+    high = stop.parameters["high"].value if "high" in stop.parameters else np.inf
+    low = stop.parameters["low"].value if "low" in stop.parameters else -np.inf
+    return float(max(np.max(x) - high, low - np.min(x), 0.0) / max(float(np.ptp(x)), 1e-300))
+
+
+def telling_windows(fitted: Fitted, rows: int) -> list[BoolArray]:
+    """Return which windows of each recording to search on: a run of them that a fit leaves most in.
+
+    As many of every recording as hold its share of some rows. One follows the other, so that where one ends tells where
+    the next begins.
+    """
+    share = rows / sum(int(np.sum(w.stops - w.starts)) for w in fitted.windows)
+    kept = []
+    for w, e in zip(fitted.windows, fitted.residuals, strict=True):
+        squares = [float(np.nansum(e[a:b] ** 2)) for a, b in zip(w.starts, w.stops, strict=True)]
+        count = min(max(round(share * w.starts.size), 1), w.starts.size)
+        first = int(np.argmax(np.convolve(squares, np.ones(count), "valid")))
+        kept.append((np.arange(w.starts.size) >= first) & (np.arange(w.starts.size) < first + count))
+    return kept
 
 
 def jumping(compiled: Compiled, effects: Sequence[Effect]) -> tuple[ModelParameter, ...]:
@@ -537,6 +629,8 @@ def sought(p: ModelParameter, effects: Sequence[Effect], spreads: Mapping[str, f
     name = effects[number].name
     if key in GIVEN or p.spread == 0.0 or (name, key) in OUTER:
         return replace(p, spread=0.0)
+    if (name, key) == ("plant.sine_torque", "period") and "phase" not in effects[number].parameters:
+        return replace(p, spread=0.0)  # gravity on an angle
     if (name, key) == ("plant.hysteresis", "width"):
         return replace(p, least=spreads.get(f"width at {place_of(effects[number])}", 0.0))
     if (name, key) == ("plant.hard_stop", "stiffness"):

@@ -25,6 +25,8 @@ ON_COMMAND = (
 ON_READING = ("sensor.lag", "sensor.nonlinear_gain", "sensor.drift")
 #: What nearly every machine has, and models leave out: tried beside a large effect whatever others predict.
 USUAL = frozenset({"plant.coulomb_friction"})
+#: Shares of the time that a position without a stop is on this side of it, where stops are tried.
+STOPS = (0.8, 0.9, 0.97, 0.995)
 BY_KIND = {
     "speed": ON_SPEED, "level": ON_LEVEL, "temperature": ON_TEMPERATURE, "pressure": ON_LEVEL, "current": (),
     "force": (*ON_SPEED, *ON_POSITION), "torque": (*ON_SPEED, *ON_POSITION), "flow": ON_LEVEL, "heat": ON_TEMPERATURE,
@@ -59,12 +61,32 @@ def place_of(effect: Effect) -> str:
 
 def plainer(effect: Effect) -> Effect | None:
     """Return the effect of fewer numbers that another one comes down to in a limit; nothing where there is none."""
+    if effect.name == "plant.sine_torque" and not is_gravity(effect):
+        return gravity(effect, effect.parameters["amplitude"].value)
     level = {"plant.stribeck_friction": "level", "plant.hysteresis": "amplitude"}.get(effect.name)
     if level is None:
         return None
     size = effect.parameters[level]
     parameters = MappingProxyType({"level": replace(size, value=abs(size.value))})
     return replace(effect, name="plant.coulomb_friction", parameters=parameters)
+
+
+def eased(effect: Effect) -> Effect:
+    """Return dry friction at half of its force, any other effect as it is."""
+    forces = {key: q for key, q in effect.parameters.items() if key in ("level", "breakaway")}
+    less = {key: replace(q, value=0.5 * q.value) for key, q in forces.items()}
+    return replace(effect, parameters=MappingProxyType({**effect.parameters, **less}))
+
+
+def gravity(effect: Effect, amplitude: float) -> Effect:
+    """Return a sine torque as gravity on an angle: over one turn, from angle zero on; its amplitude alone is sought."""
+    values = {"amplitude": Parameter(value=amplitude), "period": Parameter(value=2.0 * np.pi, unit="rad")}
+    return replace(effect, parameters=MappingProxyType(values))
+
+
+def is_gravity(effect: Effect) -> bool:
+    """Whether an effect is gravity on an angle."""
+    return effect.name == "plant.sine_torque" and "phase" not in effect.parameters
 
 
 def is_plainer(effect: Effect) -> bool:
@@ -166,7 +188,7 @@ def _on_place(model: EquationModel, s: Signals, key: str, name: str, effect: str
         case "plant.radiation_loss":
             yield from _radiation(model, s, key, name, force)
         case _ if position is not None:
-            yield from _on_position(key, name, effect, force, position, s)
+            yield from _on_position(key, name, effect, force, position, s, _is_angle(model, key, name))
 
 
 def _radiation(model: EquationModel, s: Signals, key: str, name: str, force: float) -> Iterator[Trial]:
@@ -181,13 +203,25 @@ def _radiation(model: EquationModel, s: Signals, key: str, name: str, force: flo
         yield Trial(effect=_effect("plant.radiation_loss", key, name, **values), scaled=("coefficient",))
 
 
-def _on_position(key: str, name: str, effect: str, force: float, x: FloatArray, s: Signals) -> Iterator[Trial]:
+def _is_angle(model: EquationModel, key: str, name: str) -> bool:
+    """Whether the position at a place may be an angle in rad, as far as kinds and units say."""
+    if key == "port":
+        return any(one.name == name and one.kind == "torque" for one in model.ports)
+    states = {one.name: one for one in model.states}
+    return states[states[name].of or name].unit.strip() in ("", "rad")
+
+
+def _on_position(
+    key: str, name: str, effect: str, force: float, x: FloatArray, s: Signals, is_angle: bool
+) -> Iterator[Trial]:
     span = float(np.max(x) - np.min(x)) + 1e-300
     match effect:
         case "plant.cubic_stiffness":
             size = float(np.quantile(np.abs(x), 0.95)) + 1e-300
             yield Trial(effect=_effect(effect, key, name, coefficient=force / size**3), scaled=("coefficient",))
         case "plant.sine_torque":
+            if is_angle:
+                yield Trial(effect=gravity(_effect(effect, key, name), force), scaled=("amplitude",))
             for period in (0.2 * span, 0.35 * span, 0.6 * span, 2.0 * np.pi):
                 for phase in (0.0, 0.5 * np.pi):
                     values = {"amplitude": force, "period": period, "phase": phase or 1e-3}
@@ -200,7 +234,8 @@ def _on_position(key: str, name: str, effect: str, force: float, x: FloatArray, 
             # at a port a force, which an inertia turns into an acceleration
             rate = float(np.std(np.diff(s.values[name]) / s.dt_s)) if key == "port" else 0.0
             stiffness = (0.5 / s.dt_s) ** 2 * (s.sizes[name] / rate if rate > 0.0 else 1.0)
-            for side, level in (("high", np.quantile(x, 0.97)), ("low", np.quantile(x, 0.03))):
+            for side, share in ((side, share) for share in STOPS for side in ("high", "low")):
+                level = np.quantile(x, share if side == "high" else 1.0 - share)
                 values = {side: float(level), "stiffness": stiffness, "damping": 2.0 * s.dt_s * stiffness}
                 yield Trial(effect=_effect(effect, key, name, **values))
 

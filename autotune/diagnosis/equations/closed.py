@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from autotune.arrays import BoolArray, FloatArray, IntArray
-from autotune.diagnosis.equations.bench import HELD_OUT, Outcome, jumping, sought
+from autotune.diagnosis.equations.bench import HELD_OUT, Bench, Outcome, jumping, sought
 from autotune.diagnosis.equations.candidates import Signals, Trial
 from autotune.diagnosis.evidence.stretches import stretches_in
 from autotune.equations.black_box import BlackBox, driven, read_out
@@ -191,6 +191,18 @@ class ClosedBench:
     def lengthened(self, outcome: Outcome) -> Outcome:
         """Return the fit as it is."""
         return outcome
+
+    def part(self, outcome: Outcome, rows: int) -> tuple[Bench, Outcome] | None:
+        """Return nothing: a recording is one run from the model's own start."""
+        return None
+
+    def carried(self, outcome: Outcome, iterations: int) -> Outcome:
+        """Return the fit as it is."""
+        return outcome
+
+    def is_stand_in(self, outcome: Outcome) -> bool:
+        """Return no: effects inside that could be one are not tried."""
+        return False
 
     def is_sought_outside(self, effect: Effect) -> bool:
         """Return no: dead times are fitted with the other numbers."""

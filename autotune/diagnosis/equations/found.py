@@ -254,7 +254,9 @@ def _judged(
     limits = found.limits
     explains = left < limits.equation_explained - 1.0 or left < (1.0 - limits.equation_most) * before
     better = errors[2] < errors[1] or errors[2] < limits.equation_held_out * errors[3]
-    mostly = not explains and _explains_most(errors, limits)
+    # a load of free timing explains a part of everything
+    loads = any(one.name.startswith("environment.") for one in added)
+    mostly = not explains and not loads and _explains_most(errors, limits)
     verdict: Literal["none", "parameters", "effect", "unexplained"]
     if (added and (explains or mostly) and better) or (seen and left < 1.0):
         verdict = "effect"

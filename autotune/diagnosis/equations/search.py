@@ -6,13 +6,14 @@ The steps of one search: the file is a little longer than others.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from autotune.arrays import FloatArray
 from autotune.diagnosis.equations.bench import Bench, Outcome, scaled
-from autotune.diagnosis.equations.candidates import USUAL, Trial, is_plainer, place_of, plainer, trials
+from autotune.diagnosis.equations.candidates import USUAL, Trial, eased, is_plainer, place_of, plainer, trials
 from autotune.diagnosis.evidence.stretches import advantage
 from autotune.diagnosis.fitting.noise import Noise, noise_from_differences
 from autotune.diagnosis.thresholds import IN_USE, Thresholds
@@ -20,8 +21,8 @@ from autotune.errors import InputError
 from autotune.models import Effect
 from autotune.progress import Progress
 
-#: Iterations of a fit that shows whether more are worth it, of a first fit, and of the best ones.
-LOOK, FIRST, LAST = 2, 4, 8
+#: Iterations of a fit that shows whether more are worth it, of a first fit, of the best ones, and of the chosen one.
+LOOK, FIRST, LAST, FINAL = 2, 4, 8, 30
 #: Fits to short windows that go on to long ones.
 CARRIED = 3
 
@@ -98,21 +99,45 @@ def search(bench: Bench, without: Sequence[str], progress: Progress, limits: Thr
     while len(chosen.effects) - len(retuned.effects) < limits.equation_effects:
         if _is_noise(bench, chosen, limits.equation_noise, limits) and not _is_slow(bench, chosen, limits):
             break
-        new = _round(bench, chosen, without, progress, limits, chosen is not retuned)
+        new = _leading(bench, chosen, without, progress, limits, chosen is not retuned)
         tried += new
         noise = _noise(bench, min([chosen, *new], key=lambda one: one.rss))
         rows = _independent(retuned, noise)
-        # a load of free timing explains a part of everything: others come first unless it leaves noise alone
-        new.sort(key=lambda one: (_is_partial_load(bench, one, limits), penalised(one, rows, limits)))
-        best = next((one for one in new if _worth(chosen, one, rows, limits)), new[0] if new else None)
-        best = best and _plainest(bench, best, tried, rows, limits)
-        if best is None or not _is_needed(bench, chosen, best, len(retuned.effects), rows, limits):
+        larger = _larger(bench, chosen, new, tried, len(retuned.effects), rows, limits)
+        if larger is None:
             break
-        chosen = best
+        chosen = larger
     chosen = _pruned(bench, chosen, len(retuned.effects), tried, rows, limits)
+    if chosen is not retuned and not _is_noise(bench, chosen, limits.equation_noise, limits):
+        chosen = _finished(bench, chosen, retuned)
+        tried.append(chosen)
     return Searched(
         nominal=nominal, retuned=retuned, chosen=chosen, tried=tuple(tried), noise=noise, rows=rows, limits=limits
     )
+
+
+def _finished(bench: Bench, chosen: Outcome, retuned: Outcome) -> Outcome:
+    """Return a fit to its end: from where it is, from the numbers without effects, and with start states found anew.
+
+    Where dry friction held the plant while numbers were still wrong, start states stay behind, and hold numbers back:
+    from the numbers without effects it begins at half of what was found.
+    """
+    fits = [chosen, _attempt(bench, chosen.effects, chosen, FINAL)]
+    fits.append(_attempt(bench, [eased(effect) for effect in chosen.effects], retuned, FINAL))
+    with suppress(InputError):
+        fits.append(bench.carried(chosen, FINAL))
+    return min((one for one in fits if one is not None), key=lambda one: one.rss)
+
+
+def _larger(
+    bench: Bench, parent: Outcome, new: list[Outcome], tried: list[Outcome], own: int, rows: float, limits: Thresholds
+) -> Outcome | None:
+    """Return the best hypothesis with one more effect in its plainest form; nothing where none is needed."""
+    # a load of free timing explains a part of everything: others come first unless it leaves noise alone
+    new.sort(key=lambda one: (_is_partial_load(bench, one, limits), penalised(one, rows, limits)))
+    best = next((one for one in new if _worth(parent, one, rows, limits)), new[0] if new else None)
+    best = best and _plainest(bench, best, tried, rows, limits)
+    return best if best is not None and _is_needed(bench, parent, best, own, rows, limits) else None
 
 
 def _worth(before: Outcome, after: Outcome, rows: float, limits: Thresholds) -> bool:
@@ -144,6 +169,13 @@ def _is_noise(bench: Bench, one: Outcome, most: float, limits: Thresholds) -> bo
     return _ratio(one, noise) < most and not (noise.ar and noise.ar[0] > limits.slow_noise)
 
 
+def _is_settled(bench: Bench, one: Outcome, best: Outcome, limits: Thresholds) -> bool:
+    """Whether a fit need not be finished: another one of the same rows leaves noise alone, and it is far behind."""
+    if one is best or _ratio(best, _noise(bench, best)) >= limits.equation_noise:
+        return False
+    return one.residual.size * float(np.log(one.rss / max(best.rss, 1e-300))) > limits.equation_behind
+
+
 def _is_slow(bench: Bench, one: Outcome, limits: Thresholds) -> bool:
     """Whether block means of a residual vary by more than its noise says."""
     noise, ratios = _noise(bench, one), []
@@ -155,6 +187,30 @@ def _is_slow(bench: Bench, one: Outcome, limits: Thresholds) -> bool:
         wanted = noise.total_sd**2 / width * (1.0 + rho) / (1.0 - rho)
         ratios.append(float(np.mean(means**2)) / max(wanted, 1e-300))
     return bool(np.mean(ratios) > limits.equation_slow)
+
+
+def _leading(
+    bench: Bench, base: Outcome, without: Sequence[str], progress: Progress, limits: Thresholds, further: bool
+) -> list[Outcome]:
+    """Return fits with one more effect, sought on a part of the rows where there are many, fitted to all of them."""
+    part = bench.part(base, limits.equation_rows)
+    if part is None:
+        return _round(bench, base, without, progress, limits, further)
+    small, there = part
+    found = _round(small, there, without, progress, limits, further)
+    rows = _independent(there, _noise(small, there))
+    found.sort(key=lambda one: (_is_partial_load(small, one, limits), penalised(one, rows, limits)))
+    once = {(one.effects[-1].name, place_of(one.effects[-1]), len(one.effects)): one for one in reversed(found)}
+    carried: list[Outcome] = []
+    for one in sorted(once.values(), key=found.index)[: limits.confirmed]:
+        if np.log(there.rss / one.rss) < limits.equation_near * np.log(there.rss / found[0].rss):
+            continue
+        progress(f"fitting {one.effects[-1].name} to all rows", 0.85 if further else 0.45)
+        try:
+            carried.append(bench.carried(one, LAST if carried else 2 * LAST))
+        except InputError:
+            continue
+    return carried
 
 
 def _round(
@@ -174,13 +230,16 @@ def _round(
         if short is not None:
             # the base itself goes on as well: its effects may have been fitted in a wrong minimum
             again = [short] if further else []
-            found += _lengthened(bench, [*again, *_grown(bench, short, without, told, limits, count, beside)])
+            fits = [*again, *_grown(bench, short, without, told, limits, count, beside)]
+            found += _lengthened(bench, fits, limits)
     found.sort(key=lambda one: one.rss)
     for k, one in enumerate(found[:2]):
+        if _is_settled(bench, one, found[0], limits):
+            break
         progress(f"fitting {one.effects[-1].name}", share + 0.35 + 0.04 * k)
         better = _attempt(bench, one.effects, one, LAST)
         found[k] = better if better is not None and better.rss < one.rss else one
-    return found
+    return [one for one in found if not bench.is_stand_in(one)]
 
 
 def _grown(
@@ -267,7 +326,9 @@ def _plainest(bench: Bench, best: Outcome, tried: list[Outcome], rows: float, li
     less = plainer(last)
     if less is None:
         return best
-    one = _attempt(bench, (*best.effects[:-1], less), best, LAST)
+    one = _attempt(bench, (*best.effects[:-1], less), best, FIRST)
+    if one is not None and not _is_settled(bench, one, best, limits):
+        one = _attempt(bench, one.effects, one, LAST) or one
     if one is None:
         return best
     tried.append(one)
@@ -304,9 +365,7 @@ def _fitted(
         if one is None:
             continue
         best = min(found, key=lambda other: other.rss, default=one)
-        settled = best is not one and _ratio(best, _noise(bench, best)) < limits.equation_noise
-        behind = one.residual.size * float(np.log(one.rss / max(best.rss, 1e-300)))
-        if not outer and not (settled and behind > limits.equation_behind):
+        if not outer and not _is_settled(bench, one, best, limits):
             further = _attempt(bench, one.effects, one, FIRST)
             one = further if further is not None and further.rss < one.rss else one
         found.append(one)
@@ -326,11 +385,13 @@ def _ends_usual(one: Outcome) -> bool:
     return len(one.effects) > 1 and one.effects[-1].name in USUAL
 
 
-def _lengthened(bench: Bench, fits: Sequence[Outcome]) -> list[Outcome]:
+def _lengthened(bench: Bench, fits: Sequence[Outcome], limits: Thresholds) -> list[Outcome]:
     """Return the best fits to short windows carried on to long ones, and those with usual effects."""
-    found = []
+    found: list[Outcome] = []
     ranked = sorted(fits, key=lambda one: one.rss)
     for one in [*ranked[:CARRIED], *(one for one in ranked[CARRIED:] if _ends_usual(one))]:
+        if _is_settled(bench, one, ranked[0], limits) and _is_noise(bench, found[0], limits.equation_noise, limits):
+            continue
         try:
             found.append(bench.lengthened(one))
         except InputError:
@@ -346,7 +407,7 @@ def screened(
     Returns
     -------
     list of (decrease of the sum of squares, effect)
-        The best first; an effect at a place stands once.
+        The best first; an effect at a place stands once, and once more in its plainer form.
     """
     signals = bench.signals(base)
     present = {(effect.name, place_of(effect)) for effect in base.effects}
@@ -355,14 +416,14 @@ def screened(
     all_trials = [one for one in tried if (one.effect.name, one.place) not in present]
     basis, e = bench.explained(base), bench.without_starts(base, base.residual)
     e = e - basis @ (basis.T @ e)
-    best: dict[tuple[str, str], tuple[float, Effect]] = {}
+    best: dict[tuple[str, str, bool], tuple[float, Effect]] = {}
     directions = bench.each(lambda trial: _direction(bench, base, trial, basis), all_trials)
     for k, (trial, d) in enumerate(zip(all_trials, directions, strict=True)):
         progress("trying every effect", k / len(all_trials))
         if d is None:
             continue
         gain, factor = predicted(e, d, trial)
-        key = (trial.effect.name, trial.place)
+        key = (trial.effect.name, trial.place, plainer(trial.effect) is None)
         if gain > 0.0 and (key not in best or gain > best[key][0]):
             best[key] = (gain, scaled(trial, factor))
     ranked = sorted(best.values(), key=lambda pair: -pair[0])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -163,3 +164,18 @@ def test_a_start_that_the_readings_hardly_feel_holds_up_no_number() -> None:
     found = fit(compile_model(_fan(3.6, 0.12, 1.2)), [swung], horizon_s=1.0, iterations=15)
     assert found.noise_sd < 2.2e-3
     np.testing.assert_allclose(found.parameters, [3.0, 0.1, 1.5], rtol=0.02)
+
+
+@pytest.mark.parametrize("start", [(3.0, 0.0), (0.0, 14.0), (6.0, 25.0)])
+def test_a_window_that_follows_another_swing_is_started_anew(
+    pair: list[Recording], start: tuple[float, float]
+) -> None:  # fmt: skip
+    """A start state near the top, or so quick that it goes over: steps of Gauss and Newton lead no way back."""
+    compiled = compile_model(model())
+    right = fit(compiled, pair, horizon_s=4.0)
+    assert right.noise_sd == pytest.approx(0.003, rel=0.1)
+    states = right.windows[0].states.copy()
+    states[2] = start
+    wrong = [replace(right.windows[0], states=states), right.windows[1]]
+    again = fit(compiled, pair, z=right.z, windows=wrong, iterations=6)
+    assert again.noise_sd == pytest.approx(0.003, rel=0.1)

@@ -50,6 +50,8 @@ def test_a_dead_time_between_rows_is_the_closed_solution() -> None:
         ("two coupled tanks", "plant.leak", "h2", 0.2, 63),
         ("dc motor", "plant.coulomb_friction", "T_d", 0.15, 65),
         ("heater", "clean", "", 0.0, 61),
+        # the stop lies where without it the pendulum would be for a fifth of the time
+        ("pendulum", "plant.hard_stop", "omega", 0.85, 22066),
     ],
     ids=lambda case: f"{case[0]}, {case[1]}",
 )
