@@ -29,7 +29,7 @@ from autotune.equations.sensitivity import (
     side_by_side,
 )
 from autotune.equations.simulate import Compiled, Drive, Run, drive_of, simulate
-from autotune.equations.starts import fitted_starts, given_starts, refined_start, state_scales
+from autotune.equations.starts import fitted_starts, given_starts, started_anew, state_scales
 from autotune.errors import InputError
 from autotune.progress import Progress, quiet
 from autotune.recording import Recording
@@ -49,9 +49,8 @@ LOST = 30.0
 #: Weight of the belief that a start state is where it was, of what the readings tell of all, and by what it grows
 #: where a move fails: a state that readings hardly feel would jump, and hold up every number beside it.
 FIRMNESS, FIRMER = 1e-9, 10.0
-#: Times the median window's mean square from which on a window stands out and is started anew, and the shares of its
-#: rows that its start is fitted to, one after the other: wrong numbers lead the rest astray.
-STANDS_OUT, ANEW = 4.0, (0.1, 0.3, 1.0)
+#: Times the median window's mean square from which on a window stands out and is started anew.
+STANDS_OUT = 4.0
 #: Windows at least of which one may stand out, and what of its mean square a new start may leave to be taken.
 LEAST_WINDOWS, RESTARTED = 4, 0.7
 #: Part of a third of a value below which the straight scale is exponential again.
@@ -496,7 +495,9 @@ class Descent:
             return False
         most = STANDS_OUT * float(np.median(known))
         windows = [
-            _anew(self._compiled, p, one, np.flatnonzero(size > most), self._scales)
+            started_anew(
+                self._compiled, p, one.drive, one.y, one.good, one.windows, np.flatnonzero(size > most), self._scales
+            )
             for one, size in zip(self._data, before, strict=True)
         ]
         found = False
@@ -540,18 +541,6 @@ class Descent:
             compiled=compiled, parameters=p, sd=sd, z=self._z, windows=tuple(one.windows for one in self._data),
             simulated=simulated, residuals=residuals, noise_sd=self._sd, jacobian=whole, converged=converged,
         )  # fmt: skip
-
-
-def _anew(compiled: Compiled, p: FloatArray, one: FitData, which: IntArray, scales: FloatArray) -> Windows:
-    """Return windows, some of them started anew: from where the one before them ends, or from where they start."""
-    w, states = one.windows, one.windows.states.copy()
-    for k in which:
-        single = Windows(starts=w.starts[k : k + 1], stops=w.stops[k : k + 1], states=states[k : k + 1].copy())
-        if k and w.stops[k - 1] == w.starts[k]:
-            end = simulate(compiled, p, one.drive, states[k - 1 : k], starts=w.starts[k - 1 : k], stops=single.starts)
-            single = replace(single, states=end.ends) if np.all(np.isfinite(end.ends)) else single
-        states[k] = refined_start(compiled, p, one.drive, one.y, one.good, single, scales, shares=ANEW)
-    return replace(w, states=states)
 
 
 def _linear(compiled: Compiled) -> BoolArray:

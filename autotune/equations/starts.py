@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -14,6 +13,9 @@ from autotune.equations.simulate import Compiled, Drive, derivatives, simulate
 
 #: Rows that a start state is fitted to at least; where those run away, to a part of them first, this many at least.
 LEAST, LEAST_WINDOW = 30, 4
+#: Shares of its rows that a window started anew is fitted to, one after the other: wrong numbers lead the rest astray;
+#: and steps of each.
+ANEW, ANEW_STEPS = (0.1, 0.3, 1.0), 4
 
 
 def given_starts(compiled: Compiled) -> FloatArray:
@@ -147,18 +149,41 @@ def fitted_starts(
     return Windows(starts=starts, stops=stops, states=np.array(found))
 
 
-def refined_start(
-    compiled: Compiled, parameters: FloatArray, drive: Drive, y: FloatArray, good: BoolArray, window: Windows,
-    scales: FloatArray, *, shares: Sequence[float], iterations: int = 4,
-) -> FloatArray:  # fmt: skip
-    """Return the start state of one window fitted to growing shares of its rows, (n,)."""
-    a, b = int(window.starts[0]), int(window.stops[0])
-    free = np.flatnonzero(~np.isfinite(given_starts(compiled))) if a == 0 else np.arange(scales.size)
-    for share in shares:
-        until = min(max(int(a + share * (b - a)), a + LEAST), b)
-        window = replace(window, stops=np.array([until]))
-        window = _fitted(compiled, parameters, drive, y, good, window, scales, free, iterations)
-    return np.asarray(window.states[0])
+def started_anew(
+    compiled: Compiled, parameters: FloatArray, drive: Drive, y: FloatArray, good: BoolArray, windows: Windows,
+    which: IntArray, scales: FloatArray,
+) -> Windows:  # fmt: skip
+    """Return windows, some of them started anew: from where the one before them ends, or from where they start.
+
+    Parameters
+    ----------
+    compiled, parameters, drive
+        The model and what drives it.
+    y, good : (N,) arrays
+        Readings, and which of them count.
+    windows : Windows
+        Of one recording.
+    which : int array
+        Those to be started anew; each is fitted to growing shares of its rows.
+    scales : (n,) array
+        How large each state typically is.
+    """
+    w, states = windows, windows.states.copy()
+    for k in which:
+        start, stop = int(w.starts[k]), int(w.stops[k])
+        one = Windows(starts=w.starts[k : k + 1], stops=w.stops[k : k + 1], states=states[k : k + 1].copy())
+        if k and w.stops[k - 1] == start:
+            before = simulate(
+                compiled, parameters, drive, states[k - 1 : k], starts=w.starts[k - 1 : k], stops=one.starts
+            )
+            one = replace(one, states=before.ends) if np.all(np.isfinite(before.ends)) else one
+        free = np.flatnonzero(~np.isfinite(given_starts(compiled))) if start == 0 else np.arange(scales.size)
+        for share in ANEW:
+            until = min(max(int(start + share * (stop - start)), start + LEAST), stop)
+            one = replace(one, stops=np.array([until]))
+            one = _fitted(compiled, parameters, drive, y, good, one, scales, free, ANEW_STEPS)
+        states[k] = one.states[0]
+    return replace(w, states=states)
 
 
 def _ends(compiled: Compiled, parameters: FloatArray, drive: Drive, window: Windows) -> list[int]:

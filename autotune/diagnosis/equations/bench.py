@@ -14,6 +14,7 @@ import numpy as np
 
 from autotune.arrays import BoolArray, FloatArray
 from autotune.diagnosis.equations.candidates import Signals, Trial, place_of
+from autotune.diagnosis.equations.parts import beyond, telling_windows
 from autotune.diagnosis.evidence.stretches import stretches_in
 from autotune.equations.effects import compile_with, with_values
 from autotune.equations.expressions import Expression, to_text
@@ -535,7 +536,7 @@ class EquationBench:
             return False
         values = self._signals(outcome)[1]
         return any(
-            _beyond(values[self._positions[place_of(e)]], e) > BEYOND for e in stops
+            beyond(values[self._positions[place_of(e)]], e) > BEYOND for e in stops
             if self._positions[place_of(e)] in values
         )  # fmt: skip
 
@@ -571,29 +572,6 @@ class EquationBench:
         change = np.abs(derivatives(compile_model(self.model, [one]), p, x, u)[0] - none)[0]
         ratios = [sizes[n] / c for n, c in zip(self.model.state_names, change, strict=True) if c > 0.0]
         return max(ratios, default=1.0)
-
-
-def _beyond(x: FloatArray, stop: Effect) -> float:
-    """Return how far a position goes beyond a stop, as a share of what it moves through."""
-    high = stop.parameters["high"].value if "high" in stop.parameters else np.inf
-    low = stop.parameters["low"].value if "low" in stop.parameters else -np.inf
-    return float(max(np.max(x) - high, low - np.min(x), 0.0) / max(float(np.ptp(x)), 1e-300))
-
-
-def telling_windows(fitted: Fitted, rows: int) -> list[BoolArray]:
-    """Return which windows of each recording to search on: a run of them that a fit leaves most in.
-
-    As many of every recording as hold its share of some rows. One follows the other, so that where one ends tells where
-    the next begins.
-    """
-    share = rows / sum(int(np.sum(w.stops - w.starts)) for w in fitted.windows)
-    kept = []
-    for w, e in zip(fitted.windows, fitted.residuals, strict=True):
-        squares = [float(np.nansum(e[a:b] ** 2)) for a, b in zip(w.starts, w.stops, strict=True)]
-        count = min(max(round(share * w.starts.size), 1), w.starts.size)
-        first = int(np.argmax(np.convolve(squares, np.ones(count), "valid")))
-        kept.append((np.arange(w.starts.size) >= first) & (np.arange(w.starts.size) < first + count))
-    return kept
 
 
 def jumping(compiled: Compiled, effects: Sequence[Effect]) -> tuple[ModelParameter, ...]:
