@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -65,7 +66,8 @@ def held_out(retuned: Fit, chosen: Fit, data: Data) -> FitQuality:
     spread = float(np.std(y)) or 1.0
 
     def error(result: Fit, tune: bool) -> float:
-        fits = [_tested(result, tune, *pair) for pair in (halves, halves[::-1])]
+        with ThreadPoolExecutor(2) as pool:
+            fits = list(pool.map(lambda pair: _tested(result, tune, *pair), (halves, halves[::-1])))
         squares = sum(float(e @ e) for f in fits for e in f.residuals)
         freedom = sum(f.rows - f.states_told for f in fits)
         return math.sqrt(squares / max(freedom, 1)) / spread

@@ -19,7 +19,7 @@ from autotune.diagnosis.evidence.adequacy import ResidualTests, line_in, residua
 from autotune.diagnosis.evidence.constancy import linear_gain
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import Fit, fit
-from autotune.diagnosis.fitting.noise import Noise, autoregressive
+from autotune.diagnosis.fitting.noise import Noise, autoregressive_up_to
 from autotune.diagnosis.thresholds import Thresholds
 
 #: Highest order of the noise that is tried, times that noise and numbers are fitted in turn, and Gauss-Newton steps.
@@ -105,8 +105,7 @@ def own_noise(retuned: Fit, data: Data) -> OwnNoise | None:
 def coloured_noise(residuals: Sequence[FloatArray], good: Sequence[BoolArray]) -> Noise:
     """Return the autoregressive noise, of the order that Schwarz's criterion chooses, that a residual may be."""
     rows = sum(int(g.sum()) for g in good)
-    found = [autoregressive(residuals, good, order) for order in range(1, min(ORDERS, rows // 20) + 1)]
-    found = [noise for noise in found if noise.sd > 0.0]
+    found = [n for n in autoregressive_up_to(residuals, good, min(ORDERS, rows // 20)) if n.sd > 0.0]
     return min(
         found,
         key=lambda noise: rows * math.log(noise.sd**2) + len(noise.ar) * math.log(rows),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cached_property
 from typing import Literal, TypeAlias
 
 import numpy as np
@@ -52,7 +53,6 @@ class FreedResidual:
         model = result.parametrisation.model
         at_plant = next((b.unit for b in model.blocks if b.place == "actuator" and b.unit), model.input.unit)
         self.unit = {"actuator": model.input.unit, "plant": at_plant, "sensor": model.output.unit}
-        self.signals = self._signals()
         plain = replace(result.sim.linear(), u_offset=0.0, y_offset=0.0, linear_hold=False)
         chain = result.sim.chain
         force = np.zeros_like(chain.B)
@@ -96,8 +96,9 @@ class FreedResidual:
         """Return a freed direction, (N,) or (N, q), without what the model's own numbers explain."""
         return np.asarray(direction - self.own @ (self.own.T @ direction))
 
-    def _signals(self) -> dict[Place, dict[str, list[FloatArray]]]:
-        """Return the signals that something missing may depend on, per place and recording; silent ones left out.
+    @cached_property
+    def signals(self) -> dict[Place, dict[str, list[FloatArray]]]:
+        """The signals that something missing may depend on, per place and recording; silent ones left out.
 
         Where the simulation is wrong its output is too: a position follows the readings, by the simulation plus its
         smoothed residual. A speed or level may not: a low-passed reading explains itself.

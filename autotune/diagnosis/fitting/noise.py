@@ -104,6 +104,16 @@ def autoregressive(residuals: Sequence[FloatArray], good: Sequence[BoolArray], o
     Noise
         Innovations and coefficients.
     """
+    return _yule_walker(_autocovariances(residuals, good, order))
+
+
+def autoregressive_up_to(residuals: Sequence[FloatArray], good: Sequence[BoolArray], orders: int) -> list[Noise]:
+    """Return :func:`autoregressive` for every order from 1 on; the covariances are the same for all."""
+    c = _autocovariances(residuals, good, orders)
+    return [_yule_walker(c[: order + 1]) for order in range(1, orders + 1)]
+
+
+def _autocovariances(residuals: Sequence[FloatArray], good: Sequence[BoolArray], order: int) -> FloatArray:
     c = np.zeros(order + 1)
     for lag in range(order + 1):
         count = 0
@@ -112,6 +122,12 @@ def autoregressive(residuals: Sequence[FloatArray], good: Sequence[BoolArray], o
             c[lag] += float(np.sum((r[lag:] * r[: r.size - lag])[both]))
             count += int(both.sum())
         c[lag] /= max(count, 1)
+    return c
+
+
+def _yule_walker(c: FloatArray) -> Noise:
+    """Return the autoregressive model that autocovariances from lag 0 on belong to."""
+    order = c.size - 1
     if c[0] <= 0.0:
         return Noise(sd=0.0)
     R = np.array([[c[abs(i - j)] for j in range(order)] for i in range(order)]) + 1e-9 * c[0] * np.eye(order)

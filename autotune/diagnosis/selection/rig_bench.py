@@ -97,7 +97,8 @@ class RigBench:
         p, held = one.fit.parametrisation, np.zeros(one.fit.theta.size, dtype=bool)
         both = self.long.beside(self.few)
         try:
-            begun = [fit(p, both, theta, free=held, iterations=STEPS) for theta in (one.fit.theta, one.short.theta)]
+            thetas = one.fit.theta, one.short.theta
+            begun = list(self.pool.map(lambda theta: fit(p, both, theta, free=held, iterations=STEPS), thetas))
             start = min(begun, key=lambda each: each.cost)
             joint = fit(p, both, start.theta, start.x0, iterations=LAST_STEPS)
             far = fit(p, self.long, joint.theta, free=held, iterations=STEPS)

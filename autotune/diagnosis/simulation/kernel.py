@@ -51,8 +51,8 @@ SIGNALS = 4
 #: Positions in the vector of integers, before those that say which effects act.
 (
     NUMBER, SIGNALS_ASKED, LINEAR_HOLD, DIRECTIONAL, ACTUATOR, SPEED_STATE, POSITION_STATE, FORCED, SMOOTH, RUBBING,
-    DRAINING, STOPPED, SENSING, PLAIN, REPLAYED, ROWS, FLAGS
-) = range(17)  # fmt: skip
+    DRAINING, STOPPED, SENSING, PLAIN, DRY, REPLAYED, ROWS, FLAGS
+) = range(18)  # fmt: skip
 
 
 class _Linear(NamedTuple):
@@ -162,6 +162,26 @@ def _push(slot: int, w: float, t: float, dt: float, linear: _Linear, work: _Work
         added = outflow(_tap(taps, POSITION, x), _tap(taps, FIRST_LEVEL, x), effects)
         for row in range(n):
             free[row] += M[slot, row, n + 2] * added
+
+
+@inlined
+def _rub(slot: int, w: float, pieces: int, linear: _Linear, x: FloatArray, effects: Effects) -> None:
+    """Advance two states on which dry friction acts alone: the sums of the general way, not written down in between."""
+    M, taps = linear.M, linear.taps
+    first, second = x[0], x[1]
+    column = M[slot, 0, 3], M[slot, 1, 3]
+    speed = taps[SPEED, 0], taps[SPEED, 1]
+    per_force = speed[0] * column[0] + speed[1] * column[1]
+    for _ in range(pieces):
+        free = M[slot, 0, 2] * w + M[slot, 0, 0] * first + M[slot, 0, 1] * second
+        other = M[slot, 1, 2] * w + M[slot, 1, 0] * first + M[slot, 1, 1] * second
+        rubbed = 0.0
+        if per_force != 0.0:
+            level = friction(speed[0] * first + speed[1] * second, effects)
+            rubbed = min(max(-(speed[0] * free + speed[1] * other) / per_force, -level), level)
+        first = free + column[0] * rubbed
+        second = other + column[1] * rubbed
+    x[0], x[1] = first, second
 
 
 @inlined
@@ -289,6 +309,11 @@ def run(
                     for _ in range(pieces):
                         _advance(M, slot, x, w, free)
                         x[:] = free
+                    now = until
+                    continue
+                if flags[DRY]:
+                    w = u[j] - u_offset
+                    _rub(slot, w, pieces, linear, x, effects)
                     now = until
                     continue
                 for piece in range(pieces):

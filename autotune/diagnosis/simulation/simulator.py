@@ -170,11 +170,14 @@ class Simulator:
         directional = self.falling is not self.chain
         forced = any(_acts_at(kind, *_FORCED) for kind in self.kinds)
         driven = any(_acts_at(kind, "converter", "command", "stop") for kind in self.kinds)
+        others = tuple(name for name in _FORCED if name != "friction")
+        rubbed = forced and self.order == 2 and not any(_acts_at(kind, *others) for kind in self.kinds)
         return (
             int(self.linear_hold), int(directional), *self.chain.where, int(forced),
             *(int(any(_acts_at(kind, stage) for kind in self.kinds)) for stage in _TOLD),
             int(any(_acts_at(kind, "sensor", "reading") for kind in self.kinds)),
             int(not (forced or driven or directional or self.linear_hold)),
+            int(rubbed and not (driven or directional or self.linear_hold)),
             int(any(kind.memory is not None and kind.memory.replayed for kind in self.kinds)),
         )  # fmt: skip
 

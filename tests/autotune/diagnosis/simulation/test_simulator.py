@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import MappingProxyType
 
 import numpy as np
@@ -10,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
+from autotune.diagnosis.fitting.parameters import effect_with
 from autotune.diagnosis.simulation.assembly import assemble
 from autotune.diagnosis.simulation.simulator import Windows
 from autotune.errors import InputError
@@ -133,3 +135,21 @@ def test_a_converters_levels_pass_through_its_origin(step: float, origin: float,
     got, _ = stepped.run(recording(u, 0.01), np.zeros(3))
     want, _ = assemble(servo()).run(recording(rounded, 0.01), np.zeros(3))
     np.testing.assert_allclose(got, want, atol=1e-10)
+
+
+@pytest.mark.parametrize("friction", ["plant.coulomb_friction", "plant.stribeck_friction"])
+@given(st.integers(0, 2**32 - 1), st.floats(0.02, 0.4), st.floats(0.0, 0.05))
+def test_dry_friction_alone_is_simulated_as_beside_a_load_of_nothing(
+    friction: str, seed: int, level: float, delay: float
+) -> None:
+    rng = np.random.default_rng(seed)
+    dynamics = TransferFunction(num=(4.0,), den=(0.3, 1.0, 5.0), delay_s=delay)
+    plain = Model(name="m", input=Port(), output=Port(), blocks=(Block(name="b", place="plant", dynamics=dynamics),))
+    t = np.cumsum(rng.uniform(0.01, 0.04, 300))
+    recording = Recording(t=t, u=np.repeat(rng.normal(size=30), 10), y=0.0 * t)
+    values = (level,) if friction == "plant.coulomb_friction" else (level, 2.0 * level, 0.1)
+    alone = replace(plain, effects=(effect_with(friction, values),))
+    beside = replace(plain, effects=(*alone.effects, effect_with("environment.drifting_load", (0.0,))))
+    runs = [assemble(model).run(recording, np.zeros(2))[0] for model in (alone, beside)]
+    np.testing.assert_array_equal(runs[0], runs[1])
+    assert np.ptp(runs[0][:, 0]) > 0.0
