@@ -120,3 +120,21 @@ def test_yule_walker_recovers_an_autoregressive_noise() -> None:
     noise = autoregressive([n], [np.ones(n.size, dtype=bool)])
     assert noise.sd == pytest.approx(2.0, rel=0.02)
     assert noise.ar == pytest.approx((0.4, 0.2), abs=0.03)
+
+
+@pytest.mark.parametrize(("step", "share"), [(2.0, 0.1), (5.0, 0.12), (8.0, 0.25)])
+def test_the_noise_of_readings_behind_a_coarse_converter_is_what_it_leaves(step: float, share: float) -> None:
+    # noise of 1 on a signal that changes by 0.3 a row, rounded to several times the noise: most readings stay
+    rng = np.random.default_rng(4)
+    clean = 20.0 * np.sin(0.015 * np.arange(6000))
+    left = step * np.round((clean + rng.normal(size=clean.size)) / step) - clean
+    noise = noise_from_differences([left], [np.ones(left.size, dtype=bool)])
+    assert noise.total_sd == pytest.approx(float(np.std(left)), rel=share)
+
+
+def test_a_few_jumps_are_no_noise() -> None:
+    rng = np.random.default_rng(4)
+    left = rng.normal(size=4000)
+    left[::50] += 30.0 * rng.choice([-1.0, 1.0], size=80)
+    noise = noise_from_differences([left], [np.ones(left.size, dtype=bool)])
+    assert noise.total_sd < 1.5
