@@ -15,6 +15,10 @@ import numpy as np
 from autotune.arrays import BoolArray, FloatArray
 from autotune.diagnosis.thresholds import Thresholds
 
+#: Ratio of the standard deviations that the farthest tenth and the median of differences tell, from which on most of
+#: them are small and some are jumps: normal noise has 1, Laplace's 1.4.
+MOSTLY_SMALL = 2.0
+
 
 @dataclass(frozen=True, kw_only=True)
 class Noise:
@@ -91,12 +95,13 @@ def noise_from_differences(
 
 
 def _usual_spread(d: FloatArray) -> float:
-    """Return a robust standard deviation, from the median and from the tenth that is farthest out.
+    """Return a robust standard deviation: from the median, or from the farthest tenth where most differences are small.
 
-    Most differences behind a coarse converter are of readings that stay: their median tells nothing of its jumps.
+    Behind a coarse converter most readings stay: their median tells nothing of its jumps.
     """
     off = np.abs(d - np.median(d))
-    return float(max(1.4826 * np.median(off), np.quantile(off, 0.9) / 1.645))
+    usual, far = 1.4826 * float(np.median(off)), float(np.quantile(off, 0.9)) / 1.645
+    return far if far > MOSTLY_SMALL * usual else usual
 
 
 def autoregressive(residuals: Sequence[FloatArray], good: Sequence[BoolArray], order: int = 2) -> Noise:
