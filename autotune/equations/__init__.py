@@ -53,7 +53,8 @@ there on with a reason in ``run.reasons``; :func:`~autotune.equations.simulate.r
 
 from autotune.equations.effects import apply
 from autotune.equations.expressions import parse, to_text
-from autotune.equations.fit import Fitted, fit, retune
+from autotune.equations.fit import fit, retune
+from autotune.equations.fit_data import Fitted
 from autotune.equations.forecast import forecast
 from autotune.equations.identifiability import combinations, undetermined
 from autotune.equations.model import (

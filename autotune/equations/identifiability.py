@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from autotune.arrays import FloatArray
-from autotune.equations.fit import Fitted
+from autotune.equations.fit_data import Fitted
 
 #: A parameter belongs to a combination where its share of the direction's length is at least this.
 _SHARE = 0.2

@@ -8,7 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from autotune.arrays import FloatArray, IntArray
-from autotune.equations.fit import Descent, Fitted, data_of
+from autotune.equations.descent import Descent
+from autotune.equations.fit_data import Fitted, data_of
 from autotune.recording import Recording
 
 

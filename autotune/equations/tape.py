@@ -20,8 +20,8 @@ import numpy as np
 from autotune.arrays import FloatArray, IntArray
 from autotune.equations import opcodes as op
 from autotune.equations.expressions import Call, Expression, Name, Number, parse, substituted
-from autotune.equations.kernel import Tape
 from autotune.equations.model import EquationModel, Extension
+from autotune.equations.work import Tape
 from autotune.errors import InputError
 
 #: What an operation waits for: nothing but parameters, held inputs too, states or time or inputs that run.

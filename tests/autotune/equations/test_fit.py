@@ -11,8 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from autotune.equations import Drive, EquationModel, combinations, compile_model, retune, simulate, undetermined
-from autotune.equations.fit import fit, slopes_of, values_of
+from autotune.equations.fit import fit
 from autotune.equations.forecast import forecast
+from autotune.equations.parameter_scales import slopes_of, values_of
 from autotune.equations.starts import rest_state
 from autotune.errors import InputError
 from autotune.recording import Recording

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from autotune.equations import Drive, apply, compile_model, fit, simulate
 from autotune.equations.effects import compile_with
-from autotune.equations.fit import window_rows
+from autotune.equations.fit_data import window_rows
 from autotune.models import Effect, Parameter
 from autotune.recording import Recording
 from tests.autotune.equations.models import one_state

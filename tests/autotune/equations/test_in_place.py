@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from autotune.arrays import FloatArray
-from autotune.equations import compile_model, kernel
+from autotune.equations import compile_model, switching
 from autotune.equations import in_place as module
+from autotune.equations import work as room
 from tests.autotune.equations.models import one_state
 
 
@@ -28,9 +29,9 @@ def test_no_references_are_counted_where_derivatives_are_evaluated(monkeypatch: 
     monkeypatch.setitem(module.COMPILED, "cache", False)
     compiled = compile_model(one_state("x", {"a": 2.0}, state=[{"name": "x", "derivative": "u - a*x^3"}]))
     p = compiled.program.tape
-    work = kernel._work(p, compiled.program.registers, compiled.parameter_vector)
+    work = room.new_work(p, compiled.program.registers, compiled.parameter_vector)
     for make, counts in ((module.in_place, False), (numba.njit, True)):
-        field = make(kernel._field_in_row.py_func)
+        field = make(switching.field_in_row.py_func)
         field(p, work, np.array([0.5]), 0.0)
         assert work.K[0, 0] == pytest.approx(-0.25)
         assert ("call void @NRT_incref" in field.inspect_llvm(field.signatures[0])) is counts

@@ -1,0 +1,101 @@
+"""What a fit works on, windows of recordings, and what it finds."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from autotune.arrays import BoolArray, FloatArray, IntArray
+from autotune.equations.sensitivity import Windows
+from autotune.equations.simulate import Compiled, Drive, drive_of
+from autotune.equations.starts import fitted_starts
+from autotune.errors import InputError
+from autotune.recording import Recording
+
+#: Share of a window by which windows may be longer than what was asked for, so that no short rest is left.
+LONGER = 0.1
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Fitted:
+    """What a fit found.
+
+    Attributes
+    ----------
+    compiled : Compiled
+        The model.
+    parameters, sd : (P,) arrays
+        Estimates, and their standard deviations with the beliefs counted; 0 for what is not retuned.
+    z : (P,) array
+        Distance from the nominal values in prior standard deviations.
+    windows : tuple of Windows
+        Start states, one entry per recording.
+    simulated : tuple of (N,) array
+        y at every row.
+    residuals : tuple of (N,) array
+        Reading less simulation; NaN where the reading does not count.
+    noise_sd : float
+        Root mean square of the residuals [y unit].
+    jacobian : (rows, P) array
+        dy/dz over the noise where the last step began, start states projected out; see
+        :mod:`autotune.equations.identifiability`.
+    converged : bool
+        Whether the last step changed next to nothing.
+    """
+
+    compiled: Compiled
+    parameters: FloatArray
+    sd: FloatArray
+    z: FloatArray
+    windows: tuple[Windows, ...]
+    simulated: tuple[FloatArray, ...]
+    residuals: tuple[FloatArray, ...]
+    noise_sd: float
+    jacobian: FloatArray
+    converged: bool
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FitData:
+    """A recording prepared for a fit."""
+
+    drive: Drive
+    y: FloatArray
+    good: BoolArray
+    windows: Windows
+
+
+def window_rows(t: FloatArray, horizon_s: float | None) -> tuple[IntArray, IntArray]:
+    """Return the first rows of windows of about a length, and the rows before which they end; one window without it.
+
+    All are as long as one another: in a longer one an unstable plant would run away.
+    """
+    if horizon_s is None:
+        return np.zeros(1, dtype=np.int64), np.array([t.size], dtype=np.int64)
+    span = float(t[-1] - t[0])
+    count = max(int(np.ceil(span / horizon_s - LONGER)), 1)
+    edges = np.searchsorted(t, t[0] + span / count * np.arange(count) - 1e-9 * horizon_s).astype(np.int64)
+    edges = np.unique(edges)
+    return edges, np.append(edges[1:], t.size)
+
+
+def data_of(
+    compiled: Compiled, recording: Recording, parameters: FloatArray, length_s: float | None, windows: Windows | None
+) -> FitData:
+    """Return a recording prepared for a fit, on given windows or on ones of a length.
+
+    Raises
+    ------
+    InputError
+        Fewer than 8 readings that count.
+    """
+    drive, good = drive_of(compiled.model, recording), np.isfinite(recording.y)
+    if good.sum() < 8:
+        raise InputError("fewer than 8 finite readings", where=recording.name, remedy="record longer")
+    if windows is None:
+        starts, stops = window_rows(recording.t, length_s)
+        read = np.add.reduceat(good, starts) > 0  # a window without a reading tells nothing
+        starts, stops = starts[read], stops[read]
+        windows = fitted_starts(compiled, parameters, drive, recording.y, good, starts, stops)
+    return FitData(drive=drive, y=recording.y, good=good, windows=windows)
