@@ -8,13 +8,16 @@ from dataclasses import replace
 import numpy as np
 
 from autotune.arrays import BoolArray, FloatArray, IntArray
-from autotune.diagnosis.equations.bench import HELD_OUT, Bench, Outcome, jumping, sought
+from autotune.diagnosis.equations.bench import Bench, Outcome
 from autotune.diagnosis.equations.candidates import Signals, Trial
+from autotune.diagnosis.equations.held_out import HELD_OUT
+from autotune.diagnosis.equations.sought import jumping, sought
 from autotune.diagnosis.evidence.stretches import stretches_in
 from autotune.equations.black_box import BlackBox, driven, read_out
 from autotune.equations.effects import OUTPUTS, apply, compile_with, with_values
-from autotune.equations.fit import Fitted, slopes_of, values_of
+from autotune.equations.fit_data import Fitted
 from autotune.equations.model import EquationModel
+from autotune.equations.parameter_scales import slopes_of, values_of
 from autotune.equations.simulate import Compiled, Drive
 from autotune.errors import InputError
 from autotune.models import Effect

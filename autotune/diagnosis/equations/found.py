@@ -16,8 +16,9 @@ import numpy as np
 from autotune.arrays import BoolArray
 from autotune.controller import Controller
 from autotune.diagnosis.effects import KINDS, kind_of
-from autotune.diagnosis.equations.bench import Bench, EquationBench, Outcome
+from autotune.diagnosis.equations.bench import Bench, Outcome
 from autotune.diagnosis.equations.closed import ClosedBench
+from autotune.diagnosis.equations.equation_bench import EquationBench
 from autotune.diagnosis.equations.probable import candidates_of, probability_of, without_improbable
 from autotune.diagnosis.equations.search import Searched, search
 from autotune.diagnosis.evidence.held_out import FitQuality

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from autotune.arrays import BoolArray, FloatArray
-from autotune.equations.fit import Fitted
+from autotune.equations.fit_data import Fitted
 from autotune.models import Effect
 
 

@@ -12,8 +12,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from autotune.arrays import FloatArray
-from autotune.diagnosis.equations.bench import Bench, Outcome, scaled
+from autotune.diagnosis.equations.bench import Bench, Outcome
 from autotune.diagnosis.equations.candidates import USUAL, Trial, eased, is_plainer, place_of, plainer, trials
+from autotune.diagnosis.equations.sought import scaled
 from autotune.diagnosis.evidence.stretches import advantage
 from autotune.diagnosis.fitting.noise import Noise, noise_from_differences
 from autotune.diagnosis.thresholds import IN_USE, Thresholds

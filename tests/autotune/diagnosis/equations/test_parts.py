@@ -9,7 +9,7 @@ import pytest
 
 from autotune.arrays import FloatArray
 from autotune.diagnosis.equations import diagnose_equations
-from autotune.diagnosis.equations.bench import EquationBench
+from autotune.diagnosis.equations.equation_bench import EquationBench
 from autotune.diagnosis.equations.parts import telling_windows
 from autotune.equations import Drive, compile_model, simulate
 from autotune.equations.effects import compile_with

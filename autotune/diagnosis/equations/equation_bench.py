@@ -1,0 +1,368 @@
+"""Equations on recordings: they answer all that a search asks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
+from types import MappingProxyType
+
+import numpy as np
+
+from autotune.arrays import BoolArray, FloatArray
+from autotune.diagnosis.equations.bench import Bench, Outcome
+from autotune.diagnosis.equations.candidates import Signals, Trial, place_of
+from autotune.diagnosis.equations.first_order import explained, start_bases, without_starts
+from autotune.diagnosis.equations.followed import followed, positions_of, sizes_of
+from autotune.diagnosis.equations.held_out import HELD_OUT, forecast_errors, free_run_errors, until
+from autotune.diagnosis.equations.parts import beyond, telling_windows
+from autotune.diagnosis.equations.sought import LEAST_WIDTH, OUTER, changed, sought
+from autotune.diagnosis.evidence.stretches import stretches_in
+from autotune.equations.effects import compile_with, with_values
+from autotune.equations.fit import LEAST_ROWS, fit, retune
+from autotune.equations.fit_data import Fitted
+from autotune.equations.left_out import left_out_squares
+from autotune.equations.model import EquationModel
+from autotune.equations.parameter_scales import values_of
+from autotune.equations.sensitivity import Windows, side_by_side
+from autotune.equations.simulate import Compiled, drive_of, simulate
+from autotune.errors import InputError
+from autotune.models import Effect, Parameter
+from autotune.recording import Recording
+
+#: Steps between two rows, on average, that a simulation with effects may take, and times those of the model without.
+STEPS, TIMES_STEPS = 20.0, 5.0
+#: Iterations of a fit from which on a number that moves by jumps is sought: fewer show whether more are worth it.
+LEAST_SOUGHT = 3
+#: Windows per recording that a search works on: long enough to tell, short enough to converge.
+WINDOWS = 3
+#: Rows of such a window at most: in longer ones fits take more steps, and say no more.
+MOST_ROWS = 500
+#: How far a position may go beyond a hard stop, of what it moves through: what gives way by more is no stop.
+BEYOND = 0.15
+#: A search works on a part of the rows where there are this many times as many.
+PARTED = 1.5
+#: How many times as long as short windows long ones are.
+SHORTER = 8
+
+
+class EquationBench:
+    """Equations on recordings.
+
+    Parameters
+    ----------
+    model : EquationModel
+        The nominal model.
+    recordings : sequence of Recording
+        What was measured.
+    good : sequence of (N,) bool array
+        Rows whose reading counts.
+    """
+
+    def __init__(self, model: EquationModel, recordings: Sequence[Recording], good: Sequence[BoolArray]) -> None:
+        self._model = model
+        self._recordings = tuple(
+            replace(r, y=np.where(ok, r.y, np.nan)) for r, ok in zip(recordings, good, strict=True)
+        )
+        self._rows = [np.isfinite(r.y) for r in self.recordings]
+        self._drives = [drive_of(model, r) for r in self.recordings]
+        span = max(float(r.t[-1] - r.t[0]) for r in recordings)
+        dt = max(float(np.median(np.diff(r.t))) for r in recordings)
+        self.length_s = model.horizon_s or min(span / WINDOWS, MOST_ROWS * dt)
+
+    @property
+    def model(self) -> EquationModel:
+        """The equations."""
+        return self._model
+
+    @property
+    def recordings(self) -> tuple[Recording, ...]:
+        """What was measured; readings that do not count are no numbers."""
+        return self._recordings
+
+    @property
+    def is_closed(self) -> bool:
+        """Every state can be reached."""
+        return False
+
+    def retuned(self) -> Outcome:
+        """Return the model with its own numbers retuned, on windows of the search's length."""
+        compiled = self._compiled(self.model.effects, {})
+        found = retune(compiled, self.recordings, longest_s=self.length_s)
+        self._most_steps = max(STEPS, TIMES_STEPS * self._steps(found))
+        return self._outcome(tuple(self.model.effects), found)
+
+    def _steps(self, found: Fitted) -> float:
+        """Return how many steps the simulation of a fit takes between two rows."""
+        each = zip(self._drives, found.windows, strict=True)
+        runs = [simulate(found.compiled, found.parameters, d, w.states, starts=w.starts, stops=w.stops)
+                for d, w in each]  # fmt: skip
+        return float(sum(run.steps.sum() for run in runs)) / sum(len(r) for r in self.recordings)
+
+    def as_it_is(self, retuned: Outcome) -> Outcome:
+        """Return the model with its nominal numbers, only start states fitted."""
+        compiled = self._compiled(self.model.effects, {})
+        none = np.zeros(len(compiled.parameters), dtype=bool)
+        try:
+            found = fit(compiled, self.recordings, free=none, windows=retuned.fitted.windows, iterations=4)
+        except InputError:
+            return retuned
+        return self._outcome(tuple(self.model.effects), found)
+
+    def held_out_error(self, outcome: Outcome, refits: bool) -> float:
+        """Return the rms error on the last third of every recording, the numbers fitted to the rest."""
+        compiled = self._compiled(outcome.effects, self._spreads())
+        cuts = [int((1.0 - HELD_OUT) * len(r)) for r in self.recordings]
+        z = np.zeros(len(compiled.parameters))
+        own = len(self.model.parameters)
+        z[:own] = outcome.fitted.z[:own]
+        each = list(zip(self.recordings, cuts, outcome.fitted.windows, strict=True))
+        errors = []
+        try:
+            windows = [until(w, k) for _, k, w in each]
+            if refits:
+                first = [replace(r, y=np.where(np.arange(len(r)) < k, r.y, np.nan)) for r, k, _ in each]
+                found = fit(compiled, first, z=z, windows=windows, iterations=8)
+                z, windows = found.z, list(found.windows)
+            p = values_of(compiled, z)
+            for (r, k, _), drive, w in zip(each, self._drives, windows, strict=True):
+                if self.model.horizon_s is not None:
+                    errors.append(forecast_errors(compiled, p, drive, r.y, k, self.model.horizon_s))
+                else:
+                    errors.append(free_run_errors(compiled, p, drive, r.y, w, k))
+        except InputError:
+            return float("inf")
+        e = np.concatenate(errors)
+        return float(np.sqrt(np.nanmean(e**2)))
+
+    def left_out_squares(self, outcome: Outcome) -> FloatArray:
+        """Return squared errors on stretches, the numbers fitted to the other ones."""
+        windows = outcome.fitted.windows
+        rows = [len(r) for r in self.recordings]
+        labels = stretches_in(rows, [w.starts for w in windows], [w.stops for w in windows])
+        return left_out_squares(outcome.fitted, self.recordings, labels)
+
+    def periodic(self, outcome: Outcome, signals: Signals) -> list[Trial]:
+        """Return loads at the frequencies that stand out of a residual."""
+        residual = max(outcome.fitted.residuals, key=len)
+        e = np.nan_to_num(residual - np.nanmean(residual)) * np.hanning(residual.size)
+        power = np.abs(np.fft.rfft(e))
+        power[:3] = 0.0
+        found = []
+        for k in np.argsort(-power)[:3]:
+            frequency = float(np.fft.rfftfreq(e.size, signals.dt_s)[k])
+            for name, size in signals.sizes.items():
+                state = next((s for s in self.model.states if s.name == name), None)
+                if (self.model.ports and state) or (state and state.kind not in ("speed", "level", "temperature")):
+                    continue
+                for key in ("in_phase", "quadrature"):
+                    values = {"in_phase": 1e-6 * size, "quadrature": 1e-6 * size, key: 0.05 * size}
+                    parameters = {k: Parameter(value=v) for k, v in (values | {"frequency": frequency}).items()}
+                    where = {"state" if state else "port": name}
+                    effect = Effect(name="environment.periodic_load", parameters=parameters, **where)
+                    found.append(Trial(effect=effect, scaled=(key,)))
+        return found
+
+    def _compiled(self, effects: Sequence[Effect], spreads: Mapping[str, float]) -> Compiled:
+        compiled, own = compile_with(self.model, effects), len(self.model.parameters)
+        scaled_for_search = tuple(sought(p, effects, spreads) for p in compiled.parameters[own:])
+        parameters = (*compiled.parameters[:own], *scaled_for_search)
+        return replace(compiled, parameters=parameters, most_steps=min(self._most_steps, compiled.most_steps))
+
+    def _spreads(self) -> dict[str, float]:
+        u = np.concatenate([r[self.model.columns[0]] for r in self.recordings])
+        span = max(float(r.t[-1] - r.t[0]) for r in self.recordings)
+        y = np.concatenate([r.y for r in self.recordings])
+        size = {"high": float(np.std(u)), "low": float(np.std(u)), "time": 0.2 * span, "phase": 1.0,
+                "origin of y": float(np.nanstd(y)), "origin of u": float(np.std(u))}  # fmt: skip
+        spread = max(float(np.max(s)) for s in self._sizes.values()) if self._sizes else 0.0
+        size |= {f"width at {place}": LEAST_WIDTH * span for place, span in self._spans.items()}
+        size |= {f"stiffness at {place}": self._sizes.get(place, 0.0) / max(span, 1e-300)
+                 for place, span in self._spans.items()}  # fmt: skip
+        return size | ({"in_phase": spread, "quadrature": spread} if spread else {})
+
+    def fitted(self, effects: Sequence[Effect], start: Outcome, iterations: int = 15) -> Outcome:
+        """Return the model fitted with effects; what moves by jumps is sought by a direct search around."""
+        outer = [(i, key) for i, e in enumerate(effects) for key in e.parameters if (e.name, key) in OUTER]
+        if not outer or iterations < LEAST_SOUGHT:
+            return self._inner(effects, start, iterations)
+        i, key = outer[-1]
+        best, tried = None, float(effects[i].parameters[key].value)
+        factor = 2.0
+        while factor > 1.03:
+            for value in (tried / factor, tried * factor) if best else (tried / factor, tried, tried * factor):
+                try:
+                    new = self._inner(changed(effects, i, key, value), best or start, 4)
+                except InputError:
+                    continue
+                if best is None or new.rss < best.rss:
+                    best = new
+            if best is None:
+                break
+            moved = float(best.effects[i].parameters[key].value)
+            factor = factor if moved != tried and factor < 2.5 else np.sqrt(factor)
+            tried = moved
+        return best or self._inner(effects, start, iterations)
+
+    def _inner(self, effects: Sequence[Effect], start: Outcome, iterations: int) -> Outcome:
+        compiled = self._compiled(effects, self._spreads())
+        z = np.zeros(len(compiled.parameters))
+        own = len(self.model.parameters)
+        z[:own] = start.fitted.z[:own]
+        windows = [
+            Windows(starts=w.starts, stops=w.stops, states=self._states(compiled, start, w, k))
+            for k, w in enumerate(start.fitted.windows)
+        ]
+        found = fit(compiled, self.recordings, z=z, windows=windows, iterations=iterations)
+        return self._outcome(tuple(effects), found)
+
+    def shortened(self, outcome: Outcome) -> Outcome | None:
+        """Return the same effects on short windows, from the nominal numbers; nothing where there are none."""
+        compiled = self._compiled(outcome.effects, self._spreads())
+        length = self.length_s / SHORTER
+        dt = max(float(np.median(np.diff(r.t))) for r in self.recordings)
+        if length / dt < LEAST_ROWS:
+            return None
+        try:
+            return self._outcome(outcome.effects, retune(compiled, self.recordings, longest_s=length))
+        except InputError:
+            return None
+
+    def lengthened(self, outcome: Outcome) -> Outcome:
+        """Return a fit to short windows carried on to long ones."""
+        own = len(self.model.parameters)
+        for length in (0.5 * self.length_s, self.length_s):
+            compiled = self._compiled(outcome.effects, self._spreads())
+            z = np.zeros(len(compiled.parameters))
+            z[:own] = outcome.fitted.z[:own]
+            found = fit(compiled, self.recordings, z=z, horizon_s=length, iterations=12)
+            outcome = self._outcome(outcome.effects, found)
+        return outcome
+
+    def part(self, outcome: Outcome, rows: int) -> tuple[Bench, Outcome] | None:
+        """Return a bench on the windows that say most, with a fit there; nothing where there are hardly more rows."""
+        if sum(int(ok.sum()) for ok in self._rows) < PARTED * rows:
+            return None
+        kept = telling_windows(outcome.fitted, rows)
+        good, windows = [], []
+        for ok, w, keep in zip(self._rows, outcome.fitted.windows, kept, strict=True):
+            mask = np.zeros(ok.size, dtype=bool)
+            for a, b in zip(w.starts[keep], w.stops[keep], strict=True):
+                mask[a:b] = True
+            good.append(ok & mask)
+            windows.append(Windows(starts=w.starts[keep], stops=w.stops[keep], states=w.states[keep]))
+        small = EquationBench(self.model, self.recordings, good)
+        self.signals(outcome)  # sizes and spans, for fits on all rows too
+        small.length_s, small._most_steps = self.length_s, self._most_steps
+        there = replace(outcome, fitted=replace(outcome.fitted, windows=tuple(windows)))
+        return small, small._inner(outcome.effects, there, LEAST_SOUGHT)
+
+    def carried(self, outcome: Outcome, iterations: int) -> Outcome:
+        """Return a fit to a part of the rows carried on to all of them."""
+        own = len(self.model.parameters)
+        compiled = self._compiled(outcome.effects, self._spreads())
+        z = np.zeros(len(compiled.parameters))
+        z[:own] = outcome.fitted.z[:own]
+        return self._outcome(
+            outcome.effects, fit(compiled, self.recordings, z=z, horizon_s=self.length_s, iterations=iterations)
+        )
+
+    def is_sought_outside(self, effect: Effect) -> bool:
+        """Whether a direct search around the fits seeks one of the effect's numbers."""
+        return any((effect.name, key) in OUTER for key in effect.parameters)
+
+    def _states(self, compiled: Compiled, start: Outcome, w: Windows, number: int) -> FloatArray:
+        """Return start states by name, those of new effects at what they would hold at rest."""
+        known = dict(zip(start.fitted.compiled.states, w.states.T, strict=True))
+        u = self._drives[number].inputs[np.maximum(w.starts - 1, 0), 0] - self.model.inputs[0].offset
+        y = np.nan_to_num(start.fitted.simulated[number][w.starts])
+        columns = []
+        for name in compiled.states:
+            at_command = name.startswith(("lag_", "asymmetric_lag_", "rate_limit_"))
+            at_reading = name.startswith(("slow_mode_", "resonance_")) and name.endswith("memory")
+            fresh = u if at_command else y if at_reading else np.zeros(w.starts.size)
+            if at_command and any(e.name == "sensor.lag" for e in start.effects):
+                fresh = y
+            columns.append(known.get(name, fresh))
+        return np.column_stack(columns)
+
+    def _outcome(self, effects: tuple[Effect, ...], found: Fitted) -> Outcome:
+        values = {
+            p.name: (float(v), float(s))
+            for p, v, s in zip(found.compiled.parameters, found.parameters, found.sd, strict=True)
+        }
+        residual = np.concatenate([r[ok] for r, ok in zip(found.residuals, self._rows, strict=True)])
+        outer = sum((e.name, key) in OUTER for e in effects for key in e.parameters)
+        count = sum(p.spread > 0.0 for p in found.compiled.parameters) + outer
+        return Outcome(effects=with_values(effects, values), fitted=found, count=count, residual=residual)
+
+    def _simulated(self, compiled: Compiled, outcome: Outcome) -> FloatArray | None:
+        """Return readings at the rows that count, the outcome's numbers and start states given."""
+        own = len(self.model.parameters)
+        p = compiled.parameter_vector
+        p[:own] = outcome.fitted.parameters[:own]
+        parts = []
+        for k, (drive, w) in enumerate(zip(self._drives, outcome.fitted.windows, strict=True)):
+            x = self._states(compiled, outcome, w, k)
+            run = simulate(compiled, p, drive, x, starts=w.starts, stops=w.stops)
+            parts.append(run.y[self._rows[k]])
+        y = np.concatenate(parts)
+        return y if np.all(np.isfinite(y)) else None
+
+    def with_trial(self, outcome: Outcome, effect: Effect) -> FloatArray | None:
+        """Return how the readings change with one more effect, everything else as it is."""
+        if self._base_of is not outcome:
+            self._base_of, self._base = outcome, self._simulated(self._compiled(outcome.effects, {}), outcome)
+        base = self._base
+        new = self._simulated(self._compiled((*outcome.effects, effect), {}), outcome)
+        return None if base is None or new is None else new - base
+
+    def each(self, one: Callable[[Trial], FloatArray | None], found: Sequence[Trial]) -> Iterable[FloatArray | None]:
+        """Return what a function makes of every trial, several at a time."""
+        return side_by_side(one, found)
+
+    def explained(self, outcome: Outcome) -> FloatArray:
+        """Return an orthonormal basis of what the numbers of a fit can explain, start states projected out."""
+        return explained(outcome.fitted)
+
+    def without_starts(self, outcome: Outcome, d: FloatArray) -> FloatArray:
+        """Return a change of the readings without what other start states make of it, to first order."""
+        if self._bases_of is not outcome:
+            each = enumerate(zip(self._drives, self._rows, strict=True))
+            self._bases = [start_bases(outcome.fitted, drive, rows, k) for k, (drive, rows) in each]
+            self._bases_of = outcome
+        return without_starts(d, outcome.fitted, self._rows, self._bases)
+
+    _base_of: Outcome | None = None
+    _bases_of: Outcome | None = None
+    _base: FloatArray | None = None
+    _sizes: Mapping[str, float] = MappingProxyType({})
+    _spans: Mapping[str, float] = MappingProxyType({})
+    _most_steps = np.inf
+
+    def _followed(self, outcome: Outcome) -> tuple[FloatArray, dict[str, FloatArray]]:
+        def states(compiled: Compiled, w: Windows, number: int) -> FloatArray:
+            return self._states(compiled, outcome, w, number)
+
+        return followed(self.model, outcome.effects, outcome.fitted, self._drives, states)
+
+    def is_stand_in(self, outcome: Outcome) -> bool:
+        """Whether one of the effects is no longer what its name says: a stop that the position goes far beyond."""
+        stops = [e for e in outcome.effects[len(self.model.effects) :] if e.name == "plant.hard_stop"]
+        if not stops:
+            return False
+        values, at = self._followed(outcome)[1], positions_of(self.model)
+        return any(beyond(values[at[place_of(e)]], e) > BEYOND for e in stops if at[place_of(e)] in values)
+
+    def signals(self, outcome: Outcome) -> Signals:
+        """Return states, differences across ports, and sizes of derivatives under a fit."""
+        y, values = self._followed(outcome)
+        dt = float(np.median(np.concatenate([np.diff(r.t) for r in self.recordings])))
+        self._sizes = sizes_of(self.model, outcome.fitted.parameters, values, self._drives[0].inputs[:1], dt)
+        self._spans = {
+            place: float(np.ptp(values[name])) for place, name in positions_of(self.model).items()
+            if name in values and name != place
+        }  # fmt: skip
+        duration = max(float(r.t[-1] - r.t[0]) for r in self.recordings)
+        u = np.concatenate([d.inputs[:, 0] for d in self._drives])
+        return Signals(u=u, y=y, values=values, sizes=self._sizes, dt_s=dt, duration_s=duration,
+                       slow_s=0.05 * duration)  # fmt: skip
