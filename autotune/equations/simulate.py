@@ -10,12 +10,15 @@ import numpy as np
 from autotune.arrays import FloatArray, IntArray
 from autotune.equations import kernel
 from autotune.equations.model import EquationModel, Extension, ModelParameter
+from autotune.equations.native import Translator
 from autotune.equations.tape import Program, translate
 from autotune.errors import InputError
 from autotune.recording import Recording
 
 #: Local error of a step, of the largest magnitude that the state has had so far in its window.
 TOLERANCE = 1e-6
+#: Machine code of models that are simulated often, shared by all threads.
+_TRANSLATOR = Translator()
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -227,8 +230,10 @@ def simulate(
         )
     outputs = np.full((program.outputs.size, rows), np.nan)
     ends, status = np.full(states.shape, np.nan), np.zeros((first.size, 3))
+    native = _TRANSLATOR.native(program.code, program.still, program.dynamic, int(np.sum(last - first)))
+    tape = program.tape(0 if native is None else native.address)
     kernel.run(
-        program.tape, program.registers, np.ascontiguousarray(parameters, dtype=np.float64), drive.t, drive.inputs,
+        tape, program.registers, np.ascontiguousarray(parameters, dtype=np.float64), drive.t, drive.inputs,
         late if delays is None else np.asarray(delays, dtype=np.float64),
         first, last, states, tolerance, float(compiled.most_steps), outputs, ends, status,
     )  # fmt: skip
@@ -273,7 +278,7 @@ def derivatives(
         Derivatives, and y with the signals.
     """
     found: tuple[FloatArray, FloatArray] = kernel.look(
-        compiled.program.tape,
+        compiled.program.tape(),
         compiled.program.registers,
         np.ascontiguousarray(parameters[: parameters.size - len(compiled.held)], dtype=np.float64),
         np.ascontiguousarray(np.atleast_2d(states), dtype=np.float64),

@@ -14,6 +14,7 @@ import numpy as np
 
 from autotune.arrays import FloatArray
 from autotune.equations.in_place import in_place
+from autotune.equations.native import call
 from autotune.equations.tape_ops import evaluate, solve, tangents
 from autotune.equations.work import ROW, Tape, Work, copy
 
@@ -24,7 +25,11 @@ _NEAR = 1e-6  # likewise, for a state that slides already
 @in_place(inline="always")
 def _evaluate_slopes(p: Tape, w: Work, row: int) -> None:
     r, K, slopes = w.r, w.K, p.slopes
-    evaluate(p.code, p.still, p.dynamic, r, 0 < row < 6)  # rows 0 and 6 of K are ends of steps, the others stages
+    extended = 0 < row < 6  # rows 0 and 6 of K are ends of steps, the others stages
+    if p.native != 0:
+        call(p.native, r, extended)
+    else:
+        evaluate(p.code, p.still, p.dynamic, r, extended)
     for i in range(p.n):
         K[row, i] = r[slopes[i]]
 
@@ -33,14 +38,12 @@ def _evaluate_slopes(p: Tape, w: Work, row: int) -> None:
 def _speeds_of_switches(p: Tape, w: Work) -> None:
     """Find how fast each switching function runs along the field in the filled row of K, modes fixed."""
     row = int(w.memory[ROW])
-    for i in range(w.d.size):
-        w.d[i] = 0.0
     w.d[0] = 1.0
     for i in range(p.n):
         w.d[1 + i] = w.K[row, i]
     for j in range(w.ramp.size):
         w.d[1 + p.n + j] = w.ramp[j]
-    tangents(p.code, p.still, p.dynamic, w.r, w.d)
+    tangents(p.speeds, 0, p.speeds.shape[0], w.r, w.d)
     for k in range(p.switches.size):
         w.g_dot[k] = w.d[p.switches[k]]
 

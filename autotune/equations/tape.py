@@ -49,6 +49,8 @@ class Program:
         Registers of the switching functions and of their modes, and the mode where one stays at zero.
     linear : (m,) int array
         1 where the input runs straight between rows.
+    speeds : (S, 5) int array
+        The operations that switching functions depend on, which tell how fast these run.
     """
 
     code: IntArray
@@ -64,13 +66,13 @@ class Program:
     modes: IntArray
     ties: IntArray
     linear: IntArray
+    speeds: IntArray
 
-    @property
-    def tape(self) -> Tape:
-        """The arrays that the kernel takes."""
+    def tape(self, native: int = 0) -> Tape:
+        """Return the arrays that the kernel takes; ``native`` is the address of the derivatives' machine code."""
         return Tape(
             self.code, self.still, self.dynamic, self.slopes, self.outputs, self.switches, self.modes, self.ties,
-            self.linear, self.slopes.size,
+            self.linear, self.speeds, self.slopes.size, native,
         )  # fmt: skip
 
 
@@ -240,6 +242,7 @@ class _Translation:
             modes=np.array(tape.modes, dtype=np.int64),
             ties=np.array(tape.ties, dtype=np.int64),
             linear=np.array([one.hold == "linear" for one in self._model.inputs], dtype=np.int64),
+            speeds=_needed(dynamic, tape.switches),
         )
 
     def _of(self, tree: Expression) -> int:
@@ -322,6 +325,16 @@ class _Translation:
         if tie == -1:
             return mirrored
         return tape.write(op.MUL, tape.constant(0.5), tape.write(op.ADD, register, mirrored))
+
+
+def _needed(code: Sequence[tuple[int, ...]], registers: Sequence[int]) -> IntArray:
+    """Return the operations that registers depend on, in their order."""
+    wanted, found = set(registers), []
+    for row in reversed(code):
+        if row[1] in wanted:
+            wanted.update(row[2:])
+            found.append(row)
+    return np.array(found[::-1], dtype=np.int64).reshape(-1, 5)
 
 
 def _valued(tree: Expression, value: Expression | None) -> Expression:

@@ -18,7 +18,7 @@ STEP, IS_STIFF, STEPS, CROSSINGS, AT_BOUND, ROW = 0, 1, 2, 3, 4, 5
 
 
 class Tape(NamedTuple):
-    """A program's arrays, see :class:`autotune.equations.tape.Program`; n states."""
+    """A program's arrays, see :class:`autotune.equations.tape.Program`; n states; the address of machine code, or 0."""
 
     code: IntArray
     still: int
@@ -29,7 +29,9 @@ class Tape(NamedTuple):
     modes: IntArray
     ties: IntArray
     linear: IntArray
+    speeds: IntArray
     n: int
+    native: int
 
 
 class Work(NamedTuple):

@@ -28,7 +28,7 @@ def _add(pair: Pair) -> None:
 def test_no_references_are_counted_where_derivatives_are_evaluated(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(module.COMPILED, "cache", False)
     compiled = compile_model(one_state("x", {"a": 2.0}, state=[{"name": "x", "derivative": "u - a*x^3"}]))
-    p = compiled.program.tape
+    p = compiled.program.tape()
     work = room.new_work(p, compiled.program.registers, compiled.parameter_vector)
     for make, counts in ((module.in_place, False), (numba.njit, True)):
         field = make(switching.field_in_row.py_func)
