@@ -142,9 +142,10 @@ def beside(effects: Sequence[FoundEffect], evidence: Evidence) -> str:
     unnamed = [name for name in evidence.search.chosen.names if name not in {e.name for e in effects}]
     if not unnamed:
         return ""
-    why = "may be" if not evidence.contradicted & set(unnamed) else "must be"
-    scatter = "" if why == "may be" else ": readings scatter on where it would hold them still"
-    return f" The extended model predicts with {' and '.join(unnamed)} as well, which {why} something else{scatter}."
+    what = "may be something else"
+    if evidence.contradicted & set(unnamed):
+        what = "must be something else: readings scatter on where it would hold them still"
+    return f" The extended model predicts with {' and '.join(unnamed)} as well, which {what}."
 
 
 def sentences_of(

@@ -131,8 +131,8 @@ def fitted_starts(
     scales = state_scales(compiled, parameters, drive, x)
     found = []
     for k, (a, b) in enumerate(zip(starts, stops, strict=True)):
-        free = np.flatnonzero(~np.isfinite(given)) if a == 0 else np.arange(x.size)
-        until = min(max(int(a + share * (b - a)), a + least), b)
+        free = _free(given, a)
+        until = _until(a, b, share, least)
         window = Windows(starts=np.array([a]), stops=np.array([until]), states=x[None, :])
         if k and _is_lost(compiled, parameters, drive, y, good, window):
             # what runs away ends far from the readings: the window begins at rest at its own first one
@@ -168,7 +168,7 @@ def started_anew(
     scales : (n,) array
         How large each state typically is.
     """
-    w, states = windows, windows.states.copy()
+    w, states, given = windows, windows.states.copy(), given_starts(compiled)
     for k in which:
         start, stop = int(w.starts[k]), int(w.stops[k])
         one = Windows(starts=w.starts[k : k + 1], stops=w.stops[k : k + 1], states=states[k : k + 1].copy())
@@ -177,13 +177,21 @@ def started_anew(
                 compiled, parameters, drive, states[k - 1 : k], starts=w.starts[k - 1 : k], stops=one.starts
             )
             one = replace(one, states=before.ends) if np.all(np.isfinite(before.ends)) else one
-        free = np.flatnonzero(~np.isfinite(given_starts(compiled))) if start == 0 else np.arange(scales.size)
         for share in ANEW:
-            until = min(max(int(start + share * (stop - start)), start + LEAST), stop)
-            one = replace(one, stops=np.array([until]))
-            one = _fitted(compiled, parameters, drive, y, good, one, scales, free, ANEW_STEPS)
+            one = replace(one, stops=np.array([_until(start, stop, share, LEAST)]))
+            one = _fitted(compiled, parameters, drive, y, good, one, scales, _free(given, start), ANEW_STEPS)
         states[k] = one.states[0]
     return replace(w, states=states)
+
+
+def _free(given: FloatArray, start: int) -> IntArray:
+    """Return which states of a window's start are sought: at a recording's beginning those that are not given."""
+    return np.flatnonzero(~np.isfinite(given)) if start == 0 else np.arange(given.size)
+
+
+def _until(start: int, stop: int, share: float, least: int) -> int:
+    """Return the end of the share of a window's rows that its start is fitted to, some rows at least."""
+    return min(max(int(start + share * (stop - start)), start + least), stop)
 
 
 def _ends(compiled: Compiled, parameters: FloatArray, drive: Drive, window: Windows) -> list[int]:

@@ -183,6 +183,10 @@ ACTUATOR_LAG = Structure(
 )
 
 
+#: Different commands up to which a command takes few: their answers are kept, and steps over them are tried closely.
+FEW_LEVELS = 100
+
+
 class Scan(Protocol):
     """What a direct search for starting values may look at: the recordings under a fit without the effect."""
 
@@ -218,11 +222,15 @@ class Scan(Protocol):
         """Commands in the recordings."""
 
     @property
+    def levels(self) -> FloatArray:
+        """Different commands in the recordings, smallest first."""
+
+    @property
     def operating_command(self) -> float:
         """Command at the nominal operating point."""
 
     def commanded(self, changes: FloatArray) -> FloatArray:
-        """Return the decrease that each row of (K, L) changes of the L different commands predicts, smallest first."""
+        """Return the decrease that each row of (K, L) changes of the L levels predicts."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -5,17 +5,17 @@ from __future__ import annotations
 import numpy as np
 
 from autotune.arrays import FloatArray
-from autotune.diagnosis.effects.base import Scan
+from autotune.diagnosis.effects.base import FEW_LEVELS, Scan
 
 #: Steps that are tried, as shares of the standard deviation of u: from a known origin, and as lines over u.
 _STEPS_TRIED, _LINES_OVER = (0.01, 3.0), (0.02, 3.0)
 #: How closely lines over u are looked at, as a share of a line's width; lines that are tried.
 _LINE_SHARE, _LINES_TRIED = 0.3, 24
-#: Shift of the farthest command's phase from one step tried to the next, in steps: where a command takes many values,
-#: and few, of which each is rounded the other way at steps of its own; values that are few.
-_MANY_SHIFT, _FEW_SHIFT, _FEW_VALUES = 0.2, 0.02, 100
-#: Steps tried at one time, and at most from one origin.
-_AT_ONCE, _MOST_STEPS = 128, 20_000
+#: Shift of the farthest command's phase from one step tried to the next, in steps, and steps at most from one origin:
+#: where a command takes many values, and few, of which each is rounded the other way at steps of its own.
+_MANY, _FEW = (0.2, 4_000), (0.02, 20_000)
+#: Steps tried at one time.
+_AT_ONCE = 128
 #: What is followed, of all that was tried.
 _KEPT = 2
 
@@ -68,11 +68,11 @@ def _counted(scan: Scan, origin: float) -> list[float]:
     commands are far from the origin for their spread, so many steps would have to be tried that any phase has its
     chance: the origin tells nothing.
     """
-    values = np.unique(scan.commands)
-    spread, far = float(np.std(scan.commands)), float(np.max(np.abs(values - origin)))
-    shift = _FEW_SHIFT if values.size <= _FEW_VALUES else _MANY_SHIFT
+    values, spread = scan.levels, float(np.std(scan.commands))
+    far = float(np.max(np.abs(values - origin)))
+    shift, most = _FEW if values.size <= FEW_LEVELS else _MANY
     smallest, largest = (share * spread for share in _STEPS_TRIED)
-    if far / (shift * smallest) > (_MOST_STEPS if values.size <= _FEW_VALUES else _MOST_STEPS / 5):
+    if far / (shift * smallest) > most:
         return []
     steps = 1.0 / np.arange(1.0 / largest, 1.0 / smallest, shift / far)
     decreases = np.empty(steps.size)

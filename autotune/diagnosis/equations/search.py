@@ -134,11 +134,18 @@ def _larger(
     bench: Bench, parent: Outcome, new: list[Outcome], tried: list[Outcome], own: int, rows: float, limits: Thresholds
 ) -> Outcome | None:
     """Return the best hypothesis with one more effect in its plainest form; nothing where none is needed."""
-    # a load of free timing explains a part of everything: others come first unless it leaves noise alone
-    new.sort(key=lambda one: (_is_partial_load(bench, one, limits), penalised(one, rows, limits)))
+    new.sort(key=_first(bench, rows, limits))
     best = next((one for one in new if _worth(parent, one, rows, limits)), new[0] if new else None)
     best = best and _plainest(bench, best, tried, rows, limits)
     return best if best is not None and _is_needed(bench, parent, best, own, rows, limits) else None
+
+
+def _first(bench: Bench, rows: float, limits: Thresholds) -> Callable[[Outcome], tuple[bool, float]]:
+    """Return the key by which the best hypothesis comes first.
+
+    A load of free timing explains a part of everything: others come first unless it leaves noise alone.
+    """
+    return lambda one: (_is_partial_load(bench, one, limits), penalised(one, rows, limits))
 
 
 def _worth(before: Outcome, after: Outcome, rows: float, limits: Thresholds) -> bool:
@@ -200,7 +207,7 @@ def _leading(
     small, there = part
     found = _round(small, there, without, progress, limits, further)
     rows = _independent(there, _noise(small, there))
-    found.sort(key=lambda one: (_is_partial_load(small, one, limits), penalised(one, rows, limits)))
+    found.sort(key=_first(small, rows, limits))
     once = {(one.effects[-1].name, place_of(one.effects[-1]), len(one.effects)): one for one in reversed(found)}
     carried: list[Outcome] = []
     for one in sorted(once.values(), key=found.index)[: limits.confirmed]:

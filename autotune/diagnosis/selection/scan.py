@@ -13,7 +13,7 @@ from scipy.signal import fftconvolve, lfilter
 
 from autotune.arrays import FloatArray, IntArray
 from autotune.diagnosis.effects import kind_of
-from autotune.diagnosis.effects.base import SignalSizes
+from autotune.diagnosis.effects.base import FEW_LEVELS, SignalSizes
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import RUNAWAY, Fit
 from autotune.diagnosis.fitting.parameters import effect_with
@@ -22,8 +22,8 @@ from autotune.diagnosis.selection.prediction import direction, predictions, sign
 from autotune.models import Effect
 from autotune.recording import Recording
 
-#: Different commands up to which the answers to each are kept; largest factor of a change that is predicted.
-FEW_LEVELS, LARGEST_SCALE = 100, 4.0
+#: Largest factor of a change that is predicted.
+LARGEST_SCALE = 4.0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -149,14 +149,18 @@ class FitScan:
         if few is not None:
             slope, curvature = changes @ few[0], np.einsum("ij,ij->i", changes @ few[1], changes)
         else:
-            moved = self._moved(changes[:, self._levels[1]])
-            left = moved - (moved @ self.base.explained) @ self.base.explained.T
-            slope, curvature = moved @ self.base.e, np.einsum("ij,ij->i", moved, left)
+            moved = self._moved(changes[:, self._numbered[1]])
+            slope, curvature = moved @ self.base.e, np.einsum("ij,ji->i", moved, self.base.without_numbers(moved.T))
         a = np.clip(slope / np.maximum(curvature, 1e-300), 0.0, LARGEST_SCALE)
         return np.asarray(2.0 * a * slope - a * a * curvature)
 
+    @property
+    def levels(self) -> FloatArray:
+        """Different commands in the recordings, smallest first."""
+        return self._numbered[0]
+
     @cached_property
-    def _levels(self) -> tuple[FloatArray, IntArray]:
+    def _numbered(self) -> tuple[FloatArray, IntArray]:
         """Different commands, smallest first, and each row's number among them."""
         values, numbers = np.unique(self.commands, return_inverse=True)
         return values, numbers
@@ -164,12 +168,11 @@ class FitScan:
     @cached_property
     def _few_levels(self) -> tuple[FloatArray, FloatArray] | None:
         """Slope and curvature of chi2 over the levels of a command that takes few values; nothing of one with many."""
-        values, numbers = self._levels
+        values, numbers = self._numbered
         if values.size > FEW_LEVELS:
             return None
         moved = self._moved((numbers == np.arange(values.size)[:, None]).astype(np.float64))
-        left = moved - (moved @ self.base.explained) @ self.base.explained.T
-        return moved @ self.base.e, moved @ left.T
+        return moved @ self.base.e, moved @ self.base.without_numbers(moved.T)
 
     def _moved(self, commands: FloatArray) -> FloatArray:
         """Return how added (K, N) commands take from the whitened residual, freed of what start states explain."""
@@ -178,7 +181,7 @@ class FitScan:
         answer = rfft(self._answer, size)
         for (a, b), Q in zip(self.base.windows, self.base.states_explain, strict=True):
             moved = irfft(rfft(commands[:, a:b], size) * answer, size)[:, : b - a]
-            result[:, a:b] = moved - (moved @ Q) @ Q.T
+            result[:, a:b] = moved - (moved @ Q) @ Q.T  # all trials at once: a window's product, not a loop over rows
         return result
 
 
