@@ -105,8 +105,11 @@ class ModbusRig:
         self._thread = threading.Thread(target=self._run, name="modbus rig", daemon=True)
 
     def __enter__(self) -> ModbusRig:
+        self.device.live(1e-9)  # the plant's first step may have to be compiled: before a port is waited for
         self._thread.start()
-        self._ready.wait(_START_S)
+        if not self._ready.wait(_START_S):
+            self.__exit__(None, None, None)
+            raise ConnectionError(f"cannot serve on {self._transport}: nothing listens after {_START_S:g} s")
         if self._failure is not None:
             raise ConnectionError(f"cannot serve on {self._transport}: {self._failure}") from self._failure
         return self
@@ -133,7 +136,6 @@ class ModbusRig:
         self._loop = asyncio.get_running_loop()
         self._stop = asyncio.Event()
         server = self._server()
-        self.device.live(1e-9)  # the plant's first step may have to be compiled
         self._start_s = time.perf_counter()
         await server.serve_forever(background=True)
         if isinstance(self._transport, TcpTransport):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import struct
+import threading
 from typing import Any
 
 import pytest
@@ -156,3 +157,15 @@ def test_a_map_with_a_heartbeat_may_read_it_back_from_its_own_register() -> None
             rig.write(0.25)
             assert rig.read().u_applied == 0.25
             rig.close()
+
+
+def test_a_rig_that_does_not_listen_in_time_says_so_instead_of_serving_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    released = threading.Event()
+    monkeypatch.setattr("sim.modbus_rig._START_S", 0.01)
+    monkeypatch.setattr(ModbusRig, "_run", lambda _: released.wait())
+    rig = ModbusRig(register_device(), TcpTransport())
+    try:
+        with pytest.raises(ConnectionError, match="nothing listens after 0.01 s"), rig:
+            pytest.fail(f"serves port {rig.port}")
+    finally:
+        released.set()
