@@ -165,7 +165,7 @@ def test_a_rig_that_does_not_listen_in_time_says_so_instead_of_serving_nothing(m
     monkeypatch.setattr(ModbusRig, "_run", lambda _: released.wait())
     rig = ModbusRig(register_device(), TcpTransport())
     try:
-        with pytest.raises(ConnectionError, match="nothing listens after 0.01 s"), rig:
+        with pytest.raises(ConnectionError, match=r"nothing listens after 0\.01 s"), rig:
             pytest.fail(f"serves port {rig.port}")
     finally:
         released.set()
