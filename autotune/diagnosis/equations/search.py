@@ -14,9 +14,20 @@ import numpy as np
 from autotune.arrays import FloatArray
 from autotune.diagnosis.equations.bench import Bench, Outcome
 from autotune.diagnosis.equations.candidates import USUAL, Trial, eased, is_plainer, place_of, plainer, trials
+from autotune.diagnosis.equations.scores import (
+    attempt,
+    independent_rows,
+    is_noise,
+    is_settled,
+    is_slow,
+    is_worth,
+    noise_of,
+    penalised,
+    variance_ratio,
+)
 from autotune.diagnosis.equations.sought import scaled
 from autotune.diagnosis.evidence.stretches import advantage
-from autotune.diagnosis.fitting.noise import Noise, noise_from_differences
+from autotune.diagnosis.fitting.noise import Noise
 from autotune.diagnosis.thresholds import IN_USE, Thresholds
 from autotune.errors import InputError
 from autotune.models import Effect
@@ -63,12 +74,6 @@ class Searched:
         return one.rss / one.residual.size / max(self.noise.total_sd**2, 1e-300)
 
 
-def penalised(one: Outcome, rows: float, limits: Thresholds) -> float:
-    """Return rows log(mean square) and what each number pays: Schwarz's criterion with unknown noise, and a lead."""
-    each = float(np.log(rows)) + limits.equation_lead
-    return rows * float(np.log(max(one.rss / one.residual.size, 1e-300))) + one.count * each
-
-
 def search(bench: Bench, without: Sequence[str], progress: Progress, limits: Thresholds = IN_USE) -> Searched:
     """Search for what is missing.
 
@@ -93,23 +98,23 @@ def search(bench: Bench, without: Sequence[str], progress: Progress, limits: Thr
     progress("retuning the model", 0.02)
     retuned = bench.retuned()
     nominal = bench.as_it_is(retuned)
-    noise = _noise(bench, retuned)
-    rows = _independent(retuned, noise)
+    noise = noise_of(bench, retuned)
+    rows = independent_rows(retuned, noise)
     tried: list[Outcome] = []
     chosen = retuned
     while len(chosen.effects) - len(retuned.effects) < limits.equation_effects:
-        if _is_noise(bench, chosen, limits.equation_noise, limits) and not _is_slow(bench, chosen, limits):
+        if is_noise(bench, chosen, limits.equation_noise, limits) and not is_slow(bench, chosen, limits):
             break
         new = _leading(bench, chosen, without, progress, limits, chosen is not retuned)
         tried += new
-        noise = _noise(bench, min([chosen, *new], key=lambda one: one.rss))
-        rows = _independent(retuned, noise)
+        noise = noise_of(bench, min([chosen, *new], key=lambda one: one.rss))
+        rows = independent_rows(retuned, noise)
         larger = _larger(bench, chosen, new, tried, len(retuned.effects), rows, limits)
         if larger is None:
             break
         chosen = larger
     chosen = _pruned(bench, chosen, len(retuned.effects), tried, rows, limits)
-    if chosen is not retuned and not _is_noise(bench, chosen, limits.equation_noise, limits):
+    if chosen is not retuned and not is_noise(bench, chosen, limits.equation_noise, limits):
         chosen = _finished(bench, chosen, retuned)
         tried.append(chosen)
     return Searched(
@@ -123,8 +128,8 @@ def _finished(bench: Bench, chosen: Outcome, retuned: Outcome) -> Outcome:
     Where dry friction held the plant while numbers were still wrong, start states stay behind, and hold numbers back:
     from the numbers without effects it begins at half of what was found.
     """
-    fits = [chosen, _attempt(bench, chosen.effects, chosen, FINAL)]
-    fits.append(_attempt(bench, [eased(effect) for effect in chosen.effects], retuned, FINAL))
+    fits = [chosen, attempt(bench, chosen.effects, chosen, FINAL)]
+    fits.append(attempt(bench, [eased(effect) for effect in chosen.effects], retuned, FINAL))
     with suppress(InputError):
         fits.append(bench.carried(chosen, FINAL))
     return min((one for one in fits if one is not None), key=lambda one: one.rss)
@@ -135,7 +140,7 @@ def _larger(
 ) -> Outcome | None:
     """Return the best hypothesis with one more effect in its plainest form; nothing where none is needed."""
     new.sort(key=_first(bench, rows, limits))
-    best = next((one for one in new if _worth(parent, one, rows, limits)), new[0] if new else None)
+    best = next((one for one in new if is_worth(parent, one, rows, limits)), new[0] if new else None)
     best = best and _plainest(bench, best, tried, rows, limits)
     return best if best is not None and _is_needed(bench, parent, best, own, rows, limits) else None
 
@@ -148,55 +153,6 @@ def _first(bench: Bench, rows: float, limits: Thresholds) -> Callable[[Outcome],
     return lambda one: (_is_partial_load(bench, one, limits), penalised(one, rows, limits))
 
 
-def _worth(before: Outcome, after: Outcome, rows: float, limits: Thresholds) -> bool:
-    more = penalised(before, rows, limits) - penalised(after, rows, limits) > limits.equation_decrease
-    return more and after.rss < (1.0 - limits.equation_share) * before.rss
-
-
-def _noise(bench: Bench, one: Outcome) -> Noise:
-    """Return the noise that a residual's differences show, row by row of each recording."""
-    residuals = [np.nan_to_num(r) for r in one.fitted.residuals]
-    good = [np.isfinite(r) for r in one.fitted.residuals]
-    found = noise_from_differences(residuals, good)
-    spread = max(float(np.nanstd(r.y)) for r in bench.recordings)
-    return found if found.sd > 1e-6 * spread else Noise(sd=max(1e-6 * spread, 1e-300))
-
-
-def _independent(one: Outcome, noise: Noise) -> float:
-    rho = noise.ar[0] if noise.ar else 0.0
-    return max(one.residual.size * (1.0 - rho) / (1.0 + rho), 20.0)
-
-
-def _ratio(one: Outcome, noise: Noise) -> float:
-    return one.rss / one.residual.size / max(noise.total_sd**2, 1e-300)
-
-
-def _is_noise(bench: Bench, one: Outcome, most: float, limits: Thresholds) -> bool:
-    """Whether a residual has a noise's variance; what goes on from row to row may be physics that is left out."""
-    noise = _noise(bench, one)
-    return _ratio(one, noise) < most and not (noise.ar and noise.ar[0] > limits.slow_noise)
-
-
-def _is_settled(bench: Bench, one: Outcome, best: Outcome, limits: Thresholds) -> bool:
-    """Whether a fit need not be finished: another one of the same rows leaves noise alone, and it is far behind."""
-    if one is best or _ratio(best, _noise(bench, best)) >= limits.equation_noise:
-        return False
-    return one.residual.size * float(np.log(one.rss / max(best.rss, 1e-300))) > limits.equation_behind
-
-
-def _is_slow(bench: Bench, one: Outcome, limits: Thresholds) -> bool:
-    """Whether block means of a residual vary by more than its noise says."""
-    noise, ratios = _noise(bench, one), []
-    rho = noise.ar[0] if noise.ar else 0.0
-    for residual in one.fitted.residuals:
-        e = residual[np.isfinite(residual)]
-        width = max(10, e.size // 60)
-        means = e[: e.size // width * width].reshape(-1, width).mean(axis=1)
-        wanted = noise.total_sd**2 / width * (1.0 + rho) / (1.0 - rho)
-        ratios.append(float(np.mean(means**2)) / max(wanted, 1e-300))
-    return bool(np.mean(ratios) > limits.equation_slow)
-
-
 def _leading(
     bench: Bench, base: Outcome, without: Sequence[str], progress: Progress, limits: Thresholds, further: bool
 ) -> list[Outcome]:
@@ -206,7 +162,7 @@ def _leading(
         return _round(bench, base, without, progress, limits, further)
     small, there = part
     found = _round(small, there, without, progress, limits, further)
-    rows = _independent(there, _noise(small, there))
+    rows = independent_rows(there, noise_of(small, there))
     found.sort(key=_first(small, rows, limits))
     once = {(one.effects[-1].name, place_of(one.effects[-1]), len(one.effects)): one for one in reversed(found)}
     carried: list[Outcome] = []
@@ -230,10 +186,10 @@ def _round(
     def told(what: str, done: float) -> None:
         progress(what, share + 0.35 * done)
 
-    beside = further and not _is_noise(bench, base, limits.equation_astray, limits)
+    beside = further and not is_noise(bench, base, limits.equation_astray, limits)
     found = _grown(bench, base, without, told, limits, count, beside)
     best = min(found, key=lambda one: one.rss, default=base)
-    if not _is_noise(bench, best, limits.equation_astray, limits):
+    if not is_noise(bench, best, limits.equation_astray, limits):
         short = bench.shortened(base)
         if short is not None:
             # the base itself goes on as well: its effects may have been fitted in a wrong minimum
@@ -242,10 +198,10 @@ def _round(
             found += _lengthened(bench, fits, limits)
     found.sort(key=lambda one: one.rss)
     for k, one in enumerate(found[:2]):
-        if _is_settled(bench, one, found[0], limits):
+        if is_settled(bench, one, found[0], limits):
             break
         progress(f"fitting {one.effects[-1].name}", share + 0.35 + 0.04 * k)
-        better = _attempt(bench, one.effects, one, LAST)
+        better = attempt(bench, one.effects, one, LAST)
         found[k] = better if better is not None and better.rss < one.rss else one
     return [one for one in found if not bench.is_stand_in(one)]
 
@@ -272,7 +228,7 @@ def _pruned(
     while len(chosen.effects) - own > 1:
         smaller = []
         for i in range(own, len(chosen.effects)):
-            one = _attempt(bench, (*chosen.effects[:i], *chosen.effects[i + 1 :]), chosen, LAST)
+            one = attempt(bench, (*chosen.effects[:i], *chosen.effects[i + 1 :]), chosen, LAST)
             smaller += [] if one is None else [one]
         tried += smaller
         smaller.sort(key=lambda one: penalised(one, rows, limits))
@@ -292,14 +248,14 @@ def _is_needed(bench: Bench, before: Outcome, after: Outcome, own: int, rows: fl
     fitted something is always gained. A load of free timing explains a part of everything: beside other effects it must
     leave noise alone. Where the model's error and not noise is left, rows are no witnesses and stretches decide alone.
     """
-    worth = _worth(before, after, rows, limits)
-    if len(before.effects) <= own and (worth or _is_noise(bench, after, limits.equation_astray, limits)):
+    worth = is_worth(before, after, rows, limits)
+    if len(before.effects) <= own and (worth or is_noise(bench, after, limits.equation_astray, limits)):
         return worth
     had = {(e.name, place_of(e)) for e in before.effects}
     loads = any(e.name.startswith("environment.") and (e.name, place_of(e)) not in had for e in after.effects)
-    if loads and before.effects[own:] and not _is_noise(bench, after, limits.equation_noise, limits):
+    if loads and before.effects[own:] and not is_noise(bench, after, limits.equation_noise, limits):
         return False
-    if not worth and _ratio(after, _noise(bench, after)) < limits.equation_astray:
+    if not worth and variance_ratio(after, noise_of(bench, after)) < limits.equation_astray:
         return False
     return _is_earned(bench, before, after, limits)
 
@@ -316,7 +272,7 @@ def _predicts(bench: Bench, smaller: Outcome, error: float, limits: Thresholds) 
 def _is_partial_load(bench: Bench, one: Outcome, limits: Thresholds) -> bool:
     """Whether the last effect is a load, and more than noise is left beside it."""
     load = one.effects[-1].name.startswith("environment.")
-    return load and not _is_noise(bench, one, limits.equation_noise, limits)
+    return load and not is_noise(bench, one, limits.equation_noise, limits)
 
 
 def _is_earned(bench: Bench, before: Outcome, after: Outcome, limits: Thresholds) -> bool:
@@ -334,24 +290,16 @@ def _plainest(bench: Bench, best: Outcome, tried: list[Outcome], rows: float, li
     less = plainer(last)
     if less is None:
         return best
-    one = _attempt(bench, (*best.effects[:-1], less), best, FIRST)
-    if one is not None and not _is_settled(bench, one, best, limits):
-        one = _attempt(bench, one.effects, one, LAST) or one
+    one = attempt(bench, (*best.effects[:-1], less), best, FIRST)
+    if one is not None and not is_settled(bench, one, best, limits):
+        one = attempt(bench, one.effects, one, LAST) or one
     if one is None:
         return best
     tried.append(one)
     if is_plainer(last):
         tried[:] = [other for other in tried if not (other.effects and is_plainer(other.effects[-1]))]
         return one
-    return best if _worth(one, best, rows, limits) and _is_earned(bench, one, best, limits) else one
-
-
-def _attempt(bench: Bench, effects: Sequence[Effect], start: Outcome, iterations: int) -> Outcome | None:
-    """Fit effects; nothing where the simulation runs away."""
-    try:
-        return bench.fitted(effects, start, iterations)
-    except InputError:
-        return None
+    return best if is_worth(one, best, rows, limits) and _is_earned(bench, one, best, limits) else one
 
 
 def _fitted(
@@ -369,12 +317,12 @@ def _fitted(
         told(f"fitting {effect.name}")
         whole = (*base.effects, effect)
         outer = bench.is_sought_outside(effect)
-        one = _attempt(bench, whole, base, FIRST if outer else LOOK)
+        one = attempt(bench, whole, base, FIRST if outer else LOOK)
         if one is None:
             continue
         best = min(found, key=lambda other: other.rss, default=one)
-        if not outer and not _is_settled(bench, one, best, limits):
-            further = _attempt(bench, one.effects, one, FIRST)
+        if not outer and not is_settled(bench, one, best, limits):
+            further = attempt(bench, one.effects, one, FIRST)
             one = further if further is not None and further.rss < one.rss else one
         found.append(one)
     return found
@@ -385,7 +333,7 @@ def _leaves_nothing(bench: Bench, one: Outcome, effect: Effect, limits: Threshol
     last = one.effects[-1]
     if (last.name, place_of(last)) != (effect.name, place_of(effect)):
         return False
-    return (1.0 - limits.equation_share) * _ratio(one, _noise(bench, one)) < 1.0
+    return (1.0 - limits.equation_share) * variance_ratio(one, noise_of(bench, one)) < 1.0
 
 
 def _ends_usual(one: Outcome) -> bool:
@@ -398,7 +346,7 @@ def _lengthened(bench: Bench, fits: Sequence[Outcome], limits: Thresholds) -> li
     found: list[Outcome] = []
     ranked = sorted(fits, key=lambda one: one.rss)
     for one in [*ranked[:CARRIED], *(one for one in ranked[CARRIED:] if _ends_usual(one))]:
-        if _is_settled(bench, one, ranked[0], limits) and _is_noise(bench, found[0], limits.equation_noise, limits):
+        if is_settled(bench, one, ranked[0], limits) and is_noise(bench, found[0], limits.equation_noise, limits):
             continue
         try:
             found.append(bench.lengthened(one))
