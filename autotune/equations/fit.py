@@ -33,6 +33,7 @@ def fit(
     recordings: Sequence[Recording],
     *,
     windows: Sequence[Windows] | None = None,
+    known: Sequence[Windows] | None = None,
     horizon_s: float | None = None,
     z: FloatArray | None = None,
     free: BoolArray | None = None,
@@ -49,6 +50,8 @@ def fit(
         What was measured; rows whose y is no number do not count.
     windows : sequence of Windows, optional
         One per recording; by default windows of a length, with start states that fit them.
+    known : sequence of Windows, optional
+        States that an earlier fit found, on its own windows, for windows of a length.
     horizon_s : float, optional
         That length [s]; by default the model's, or one free run per recording.
     z : (P,) array, optional
@@ -75,9 +78,9 @@ def fit(
     which = np.flatnonzero((spread > 0.0) & (np.ones(spread.size, dtype=bool) if free is None else free))
     length = compiled.model.horizon_s if horizon_s is None else horizon_s
     p = values_of(compiled, z)
-    data = [
-        data_of(compiled, one, p, length, None if windows is None else windows[k]) for k, one in enumerate(recordings)
-    ]
+    none = [None] * len(recordings)
+    each = zip(recordings, windows or none, known or none, strict=True)
+    data = [data_of(compiled, one, p, length, at, before) for one, at, before in each]
     state = Descent(compiled, data, which, z)
     converged = False
     for k in range(iterations):
@@ -128,11 +131,11 @@ def retune(
     lengths = [longest / count for count in counts or [1]]
     found: Fitted | None = None
     for k, length in enumerate(lengths):
-        z = None if found is None else found.z
+        z, known = (None, None) if found is None else (found.z, found.windows)
         last = length >= whole
         try:
             new = fit(
-                compiled, recordings, z=z, free=free, horizon_s=None if last else length,
+                compiled, recordings, z=z, free=free, known=known, horizon_s=None if last else length,
                 iterations=30 if k == len(lengths) - 1 else 12,
                 progress=lambda what, share, k=k: progress(what, (k + share) / len(lengths)),
             )  # fmt: skip

@@ -81,9 +81,12 @@ def window_rows(t: FloatArray, horizon_s: float | None) -> tuple[IntArray, IntAr
 
 
 def data_of(
-    compiled: Compiled, recording: Recording, parameters: FloatArray, length_s: float | None, windows: Windows | None
-) -> FitData:
+    compiled: Compiled, recording: Recording, parameters: FloatArray, length_s: float | None, windows: Windows | None,
+    known: Windows | None = None,
+) -> FitData:  # fmt: skip
     """Return a recording prepared for a fit, on given windows or on ones of a length.
+
+    What an earlier fit knows of states, on its own windows, is taken over.
 
     Raises
     ------
@@ -97,5 +100,5 @@ def data_of(
         starts, stops = window_rows(recording.t, length_s)
         read = np.add.reduceat(good, starts) > 0  # a window without a reading tells nothing
         starts, stops = starts[read], stops[read]
-        windows = fitted_starts(compiled, parameters, drive, recording.y, good, starts, stops)
+        windows = fitted_starts(compiled, parameters, drive, recording.y, good, starts, stops, known=known)
     return FitData(drive=drive, y=recording.y, good=good, windows=windows)

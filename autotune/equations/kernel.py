@@ -22,7 +22,7 @@ from autotune.equations.work import CROSSINGS, ROW, STEP, STEPS, Tape, Work, beg
 DONE, NOT_A_NUMBER, TOO_MANY_STEPS = 0, 1, 2
 MOST_STEPS = 20_000  # between two rows
 MOST_ON_AVERAGE = 200  # between two rows, over a window: else one fit of a chattering model would take hours
-SPARE_ROWS = 2000  # so many rows' steps may be taken ahead: a few hard places are carried through
+SPARE_STEPS = 400_000  # may be taken ahead of that average: a few hard places are carried through
 MOST_CROSSINGS = 100  # located between two rows; further ones are taken at the end of their steps
 _LOCATED = 1e-9  # of the time between rows: how closely a crossing is located
 _LARGEST = 1e15  # a state beyond runs away
@@ -161,8 +161,8 @@ def _row_before(times: FloatArray, t: float) -> int:
 @in_place
 def _integrate(
     p: Tape, w: Work, times: FloatArray, columns: FloatArray, delays: FloatArray, start: int, stop: int, x0: FloatArray,
-    tolerance: float, most: float, out: FloatArray, ends: FloatArray, status: FloatArray, window: int, x: FloatArray,
-    at: IntArray,
+    tolerance: float, most: float, spare: float, out: FloatArray, ends: FloatArray, status: FloatArray, window: int,
+    x: FloatArray, at: IntArray,
 ) -> None:  # fmt: skip
     """Integrate one window; ``x`` and ``at`` are room for the state and for every input's row."""
     close = 1e-9 * (times[-1] - times[0]) / max(times.size - 1, 1)
@@ -174,7 +174,6 @@ def _integrate(
     _inputs(p, w, times, columns, delays, at, t - 3.0 * close, close)
     settle(p, w, x, t - times[0])
     status[window, 0], status[window, 1] = DONE, t
-    spare = most * SPARE_ROWS
     for row in range(start, stop):
         evaluate(p.code, p.dynamic, p.code.shape[0], w.r, False)
         for q in range(p.outputs.size):
@@ -196,20 +195,21 @@ def _integrate(
 @njit(**COMPILED)
 def run(
     p: Tape, template: FloatArray, parameters: FloatArray, times: FloatArray, columns: FloatArray, delays: FloatArray,
-    starts: IntArray, stops: IntArray, x0: FloatArray, tolerance: float, most: float, out: FloatArray,
-    ends: FloatArray, status: FloatArray,
+    starts: IntArray, stops: IntArray, x0: FloatArray, tolerance: float, most: float, spare: float,
+    out: FloatArray, ends: FloatArray, status: FloatArray,
 ) -> None:  # fmt: skip
     """Integrate every window and write outputs at its rows, its end state, and how it ended.
 
-    ``most`` bounds the steps between two rows on average. ``out`` is (q, N); ``ends`` (W, n) receives the state at each
-    window's stop row (or at the last row); ``status`` (W, 3) the reason and the time of the end, and the steps taken.
+    ``most`` bounds the steps between two rows on average, all but ``spare`` of a window's. ``out`` is (q, N);
+    ``ends`` (W, n) receives the state at each window's stop row (or at the last row); ``status`` (W, 3) the reason and
+    the time of the end, and the steps taken.
     """
     w = new_work(p, template, parameters)
     x, at = np.zeros(p.n), np.zeros(p.linear.size, dtype=np.int64)
     for window in range(starts.size):
         _integrate(
-            p, w, times, columns, delays, starts[window], stops[window], x0, tolerance, most, out, ends, status, window,
-            x, at,
+            p, w, times, columns, delays, starts[window], stops[window], x0, tolerance, most, spare, out, ends, status,
+            window, x, at,
         )  # fmt: skip
 
 

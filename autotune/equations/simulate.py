@@ -61,6 +61,8 @@ class Compiled:
         What is done to inputs before they drive the equations, in this order.
     most_steps : float
         Steps between two rows, on average, that a simulation may take.
+    spare_steps : float
+        Steps of a window that may be taken ahead of that average, for a few hard places.
     """
 
     model: EquationModel
@@ -70,6 +72,7 @@ class Compiled:
     signals: tuple[str, ...] = ()
     held: tuple[Held, ...] = ()
     most_steps: float = kernel.MOST_ON_AVERAGE
+    spare_steps: float = kernel.SPARE_STEPS
 
     @property
     def states(self) -> tuple[str, ...]:
@@ -235,7 +238,8 @@ def simulate(
     kernel.run(
         tape, program.registers, np.ascontiguousarray(parameters, dtype=np.float64), drive.t, drive.inputs,
         late if delays is None else np.asarray(delays, dtype=np.float64),
-        first, last, states, tolerance, float(compiled.most_steps), outputs, ends, status,
+        first, last, states, tolerance, float(compiled.most_steps), float(compiled.spare_steps),
+        outputs, ends, status,
     )  # fmt: skip
     reasons = status[:, 0].astype(np.int64)
     return Run(outputs=outputs.T, ends=ends, reasons=reasons, until_s=status[:, 1], steps=status[:, 2])

@@ -13,6 +13,9 @@ from autotune.equations.simulate import Compiled, Drive, derivatives, simulate
 
 #: Rows that a start state is fitted to at least; where those run away, to a part of them first, this many at least.
 LEAST, LEAST_WINDOW = 30, 4
+#: Parts of a window in which its state is found anew, one after the other, where a simulation ends with this many times
+#: the error that it begins with.
+HOPS, STRAYS = 8, 2.0
 #: Shares of its rows that a window started anew is fitted to, one after the other: wrong numbers lead the rest astray;
 #: and steps of each.
 ANEW, ANEW_STEPS = (0.1, 0.3, 1.0), 4
@@ -99,6 +102,7 @@ def fitted_starts(
     iterations: int = 8,
     share: float = 0.1,
     least: int = LEAST,
+    known: Windows | None = None,
 ) -> Windows:
     """Find each window's start state: the previous window's end, then what fits its readings.
 
@@ -118,6 +122,8 @@ def fitted_starts(
         Share of a window's rows that its start is fitted to: wrong parameters lead the rest astray.
     least : int
         Rows that it is fitted to at least.
+    known : Windows, optional
+        Where an earlier fit knows the state, on its own windows: a window that starts within one takes it over.
 
     Returns
     -------
@@ -134,19 +140,59 @@ def fitted_starts(
         free = _free(given, a)
         until = _until(a, b, share, least)
         window = Windows(starts=np.array([a]), stops=np.array([until]), states=x[None, :])
-        if k and _is_lost(compiled, parameters, drive, y, good, window):
+        taken = None if known is None else _state_at(compiled, parameters, drive, known, int(a))
+        if taken is not None:
+            window = replace(window, states=taken[None, :])
+        elif k and _is_lost(compiled, parameters, drive, y, good, window):
             # what runs away ends far from the readings: the window begins at rest at its own first one
             ahead = y[a:until][good[a:until]]
             at_rest = rest_state(compiled, parameters, drive.inputs[a - 1], float(ahead[0]) if ahead.size else np.nan)
             window = replace(window, states=at_rest[None, :])
-        for end in _ends(compiled, parameters, drive, window):
+        for end in _ends(compiled, parameters, drive, window) if taken is None else ():
             window = replace(window, stops=np.array([end]))
             window = _fitted(compiled, parameters, drive, y, good, window, scales, free, iterations)
         found.append(window.states[0])
         if k + 1 < starts.size:
-            run = simulate(compiled, parameters, drive, window.states, starts=np.array([a]), stops=np.array([b]))
-            x = run.ends[0] if np.all(np.isfinite(run.ends)) else x
+            whole = replace(window, stops=np.array([b]))
+            x = _followed(compiled, parameters, drive, y, good, whole, scales, iterations)
     return Windows(starts=starts, stops=stops, states=np.array(found))
+
+
+def _state_at(
+    compiled: Compiled, parameters: FloatArray, drive: Drive, known: Windows, row: int
+) -> FloatArray | None:  # fmt: skip
+    """Return the state at a row within known windows; nothing elsewhere, or where the simulation runs away."""
+    inside = np.flatnonzero((known.starts <= row) & (row < known.stops))
+    if inside.size == 0:
+        return None
+    k = inside[-1:]
+    run = simulate(compiled, parameters, drive, known.states[k], starts=known.starts[k], stops=np.array([row]))
+    x = known.states[k[0]] if known.starts[k[0]] == row else run.ends[0]
+    return np.array(x) if np.all(np.isfinite(x)) else None
+
+
+def _followed(
+    compiled: Compiled, parameters: FloatArray, drive: Drive, y: FloatArray, good: BoolArray, window: Windows,
+    scales: FloatArray, iterations: int,
+) -> FloatArray:  # fmt: skip
+    """Return the state at a window's end: where a simulation leads that keeps to the readings, else found on the way.
+
+    A simulation that strays ends on another swing than the readings, and the next window would begin there.
+    """
+    a, b = int(window.starts[0]), int(window.stops[0])
+    run = simulate(compiled, parameters, drive, window.states, starts=window.starts, stops=window.stops)
+    hop = max((b - a) // HOPS, LEAST)
+    error = np.where(good[a:b], y[a:b] - run.y[a:b], 0.0) ** 2
+    if run.is_complete and not np.mean(error[-hop:]) > STRAYS**2 * np.mean(error[:hop]):
+        return np.array(run.ends[0])
+    x = window.states[0]
+    for at in range(a, b, hop):
+        one = Windows(starts=np.array([at]), stops=np.array([min(at + hop, b)]), states=x[None, :])
+        if at > a:
+            one = _fitted(compiled, parameters, drive, y, good, one, scales, np.arange(x.size), iterations)
+        ends = simulate(compiled, parameters, drive, one.states, starts=one.starts, stops=one.stops).ends[0]
+        x = ends if np.all(np.isfinite(ends)) else x
+    return np.array(x)
 
 
 def started_anew(

@@ -31,8 +31,12 @@ from autotune.recording import Recording
 
 #: Steps between two rows, on average, that a simulation with effects may take, and times those of the model without.
 STEPS, TIMES_STEPS = 20.0, 5.0
+#: For so many rows of a window steps may be taken ahead: numbers that make a plant stiff are no way to explain it.
+SPARE_ROWS = 200
 #: Iterations of a fit from which on a number that moves by jumps is sought: fewer show whether more are worth it.
 LEAST_SOUGHT = 3
+#: By what such a number is multiplied and divided first, and where an earlier fit has sought it already.
+FAR, NEAR = 2.0, 1.2
 #: Windows per recording that a search works on: long enough to tell, short enough to converge.
 WINDOWS = 3
 #: Rows of such a window at most: in longer ones fits take more steps, and say no more.
@@ -41,6 +45,8 @@ MOST_ROWS = 500
 BEYOND = 0.15
 #: A search works on a part of the rows where there are this many times as many.
 PARTED = 1.5
+#: Shares of the search's length, where a fit to short windows is carried on to long ones, and iterations on each.
+LONGER_AND_LONGER, LENGTHENED = (0.25, 1.0), 12
 #: How many times as long as short windows long ones are.
 SHORTER = 8
 
@@ -166,7 +172,8 @@ class EquationBench:
         compiled, own = compile_with(self.model, effects), len(self.model.parameters)
         scaled_for_search = tuple(sought(p, effects, spreads) for p in compiled.parameters[own:])
         parameters = (*compiled.parameters[:own], *scaled_for_search)
-        return replace(compiled, parameters=parameters, most_steps=min(self._most_steps, compiled.most_steps))
+        most, spare = min(self._most_steps, compiled.most_steps), SPARE_ROWS * self._most_steps
+        return replace(compiled, parameters=parameters, most_steps=most, spare_steps=min(spare, compiled.spare_steps))
 
     def _spreads(self) -> dict[str, float]:
         u = np.concatenate([r[self.model.columns[0]] for r in self.recordings])
@@ -187,9 +194,10 @@ class EquationBench:
             return self._inner(effects, start, iterations)
         i, key = outer[-1]
         best, tried = None, float(effects[i].parameters[key].value)
-        factor = 2.0
+        factor = NEAR if i < len(start.effects) and start.effects[i].name == effects[i].name else FAR
         while factor > 1.03:
-            for value in (tried / factor, tried * factor) if best else (tried / factor, tried, tried * factor):
+            values = self._promising(best, i, key, tried, factor) if best else (tried / factor, tried, tried * factor)
+            for value in values:
                 try:
                     new = self._inner(changed(effects, i, key, value), best or start, 4)
                 except InputError:
@@ -202,6 +210,19 @@ class EquationBench:
             factor = factor if moved != tried and factor < 2.5 else np.sqrt(factor)
             tried = moved
         return best or self._inner(effects, start, iterations)
+
+    def _promising(self, best: Outcome, i: int, key: str, tried: float, factor: float) -> list[float]:
+        """Return the value, of one below and one above, that to first order in all others leaves less than a fit."""
+        basis = explained(best.fitted)
+        readings = np.concatenate([r.y[ok] for r, ok in zip(self.recordings, self._rows, strict=True)])
+        left: list[tuple[float, float]] = []
+        for value in (tried / factor, tried, tried * factor):
+            y = self._simulated(self._compiled(changed(best.effects, i, key, value), {}), best)
+            if y is not None:
+                e = self.without_starts(best, readings - y)
+                e = e - basis @ (basis.T @ e)
+                left.append((float(e @ e), value))
+        return [value for _, value in sorted(left)[:1] if value != tried]
 
     def _inner(self, effects: Sequence[Effect], start: Outcome, iterations: int) -> Outcome:
         compiled = self._compiled(effects, self._spreads())
@@ -229,13 +250,9 @@ class EquationBench:
 
     def lengthened(self, outcome: Outcome) -> Outcome:
         """Return a fit to short windows carried on to long ones."""
-        own = len(self.model.parameters)
-        for length in (0.5 * self.length_s, self.length_s):
-            compiled = self._compiled(outcome.effects, self._spreads())
-            z = np.zeros(len(compiled.parameters))
-            z[:own] = outcome.fitted.z[:own]
-            found = fit(compiled, self.recordings, z=z, horizon_s=length, iterations=12)
-            outcome = self._outcome(outcome.effects, found)
+        outcome = self._inner(outcome.effects, outcome, LENGTHENED)
+        for share in LONGER_AND_LONGER:
+            outcome = self._on(outcome, share * self.length_s, LENGTHENED)
         return outcome
 
     def part(self, outcome: Outcome, rows: int) -> tuple[Bench, Outcome] | None:
@@ -258,13 +275,17 @@ class EquationBench:
 
     def carried(self, outcome: Outcome, iterations: int) -> Outcome:
         """Return a fit to a part of the rows carried on to all of them."""
-        own = len(self.model.parameters)
+        return self._on(outcome, self.length_s, iterations)
+
+    def _on(self, outcome: Outcome, length_s: float, iterations: int) -> Outcome:
+        """Return the same effects fitted on windows of a length, from where a fit is, its states taken over."""
         compiled = self._compiled(outcome.effects, self._spreads())
         z = np.zeros(len(compiled.parameters))
+        own = len(self.model.parameters)
         z[:own] = outcome.fitted.z[:own]
-        return self._outcome(
-            outcome.effects, fit(compiled, self.recordings, z=z, horizon_s=self.length_s, iterations=iterations)
-        )
+        found = fit(compiled, self.recordings, z=z, known=outcome.fitted.windows, horizon_s=length_s,
+                    iterations=iterations)  # fmt: skip
+        return self._outcome(outcome.effects, found)
 
     def is_sought_outside(self, effect: Effect) -> bool:
         """Whether a direct search around the fits seeks one of the effect's numbers."""
