@@ -1,4 +1,4 @@
-"""Start states of windows: what an earlier fit knows is taken over, and a simulation that strays leads no one astray."""
+"""Start states of windows: what an earlier fit knows is taken over, and what strays leads no later window astray."""
 
 from __future__ import annotations
 
