@@ -71,13 +71,6 @@ def plainer(effect: Effect) -> Effect | None:
     return replace(effect, name="plant.coulomb_friction", parameters=parameters)
 
 
-def eased(effect: Effect) -> Effect:
-    """Return dry friction at half of its force, any other effect as it is."""
-    forces = {key: q for key, q in effect.parameters.items() if key in ("level", "breakaway")}
-    less = {key: replace(q, value=0.5 * q.value) for key, q in forces.items()}
-    return replace(effect, parameters=MappingProxyType({**effect.parameters, **less}))
-
-
 def gravity(effect: Effect, amplitude: float) -> Effect:
     """Return a sine torque as gravity on an angle: over one turn, from angle zero on; its amplitude alone is sought."""
     values = {"amplitude": Parameter(value=amplitude), "period": Parameter(value=2.0 * np.pi, unit="rad")}

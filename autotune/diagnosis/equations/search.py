@@ -13,7 +13,8 @@ import numpy as np
 
 from autotune.arrays import FloatArray
 from autotune.diagnosis.equations.bench import Bench, Outcome
-from autotune.diagnosis.equations.candidates import USUAL, Trial, eased, is_plainer, place_of, plainer, trials
+from autotune.diagnosis.equations.candidates import USUAL, Trial, is_plainer, place_of, plainer, trials
+from autotune.diagnosis.equations.dry_friction import settled_among, swept, with_force
 from autotune.diagnosis.equations.scores import (
     attempt,
     independent_rows,
@@ -115,24 +116,25 @@ def search(bench: Bench, without: Sequence[str], progress: Progress, limits: Thr
         chosen = larger
     chosen = _pruned(bench, chosen, len(retuned.effects), tried, rows, limits)
     if chosen is not retuned and not is_noise(bench, chosen, limits.equation_noise, limits):
-        chosen = _finished(bench, chosen, retuned)
+        chosen = _finished(bench, chosen, retuned, rows)
         tried.append(chosen)
     return Searched(
         nominal=nominal, retuned=retuned, chosen=chosen, tried=tuple(tried), noise=noise, rows=rows, limits=limits
     )
 
 
-def _finished(bench: Bench, chosen: Outcome, retuned: Outcome) -> Outcome:
+def _finished(bench: Bench, chosen: Outcome, retuned: Outcome, rows: float) -> Outcome:
     """Return a fit to its end: from where it is, from the numbers without effects, and with start states found anew.
 
     Where dry friction held the plant while numbers were still wrong, start states stay behind, and hold numbers back:
     from the numbers without effects it begins at half of what was found.
     """
     fits = [chosen, attempt(bench, chosen.effects, chosen, FINAL)]
-    fits.append(attempt(bench, [eased(effect) for effect in chosen.effects], retuned, FINAL))
+    fits.append(attempt(bench, [with_force(effect, 0.5) for effect in chosen.effects], retuned, FINAL))
     with suppress(InputError):
         fits.append(bench.carried(chosen, FINAL))
-    return min((one for one in fits if one is not None), key=lambda one: one.rss)
+    best = min((one for one in fits if one is not None), key=lambda one: one.rss)
+    return settled_among(bench, swept(bench, best), rows, variance_ratio(best, noise_of(bench, best)))
 
 
 def _larger(
@@ -142,7 +144,23 @@ def _larger(
     new.sort(key=_first(bench, rows, limits))
     best = next((one for one in new if is_worth(parent, one, rows, limits)), new[0] if new else None)
     best = best and _plainest(bench, best, tried, rows, limits)
-    return best if best is not None and _is_needed(bench, parent, best, own, rows, limits) else None
+    if best is not None and _is_needed(bench, parent, best, own, rows, limits):
+        return best
+    usual = (one for one in new if one.effects[-1].name in USUAL)
+    return next((one for one in usual if _is_usual(bench, parent, one, rows, limits)), None)
+
+
+def _is_usual(bench: Bench, before: Outcome, after: Outcome, rows: float, limits: Thresholds) -> bool:
+    """Whether a usual effect pays for its number and predicts what was left out, if only a little.
+
+    It was expected, not the best of a hundred: where more than noise is left it need not take a large share away.
+    """
+    if is_noise(bench, before, limits.equation_astray, limits):
+        return False
+    if penalised(after, rows, limits) >= penalised(before, rows, limits):
+        return False
+    speaks = advantage(bench.left_out_squares(before), bench.left_out_squares(after)) > 0.0
+    return speaks and bench.held_out_error(after, True) < bench.held_out_error(before, True)
 
 
 def _first(bench: Bench, rows: float, limits: Thresholds) -> Callable[[Outcome], tuple[bool, float]]:
@@ -170,11 +188,21 @@ def _leading(
         if np.log(there.rss / one.rss) < limits.equation_near * np.log(there.rss / found[0].rss):
             continue
         progress(f"fitting {one.effects[-1].name} to all rows", 0.85 if further else 0.45)
-        try:
-            carried.append(bench.carried(one, LAST if carried else 2 * LAST))
-        except InputError:
-            continue
+        fits: list[Outcome | None] = []
+        with suppress(InputError):
+            fits.append(bench.carried(one, LAST if carried else 2 * LAST))
+        if one.effects[-1].name in USUAL:  # with start states that hold without it
+            fits.append(attempt(bench, one.effects, base, LAST))
+        known = [fit for fit in fits if fit is not None]
+        carried += [_elsewhere(bench, min(known, key=lambda fit: fit.rss), limits)] if known else []
     return carried
+
+
+def _elsewhere(bench: Bench, one: Outcome, limits: Thresholds) -> Outcome:
+    """Return a fit from wherever it ends best, where a usual effect makes many minima and more than noise is left."""
+    if one.effects[-1].name not in USUAL or is_noise(bench, one, limits.equation_astray, limits):
+        return one
+    return min(swept(bench, one), key=lambda other: other.rss)
 
 
 def _round(
@@ -233,12 +261,20 @@ def _pruned(
         tried += smaller
         smaller.sort(key=lambda one: penalised(one, rows, limits))
         whole = bench.held_out_error(chosen, True)
-        less = next((one for one in smaller if not (_predicts(bench, one, whole, limits)
-                     and _is_needed(bench, one, chosen, own, rows, limits))), None)  # fmt: skip
+        less = next((one for one in smaller if not ((_predicts(bench, one, whole, limits)
+                     and _is_needed(bench, one, chosen, own, rows, limits))
+                     or (_lacks_usual(one, chosen) and _is_usual(bench, one, chosen, rows, limits)))),
+                    None)  # fmt: skip
         if less is None:
             break
         chosen = less
     return chosen
+
+
+def _lacks_usual(smaller: Outcome, larger: Outcome) -> bool:
+    """Whether what a hypothesis has beyond another one is a usual effect."""
+    have = {(e.name, place_of(e)) for e in smaller.effects}
+    return any(e.name in USUAL and (e.name, place_of(e)) not in have for e in larger.effects)
 
 
 def _is_needed(bench: Bench, before: Outcome, after: Outcome, own: int, rows: float, limits: Thresholds) -> bool:
@@ -324,7 +360,7 @@ def _fitted(
         if not outer and not is_settled(bench, one, best, limits):
             further = attempt(bench, one.effects, one, FIRST)
             one = further if further is not None and further.rss < one.rss else one
-        found.append(one)
+        found.append(_elsewhere(bench, one, limits))
     return found
 
 

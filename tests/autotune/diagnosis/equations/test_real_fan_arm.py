@@ -7,28 +7,41 @@ from pathlib import Path
 import pytest
 
 from autotune.diagnosis.equations import diagnose_equations
+from autotune.equations.model import EquationModel
 from autotune.equations.read import equations_of
 from autotune.recording import Recording, read_recording
 
 
-@pytest.mark.slow
-def test_dry_friction_is_what_thrust_and_gravity_leave_out(shared: Path) -> None:
-    """The nominal thrust is twice what it is, so that the arm would go over the top; the rig leaves more than noise."""
-    file = shared / "real_cases" / "case_04" / "fit.csv"
+def recording(shared: Path, name: str) -> Recording:
+    """Return every second row of a recording of the arm."""
+    file = shared / "real_cases" / "case_04" / f"{name}.csv"
     if not file.exists():
         pytest.skip("no real recordings beside the checkout")
     r = read_recording(file)
-    few = Recording(t=r.t[::2], u=r.u[::2], y=r.y[::2], name="fan arm")
+    return Recording(t=r.t[::2], u=r.u[::2], y=r.y[::2], name=name)
+
+
+def arm(acceleration: str, **numbers: object) -> EquationModel:
+    """Return the arm's equations: a fan that follows its command, and what it and the arm's weight do."""
     content = {
         "name": "fan arm", "input": [{"column": "u"}], "output": {"value": "theta", "unit": "rad"},
         "state": [
             {"name": "n", "kind": "other", "derivative": "(u - n)/T"},
             {"name": "theta", "unit": "rad", "kind": "position", "derivative": "omega"},
-            {"name": "omega", "kind": "speed", "of": "theta", "derivative": "k*n^2 - c*omega - G*sin(theta)"},
+            {"name": "omega", "kind": "speed", "of": "theta", "derivative": acceleration},
         ],
-        "parameters": {"T": 0.0574, "k": 73.0, "c": {"value": 3.5, "spread": 0.5}, "G": 165.0},
+        "parameters": {"T": 0.0574, "c": {"value": 3.5, "spread": 0.5}, "G": 165.0, **numbers},
     }  # fmt: skip
-    found = diagnose_equations(equations_of(content, "arm.toml"), [few])
+    return equations_of(content, "arm.toml")
+
+
+WITH_GRAVITY = arm("k*n^2 - c*omega - G*sin(theta)", k=73.0)
+
+
+@pytest.mark.slow
+def test_dry_friction_is_what_thrust_and_gravity_leave_out(shared: Path) -> None:
+    """The nominal thrust is twice what it is, so that the arm would go over the top; the rig leaves more than noise."""
+    found = diagnose_equations(WITH_GRAVITY, [recording(shared, "fit")])
     assert found.verdict == "effect"
     assert [(e.name, e.state) for e in found.effects] == [("plant.coulomb_friction", "omega")]
     assert found.effects[0].parameters["level"].value == pytest.approx(1.6, rel=0.15)
