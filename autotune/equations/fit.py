@@ -131,11 +131,11 @@ def retune(
     lengths = [longest / count for count in counts or [1]]
     found: Fitted | None = None
     for k, length in enumerate(lengths):
-        z, known = (None, None) if found is None else (found.z, found.windows)
+        z = None if found is None else found.z
         last = length >= whole
         try:
             new = fit(
-                compiled, recordings, z=z, free=free, known=known, horizon_s=None if last else length,
+                compiled, recordings, z=z, free=free, horizon_s=None if last else length,
                 iterations=30 if k == len(lengths) - 1 else 12,
                 progress=lambda what, share, k=k: progress(what, (k + share) / len(lengths)),
             )  # fmt: skip

@@ -123,7 +123,8 @@ def fitted_starts(
     least : int
         Rows that it is fitted to at least.
     known : Windows, optional
-        Where an earlier fit knows the state, on its own windows: a window that starts within one takes it over.
+        Where an earlier fit knows the state, on its own windows: a window that starts within one takes it over. Its
+        numbers are worth following, so that others begin where the readings lead, see :func:`_followed`.
 
     Returns
     -------
@@ -154,7 +155,10 @@ def fitted_starts(
         found.append(window.states[0])
         if k + 1 < starts.size:
             whole = replace(window, stops=np.array([b]))
-            x = _followed(compiled, parameters, drive, y, good, whole, scales, iterations)
+            run = simulate(compiled, parameters, drive, whole.states, starts=whole.starts, stops=whole.stops)
+            x = run.ends[0] if np.all(np.isfinite(run.ends)) else x
+            if known is not None and _strays(run.y, y, good, whole):
+                x = _followed(compiled, parameters, drive, y, good, whole, scales, iterations)
     return Windows(starts=starts, stops=stops, states=np.array(found))
 
 
@@ -171,24 +175,29 @@ def _state_at(
     return np.array(x) if np.all(np.isfinite(x)) else None
 
 
+def _hop(window: Windows) -> int:
+    return max(int(window.stops[0] - window.starts[0]) // HOPS, LEAST)
+
+
+def _strays(simulated: FloatArray, y: FloatArray, good: BoolArray, window: Windows) -> bool:
+    """Whether a simulation ends much further from the readings than it begins, or does not reach its end."""
+    a, b, hop = int(window.starts[0]), int(window.stops[0]), _hop(window)
+    error = np.where(good[a:b], y[a:b] - simulated[a:b], 0.0) ** 2
+    return not float(np.mean(error[-hop:])) <= STRAYS**2 * float(np.mean(error[:hop]))
+
+
 def _followed(
     compiled: Compiled, parameters: FloatArray, drive: Drive, y: FloatArray, good: BoolArray, window: Windows,
     scales: FloatArray, iterations: int,
 ) -> FloatArray:  # fmt: skip
-    """Return the state at a window's end: where a simulation leads that keeps to the readings, else found on the way.
+    """Return the state at a window's end, found anew from the readings part by part.
 
     A simulation that strays ends on another swing than the readings, and the next window would begin there.
     """
-    a, b = int(window.starts[0]), int(window.stops[0])
-    run = simulate(compiled, parameters, drive, window.states, starts=window.starts, stops=window.stops)
-    hop = max((b - a) // HOPS, LEAST)
-    error = np.where(good[a:b], y[a:b] - run.y[a:b], 0.0) ** 2
-    if run.is_complete and not np.mean(error[-hop:]) > STRAYS**2 * np.mean(error[:hop]):
-        return np.array(run.ends[0])
-    x = window.states[0]
-    for at in range(a, b, hop):
+    b, hop, x = int(window.stops[0]), _hop(window), window.states[0]
+    for at in range(int(window.starts[0]), b, hop):
         one = Windows(starts=np.array([at]), stops=np.array([min(at + hop, b)]), states=x[None, :])
-        if at > a:
+        if at > window.starts[0]:
             one = _fitted(compiled, parameters, drive, y, good, one, scales, np.arange(x.size), iterations)
         ends = simulate(compiled, parameters, drive, one.states, starts=one.starts, stops=one.stops).ends[0]
         x = ends if np.all(np.isfinite(ends)) else x
