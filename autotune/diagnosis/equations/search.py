@@ -5,7 +5,7 @@ The steps of one search: the file is a little longer than others.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Sequence, Set
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
@@ -32,7 +32,7 @@ from autotune.diagnosis.fitting.noise import Noise
 from autotune.diagnosis.thresholds import IN_USE, Thresholds
 from autotune.errors import InputError
 from autotune.models import Effect
-from autotune.progress import Progress
+from autotune.progress import Progress, quiet
 
 #: Iterations of a fit that shows whether more are worth it, of a first fit, of the best ones, and of the chosen one.
 LOOK, FIRST, LAST, FINAL = 2, 4, 8, 30
@@ -195,7 +195,22 @@ def _leading(
             fits.append(attempt(bench, one.effects, base, LAST))
         known = [fit for fit in fits if fit is not None]
         carried += [_elsewhere(bench, min(known, key=lambda fit: fit.rss), limits)] if known else []
-    return carried
+    return [*carried, *_usual_beside(bench, base, carried, without, limits)]
+
+
+def _usual_beside(
+    bench: Bench, base: Outcome, found: Sequence[Outcome], without: Sequence[str], limits: Thresholds
+) -> list[Outcome]:
+    """Return fits to all rows with the usual effects that a part did not lead to, where more than noise is left.
+
+    A part where a rig's own error is largest may say nothing of them.
+    """
+    if is_noise(bench, min([base, *found], key=lambda one: one.rss), limits.equation_astray, limits):
+        return []
+    have = {(one.effects[-1].name, place_of(one.effects[-1])) for one in found}
+    usual = [e for _, e in screened(bench, base, without, quiet, limits, USUAL) if (e.name, place_of(e)) not in have]
+    fits = (attempt(bench, (*base.effects, effect), base, LAST) for effect in usual)
+    return [_elsewhere(bench, one, limits) for one in fits if one is not None]
 
 
 def _elsewhere(bench: Bench, one: Outcome, limits: Thresholds) -> Outcome:
@@ -392,9 +407,23 @@ def _lengthened(bench: Bench, fits: Sequence[Outcome], limits: Thresholds) -> li
 
 
 def screened(
-    bench: Bench, base: Outcome, without: Sequence[str], progress: Progress, limits: Thresholds = IN_USE
-) -> list[tuple[float, Effect]]:
+    bench: Bench, base: Outcome, without: Sequence[str], progress: Progress, limits: Thresholds = IN_USE,
+    only: Set[str] = frozenset(),
+) -> list[tuple[float, Effect]]:  # fmt: skip
     """Return for every effect and place the decrease that first order predicts, with the values that bring it.
+
+    Parameters
+    ----------
+    bench, base : Bench, Outcome
+        The model on its recordings, and the fit beside which effects are tried.
+    without : sequence of str
+        Effects that are left out.
+    progress : callable
+        Told what is being done and the share done.
+    limits : Thresholds
+        What decides.
+    only : set of str
+        Effects that are tried; all where it is empty.
 
     Returns
     -------
@@ -405,6 +434,7 @@ def screened(
     present = {(effect.name, place_of(effect)) for effect in base.effects}
     tried = trials(bench.model, signals, without, bench.is_closed)
     tried += bench.periodic(base, signals) if "environment.periodic_load" not in without else []
+    tried = [one for one in tried if not only or one.effect.name in only]
     all_trials = [one for one in tried if (one.effect.name, one.place) not in present]
     basis, e = bench.explained(base), bench.without_starts(base, base.residual)
     e = e - basis @ (basis.T @ e)
