@@ -13,7 +13,16 @@ import numpy as np
 
 from autotune.arrays import FloatArray
 from autotune.diagnosis.equations.bench import Bench, Outcome
-from autotune.diagnosis.equations.candidates import USUAL, Trial, is_plainer, place_of, plainer, trials
+from autotune.diagnosis.equations.candidates import (
+    USUAL,
+    Trial,
+    gravity,
+    is_gravity,
+    is_plainer,
+    place_of,
+    plainer,
+    trials,
+)
 from autotune.diagnosis.equations.dry_friction import settled_among, swept, with_force
 from autotune.diagnosis.equations.scores import (
     attempt,
@@ -113,7 +122,7 @@ def search(bench: Bench, without: Sequence[str], progress: Progress, limits: Thr
         larger = _larger(bench, chosen, new, tried, len(retuned.effects), rows, limits)
         if larger is None:
             break
-        chosen = larger
+        chosen = _simplified(bench, larger, retuned, tried, rows, limits)
     chosen = _pruned(bench, chosen, len(retuned.effects), tried, rows, limits)
     if chosen is not retuned and not is_noise(bench, chosen, limits.equation_noise, limits):
         chosen = _finished(bench, chosen, retuned, rows)
@@ -121,6 +130,29 @@ def search(bench: Bench, without: Sequence[str], progress: Progress, limits: Thr
     return Searched(
         nominal=nominal, retuned=retuned, chosen=chosen, tried=tuple(tried), noise=noise, rows=rows, limits=limits
     )
+
+
+def _simplified(
+    bench: Bench, one: Outcome, retuned: Outcome, tried: list[Outcome], rows: float, limits: Thresholds
+) -> Outcome:
+    """Return a hypothesis with the effects before its last one in their plainest form where more is not worth it.
+
+    A torque of free period and phase may have stood for gravity and a bend: beside the bend gravity is enough.
+    """
+    for i in range(len(retuned.effects), len(one.effects) - 1):
+        less = plainer(one.effects[i])
+        if less is None:
+            continue
+        effects = [*one.effects[:i], less, *one.effects[i + 1 :]]
+        fits = [attempt(bench, effects, one, LAST)]
+        if is_gravity(less):  # a spring that a bent torque has moved away from is far from where gravity leaves it
+            effects[i] = gravity(less, abs(less.parameters["amplitude"].value))
+            fits.append(attempt(bench, effects, retuned, FINAL))
+        simple = min((fit for fit in fits if fit is not None), key=lambda fit: fit.rss, default=None)
+        if simple is not None:
+            tried.append(simple)
+            one = one if is_worth(simple, one, rows, limits) else simple
+    return one
 
 
 def _finished(bench: Bench, chosen: Outcome, retuned: Outcome, rows: float) -> Outcome:

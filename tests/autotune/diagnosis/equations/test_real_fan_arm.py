@@ -12,13 +12,13 @@ from autotune.equations.read import equations_of
 from autotune.recording import Recording, read_recording
 
 
-def recording(shared: Path, name: str) -> Recording:
-    """Return every second row of a recording of the arm."""
+def recording(shared: Path, name: str, every: int = 2) -> Recording:
+    """Return every second row, or as many, of a recording of the arm."""
     file = shared / "real_cases" / "case_04" / f"{name}.csv"
     if not file.exists():
         pytest.skip("no real recordings beside the checkout")
     r = read_recording(file)
-    return Recording(t=r.t[::2], u=r.u[::2], y=r.y[::2], name=name)
+    return Recording(t=r.t[::every], u=r.u[::every], y=r.y[::every], name=name)
 
 
 def arm(acceleration: str, **numbers: object) -> EquationModel:
@@ -37,6 +37,9 @@ def arm(acceleration: str, **numbers: object) -> EquationModel:
 
 WITH_GRAVITY = arm("k*n^2 - c*omega - G*sin(theta)", k=73.0)
 
+#: Its tangent at the middle of the range: neither the fan's square nor gravity's sine is in it.
+LINEAR = arm("k*(n - u0) - c*omega - G*theta", k=100.0, u0=0.68)
+
 
 @pytest.mark.slow
 def test_dry_friction_is_what_thrust_and_gravity_leave_out(shared: Path) -> None:
@@ -48,3 +51,18 @@ def test_dry_friction_is_what_thrust_and_gravity_leave_out(shared: Path) -> None
     nominal, retuned, extended, _ = found.errors
     assert nominal > 1.0  # of the spread of y: the nominal arm goes over the top
     assert extended < 0.75 * retuned < 0.1
+
+
+@pytest.mark.slow
+def test_the_tangent_without_gravity_says_the_same_gravity_and_friction(shared: Path) -> None:
+    """The spring comes to nothing beside gravity, which is as with gravity in the nominal: 195 to 198 rad/s^2."""
+    first, second = (recording(shared, name, every=1) for name in ("fit", "test"))
+    from_gravity = diagnose_equations(WITH_GRAVITY, [first])
+    from_tangent = diagnose_equations(LINEAR, [first, second])
+    assert from_gravity.verdict == from_tangent.verdict == "effect"
+    (friction,) = from_gravity.effects
+    others = {e.name: e.parameters for e in from_tangent.effects}
+    assert others["plant.sine_torque"]["amplitude"].value == pytest.approx(196.0, rel=0.05)
+    told, again = friction.parameters["level"], others["plant.coulomb_friction"]["level"]
+    assert abs(told.value - again.value) < told.sd + again.sd
+    assert from_tangent.errors[2] < 0.4 * from_tangent.errors[1]
