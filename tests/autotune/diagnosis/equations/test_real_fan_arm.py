@@ -54,6 +54,7 @@ def test_dry_friction_is_what_thrust_and_gravity_leave_out(shared: Path) -> None
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(900)
 def test_the_tangent_without_gravity_says_the_same_gravity_and_friction(shared: Path) -> None:
     """The spring comes to nothing beside gravity, which is as with gravity in the nominal: 195 to 198 rad/s^2."""
     first, second = (recording(shared, name, every=1) for name in ("fit", "test"))
