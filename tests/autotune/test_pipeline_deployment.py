@@ -72,7 +72,7 @@ class Line:
         return ((0.0, frame),)
 
     def rig(self) -> Any:
-        return rig_of(tcp_settings(self.relay.port, APART, timeout_s=0.1, retries=0))
+        return rig_of(tcp_settings(self.relay.port, APART, timeout_s=0.5, retries=0))
 
     @property
     def gains(self) -> PIDController:
@@ -167,7 +167,7 @@ def test_ctrl_c_between_the_gains_leaves_the_old_ones(line: Line, tmp_path: Path
 
 def test_a_second_ctrl_c_waits_until_the_old_gains_are_back(line: Line, tmp_path: Path) -> None:
     line.times, line.seen = 3, lambda: os.kill(os.getpid(), signal.SIGINT)  # the third hits the writing back
-    rig = rig_of(tcp_settings(line.relay.port, APART, timeout_s=0.1, retries=3))
+    rig = rig_of(tcp_settings(line.relay.port, APART, timeout_s=0.5, retries=3))
     with pytest.raises(OperatorStop, match="the old gains are in place again"):
         deploy(rig, NEW, tmp_path / "journal.jsonl", agree=agreed, try_out=None)
     assert line.gains == OLD
