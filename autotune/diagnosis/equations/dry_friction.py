@@ -79,7 +79,8 @@ def settled_among(bench: Bench, fits: Sequence[Outcome], rows: float, ratio: flo
     Notes
     -----
     Minima are told apart where the profile of the likelihood is one standard deviation worse: rows ln(squared error /
-    the least) > max(ratio, 1). A level's standard deviation reaches at least to the others.
+    the least) > max(ratio, 1). A level's standard deviation reaches at least to the others. Where there
+    are several, the held-out error has told which is taken, and as the error of what was taken it is a little too good.
     """
     least = min(one.rss for one in fits)
     near = [one for one in fits if rows * np.log(one.rss / least) < max(ratio, 1.0)]

@@ -77,3 +77,8 @@ def attempt(bench: Bench, effects: Sequence[Effect], start: Outcome, iterations:
         return bench.fitted(effects, start, iterations)
     except InputError:
         return None
+
+
+def least(fits: Sequence[Outcome | None]) -> Outcome | None:
+    """Return the fit that leaves least; nothing where all ran away."""
+    return min((one for one in fits if one is not None), key=lambda one: one.rss, default=None)

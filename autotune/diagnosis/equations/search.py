@@ -5,23 +5,20 @@ The steps of one search: the file is a little longer than others.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence, Set
+from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from autotune.arrays import FloatArray
 from autotune.diagnosis.equations.bench import Bench, Outcome
 from autotune.diagnosis.equations.candidates import (
     USUAL,
-    Trial,
     gravity,
     is_gravity,
     is_plainer,
     place_of,
     plainer,
-    trials,
 )
 from autotune.diagnosis.equations.dry_friction import settled_among, swept, with_force
 from autotune.diagnosis.equations.scores import (
@@ -31,11 +28,12 @@ from autotune.diagnosis.equations.scores import (
     is_settled,
     is_slow,
     is_worth,
+    least,
     noise_of,
     penalised,
     variance_ratio,
 )
-from autotune.diagnosis.equations.sought import scaled
+from autotune.diagnosis.equations.screening import screened
 from autotune.diagnosis.evidence.stretches import advantage
 from autotune.diagnosis.fitting.noise import Noise
 from autotune.diagnosis.thresholds import IN_USE, Thresholds
@@ -81,7 +79,7 @@ class Searched:
 
     def variance_ratio(self, one: Outcome) -> float:
         """Return the residual's variance in units of the noise's."""
-        return one.rss / one.residual.size / max(self.noise.total_sd**2, 1e-300)
+        return variance_ratio(one, self.noise)
 
 
 def search(bench: Bench, without: Sequence[str], progress: Progress, limits: Thresholds = IN_USE) -> Searched:
@@ -148,7 +146,7 @@ def _simplified(
         if is_gravity(less):  # a spring that a bent torque has moved away from is far from where gravity leaves it
             effects[i] = gravity(less, abs(less.parameters["amplitude"].value))
             fits.append(attempt(bench, effects, retuned, FINAL))
-        simple = min((fit for fit in fits if fit is not None), key=lambda fit: fit.rss, default=None)
+        simple = least(fits)
         if simple is not None:
             tried.append(simple)
             one = one if is_worth(simple, one, rows, limits) else simple
@@ -165,7 +163,7 @@ def _finished(bench: Bench, chosen: Outcome, retuned: Outcome, rows: float) -> O
     fits.append(attempt(bench, [with_force(effect, 0.5) for effect in chosen.effects], retuned, FINAL))
     with suppress(InputError):
         fits.append(bench.carried(chosen, FINAL))
-    best = min((one for one in fits if one is not None), key=lambda one: one.rss)
+    best = least(fits) or chosen
     return settled_among(bench, swept(bench, best), rows, variance_ratio(best, noise_of(bench, best)))
 
 
@@ -225,8 +223,8 @@ def _leading(
             fits.append(bench.carried(one, LAST if carried else 2 * LAST))
         if one.effects[-1].name in USUAL:  # with start states that hold without it
             fits.append(attempt(bench, one.effects, base, LAST))
-        known = [fit for fit in fits if fit is not None]
-        carried += [_elsewhere(bench, min(known, key=lambda fit: fit.rss), limits)] if known else []
+        best = least(fits)
+        carried += [] if best is None else [_elsewhere(bench, best, limits)]
     return [*carried, *_usual_beside(bench, base, carried, without, limits)]
 
 
@@ -249,7 +247,7 @@ def _elsewhere(bench: Bench, one: Outcome, limits: Thresholds) -> Outcome:
     """Return a fit from wherever it ends best, where a usual effect makes many minima and more than noise is left."""
     if one.effects[-1].name not in USUAL or is_noise(bench, one, limits.equation_astray, limits):
         return one
-    return min(swept(bench, one), key=lambda other: other.rss)
+    return least(swept(bench, one)) or one
 
 
 def _round(
@@ -436,85 +434,3 @@ def _lengthened(bench: Bench, fits: Sequence[Outcome], limits: Thresholds) -> li
         except InputError:
             continue
     return found
-
-
-def screened(
-    bench: Bench, base: Outcome, without: Sequence[str], progress: Progress, limits: Thresholds = IN_USE,
-    only: Set[str] = frozenset(),
-) -> list[tuple[float, Effect]]:  # fmt: skip
-    """Return for every effect and place the decrease that first order predicts, with the values that bring it.
-
-    Parameters
-    ----------
-    bench, base : Bench, Outcome
-        The model on its recordings, and the fit beside which effects are tried.
-    without : sequence of str
-        Effects that are left out.
-    progress : callable
-        Told what is being done and the share done.
-    limits : Thresholds
-        What decides.
-    only : set of str
-        Effects that are tried; all where it is empty.
-
-    Returns
-    -------
-    list of (decrease of the sum of squares, effect)
-        The best first; an effect at a place stands once, and once more in its plainer form.
-    """
-    signals = bench.signals(base)
-    present = {(effect.name, place_of(effect)) for effect in base.effects}
-    tried = trials(bench.model, signals, without, bench.is_closed)
-    tried += bench.periodic(base, signals) if "environment.periodic_load" not in without else []
-    tried = [one for one in tried if not only or one.effect.name in only]
-    all_trials = [one for one in tried if (one.effect.name, one.place) not in present]
-    basis, e = bench.explained(base), bench.without_starts(base, base.residual)
-    e = e - basis @ (basis.T @ e)
-    best: dict[tuple[str, str, bool], tuple[float, Effect]] = {}
-    directions = bench.each(lambda trial: _direction(bench, base, trial, basis), all_trials)
-    for k, (trial, d) in enumerate(zip(all_trials, directions, strict=True)):
-        progress("trying every effect", k / len(all_trials))
-        if d is None:
-            continue
-        gain, factor = predicted(e, d, trial)
-        key = (trial.effect.name, trial.place, plainer(trial.effect) is None)
-        if gain > 0.0 and (key not in best or gain > best[key][0]):
-            best[key] = (gain, scaled(trial, factor))
-    ranked = sorted(best.values(), key=lambda pair: -pair[0])
-    least = limits.equation_faint * ranked[0][0] if ranked else 0.0
-    return [pair for pair in ranked if pair[0] >= least]
-
-
-def _direction(bench: Bench, base: Outcome, trial: Trial, basis: FloatArray) -> FloatArray | None:
-    """Return how readings change with a trial beyond what numbers and starts explain."""
-    for shrink in (1.0, 0.1):
-        one = trial if shrink == 1.0 else replace(trial, effect=scaled(trial, shrink))
-        try:
-            d = bench.with_trial(base, one.effect)
-        except InputError:
-            return None
-        if d is not None:
-            d = bench.without_starts(base, d) / shrink
-            return np.asarray(d - basis @ (basis.T @ d))
-        if not trial.scaled:
-            return None
-    return None
-
-
-def predicted(e: FloatArray, d: FloatArray, trial: Trial) -> tuple[float, float]:
-    """Return the decrease predicted along a direction, and the factor of its amplitude, or of the whole of it."""
-    size = float(d @ d)
-    if size <= 1e-12 * float(e @ e):
-        return 0.0, 1.0
-    factor = float(e @ d) / size
-    if trial.scaled:
-        name = trial.effect.name
-        signed = name.startswith(("environment", "actuator", "sensor")) or name in (
-            "plant.sine_torque", "plant.cubic_stiffness", "plant.leak",
-        )  # fmt: skip
-        if factor <= 0.0 and not signed:
-            return 0.0, 1.0
-        factor = float(np.clip(factor, -60.0, 60.0))
-        return 2.0 * factor * float(e @ d) - factor**2 * size, factor
-    factor = float(np.clip(factor, 0.0, 1.5))
-    return 2.0 * factor * float(e @ d) - factor**2 * size, 1.0
