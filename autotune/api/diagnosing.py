@@ -20,7 +20,7 @@ def diagnosed(model: Any, recordings: Sequence[Recording], controller: Controlle
     given = _model(model)
     if isinstance(given, Model):
         return diagnose(given, recordings, controller, **settings)
-    return diagnose_equations(given, recordings, **settings)
+    return diagnose_equations(given, recordings, controller=controller, **settings)
 
 
 def simulated(model: Any, recording: Recording, horizon_s: float | None) -> FloatArray:

@@ -98,7 +98,9 @@ def _swings(scan: Scan) -> list[tuple[float, ...]]:
     """Return periodic loads at the strongest lines of the residual; far above the plant's corner no load shows."""
     duration = max(scan.durations_s)
     frequencies, power = scan.lines_over_time()
-    highest = min(_FASTEST_SAMPLED / scan.sizes.dt_s, _FASTEST_LAGGED / scan.slowest_lag_s)
+    highest = _FASTEST_SAMPLED / scan.sizes.dt_s
+    if scan.slowest_lag_s > 0.0:  # an integrator has no corner
+        highest = min(highest, _FASTEST_LAGGED / scan.slowest_lag_s)
     use = (frequencies >= 1.0 / duration) & (frequencies <= highest)
     frequencies, power = frequencies[use], power[use]
     if frequencies.size < 3:

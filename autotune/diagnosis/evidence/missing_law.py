@@ -230,11 +230,15 @@ def _bins(
     tried = []
     for bins in BINS:
         members = list(_members(signal, counts, _edges(signal[counts], bins, line.line.stage == "friction")))
+        if not members:  # steps that the signal stands on between a few scattered values fill no bin alone
+            continue
         deviation, error = _traced_back(line, [np.where(m, factor, 0.0) for m in members])
         tried.append((members, deviation, error))
         if np.mean(error < TELLS * size) >= INFORMATIVE:
             break
     else:
+        if not tried:
+            return none, none, none, np.zeros(0, dtype=np.int64)
         members, deviation, error = min(tried, key=lambda one: float(np.median(one[2])))
     tells = error < WIDEST * size
     at = np.array([signal[m & counts].mean() for m in members])

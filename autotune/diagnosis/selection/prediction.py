@@ -44,6 +44,9 @@ def signal_sizes(base: Fit, data: Data) -> SignalSizes:
     signals = np.concatenate(base.signals)
     rates = np.abs(np.linalg.eigvals(sim.chain.A))
     rates = rates[rates > 1e-9 * max(float(rates.max()), 1e-12)]
+    duration = max(r.duration_s for r in data.driving)
+    # an integrator alone has no time constant: half way, in logarithms, between a sample and a recording
+    lag = 1.0 / float(rates.min()) if rates.size else float(np.sqrt(data.sample_times[0] * duration))
     tiny = 1e-12
 
     def largest(values: FloatArray) -> float:
@@ -66,9 +69,9 @@ def signal_sizes(base: Fit, data: Data) -> SignalSizes:
         x_offset=sim.y_offset,
         f_peak=max(float(np.nanmax(np.abs(s[:, 3]))) for s in base.signals),
         gain=float(sim.chain.gains[0]),
-        lag_s=1.0 / float(rates.min()),
+        lag_s=lag,
         dt_s=data.sample_times[0],
-        duration_s=max(r.duration_s for r in data.driving),
+        duration_s=duration,
         levels=sim.chain.levels,
         turn=TURNS.get(base.parametrisation.model.output.unit, 0.0) if sim.chain.has_spring else 0.0,
         static=sim.chain.is_static,

@@ -191,3 +191,22 @@ def test_a_model_with_its_operating_point_simulates_the_recording():
     )  # fmt: skip
     simulated = at.simulate(model, oven)
     assert np.std(simulated - oven.y) < 0.05
+
+
+def test_a_stated_control_law_reaches_the_diagnosis_of_equations(tmp_path):
+    file, gain = tmp_path / "tank.toml", 2.0
+    file.write_text(
+        'name = "tank"\n[[input]]\ncolumn = "u"\n[output]\nvalue = "h"\n[[state]]\nname = "h"\nkind = "level"\n'
+        'derivative = "(K*u - h)/T"\n[parameters.K]\nvalue = 1.0\n[parameters.T]\nvalue = 5.0\n'
+    )
+    random, t = np.random.default_rng(3), 0.5 * np.arange(600)
+    r, u, y, h = np.repeat(random.normal(1.0, 0.3, 30), 20), np.empty(600), np.empty(600), 0.0
+    for k in range(600):
+        y[k] = h + 0.002 * random.normal()
+        u[k] = gain * (r[k] - y[k])
+        h += (u[k] - h) * (1.0 - np.exp(-0.1))
+    recording = at.read({"t": t, "u": u, "y": y, "r": r})
+    other = at.TransferFunction(num=(3.0 * gain,), den=(1.0,))
+    assert "controller.law" in [e["name"] for e in at.diagnose(file, recording, other).as_json()["effects"]]
+    same = at.diagnose(file, recording, at.TransferFunction(num=(gain,), den=(1.0,)))
+    assert same.verdict == "none"

@@ -85,6 +85,18 @@ def test_intervals_of_the_retuned_gain_cover_the_truth_in_closed_loop() -> None:
     assert 25 <= inside <= 30  # 95 % of 30 are 28.5; fewer than 25 have a chance of 0.3 %
 
 
+def test_a_plant_that_only_integrates_has_no_lag_and_is_diagnosed() -> None:
+    """No time constant tells which lags and loads to try."""
+    random = np.random.default_rng(1)
+    t, u = 0.1 * np.arange(600), np.repeat(random.normal(size=30), 20)
+    acts = u - np.clip(u, -0.4, 0.4)
+    y = np.concatenate([[0.0], np.cumsum(0.1 * acts)[:-1]]) + 0.01 * random.normal(size=600)
+    block = Block(name="tank", place="plant", dynamics=TransferFunction(num=(1.0,), den=(1.0, 0.0)))
+    model = Model(name="tank", input=Port(unit="V"), output=Port(unit="cm"), blocks=(block,))
+    found = diagnose(model, [Recording(t=t, u=u, y=y)])
+    assert [effect.name for effect in found.effects] == ["actuator.dead_zone"]
+
+
 def test_a_fit_with_nothing_free_but_the_start_states_leaves_the_numbers_alone() -> None:
     r = rig(7, rows=600)
     data, result = prepare(servo(), [r], inspect([r])[0])

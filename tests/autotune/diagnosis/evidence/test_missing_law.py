@@ -135,3 +135,14 @@ def test_the_number_of_a_recording_goes_with_a_load_that_comes_in_it_alone() -> 
     assert law is not None
     assert np.all(law.acts[0] == 0.0)
     assert law.acts[1].max() == pytest.approx(0.2)
+
+
+def test_a_signal_whose_rows_fill_no_bin_has_a_law_without_bins() -> None:
+    r = servo_recording(6, rows=90)
+    data, _ = prepare(servo_model(), [r], [np.isfinite(r.y)])
+    p = parametrise(servo_model(), [effect_with("plant.quadratic_drag", [DRAG])], 1.0, 0.02)
+    law = missing_law(fit(p, data, free=np.zeros(p.centre.size, dtype=bool)), data, "plant.quadratic_drag")
+    assert law is not None
+    (branch,) = law.branches
+    assert branch.x.size > 0
+    assert np.all(branch.rows >= 20)
