@@ -1,4 +1,4 @@
-"""Array types that every room uses in its signatures."""
+"""Array types that every room uses in its signatures, and deviations that rounding leaves whole."""
 
 from __future__ import annotations
 
@@ -6,8 +6,32 @@ from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
 
 FloatArray: TypeAlias = NDArray[np.float64]
 ComplexArray: TypeAlias = NDArray[np.complex128]
 BoolArray: TypeAlias = NDArray[np.bool_]
 IntArray: TypeAlias = NDArray[np.int64]
+
+
+def deviations_beside_prior(J: FloatArray) -> FloatArray:
+    """Return standard deviations of numbers from derivatives in units of the noise, beside a prior of deviation 1.
+
+    Parameters
+    ----------
+    J : (N, p) array
+        Derivatives of the whitened residual by every number, in units of what is believed of it.
+
+    Returns
+    -------
+    (p,) array
+        Roots of the diagonal of (J' J + I)^-1: between 0 and 1.
+
+    Notes
+    -----
+    J' J + I = R' R for the triangular factor R of [J; I], so the diagonal is a sum of squares: an inverse of the
+    product loses it to rounding where one number says a million times more than another, and may leave it negative.
+    """
+    R = np.linalg.qr(np.vstack([J, np.eye(J.shape[1])]), mode="r")
+    rows = solve_triangular(R, np.eye(J.shape[1]))
+    return np.asarray(np.linalg.norm(rows, axis=1))

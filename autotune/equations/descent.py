@@ -14,7 +14,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from autotune.arrays import BoolArray, FloatArray, IntArray
+from autotune.arrays import BoolArray, FloatArray, IntArray, deviations_beside_prior
 from autotune.equations.fit_data import FitData, Fitted
 from autotune.equations.parameter_scales import linear, slopes_of, values_of
 from autotune.equations.sensitivity import (
@@ -276,10 +276,9 @@ class Descent:
         if self._last is None:
             self._last = np.vstack([part for part, _ in self._derivatives()])
         J = self._last / self._sd
-        covariance = np.linalg.inv(J.T @ J + np.eye(self._which.size))
         per_z = np.abs(slopes_of(compiled, self._z))
         sd, whole = np.zeros(p.size), np.zeros((J.shape[0], p.size))
-        sd[self._which] = np.sqrt(np.diag(covariance)) * per_z[self._which]
+        sd[self._which] = deviations_beside_prior(J) * per_z[self._which]
         whole[:, self._which] = J
         simulated = tuple(
             simulate(compiled, p, one.drive, one.windows.states, starts=one.windows.starts, stops=one.windows.stops).y

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from autotune.arrays import BoolArray, FloatArray, IntArray
+from autotune.arrays import BoolArray, FloatArray, IntArray, deviations_beside_prior
 from autotune.diagnosis.equations.bench import Bench, Outcome
 from autotune.diagnosis.equations.candidates import Signals, Trial
 from autotune.diagnosis.equations.held_out import HELD_OUT
@@ -152,8 +152,7 @@ class ClosedBench:
         p = values_of(compiled, z)
         deviation = np.zeros(p.size)
         if which.size:
-            covariance = np.linalg.inv(J.T @ J / sd**2 + np.eye(which.size))
-            deviation[which] = np.sqrt(np.diag(covariance)) * np.abs(slopes_of(compiled, z))[which]
+            deviation[which] = deviations_beside_prior(J / sd) * np.abs(slopes_of(compiled, z))[which]
         whole = np.zeros((e.size, p.size))
         whole[:, which] = J / sd
         runs = self._simulated(compiled, effects, z)
