@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import os
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -23,6 +24,9 @@ from autotune.outputs import write_whole
 from autotune.text_files import read_toml
 
 Place: TypeAlias = Literal["actuator", "plant", "sensor"]
+#: What a speed is called, and its units.
+_SPEED = re.compile(r"speed|velocity|\brpm\b")
+_SPEED_UNIT = re.compile(r"^(m|mm|cm|km|rad|deg|°|rev|turns?)/(s|min|h)$|^rpm$|^1/min$")
 Hold: TypeAlias = Literal["zero", "linear"]
 
 #: Most blocks of a chain and most coefficients of a polynomial: far beyond any plant, far before work becomes a wait.
@@ -163,6 +167,12 @@ class Block:
     dynamics: TransferFunction
     output: str = ""
     unit: str = ""
+
+    @property
+    def is_speed(self) -> bool:
+        """Whether the output of a first-order block is a speed, by its name or unit."""
+        said = f"{self.name} {self.output}".lower()
+        return len(self.dynamics.den) == 2 and bool(_SPEED.search(said) or _SPEED_UNIT.search(self.unit.lower()))
 
 
 @dataclass(frozen=True, kw_only=True)

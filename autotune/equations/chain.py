@@ -8,9 +8,9 @@ from dataclasses import replace
 from typing import Any
 
 from autotune.equations.expressions import Call, Expression, Name, Number
-from autotune.equations.model import EquationModel, InputColumn, ModelParameter, State
+from autotune.equations.model import EquationModel, InputColumn, ModelParameter, State, StateKind
 from autotune.errors import InputError
-from autotune.models import Model, TransferFunction, model_of
+from autotune.models import Block, Model, TransferFunction, model_of
 
 
 def from_chain(model: Model, column: str = "u") -> EquationModel:
@@ -32,15 +32,15 @@ def from_chain(model: Model, column: str = "u") -> EquationModel:
     made = _Chain([column])
     signal: Expression = Name(column)
     for block in model.blocks:
-        signal = made.block(block.name, block.dynamics, signal)
+        signal = made.block(block.name, block.dynamics, signal, kind_of(block))
     command = InputColumn(
         column=column, unit=model.input.unit, hold=model.input.hold, offset=model.input.offset,
         delay_s=sum(block.dynamics.delay_s for block in model.blocks),
     )  # fmt: skip
     output = Call("+", (signal, Number(model.output.offset))) if model.output.offset else signal
     return EquationModel(
-        name=model.name, inputs=(command,), output=output, output_unit=model.output.unit, states=tuple(made.states),
-        parameters=tuple(made.parameters),
+        name=model.name, inputs=(command,), output=output, output_unit=model.output.unit,
+        states=with_speeds(made.states), parameters=tuple(made.parameters),
     )  # fmt: skip
 
 
@@ -83,12 +83,33 @@ def chain_with_inputs(content: Mapping[str, Any], where: str) -> EquationModel:
     for block in chain.blocks:
         if block.place == "plant" and not entered:
             entered, signal = True, _sum([signal, *at_plant])
-        signal = made.block(block.name, block.dynamics, signal)
+        signal = made.block(block.name, block.dynamics, signal, kind_of(block))
     output = _sum([signal, *at_output, *([Number(chain.output.offset)] if chain.output.offset else [])])
     return EquationModel(
         name=chain.name, inputs=tuple(columns), output=output, output_unit=chain.output.unit,
-        states=tuple(made.states), parameters=tuple(made.parameters), effects=chain.effects,
+        states=with_speeds(made.states), parameters=tuple(made.parameters), effects=chain.effects,
     )  # fmt: skip
+
+
+def kind_of(block: Block) -> StateKind:
+    """Return what the states of a block are, as far as it says so itself: a speed, or a level where a plant stores."""
+    if block.is_speed:
+        return "speed"
+    return "level" if block.place == "plant" else "other"
+
+
+def with_speeds(states: Sequence[State]) -> tuple[State, ...]:
+    """Return states that say which are positions and which the speeds of them: a position moves by a state alone."""
+    names = {one.name for one in states}
+    of = {tree.name: one.name for one in states if isinstance(tree := one.derivative, Name) and tree.name in names}
+    found = []
+    for one in states:
+        if one.name in of:
+            one = replace(one, kind="speed", of=of[one.name])
+        elif one.name in of.values():
+            one = replace(one, kind="position")
+        found.append(one)
+    return tuple(found)
 
 
 def _disturbance(table: Mapping[str, Any], where: str) -> tuple[InputColumn, TransferFunction, str]:
@@ -128,7 +149,7 @@ class _Chain:
         self.parameters: list[ModelParameter] = []
         self._names = {"t", "pi", *columns}
 
-    def block(self, name: str, dynamics: TransferFunction, signal: Expression) -> Expression:
+    def block(self, name: str, dynamics: TransferFunction, signal: Expression, kind: StateKind = "other") -> Expression:
         """Add a block that is driven by a signal, in controllable form, and return its output."""
         label = self._label(name)
         lead = dynamics.den[0]
@@ -137,7 +158,7 @@ class _Chain:
         order = len(den)
         num = [0.0] * (order + 1 - len(num)) + num
         if order == 1 and num[0] == 0.0 and den[0] != 0.0:
-            return self._lag(label, num[1] / den[0], 1.0 / den[0], signal)
+            return self._lag(label, num[1] / den[0], 1.0 / den[0], signal, kind)
         a = [self._number(f"{label}_a{order - 1 - i}", value) for i, value in enumerate(den)]
         b = [self._number(f"{label}_b{order - i}", value) for i, value in enumerate(num)]
         x = [f"{label}_{i + 1}" if order > 1 else label for i in range(order)]
@@ -145,17 +166,17 @@ class _Chain:
         for i, coefficient in enumerate(a):  # highest derivative = signal - a_(n-1) x_n - ... - a_0 x_1
             feed = _minus(feed, _times(coefficient, Name(x[order - 1 - i])))
         for i in range(order):
-            self.states.append(State(name=x[i], derivative=Name(x[i + 1]) if i + 1 < order else feed))
+            self.states.append(State(name=x[i], derivative=Name(x[i + 1]) if i + 1 < order else feed, kind=kind))
         parts = [_times(b[order - i], Name(x[i])) for i in range(order)]
         if num[0] != 0.0:  # direct: the highest derivative itself
             parts.append(_times(b[0], feed))
         used = [part for part in parts if part != Number(0.0)]
         return _sum(used) if used else Number(0.0)
 
-    def _lag(self, label: str, gain: float, time_constant: float, signal: Expression) -> Expression:
+    def _lag(self, label: str, gain: float, time_constant: float, signal: Expression, kind: StateKind) -> Expression:
         K, T = self._number(f"{label}_K", gain), self._number(f"{label}_T", time_constant)
         slope = Call("/", (Call("-", (_times(K, signal), Name(label))), T))
-        self.states.append(State(name=label, derivative=slope))
+        self.states.append(State(name=label, derivative=slope, kind=kind))
         return Name(label)
 
     def _number(self, name: str, value: float) -> Expression:

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from autotune.arrays import FloatArray
-from autotune.equations.expressions import Expression, Name, parse, substituted, to_text
+from autotune.equations.expressions import Call, Expression, Name, parse, substituted, to_text
 from autotune.equations.model import EquationModel, Extension, ModelParameter, State
 from autotune.equations.samples import BEFORE, quantised
 from autotune.equations.simulate import Compiled, Drive, Held, compile_model
@@ -62,6 +62,10 @@ OUTPUTS: Mapping[str, str] = {
     "plant.slow_mode": "(1 - share)*value + share*memory",
     "plant.resonance": "memory",
 }
+#: What is added wherever it acts: at a state, a port, an input, or to the reading.
+ADDED: Mapping[str, str] = {"environment.measured_input": "gain*(column - reference)"}
+#: The same where a parameter of the effect's memory is given; otherwise it has none.
+DELAYED: Mapping[str, str] = {"environment.measured_input": "gain*memory"}
 #: States that effects bring: name, derivative, and whether it starts at the undisturbed value.
 MEMORIES: Mapping[str, Sequence[tuple[str, str]]] = {
     "plant.hysteresis": (("memory", "(V - abs(V)*memory)/width"),),
@@ -71,6 +75,7 @@ MEMORIES: Mapping[str, Sequence[tuple[str, str]]] = {
     ),
     "actuator.rate_limit": (("memory", "rate*sign(value - memory)"),),
     "sensor.lag": (("memory", "(value - memory)/time_constant"),),
+    "environment.measured_input": (("memory", "(column - reference - memory)/time_constant"),),
     "plant.slow_mode": (("memory", "(value - memory)/time_constant"),),
     "plant.resonance": (
         ("memory", "memory_rate"),
@@ -80,14 +85,20 @@ MEMORIES: Mapping[str, Sequence[tuple[str, str]]] = {
 #: Parameters that may be left out, with the value that they then have.
 DEFAULTS: Mapping[str, float] = {
     "low": -1e300, "high": 1e300, "second_order": 0.0, "third_order": 0.0, "origin": 0.0, "end": 1e300, "phase": 0.0,
-    "zero": 0.0, "surroundings": 293.15, "damping": 0.0, "fold": 0.0,
+    "zero": 0.0, "surroundings": 293.15, "damping": 0.0, "fold": 0.0, "reference": 0.0,
 }  # fmt: skip
+#: What a name in the expressions stands for that a model may lack, and how to add it.
+WANTED: Mapping[str, tuple[str, str]] = {
+    "V": ("speed", 'say of the states what they are: kind = "position", "speed" with of, "level"'),
+    "X": ("position", 'say of the states what they are: kind = "position", "speed" with of, "level"'),
+    "column": ("column", 'name a column of the recording that is a further [[input]]: column = "NAME"'),
+}
 #: Effects on the samples of the reading.
 AFTER = ("sensor.quantisation",)
 #: Effects that lie in the recorded samples or the law alone: a simulation stays as it is.
 IDLE = ("sensor.dropout", "sensor.outliers", "timing.jitter", "controller.law")
 #: All that a model of equations can be simulated with.
-KNOWN = frozenset({*FORCES, *INPUTS, *OUTPUTS, *BEFORE, *AFTER, *IDLE, "timing.dead_time"})
+KNOWN = frozenset({*FORCES, *INPUTS, *OUTPUTS, *ADDED, *BEFORE, *AFTER, *IDLE, "timing.dead_time"})
 
 #: Width of belief about an effect's parameter, on a logarithmic scale: it may well be three times as large or small.
 EFFECT_SPREAD = 1.0
@@ -219,21 +230,18 @@ def extension_of(model: EquationModel, effect: Effect, number: int = 0) -> Exten
         Nowhere to act, or a parameter that is missing.
     """
     prefix = f"{effect.name.split('.')[1]}_{number}_"
-    texts = {**FORCES, **INPUTS, **OUTPUTS}
-    V, X = _speed_and_position(model, effect)
-    local = {"V": V, "X": X}
+    text = text_of(effect)
+    local = _local(model, effect)
     parameters: dict[str, ModelParameter] = {}
 
     def bound(text: str) -> Expression:
         def replaced(name: str) -> Expression | None:
             if name in local:
-                if local[name] is None:
-                    raise InputError(
-                        f"{effect.name} needs a speed or a position",
-                        where=model.name,
-                        remedy='say of the states what they are: kind = "position", "speed" with of, "level"',
-                    )
-                return local[name]
+                tree = local[name]
+                if tree is None:
+                    raise InputError(f"{effect.name} needs a {WANTED[name][0]}", where=model.name,
+                                     remedy=WANTED[name][1])  # fmt: skip
+                return tree
             if name in ("value", "t", "pi"):
                 return None
             if name.startswith("memory"):
@@ -248,9 +256,15 @@ def extension_of(model: EquationModel, effect: Effect, number: int = 0) -> Exten
 
         return substituted(parse(text, effect.name), replaced)
 
-    tree = bound(texts[effect.name])
-    states = tuple(State(name=prefix + name, derivative=bound(text)) for name, text in MEMORIES.get(effect.name, ()))
+    tree = bound(text)
+    states = tuple(
+        State(name=prefix + name, derivative=bound(slope)) for name, slope in MEMORIES.get(effect.name, ())
+        if effect.name not in ADDED or text == DELAYED[effect.name]
+    )  # fmt: skip
     made = Extension(name=effect.name, states=states, parameters=tuple(parameters.values()))
+    if effect.name in ADDED and not (effect.state or effect.port):
+        whole = Call("+", (Name("value"), tree))
+        return replace(made, input={effect.input: whole}) if effect.input else replace(made, output=whole)
     if effect.name in OUTPUTS:
         return replace(made, output=tree)
     if effect.name in INPUTS:
@@ -261,6 +275,19 @@ def extension_of(model: EquationModel, effect: Effect, number: int = 0) -> Exten
         raise InputError(f"{effect.name} does not say where it acts", where=model.name,
                          remedy='add state = "NAME" or port = "NAME"')  # fmt: skip
     return replace(made, derivative={effect.state: tree})
+
+
+def text_of(effect: Effect) -> str:
+    """Return what an effect does, as text; a lag of what is added is left out where its parameters are."""
+    if effect.name in ADDED:
+        return (DELAYED if "time_constant" in effect.parameters else ADDED)[effect.name]
+    return {**FORCES, **INPUTS, **OUTPUTS}[effect.name]
+
+
+def _local(model: EquationModel, effect: Effect) -> dict[str, Expression | None]:
+    """Return what names in an effect's text stand for that are no parameters of it; nothing for what is not there."""
+    V, X = _speed_and_position(model, effect)
+    return {"V": V, "X": X, "column": Name(effect.column) if effect.column in model.columns else None}
 
 
 def _speed_and_position(model: EquationModel, effect: Effect) -> tuple[Expression | None, Expression | None]:
@@ -326,16 +353,22 @@ def with_values(effects: Sequence[Effect], values: Mapping[str, tuple[float, flo
     return tuple(found)
 
 
+def where_told(effect: Effect) -> str:
+    """Return where an effect acts, for a reader."""
+    place = effect.state or effect.port or effect.input or "the reading"
+    return f"{place} from column {effect.column}" if effect.column else place
+
+
 def equation_of(model: EquationModel, effect: Effect) -> str:
     """Return an effect's equation for a reader, with the names of its states and parameters."""
-    texts = {**FORCES, **INPUTS, **OUTPUTS}
     if effect.name == "timing.dead_time":
         return f"{effect.input or model.columns[0]}(t - delay)"
-    if effect.name not in texts:
+    if effect.name not in {*FORCES, *INPUTS, *OUTPUTS, *ADDED}:
         return ""
-    V, X = _speed_and_position(model, effect)
-    tree = substituted(parse(texts[effect.name]), {"V": V, "X": X}.get)
+    tree = substituted(parse(text_of(effect)), _local(model, effect).get)
     column = effect.input or model.columns[0]
+    if effect.name in ADDED and not (effect.state or effect.port):
+        return f"{effect.input or 'y'} -> {effect.input or 'y'} + {to_text(tree)}"
     if effect.name in INPUTS:
         text = to_text(substituted(tree, lambda name: Name(column) if name == "value" else None))
         return f"{column} -> {text}"

@@ -52,7 +52,8 @@ def with_next_experiment_in_equations(found: EquationDiagnosis) -> EquationDiagn
             return replace(found, next_experiment=_extra_signal(effect.name, sits))
     if model.horizon_s is not None or not any(float(np.ptp(r[model.columns[0]])) > 0.0 for r in found.recordings):
         return found
-    return replace(found, next_experiment=_planned(found, model))
+    # with the further columns that a hypothesis may be driven by
+    return replace(found, next_experiment=_planned(found, found.searched.retuned.fitted.compiled.model))
 
 
 def _extra_signal(name: str, sits: tuple[str, ...]) -> NextExperiment:

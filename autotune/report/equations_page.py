@@ -8,7 +8,7 @@ import numpy as np
 
 from autotune.diagnosis.equations import EquationDiagnosis
 from autotune.equations.black_box import BlackBox
-from autotune.equations.effects import equation_of
+from autotune.equations.effects import equation_of, where_told
 from autotune.equations.exports import as_text
 from autotune.equations.identifiability import combinations
 from autotune.errors import InputError
@@ -58,7 +58,7 @@ def _verdict(found: EquationDiagnosis) -> str:
     if found.verdict != "effect":
         return found.sentences[0]
     told = [
-        f"{clause(e.name)} ({e.name} at {e.state or e.port or e.input or 'the reading'}, probability {p:.2f})"
+        f"{clause(e.name)} ({e.name} at {where_told(e)}, probability {p:.2f})"
         for e, p in zip(found.effects, found.probabilities, strict=True)
     ]
     told += [f"{clause(s.name)} ({s.name})" for s in found.samples]
@@ -88,7 +88,7 @@ def _effects(found: EquationDiagnosis) -> Section:
         values = ", ".join(
             f"{k.replace('_', ' ')} = {with_spread(q)}" for k, q in effect.parameters.items() if q.sd > 0.0
         )
-        rows.append((effect.name, f"{p:.2f}", effect.state or effect.port or effect.input, values,
+        rows.append((effect.name, f"{p:.2f}", where_told(effect), values,
                      equation_of(found.equations, effect)))  # fmt: skip
     rows += [(s.name, "", "reading", "", s.equation) for s in found.samples]
     named = {effect.name for effect in found.effects} | {s.name for s in found.samples}
@@ -138,7 +138,7 @@ def _against(found: EquationDiagnosis) -> Section:
     base = searched.score(searched.retuned)
     own = len(searched.retuned.effects)
     rows = tuple(
-        (" + ".join(f"{e.name} at {e.state or e.port or e.input or 'reading'}" for e in one.effects[own:]),
+        (" + ".join(f"{e.name} at {where_told(e)}" for e in one.effects[own:]),
          f"{base - searched.score(one):.1f}", f"{searched.variance_ratio(one):.3g}")
         for one in sorted(searched.tried, key=searched.score)
     )  # fmt: skip

@@ -25,6 +25,9 @@ ON_COMMAND = (
 ON_READING = ("sensor.lag", "sensor.nonlinear_gain", "sensor.drift")
 #: What nearly every machine has, and models leave out: tried beside a large effect whatever others predict.
 USUAL = frozenset({"plant.coulomb_friction"})
+MEASURED = "environment.measured_input"
+#: Lags between a recorded column and what it acts on, as shares of the way from a sample to the slowest, in logarithms.
+LAGS = (0.3, 0.65, 1.0)
 #: Shares of the time that a position without a stop is on this side of it, where stops are tried.
 STOPS = (0.8, 0.9, 0.97, 0.995)
 BY_KIND = {
@@ -48,10 +51,10 @@ class Trial:
     effect: Effect
     scaled: tuple[str, ...] = ()
 
-    @property
-    def place(self) -> str:
-        """State, port or input that it acts on, for telling trials of one effect apart."""
-        return place_of(self.effect)
+
+def key_of(effect: Effect) -> tuple[str, str, str]:
+    """Return what tells effects of a hypothesis apart: the name, the place that it acts on, and the column it is of."""
+    return effect.name, place_of(effect), effect.column
 
 
 def place_of(effect: Effect) -> str:
@@ -63,6 +66,9 @@ def plainer(effect: Effect) -> Effect | None:
     """Return the effect of fewer numbers that another one comes down to in a limit; nothing where there is none."""
     if effect.name == "plant.sine_torque" and not is_gravity(effect):
         return gravity(effect, effect.parameters["amplitude"].value)
+    if effect.name == MEASURED and "time_constant" in effect.parameters:
+        without_lag = {key: q for key, q in effect.parameters.items() if key != "time_constant"}
+        return replace(effect, parameters=MappingProxyType(without_lag))
     level = {"plant.stribeck_friction": "level", "plant.hysteresis": "amplitude"}.get(effect.name)
     if level is None:
         return None
@@ -103,6 +109,8 @@ class Signals:
         States, and differences across ports.
     sizes : mapping of state or port to float
         How large a derivative (or a force at a port) typically is.
+    columns : mapping of str to (rows,) arrays
+        Further columns of the recordings, which the model does not have.
     dt_s, duration_s, slow_s : float
         Sample time, length of a recording, and the slowest lag that is looked for [s].
     """
@@ -111,6 +119,7 @@ class Signals:
     y: FloatArray
     values: dict[str, FloatArray]
     sizes: dict[str, float]
+    columns: dict[str, FloatArray]
     dt_s: float
     duration_s: float
     slow_s: float
@@ -147,6 +156,8 @@ def trials(model: EquationModel, signals: Signals, without: Sequence[str] = (), 
         for one in model.inputs:
             if one.kind:
                 found += _loads(signals, "input", one.column)
+    for key, name, force in _acted_on(model, signals, black_box):
+        found += _measured(signals, key, name, force)
     return [one for one in found if one.effect.name not in without]
 
 
@@ -231,6 +242,28 @@ def _on_position(
                 level = np.quantile(x, share if side == "high" else 1.0 - share)
                 values = {side: float(level), "stiffness": stiffness, "damping": 2.0 * s.dt_s * stiffness}
                 yield Trial(effect=_effect(effect, key, name, **values))
+
+
+def _acted_on(model: EquationModel, s: Signals, black_box: bool) -> Iterator[tuple[str, str, float]]:
+    """Yield key, name and size of every place where a measured signal may act, inside first."""
+    if not black_box:
+        speeds_of = {one.of for one in model.states}
+        free = [one.name for one in model.states if one.name not in speeds_of]  # a position moves by its speed alone
+        for key, name in [("port", one.name) for one in model.ports] or [("state", name) for name in free]:
+            yield key, name, s.sizes.get(name, 1.0)
+    yield "input", model.columns[0], float(np.std(s.u)) or 1.0
+    yield "", "", float(np.nanstd(s.y)) or 1.0
+
+
+def _measured(s: Signals, key: str, name: str, size: float) -> Iterator[Trial]:
+    """Yield recorded columns that act at a place: as they are and from their mean on, at once and with a lag."""
+    slowest = np.log(s.slow_s / s.dt_s)
+    for column, d in s.columns.items():
+        for reference in dict.fromkeys((0.0, float(np.mean(d)))):
+            values = {"gain": 0.05 * size / float(np.std(d)), "reference": reference}
+            for lag in ({}, *({"time_constant": s.dt_s * float(np.exp(share * slowest))} for share in LAGS)):
+                effect = replace(_effect(MEASURED, key, name, **values, **lag), column=column)
+                yield Trial(effect=effect, scaled=("gain",))
 
 
 def _loads(s: Signals, key: str, name: str) -> Iterator[Trial]:

@@ -239,7 +239,7 @@ class ClosedBench:
         dt = float(np.median(np.concatenate([np.diff(d.t) for d in self._drives])))
         duration = max(float(d.t[-1] - d.t[0]) for d in self._drives)
         sizes = {one.column: float(np.std(u)) for one in self._box.inputs if one.kind}
-        return Signals(u=u, y=np.concatenate(outcome.fitted.simulated), values={}, sizes=sizes, dt_s=dt,
+        return Signals(u=u, y=np.concatenate(outcome.fitted.simulated), values={}, sizes=sizes, columns={}, dt_s=dt,
                        duration_s=duration, slow_s=0.05 * duration)  # fmt: skip
 
     def periodic(self, outcome: Outcome, signals: Signals) -> list[Trial]:

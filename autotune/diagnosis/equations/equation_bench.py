@@ -13,6 +13,7 @@ from autotune.diagnosis.equations.bench import Bench, Outcome
 from autotune.diagnosis.equations.candidates import Signals, Trial, place_of
 from autotune.diagnosis.equations.first_order import explained, start_bases, without_starts
 from autotune.diagnosis.equations.followed import followed, positions_of, sizes_of
+from autotune.diagnosis.equations.further import further_columns
 from autotune.diagnosis.equations.held_out import HELD_OUT, forecast_errors, free_run_errors, until
 from autotune.diagnosis.equations.parts import beyond, telling_windows
 from autotune.diagnosis.equations.sought import LEAST_WIDTH, OUTER, changed, sought
@@ -21,7 +22,7 @@ from autotune.equations.effects import compile_with, with_values
 from autotune.equations.fit import LEAST_ROWS, fit, retune
 from autotune.equations.fit_data import Fitted
 from autotune.equations.left_out import left_out_squares
-from autotune.equations.model import EquationModel
+from autotune.equations.model import EquationModel, InputColumn
 from autotune.equations.parameter_scales import values_of
 from autotune.equations.sensitivity import Windows, side_by_side
 from autotune.equations.simulate import Compiled, drive_of, simulate
@@ -65,12 +66,15 @@ class EquationBench:
     """
 
     def __init__(self, model: EquationModel, recordings: Sequence[Recording], good: Sequence[BoolArray]) -> None:
-        self._model = model
+        self._nominal, self._further = model, further_columns(model, recordings)
+        # further columns drive nothing until an effect takes them; what is measured runs on between rows
+        measured = (InputColumn(column=name, hold="linear") for name in self._further)
+        self._model = replace(model, inputs=(*model.inputs, *measured))
         self._recordings = tuple(
             replace(r, y=np.where(ok, r.y, np.nan)) for r, ok in zip(recordings, good, strict=True)
         )
         self._rows = [np.isfinite(r.y) for r in self.recordings]
-        self._drives = [drive_of(model, r) for r in self.recordings]
+        self._drives = [drive_of(self._model, r) for r in self.recordings]
         span = max(float(r.t[-1] - r.t[0]) for r in recordings)
         dt = max(float(np.median(np.diff(r.t))) for r in recordings)
         self.length_s = model.horizon_s or min(span / WINDOWS, MOST_ROWS * dt)
@@ -181,6 +185,8 @@ class EquationBench:
         y = np.concatenate([r.y for r in self.recordings])
         size = {"high": float(np.std(u)), "low": float(np.std(u)), "time": 0.2 * span, "phase": 1.0,
                 "origin of y": float(np.nanstd(y)), "origin of u": float(np.std(u))}  # fmt: skip
+        for name in self._further:
+            size[f"reference of {name}"] = float(np.sqrt(np.mean([np.mean(r[name] ** 2) for r in self.recordings])))
         spread = max(float(np.max(s)) for s in self._sizes.values()) if self._sizes else 0.0
         size |= {f"width at {place}": LEAST_WIDTH * span for place, span in self._spans.items()}
         size |= {f"stiffness at {place}": self._sizes.get(place, 0.0) / max(span, 1e-300)
@@ -267,7 +273,7 @@ class EquationBench:
                 mask[a:b] = True
             good.append(ok & mask)
             windows.append(Windows(starts=w.starts[keep], stops=w.stops[keep], states=w.states[keep]))
-        small = EquationBench(self.model, self.recordings, good)
+        small = EquationBench(self._nominal, self.recordings, good)
         self.signals(outcome)  # sizes and spans, for fits on all rows too
         small.length_s, small._most_steps = self.length_s, self._most_steps
         there = replace(outcome, fitted=replace(outcome.fitted, windows=tuple(windows)))
@@ -385,5 +391,6 @@ class EquationBench:
         }  # fmt: skip
         duration = max(float(r.t[-1] - r.t[0]) for r in self.recordings)
         u = np.concatenate([d.inputs[:, 0] for d in self._drives])
-        return Signals(u=u, y=y, values=values, sizes=self._sizes, dt_s=dt, duration_s=duration,
+        columns = {name: np.concatenate([r[name] for r in self.recordings]) for name in self._further}
+        return Signals(u=u, y=y, values=values, sizes=self._sizes, columns=columns, dt_s=dt, duration_s=duration,
                        slow_s=0.05 * duration)  # fmt: skip

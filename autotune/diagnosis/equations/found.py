@@ -17,6 +17,7 @@ from autotune.arrays import BoolArray
 from autotune.controller import Controller
 from autotune.diagnosis.effects import KINDS, kind_of
 from autotune.diagnosis.equations.bench import Bench, Outcome
+from autotune.diagnosis.equations.candidates import LOADS
 from autotune.diagnosis.equations.closed import ClosedBench
 from autotune.diagnosis.equations.equation_bench import EquationBench
 from autotune.diagnosis.equations.probable import candidates_of, probability_of, without_improbable
@@ -29,7 +30,7 @@ from autotune.diagnosis.result import NextExperiment
 from autotune.diagnosis.selection.probability import Candidate
 from autotune.diagnosis.thresholds import IN_USE, Thresholds
 from autotune.equations.black_box import BlackBox
-from autotune.equations.effects import equation_of
+from autotune.equations.effects import equation_of, where_told
 from autotune.equations.identifiability import undetermined
 from autotune.equations.model import EquationModel
 from autotune.errors import InputError
@@ -129,7 +130,7 @@ def _effect_table(
         "parameters": {
             k: {"value": q.value, "sd": q.sd if np.isfinite(q.sd) else None, "unit": q.unit} for k, q in shown.items()
         },
-        "state": e.state or None, "input": e.input or None, "port": e.port or None,
+        "state": e.state or None, "input": e.input or None, "port": e.port or None, "column": e.column or None,
         "equation": equation_of(model, e), "windows": whole,
     }  # fmt: skip
 
@@ -139,7 +140,7 @@ def _sample_table(s: SampleEffect, whole: list[list[float]]) -> dict[str, Any]:
         "name": s.name, "probability": 0.97, "places": [kind_of(s.name).place],
         "parameters": {k: {"value": q.value, "sd": q.sd if np.isfinite(q.sd) else None, "unit": q.unit}
                        for k, q in s.parameters.items()},
-        "state": None, "input": None, "port": None, "equation": s.equation,
+        "state": None, "input": None, "port": None, "column": None, "equation": s.equation,
         "windows": [list(w) for w in s.windows] or whole,
     }  # fmt: skip
 
@@ -256,7 +257,7 @@ def _judged(
     explains = left < limits.equation_explained - 1.0 or left < (1.0 - limits.equation_most) * before
     better = errors[2] < errors[1] or errors[2] < limits.equation_held_out * errors[3]
     # a load of free timing explains a part of everything
-    loads = any(one.name.startswith("environment.") for one in added)
+    loads = any(one.name in LOADS for one in added)
     mostly = not explains and not loads and _explains_most(errors, limits)
     verdict: Literal["none", "parameters", "effect", "unexplained"]
     if (added and (explains or mostly) and better) or (seen and left < 1.0):
@@ -303,7 +304,9 @@ def _with_numbers(model: EquationModel | BlackBox, outcome: Outcome) -> Equation
     if isinstance(model, BlackBox):
         numbers = tuple(replace(p, value=float(v)) for p, v in zip(model.parameters, values, strict=True))
         return replace(model, parameters=numbers, effects=outcome.effects)
-    return replace(model.with_parameters(values), effects=outcome.effects)
+    inputs = [one for one in outcome.fitted.compiled.model.inputs if one.column not in model.columns]
+    used = tuple(one for one in inputs if any(one.column == e.column for e in outcome.effects))
+    return replace(model.with_parameters(values), inputs=(*model.inputs, *used), effects=outcome.effects)
 
 
 def _sentences(
@@ -319,7 +322,7 @@ def _sentences(
         case "parameters":
             first = "The structure is right, its numbers are not: retuned, the simulation explains the recordings."
         case "effect":
-            told = [f"{e.name} at {e.state or e.port or e.input or 'the reading'} (probability "
+            told = [f"{e.name} at {where_told(e)} (probability "
                     f"{probability_of(e, candidates):.2f})" for e in named]  # fmt: skip
             first = f"Physics was left out: {' and '.join([*told, *(s.name for s in seen)])}."
         case _:

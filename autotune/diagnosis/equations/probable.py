@@ -9,7 +9,7 @@ import numpy as np
 
 from autotune.diagnosis.effects import KINDS, kind_of
 from autotune.diagnosis.equations.bench import Outcome
-from autotune.diagnosis.equations.candidates import place_of
+from autotune.diagnosis.equations.candidates import key_of
 from autotune.diagnosis.equations.search import Searched
 from autotune.diagnosis.selection.probability import Candidate, weighed
 from autotune.models import Effect
@@ -57,8 +57,8 @@ def without_improbable(found: Searched) -> Searched:
         candidates = candidates_of(found, found.limits.unknown_odds)
         each = [probability_of(e, candidates) for e in found.chosen.effects[own:]]
         least = int(np.argmin(each))
-        names = [(e.name, place_of(e)) for i, e in enumerate(found.chosen.effects) if i != own + least]
-        smaller = [one for one in found.tried if sorted((e.name, place_of(e)) for e in one.effects) == sorted(names)]
+        names = [key_of(e) for i, e in enumerate(found.chosen.effects) if i != own + least]
+        smaller = [one for one in found.tried if sorted(key_of(e) for e in one.effects) == sorted(names)]
         if each[least] >= found.limits.least_named or not smaller:
             break
         best = min(smaller, key=found.score)

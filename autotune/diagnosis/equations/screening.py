@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence, Set
+from collections.abc import Iterable, Sequence, Set
 from dataclasses import replace
 
 import numpy as np
 
 from autotune.arrays import FloatArray
 from autotune.diagnosis.equations.bench import Bench, Outcome
-from autotune.diagnosis.equations.candidates import Trial, place_of, plainer, trials
+from autotune.diagnosis.equations.candidates import Trial, key_of, plainer, trials
 from autotune.diagnosis.equations.sought import scaled
 from autotune.diagnosis.thresholds import IN_USE, Thresholds
 from autotune.errors import InputError
 from autotune.models import Effect
 from autotune.progress import Progress
+
+#: Cosine from which on two changes of the readings are one.
+PARALLEL = 1.0 - 1e-6
 
 
 def screened(
@@ -42,26 +45,39 @@ def screened(
         The best first; an effect at a place stands once, and once more in its plainer form.
     """
     signals = bench.signals(base)
-    present = {(effect.name, place_of(effect)) for effect in base.effects}
+    present = {key_of(effect) for effect in base.effects}
     tried = trials(bench.model, signals, without, bench.is_closed)
     tried += bench.periodic(base, signals) if "environment.periodic_load" not in without else []
     tried = [one for one in tried if not only or one.effect.name in only]
-    all_trials = [one for one in tried if (one.effect.name, one.place) not in present]
+    all_trials = [one for one in tried if key_of(one.effect) not in present]
     basis, e = bench.explained(base), bench.without_starts(base, base.residual)
     e = e - basis @ (basis.T @ e)
-    best: dict[tuple[str, str, bool], tuple[float, Effect]] = {}
+    best: dict[tuple[str, str, str, bool], tuple[float, Effect, FloatArray]] = {}
     directions = bench.each(lambda trial: _direction(bench, base, trial, basis), all_trials)
     for k, (trial, d) in enumerate(zip(all_trials, directions, strict=True)):
         progress("trying every effect", k / len(all_trials))
         if d is None:
             continue
         gain, factor = predicted(e, d, trial)
-        key = (trial.effect.name, trial.place, plainer(trial.effect) is None)
+        key = (*key_of(trial.effect), plainer(trial.effect) is None)
         if gain > 0.0 and (key not in best or gain > best[key][0]):
-            best[key] = (gain, scaled(trial, factor))
-    ranked = sorted(best.values(), key=lambda pair: -pair[0])
+            best[key] = (gain, scaled(trial, factor), d)
+    ranked = sorted(_apart(best.values()), key=lambda pair: -pair[0])
     least = limits.equation_faint * ranked[0][0] if ranked else 0.0
     return [pair for pair in ranked if pair[0] >= least]
+
+
+def _apart(found: Iterable[tuple[float, Effect, FloatArray]]) -> list[tuple[float, Effect]]:
+    """Return effects and what they predict, without those that are another one at another place, the first one kept.
+
+    A signal that is added to a command which drives one state alone is the same as one that drives that state.
+    """
+    kept: list[tuple[float, Effect, FloatArray]] = []
+    for gain, effect, d in found:
+        same = (other for _, one, other in kept if (one.name, one.column) == (effect.name, effect.column))
+        if not any(abs(float(d @ e)) > PARALLEL * float(np.linalg.norm(d)) * float(np.linalg.norm(e)) for e in same):
+            kept.append((gain, effect, d))
+    return [(gain, effect) for gain, effect, _ in kept]
 
 
 def _direction(bench: Bench, base: Outcome, trial: Trial, basis: FloatArray) -> FloatArray | None:

@@ -13,11 +13,12 @@ import numpy as np
 
 from autotune.diagnosis.equations.bench import Bench, Outcome
 from autotune.diagnosis.equations.candidates import (
+    LOADS,
     USUAL,
     gravity,
     is_gravity,
     is_plainer,
-    place_of,
+    key_of,
     plainer,
 )
 from autotune.diagnosis.equations.dry_friction import settled_among, swept, with_force
@@ -212,7 +213,7 @@ def _leading(
     found = _round(small, there, without, progress, limits, further)
     rows = independent_rows(there, noise_of(small, there))
     found.sort(key=_first(small, rows, limits))
-    once = {(one.effects[-1].name, place_of(one.effects[-1]), len(one.effects)): one for one in reversed(found)}
+    once = {(*key_of(one.effects[-1]), len(one.effects)): one for one in reversed(found)}
     carried: list[Outcome] = []
     for one in sorted(once.values(), key=found.index)[: limits.confirmed]:
         if np.log(there.rss / one.rss) < limits.equation_near * np.log(there.rss / found[0].rss):
@@ -237,8 +238,8 @@ def _usual_beside(
     """
     if is_noise(bench, min([base, *found], key=lambda one: one.rss), limits.equation_astray, limits):
         return []
-    have = {(one.effects[-1].name, place_of(one.effects[-1])) for one in found}
-    usual = [e for _, e in screened(bench, base, without, quiet, limits, USUAL) if (e.name, place_of(e)) not in have]
+    have = {key_of(one.effects[-1]) for one in found}
+    usual = [e for _, e in screened(bench, base, without, quiet, limits, USUAL) if key_of(e) not in have]
     fits = (attempt(bench, (*base.effects, effect), base, LAST) for effect in usual)
     return [_elsewhere(bench, one, limits) for one in fits if one is not None]
 
@@ -318,8 +319,8 @@ def _pruned(
 
 def _lacks_usual(smaller: Outcome, larger: Outcome) -> bool:
     """Whether what a hypothesis has beyond another one is a usual effect."""
-    have = {(e.name, place_of(e)) for e in smaller.effects}
-    return any(e.name in USUAL and (e.name, place_of(e)) not in have for e in larger.effects)
+    have = {key_of(e) for e in smaller.effects}
+    return any(e.name in USUAL and key_of(e) not in have for e in larger.effects)
 
 
 def _is_needed(bench: Bench, before: Outcome, after: Outcome, own: int, rows: float, limits: Thresholds) -> bool:
@@ -332,8 +333,8 @@ def _is_needed(bench: Bench, before: Outcome, after: Outcome, own: int, rows: fl
     worth = is_worth(before, after, rows, limits)
     if len(before.effects) <= own and (worth or is_noise(bench, after, limits.equation_astray, limits)):
         return worth
-    had = {(e.name, place_of(e)) for e in before.effects}
-    loads = any(e.name.startswith("environment.") and (e.name, place_of(e)) not in had for e in after.effects)
+    had = {key_of(e) for e in before.effects}
+    loads = any(e.name in LOADS and key_of(e) not in had for e in after.effects)
     if loads and before.effects[own:] and not is_noise(bench, after, limits.equation_noise, limits):
         return False
     if not worth and variance_ratio(after, noise_of(bench, after)) < limits.equation_astray:
@@ -352,8 +353,7 @@ def _predicts(bench: Bench, smaller: Outcome, error: float, limits: Thresholds) 
 
 def _is_partial_load(bench: Bench, one: Outcome, limits: Thresholds) -> bool:
     """Whether the last effect is a load, and more than noise is left beside it."""
-    load = one.effects[-1].name.startswith("environment.")
-    return load and not is_noise(bench, one, limits.equation_noise, limits)
+    return one.effects[-1].name in LOADS and not is_noise(bench, one, limits.equation_noise, limits)
 
 
 def _is_earned(bench: Bench, before: Outcome, after: Outcome, limits: Thresholds) -> bool:
@@ -412,7 +412,7 @@ def _fitted(
 def _leaves_nothing(bench: Bench, one: Outcome, effect: Effect, limits: Thresholds) -> bool:
     """Whether an outcome's last effect is a given one and leaves less beside noise than an effect must bring."""
     last = one.effects[-1]
-    if (last.name, place_of(last)) != (effect.name, place_of(effect)):
+    if key_of(last) != key_of(effect):
         return False
     return (1.0 - limits.equation_share) * variance_ratio(one, noise_of(bench, one)) < 1.0
 

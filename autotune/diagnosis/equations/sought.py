@@ -12,7 +12,7 @@ from autotune.models import Effect
 
 #: Parameters of effects that may have either sign, and those that are not sought.
 SIGNED = frozenset({"high", "low", "second_order", "third_order", "offset", "phase", "time", "in_phase", "quadrature",
-                    "amplitude", "fold"})  # fmt: skip
+                    "amplitude", "fold", "gain"})  # fmt: skip
 SIGNED_RATES = frozenset({"actuator.gain_drift", "sensor.drift", "environment.drifting_load", "plant.leak",
                           "plant.cubic_stiffness"})  # fmt: skip
 GIVEN = frozenset({"zero", "end"})
@@ -68,6 +68,8 @@ def sought(p: ModelParameter, effects: Sequence[Effect], spreads: Mapping[str, f
         return replace(p, least=spreads.get(f"stiffness at {place_of(effects[number])}", 0.0))
     if key == "surroundings":
         return replace(p, linear=True, spread=SURROUNDINGS_SD)
+    if key == "reference":
+        return replace(p, linear=True, spread=spreads.get(f"reference of {effects[number].column}", 0.0))
     if key == "origin":
         size = spreads.get("origin of y" if name.startswith("sensor.") else "origin of u", 0.0)
         return replace(p, linear=True, spread=size)

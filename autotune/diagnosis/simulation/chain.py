@@ -6,7 +6,6 @@ are in controllable form. Forces enter at the input of the first plant block, in
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
@@ -20,9 +19,6 @@ from autotune.models import Block, Model
 
 #: Positions in a chain's ``where``.
 ACTUATOR, SPEED, POSITION = range(3)
-#: What a speed is called, and its units.
-_SPEED = re.compile(r"speed|velocity|\brpm\b")
-_SPEED_UNIT = re.compile(r"^(m|mm|cm|km|rad|deg|°|rev|turns?)/(s|min|h)$|^rpm$|^1/min$")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -225,7 +221,7 @@ def _plant_blocks(blocks: Sequence[Block]) -> list[int]:
     """Return the numbers of the plant's dynamic blocks; without any, of the slowest block."""
     dynamic = [i for i, b in enumerate(blocks) if len(b.dynamics.den) > 1]
     plant = [i for i in dynamic if blocks[i].place == "plant"]
-    if len(plant) == 1 and plant[0] - 1 in dynamic and _integrates(blocks[plant[0]]) and is_speed(blocks[plant[0] - 1]):
+    if len(plant) == 1 and plant[0] - 1 in dynamic and _integrates(blocks[plant[0]]) and blocks[plant[0] - 1].is_speed:
         return [plant[0] - 1, *plant]  # the speed of what integrates, wherever its block is said to be
 
     def slowness(i: int) -> float:
@@ -243,12 +239,6 @@ def _law(blocks: Sequence[Block]) -> int | None:
 
 def _integrates(block: Block) -> bool:
     return len(block.dynamics.den) == 2 and block.dynamics.den[-1] == 0.0
-
-
-def is_speed(block: Block) -> bool:
-    """Whether a first-order block's output is a speed, by its name or unit."""
-    said = f"{block.name} {block.output}".lower()
-    return len(block.dynamics.den) == 2 and bool(_SPEED.search(said) or _SPEED_UNIT.search(block.unit.lower()))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -274,7 +264,7 @@ def _note_signals(
     if first:
         gains[0] = static
         taps[kernel.FIRST_LEVEL] = row
-        if n == 1 and last and is_speed(block):
+        if n == 1 and last and block.is_speed:
             taps[kernel.SPEED], where[SPEED] = row, at
         if n == 2 and last and c[0] != 0.0:
             taps[kernel.SPEED, at + 1] = c[0]

@@ -15,9 +15,9 @@ T = np.arange(400) * 0.02
 U = np.repeat(np.random.default_rng(7).normal(0.0, 0.6, 20), 20)
 
 
-def effect(name: str, *, state: str = "", input: str = "", port: str = "", **values: float) -> Effect:
+def effect(name: str, *, state: str = "", input: str = "", port: str = "", column: str = "", **values: float) -> Effect:
     parameters = {key: Parameter(value=value) for key, value in values.items()}
-    return Effect(name=name, parameters=parameters, state=state, input=input, port=port)
+    return Effect(name=name, parameters=parameters, state=state, input=input, port=port, column=column)
 
 
 def y_of(base: EquationModel, *effects: Effect, u: np.ndarray = U) -> np.ndarray:
@@ -140,8 +140,27 @@ def test_every_known_effect_can_be_simulated() -> None:
     values = dict.fromkeys(
         ("level", "breakaway", "stribeck_speed", "coefficient", "amplitude", "period", "rate", "width", "stiffness",
          "half_width", "band", "step", "delay", "offset", "time_constant", "time_constant_up", "time_constant_down",
-         "slope", "share", "frequency", "time", "in_phase", "quadrature", "damping"), 0.3,
+         "slope", "share", "frequency", "time", "in_phase", "quadrature", "damping", "gain"), 0.3,
     )  # fmt: skip
     for name in sorted(KNOWN):
         state = "omega" if name.startswith(("plant", "environment")) else ""
-        assert np.all(np.isfinite(y_of(PENDULUM, effect(name, state=state, **values)))), name
+        assert np.all(np.isfinite(y_of(PENDULUM, effect(name, state=state, column="u", **values)))), name
+
+
+def test_a_recorded_column_acts_at_a_state_at_an_input_and_beside_the_reading() -> None:
+    name, inputs = "environment.measured_input", [{"column": "u"}, {"column": "w", "hold": "linear"}]
+    plant = one_state("u - x", input=inputs, state=[{"name": "x", "derivative": "u - x"}])
+    late = {"gain": 0.5, "reference": 0.1, "time_constant": 0.2}
+
+    def run(*effects: Effect) -> np.ndarray:
+        compiled = compile_model(plant, apply(plant, effects).extensions)
+        drive = Drive(t=T, inputs=np.column_stack([U, np.sin(T)]))
+        return simulate(compiled, compiled.parameter_vector, drive, np.zeros((1, len(compiled.states)))).y
+
+    at_state = run(effect(name, column="w", state="x", **late))
+    np.testing.assert_allclose(at_state, run(effect(name, column="w", input="u", **late)), atol=1e-6)
+    beside = run(effect(name, column="w", gain=0.5, reference=0.1))
+    np.testing.assert_allclose(beside, run() + 0.5 * (np.sin(T) - 0.1), atol=1e-9)
+    assert equation_of(plant, effect(name, column="w", state="x", gain=1.0)).startswith("d x/dt: + gain*(w")
+    with pytest.raises(InputError, match="column"):
+        run(effect(name, column="wind", state="x", gain=1.0))
