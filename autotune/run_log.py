@@ -31,8 +31,8 @@ import numpy as np
 from autotune.config import Config
 from autotune.controller import PIDController
 from autotune.errors import AutotuneError, ExperimentStopped, OperatorStop
+from autotune.experiment.judgement import Verification, smoothed
 from autotune.experiment.result import Status
-from autotune.experiment.verify import Verification, smoothed
 from autotune.models import TransferFunction
 from autotune.outputs import append_whole
 from autotune.points import FrequencyPoint, points_to_json

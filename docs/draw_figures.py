@@ -23,7 +23,7 @@ import numpy as np
 
 from autotune.cli.common import rig_of
 from autotune.config import load_config
-from autotune.experiment.verify import Verification
+from autotune.experiment.judgement import Verification
 from autotune.pipeline import tune
 from autotune.recording import read_recording
 from autotune.report.page import write_page

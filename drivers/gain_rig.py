@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -18,6 +19,8 @@ from drivers.registers import Codec, blocks
 
 #: steps of a register, relative to what it holds, that are fine enough for a gain
 _FINE = 0.01
+#: signals without which the device's own controller cannot be tried: to start it, and to see what it does
+_TRIAL = ("automatic", "setpoint", "u_applied")
 
 
 class GainRegisterRig(RegisterRig):
@@ -90,23 +93,112 @@ class GainRegisterRig(RegisterRig):
         except LinkError as error:
             raise self._restored(old, error) from None
 
-    def start_controller(self, setpoint: float) -> None:
-        """Give the actuator to the device's own controller, at a set-point [y unit].
+    @property
+    def not_startable(self) -> str:
+        """Which signals are not mapped that the trial of the device's own controller needs; empty where all are."""
+        lacking = [name for name in _TRIAL if name not in self._codecs]
+        return f"{' and '.join(lacking)} {'is' if len(lacking) == 1 else 'are'} not mapped" if lacking else ""
+
+    @property
+    def takes_load(self) -> bool:
+        """Whether a load can be added to the output of the device's own controller."""
+        return "load" in self._codecs
+
+    @property
+    def scan_time_s(self) -> float:
+        """Cycle of the device's program [s]; 20 ms where the configuration does not say it."""
+        return self._scan_s
+
+    def start_controller(self, setpoint: float) -> float:
+        """Give the actuator to the device's own controller, at a set-point, and go on with reading.
+
+        Parameters
+        ----------
+        setpoint : float
+            Where it is to hold y [y unit].
+
+        Returns
+        -------
+        float
+            The set-point as the register holds it [y unit].
 
         Raises
         ------
         InputError
-            The register map has no ``automatic`` or no ``setpoint``; nothing was done.
+            The register map lacks what this needs; nothing was done.
+        LinkError
+            The host does not command.
         """
-        for name in ("automatic", "setpoint"):
-            if name not in self._codecs:
-                raise InputError(f"{name} is not mapped", where=self._link.where, remedy=f"map rig.registers.{name}")
-        self._link.connect()
+        if self.not_startable:
+            remedy = " and ".join(f"rig.registers.{name}" for name in _TRIAL)
+            raise InputError(self.not_startable, where=self._link.where, remedy=f"map {remedy}")
+        self._require(self._is_commanding, "the host is not in command", "open the rig first")
+        self._release(setpoint)
+        self._is_commanding, self._released_s = False, self._clock.now()
+        return self._held("setpoint", setpoint)
+
+    def ask_controller(self, setpoint: float, load: float) -> tuple[float, float]:
+        """Change what the device's own controller is asked for.
+
+        Parameters
+        ----------
+        setpoint : float
+            New set-point [y unit].
+        load : float
+            What is added to its output [u unit]; 0 where the register map has no load.
+
+        Returns
+        -------
+        setpoint, load : float
+            As the registers hold them.
+        """
         self._put("setpoint", setpoint)
-        self._put("automatic", 1.0)
-        if "enable" in self._codecs:
-            self._put("enable", 0.0)
-        self._is_commanding = False
+        if self.takes_load:
+            self._put("load", load)
+        return self._held("setpoint", setpoint), self._held("load", load) if self.takes_load else 0.0
+
+    def misread(self, controller: PIDController) -> dict[str, PIDController]:
+        """Return the controllers that a device holds which reads words or bytes of these gains in another order.
+
+        Parameters
+        ----------
+        controller : PIDController
+            Gains as they were written.
+
+        Returns
+        -------
+        dict of str to PIDController
+            By what is wrong, for one register after the other and for all of them; without those that change nothing.
+        """
+        right = self._shown(self._encoded(controller))
+        found: dict[str, PIDController] = {}
+        for order in ("word_order", "byte_order"):
+            wrong = {name: self._otherwise(name, value, order) for name, value in right.items()}
+            for names in (*((name,) for name in right), tuple(right)):
+                shown = right | {name: wrong[name] for name in names}
+                if shown == right or not all(math.isfinite(value) for value in shown.values()):
+                    continue
+                which = "all gains" if len(names) > 1 else f"rig.registers.{names[0]}"
+                with contextlib.suppress(ArithmeticError, InputError):  # what the form cannot say
+                    found.setdefault(f"{order} of {which}", self._controller(shown))
+        return found
+
+    def misread_setpoint(self, setpoint: float) -> dict[str, float]:
+        """Return the set-points that a device has which reads words or bytes in another order [y unit]."""
+        right = self._held("setpoint", setpoint)
+        orders = ("word_order", "byte_order")
+        wrong = {f"{order} of rig.registers.setpoint": self._otherwise("setpoint", right, order) for order in orders}
+        return {name: value for name, value in wrong.items() if math.isfinite(value) and value != right}
+
+    def _held(self, name: str, value: float) -> float:
+        """Return what a register holds of a value."""
+        return self._codecs[name].decode(self._codecs[name].encode(value))
+
+    def _otherwise(self, name: str, value: float, order: str) -> float:
+        """Return the value as a device reads it that has words or bytes in the other order."""
+        codec = self._codecs[name]
+        other = "big" if getattr(codec.register, order) == "little" else "little"
+        return Codec(name=name, register=codec.register.model_copy(update={order: other})).decode(codec.encode(value))
 
     def _encoded(self, controller: PIDController) -> list[list[int]]:
         """Return the words of every block of gains."""
@@ -116,9 +208,16 @@ class GainRegisterRig(RegisterRig):
         ]
 
     def _decoded(self, words: Sequence[list[int]]) -> PIDController:
+        return self._controller(self._shown(words))
+
+    def _shown(self, words: Sequence[list[int]]) -> dict[str, float]:
+        """Return the engineering values of the words of every block of gains."""
         shown: dict[str, float] = {}
         for block, held in zip(self._parts, words, strict=True):
             shown |= block.decode(held)
+        return shown
+
+    def _controller(self, shown: Mapping[str, float]) -> PIDController:
         return controller_of(self._gains, {name: shown[mapped] for name, mapped in self._gain_names.items()})
 
     def _write_checked(self, words: Sequence[list[int]]) -> None:

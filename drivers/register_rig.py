@@ -43,6 +43,8 @@ class RegisterRig:
         Cycle of the device's program [s]; 20 ms where it is not known.
     permissives : sequence of PermissiveSettings
         Conditions that are read with every sample, and without which the rig is not moved.
+    clock : Clock, optional
+        Time as the device lives it; the monotonic clock where absent.
 
     Raises
     ------
@@ -69,12 +71,13 @@ class RegisterRig:
         feed_s: float = 0.1,
         scan_time_s: float | None = None,
         permissives: Sequence[PermissiveSettings] = (),
+        clock: Clock | None = None,
     ) -> None:
         self._link = link
         self._codecs = codecs(registers.mapped())
         self._permissives = {f"permissive {one.name!r}": one for one in permissives}
         conditions = codecs(self._permissives)
-        self._clock = MonotonicClock()
+        self._clock: Clock = clock if clock is not None else MonotonicClock()
         self._u_range = u_range
         self._u_safe = u_safe
         self._feed_s = feed_s
@@ -95,6 +98,7 @@ class RegisterRig:
         self._is_open = False
         self._is_taken = False  # whether anything was written in this session
         self._is_commanding = False
+        self._released_s = math.nan  # when this session gave the actuator to the device's own controller
 
     @property
     def clock(self) -> Clock:
@@ -168,6 +172,7 @@ class RegisterRig:
         self.feed()
         reading, values = self._sample()
         self._check_permissives(values)
+        self._check_released(values)
         if self._is_commanding and values.get("in_command") == 0.0:
             self._is_commanding = False
             raise LinkError(
@@ -192,8 +197,8 @@ class RegisterRig:
         self._command()
 
     def feed(self) -> None:
-        """Feed the device's dead-man where that is due; nothing where the host does not command."""
-        if self._is_commanding and self._clock.now() - self._heart.fed_s > self._feed_s:
+        """Feed the device's dead-man where that is due, also while its own controller is watched on trial."""
+        if (self._is_commanding or self._is_released) and self._clock.now() - self._heart.fed_s > self._feed_s:
             self._feed()
 
     def make_safe(self) -> None:
@@ -223,28 +228,52 @@ class RegisterRig:
         LinkError
             The device could not be reached, or does not hold what was written; it is not known who commands.
         """
-        self._require(self._is_commanding and self._former is not None, "no controller had the actuator", "")
         former = self._former
-        if former is not None and math.isfinite(former.setpoint):
-            self._put("setpoint", former.setpoint)
-        self._put("automatic", 1.0)
-        if "enable" in self._codecs:
-            self._put("enable", 0.0)
+        self._require(
+            (self._is_commanding or self._is_released) and former is not None, "no controller had the actuator", ""
+        )
+        self._release(former.setpoint if former is not None else math.nan)
         self._await_command(0.0)
-        self._is_commanding = False
+        self._is_commanding, self._released_s = False, math.nan
         held = self._read(("automatic",))
         self._require(held["automatic"] == 1.0, "the device's controller is not in automatic", "set it at the rig")
 
     def close(self) -> None:
         """Disconnect."""
         self._is_open = self._is_commanding = self._is_taken = False
+        self._released_s = math.nan
         self._link.disconnect()
 
+    @property
+    def _is_released(self) -> bool:
+        """Whether this session gave the actuator to the device's own controller and watches it."""
+        return math.isfinite(self._released_s)
+
+    def _release(self, setpoint: float) -> None:
+        """Let the device's own controller have the actuator, without a load; NaN leaves its set-point."""
+        if "load" in self._codecs:
+            self._put("load", 0.0)
+        if math.isfinite(setpoint):
+            self._put("setpoint", setpoint)
+        self._put("automatic", 1.0)
+        if "enable" in self._codecs:
+            self._put("enable", 0.0)
+
+    def _check_released(self, values: Mapping[str, float]) -> None:
+        """Refuse a device that is some program cycles later still not run by its own controller."""
+        if not self._is_released or self._clock.now() - self._released_s < max(_TAKE_S, self._late_s):
+            return
+        self._require(
+            values.get("in_command", 0.0) == 0.0,
+            "the device's own controller does not take the actuator",
+            "look at the device's mode switch; enable at 0 and automatic at 1 were written",
+        )
+
     def _go_safe(self) -> None:
-        self._is_commanding = False
+        self._is_commanding, self._released_s = False, math.nan
         self._u = self._u_safe
         self._write(self._first_blocks)  # a device that restarted has forgotten its safe output
-        for name in ("automatic", "enable"):
+        for name in ("automatic", "enable", "load"):
             if name in self._codecs:
                 self._put(name, 0.0)
 

@@ -18,7 +18,6 @@ from dataclasses import dataclass
 from sim.plant import Plant
 from sim.registers import RegisterSpec, Table, from_words, to_words
 
-_TICK_S = 0.01
 _KEPT = 100_000
 _GAINS = ("K", "Ti", "Td", "Tf")
 
@@ -59,8 +58,8 @@ class RegisterDevice:
         What it moves and measures.
     registers : mapping of str to RegisterSpec
         Signals ``y``, ``u`` and any of ``u_applied``, ``device_time``, ``heartbeat``, ``heartbeat_echo``, ``enable``,
-        ``in_command``, ``safe``, ``automatic``, ``setpoint``, ``K``, ``Ti``, ``Td``, ``Tf``, ``unlock``; others are
-        held as they are written.
+        ``in_command``, ``safe``, ``automatic``, ``setpoint``, ``load``, ``K``, ``Ti``, ``Td``, ``Tf``,
+        ``unlock``; others are held as they are written.
     u_safe : float
         Safe output until the host writes another [u unit].
     u_range : (float, float)
@@ -73,6 +72,8 @@ class RegisterDevice:
         What further registers hold when it is delivered.
     law : callable, optional
         From all that the registers hold to K, Ti, Td, Tf of the controller, where it has its gains in another form.
+    scan_s : float
+        Cycle of the controller [s].
     unlock_code : float, optional
         Without it in ``unlock`` the device refuses new gains, with Modbus's illegal value.
     """
@@ -89,6 +90,7 @@ class RegisterDevice:
         held: Mapping[str, float] | None = None,
         law: Callable[[Mapping[str, float]], tuple[float, float, float, float]] | None = None,
         unlock_code: float | None = None,
+        scan_s: float = 0.01,
     ) -> None:
         self.plant = plant
         self.registers = dict(registers)
@@ -109,6 +111,7 @@ class RegisterDevice:
             "enable": 0.0,
             "automatic": 0.0,
             "setpoint": 0.0,
+            "load": 0.0,
             "K": gains[0],
             "Ti": gains[1],
             "Td": 0.0,
@@ -118,6 +121,8 @@ class RegisterDevice:
         self._law = law if law is not None else _isa
         self._unlock_code = unlock_code
         self._u_range = u_range
+        self._scan_s = scan_s
+        self._controlled = 0.0  # what the controller asks for, without the load
         self.deadman_s = deadman_s
         self._output = plant.u_applied
         self._by_host = False
@@ -272,23 +277,26 @@ class RegisterDevice:
         if self._values["automatic"] == 1.0:
             self._y_filtered, self._y_rate = self.plant.measure(), 0.0
             self._error = self._values["setpoint"] - self._y_filtered
-            self._tick_s = self._now_s + _TICK_S
+            self._tick_s = self._now_s + self._scan_s
+            self._controlled = self._output - self._values["load"]
         else:
             self._set(self._values["safe"], cause)
 
     def _control(self) -> None:
         """One tick of the controller in velocity form, held within the actuator's range; no derivative of r."""
         K, Ti, Td, Tf = self._law(self._values)
+        tick_s, load = self._scan_s, self._values["load"]
         before, rate = self._y_filtered, self._y_rate
-        self._y_filtered += _TICK_S / (Tf + _TICK_S) * (self.plant.measure() - before)
-        self._y_rate = (self._y_filtered - before) / _TICK_S
+        self._y_filtered += tick_s / (Tf + tick_s) * (self.plant.measure() - before)
+        self._y_rate = (self._y_filtered - before) / tick_s
         error = self._values["setpoint"] - self._y_filtered
         low, high = self._u_range
-        u = self._output + K * (error - self._error) + (K * _TICK_S / Ti * error if Ti > 0 else 0.0)
+        u = self._controlled + K * (error - self._error) + (K * tick_s / Ti * error if Ti > 0 else 0.0)
         u -= K * Td * (self._y_rate - rate)
         self._error = error
-        self._tick_s += _TICK_S
-        self._set(min(max(u, low), high), "controller")
+        self._tick_s += tick_s
+        self._controlled = min(max(u, low - load), high - load)
+        self._set(self._controlled + load, "controller")
 
     def _set(self, output: float, cause: str) -> None:
         self._output = output

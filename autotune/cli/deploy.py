@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 
     from autotune.config import Config
     from autotune.controller import PIDController
+    from autotune.experiment.judgement import Verification
     from autotune.experiment.rig import HoldsGains, Rig
-    from autotune.experiment.verify import Verification
     from autotune.identification.parametric import PlantFit
     from autotune.pipeline.audit import AuditLog
     from autotune.pipeline.folder import Measured
@@ -95,7 +95,7 @@ def deploy(
     def try_out(held: PIDController) -> Verification:
         assert measured is not None
         assert fit is not None
-        return _verify(rig, content, held, fit, measured, folder)
+        return _verify(rig, content, held, fit, measured, folder, on_device=True)
 
     trial = try_out if verify else None
     done = hand_over(rig, new, folder / JOURNAL, agree=agree, try_out=trial, audit=audit)
@@ -106,6 +106,7 @@ def deploy(
             "old": asdict(done.old),
             "new": asdict(done.new),
             "kept": done.kept,
+            "verified": verification.whose if verification is not None else "not verified",
             "verification": verification_json(verification) if verification is not None else None,
         },
         result,
@@ -134,9 +135,10 @@ def verify(
     content = load_config(config)
     measured, fit = _plant(run, points)
     rig = rig_of(content)
-    gains = read_gains(rig) if isinstance(rig, HoldsGains) and controller is None else _gains(controller, None, run)
+    own = isinstance(rig, HoldsGains) and controller is None
+    gains = read_gains(rig) if isinstance(rig, HoldsGains) and own else _gains(controller, None, run)
     folder = _folder(config, run, out)
-    verification = _verify(rig, content, gains, fit, measured, folder)
+    verification = _verify(rig, content, gains, fit, measured, folder, on_device=own)
     result = next_free(folder / "verify.json", ".html")
     write_json({"controller": asdict(gains), "verification": verification_json(verification)}, result)
     page = verification_page(content.name, content.signals, gains, verification)
@@ -233,7 +235,7 @@ def _restore_interrupted(rig: HoldsGains, journal: Path, console: Console, yes: 
 
 
 def _verify(
-    rig: Rig, config: Config, gains: PIDController, fit: PlantFit, measured: Measured, folder: Path
+    rig: Rig, config: Config, gains: PIDController, fit: PlantFit, measured: Measured, folder: Path, *, on_device: bool
 ) -> Verification:
     from autotune.experiment.verify import run_verification
     from autotune.pipeline.folder import VERIFICATION, next_free
@@ -247,6 +249,7 @@ def _verify(
             next_free(folder / VERIFICATION, ".toml"),
             u_rest=measured.u_rest,
             noise_sd=measured.noise_sd,
+            on_device=on_device,
             on_status=bar.show,
         )
 

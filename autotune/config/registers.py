@@ -211,6 +211,9 @@ class RegisterMap(Section):
     safe: RegisterSettings | None = _signal("output that the device sets when the host falls silent [u unit]")
     automatic: RegisterSettings | None = _signal("1 while the device's own controller may run")
     setpoint: RegisterSettings | None = _signal("set-point of the device's own controller [y unit]")
+    load: RegisterSettings | None = _signal(
+        "added to the output of the device's own controller, for a load step of its verification [u unit]"
+    )
     K: RegisterSettings | None = _signal("proportional gain of the device's own controller [u unit/y unit]")
     Ti: RegisterSettings | None = _signal("integral time of the device's own controller [s]; 0 is no integral action")
     Td: RegisterSettings | None = _signal("derivative time of the device's own controller [s]; absent: it is a PI")
@@ -248,7 +251,7 @@ class RegisterMap(Section):
     @model_validator(mode="after")
     def _consistent(self) -> RegisterMap:
         mapped = self.mapped()
-        written = ("u", "heartbeat", "safe", "setpoint", *_LOGICAL, *_PLAIN)
+        written = ("u", "heartbeat", "safe", "setpoint", "load", *_LOGICAL, *_PLAIN)
         for name, register in mapped.items():
             if (name in written or name.startswith("gains.")) and name != "in_command" and not register.writable:
                 raise ValueError(f"{name} is written by the host, so it cannot lie in table {register.table!r}")

@@ -179,6 +179,34 @@ class ControlLoop:
         self.tick = self._judged(self._reading, u=u)
         return self.tick
 
+    @property
+    def applied(self) -> float:
+        """Output that the device applied when the latest sample was taken; the command where it does not say."""
+        shown = self._reading.u_applied
+        return shown if math.isfinite(shown) else self.tick.u
+
+    def observe(self, *, extra: Mapping[str, float] | None = None) -> Tick:
+        """Leave the output to the rig's own controller until the next sample, and return that sample.
+
+        Raises
+        ------
+        ExperimentStopped
+            From the limits on y, which hold as ever; or its output is beyond those of the command.
+        """
+        limits, applied = self.envelope.settings, self.applied
+        slack = min(self.monitor.u_tolerance, 0.02 * (limits.u_max - limits.u_min))
+        if not limits.u_min - slack <= applied <= limits.u_max + slack:
+            raise ExperimentStopped(
+                f"limit reached: the device's own controller puts out {applied:.4g},"
+                f" outside {limits.u_min:g}..{limits.u_max:g}",
+                remedy="limit its output in the device as limits.u_min..u_max do here",
+            )
+        self._write_row(applied, extra or {})
+        self._wait()
+        self._reading = self.rig.read()
+        self.tick = self._judged(self._reading, u=self.applied)
+        return self.tick
+
     def begin(self, reading: Reading) -> None:
         """Take the sample after which a law on the device begins; its row is written with the one that follows."""
         if self._time_of(reading) > self.tick.t_s:

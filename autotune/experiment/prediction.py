@@ -88,6 +88,7 @@ def predict(
     rng: np.random.Generator,
     *,
     u_rest: float,
+    thin: int = 1,
 ) -> Prediction:
     """Predict the loop around its operating point, the limits of the command and of its rate included.
 
@@ -107,21 +108,25 @@ def predict(
         Source of the noise.
     u_rest : float
         Command that holds the operating point [u unit], which the limits are counted from.
+    thin : int
+        Samples of the law between two rows, of a device whose own law runs faster than it is looked at.
 
     Notes
     -----
     The loop runs on noise alone for N samples before the first one counts, so that the band holds the wander that the
     noise itself causes. Quantisation of u is not in it.
     """
+    setpoint, disturbance = np.repeat(setpoint, thin), np.repeat(disturbance, thin)
     count = setpoint.size
     quiet = np.zeros(count)
     y, u = _respond(plant, law, setpoint, disturbance, quiet, u_rest)
     whole_setpoint, whole_disturbance = np.concatenate([quiet, setpoint]), np.concatenate([quiet, disturbance])
-    y_draws = np.empty((len(draws), count))
+    y_draws = np.empty((len(draws), count // thin))
     for i, drawn in enumerate(draws):
         noise = noise_sd * rng.standard_normal(2 * count)
         true, _ = _respond(drawn, law, whole_setpoint, whole_disturbance, noise, u_rest)
-        y_draws[i] = (true + noise)[count:]
+        y_draws[i] = (true + noise)[count::thin]
+    y, u, count = y[::thin], u[::thin], count // thin
     scatter = np.sqrt(uniform_filter1d(np.mean((y_draws - y) ** 2, axis=0), max(1, count // 60), mode="nearest"))
     return Prediction(y=y, low=y - 1.96 * scatter, high=y + 1.96 * scatter, u=u, y_draws=y_draws)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -214,6 +215,42 @@ class HoldsGains(Rig, Protocol):
 
     def write_gains(self, controller: PIDController) -> None:
         """Write gains and read them back; raises LinkError if what is read back differs."""
+        ...
+
+
+@runtime_checkable
+class RunsOwnController(HoldsGains, Protocol):
+    """A rig whose own controller, on the gains that it holds, may be given the actuator by the host and watched."""
+
+    @property
+    def not_startable(self) -> str:
+        """What the host lacks for that, as half a sentence; empty where it can."""
+        ...
+
+    @property
+    def takes_load(self) -> bool:
+        """Whether a load can be added to the output of the rig's own controller."""
+        ...
+
+    @property
+    def scan_time_s(self) -> float:
+        """Cycle of the device's program [s]; what is assumed where nobody said it."""
+        ...
+
+    def start_controller(self, setpoint: float) -> float:
+        """Give it the actuator at a set-point [y unit], readings go on; return the set-point as the device holds it."""
+        ...
+
+    def ask_controller(self, setpoint: float, load: float) -> tuple[float, float]:
+        """Change set-point [y unit] and what is added to its output [u unit]; return both as the device holds them."""
+        ...
+
+    def misread(self, controller: PIDController) -> Mapping[str, PIDController]:
+        """Return what a device would hold that reads the registers of the gains otherwise, by how."""
+        ...
+
+    def misread_setpoint(self, setpoint: float) -> Mapping[str, float]:
+        """Return what a device would regulate to that reads the set-point's register otherwise, by how [y unit]."""
         ...
 
 

@@ -47,8 +47,23 @@ class StepTest:
 
     @property
     def disturbed_from(self) -> int:
-        """First sample of the load step."""
-        return int(np.argmax(self.disturbance != 0.0))
+        """First sample of the second step: the load's, or the set-point's way back."""
+        changed = (self.disturbance != self.disturbance[0]) | (self.setpoint != self.setpoint[0])
+        return int(np.argmax(changed))
+
+    @property
+    def sample_time_s(self) -> float:
+        """Time between two samples [s]."""
+        return float(self.t[1] - self.t[0])
+
+    def asked(self, k: int) -> tuple[float, float]:
+        """Return departure of the set-point and load of a sample; none before the first one."""
+        return (float(self.setpoint[k]), float(self.disturbance[k])) if k >= 0 else (0.0, 0.0)
+
+    def without_load(self) -> StepTest:
+        """Return the test of a loop that takes no load: the set-point's step back comes in its place."""
+        back = np.arange(self.t.size) >= self.disturbed_from
+        return replace(self, setpoint=np.where(back, 0.0, self.setpoint), disturbance=np.zeros(self.t.size))
 
 
 def plan_test(

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from scipy.ndimage import uniform_filter1d
 
 from autotune.arrays import FloatArray
 from autotune.config import Config
@@ -19,11 +17,12 @@ from autotune.design.law import PILaw
 from autotune.design.margins import Margins, margins
 from autotune.errors import DesignError
 from autotune.experiment.device import try_on_device
+from autotune.experiment.judgement import Verification, judge
 from autotune.experiment.limits import Watch
 from autotune.experiment.loop import ControlLoop
-from autotune.experiment.prediction import Prediction, predict
+from autotune.experiment.own_law import law_of, try_own_law
 from autotune.experiment.result import State, Status
-from autotune.experiment.rig import Exchanges, Rig, RunsLaws
+from autotune.experiment.rig import Exchanges, HoldsGains, Rig, RunsLaws, RunsOwnController
 from autotune.experiment.run import (
     OnStatus,
     bring_to_operating_point,
@@ -35,73 +34,6 @@ from autotune.experiment.run import (
 from autotune.experiment.step_test import StepTest, plan_test
 from autotune.identification.parametric import PlantFit
 from autotune.recording import RecordingWriter
-
-#: plants and noise sequences drawn for the prediction's band
-DRAWS = 60
-#: part of the predicted departure's rms that unmodelled dynamics may add before the loop counts as another one
-TOLERANCE = 0.15
-#: share of the test with the command at a limit from which on it is told
-AT_LIMIT = 0.1
-
-
-@dataclass(frozen=True, kw_only=True)
-class StepFigures:
-    """What people look at in a step response.
-
-    Attributes
-    ----------
-    overshoot : float
-        Largest excess over the set-point step, as a share of it.
-    rise_s : float
-        Time to reach nine tenths of the set-point step [s]; NaN where it is not reached.
-    peak : float
-        Largest departure under the load step [y unit].
-    h2 : float
-        Root of the integral of y^2 over the load step, per unit of load: the criterion (11), over this time only.
-    """
-
-    overshoot: float
-    rise_s: float
-    peak: float
-    h2: float
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Verification:
-    """The measured loop beside the predicted one, and the decision.
-
-    Attributes
-    ----------
-    accepted : bool
-        Whether the loop behaves as predicted.
-    reason : str
-        Why, in one sentence.
-    test : StepTest
-        What was asked.
-    y, u : (N,) array
-        Measured departure from the operating point [y unit]; the law's command [u unit].
-    prediction : Prediction
-        What was expected.
-    rms_error, allowed : float
-        Root mean square of measured less predicted, both smoothed, and the largest that prediction and noise explain
-        [y unit].
-    measured, predicted : StepFigures
-        Of the smoothed measurement, and their means over the drawn plants and noise.
-    predicted_sd : StepFigures
-        Standard deviation of the figures over the drawn plants and noise.
-    """
-
-    accepted: bool
-    reason: str
-    test: StepTest
-    y: FloatArray
-    u: FloatArray
-    prediction: Prediction
-    rms_error: float
-    allowed: float
-    measured: StepFigures
-    predicted: StepFigures
-    predicted_sd: StepFigures
 
 
 def run_test(
@@ -143,17 +75,9 @@ def run_test(
     count = test.settle + test.t.size
     setpoint = operating_y + np.concatenate([np.zeros(test.settle), test.setpoint])
     load = np.concatenate([np.zeros(test.settle), test.disturbance])
-    every = max(1, round(0.5 / law.sample_time_s))
-
-    def tell(k: int) -> None:
-        if on_status is not None and k % every == 0:
-            left_s = (count - k) * law.sample_time_s
-            message = "steps with the new gains"
-            on_status(Status(state=State.VERIFY, elapsed_s=loop.tick.t_s, remaining_s=left_s, message=message))
-
+    tell = _teller(loop, count, "steps with the new gains", on_status)
     if isinstance(loop.rig, RunsLaws):
-        while loop.tick.u != (u_next := loop.nearest(u_hold)):
-            loop.step(u_next)
+        _hold(loop, u_hold)
         y, u = try_on_device(loop, loop.rig, law.controller, setpoint, load, tell)
         return (y - operating_y)[test.settle :], u[test.settle :]
     y, u = np.full(count, np.nan), np.full(count, np.nan)
@@ -169,6 +93,24 @@ def run_test(
         before = k
     u[before + 1 :] = u[before]
     return y[test.settle :], u[test.settle :]
+
+
+def _hold(loop: ControlLoop, u: float) -> None:
+    """Bring the command to a value."""
+    while loop.tick.u != (u_next := loop.nearest(u)):
+        loop.step(u_next)
+
+
+def _teller(loop: ControlLoop, count: int, message: str, on_status: OnStatus | None) -> Callable[[int], None]:
+    """Return what tells a listener twice a second which of the samples has come."""
+    every = max(1, round(0.5 / loop.sample_time_s))
+
+    def tell(k: int) -> None:
+        if on_status is not None and k % every == 0:
+            left_s = (count - k) * loop.sample_time_s
+            on_status(Status(state=State.VERIFY, elapsed_s=loop.tick.t_s, remaining_s=left_s, message=message))
+
+    return tell
 
 
 def expected_margins(fit: PlantFit, controller: PIDController) -> Margins:
@@ -198,6 +140,7 @@ def run_verification(
     *,
     u_rest: float | None = None,
     noise_sd: float | None = None,
+    on_device: bool = False,
     on_status: OnStatus | None = None,
 ) -> Verification:
     """Bring the rig to its operating point, close the loop with the new controller, test it and leave the rig safe.
@@ -217,6 +160,8 @@ def run_verification(
     u_rest, noise_sd : float, optional
         From the experiment: command that holds the operating point [u unit], standard deviation of the noise of y
         [y unit]; found on the way to the operating point where they are not known.
+    on_device : bool
+        Whether the rig's own controller holds the gains: then it is what is tried, where the host may start it.
     on_status : callable, optional
         Told where the procedure is.
 
@@ -232,19 +177,49 @@ def run_verification(
     if isinstance(rig, Exchanges) and not isinstance(rig, RunsLaws):
         fit = _delayed(fit, config.signals.sample_time_s)  # its commands act one sample after what they come from
     test = plan_test(config, law, fit, crossover_rad_s, u_rest)
+    own, untried = _own_controller(rig, on_device)
     extra = ("r", *further_columns(rig))
     writer = RecordingWriter(recording, ("t", "u", "y", *extra), recording_metadata(config))
+    y_rest, trial = config.operating_point.y, None
     with ControlLoop(rig=rig, envelope=envelope_of(config), writer=writer, extra=extra) as loop:
         loop.metadata["controller"] = {"kind": controller.kind, "K": controller.K, "Ti_s": controller.Ti_s}
         if config.operating_point.approach == "ramp":
             wait_for_rest(loop)
         known = bring_to_operating_point(loop, config, u_rest=u_rest)
         loop.note(test_start_s=loop.tick.t_s)
-        y, u = run_test(loop, law, test, config.operating_point.y, known.midpoint, on_status)
+        if own is None:
+            y, u = run_test(loop, law, test, y_rest, known.midpoint, on_status)
+        else:
+            _hold(loop, known.midpoint)
+            tell = _teller(loop, test.settle + test.t.size, "steps of the device's own controller", on_status)
+            asked = test if own.takes_load else test.without_load()
+            trial = try_own_law(loop, own, controller, asked, y_rest, tell)
+    noise_sd = known.noise_sd if noise_sd is None else noise_sd
+    if own is not None and trial is not None:
+        law = replace(law, sample_time_s=_scan(own, law.sample_time_s), u_rate=math.inf)
+        y, u = trial.record.y[test.settle :] - y_rest, trial.record.u[test.settle :]
+        ran = law_of(trial.record, own, controller)
+        return judge(trial.test, y, u, law, fit, noise_sd, u_rest=known.midpoint, by="device", running_law=ran)
     if isinstance(rig, RunsLaws):
         law = replace(law, u_rate=math.inf)  # the device's own PI has no limit of the rate
-    noise_sd = known.noise_sd if noise_sd is None else noise_sd
-    return judge(test, y, u, law, fit, noise_sd, u_rest=known.midpoint)
+        return judge(test, y, u, law, fit, noise_sd, u_rest=known.midpoint, by="device")
+    return judge(test, y, u, law, fit, noise_sd, u_rest=known.midpoint, untried=untried)
+
+
+def _own_controller(rig: Rig, on_device: bool) -> tuple[RunsOwnController | None, str]:
+    """Return the rig where its own controller is to be tried, else why it is not."""
+    if not isinstance(rig, HoldsGains) or isinstance(rig, RunsLaws):
+        return None, ""
+    if not isinstance(rig, RunsOwnController):
+        return None, "the host has no means to start it"
+    if rig.not_startable:
+        return None, rig.not_startable
+    return (rig, "") if on_device else (None, "the gains were not in it")
+
+
+def _scan(rig: RunsOwnController, sample_time_s: float) -> float:
+    """Return the device's cycle, as a whole part of the sample time [s]."""
+    return sample_time_s / max(1, round(sample_time_s / rig.scan_time_s))
 
 
 def _delayed(fit: PlantFit, delay_s: float) -> PlantFit:
@@ -252,95 +227,6 @@ def _delayed(fit: PlantFit, delay_s: float) -> PlantFit:
     parameters[-1] += delay_s
     plant = replace(fit.plant, delay_s=fit.plant.delay_s + delay_s)
     return replace(fit, plant=plant, parameters=parameters)
-
-
-def judge(
-    test: StepTest,
-    y: FloatArray,
-    u: FloatArray,
-    law: PILaw,
-    fit: PlantFit,
-    noise_sd: float,
-    *,
-    u_rest: float,
-    seed: int = 0,
-) -> Verification:
-    """Compare the measured responses with the prediction.
-
-    Parameters
-    ----------
-    test : StepTest
-        What was asked.
-    y, u : (N,) array
-        From :func:`run_test`.
-    law : PILaw
-        The law that ran.
-    fit : PlantFit
-        Estimated plant with its uncertainty.
-    noise_sd : float
-        Standard deviation of the measurement noise [y unit].
-    u_rest : float
-        Command that holds the operating point, as it was known before the test [u unit].
-    seed : int
-        Of the draws.
-
-    Returns
-    -------
-    Verification
-        Accepted where the rms error is within what drawn plants and noise give in 99 % of cases, widened by 15 % of the
-        predicted response's rms for dynamics that the fitted structure leaves out.
-    """
-    rng = np.random.default_rng(seed)
-    draws = fit.draws(DRAWS, rng)
-    prediction = predict(fit.plant, draws, law, test.setpoint, test.disturbance, noise_sd, rng, u_rest=u_rest)
-    usable = np.isfinite(y)
-    expected = smoothed(prediction.y, test)
-    measured = smoothed(np.where(usable, y, np.interp(test.t, test.t[usable], y[usable])), test)
-    responses = [smoothed(draw, test) for draw in prediction.y_draws]
-    rms_error = _rms(measured - expected)
-    explained = float(np.quantile([_rms(response - expected) for response in responses], 0.99))
-    # the response counts from the set-point, where the loop is to bring it
-    allowed = math.hypot(explained, TOLERANCE * _rms(expected - test.setpoint))
-    accepted = rms_error <= allowed
-    drawn = [_figures(test, response) for response in responses]
-    error, limit = (f"{value:.3g} {test.y_unit}".strip() for value in (rms_error, allowed))
-    reason = (
-        f"the loop behaves as predicted: rms error {error}, up to {limit} is explained"
-        if accepted
-        else f"the loop does not behave as predicted: rms error {error}, only {limit} is explained"
-    )
-    if (at_limit := _share_at_limit(test, u, law)) > AT_LIMIT:
-        reason += f"; the command is at its limit for {100 * at_limit:.0f} % of the steps, where dead time hardly shows"
-    return Verification(
-        accepted=accepted,
-        reason=reason,
-        test=test,
-        y=y,
-        u=u,
-        prediction=prediction,
-        rms_error=rms_error,
-        allowed=allowed,
-        measured=_figures(test, measured),
-        predicted=_over(drawn, np.mean),
-        predicted_sd=_over(drawn, np.std),
-    )
-
-
-def _share_at_limit(test: StepTest, u: FloatArray, law: PILaw) -> float:
-    """Return the share of the samples at which the command, the load included, ends at a limit."""
-    whole, slack = u + test.disturbance, 1e-3 * (law.u_max - law.u_min)
-    return float(np.mean((whole <= law.u_min + slack) | (whole >= law.u_max - slack)))
-
-
-def _over(drawn: Sequence[StepFigures], statistic: Callable[[list[float]], Any]) -> StepFigures:
-    """Return a statistic of every figure over the draws."""
-    reached = [figure.rise_s for figure in drawn if math.isfinite(figure.rise_s)]
-    return StepFigures(
-        overshoot=float(statistic([figure.overshoot for figure in drawn])),
-        rise_s=float(statistic(reached)) if reached else math.nan,
-        peak=float(statistic([figure.peak for figure in drawn])),
-        h2=float(statistic([figure.h2 for figure in drawn])),
-    )
 
 
 def beside(law: PILaw, load: float) -> PILaw:
@@ -356,29 +242,4 @@ def law_for(controller: PIDController, limits: LimitSettings, sample_time_s: flo
         u_min=limits.u_min + abs(reserve),
         u_max=limits.u_max - abs(reserve),
         u_rate=limits.u_rate,
-    )
-
-
-def smoothed(y: FloatArray, test: StepTest) -> FloatArray:
-    """Return the centred moving average over the test's smoothing, step by step so that a step stays a step."""
-    split = test.disturbed_from
-    parts = (y[:split], y[split:])
-    return np.concatenate([uniform_filter1d(part, test.smoothing, mode="nearest") for part in parts])
-
-
-def _rms(values: FloatArray) -> float:
-    return float(np.sqrt(np.mean(values**2)))
-
-
-def _figures(test: StepTest, y: FloatArray) -> StepFigures:
-    split = test.disturbed_from
-    step, load = float(test.setpoint[0]), float(test.disturbance[-1])
-    rising, loaded = y[:split] / step, y[split:] - step
-    reached = rising >= 0.9
-    dt = float(test.t[1] - test.t[0])
-    return StepFigures(
-        overshoot=max(0.0, float(rising.max()) - 1.0),
-        rise_s=float(np.argmax(reached)) * dt if reached.any() else math.nan,
-        peak=float(np.abs(loaded).max()),
-        h2=float(np.sqrt(dt * np.sum(loaded**2))) / abs(load),
     )

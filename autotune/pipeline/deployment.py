@@ -15,8 +15,8 @@ from typing import Any, NoReturn
 from autotune.config.procedure import DesignSettings
 from autotune.controller import PIDController, held_from_table
 from autotune.errors import AutotuneError, ExperimentStopped, InputError, OperatorStop
+from autotune.experiment.judgement import Verification
 from autotune.experiment.rig import HoldsGains
-from autotune.experiment.verify import Verification
 from autotune.interrupts import interrupt_deferred
 from autotune.pipeline.audit import AuditLog
 from autotune.pipeline.held_gains import held_by
@@ -32,6 +32,7 @@ class Step(StrEnum):
     WRITTEN = "written and read back"
     ON_TRIAL = "written and read back, on trial"
     KEPT = "verified, kept"
+    HOST_ONLY = "host's law verified; the device's own law not tried"
     RESTORING = "restoring"
     RESTORED = "restored"
 
@@ -188,14 +189,19 @@ def hand_over(
         message says whether the old ones are in place again.
     """
     notes = Journal(journal, audit)
-    before = notes.unfinished()
-    if before is not None:
-        restore(rig, before, journal, audit=audit, why="an earlier hand-over was interrupted")
+    restore_interrupted(rig, journal, audit=audit)
     old = read_gains(rig)
     notes.note(Step.READ, old)
     if controller is not None:
         _write(rig, controller, old, notes, Step.WRITTEN, why)
     return old
+
+
+def restore_interrupted(rig: HoldsGains, journal: Path, *, audit: AuditLog | None = None) -> None:
+    """Write the gains back that the rig held before a hand-over that did not come to its end, where there was one."""
+    before = Journal(journal).unfinished()
+    if before is not None:
+        restore(rig, before, journal, audit=audit, why="an earlier hand-over was interrupted")
 
 
 def deploy(
@@ -241,7 +247,8 @@ def deploy(
     except BaseException as error:
         _take_back(rig, old, notes, error, "the verification was broken off")
     if verification.accepted:
-        notes.note(Step.KEPT, held, verification.reason)
+        step = Step.KEPT if verification.by == "device" else Step.HOST_ONLY
+        notes.note(step, held, f"{verification.whose}; {verification.reason}")
     else:
         restore(rig, old, journal, audit=audit, why=verification.reason)
     return Deployment(old=old, new=held, verification=verification)

@@ -9,8 +9,9 @@ from typing import Any
 
 from autotune.design.nugap import Validation
 from autotune.diagnosis.result import Diagnosis
+from autotune.experiment.judgement import Verification
 from autotune.experiment.result import ExperimentResult
-from autotune.experiment.verify import Verification
+from autotune.experiment.running_law import RunningLaw
 from autotune.outputs import write_whole
 from autotune.pipeline.analysis import Analysis
 from autotune.points import points_to_json
@@ -116,6 +117,23 @@ def verification_json(verification: Verification) -> dict[str, Any]:
     return {
         "accepted": verification.accepted,
         "reason": verification.reason,
+        "law": verification.by,
+        "verified": verification.whose,
+        "running_law": _running_law_json(verification.running_law),
         "predicted": asdict(verification.predicted) | {"rms_error_allowed": verification.allowed},
         "measured": asdict(verification.measured) | {"rms_error": verification.rms_error},
+    }
+
+
+def _running_law_json(law: RunningLaw | None) -> dict[str, Any] | None:
+    if law is None:
+        return None
+    return {
+        "is_given": law.is_given,
+        "said": law.sentence,
+        "misreading": law.misreading,
+        "K": law.K,
+        "Ti_s": law.Ti_s,
+        "Td_s": law.Td_s,
+        "departure": law.departure,
     }

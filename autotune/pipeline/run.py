@@ -12,15 +12,17 @@ from autotune.controller import PIDController
 from autotune.design.noise import LoopFacts
 from autotune.errors import AutotuneError, ExperimentStopped, OperatorStop
 from autotune.experiment.cycles import Earlier
+from autotune.experiment.judgement import Verification
 from autotune.experiment.result import ExperimentResult
-from autotune.experiment.rig import HoldsGains, Rig
+from autotune.experiment.rig import HoldsGains, Rig, RunsOwnController
 from autotune.experiment.run import OnStatus, run_experiment
 from autotune.experiment.sweep import missing_phases
-from autotune.experiment.verify import Verification, run_verification
+from autotune.experiment.verify import run_verification
 from autotune.outputs import unwritable
 from autotune.pipeline.analysis import Analysis, analyse
 from autotune.pipeline.audit import audit_log
-from autotune.pipeline.deployment import hand_over
+from autotune.pipeline.deployment import deploy as deploy_and_try
+from autotune.pipeline.deployment import hand_over, restore_interrupted
 from autotune.pipeline.folder import (
     JOURNAL,
     PROGRESS,
@@ -149,27 +151,11 @@ def _tune(
             analysis = on_registers(analysis, held)
         reduced = None if analysis.reduced is None else analysis.reduced.transfer_function()
         log.analysed(analysis.points, analysis.fit.plant, reduced, analysis.controller)
-        verification = None
-        if verify:
-            verification = run_verification(
-                rig,
-                config,
-                analysis.controller,
-                analysis.fit,
-                log.recording(next_free(out / VERIFICATION, ".toml")),
-                u_rest=experiment.u_rest,
-                noise_sd=experiment.noise_sd,
-                on_status=on_status,
-            )
-            log.verified(verification)
-        accepted = verification is not None and verification.accepted
-        old, deployed = None, False
-        if isinstance(rig, HoldsGains):
-            audit = audit_log(config, out, "run")
-            new = analysis.controller if accepted and deploy else None
-            said = verification.reason if verification is not None else ""
-            old = hand_over(rig, new, out / JOURNAL, audit=audit, why=said)
-            deployed = accepted and deploy
+        handed = _hand_over(
+            rig, config, analysis, experiment, out, log, verify=verify, deploy=deploy, on_status=on_status
+        )
+        verification, old, deployed = handed.verification, handed.old, handed.deployed
+        audit = audit_log(config, out, "run")
         log.gains(old, analysis.controller, deployed=deployed)
         if isinstance(rig, HoldsGains) and old is not None and deployed and keep is not None:
             log.waiting(DECISION_S)
@@ -195,6 +181,65 @@ def _tune(
     return Tuning(
         experiment=experiment, analysis=analysis, verification=verification, old_controller=old, deployed=deployed
     )
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Handed:
+    """What became of the new controller at the rig."""
+
+    verification: Verification | None = None
+    old: PIDController | None = None
+    deployed: bool = False
+
+
+def _hand_over(
+    rig: Rig,
+    config: Config,
+    analysis: Analysis,
+    experiment: ExperimentResult,
+    out: Path,
+    log: RunLog,
+    *,
+    verify: bool,
+    deploy: bool,
+    on_status: OnStatus,
+) -> _Handed:
+    """Verify the controller and hand it over: first the gains, then the trial, where the rig's own law can be tried."""
+    audit = audit_log(config, out, "run")
+
+    def verified(controller: PIDController, on_device: bool) -> Verification:
+        found = run_verification(
+            rig,
+            config,
+            controller,
+            analysis.fit,
+            log.recording(next_free(out / VERIFICATION, ".toml")),
+            u_rest=experiment.u_rest,
+            noise_sd=experiment.noise_sd,
+            on_device=on_device,
+            on_status=on_status,
+        )
+        log.verified(found)
+        return found
+
+    if verify and deploy and isinstance(rig, RunsOwnController) and not rig.not_startable:
+        restore_interrupted(rig, out / JOURNAL, audit=audit)
+        done = deploy_and_try(
+            rig,
+            analysis.controller,
+            out / JOURNAL,
+            agree=lambda old, new: None,
+            try_out=lambda held: verified(held, on_device=True),
+            audit=audit,
+        )
+        return _Handed(verification=done.verification, old=done.old, deployed=done.kept)
+    verification = verified(analysis.controller, on_device=False) if verify else None
+    accepted = verification is not None and verification.accepted
+    if not isinstance(rig, HoldsGains):
+        return _Handed(verification=verification)
+    said = f"{verification.whose}; {verification.reason}" if verification is not None else ""
+    old = hand_over(rig, analysis.controller if accepted and deploy else None, out / JOURNAL, audit=audit, why=said)
+    return _Handed(verification=verification, old=old, deployed=accepted and deploy)
 
 
 def _facts(config: Config, experiment: ExperimentResult) -> LoopFacts:

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Literal
 
 import numpy as np
 
 from autotune.config.procedure import SignalSettings
 from autotune.controller import PIDController
 from autotune.diagnosis.result import Diagnosis
+from autotune.experiment.judgement import Verification, smoothed
 from autotune.experiment.leaving import sentence
 from autotune.experiment.result import ExperimentResult, Segment
-from autotune.experiment.verify import Verification, smoothed
+from autotune.experiment.step_test import StepTest
 from autotune.pipeline import Analysis, Tuning
 from autotune.pipeline.deployment import Deployment
 from autotune.recording import Recording
@@ -153,8 +155,9 @@ def deployment_page(name: str, signals: SignalSettings, done: Deployment) -> Pag
     new, verification = gains_text(done.new, signals), done.verification
     if verification is None:
         verdict = f"Written and read back: {new}; not verified."
-    elif verification.accepted:
-        verdict = f"Kept: {new}; {verification.reason}."
+    elif done.kept:
+        word = "Kept" if verification.by == "device" else "Written and read back"
+        verdict = f"{word}: {new}; {verification.reason}; {verification.whose}."
     else:
         verdict = f"Not kept: {new}; {verification.reason}. The old gains are in place again."
     gains = Table(
@@ -174,7 +177,7 @@ def deployment_page(name: str, signals: SignalSettings, done: Deployment) -> Pag
     return Page(
         title=f"Gains handed over: {name}",
         verdict=verdict,
-        tone="warn" if verification is None else "good" if done.kept else "bad",
+        tone=_tone(verification),
         answers=(("What to do", _next_step(verification)),),
         sections=(
             Section(title="Gains", tables=(gains,)),
@@ -202,16 +205,28 @@ def verification_page(
     said = "Accepted" if verification.accepted else "Not accepted"
     return Page(
         title=f"Verification: {name}",
-        verdict=f"{said}: {gains_text(controller, signals)}; {verification.reason}.",
-        tone="good" if verification.accepted else "bad",
+        verdict=f"{said}: {gains_text(controller, signals)}; {verification.reason}; {verification.whose}.",
+        tone=_tone(verification),
         answers=(("What to do", _next_step(verification)),),
         sections=(_verification_section(verification, signals),),
     )
 
 
+def _tone(verification: Verification | None) -> Literal["good", "warn", "bad"]:
+    """Return the tone of a page: good only where what was verified is what will run."""
+    if verification is None or (verification.accepted and verification.untried):
+        return "warn"
+    return "good" if verification.accepted else "bad"
+
+
 def _next_step(verification: Verification | None) -> str:
     if verification is None:
         return "Verify the controller on the rig."
+    if verification.accepted and verification.untried:
+        return (
+            "Put the device's own controller in automatic, stand beside it, and step its set-point: only the host's law"
+            f" was verified ({verification.untried})."
+        )
     if verification.accepted:
         return "Watch the loop through its usual operating range; the points were measured at one of them."
     return (
@@ -228,7 +243,8 @@ def _verdict(tuning: Tuning, signals: SignalSettings, dry_run: bool) -> tuple[st
         held = "the rig holds its old gains" if tuning.old_controller else "its gains are in result.json"
         where = "the rig holds it now" if tuning.deployed else held
         where = "this was its simulated twin, the rig was not touched" if dry_run else where
-        return f"Accepted: {gains}; {tuning.verification.reason}; {where}.", True
+        whose = "" if dry_run else f"{tuning.verification.whose}; "
+        return f"Accepted: {gains}; {tuning.verification.reason}; {whose}{where}.", True
     return f"Not accepted: {gains}; {tuning.verification.reason}. The old gains were kept.", False
 
 
@@ -336,14 +352,17 @@ def _verification_section(verification: Verification, signals: SignalSettings) -
     return Section(
         title="Verification on the rig",
         text=(
-            f"Set-point step of {verification.test.setpoint[0]:.3g} {unit}, then a load of"
-            f" {verification.test.disturbance[-1]:.3g} {signals.u_unit} added to the command.",
-            _sentence(verification.reason),
+            _asked(verification.test, signals),
+            _sentence(f"{verification.whose}: {verification.reason}"),
+            *((_sentence(law.sentence),) if (law := verification.running_law) is not None else ()),
         ),
         tables=(
             Table(
                 header=("", "measured", "predicted", "predicted scatter (sd)"),
-                rows=tuple((name, *(f"{value:.3g}" for value in values)) for name, *values in rows),
+                rows=tuple(
+                    (name, *(f"{value:.3g}" if math.isfinite(value) else "-" for value in values))
+                    for name, *values in rows
+                ),
                 caption="Of the smoothed responses; what is left of the noise is in the scatter.",
             ),
         ),
@@ -386,6 +405,13 @@ def _diagnosis_section(found: Diagnosis) -> Section:
 
 def _sentence(text: str) -> str:
     return f"{text[0].upper()}{text[1:]}."
+
+
+def _asked(test: StepTest, signals: SignalSettings) -> str:
+    step, load = f"Set-point step of {test.setpoint[0]:.3g} {signals.y_unit}", float(test.disturbance[-1])
+    if load == 0.0:
+        return f"{step}, then back; no load was tried, as the device takes none (rig.registers.load is not mapped)."
+    return f"{step}, then a load of {load:.3g} {signals.u_unit} added to the command."
 
 
 def _step_figure(verification: Verification, signals: SignalSettings) -> Chart:

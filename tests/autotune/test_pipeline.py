@@ -15,8 +15,9 @@ from autotune.config import Config, load_config
 from autotune.config.procedure import DesignSettings
 from autotune.controller import PIDController
 from autotune.errors import DesignError, IdentificationError, InputError, LinkError
+from autotune.experiment.judgement import Verification
 from autotune.experiment.rig import Reading
-from autotune.experiment.verify import Verification, run_verification
+from autotune.experiment.verify import run_verification
 from autotune.identification.parametric import fit_plant
 from autotune.models import TransferFunction
 from autotune.pipeline import analyse, hand_over, tune

@@ -15,7 +15,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import pytest
 import tomli_w
@@ -26,9 +26,9 @@ from autotune.config import Config, load_config
 from autotune.config.registers import RegisterMap
 from autotune.controller import PIDController
 from autotune.errors import ExperimentStopped, InputError, LinkError, OperatorStop
+from autotune.experiment.judgement import Verification
 from autotune.experiment.loop import ControlLoop
 from autotune.experiment.run import envelope_of
-from autotune.experiment.verify import Verification
 from autotune.pipeline.audit import AuditLog, audit_log, user
 from autotune.pipeline.deployment import Journal, Step, deploy, hand_over, restore
 from autotune.recording import RecordingWriter
@@ -100,7 +100,7 @@ def refused(old: PIDController, new: PIDController) -> None:
     raise InputError("refused: nothing was written")
 
 
-def verified(accepted: bool) -> Any:
+def verified(accepted: bool, by: Literal["host", "device"] = "device") -> Any:
     """Return a trial that ends at once with the verdict; what is under test is what follows from it."""
     curve: Any = None
 
@@ -108,7 +108,7 @@ def verified(accepted: bool) -> Any:
         figures: Any = None
         return Verification(
             accepted=accepted, reason="", test=curve, y=curve, u=curve, prediction=curve,
-            rms_error=0.0, allowed=0.0, measured=figures, predicted=figures, predicted_sd=figures,
+            rms_error=0.0, allowed=0.0, measured=figures, predicted=figures, predicted_sd=figures, by=by,
         )  # fmt: skip
 
     return try_out
@@ -127,6 +127,14 @@ def test_gains_are_written_read_back_tried_and_kept(line: Line, tmp_path: Path) 
     assert (done.old, done.new, line.gains) == (OLD, NEW, NEW)
     assert tried == [(NEW, NEW, ["read", "writing", "written and read back, on trial"])]
     assert steps(journal)[-1] == "verified, kept"
+    assert Journal(journal).unfinished() is None
+
+
+def test_gains_whose_law_ran_in_the_host_alone_are_never_called_kept(line: Line, tmp_path: Path) -> None:
+    journal = tmp_path / "journal.jsonl"
+    done = deploy(line.rig(), NEW, journal, agree=agreed, try_out=verified(True, by="host"))
+    assert (done.kept, line.gains) == (True, NEW)
+    assert steps(journal)[-1] == "host's law verified; the device's own law not tried"
     assert Journal(journal).unfinished() is None
 
 

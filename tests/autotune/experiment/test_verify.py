@@ -13,10 +13,11 @@ import tomli_w
 from autotune.config import load_config
 from autotune.controller import PIDController
 from autotune.errors import ExperimentStopped
+from autotune.experiment.judgement import Verification, judge, smoothed
 from autotune.experiment.loop import ControlLoop
 from autotune.experiment.run import envelope_of
 from autotune.experiment.step_test import StepTest, plan_test
-from autotune.experiment.verify import Verification, judge, law_for, run_verification, smoothed
+from autotune.experiment.verify import law_for, run_verification
 from autotune.identification.parametric import PlantFit, fit_plant
 from autotune.models import TransferFunction
 from autotune.points import FrequencyPoint

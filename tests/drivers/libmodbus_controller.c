@@ -1,0 +1,141 @@
+/* A controller with a plant behind it on libmodbus, for the tests: a PI of its own in positional form, cycle 10 ms.
+ *
+ *   controller LAW    listens on a free loopback port, prints "ready PORT"
+ *
+ * LAW says how it understands its gains: ideal, swapped (words of K the other way round), minutes (T_I), percent (K of
+ * an output of 0..10 over a measurement of 0..5), parallel, reversed. The plant: 1/((0.3 s + 1)(0.1 s + 1)).
+ *
+ * Input registers: 0-1 y, 2-3 output, 4 last heartbeat, 5 whether the host commands. Holding registers: 0-1 u, 2
+ * heartbeat, 3-4 safe output, 10-11 K, 12-13 T_I in s, 14-15 set-point, 16-17 load. Coils: 0 host commands, 1 automatic.
+ * Floats have their high word first. Without a new heartbeat for half a second the host loses the output.
+ */
+#include <errno.h>
+#include <arpa/inet.h>
+#include <math.h>
+#include <modbus/modbus.h>
+#include <netinet/in.h>
+#include <stdio.h>
+#include <string.h>
+#include <sys/select.h>
+#include <sys/socket.h>
+#include <time.h>
+#include <unistd.h>
+
+#define SCAN 0.01
+enum { IDLE, HOST, OWN };
+
+static double now(void)
+{
+    struct timespec t;
+    clock_gettime(CLOCK_MONOTONIC, &t);
+    return t.tv_sec + 1e-9 * t.tv_nsec;
+}
+
+static double get(const uint16_t *words, int swapped)
+{
+    uint32_t bits = (uint32_t)words[swapped ? 1 : 0] << 16 | words[swapped ? 0 : 1];
+    float value;
+    memcpy(&value, &bits, sizeof value);
+    return value;
+}
+
+static void put(uint16_t *words, double value)
+{
+    float single = (float)value;
+    uint32_t bits;
+    memcpy(&bits, &single, sizeof bits);
+    words[0] = bits >> 16;
+    words[1] = bits & 0xFFFF;
+}
+
+static double clamp(double value)
+{
+    return value < 0.0 ? 0.0 : value > 10.0 ? 10.0 : value;
+}
+
+static void scan(modbus_mapping_t *memory, const char *law, double t)
+{
+    static double x1, x2, integral, output, fed;
+    static int mode = IDLE, beat = -1;
+    uint16_t *held = memory->tab_registers;
+    double y = x2, K = get(held + 10, strcmp(law, "swapped") == 0), Ti = get(held + 12, 0);
+    double e = get(held + 14, 0) - y, load = get(held + 16, 0);
+    double slope = Ti > 0.0 ? K / Ti : 0.0;
+    if (strcmp(law, "minutes") == 0)
+        slope /= 60.0;
+    if (strcmp(law, "parallel") == 0)
+        slope = Ti > 0.0 ? 1.0 / Ti : 0.0;
+    if (strcmp(law, "percent") == 0)
+        K *= 2.0, slope *= 2.0;
+    if (strcmp(law, "reversed") == 0)
+        K = -K, slope = -slope;
+
+    if (held[2] != beat || !memory->tab_bits[0])
+        beat = held[2], fed = t;
+    if (memory->tab_bits[0] && t - fed > 0.5)
+        memory->tab_bits[0] = 0;
+    int next = memory->tab_bits[0] ? HOST : memory->tab_bits[1] ? OWN : IDLE;
+    if (next == OWN && mode != OWN)
+        integral = output - K * e; /* without a bump */
+    mode = next;
+    if (mode == HOST) {
+        output = clamp(get(held, 0));
+    } else if (mode == IDLE) {
+        output = clamp(get(held + 3, 0));
+    } else {
+        double wanted = K * e + integral;
+        output = clamp(wanted + load);
+        if (output == wanted + load || (wanted + load - output) * slope * e < 0.0)
+            integral += slope * SCAN * e;
+    }
+    x1 += (1.0 - exp(-SCAN / 0.3)) * (output - x1);
+    x2 += (1.0 - exp(-SCAN / 0.1)) * (x1 - x2);
+    put(memory->tab_input_registers, x2);
+    put(memory->tab_input_registers + 2, output);
+    memory->tab_input_registers[4] = held[2];
+    memory->tab_input_registers[5] = mode == HOST;
+}
+
+int main(int count, char **words)
+{
+    const char *law = count > 1 ? words[1] : "ideal";
+    modbus_mapping_t *memory = modbus_mapping_new(8, 8, 32, 16);
+    modbus_t *link = modbus_new_tcp("127.0.0.1", 0);
+    int listener = modbus_tcp_listen(link, 4), peer = -1;
+    struct sockaddr_in address;
+    socklen_t size = sizeof address;
+    if (listener == -1 || getsockname(listener, (struct sockaddr *)&address, &size) == -1)
+        return 1;
+    put(memory->tab_registers + 10, 0.1);
+    put(memory->tab_registers + 12, 1.0);
+    printf("ready %d\n", ntohs(address.sin_port));
+    fflush(stdout);
+    for (double next = now() + SCAN;;) {
+        double wait = next - now();
+        if (wait <= 0.0) {
+            scan(memory, law, next);
+            next += SCAN;
+            continue;
+        }
+        fd_set ready;
+        FD_ZERO(&ready);
+        FD_SET(listener, &ready);
+        if (peer >= 0)
+            FD_SET(peer, &ready);
+        struct timeval limit = {0, (suseconds_t)(1e6 * wait)};
+        if (select((peer > listener ? peer : listener) + 1, &ready, NULL, NULL, &limit) <= 0)
+            continue;
+        if (FD_ISSET(listener, &ready)) {
+            if (peer >= 0)
+                close(peer);
+            peer = modbus_tcp_accept(link, &listener);
+        } else if (peer >= 0) {
+            uint8_t request[MODBUS_TCP_MAX_ADU_LENGTH];
+            int length = modbus_receive(link, request);
+            if (length > 0)
+                modbus_reply(link, request, length, memory);
+            else if (length == -1)
+                close(peer), peer = -1;
+        }
+    }
+}

@@ -1,0 +1,243 @@
+"""A device's own controller on trial: what it computes, what is called verified, and how the rig is left."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+import tomli_w
+
+from autotune.config import Config, load_config
+from autotune.config.registers import RegisterMap
+from autotune.controller import PIDController
+from autotune.errors import AutotuneError, ExperimentStopped
+from autotune.experiment.judgement import Verification
+from autotune.experiment.verify import run_verification
+from autotune.models import TransferFunction
+from autotune.pipeline.deployment import deploy
+from drivers import open_rig
+from sim.plant import make_plant
+from tests.autotune.experiment.test_verify import CONFIG as BALL
+from tests.autotune.experiment.test_verify import FIT as BALL_FIT
+from tests.autotune.experiment.test_verify import PI, fitted
+from tests.drivers.bench import tcp_settings
+from tests.drivers.virtual_device import virtual_rig
+
+#: the ball's, and a register for the load
+REGISTERS: dict[str, Any] = {
+    "y": {"table": "input", "address": 0, "type": "float32"},
+    "u_applied": {"table": "input", "address": 2, "type": "float32"},
+    "heartbeat_echo": {"table": "input", "address": 6, "type": "uint16"},
+    "in_command": {"table": "input", "address": 7, "type": "uint16"},
+    "u": {"address": 0, "type": "float32"},
+    "heartbeat": {"address": 2, "type": "uint16"},
+    "safe": {"address": 3, "type": "uint16", "scale": 1e-3},
+    "enable": {"table": "coil", "address": 0},
+    "automatic": {"table": "coil", "address": 1},
+    "K": {"address": 10, "type": "float32", "word_order": "little"},
+    "Ti": {"address": 12, "type": "uint32", "scale": 1e-3},
+    "setpoint": {"address": 14, "type": "int16", "scale": 1e-3},
+    "load": {"address": 16, "type": "float32"},
+}
+SAFE = 0.0
+
+
+def law(K: float = 1.0, Ti: float = 1.0, parallel: bool = False) -> Any:
+    """Return a device's law that takes the gains otherwise by these factors, or as a parallel form."""
+
+    def of(held: Mapping[str, float]) -> tuple[float, float, float, float]:
+        Ti_s = abs(held["K"]) * held["Ti"] if parallel else Ti * held["Ti"]
+        return K * held["K"], Ti_s, held["Td"], held["Tf"]
+
+    return of
+
+
+def tried(folder: Path, *, without: tuple[str, ...] = (), **device: Any) -> tuple[Verification, Any]:
+    """Write the ball's gains into a device, try its own controller on them, and return what was found."""
+    registers = {name: given for name, given in REGISTERS.items() if name not in without}
+    rig, held = virtual_rig(make_plant("ball", seed=1), registers=registers, **device)
+    rig.write_gains(PI)
+    return run_verification(rig, BALL, rig.read_gains(), BALL_FIT, folder / "trial.csv", on_device=True), held
+
+
+def test_the_devices_own_law_is_what_is_verified(tmp_path: Path) -> None:
+    found, device = tried(tmp_path)
+    assert found.accepted, found.reason
+    assert (found.by, found.whose) == ("device", "the device's own law verified")
+    assert any(change.cause == "controller" for change in device.history)
+    assert found.running_law is not None
+    assert found.running_law.is_given
+    assert pytest.approx(PI.K, rel=0.1) == found.running_law.K
+    assert found.running_law.Ti_s == pytest.approx(PI.Ti_s, rel=0.1)
+    assert device.output == SAFE
+    assert device.value["load"] == 0.0
+
+
+def test_without_a_register_for_the_load_the_set_point_comes_back_and_that_is_all(tmp_path: Path) -> None:
+    found, _ = tried(tmp_path, without=("load",))
+    assert found.accepted, found.reason
+    assert not found.test.disturbance.any()
+    assert found.test.setpoint[-1] == 0.0 < found.test.setpoint[0]
+
+
+@pytest.mark.parametrize("lacking", ["automatic", "setpoint", "u_applied"])
+def test_a_controller_that_the_host_cannot_start_or_see_is_never_called_verified(tmp_path: Path, lacking: str) -> None:
+    found, device = tried(tmp_path, without=(lacking,))
+    assert found.accepted
+    assert found.whose == f"host's law verified; the device's own law not tried ({lacking} is not mapped)"
+    assert not any(change.cause == "controller" for change in device.history)
+
+
+@pytest.mark.parametrize(
+    ("device", "named"),
+    [
+        ({"on_device": {"K": {"word_order": "big"}}}, "wrong word_order of rig.registers.K"),
+        ({"on_device": {"Ti": {"word_order": "little"}}}, "wrong word_order of rig.registers.Ti"),
+        ({"law": law(Ti=60.0)}, "times in minutes for seconds"),
+        ({"law": law(Ti=1.0 / 60.0)}, "times in seconds for minutes"),
+        ({"law": law(K=2.0)}, "percent for engineering units.*K acts (1.9|2)"),
+        ({"law": law(K=0.01)}, "percent for engineering units.*K acts 0.01 times"),
+        ({"law": law(K=100.0)}, "percent for engineering units.*K acts 100 times"),
+        ({"law": law(parallel=True)}, "the parallel form and not the ideal one"),
+        ({"law": law(K=-1.0)}, "the wrong sign"),
+        ({"on_device": {"setpoint": {"scale": 1e-2}}}, "wrong scale of the set-point: the device holds y at 10 times"),
+        ({"on_device": {"setpoint": {"scale": 1e-4}}}, "wrong scale of the set-point: the device holds y at 0.1 times"),
+        ({"on_device": {"setpoint": {"byte_order": "little"}}}, "wrong byte_order of rig.registers.setpoint"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_what_a_device_understands_otherwise_is_named_and_never_kept(
+    tmp_path: Path, device: dict[str, Any], named: str
+) -> None:
+    rig, held = virtual_rig(make_plant("ball", seed=1), registers=REGISTERS, gains=(-0.01, 6.0), **device)
+    old = rig.read_gains()
+
+    def trial(gains: PIDController) -> Verification:
+        return run_verification(rig, BALL, gains, BALL_FIT, tmp_path / "trial.csv", on_device=True)
+
+    try:
+        done = deploy(rig, PI, tmp_path / "journal.jsonl", agree=lambda *_: None, try_out=trial)
+    except ExperimentStopped as stopped:
+        said = str(stopped)
+    else:
+        assert done.verification is not None
+        assert not done.kept
+        said = done.verification.reason
+    assert re.search(named, said), said
+    assert rig.read_gains() == old
+    assert held.output == SAFE
+
+
+def test_a_controller_that_ran_before_has_its_set_point_again_and_no_load(tmp_path: Path) -> None:
+    rig, device = virtual_rig(make_plant("ball", seed=1), registers=REGISTERS, gains=(PI.K, PI.Ti_s))
+    for name, value in (("setpoint", 4.5), ("automatic", 1.0)):
+        rig._put(name, value)
+    found = run_verification(rig, BALL, rig.read_gains(), BALL_FIT, tmp_path / "trial.csv", on_device=True)
+    assert found.by == "device"
+    assert (device.value["automatic"], device.value["setpoint"], device.value["load"]) == (1.0, 4.5, 0.0)
+
+
+# a controller in C that is nobody's own code here: positional form, its plant and its clock its own
+
+LAGS = TransferFunction(num=(1.0,), den=(0.03, 0.4, 1.0), delay_s=0.02)
+GAINS = PIDController(K=0.5, Ti_s=0.3)
+FLOAT = {"type": "float32"}
+PEER: dict[str, Any] = {
+    "y": {"table": "input", "address": 0, **FLOAT},
+    "u_applied": {"table": "input", "address": 2, **FLOAT},
+    "heartbeat_echo": {"table": "input", "address": 4, "type": "uint16"},
+    "in_command": {"table": "input", "address": 5},
+    "u": {"address": 0, **FLOAT},
+    "heartbeat": {"address": 2, "type": "uint16"},
+    "safe": {"address": 3, **FLOAT},
+    "K": {"address": 10, **FLOAT},
+    "Ti": {"address": 12, **FLOAT},
+    "setpoint": {"address": 14, **FLOAT},
+    "load": {"address": 16, **FLOAT},
+    "enable": {"table": "coil", "address": 0},
+    "automatic": {"table": "coil", "address": 1},
+}
+
+
+@pytest.fixture(scope="session")
+def controller_program(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    program = tmp_path_factory.mktemp("controller") / "controller"
+    source = Path(__file__).with_name("libmodbus_controller.c")
+    command = ["gcc", "-O2", "-Wall", "-Wextra", "-I/usr/include/modbus", "-o", program, source, "-lmodbus", "-lm"]
+    subprocess.run(command, check=True)
+    return program
+
+
+@contextmanager
+def controller(program: Path, law_name: str) -> Iterator[int]:
+    with subprocess.Popen([program, law_name], stdout=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout is not None
+            yield int(process.stdout.readline().split()[1])
+        finally:
+            process.kill()
+
+
+def peer_config(port: int, folder: Path) -> Config:
+    content: dict[str, Any] = {
+        "name": "C controller",
+        "rig": tcp_settings(port, RegisterMap.model_validate(PEER), timeout_s=1.0, scan_time_s=0.01).model_dump(
+            mode="json", exclude_none=True
+        ),
+        "signals": {"sample_time_s": 0.04, "u_unit": "V", "y_unit": "V"},
+        "limits": {
+            "u_min": 0.0, "u_max": 10.0, "u_safe": 4.5, "y_min": 0.2, "y_max": 9.5, "swing": 2.0, "time_s": 120.0,
+            "late_s": 1.0,
+        },
+        "operating_point": {"y": 5.0, "u_guess": 5.0, "u_uncertainty": 1.0, "plant_sign": 1},
+        "experiment": {"budget_s": 60.0},
+        "design": {"noise_gain": 20.0},
+    }  # fmt: skip
+    path = folder / "rig.toml"
+    path.write_text(tomli_w.dumps(content))
+    return load_config(path)
+
+
+@pytest.mark.system("libmodbus-dev", "gcc")
+@pytest.mark.timeout(240)
+@pytest.mark.parametrize(
+    ("law_name", "named"),
+    [
+        ("ideal", ""),
+        ("swapped", "wrong word_order of rig.registers.K"),
+        ("minutes", "times in minutes for seconds"),
+        ("percent", "percent for engineering units"),
+        ("parallel", "parallel form"),
+        ("reversed", "the wrong sign"),
+    ],
+)
+def test_a_controller_in_c_is_verified_or_named(
+    controller_program: Path, tmp_path: Path, law_name: str, named: str
+) -> None:
+    fit = fitted(LAGS, 1.5, 3.0, 5.0, 8.0)
+    with controller(controller_program, law_name) as port:
+        config = peer_config(port, tmp_path)
+        rig: Any = open_rig(config.rig, u_range=(0.0, 10.0), u_safe=4.5)
+
+        def trial(gains: PIDController) -> Verification:
+            return run_verification(
+                rig, config, gains, fit, tmp_path / "trial.csv", u_rest=5.0, noise_sd=1e-3, on_device=True
+            )
+
+        said = ""
+        try:
+            done = deploy(rig, GAINS, tmp_path / "journal.jsonl", agree=lambda *_: None, try_out=trial)
+        except AutotuneError as stopped:
+            said, kept = str(stopped), False
+        else:
+            assert done.verification is not None
+            said, kept = done.verification.reason, done.kept
+        assert kept == (named == ""), said
+        assert named in said
+        assert pytest.approx(GAINS.K if kept else 0.1) == rig.read_gains().K
+        rig.close()
