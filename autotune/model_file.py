@@ -23,7 +23,7 @@ def read_model(path: str | os.PathLike[str]) -> Model:
     model = read_chain(path)
     if model.effects:
         # the catalogue is loaded where it is asked: a chain alone is read at once
-        from autotune.diagnosis.effects import require_known
+        from autotune.effects import require_known
 
         require_known(model.effects, str(path))
     return model
@@ -37,7 +37,7 @@ def read_any(path: str | os.PathLike[str]) -> AnyModel:
     InputError
         As :func:`autotune.equations.files.read_any_model`; an unknown effect, with the list of known ones.
     """
-    from autotune.diagnosis.effects import require_known
+    from autotune.effects import require_known
     from autotune.equations.effects import KNOWN
     from autotune.equations.files import read_any_model
 

@@ -131,7 +131,7 @@ def diagnose(
 
     from autotune.controller import read_controller
     from autotune.diagnosis.diagnose import diagnose as find
-    from autotune.diagnosis.effects import kind_of
+    from autotune.effects import kind_of
     from autotune.experiment_design.next_experiment import with_next_experiment
     from autotune.model_file import read_any as read_any_model
     from autotune.models import Model, write_model

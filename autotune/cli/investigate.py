@@ -83,7 +83,7 @@ def investigate(
 
 def _keep(known: Investigation, out: Path) -> None:
     """Write what is known so far; a later stop leaves it there."""
-    from autotune.diagnosis.effects import kind_of
+    from autotune.effects import kind_of
     from autotune.models import write_model
     from autotune.report.investigation_page import write_investigation_page
 

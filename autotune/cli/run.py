@@ -133,7 +133,7 @@ def _configuration(config: Path | None, out: Path | None, resume: Path | None, d
 
 def _diagnosed(config: Config, tuning: Tuning, folder: Path, console: Console) -> Diagnosis | None:
     """Return what the fitted plant leaves out, its files written; None where the recordings do not allow it."""
-    from autotune.diagnosis.effects import kind_of
+    from autotune.effects import kind_of
     from autotune.models import write_model
     from autotune.pipeline.folder import RESULT, VERIFICATION, recordings
     from autotune.pipeline.mismatch import diagnose_run

@@ -9,7 +9,6 @@ from dataclasses import replace
 import numpy as np
 
 from autotune.controller import Controller
-from autotune.diagnosis.effects import kind_of, require_known
 from autotune.diagnosis.evidence.adequacy import residual_tests
 from autotune.diagnosis.evidence.beside_chain import beside_chain
 from autotune.diagnosis.evidence.description import describe
@@ -30,6 +29,7 @@ from autotune.diagnosis.selection.search import search
 from autotune.diagnosis.selection.searched import Search
 from autotune.diagnosis.thresholds import IN_USE, Thresholds
 from autotune.diagnosis.verdict import Evidence, judged
+from autotune.effects import kind_of, require_known
 from autotune.errors import InputError
 from autotune.models import Model
 from autotune.progress import Progress, quiet

@@ -10,13 +10,13 @@ from types import MappingProxyType
 import numpy as np
 
 from autotune.arrays import FloatArray
-from autotune.diagnosis.effects import kind_of
 from autotune.diagnosis.evidence.sample_gain import is_nearer
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import Fit
 from autotune.diagnosis.result import Verdict
 from autotune.diagnosis.selection.hypothesis import Hypothesis
 from autotune.diagnosis.verdict import Evidence
+from autotune.effects import kind_of
 from autotune.models import Effect, Model, Parameter
 
 #: Places beyond a recorded range at which a law is looked at.

@@ -8,7 +8,6 @@ from types import MappingProxyType
 
 import numpy as np
 
-from autotune.diagnosis.effects import kind_of
 from autotune.diagnosis.evidence.description import Description
 from autotune.diagnosis.evidence.operating_point import Offset
 from autotune.diagnosis.evidence.samples import SampleEffect
@@ -19,6 +18,7 @@ from autotune.diagnosis.selection.probability import Candidate
 from autotune.diagnosis.selection.searched import Search
 from autotune.diagnosis.thresholds import Thresholds
 from autotune.diagnosis.verdict import Evidence
+from autotune.effects import kind_of
 from autotune.models import Effect, Parameter
 
 #: The effect that every fit has as a free number.

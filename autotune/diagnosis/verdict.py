@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 
-from autotune.diagnosis.effects import STRUCTURES, kind_of
 from autotune.diagnosis.evidence.adequacy import ResidualTests
 from autotune.diagnosis.evidence.held_out import FitQuality, dominates
 from autotune.diagnosis.evidence.operating_point import Offset
@@ -18,6 +17,7 @@ from autotune.diagnosis.selection.parsimony import worth_adding
 from autotune.diagnosis.selection.probability import Candidate, candidates_of
 from autotune.diagnosis.selection.searched import Search
 from autotune.diagnosis.thresholds import Thresholds
+from autotune.effects import STRUCTURES, kind_of
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -8,11 +8,11 @@ from dataclasses import replace
 import numpy as np
 
 from autotune.arrays import FloatArray
-from autotune.diagnosis.effects import KINDS as EFFECTS
-from autotune.diagnosis.effects import kind_of
 from autotune.diagnosis.equations import EquationDiagnosis
 from autotune.diagnosis.equations.bench import Outcome
 from autotune.diagnosis.result import NextExperiment, told_apart
+from autotune.effects import KINDS as EFFECTS
+from autotune.effects import kind_of
 from autotune.equations.effects import apply
 from autotune.equations.model import EquationModel
 from autotune.equations.simulate import Drive, simulate

@@ -11,8 +11,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from autotune.diagnosis.effects import kind_of
 from autotune.diagnosis.result import Diagnosis, FoundEffect, NextExperiment, told_apart
+from autotune.effects import kind_of
 from autotune.errors import InputError
 from autotune.experiment_design.conditions import as_recorded, is_driven
 from autotune.experiment_design.open_hypotheses import open_hypotheses

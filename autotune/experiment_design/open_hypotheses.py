@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from autotune.diagnosis.effects import kind_of
 from autotune.diagnosis.result import Diagnosis
 from autotune.diagnosis.selection.hypothesis import Hypothesis
+from autotune.effects import kind_of
 
 
 def open_hypotheses(found: Diagnosis) -> dict[str, tuple[Hypothesis, float]]:

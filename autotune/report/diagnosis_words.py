@@ -7,10 +7,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from autotune.diagnosis.effects import kind_of
 from autotune.diagnosis.evidence.missing_law import MissingLaw
 from autotune.diagnosis.evidence.unseen_run import UnseenRun
 from autotune.diagnosis.result import Diagnosis, FoundEffect, NextExperiment
+from autotune.effects import kind_of
 from autotune.report.effect_words import clause, in_short, joined, of_candidate, sentence, with_spread
 
 #: Probability from which a statement is called sure, likely, and what is below that a guess.

@@ -13,8 +13,8 @@ from typer.testing import CliRunner
 from autotune.cli import app
 from autotune.config import Config, load_config
 from autotune.diagnosis.diagnose import diagnose
-from autotune.diagnosis.effects import CATALOGUE, KINDS
 from autotune.diagnosis.simulation.assembly import assemble
+from autotune.effects import CATALOGUE, KINDS
 from autotune.errors import ExperimentStopped, InputError
 from autotune.experiment.excitation import Excitation
 from autotune.experiment_design import with_next_experiment

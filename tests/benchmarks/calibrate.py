@@ -24,7 +24,6 @@ from typing import Any
 
 import numpy as np
 
-from autotune.diagnosis.effects import ALL
 from autotune.diagnosis.evidence.adequacy import ResidualTests
 from autotune.diagnosis.evidence.constancy import Variation
 from autotune.diagnosis.evidence.held_out import FitQuality, dominates
@@ -32,6 +31,7 @@ from autotune.diagnosis.findings import probability_of
 from autotune.diagnosis.selection.probability import Candidate
 from autotune.diagnosis.thresholds import IN_USE, Thresholds, table
 from autotune.diagnosis.verdict import odds_of_unknown
+from autotune.effects import ALL
 from autotune.models import read_model
 from sim.proof import FIRST_PROOF_SEED, Campaign, conceal, diagnose
 from sim.score import calibration_error

@@ -15,7 +15,6 @@ import numpy as np
 
 from autotune.arrays import BoolArray
 from autotune.controller import Controller
-from autotune.diagnosis.effects import KINDS, kind_of
 from autotune.diagnosis.equations.bench import Bench, Outcome
 from autotune.diagnosis.equations.candidates import LOADS
 from autotune.diagnosis.equations.closed import ClosedBench
@@ -29,6 +28,7 @@ from autotune.diagnosis.evidence.samples import SampleEffect, inspect, outliers_
 from autotune.diagnosis.result import NextExperiment
 from autotune.diagnosis.selection.probability import Candidate
 from autotune.diagnosis.thresholds import IN_USE, Thresholds
+from autotune.effects import KINDS, kind_of
 from autotune.equations.black_box import BlackBox
 from autotune.equations.effects import equation_of, where_told
 from autotune.equations.identifiability import undetermined

@@ -7,11 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from autotune.diagnosis.effects import KINDS, kind_of
 from autotune.diagnosis.equations.bench import Outcome
 from autotune.diagnosis.equations.candidates import key_of
 from autotune.diagnosis.equations.search import Searched
 from autotune.diagnosis.selection.probability import Candidate, weighed
+from autotune.effects import KINDS, kind_of
 from autotune.models import Effect
 
 

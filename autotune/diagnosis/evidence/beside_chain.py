@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from autotune.controller import Controller
-from autotune.diagnosis.effects import kind_of
 from autotune.diagnosis.evidence.adequacy import is_white
 from autotune.diagnosis.evidence.constancy import largest_variation
 from autotune.diagnosis.evidence.jitter import jitter_effect
@@ -14,6 +13,7 @@ from autotune.diagnosis.evidence.samples import SampleEffect
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import Fit
 from autotune.diagnosis.fitting.retuning import reduced_chi2
+from autotune.effects import kind_of
 from autotune.recording import Recording
 
 

@@ -10,12 +10,12 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 
 from autotune.arrays import BoolArray, FloatArray
-from autotune.diagnosis.effects.base import EffectKind
-from autotune.diagnosis.effects.stages import Line, StageName
 from autotune.diagnosis.evidence.residual import filled
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import Fit
 from autotune.diagnosis.simulation.assembly import values_of
+from autotune.effects.base import EffectKind
+from autotune.effects.stages import Line, StageName
 
 Signal: TypeAlias = Literal["command", "speed", "position", "level", "plant input", "true reading", "time"]
 #: Where stages add what passes through them to, and the chain's input for that: the reading is none.

@@ -14,12 +14,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from autotune.arrays import BoolArray, FloatArray, IntArray
-from autotune.diagnosis.effects import kind_of
 from autotune.diagnosis.evidence.effect_line import ADDED, EffectLine, Signal, line_of, plant_unit
 from autotune.diagnosis.evidence.residual import filled
 from autotune.diagnosis.evidence.stretches import correlation_rows
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import Fit
+from autotune.effects import kind_of
 
 #: Bins over the signal: as many of these as the data tell apart; rows of a bin at least; points of the curve.
 BINS, LEAST_ROWS, POINTS = (12, 8, 5, 3, 2), 20, 161

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from autotune.arrays import FloatArray
-from autotune.diagnosis.effects import ALL
 from autotune.diagnosis.evidence.residual import shifts_by_window
 from autotune.diagnosis.fitting.fit import Fit
 from autotune.diagnosis.thresholds import Thresholds
+from autotune.effects import ALL
 from autotune.recording import Recording
 
 

@@ -14,7 +14,6 @@ from dataclasses import replace
 import numpy as np
 
 from autotune.arrays import BoolArray, FloatArray
-from autotune.diagnosis.effects import kind_of
 from autotune.diagnosis.evidence.readings import (
     CAUGHT_UP,
     ON_STEP,
@@ -28,6 +27,7 @@ from autotune.diagnosis.evidence.samples import SampleEffect
 from autotune.diagnosis.evidence.stretches import LEAST_HEAD, STRETCHES, rms
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import Fit
+from autotune.effects import kind_of
 
 _ENDS = (("low", -1.0), ("high", 1.0))
 

@@ -12,10 +12,10 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 from autotune.arrays import FloatArray
-from autotune.diagnosis.effects import kind_of
 from autotune.diagnosis.simulation.assembly import assemble
 from autotune.diagnosis.simulation.simulator import Simulator
 from autotune.diagnosis.thresholds import Thresholds
+from autotune.effects import kind_of
 from autotune.models import LARGEST, Block, Effect, Model, Parameter, TransferFunction
 
 Kind: TypeAlias = Literal["gain", "den", "num", "delay", "u_offset", "effect"]

@@ -8,13 +8,13 @@ from types import MappingProxyType
 import numpy as np
 
 from autotune.arrays import BoolArray, FloatArray
-from autotune.diagnosis.effects import kind_of
-from autotune.diagnosis.effects.base import EffectKind
-from autotune.diagnosis.effects.stages import Values
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import Fit, fit, residual_at, start_states
 from autotune.diagnosis.fitting.parameters import Parametrisation
 from autotune.diagnosis.thresholds import Thresholds
+from autotune.effects import kind_of
+from autotune.effects.base import EffectKind
+from autotune.effects.stages import Values
 
 #: Share of a window on which a start state is found first: before an impact has carried its error far away.
 BEGINNING = 4

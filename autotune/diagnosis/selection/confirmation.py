@@ -8,7 +8,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from autotune.diagnosis.effects import STRUCTURES
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import RUNAWAY, Fit, fit
 from autotune.diagnosis.fitting.retuning import at_nominal
@@ -16,6 +15,7 @@ from autotune.diagnosis.selection.hypothesis import Hypothesis, penalised
 from autotune.diagnosis.selection.parsimony import settled
 from autotune.diagnosis.selection.polishing import states_for
 from autotune.diagnosis.selection.searched import Search
+from autotune.effects import STRUCTURES
 
 #: Steps of a fit that is carried from some windows on to all.
 STEPS = 6

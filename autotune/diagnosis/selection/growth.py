@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from dataclasses import replace
 
-from autotune.diagnosis.effects import kind_of, taken_by
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import RUNAWAY, Fit, fit
 from autotune.diagnosis.selection.hypothesis import Hypothesis, hypothesis, is_stand_in, merged, penalised
@@ -15,6 +14,7 @@ from autotune.diagnosis.selection.scan import searched
 from autotune.diagnosis.selection.screening import Bench, Width, at_once, extend
 from autotune.diagnosis.simulation.assembly import states_that_stay
 from autotune.diagnosis.thresholds import Thresholds
+from autotune.effects import kind_of, taken_by
 from autotune.models import Effect
 
 

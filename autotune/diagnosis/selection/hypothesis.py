@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from autotune.diagnosis.effects import kind_of
-from autotune.diagnosis.effects.base import EffectKind, Fitted
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import Fit
+from autotune.effects import kind_of
+from autotune.effects.base import EffectKind, Fitted
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

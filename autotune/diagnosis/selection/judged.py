@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from autotune.arrays import FloatArray
-from autotune.diagnosis.effects import kind_of
 from autotune.diagnosis.evidence.constancy import largest_variation
 from autotune.diagnosis.evidence.held_out import FitQuality
 from autotune.diagnosis.evidence.stretches import advantage, judged_rows, rms
@@ -19,6 +18,7 @@ from autotune.diagnosis.selection.hypothesis import Hypothesis, vanished
 from autotune.diagnosis.selection.probability import Candidate, weighed
 from autotune.diagnosis.selection.searched import Search
 from autotune.diagnosis.thresholds import Thresholds
+from autotune.effects import kind_of
 
 #: Leading hypotheses that are compared as what is material in them.
 LEADING = 4

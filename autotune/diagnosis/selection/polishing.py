@@ -8,13 +8,13 @@ from types import MappingProxyType
 import numpy as np
 
 from autotune.arrays import FloatArray
-from autotune.diagnosis.effects import kind_of
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import RUNAWAY, Fit, fit, start_states
 from autotune.diagnosis.fitting.restarts import renewed
 from autotune.diagnosis.fitting.retuning import far_from_prior
 from autotune.diagnosis.selection.hypothesis import Hypothesis, is_stand_in
 from autotune.diagnosis.selection.screening import freed
+from autotune.effects import kind_of
 
 #: Decrease of the cost for which a time of change is moved: of chi-square, or as a share of it where model error and
 #: not noise is its unit.

@@ -8,12 +8,12 @@ from types import MappingProxyType
 import numpy as np
 
 from autotune.arrays import FloatArray
-from autotune.diagnosis.effects import kind_of
-from autotune.diagnosis.effects.base import EffectKind, SignalSizes
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.descent import bounded
 from autotune.diagnosis.fitting.fit import RUNAWAY, Fit, residual_at
 from autotune.diagnosis.fitting.parameters import Parametrisation, effect_with, parametrise
+from autotune.effects import kind_of
+from autotune.effects.base import EffectKind, SignalSizes
 from autotune.errors import IdentificationError
 from autotune.models import Effect, Model
 

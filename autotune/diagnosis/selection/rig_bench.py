@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from autotune.arrays import FloatArray
-from autotune.diagnosis.effects.base import EffectKind
 from autotune.diagnosis.evidence.stretches import held_out_squares, rms
 from autotune.diagnosis.fitting.data import Data, as_white
 from autotune.diagnosis.fitting.fit import RUNAWAY, Fit, fit, start_states
@@ -16,6 +15,7 @@ from autotune.diagnosis.fitting.parameters import Parametrisation
 from autotune.diagnosis.selection.hypothesis import hypothesis
 from autotune.diagnosis.selection.judged import Judged
 from autotune.diagnosis.thresholds import Thresholds
+from autotune.effects.base import EffectKind
 from autotune.models import Effect
 
 #: Gauss-Newton steps of a fit in the search, and of the leading ones at its end.

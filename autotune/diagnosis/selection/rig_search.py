@@ -19,9 +19,6 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from autotune.arrays import BoolArray
-from autotune.diagnosis.effects import ALL, kind_of, taken_by
-from autotune.diagnosis.effects.base import EffectKind, SignalSizes
-from autotune.diagnosis.effects.rigs import rig_kind
 from autotune.diagnosis.evidence.operating_point import unmoved
 from autotune.diagnosis.evidence.stretches import correlation_rows, judged_rows, rms
 from autotune.diagnosis.fitting.data import Data
@@ -40,6 +37,9 @@ from autotune.diagnosis.selection.screening import at_once, distinct
 from autotune.diagnosis.simulation.assembly import input_size
 from autotune.diagnosis.simulation.chain import build_chain
 from autotune.diagnosis.thresholds import IN_USE, Thresholds
+from autotune.effects import ALL, kind_of, taken_by
+from autotune.effects.base import EffectKind, SignalSizes
+from autotune.effects.rigs import rig_kind
 from autotune.models import Effect, Model
 from autotune.progress import Progress, quiet
 from autotune.recording import Recording

@@ -12,13 +12,13 @@ from scipy.fft import irfft, next_fast_len, rfft
 from scipy.signal import fftconvolve, lfilter
 
 from autotune.arrays import FloatArray, IntArray
-from autotune.diagnosis.effects import kind_of
-from autotune.diagnosis.effects.base import FEW_LEVELS, SignalSizes
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import RUNAWAY, Fit
 from autotune.diagnosis.fitting.parameters import effect_with
 from autotune.diagnosis.fitting.windows import model_lag_s
 from autotune.diagnosis.selection.prediction import direction, predictions, signal_sizes
+from autotune.effects import kind_of
+from autotune.effects.base import FEW_LEVELS, SignalSizes
 from autotune.models import Effect
 from autotune.recording import Recording
 

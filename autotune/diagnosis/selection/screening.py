@@ -9,8 +9,6 @@ from typing import TypeVar
 
 import numpy as np
 
-from autotune.diagnosis.effects import kind_of
-from autotune.diagnosis.effects.base import EffectKind
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import RUNAWAY, Fit, fit
 from autotune.diagnosis.fitting.restarts import realigned, restarted
@@ -23,6 +21,8 @@ from autotune.diagnosis.selection.prediction import (
     starting_effects,
 )
 from autotune.diagnosis.thresholds import Thresholds
+from autotune.effects import kind_of
+from autotune.effects.base import EffectKind
 from autotune.models import Effect
 
 #: Steps of a fit after which it is decided whether it goes on.

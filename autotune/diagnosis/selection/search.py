@@ -10,7 +10,6 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from autotune.arrays import BoolArray
-from autotune.diagnosis.effects import CATALOGUE, STRUCTURES
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import RUNAWAY, Fit, fit, states_of
 from autotune.diagnosis.fitting.noise import Noise, noise_from_differences
@@ -39,6 +38,7 @@ from autotune.diagnosis.selection.parsimony import (
 from autotune.diagnosis.selection.screening import Bench, Width, at_once
 from autotune.diagnosis.selection.searched import Search
 from autotune.diagnosis.thresholds import IN_USE, Thresholds
+from autotune.effects import CATALOGUE, STRUCTURES
 from autotune.models import Model
 from autotune.progress import Progress, quiet
 from autotune.recording import Recording

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from autotune.diagnosis.effects import KINDS, kind_of
-from autotune.diagnosis.effects.base import EffectKind
 from autotune.diagnosis.simulation.chain import blocks_of, build_chain, chain_of
 from autotune.diagnosis.simulation.simulator import ICE_K, Simulator, layout
+from autotune.effects import KINDS, kind_of
+from autotune.effects.base import EffectKind
 from autotune.errors import InputError
 from autotune.models import Effect, Model
 from autotune.recording import Recording

@@ -24,10 +24,10 @@ from functools import cache
 from pathlib import Path
 
 from autotune.arrays import FloatArray
-from autotune.diagnosis.effects import ALL
-from autotune.diagnosis.effects.base import EffectKind
-from autotune.diagnosis.effects.stages import STAGES, Line, StageName
 from autotune.diagnosis.simulation import kernel, stages
+from autotune.effects import ALL
+from autotune.effects.base import EffectKind
+from autotune.effects.stages import STAGES, Line, StageName
 from autotune.errors import InputError
 
 

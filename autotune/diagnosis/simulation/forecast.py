@@ -13,9 +13,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from autotune.arrays import BoolArray, FloatArray
-from autotune.diagnosis.effects import kind_of
 from autotune.diagnosis.simulation.assembly import assemble, input_size
 from autotune.diagnosis.simulation.simulator import Simulator, Windows
+from autotune.effects import kind_of
 from autotune.errors import InputError
 from autotune.models import Model
 from autotune.recording import Recording

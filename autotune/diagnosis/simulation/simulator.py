@@ -11,13 +11,13 @@ import numpy as np
 from scipy.linalg import expm
 
 from autotune.arrays import FloatArray, IntArray
-from autotune.diagnosis.effects import ALL
-from autotune.diagnosis.effects.base import EffectKind
-from autotune.diagnosis.effects.stages import STAGES, StageName
 from autotune.diagnosis.simulation import kernel
 from autotune.diagnosis.simulation.chain import Chain
 from autotune.diagnosis.simulation.compiled import Layout, Run, compiled_run, layout_of
 from autotune.diagnosis.simulation.transitions import transition_table
+from autotune.effects import ALL
+from autotune.effects.base import EffectKind
+from autotune.effects.stages import STAGES, StageName
 from autotune.recording import Recording
 
 #: Sub-steps of a sample at most, of one whose command runs straight between rows, and the largest sub-step of a forced

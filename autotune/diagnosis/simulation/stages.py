@@ -1,7 +1,7 @@
 """The stages of the compiled simulation as they are without any effect.
 
 :mod:`autotune.diagnosis.simulation.compiled` writes each of them anew with the lines that effects have there; types and
-order of the arguments are those of :data:`autotune.diagnosis.effects.stages.STAGES`.
+order of the arguments are those of :data:`autotune.effects.stages.STAGES`.
 """
 
 from __future__ import annotations

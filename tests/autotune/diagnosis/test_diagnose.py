@@ -11,11 +11,11 @@ from typer.testing import CliRunner
 
 from autotune.cli import app
 from autotune.diagnosis.diagnose import diagnose
-from autotune.diagnosis.effects import CATALOGUE
 from autotune.diagnosis.evidence.samples import inspect
 from autotune.diagnosis.fitting.fit import fit
 from autotune.diagnosis.fitting.retuning import prepare
 from autotune.diagnosis.simulation.forecast import forecast
+from autotune.effects import CATALOGUE
 from autotune.experiment_design import with_next_experiment
 from autotune.models import Block, Model, Port, TransferFunction, read_model
 from autotune.recording import Recording, read_recording

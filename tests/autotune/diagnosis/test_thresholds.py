@@ -10,8 +10,8 @@ import pytest
 
 import autotune
 from autotune.diagnosis.diagnose import diagnose
-from autotune.diagnosis.effects import CATALOGUE
 from autotune.diagnosis.thresholds import IN_USE, Origin, table
+from autotune.effects import CATALOGUE
 from tests.autotune.diagnosis.servo_rigs import servo_model, servo_recording
 
 

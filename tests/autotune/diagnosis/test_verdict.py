@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from autotune.diagnosis.diagnose import diagnose
-from autotune.diagnosis.effects import CATALOGUE
 from autotune.diagnosis.evidence.adequacy import ResidualTests
 from autotune.diagnosis.evidence.constancy import Variation
 from autotune.diagnosis.thresholds import IN_USE
 from autotune.diagnosis.verdict import TABLE, odds_of_unknown, verdict_of
+from autotune.effects import CATALOGUE
 from tests.autotune.diagnosis.servo_rigs import servo_model, servo_recording
 
 FACTS = sorted(set().union(*(holds | lacks for holds, lacks, _ in TABLE)))

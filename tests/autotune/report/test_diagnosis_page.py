@@ -13,10 +13,10 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from autotune.diagnosis.diagnose import diagnose
-from autotune.diagnosis.effects import ALL, CATALOGUE
 from autotune.diagnosis.findings import sentences_of
 from autotune.diagnosis.result import Diagnosis
 from autotune.diagnosis.verdict import Evidence
+from autotune.effects import ALL, CATALOGUE
 from autotune.models import Block, Effect, Model, Parameter, Port, TransferFunction
 from autotune.report.chain_diagram import chain_diagram
 from autotune.report.diagnosis_page import write_diagnosis_page

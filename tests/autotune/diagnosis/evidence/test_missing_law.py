@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from autotune.diagnosis.effects import CATALOGUE, kind_of
 from autotune.diagnosis.evidence.effect_line import line_of
 from autotune.diagnosis.evidence.missing_law import MissingLaw, missing_law
 from autotune.diagnosis.evidence.samples import inspect
@@ -17,6 +16,7 @@ from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import Fit, fit
 from autotune.diagnosis.fitting.parameters import effect_with, parametrise
 from autotune.diagnosis.fitting.retuning import prepare
+from autotune.effects import CATALOGUE, kind_of
 from tests.autotune.diagnosis.servo_rigs import GAIN, servo_model, servo_recording
 
 DRAG, FRICTION = 0.06, 0.12

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from autotune.diagnosis.diagnose import diagnose
-from autotune.diagnosis.effects import CATALOGUE
 from autotune.diagnosis.evidence.samples import inspect
 from autotune.diagnosis.evidence.screens import (
     direction_screen,
@@ -24,6 +23,7 @@ from autotune.diagnosis.evidence.screens import (
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import Fit
 from autotune.diagnosis.fitting.retuning import prepare
+from autotune.effects import CATALOGUE
 from autotune.recording import Recording
 from autotune.report.diagnosis_page import write_diagnosis_page
 from tests.autotune.diagnosis.servo_rigs import K, servo_model, servo_recording

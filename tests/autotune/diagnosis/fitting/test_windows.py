@@ -7,7 +7,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from autotune.diagnosis.effects import CATALOGUE
 from autotune.diagnosis.evidence.samples import inspect
 from autotune.diagnosis.fitting.descent import freed_of
 from autotune.diagnosis.fitting.fit import fit
@@ -17,6 +16,7 @@ from autotune.diagnosis.fitting.windows import window_rows
 from autotune.diagnosis.selection.prediction import extended
 from autotune.diagnosis.selection.search import search
 from autotune.diagnosis.thresholds import IN_USE
+from autotune.effects import CATALOGUE
 from autotune.recording import Recording
 from tests.autotune.diagnosis.servo_rigs import GAIN, servo_model, servo_recording
 

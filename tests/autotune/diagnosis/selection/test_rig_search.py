@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from autotune.diagnosis import diagnose
-from autotune.diagnosis.effects import ALL, taken_by
-from autotune.diagnosis.effects.rigs import rig_kind
 from autotune.diagnosis.selection.rig_search import search_rig
 from autotune.diagnosis.simulation.chain import build_chain
 from autotune.diagnosis.thresholds import IN_USE
+from autotune.effects import ALL, taken_by
+from autotune.effects.rigs import rig_kind
 from autotune.models import Block, Model, Port, TransferFunction
 from autotune.recording import Recording
 

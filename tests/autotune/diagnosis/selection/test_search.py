@@ -11,7 +11,6 @@ import pytest
 from scipy.signal import lfilter
 
 from autotune.arrays import FloatArray
-from autotune.diagnosis.effects import CATALOGUE
 from autotune.diagnosis.evidence.samples import inspect
 from autotune.diagnosis.fitting.fit import Fit, fit
 from autotune.diagnosis.fitting.parameters import effect_with
@@ -22,6 +21,7 @@ from autotune.diagnosis.selection.prediction import extended
 from autotune.diagnosis.selection.scan import searched
 from autotune.diagnosis.selection.search import search
 from autotune.diagnosis.thresholds import IN_USE
+from autotune.effects import CATALOGUE
 from autotune.models import Block, Effect, Model, Port, TransferFunction
 from autotune.recording import Recording
 from tests.autotune.diagnosis.servo_rigs import GAIN, servo_model, servo_recording

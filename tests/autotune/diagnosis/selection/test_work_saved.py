@@ -9,7 +9,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from autotune.diagnosis.effects import ALL
 from autotune.diagnosis.fitting.bases import basis, determined
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import Fit, fit
@@ -21,6 +20,7 @@ from autotune.diagnosis.selection.rig_search import search_rig
 from autotune.diagnosis.selection.screening import at_once
 from autotune.diagnosis.simulation.assembly import assemble
 from autotune.diagnosis.thresholds import IN_USE
+from autotune.effects import ALL
 from autotune.models import Block, Model, Port, TransferFunction
 from autotune.recording import Recording
 

@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from autotune.diagnosis.effects import ALL
-from autotune.diagnosis.effects.base import EffectKind, Quantity
-from autotune.diagnosis.effects.checks import require_complete
-from autotune.diagnosis.effects.stages import STAGES, Line
 from autotune.diagnosis.simulation import stages
 from autotune.diagnosis.simulation.assembly import assemble
 from autotune.diagnosis.simulation.compiled import layout_of, run_of, source_of
+from autotune.effects import ALL
+from autotune.effects.base import EffectKind, Quantity
+from autotune.effects.checks import require_complete
+from autotune.effects.stages import STAGES, Line
 from autotune.errors import InputError
 from autotune.models import Block, Model, Port, TransferFunction
 from autotune.recording import Recording

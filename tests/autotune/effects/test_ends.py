@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from autotune.diagnosis import diagnose
-from autotune.diagnosis.effects import ALL
 from autotune.diagnosis.simulation.assembly import assemble
+from autotune.effects import ALL
 from autotune.models import Block, Effect, Model, Parameter, Port, TransferFunction
 from autotune.recording import Recording
 

@@ -1,9 +1,9 @@
 """What is known of one effect, in one record: equation, parameters, compiled lines, linear part, searches, source.
 
 An effect acts in one or both of two ways. A *line* is a small plain function of scalars that is put into the compiled
-simulation at a stage (:data:`autotune.diagnosis.effects.stages.STAGES`); its arguments are taken by their names:
+simulation at a stage (:data:`autotune.effects.stages.STAGES`); its arguments are taken by their names:
 signals of the stage, the effect's own parameters, its memory. A *linear part* changes the blocks of the chain. What is
-incomplete is refused when the package is imported, see :mod:`autotune.diagnosis.effects.checks`.
+incomplete is refused when the package is imported, see :mod:`autotune.effects.checks`.
 
 Most of the file says what each attribute means.
 """
@@ -16,7 +16,7 @@ from functools import cached_property
 from typing import Literal, Protocol, TypeAlias
 
 from autotune.arrays import FloatArray
-from autotune.diagnosis.effects.stages import Line, LinearPart, Memory, StageName, Values
+from autotune.effects.stages import Line, LinearPart, Memory, StageName, Values
 from autotune.models import Model, Parameter
 
 #: What a parameter is to a search.
@@ -351,7 +351,7 @@ class EffectKind:
         law goes on there beyond what was recorded: it neither turns back nor feeds what it acts on. Its last two
         parameters are then :func:`ends`, marks of an extended model beyond which it adds what it adds there.
     odds : mapping
-        Prior odds that a rig of a kind (:mod:`autotune.diagnosis.effects.rigs`; ``any`` for all others) has it and its
+        Prior odds that a rig of a kind (:mod:`autotune.effects.rigs`; ``any`` for all others) has it and its
         model lacks it. They count where model error and not noise decides; without odds it is not considered there.
     """
 

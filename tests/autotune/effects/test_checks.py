@@ -12,10 +12,10 @@ from typing import Any
 import pytest
 
 import autotune
-from autotune.diagnosis.effects import ALL, CATALOGUE, kind_of
-from autotune.diagnosis.effects.base import EffectKind, Quantity
-from autotune.diagnosis.effects.checks import require_complete
-from autotune.diagnosis.effects.stages import Line, LinearPart, Memory
+from autotune.effects import ALL, CATALOGUE, kind_of
+from autotune.effects.base import EffectKind, Quantity
+from autotune.effects.checks import require_complete
+from autotune.effects.stages import Line, LinearPart, Memory
 from autotune.errors import InputError
 
 
@@ -85,7 +85,7 @@ def test_an_incomplete_record_is_refused_when_the_package_is_imported(tmp_path: 
     """A record as a newcomer writes it into the file of its place, with one of its parts left out."""
     copy = tmp_path / "autotune"
     subprocess.run(["cp", "-r", str(Path(autotune.__file__).parent), str(copy)], check=True)
-    place = copy / "diagnosis" / "effects" / "timing.py"
+    place = copy / "effects" / "timing.py"
     parts = {
         "name": 'name="timing.slowness"', "equation": 'equation="w -> w (1 - share)"',
         "parameters": 'parameters=(Quantity(name="share", unit="1", role="amplitude"),)',
@@ -99,7 +99,7 @@ def test_an_incomplete_record_is_refused_when_the_package_is_imported(tmp_path: 
     )
     place.write_text(text, encoding="utf-8")
     found = subprocess.run(
-        [sys.executable, "-c", "import autotune.diagnosis.effects"], cwd=tmp_path, capture_output=True, text=True
+        [sys.executable, "-c", "import autotune.effects"], cwd=tmp_path, capture_output=True, text=True
     )
     assert found.returncode != 0
     said = found.stderr.splitlines()[-1]

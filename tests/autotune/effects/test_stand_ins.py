@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from autotune.diagnosis.effects import kind_of
-from autotune.diagnosis.effects.base import Fitted
+from autotune.effects import kind_of
+from autotune.effects.base import Fitted
 
 
 @pytest.mark.parametrize(("damping", "is_other"), [(0.2, False), (0.9, False), (1.0, True), (3.0, True)])

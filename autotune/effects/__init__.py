@@ -9,14 +9,14 @@ from __future__ import annotations
 from collections.abc import Iterable
 from difflib import get_close_matches
 
-from autotune.diagnosis.effects.actuator import ACTUATOR
-from autotune.diagnosis.effects.base import EffectKind
-from autotune.diagnosis.effects.checks import require_complete
-from autotune.diagnosis.effects.controller import CONTROLLER
-from autotune.diagnosis.effects.environment import ENVIRONMENT
-from autotune.diagnosis.effects.plant import PLANT
-from autotune.diagnosis.effects.sensor import SENSOR
-from autotune.diagnosis.effects.timing import TIMING
+from autotune.effects.actuator import ACTUATOR
+from autotune.effects.base import EffectKind
+from autotune.effects.checks import require_complete
+from autotune.effects.controller import CONTROLLER
+from autotune.effects.environment import ENVIRONMENT
+from autotune.effects.plant import PLANT
+from autotune.effects.sensor import SENSOR
+from autotune.effects.timing import TIMING
 from autotune.errors import InputError
 from autotune.models import Effect
 

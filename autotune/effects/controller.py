@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from autotune.diagnosis.effects.base import EffectKind, Quantity
+from autotune.effects.base import EffectKind, Quantity
 
 CONTROLLER = (
     EffectKind(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from typing import Literal, TypeAlias
 
-from autotune.diagnosis.effects.base import Chain
+from autotune.effects.base import Chain
 from autotune.models import Model
 
 #: ``arm``: an angle that gravity or a spring pulls back; ``shaft``: an angle that nothing does; ``carriage``: a

@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 
 from autotune.arrays import FloatArray
-from autotune.diagnosis.effects.actuator import limit_starts, rises
-from autotune.diagnosis.effects.base import NEVER, EffectKind, Quantity, ends
-from autotune.diagnosis.effects.stages import Blocks, Line, LinearPart, Values
+from autotune.effects.actuator import limit_starts, rises
+from autotune.effects.base import NEVER, EffectKind, Quantity, ends
+from autotune.effects.stages import Blocks, Line, LinearPart, Values
 from autotune.models import Block, TransferFunction
 
 _LJUNG = "Ljung, System Identification, 2nd ed., sec. 5.1"

@@ -6,9 +6,9 @@ import inspect
 from collections.abc import Iterator, Sequence
 from typing import get_args
 
-from autotune.diagnosis.effects.base import EffectKind, Role, SignalSizes
-from autotune.diagnosis.effects.rigs import RigKind
-from autotune.diagnosis.effects.stages import STAGES, Line, StageName
+from autotune.effects.base import EffectKind, Role, SignalSizes
+from autotune.effects.rigs import RigKind
+from autotune.effects.stages import STAGES, Line, StageName
 from autotune.errors import InputError
 
 PLACES = ("actuator", "plant", "sensor", "timing", "environment", "controller")

@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from autotune.arrays import FloatArray
-from autotune.diagnosis.effects.base import (
+from autotune.effects.base import (
     ACTUATOR_LAG,
     NEVER,
     EffectKind,
@@ -20,8 +20,8 @@ from autotune.diagnosis.effects.base import (
     SignalSizes,
     ends,
 )
-from autotune.diagnosis.effects.converter import converter_steps
-from autotune.diagnosis.effects.stages import Blocks, Line, LinearPart, Memory, Values
+from autotune.effects.converter import converter_steps
+from autotune.effects.stages import Blocks, Line, LinearPart, Memory, Values
 from autotune.models import Block, TransferFunction
 
 _LJUNG = "Ljung, System Identification, 2nd ed., sec. 5.1"

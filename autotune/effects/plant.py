@@ -10,8 +10,8 @@ import math
 import numpy as np
 
 from autotune.arrays import FloatArray
-from autotune.diagnosis.effects.actuator import limit_starts
-from autotune.diagnosis.effects.base import (
+from autotune.effects.actuator import limit_starts
+from autotune.effects.base import (
     INTEGRATING,
     LEVEL,
     MECHANICAL,
@@ -25,7 +25,7 @@ from autotune.diagnosis.effects.base import (
     SignalSizes,
     ends,
 )
-from autotune.diagnosis.effects.stages import Blocks, Line, LinearPart, Memory, Values
+from autotune.effects.stages import Blocks, Line, LinearPart, Memory, Values
 from autotune.models import Block, Model, TransferFunction
 
 _OLSSON = "Olsson, Astrom, Canudas de Wit, Gafvert and Lischinsky, Eur. J. Control 4, 1998"

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from autotune.diagnosis.effects.base import EffectKind, Quantity
-from autotune.diagnosis.effects.stages import Blocks, Line, LinearPart, Values
+from autotune.effects.base import EffectKind, Quantity
+from autotune.effects.stages import Blocks, Line, LinearPart, Values
 from autotune.errors import InputError
 
 _LJUNG = "Ljung, System Identification, 2nd ed., sec. 5.1"

@@ -7,8 +7,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from autotune.diagnosis.effects.base import LEVEL, NEVER, EffectKind, Quantity, Scan
-from autotune.diagnosis.effects.stages import Line, Values
+from autotune.effects.base import LEVEL, NEVER, EffectKind, Quantity, Scan
+from autotune.effects.stages import Line, Values
 from autotune.models import Parameter
 
 _ASTROM = "Astrom and Hagglund, Advanced PID Control, 2006, ch. 4"

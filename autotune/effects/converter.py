@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from autotune.arrays import FloatArray
-from autotune.diagnosis.effects.base import FEW_LEVELS, Scan
+from autotune.effects.base import FEW_LEVELS, Scan
 
 #: Steps that are tried, as shares of the standard deviation of u: from a known origin, and as lines over u.
 _STEPS_TRIED, _LINES_OVER = (0.01, 3.0), (0.02, 3.0)
