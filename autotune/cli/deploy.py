@@ -62,7 +62,7 @@ def deploy(
 ) -> None:
     """Write gains into the rig's own controller, read them back, verify the loop; else restore the old gains."""
     from autotune.config import load_config
-    from autotune.experiment.verify import expected_margins
+    from autotune.experiment.judgement import require_predictable
     from autotune.pipeline.audit import audit_log
     from autotune.pipeline.deployment import deploy as hand_over
     from autotune.pipeline.folder import JOURNAL, next_free
@@ -77,7 +77,7 @@ def deploy(
     rig = _with_gains(rig_of(content))
     new = held_by(rig, new, content.design, fit=fit)
     if fit is not None:
-        expected_margins(fit, new)
+        require_predictable(fit, new)
     if not yes and not sys.stdin.isatty():
         raise InputError(
             "nobody can be asked here", where="autotune deploy", remedy="look at the gains, then give --yes"

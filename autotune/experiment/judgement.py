@@ -5,13 +5,16 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, NoReturn
 
 import numpy as np
 from scipy.ndimage import uniform_filter1d
 
 from autotune.arrays import FloatArray
+from autotune.controller import PIDController
 from autotune.design.law import PILaw
+from autotune.design.margins import Margins, margins
+from autotune.errors import DesignError
 from autotune.experiment.prediction import Prediction, predict
 from autotune.experiment.running_law import RunningLaw
 from autotune.experiment.step_test import StepTest
@@ -25,6 +28,11 @@ TOLERANCE = 0.15
 AT_LIMIT = 0.1
 #: part of the step that an explained error may have: a larger one would explain any loop
 VACUOUS = 1.0 / 3.0
+#: what to do then
+REMEDY = "measure the points again with a longer experiment.budget_s, or allow more limits.swing"
+#: probability of so large a chi-square below which the points contradict their covariance, where a point is also
+#: further from the plant, relative to its gain, than the tolerance of a verification covers
+CONTRADICTED, RESIDUAL = 1e-4, 0.05
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,6 +111,51 @@ class Verification:
         if not self.untried:  # the rig has none
             return "host's law verified"
         return f"host's law verified; the device's own law not tried ({self.untried})"
+
+
+def require_predictable(fit: PlantFit, controller: PIDController) -> Margins:
+    """Refuse to predict a loop from points that leave open whether it is stable, or that contradict one another.
+
+    Parameters
+    ----------
+    fit : PlantFit
+        Plant for the prediction.
+    controller : PIDController
+        Gains to be tried.
+
+    Returns
+    -------
+    Margins
+        Of the loop with the estimated plant.
+
+    Raises
+    ------
+    DesignError
+        The loop would be unstable, or have no crossover that its test could be timed by; or a plant that the points
+        allow makes it unstable; or the points are further from every structure than their covariance and a fitted
+        structure's simplicity explain.
+    """
+
+    def refuse(what: str, remedy: str) -> NoReturn:
+        raise DesignError(what, where="verification", remedy=f"nothing was tried on the rig; {remedy}")
+
+    expected = margins(fit.plant, controller)
+    gains, crossover = f"K = {controller.K:.4g}, T_I = {controller.Ti_s:.4g} s", expected.crossover_rad_s
+    if not expected.stable or not math.isfinite(crossover):
+        refuse(f"on the measured plant {gains} make no stable loop", "design the controller on this rig's points")
+    if fit.p_value < CONTRADICTED and fit.largest_residual > RESIDUAL:
+        refuse(
+            f"the points contradict their covariance: chi-square {fit.chi_square:.3g} at {fit.degrees_of_freedom}"
+            f" degrees of freedom, a point is {100 * fit.largest_residual:.2g} % from the fitted plant",
+            "measure the points again, and look for a load, a drift or an actuator at its limit between them",
+        )
+    unstable = sum(not margins(plant, controller).stable for plant in fit.draws(DRAWS, np.random.default_rng(0)))
+    if unstable:
+        refuse(
+            f"{unstable} of {DRAWS} plants that the points allow make no stable loop with {gains}",
+            f"measure points around {crossover:.3g} rad/s again, with a longer experiment.budget_s or a larger relay",
+        )
+    return expected
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -229,7 +282,7 @@ def judge(
 def _reason(test: StepTest, expected: Expectation, rms_error: float, accepted: bool) -> str:
     error, limit = (f"{value:.3g} {test.y_unit}".strip() for value in (rms_error, expected.allowed))
     if expected.is_vacuous:
-        return f"nothing is verified: {expected.vacuous}"
+        return f"nothing is verified: {expected.vacuous}; {REMEDY}"
     if accepted:
         return f"the loop behaves as predicted: rms error {error}, up to {limit} is explained"
     return f"the loop does not behave as predicted: rms error {error}, only {limit} is explained"

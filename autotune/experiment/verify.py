@@ -14,10 +14,9 @@ from autotune.config import Config
 from autotune.config.procedure import LimitSettings
 from autotune.controller import PIDController
 from autotune.design.law import PILaw
-from autotune.design.margins import Margins, margins
 from autotune.errors import DesignError
 from autotune.experiment.device import try_on_device
-from autotune.experiment.judgement import Verification, judge
+from autotune.experiment.judgement import REMEDY, Expectation, Verification, expectation, judge, require_predictable
 from autotune.experiment.limits import Watch
 from autotune.experiment.loop import ControlLoop
 from autotune.experiment.own_law import law_of, try_own_law
@@ -113,24 +112,6 @@ def _teller(loop: ControlLoop, count: int, message: str, on_status: OnStatus | N
     return tell
 
 
-def expected_margins(fit: PlantFit, controller: PIDController) -> Margins:
-    """Return the margins of the controller on the fitted plant.
-
-    Raises
-    ------
-    DesignError
-        The loop would be unstable, or have no crossover that its test could be timed by.
-    """
-    expected = margins(fit.plant, controller)
-    if not expected.stable or not math.isfinite(expected.crossover_rad_s):
-        raise DesignError(
-            f"on the measured plant K = {controller.K:.4g}, T_I = {controller.Ti_s:.4g} s make no stable loop",
-            where="verification",
-            remedy="nothing was tried on the rig; design the controller on this rig's points",
-        )
-    return expected
-
-
 def run_verification(
     rig: Rig,
     config: Config,
@@ -168,15 +149,17 @@ def run_verification(
     Raises
     ------
     DesignError
-        The loop would be unstable; the rig was not touched.
+        The points do not say what the loop will do, or too little for a test to tell; the rig was not touched.
     ExperimentStopped, LinkError, OperatorStop
         What ended it; the rig is safe and the recording readable.
     """
     law = law_for(controller, config.limits, config.signals.sample_time_s)
-    crossover_rad_s = expected_margins(fit, controller).crossover_rad_s
+    crossover_rad_s = require_predictable(fit, controller).crossover_rad_s
     if isinstance(rig, Exchanges) and not isinstance(rig, RunsLaws):
         fit = _delayed(fit, config.signals.sample_time_s)  # its commands act one sample after what they come from
     test = plan_test(config, law, fit, crossover_rad_s, u_rest)
+    if noise_sd is not None:
+        _require_telling(expectation(test, law, fit, noise_sd, u_rest=config.operating_point.u_guess))
     own, untried = _own_controller(rig, on_device)
     extra = ("r", *further_columns(rig))
     writer = RecordingWriter(recording, ("t", "u", "y", *extra), recording_metadata(config))
@@ -220,6 +203,16 @@ def _own_controller(rig: Rig, on_device: bool) -> tuple[RunsOwnController | None
 def _scan(rig: RunsOwnController, sample_time_s: float) -> float:
     """Return the device's cycle, as a whole part of the sample time [s]."""
     return sample_time_s / max(1, round(sample_time_s / rig.scan_time_s))
+
+
+def _require_telling(expected: Expectation) -> None:
+    """Refuse a test that nearly any loop would pass, before the rig is touched."""
+    if expected.is_vacuous:
+        raise DesignError(
+            f"nothing could be verified: {expected.vacuous}",
+            where="verification",
+            remedy=f"nothing was tried on the rig; {REMEDY}",
+        )
 
 
 def _delayed(fit: PlantFit, delay_s: float) -> PlantFit:

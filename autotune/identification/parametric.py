@@ -60,6 +60,8 @@ class PlantFit:
         Structures that the same data do not exclude.
     source : {"points", "recording"}
         What was fitted.
+    largest_residual : float
+        Largest distance of a point from the plant, relative to its gain; 0 of a fit in time.
     """
 
     plant: TransferFunction
@@ -74,6 +76,7 @@ class PlantFit:
     criterion: float = 0.0
     others: tuple[PlantFit, ...] = ()
     source: Literal["points", "recording"] = "points"
+    largest_residual: float = 0.0
 
     @property
     def p_value(self) -> float:
@@ -248,6 +251,7 @@ def _fit_structure(
         bounds=np.stack((lower, upper)),
         build=build,
         criterion=chi_square + found.x.size * math.log(2 * omega.size),
+        largest_residual=float(np.max(np.abs(_response(omega, found.x, sign, integrating) / measured - 1.0))),
     )
 
 

@@ -12,8 +12,8 @@ import tomli_w
 
 from autotune.config import load_config
 from autotune.controller import PIDController
-from autotune.errors import ExperimentStopped
-from autotune.experiment.judgement import Verification, judge, smoothed
+from autotune.errors import DesignError, ExperimentStopped
+from autotune.experiment.judgement import Verification, expectation, judge, require_predictable, smoothed
 from autotune.experiment.loop import ControlLoop
 from autotune.experiment.run import envelope_of
 from autotune.experiment.step_test import StepTest, plan_test
@@ -31,11 +31,11 @@ BALL = TransferFunction(num=(-65.5,), den=(2.02e-5, 0.007328, 0.3836, 1.0, 0.0))
 PI = PIDController(K=-0.0247, Ti_s=3.6)
 
 
-def fitted(plant: TransferFunction, *omegas: float) -> PlantFit:
+def fitted(plant: TransferFunction, *omegas: float, relative_sd: float = 0.004) -> PlantFit:
     points = []
     for omega in omegas:
         response = complex(plant.response(np.array([omega]))[0])
-        variance = (0.004 * abs(response)) ** 2
+        variance = (relative_sd * abs(response)) ** 2
         points.append(
             FrequencyPoint(omega_rad_s=omega, response=response, covariance=((variance, 0.0), (0.0, variance)))
         )
@@ -167,3 +167,43 @@ def test_a_full_disk_ends_in_the_safe_output_with_its_reason(tmp_path: Path) -> 
     with pytest.raises(ExperimentStopped, match="recording cannot be written"):
         fill_the_disk_while_the_loop_runs()
     assert rig.command == 0.0
+
+
+#: gains that leave less room than the tuned ones
+HOT = PIDController(K=-0.06, Ti_s=1.5)
+
+
+def test_an_error_that_nearly_any_loop_would_have_verifies_nothing() -> None:
+    law = replace(LAW, controller=HOT)
+    test = plan_test(CONFIG, law, FIT, 3.0)
+    loose = fitted(BALL, 0.9, 1.5, 2.4, 3.5, 5.0, relative_sd=0.4)
+    y = expectation(test, law, loose, 0.2, u_rest=5.0).prediction.y  # exactly as expected
+    sound = judge(test, y, np.zeros_like(y), law, FIT, 0.2, u_rest=5.0)
+    assert sound.allowed < abs(test.setpoint[0]) / 3.0
+    loud = judge(test, y, np.zeros_like(y), law, loose, 0.2, u_rest=5.0)
+    assert loud.rms_error <= loud.allowed
+    assert not loud.accepted
+    assert "nothing is verified" in loud.reason
+    assert "measure the points again" in loud.reason
+
+
+def test_points_that_leave_stability_open_are_refused_before_the_rig_is_touched() -> None:
+    assert require_predictable(FIT, HOT).stable
+    loose = fitted(BALL, 0.9, 1.5, 2.4, relative_sd=1.0)
+    with pytest.raises(DesignError, match=r"of 60 plants that the points allow make no stable loop.*") as refused:
+        require_predictable(loose, HOT)
+    assert "measure points around" in refused.value.remedy
+
+
+def test_points_that_contradict_their_covariance_are_refused_and_small_errors_of_structure_are_not() -> None:
+    points = []
+    for omega, factor in ((0.9, 1.0), (1.5, 1.25), (2.4, 1.0), (3.5, 1.2), (5.0, 1.0)):
+        response = factor * complex(BALL.response(np.array([omega]))[0])
+        variance = (0.004 * abs(response)) ** 2
+        covariance = ((variance, 0.0), (0.0, variance))
+        points.append(FrequencyPoint(omega_rad_s=omega, response=response, covariance=covariance))
+    with pytest.raises(DesignError, match="the points contradict their covariance: chi-square"):
+        require_predictable(fit_plant(points), PI)
+    slight = replace(FIT, chi_square=100.0, degrees_of_freedom=2)
+    assert slight.p_value < 1e-10
+    assert require_predictable(slight, PI).stable
