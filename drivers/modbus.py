@@ -9,6 +9,8 @@ What can go wrong, and what is done about it:
   anything but a clean answer (also an interrupted request) the line is resynchronised, see :meth:`ModbusLink._flush`.
 - Every answer is checked against its request: function code, number of registers, echoed address and value.
 - An open but silent peer costs (retries + 1) x timeout_s, plus late_reply_s each on RTU; no wait is without end.
+- A peer that says that it is busy (exceptions 5 and 6) is asked again after waits that double, for as long as a silent
+  one would cost.
 """
 
 from __future__ import annotations
@@ -49,6 +51,8 @@ _EXCEPTIONS = {
     11: ("does not answer its gateway", "check unit_id and the gateway"),
 }
 _BUSY = (5, 6)
+#: first wait before a busy device is asked again [s]
+_BUSY_WAIT_S = 0.005
 #: what the library raises where the line is gone, beside the line's own errors
 _LOST = (ConnectionException,)
 _READ = {
@@ -252,7 +256,10 @@ class ModbusLink:
     ) -> tuple[ModbusPDU, int]:
         """Ask until an answer belongs to the request; return it and the number of attempts."""
         what, remedy = "no answer", "check cable, power and unit_id, or raise timeout_s"
-        for attempt in range(1, self._settings.retries + 2):
+        attempt, left = 0, self._settings.retries + 1
+        wait_s, busy_until_s = _BUSY_WAIT_S, time.monotonic() + left * self._settings.timeout_s
+        while left > 0:
+            attempt, left = attempt + 1, left - 1
             try:
                 answer = self._attempt(ask)
             except LinkError as error:
@@ -274,6 +281,9 @@ class ModbusLink:
             what = f"the device {what}"
             if code not in _BUSY:
                 raise DeviceRefused(what, where=f"{self.where}, {table} {address}", remedy=remedy)
+            if (room_s := busy_until_s - time.monotonic()) > 0.0:
+                time.sleep(min(wait_s, room_s))
+                wait_s, left = 2.0 * wait_s, max(left, 1)
         raise LinkError(what, where=f"{self.where}, {table} {address}", remedy=remedy)
 
     def _attempt(self, ask: Callable[[Any], ModbusPDU]) -> ModbusPDU:

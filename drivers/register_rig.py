@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Mapping, Sequence
 
@@ -20,6 +21,8 @@ _SAMPLE = ("y", "u_applied", "device_time", "heartbeat_echo", "in_command")
 _SCAN_S, _SCANS_LATE = 0.02, 5
 #: time that a device gets at least to say that the host commands [s]
 _TAKE_S = 0.25
+#: how long the safe output is written again where the device does not take it, and the first wait between [s]
+_SAFE_S, _SAFE_WAIT_S = 2.0, 0.05
 #: how long another master's heartbeat is looked for, in times between two of our own
 _WATCH_FEEDS = 3
 
@@ -204,21 +207,30 @@ class RegisterRig:
     def make_safe(self) -> None:
         """Command the safe output, stop the device's own controller and give the actuator back.
 
-        Nothing where this session has taken nothing: the rig is somebody else's then.
+        Nothing where this session has taken nothing: the rig is somebody else's then. A device that does not take it
+        is asked again for two seconds, over new connections.
 
         Raises
         ------
         LinkError
-            The device could not be reached, also over a new connection; its dead-man sets the safe output.
+            The device could not be reached in that time; its dead-man sets the safe output.
         """
         if not self._is_taken:
             return
-        try:
-            self._go_safe()
-        except LinkError:
+        until_s, wait_s = self._clock.now() + _SAFE_S, _SAFE_WAIT_S
+        while True:
+            try:
+                self._go_safe()
+            except LinkError:
+                if self._clock.now() + wait_s > until_s:
+                    raise
+            else:
+                return
+            self._clock.sleep_until(self._clock.now() + wait_s)
+            wait_s *= 2.0
             self._link.disconnect()
-            self._link.connect()
-            self._go_safe()
+            with contextlib.suppress(LinkError):  # what follows says it
+                self._link.connect()
 
     def hand_back(self) -> None:
         """Give the actuator back to the device's own controller, in the mode and at the set-point it had, bumplessly.
@@ -276,6 +288,19 @@ class RegisterRig:
         for name in ("automatic", "enable", "load"):
             if name in self._codecs:
                 self._put(name, 0.0)
+        self._await_echo()
+
+    def _await_echo(self) -> None:
+        """Wait until the device's program has seen the last write, where it echoes the heartbeat."""
+        start_s = self._clock.now()
+        while self._checks_echo and self._ask()[1]["heartbeat_echo"] != self._heart.value:
+            waited_s = self._clock.now() - start_s
+            self._require(
+                waited_s < max(_TAKE_S, self._late_s),
+                f"the device does not echo the heartbeat of the safe output after {waited_s:.2g} s",
+                "look whether its program runs",
+            )
+            self._clock.sleep_until(self._clock.now() + 0.25 * self._scan_s)
 
     def _refuse_other_master(self, shown: Mapping[str, float]) -> None:
         """Watch for a moving heartbeat where the device says, or may not say, that somebody commands it."""

@@ -34,6 +34,23 @@ def rig_of(config: Config, dry_run: bool = False) -> Rig:
     )
 
 
+def unguarded(config: Config) -> str:
+    """Return what is to be known of a rig whose device no one is known to make safe; empty where a dead-man is mapped.
+
+    Parameters
+    ----------
+    config : Config
+        Of the rig; a kind without registers has its dead-man in its protocol, or is in this process.
+    """
+    registers = getattr(config.rig, "registers", None)
+    if registers is None or registers.heartbeat is not None:
+        return ""
+    return (
+        "no dead-man is mapped: if this computer or the line fails, the device may hold the last command for ever;"
+        " map rig.registers.heartbeat, or stand at the rig's stop"
+    )
+
+
 OVERWRITE = Annotated[bool, typer.Option("--overwrite", help="replace what is at --out; an input never is")]
 
 

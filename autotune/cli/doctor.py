@@ -19,6 +19,7 @@ from packaging.requirements import Requirement
 from rich.console import Console
 
 from autotune.cli import app
+from autotune.cli.common import unguarded
 from autotune.errors import InputError
 
 if TYPE_CHECKING:
@@ -248,6 +249,9 @@ def _rig(content: Config) -> Iterator[Check]:
     if reach.device:
         check = _permission("the rig's port", reach.device)
         yield replace(check, verdict="wrong") if check.remedy else check  # this port is needed, others are not
+    if warning := unguarded(content):
+        what, remedy = warning.split("; ")
+        yield Check(subject="dead-man", found=what, verdict="note", remedy=remedy)
     if reach == Reach():
         nothing = "nothing that could be looked for before it is opened"
         yield Check(subject="the rig", found=f'kind = "{content.rig.kind}": {nothing}')

@@ -11,7 +11,7 @@ import typer
 from rich.console import Console
 
 from autotune.cli import app
-from autotune.cli.common import OVERWRITE, ProgressBar, new_folder, rig_of
+from autotune.cli.common import OVERWRITE, ProgressBar, new_folder, rig_of, unguarded
 from autotune.cli.live import LISTEN, PORT, TOKEN
 from autotune.cli.recordings import R, T, U, Y, read_all, signal_names
 from autotune.errors import ExperimentStopped, InputError
@@ -65,6 +65,8 @@ def run(
         may_store(content, out)
     folder = out or resume or Path()
     console = Console(highlight=False, soft_wrap=True)
+    if warning := unguarded(content):
+        console.print(f"warning: {warning}", markup=False)
     with LivePage(folder, listen, port, token) if live else nullcontext() as onlooker:
         keep = onlooker.keep if onlooker is not None else None
         with _page_where_stopped(content, folder), ProgressBar() as bar:

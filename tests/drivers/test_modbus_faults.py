@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -277,6 +278,38 @@ def test_a_modbus_exception_is_named_with_its_register(code: int, says: str) -> 
         refusing["code"] = code  # type: ignore[assignment]  # None until now
         with pytest.raises(LinkError, match=rf"input 0.*{says}"):
             bench.rig.read()
+
+
+@pytest.mark.parametrize("code", [5, 6])
+def test_a_device_that_is_busy_for_a_fifth_of_a_second_is_waited_for(code: int) -> None:
+    """Two attempts at once used to be all it got; the waits together are no longer than for a silent one."""
+    busy = {"until_s": 0.0}
+
+    def refuse(table: str, address: int, writes: bool) -> int | None:
+        return code if time.monotonic() < busy["until_s"] else None
+
+    with tcp_bench(refuse=refuse, timeout_s=1.0) as bench:
+        bench.rig.open()
+        busy["until_s"] = time.monotonic() + 0.2
+        assert bench.rig.read().suspect
+        busy["until_s"] = time.monotonic() + 0.2
+        bench.rig.write(0.5)
+        assert bench.output() == pytest.approx(0.5)
+
+
+def test_the_safe_output_is_written_again_until_a_busy_device_takes_it() -> None:
+    busy = {"until_s": 0.0}
+
+    def refuse(table: str, address: int, writes: bool) -> int | None:
+        return 6 if writes and time.monotonic() < busy["until_s"] else None
+
+    with tcp_bench(refuse=refuse, timeout_s=0.1, retries=0) as bench:
+        bench.rig.open()
+        bench.rig.write(0.5)
+        busy["until_s"] = time.monotonic() + 0.8  # longer than one request waits
+        bench.rig.make_safe()
+        assert time.monotonic() > busy["until_s"]
+        assert bench.output() == U_SAFE
 
 
 def test_a_busy_device_is_asked_again_and_the_sample_marked() -> None:

@@ -173,7 +173,8 @@ def test_a_program_that_does_not_run_is_said_and_not_taken_for_a_slow_one() -> N
         rig = rig_on(plc)
         with pytest.raises(LinkError, match=r"echo the heartbeat after 0\.\d+ s.*whether its program runs"):
             rig.open()
-        rig.make_safe()
+        with pytest.raises(LinkError, match="does not echo the heartbeat of the safe output"):  # it holds nothing
+            rig.make_safe()
         rig.close()
 
 
