@@ -31,6 +31,7 @@ class SessionLock:
         self._address = address
         self._exclusive = exclusive and fcntl is not None
         self._file: int | None = None
+        self._path = Path()
 
     def take(self) -> bool:
         """Take the lock; return whether it was not held already.
@@ -43,14 +44,25 @@ class SessionLock:
         if not self._exclusive or self._file is not None:
             return False
         digest = hashlib.sha256(self._address.encode()).hexdigest()[:16]
-        path = Path(tempfile.gettempdir()) / f"autotune-rig-{digest}.lock"
+        self._path = Path(tempfile.gettempdir()) / f"autotune-rig-{digest}.lock"
+        while self._file is None:
+            file = self._locked()
+            # whoever had it before has removed it meanwhile: this lock is on a file that nobody else finds
+            if _is_at(file, self._path):
+                self._file = file
+            else:
+                os.close(file)
+        return True
+
+    def _locked(self) -> int:
+        """Return a locked file, open."""
         try:
             # read-only is enough to lock, also on a file that another user has made
-            file = os.open(path, os.O_RDONLY | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o644)
+            file = os.open(self._path, os.O_RDONLY | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o644)
         except OSError as error:
             raise LinkError(
                 f"the lock of its address cannot be opened ({error.strerror})",
-                where=str(path),
+                where=str(self._path),
                 remedy="remove that file",
             ) from None
         try:
@@ -62,16 +74,28 @@ class SessionLock:
                 where=self._address,
                 remedy="end it, or wait until it has",
             ) from None
-        self._file = file
-        return True
+        return file
 
     def give_back(self) -> None:
-        """Give the lock back; may be called more than once."""
+        """Give the lock back and remove its file; may be called more than once."""
         file, self._file = self._file, None
-        if file is not None:
-            with contextlib.suppress(OSError):
-                os.close(file)
+        if file is None:
+            return
+        with contextlib.suppress(OSError):  # another user's file in a shared folder stays
+            if _is_at(file, self._path):
+                self._path.unlink()
+        with contextlib.suppress(OSError):
+            os.close(file)
 
     def __del__(self) -> None:
         """Give the lock back with the session that forgot to."""
         self.give_back()
+
+
+def _is_at(file: int, path: Path) -> bool:
+    """Return whether an open file is the one at the path."""
+    try:
+        found, own = path.stat(), os.fstat(file)
+    except OSError:
+        return False
+    return (found.st_dev, found.st_ino) == (own.st_dev, own.st_ino)

@@ -30,6 +30,10 @@ DISTRIBUTION = "relay-autotune"
 SPACE_MB = 500.0
 #: period that the scheduler is tried with where no configuration names one [s]
 PERIOD_S = 0.01
+#: share of missed deadlines from which on a run is not begun
+MISSED_SHARE = 0.1
+
+Verdict = Literal["ok", "note", "wrong"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,7 +52,7 @@ class Check:
 
     subject: str
     found: str
-    verdict: Literal["ok", "note", "wrong"] = "ok"
+    verdict: Verdict = "ok"
     remedy: str = ""
 
 
@@ -84,7 +88,7 @@ def _checks(config: Path | None) -> Iterator[Check]:
         yield check
     yield from _clock()
     wanted = (content.signals.sample_time_s, content.limits.late_s) if content else (PERIOD_S, 0.15)
-    yield from _scheduling(*wanted)
+    yield from _scheduling(*wanted, is_needed=content is not None and _is_real(content))
     yield from _serial_ports()
     if content is not None:
         yield from _rig(content)
@@ -192,11 +196,25 @@ def _clock() -> Iterator[Check]:
         yield Check(subject=subject, found=found)
 
 
-def _scheduling(sample_time_s: float, late_s: float) -> Iterator[Check]:
-    """Say what this computer does at the wanted period, and how to get real-time priority."""
-    from autotune.cli.lateness import real_time_priority, tried
+def _is_real(content: Config) -> bool:
+    """Return whether the rig's time goes on by itself: it is not in this process."""
+    from drivers.kinds import Reach, kind_of
 
-    found = tried(sample_time_s)
+    reach = kind_of(content.rig).reached_by(content.rig)
+    return reach.address is not None or reach.device != Reach().device
+
+
+def _scheduling(sample_time_s: float, late_s: float, *, is_needed: bool) -> Iterator[Check]:
+    """Say what this computer does at the wanted period, and how to get real-time priority.
+
+    Too many missed deadlines are wrong where a rig needs them.
+    """
+    from autotune.cli.lateness import real_time_priority, tried
+    from autotune.experiment.priority import undisturbed
+    from drivers.clock import MonotonicClock
+
+    with undisturbed(MonotonicClock()):  # as a run tries it
+        found = tried(sample_time_s)
     priority, how = real_time_priority()
     is_good = found.late_s <= 0.5 * found.period_s and found.worst_s <= max(late_s, 5.0 * sample_time_s)
     # a run rides through a late sample; many, or one that is too late, end it
@@ -206,7 +224,9 @@ def _scheduling(sample_time_s: float, late_s: float) -> Iterator[Check]:
         else "close other programs, or let the device run the law by itself; "
         + (how or "the computer is too slow for this period: raise signals.sample_time_s")
     )
-    yield Check(subject="scheduling", found=f"{found}; {priority}", verdict="ok" if is_good else "note", remedy=remedy)
+    missed = found.missed / max(found.deadlines, 1)
+    verdict: Verdict = "ok" if is_good else "wrong" if is_needed and missed > MISSED_SHARE else "note"
+    yield Check(subject="scheduling", found=f"{found}; {priority}", verdict=verdict, remedy=remedy)
     if is_good and how:
         yield Check(subject="real-time priority", found=f"not needed here; where it is: {how}")
 

@@ -20,6 +20,7 @@ from autotune.errors import AutotuneError, ExperimentStopped, LinkError, Operato
 from autotune.experiment.leaving import leave, say, verdict_on
 from autotune.experiment.limits import Envelope, Watch
 from autotune.experiment.monitor import ReadingMonitor
+from autotune.experiment.priority import undisturbed
 from autotune.experiment.rig import Exchanges, Feeds, Reading, Rig, Row
 from autotune.experiment.rows import KEPT_ROWS, RecentRows
 from autotune.experiment.timing import Tick, Timing
@@ -128,6 +129,7 @@ class ControlLoop:
     def __enter__(self) -> Self:
         warm_up()
         self._exits.enter_context(_signals(self._on_signal))
+        self._exits.enter_context(undisturbed(self.rig.clock))
         try:
             self.rig.open()
             self._start_s = self._deadline_s = self.rig.clock.now()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,7 @@ from autotune.experiment.relay import RelaySettings
 from autotune.experiment.result import ExperimentResult, Part, Segment, State, Status
 from autotune.experiment.rig import Rig, RunsLaws, ShowsOutput
 from autotune.experiment.sweep import missing_phases, sweep, sweep_warnings
+from autotune.identification.frequency.windows import Rows
 from autotune.recording import RecordingWriter
 
 #: rows whose mean is compared with that of as many rows before, to see whether y stands still
@@ -93,13 +94,40 @@ def run_experiment(
     extra = further_columns(rig)
     writer = RecordingWriter(recording, ("t", "u", "y", *extra), recording_metadata(config))
     with ControlLoop(rig=rig, envelope=envelope_of(config), writer=writer, extra=extra) as loop:
-        result = experiment_on(loop, config, earlier=earlier, on_status=on_status)
+        swept = experiment_on(loop, config, earlier=earlier, on_status=on_status)
+    sitting = len(earlier.recordings)
+
+    def rows(number: int) -> Rows:
+        return loop.history() if number == sitting else earlier.rows(number)
+
+    # all cycles together, which takes many samples' time: the rig has been handed back
+    final = refined(swept.segments, rows, config.signals.sample_time_s)
+    result = _result(final, config.experiment, (*earlier.parts, swept.part), loop.timing, swept.known)
     return replace(result, output=loop.metadata["ended"]["output"])
+
+
+@dataclass(frozen=True, kw_only=True)
+class Swept:
+    """What the loop ends with.
+
+    Attributes
+    ----------
+    segments : tuple of Segment
+        Finished limit cycles, the earlier ones among them, each with its first estimate.
+    known : Known
+        What was learnt.
+    part : Part
+        This sitting.
+    """
+
+    segments: tuple[Segment, ...]
+    known: Known
+    part: Part
 
 
 def experiment_on(
     loop: ControlLoop, config: Config, *, earlier: Earlier | None = None, on_status: OnStatus | None = None
-) -> ExperimentResult:
+) -> Swept:
     """Go through the states on an open loop; the plant is left at rest, under the command that holds it.
 
     Raises
@@ -136,9 +164,8 @@ def experiment_on(
     journal.enter(State.HAND_BACK)
     journal.show("all points measured", 0.0, known)
     loop.watch = Watch(in_range=True)
-    result = _result(segments, wanted, (*earlier.parts, part), loop.timing, known)
-    loop.step(loop.nearest(result.u_rest))
-    return result
+    loop.step(loop.nearest(float(np.mean([segment.u_mean for segment in segments]))))
+    return Swept(segments=segments, known=known, part=part)
 
 
 def wait_for_rest(loop: ControlLoop) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 from autotune.config.procedure import ExperimentSettings, OperatingPointSettings
 from autotune.errors import ExperimentStopped, IdentificationError
 from autotune.experiment.approach import Known
-from autotune.experiment.cycles import Earlier, measured, refined
+from autotune.experiment.cycles import Earlier, measured
 from autotune.experiment.limits import Envelope
 from autotune.experiment.loop import ControlLoop
 from autotune.experiment.oscillation import PATIENCE, Oscillation, mean_command
@@ -19,7 +19,6 @@ from autotune.experiment.plan import Choice, Goal, allot, choose, phase_targets,
 from autotune.experiment.relay import RelaySettings
 from autotune.experiment.result import Cycle, Segment, State
 from autotune.identification.frequency.limit_cycle import WholePeriods
-from autotune.identification.frequency.windows import Rows
 
 #: part of limits.swing that a limit cycle is planned for: the rest is for a mid-point that is not quite right
 PEAK_SHARE = 0.87
@@ -60,7 +59,7 @@ def sweep(
     Returns
     -------
     segments : tuple of Segment
-        Earlier and new cycles, each with its final point.
+        Earlier and new cycles, each with its point as the cycles before it knew the plant.
     known : Known
         What was learnt.
 
@@ -119,12 +118,7 @@ def sweep(
             swept=True,
             warnings=sweep_warnings(segments, wanted, known.link_rad_s),
         )
-
-    def rows(number: int) -> Rows:
-        return loop.history() if number == part else earlier.rows(number)
-
-    final = refined(segments, rows, loop.sample_time_s)
-    return final, replace(known, points=tuple(one.point for one in final))
+    return tuple(segments), known
 
 
 def missing_phases(wanted: ExperimentSettings, earlier: Earlier) -> tuple[float, ...]:

@@ -20,6 +20,7 @@ from autotune.experiment.rig import HandsBack
 from autotune.experiment.run import further_columns
 from autotune.recording import RecordingWriter, read_recording
 from drivers.register_rig import RegisterRig
+from drivers.session_lock import SessionLock
 from tests.drivers.bench import LIMIT_S, rig_of, tcp_settings
 from tests.drivers.lines import LIMITS
 from tests.drivers.scanning_plc import DOOR, REGISTERS, ScanningPlc, plc_settings
@@ -369,3 +370,17 @@ def test_what_the_device_says_it_applies_is_a_column_of_the_recording_where_it_i
         assert further_columns(rig_on(plc)) == ("u_applied",)
         bare = REGISTERS.model_copy(update={"u_applied": None})
         assert further_columns(rig_of(tcp_settings(plc.port, bare))) == ()
+
+
+def test_a_lock_leaves_no_file_and_lets_one_session_in() -> None:
+    first, second = SessionLock("a rig of this test"), SessionLock("a rig of this test")
+    assert first.take()
+    with pytest.raises(LinkError, match="another session on this computer"):
+        second.take()
+    path = first._path
+    first.give_back()
+    assert not path.exists()
+    assert second.take()
+    assert path.exists()
+    second.give_back()
+    assert not path.exists()

@@ -8,15 +8,18 @@ import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from autotune.errors import ExperimentStopped, LinkError
+from autotune.experiment import run
+from autotune.experiment.loop import ControlLoop
 from autotune.experiment.result import ExperimentResult, State, Status
 from autotune.experiment.rig import Reading
-from autotune.experiment.run import bring_to_operating_point, run_experiment
-from autotune.recording import read_recording
+from autotune.experiment.run import bring_to_operating_point, envelope_of, run_experiment
+from autotune.recording import RecordingWriter, read_recording
 from drivers.simulated import SimulatedRig
 from sim.ball import make_ball
 from sim.imperfections import Fault, FaultyPlant
@@ -281,3 +284,36 @@ def test_a_killed_process_leaves_a_readable_recording(tmp_path: Path) -> None:
     assert len(recording) > 500
     assert np.all(np.isfinite(recording.y))
     assert "killed" in recording.metadata["ended"]["reason"]
+
+
+def test_all_cycles_are_estimated_together_once_the_rig_is_safe(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """That takes as long as many samples: in the open loop it was a link too slow."""
+    rig, held = ball_rig(seed=7), []
+    real = run.refined
+
+    def looked(*given: Any) -> Any:
+        held.append(rig.command)
+        return real(*given)
+
+    monkeypatch.setattr(run, "refined", looked)
+    run_experiment(rig, ball_config(), tmp_path / "recording.csv")
+    assert held == [0.0]
+
+
+@pytest.mark.parametrize("sample_time_s", [0.005, 0.02])
+def test_the_ramp_is_per_second_whatever_the_sample_time(tmp_path: Path, sample_time_s: float) -> None:
+    config = ball_config()
+    config = config.model_copy(
+        update={"signals": config.signals.model_copy(update={"sample_time_s": sample_time_s, "u_step": 0.0})}
+    )
+    writer = RecordingWriter(tmp_path / "ramp.csv", ("t", "u", "y"))
+    with ControlLoop(rig=ball_rig(seed=7), envelope=envelope_of(config), writer=writer) as loop:
+        bring_to_operating_point(loop, config)
+        t, u, _ = loop.history()
+    begun = int(np.argmax(u > 4.3))
+    climbing = slice(begun, begun + round(0.5 / sample_time_s))  # half a second of the ramp, before the ball moves
+    rate = float(np.polyfit(t[climbing], u[climbing], 1)[0])
+    limits, point = config.limits, config.operating_point
+    assert rate == pytest.approx(2.4 * point.u_uncertainty / (0.08 * limits.time_s), rel=0.05)

@@ -1,0 +1,63 @@
+"""What the computer gives a loop on a real rig: the best priority that it grants, and linear algebra on one core."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Iterator
+from typing import Protocol, runtime_checkable
+
+from threadpoolctl import threadpool_limits
+
+#: real-time priority of the loop's thread: above all that is not real-time, below the kernel's own threads
+PRIORITY = 20
+
+
+@runtime_checkable
+class GoesOn(Protocol):
+    """A clock whose time goes on whether anybody waits or not."""
+
+    goes_on: bool
+
+
+@contextlib.contextmanager
+def undisturbed(clock: object) -> Iterator[None]:
+    """Let this thread run before others, and small matrices not on all cores, where the clock waits for nobody.
+
+    Parameters
+    ----------
+    clock : Clock
+        The rig's; nothing is changed for a virtual one, which would only keep others from their work.
+
+    Notes
+    -----
+    The system may refuse the priority to a user; then the loop goes on with the usual one.
+    """
+    if not isinstance(clock, GoesOn) or not clock.goes_on:
+        yield
+        return
+    with threadpool_limits(limits=1), _real_time():
+        yield
+
+
+@contextlib.contextmanager
+def _real_time() -> Iterator[None]:
+    if not hasattr(os, "sched_setscheduler"):
+        yield
+        return
+    before = os.sched_getscheduler(0), os.sched_getparam(0)
+    try:
+        # programs that are started meanwhile get the usual priority
+        os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(PRIORITY))
+        given = True
+    except OSError:
+        given = False
+    try:
+        yield
+    finally:
+        if given:
+            policy, param = before
+            try:
+                os.sched_setscheduler(0, policy, param)
+            except OSError:  # only a privileged process may take this flag back
+                os.sched_setscheduler(0, policy | os.SCHED_RESET_ON_FORK, param)

@@ -1,0 +1,57 @@
+"""Runs on the ball behind Modbus TCP, with and without four busy processes beside them: how many are accepted.
+
+``RUNS=3 python -m tests.benchmarks busy``: so many of each; ten where nothing is said.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import sys
+import tempfile
+import time
+from contextlib import ExitStack
+from pathlib import Path
+
+from tests.drivers.test_rig_commands import free_port
+
+CONFIG = Path(__file__).resolve().parents[2] / "configs" / "ball_modbus_tcp.toml"
+BUSY = 4
+
+
+def main() -> None:
+    """Print a line for each run, and how many were accepted."""
+    runs = int(os.environ.get("RUNS", "10"))
+    for busy in (0, BUSY):
+        accepted = sum(_run(busy) for _ in range(runs))
+        print(f"{busy} busy processes: {accepted} of {runs} accepted")
+
+
+def _run(busy: int) -> bool:
+    with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
+        path = Path(folder) / "rig.toml"
+        text = re.sub(r"port = \d+", f"port = {free_port()}", CONFIG.read_text())
+        path.write_text(text.replace("points = 5", "points = 3").replace("budget_s = 58.0", "budget_s = 36.0"))
+        for _ in range(busy):
+            stack.callback(subprocess.Popen([sys.executable, "-c", "while True: pass"]).kill)
+        command = [sys.executable, "-m", "autotune.cli"]
+        served = subprocess.Popen([*command, "rig", str(path)], stdout=subprocess.PIPE, text=True)
+        stack.callback(served.kill)
+        assert served.stdout is not None
+        served.stdout.readline()  # it serves
+        began_s = time.monotonic()
+        out = Path(folder) / "out"
+        done = subprocess.run([*command, "run", str(path), "--out", str(out)], capture_output=True, text=True)
+        timing = {}
+        if (out / "result.json").exists():
+            timing = json.loads((out / "result.json").read_text())["experiment"].get("timing", {})
+        said = (done.stdout if done.returncode == 0 else done.stderr).strip().splitlines()
+        line = next((text for text in said if text.startswith("Accepted")), said[-1] if said else "")
+        print(f"  {busy} busy, {time.monotonic() - began_s:.0f} s, missed {timing.get('missed')}: {line[:160]}")
+        return done.returncode == 0
+
+
+if __name__ == "__main__":
+    main()
