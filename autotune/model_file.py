@@ -38,9 +38,8 @@ def read_any(path: str | os.PathLike[str]) -> AnyModel:
         As :func:`autotune.equations.files.read_any_model`; an unknown effect, with the list of known ones.
     """
     from autotune.effects import require_known
-    from autotune.equations.effects import KNOWN
     from autotune.equations.files import read_any_model
 
     model = read_any_model(path)
-    require_known(model.effects, str(path), () if isinstance(model, Model) else KNOWN)
+    require_known(model.effects, str(path), in_chain=isinstance(model, Model))
     return model

@@ -51,16 +51,16 @@ def taken_by(names: Iterable[str]) -> set[str]:
     return given | inner | {kind.name for kind in KINDS.values() if given & set(kind.includes)}
 
 
-def unknown(name: str, where: str, known: Iterable[str] = ()) -> InputError:
+def unknown(name: str, where: str) -> InputError:
     """Return the error of an effect that no catalogue has: the name that may be meant, and all that there are."""
-    names = sorted({*KINDS, *known})
+    names = sorted(KINDS)
     near = get_close_matches(name, names, 1)
     meant = f"did you mean {near[0]!r}? " if near else ""
     return InputError(f"unknown effect {name!r}", where=where, remedy=f"{meant}Known are {', '.join(names)}")
 
 
-def require_known(effects: Iterable[Effect], where: str, known: Iterable[str] = ()) -> None:
-    """Refuse effects that no catalogue has, ``known`` beside it.
+def require_known(effects: Iterable[Effect], where: str, *, in_chain: bool = True) -> None:
+    """Refuse effects that the catalogue does not have, or not for a chain of blocks.
 
     Raises
     ------
@@ -68,5 +68,8 @@ def require_known(effects: Iterable[Effect], where: str, known: Iterable[str] = 
         The first of them, with the list of known ones.
     """
     for effect in effects:
-        if effect.name not in KINDS and effect.name not in known:
-            raise unknown(effect.name, where, known)
+        if effect.name not in KINDS:
+            raise unknown(effect.name, where)
+        if in_chain and KINDS[effect.name].sought == "equations":
+            raise InputError(f"{effect.name} acts in models of equations alone", where=where,
+                             remedy="write the plant as equations, or take the effect out")  # fmt: skip

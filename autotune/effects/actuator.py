@@ -21,6 +21,7 @@ from autotune.effects.base import (
     ends,
 )
 from autotune.effects.converter import converter_steps
+from autotune.effects.in_equations import Around, InEquations, Tried, curves
 from autotune.effects.stages import Blocks, Line, LinearPart, Memory, Values
 from autotune.models import Block, TransferFunction
 
@@ -148,9 +149,25 @@ def _asymmetric_starts(s: SignalSizes) -> list[tuple[float, ...]]:
     return [(a * s.lag_s, b * s.lag_s) for a, b in ((0.05, 0.1), (0.1, 0.05), (0.15, 0.4), (0.4, 0.15))]
 
 
+def _limits_tried(a: Around) -> list[Tried]:
+    """Return limits above and below the middle of the command."""
+    top, bottom = (float(np.quantile(a.u, q)) for q in (0.999, 0.001))
+    shares = [share * (top - bottom) for share in (0.05, 0.2, 0.4)]
+    return [Tried(values) for d in shares for values in ({"high": top - d}, {"low": bottom + d})]
+
+
+def _usual_move(u: FloatArray) -> float:
+    """Return how far a command moves; between its steps a held one says nothing of how fast it may."""
+    size = float(np.std(u)) + 1e-300
+    moves = np.abs(np.diff(u))
+    moves = moves[moves > 1e-6 * size]
+    return float(np.quantile(moves, 0.9)) if moves.size else size
+
+
 ACTUATOR = (
     EffectKind(
         name="actuator.quantisation",
+        words=("steps", "the command reaches the plant in steps"),
         equation="w = origin + step round((u - origin) / step)",
         parameters=(
             Quantity(name="step", unit="{u}", role="threshold", nonzero=True),
@@ -162,10 +179,12 @@ ACTUATOR = (
         moves=_levels_around,
         nudge=0.06,
         confusable=("actuator.stiction",),
+        in_equations=InEquations(acts="held", samples="steps"),
         reference=_ASTROM,
     ),
     EffectKind(
         name="actuator.backlash",
+        words=("play", "the actuator has play and follows late after every reversal"),
         equation="w follows u - u0 with a play of the given width",
         parameters=(Quantity(name="width", unit="{u}", role="amplitude"),),
         lines=(Line(stage="command", does=followed),),
@@ -174,10 +193,16 @@ ACTUATOR = (
         nudge=0.06,
         confusable=("actuator.stiction", "timing.dead_time"),
         odds={"any": 0.05, "shaft": 0.1, "carriage": 0.03, "lifted": 0.01, "arm": 0.01, "valve": 0.7, "process": 0.2},
+        in_equations=InEquations(
+            acts="held",
+            samples="play",
+            trials=lambda a: [Tried({"width": c * a.spread}) for c in (0.2, 0.6)],
+        ),
         reference="Nordin and Gutman, Automatica 38, 2002",
     ),
     EffectKind(
         name="actuator.stiction",
+        words=("stiction", "the actuator sticks, then jumps"),
         equation="w stays until |u - w| > band, then jumps to u",
         parameters=(
             Quantity(name="band", unit="{u}", role="threshold"),
@@ -191,10 +216,17 @@ ACTUATOR = (
         nudge=0.02,  # its local minima are narrow
         confusable=("actuator.backlash", "actuator.quantisation"),
         odds={"valve": 0.4, "process": 0.15},
+        in_equations=InEquations(
+            acts="held",
+            samples="stick",
+            jumps=("band",),
+            trials=lambda a: [Tried({"band": c * a.spread}) for c in (0.2, 0.6)],
+        ),
         reference="Stenman, Gustafsson and Forsman, Int. J. Adapt. Control 17, 2003",
     ),
     EffectKind(
         name="actuator.dead_zone",
+        words=("dead zone", "small commands do nothing"),
         equation="w = 0 for |u - u0| < half_width, else u - u0 -+ half_width",
         parameters=(Quantity(name="half_width", unit="{u}", role="amplitude"),),
         lines=(Line(stage="command", does=without_zone),),
@@ -202,10 +234,16 @@ ACTUATOR = (
         nudge=0.06,
         confusable=("plant.coulomb_friction", "actuator.nonlinear_gain"),
         odds={"any": 0.15, "level": 0.1, "thermal": 0.05, "valve": 0.1, "damper": 0.0},
+        in_equations=InEquations(
+            acts="input",
+            text="value - min(max(value, -half_width), half_width)",
+            trials=lambda a: [Tried({"half_width": c * a.spread}) for c in (0.1, 0.4)],
+        ),
         reference=_ASTROM,
     ),
     EffectKind(
         name="actuator.nonlinear_gain",
+        words=("curved gain", "the actuator's gain changes with the command"),
         equation="w = (u - u0) + second_order (u - u0)^2 + third_order (u - u0)^3",
         parameters=(
             Quantity(name="second_order", unit="1/{u}", role="amplitude", sign="real", neutral=0.0),
@@ -217,10 +255,19 @@ ACTUATOR = (
         starts=lambda s: [(0.05 / s.w, 1e-3 / s.w**2), (1e-3 / s.w, 0.05 / s.w**2)],
         confusable=("actuator.saturation", "sensor.nonlinear_gain"),
         odds={"any": 0.1, "arm": 0.5, "speed": 0.15, "carriage": 0.03, "thermal": 0.05, "shaft": 0.05, "valve": 0.05},
+        in_equations=InEquations(
+            acts="input",
+            text="value + second_order*(value - origin)^2 + third_order*(value - origin)^3",
+            defaults={"origin": 0.0},
+            either_sign=("origin",),
+            spread={"origin": lambda s: s.u},
+            trials=lambda a: curves(a.u),
+        ),
         reference=_LJUNG,
     ),
     EffectKind(
         name="actuator.saturation",
+        words=("limits", "the actuator gives no more beyond its limits"),
         equation="w = min(max(u, low), high)",
         parameters=(
             Quantity(name="low", unit="{u}", role="limit", sign="real", neutral=-NEVER),
@@ -230,10 +277,17 @@ ACTUATOR = (
         starts=lambda s: limit_starts(s.w_low, s.w_high, (0.05, 0.15, 0.3)),
         confusable=("actuator.nonlinear_gain", "actuator.rate_limit"),
         odds={"any": 0.15, "level": 0.3},
+        in_equations=InEquations(
+            acts="input",
+            text="min(max(value, low), high)",
+            spread={"low": lambda s: s.u, "high": lambda s: s.u},
+            trials=_limits_tried,
+        ),
         reference=_ASTROM,
     ),
     EffectKind(
         name="actuator.rate_limit",
+        words=("rate limit", "the actuator moves no faster than a limit"),
         equation="|dw/dt| <= rate",
         parameters=(Quantity(name="rate", unit="{u}/s", role="threshold"),),
         lines=(Line(stage="command", does=slewed),),
@@ -242,10 +296,18 @@ ACTUATOR = (
         starts=lambda s: [(s.w / (c * s.lag_s),) for c in (0.03, 0.06, 0.1, 0.16, 0.25, 0.4, 0.6, 1.0, 1.5)],
         confusable=("actuator.lag",),
         odds={"any": 0.01, "damper": 0},
+        in_equations=InEquations(
+            acts="input",
+            text="memory",
+            memory=(("memory", "rate*sign(value - memory)"),),
+            follows=True,
+            trials=lambda a: [Tried({"rate": _usual_move(a.u) / (c * a.dt_s)}) for c in (3.0, 10.0, 30.0)],
+        ),
         reference=_ASTROM,
     ),
     EffectKind(
         name="actuator.gain_drift",
+        words=("drifting gain", "the actuator's gain drifts with time"),
         equation="w = (u - u0) (1 + rate t)",
         parameters=(Quantity(name="rate", unit="1/s", role="amplitude", sign="real"),),
         lines=(Line(stage="command", does=drifted),),
@@ -254,10 +316,16 @@ ACTUATOR = (
         places=("actuator", "plant"),
         at_a_time=True,
         odds={"any": 0.02, "damper": 0, "arm": 0.005, "oscillator": 0.005},
+        in_equations=InEquations(
+            acts="input",
+            text="value*(1 + rate*t)",
+            trials=lambda a: [Tried({"rate": 0.05 / a.duration_s}, ("rate",))],
+        ),
         reference=_LJUNG,
     ),
     EffectKind(
         name="actuator.lag",
+        words=("a lag", "the command passes a lag that the model does not have"),
         equation="time_constant dw/dt = u - w",
         parameters=(Quantity(name="time_constant", unit="s", role="amplitude"),),
         linear=LinearPart(blocks=with_lag, states=1, at="front", start=_last_commands),
@@ -266,10 +334,18 @@ ACTUATOR = (
         same=("sensor.lag",),
         places=("actuator", "sensor", "plant"),
         odds={"any": 0.2, "damper": 0.05},
+        in_equations=InEquations(
+            acts="input",
+            text="memory",
+            memory=(("memory", "(value - memory)/time_constant"),),
+            follows=True,
+            trials=lambda a: [Tried({"time_constant": min(c * a.dt_s, a.slow_s)}) for c in (2.0, 8.0, 30.0)],
+        ),
         reference=_LJUNG,
     ),
     EffectKind(
         name="actuator.asymmetric_lag",
+        words=("uneven lag", "the actuator is slower one way than the other"),
         equation="the actuator's lag is time_constant_up when rising, time_constant_down when falling",
         parameters=(
             Quantity(name="time_constant_up", unit="s", role="time"),
@@ -288,16 +364,28 @@ ACTUATOR = (
         starts=_asymmetric_starts,
         confusable=("actuator.lag", "actuator.nonlinear_gain"),
         odds={"any": 0.02, "damper": 0},
+        in_equations=InEquations(
+            acts="input",
+            text="memory",
+            memory=(("memory", "(value - memory)/if(value > memory, time_constant_up, time_constant_down)"),),
+            follows=True,
+        ),
         reference=_LJUNG,
     ),
     EffectKind(
         name="actuator.offset",
+        words=("offset", "the command's operating point is another one"),
         equation="w = u - u0 + offset",
         parameters=(Quantity(name="offset", unit="{u}", role="amplitude", sign="real"),),
         linear=LinearPart(u_offset=lambda values: -values["offset"]),
         sought="operating point",
         same=("environment.step_load",),
         places=("actuator", "environment", "plant"),
+        in_equations=InEquations(
+            acts="input",
+            text="value + offset",
+            trials=lambda a: [Tried({"offset": 0.05 * a.spread}, ("offset",))],
+        ),
         reference=_ASTROM,
     ),
 )

@@ -16,6 +16,7 @@ from functools import cached_property
 from typing import Literal, Protocol, TypeAlias
 
 from autotune.arrays import FloatArray
+from autotune.effects.in_equations import InEquations
 from autotune.effects.stages import Line, LinearPart, Memory, StageName, Values
 from autotune.models import Model, Parameter
 
@@ -29,9 +30,11 @@ from autotune.models import Model, Parameter
 Role: TypeAlias = Literal["amplitude", "limit", "threshold", "time", "shape", "location", "mark", "observed"]
 Sign: TypeAlias = Literal["positive", "real"]
 #: Where an effect is looked for: among hypotheses that are fitted; among those of rigs alone, where model error and not
-#: noise decides; as a structure that is fitted beside them and is no
-#: effect; in the operating point that every fit has; in the samples; in the residual; in the recomputed law.
-Sought: TypeAlias = Literal["hypothesis", "rig", "structure", "operating point", "samples", "residual", "law"]
+#: noise decides; as a structure that is fitted beside them and is no effect; in the operating point that every fit has;
+#: in the samples; in the residual; in the recomputed law; in models of equations alone.
+Sought: TypeAlias = Literal[
+    "equations", "hypothesis", "rig", "structure", "operating point", "samples", "residual", "law"
+]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -283,6 +286,8 @@ class EffectKind:
     ----------
     name : str
         PLACE.EFFECT.
+    words : tuple of two str
+        What it is, in a few words for a diagram, and as the main clause of a sentence.
     equation : str
         What it does, for people.
     parameters : tuple of Quantity
@@ -297,6 +302,8 @@ class EffectKind:
         What its lines keep from step to step.
     linear : LinearPart, optional
         What it makes of the chain.
+    in_equations : InEquations, optional
+        How it acts in a model of equations, and which values are tried there; without it it is not tried there.
     sub_steps : int
         Sub-steps per sample that it needs at least.
     needs, suits : Structure
@@ -356,6 +363,7 @@ class EffectKind:
     """
 
     name: str
+    words: tuple[str, str] = ("", "")
     equation: str = ""
     parameters: tuple[Quantity, ...] = ()
     reference: str = ""
@@ -363,6 +371,7 @@ class EffectKind:
     lines: tuple[Line, ...] = ()
     memory: Memory | None = None
     linear: LinearPart | None = None
+    in_equations: InEquations | None = None
     sub_steps: int = 1
     needs: Structure = ANY
     suits: Structure = ANY

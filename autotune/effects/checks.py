@@ -55,7 +55,9 @@ def _of(kind: EffectKind) -> Iterator[tuple[str, str]]:
     observed = all(q.role == "observed" for q in kind.parameters)
     if observed and kind.is_simulated:
         yield "a simulated effect has observed parameters", "give its parameters the roles that a search needs"
-    if not observed and not kind.is_simulated:
+    if kind.sought == "equations" and kind.in_equations is None:
+        yield "nothing would be simulated", "give in_equations=InEquations(...)"
+    if not observed and not kind.is_simulated and kind.sought != "equations":
         yield "nothing would be simulated", "add lines=(Line(stage=..., does=...),) or linear=LinearPart(...)"
     if kind.sought in ("hypothesis", "rig", "structure") and not _has_starts(kind):
         yield "no fit would ever start", "give starts=lambda sizes: [...] or search=..."

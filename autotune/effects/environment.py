@@ -8,13 +8,19 @@ from collections.abc import Mapping
 import numpy as np
 
 from autotune.effects.base import LEVEL, NEVER, EffectKind, Quantity, Scan
+from autotune.effects.in_equations import LOADED, Around, InEquations, Tried
 from autotune.effects.stages import Line, Values
 from autotune.models import Parameter
 
+_LJUNG = "Ljung, System Identification, 2nd ed., sec. 1.1: measured disturbances"
 _ASTROM = "Astrom and Hagglund, Advanced PID Control, 2006, ch. 4"
 _PLACES = ("environment", "actuator", "plant")
 #: Size of a load that is tried, as a share of the plant's largest input.
 _TRIED = 0.02
+#: Times at which a step is tried in models of equations, and the parts of a sinusoid.
+_LOAD_TIMES, _PARTS = 24, ("in_phase", "quadrature")
+#: Lags between a recorded column and what it acts on, as shares of the way from a sample to the slowest, in logarithms.
+_LAGS = (0.3, 0.65, 1.0)
 #: Candidate times of a step per recording.
 _STEP_TIMES = 16
 #: Lines of the residual at which a periodic load is tried; steps in which its frequency is searched around each, in
@@ -143,9 +149,27 @@ def _step_of(name: str, unit: str) -> tuple[Quantity, ...]:
     )
 
 
+def _without_lag(values: Values) -> tuple[str, dict[str, float]] | None:
+    """Return a column that acts at once in place of one behind a lag."""
+    at_once = {key: value for key, value in values.items() if key != "time_constant"}
+    return ("environment.measured_input", at_once) if len(at_once) < len(values) else None
+
+
+def _measured_tried(a: Around) -> list[Tried]:
+    """Return recorded columns as they are and from their mean on, at once and with a lag."""
+    lags = [a.dt_s * float(np.exp(share * np.log(a.slow_s / a.dt_s))) for share in _LAGS]
+    found = []
+    for column, d in a.columns.items():
+        for reference in dict.fromkeys((0.0, float(np.mean(d)))):
+            values = {"gain": a.force / float(np.std(d)), "reference": reference}
+            found += [Tried(values | late, ("gain",), column) for late in ({}, *({"time_constant": s} for s in lags))]
+    return found
+
+
 ENVIRONMENT = (
     EffectKind(
         name="environment.step_load",
+        words=("a load", "a load comes at a time and stays"),
         equation="force + amplitude from the time on",
         parameters=_step_of("amplitude", "{f}"),
         lines=(Line(stage="load", does=stepped),),
@@ -155,10 +179,23 @@ ENVIRONMENT = (
         places=_PLACES,
         at_a_time=True,
         odds={"any": 0.01, "damper": 0.0},
+        in_equations=InEquations(
+            acts="force",
+            text="if(t >= time, if(t < end, amplitude, 0), 0)",
+            on=LOADED,
+            trials=lambda a: [
+                Tried({"amplitude": a.force, "time": float(c) * a.duration_s}, ("amplitude",))
+                for c in np.linspace(0.04, 0.96, _LOAD_TIMES)
+            ],
+            given=("end",),
+            spread={"time": lambda s: 0.2 * s.duration_s},
+            free_timing=True,
+        ),
         reference=_ASTROM,
     ),
     EffectKind(
         name="environment.periodic_load",
+        words=("periodic load", "a load swings at a frequency of its own"),
         equation="force + amplitude sin(2 pi frequency t + phase)",
         parameters=(
             Quantity(
@@ -174,10 +211,23 @@ ENVIRONMENT = (
         readable=_as_amplitude,
         confusable=("plant.sine_torque",),
         places=_PLACES,
+        in_equations=InEquations(
+            acts="force",
+            text="in_phase*sin(2*pi*frequency*t) + quadrature*cos(2*pi*frequency*t)",
+            on=LOADED,
+            trials=lambda a: [
+                Tried({one: a.force, other: 2e-5 * a.force, "frequency": line}, (one,))
+                for line in a.lines
+                for one, other in (_PARTS, _PARTS[::-1])
+            ],
+            spread={key: lambda s: s.size for key in _PARTS},
+            free_timing=True,
+        ),
         reference=_ASTROM,
     ),
     EffectKind(
         name="environment.drifting_load",
+        words=("drifting load", "a load grows with time"),
         equation="force + rate t",
         parameters=(Quantity(name="rate", unit="{f}/s", role="amplitude", sign="real"),),
         lines=(Line(stage="load", does=growing),),
@@ -187,10 +237,18 @@ ENVIRONMENT = (
         places=_PLACES,
         at_a_time=True,
         odds={"any": 0.03, "damper": 0},
+        in_equations=InEquations(
+            acts="force",
+            text="rate*t",
+            on=LOADED,
+            trials=lambda a: [Tried({"rate": a.force / a.duration_s}, ("rate",))],
+            free_timing=True,
+        ),
         reference=_ASTROM,
     ),
     EffectKind(
         name="environment.gain_step",
+        words=("a switched gain", "from a time on a command does more, or less, than before"),
         equation="w = (u - u0) (1 + change) from the time on: a pump, a voltage, another mode of working",
         parameters=_step_of("change", ""),
         lines=(Line(stage="command", does=regained),),
@@ -205,6 +263,7 @@ ENVIRONMENT = (
     ),
     EffectKind(
         name="environment.loss_step",
+        words=("a switched loss", "from a time on the plant loses more, or less, of what it has stored"),
         equation="tau dx/dt = -(1 + change) x + gain w from the time on: a lid opened, a valve, water added",
         parameters=_step_of("change", ""),
         lines=(Line(stage="force", does=opened),),
@@ -217,5 +276,27 @@ ENVIRONMENT = (
         at_a_time=True,
         odds={"any": 0.02, "thermal": 0.07, "level": 0.07},
         reference="Incropera and DeWitt, Fundamentals of Heat and Mass Transfer, ch. 5",
+    ),
+    EffectKind(
+        name="environment.measured_input",
+        words=("another input", "a recorded column acts on the plant"),
+        equation="gain (column - reference), or behind a lag",
+        parameters=(
+            Quantity(name="gain", unit="", role="amplitude", sign="real"),
+            Quantity(name="reference", unit="", role="shape", sign="real", neutral=0.0),
+            Quantity(name="time_constant", unit="s", role="time"),
+        ),
+        sought="equations",
+        in_equations=InEquations(
+            acts="anywhere",
+            text="gain*memory",
+            memory=(("memory", "(column - reference - memory)/time_constant"),),
+            at_once="gain*(column - reference)",
+            unless="time_constant",
+            trials=_measured_tried,
+            spread={"reference": lambda s: s.column},
+            plainer=_without_lag,
+        ),
+        reference=_LJUNG,
     ),
 )

@@ -5,6 +5,7 @@ One record and its functions per effect: the file is as long as its place has ef
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
@@ -25,6 +26,7 @@ from autotune.effects.base import (
     SignalSizes,
     ends,
 )
+from autotune.effects.in_equations import HEATED, MOVING, STORED, Around, InEquations, Tried
 from autotune.effects.stages import Blocks, Line, LinearPart, Memory, Values
 from autotune.models import Block, Model, TransferFunction
 
@@ -32,6 +34,17 @@ _OLSSON = "Olsson, Astrom, Canudas de Wit, Gafvert and Lischinsky, Eur. J. Contr
 _KHALIL = "Khalil, Nonlinear Systems, 3rd ed., ch. 1"
 #: 0 degrees Celsius [K].
 _ICE = 273.15
+#: Temperature below which nothing is, so that a smaller one is no absolute one; how far surroundings may be from the
+#: coldest that was met [K].
+_COLDEST, _SURROUNDINGS_SD = 100.0, 15.0
+#: Parameters of a friction that is larger at rest.
+_STICKING = ("level", "breakaway")
+#: Shares of the time that a position without a stop is on this side of it, where stops are tried, and how far a
+#: position may go beyond one, of what it moves through: what gives way by more is no stop.
+_STOPS, _BEYOND = (0.8, 0.9, 0.97, 0.995), 0.15
+#: Width of a hysteresis, of what the position moves through, below which it is dry friction, which has no width: its
+#: springs would swing the faster the narrower it is, and a simulation would follow them.
+LEAST_WIDTH = 1.0 / 300.0
 
 
 def dry(v: float, level: float) -> float:
@@ -200,9 +213,59 @@ def _peaks(s: SignalSizes) -> list[tuple[float, ...]]:
     return [(c / (6.28 * s.lag_s), 0.08) for c in spread if c * s.dt_s < 1.5 * s.lag_s]
 
 
+def _cubes_tried(a: Around) -> list[Tried]:
+    if not a.has_position:
+        return []
+    return [Tried({"coefficient": a.force / (float(np.quantile(np.abs(a.x), 0.95)) + 1e-300) ** 3}, ("coefficient",))]
+
+
+def _stops_tried(a: Around) -> list[Tried]:
+    """Return stops on either side of a position, that turn what moves round within a few samples."""
+    stiffness = (0.5 / a.dt_s) ** 2 * a.per_rate
+    give = {"stiffness": stiffness, "damping": 2.0 * a.dt_s * stiffness}
+    at = [(side, share) for share in _STOPS for side in ("high", "low") if a.has_position]
+    return [Tried({side: float(np.quantile(a.x, c if side == "high" else 1.0 - c)), **give}) for side, c in at]
+
+
+def _gives_way(values: Values, x: FloatArray) -> bool:
+    """Whether a position goes so far beyond a stop that it is none."""
+    past = max(float(np.max(x)) - values.get("high", np.inf), values.get("low", -np.inf) - float(np.min(x)), 0.0)
+    return past > _BEYOND * max(float(np.ptp(x)), 1e-300)
+
+
+def _outflows_tried(a: Around) -> list[Tried]:
+    is_level = float(np.quantile(a.v, 0.05)) >= -0.05 * a.largest
+    return [Tried({"coefficient": a.force / np.sqrt(a.largest)}, ("coefficient",))] if is_level else []
+
+
+def _radiation_tried(a: Around) -> list[Tried]:
+    """Return a loss to surroundings as cold as the coldest that was met, where temperatures are absolute ones."""
+    zero = 0.0 if a.unit.strip().lower() in ("k", "kelvin") else _ICE
+    top, ground = float(np.max(a.v)) + zero, float(np.min(a.v)) + zero
+    values = {"coefficient": a.force / max(top**4 - ground**4, 1e-300), "zero": zero, "surroundings": ground}
+    return [Tried(values, ("coefficient",))] if top > _COLDEST else []
+
+
+def gravity(amplitude: float) -> dict[str, float]:
+    """Return a sine torque as gravity on an angle: over one turn, from angle zero on; its amplitude alone is sought."""
+    return {"amplitude": amplitude, "period": 2.0 * np.pi}
+
+
+def _sines_tried(a: Around) -> list[Tried]:
+    """Return torques periodic in a position; gravity first, where that may be an angle."""
+    if not a.has_position:
+        return []
+    found = [Tried(gravity(a.force), ("amplitude",))] if a.is_angle else []
+    periods = (0.2 * a.span, 0.35 * a.span, 0.6 * a.span, 2.0 * np.pi)
+    for period, phase in itertools.product(periods, (1e-3, 0.5 * np.pi)):
+        found.append(Tried({"amplitude": a.force, "period": period, "phase": phase}, ("amplitude",)))
+    return found
+
+
 PLANT = (
     EffectKind(
         name="plant.coulomb_friction",
+        words=("dry friction", "dry friction opposes the motion, whatever the speed"),
         equation="force = -level sign(speed), sticking at rest",
         parameters=(
             Quantity(name="level", unit="{f}", role="amplitude"),
@@ -217,10 +280,19 @@ PLANT = (
         nudge=0.06,
         confusable=("plant.stribeck_friction", "actuator.dead_zone", "plant.quadratic_drag"),
         odds={"arm": 0.7, "shaft": 0.7, "carriage": 0.7, "speed": 0.7, "lifted": 0.1, "oscillator": 0.2, "damper": 1.0},
+        in_equations=InEquations(
+            acts="force",
+            text="-level*sign(V)",
+            on=MOVING,
+            trials=lambda a: [Tried({"level": a.force}, ("level",))],
+            usual=True,
+            levels=("level",),
+        ),
         reference=_OLSSON,
     ),
     EffectKind(
         name="plant.stribeck_friction",
+        words=("friction at rest", "friction is larger at rest than in motion"),
         equation="force = -(level + (breakaway - level) exp(-(v/stribeck_speed)^2)) sign(v)",
         parameters=(
             Quantity(name="level", unit="{f}", role="amplitude"),
@@ -236,10 +308,37 @@ PLANT = (
         confusable=("plant.coulomb_friction",),
         includes=("plant.coulomb_friction",),
         odds={"arm": 0.15, "shaft": 0.2, "carriage": 0.2, "speed": 0.2, "lifted": 0.03, "oscillator": 0.05},
+        in_equations=InEquations(
+            acts="force",
+            text="-(level + (breakaway - level)*exp(-(V/stribeck_speed)^2))*sign(V)",
+            on=MOVING,
+            trials=lambda a: [
+                Tried({"level": a.force, "breakaway": 2.0 * a.force, "stribeck_speed": c * a.largest}, _STICKING)
+                for c in (0.03, 0.15)
+            ],
+            levels=_STICKING,
+            plainer=lambda values: ("plant.coulomb_friction", {"level": abs(values["level"])}),
+            is_plainer=lambda values: values["breakaway"] <= values["level"],
+        ),
+        reference=_OLSSON,
+    ),
+    EffectKind(
+        name="plant.viscous_friction",
+        words=("friction", "friction grows with the speed"),
+        equation="force = -coefficient v",
+        parameters=(Quantity(name="coefficient", unit="{f}/({v})", role="amplitude"),),
+        sought="equations",
+        in_equations=InEquations(
+            acts="force",
+            text="-coefficient*V",
+            on=MOVING,
+            trials=lambda a: [Tried({"coefficient": a.force / a.largest}, ("coefficient",))],
+        ),
         reference=_OLSSON,
     ),
     EffectKind(
         name="plant.quadratic_drag",
+        words=("drag", "drag grows with the square of the speed"),
         equation="tau dv/dt = -v - coefficient v |v| + gain w",
         parameters=(Quantity(name="coefficient", unit="1/({v})", role="amplitude"),),
         lines=(Line(stage="force", does=dragged),),
@@ -248,10 +347,17 @@ PLANT = (
         starts=lambda s: [(0.05 / s.v,), (0.5 / s.v,)],
         confusable=("plant.coulomb_friction", "actuator.nonlinear_gain"),
         odds={"arm": 0.15, "shaft": 0.1, "carriage": 0.1, "speed": 0.2, "lifted": 0.1, "oscillator": 0.1},
+        in_equations=InEquations(
+            acts="force",
+            text="-coefficient*V*abs(V)",
+            on=MOVING,
+            trials=lambda a: [Tried({"coefficient": a.force / a.largest**2}, ("coefficient",))],
+        ),
         reference=_KHALIL,
     ),
     EffectKind(
         name="plant.cubic_stiffness",
+        words=("curved spring", "the spring's stiffness changes with the travel"),
         equation="force = -coefficient x^3",
         parameters=(Quantity(name="coefficient", unit="{f}/{y}^3", role="amplitude", sign="real"), *ends("{y}")),
         lines=(Line(stage="force", does=hardened),),
@@ -261,10 +367,17 @@ PLANT = (
         starts=lambda s: [(0.02 * s.f / s.x**3,), (0.3 * s.f / s.x**3,)],
         confusable=("plant.leak", "plant.position_dependent_gain"),
         odds={"arm": 0.1, "oscillator": 0.3, "carriage": 0.02, "shaft": 0.02, "lifted": 0.02},
+        in_equations=InEquations(
+            acts="force",
+            text="-coefficient*X^3",
+            on=MOVING,
+            trials=_cubes_tried,
+        ),
         reference="Wigren and Schoukens, Three free data sets, ECC 2013",
     ),
     EffectKind(
         name="plant.position_dependent_gain",
+        words=("gain over position", "the plant's gain changes along its travel"),
         equation="w -> w (1 + slope x)",
         parameters=(Quantity(name="slope", unit="1/{y}", role="amplitude", sign="real"), *ends("{y}")),
         lines=(Line(stage="force", does=weighed),),
@@ -272,10 +385,12 @@ PLANT = (
         starts=lambda s: [(0.02 / s.x,), (-0.02 / s.x,)],
         confusable=("plant.leak", "actuator.nonlinear_gain", "sensor.nonlinear_gain"),
         odds={"lifted": 0.2, "level": 0.02, "carriage": 0.003, "arm": 0.003, "shaft": 0.003},
+        in_equations=InEquations(acts="input", text="value*(1 + slope*X)"),
         reference=_KHALIL,
     ),
     EffectKind(
         name="plant.hard_stop",
+        words=("a stop", "the travel ends at a stop"),
         equation="the position is held at a stop, impacts are inelastic",
         parameters=(
             Quantity(name="low", unit="{y}", role="limit", sign="real", neutral=-NEVER),
@@ -289,10 +404,24 @@ PLANT = (
         impacts=True,
         confusable=("sensor.saturation",),
         odds={"lifted": 0.01, "carriage": 0.03, "arm": 0.01, "shaft": 0.01},
+        in_equations=InEquations(
+            acts="force",
+            text="if(X > high, -stiffness*(X - high) - damping*max(V, 0), 0)"
+            " + if(X < low, -stiffness*(X - low) - damping*min(V, 0), 0)",
+            on=MOVING,
+            trials=_stops_tried,
+            further=("stiffness",),
+            defaults={"damping": 0.0},
+            spread={"low": lambda s: s.u, "high": lambda s: s.u},
+            # softer than what it turns round moves by itself it would be no stop, its damping a loss of free place
+            least={"stiffness": lambda s: s.size / max(s.span, 1e-300)},
+            stand_in=_gives_way,
+        ),
         reference=_KHALIL,
     ),
     EffectKind(
         name="plant.sqrt_outflow",
+        words=("root outflow", "the outflow grows with the root of the level"),
         equation="outflow 2 X0 (sqrt(1 + x/X0) - 1) in place of x",
         parameters=(
             Quantity(name="operating_level", unit="{y}", role="shape", nonzero=True),
@@ -304,10 +433,18 @@ PLANT = (
         starts=lambda s: [(c * s.x,) * (2 if s.levels == 2 else 1) for c in (1.5, 6.0)],
         confusable=("actuator.nonlinear_gain", "sensor.nonlinear_gain", "plant.radiation_loss"),
         odds={"level": 1.0},
+        in_equations=InEquations(
+            acts="force",
+            text="-coefficient*sqrt(max(X, 0))",
+            on=STORED,
+            trials=_outflows_tried,
+            further=("coefficient",),
+        ),
         reference="Torricelli; Wigren and Schoukens, Three free data sets, ECC 2013",
     ),
     EffectKind(
         name="plant.resonance",
+        words=("resonance", "the plant resonates, which the model does not"),
         equation="times omega^2 / (s^2 + 2 damping omega s + omega^2)",
         parameters=(
             Quantity(name="frequency", unit="Hz", role="time"),
@@ -318,10 +455,21 @@ PLANT = (
         stand_in=_is_two_lags,
         confusable=("sensor.lag", "timing.dead_time"),
         places=("plant", "sensor"),
+        in_equations=InEquations(
+            acts="reading",
+            text="memory",
+            memory=(
+                ("memory", "memory_rate"),
+                ("memory_rate", "(2*pi*frequency)^2*(value - memory) - 2*damping*(2*pi*frequency)*memory_rate"),
+            ),
+            follows=True,
+            defaults={"damping": 0.0},
+        ),
         reference=_KHALIL,
     ),
     EffectKind(
         name="plant.hysteresis",
+        words=("hysteresis", "the force depends on the way that the position came"),
         equation="force = -amplitude z, dz/dt = (dx/dt - |dx/dt| z)/width",
         parameters=(
             Quantity(name="amplitude", unit="{f}", role="amplitude"),
@@ -334,10 +482,25 @@ PLANT = (
         stand_in=_is_friction_or_spring,
         confusable=("plant.coulomb_friction", "actuator.backlash"),
         odds={"valve": 0.05, "carriage": 0.01, "arm": 0.01, "shaft": 0.02, "damper": 0},
+        in_equations=InEquations(
+            acts="force",
+            text="-amplitude*memory",
+            memory=(("memory", "(V - abs(V)*memory)/width"),),
+            on=MOVING,
+            trials=lambda a: [
+                Tried({"amplitude": a.force, "width": c * a.span}, ("amplitude",))
+                for c in (0.05, 0.25)
+                if a.has_position
+            ],
+            either_sign=("amplitude",),
+            least={"width": lambda s: LEAST_WIDTH * s.span},
+            plainer=lambda values: ("plant.coulomb_friction", {"level": abs(values["amplitude"])}),
+        ),
         reference="Dahl, AIAA J. 14, 1976; Bouc and Wen with exponent 1",
     ),
     EffectKind(
         name="plant.radiation_loss",
+        words=("radiation", "heat is lost by radiation, with the fourth power of the temperature"),
         equation="tau dx/dt = -x - coefficient (T^4 - T0^4 - 4 T0^3 x) + gain w, T = T0 + x absolute",
         parameters=(Quantity(name="coefficient", unit="1/K^3", role="amplitude"),),
         lines=(Line(stage="force", does=radiated),),
@@ -346,10 +509,21 @@ PLANT = (
         starts=lambda s: [(c / (s.x_offset + _ICE) ** 3,) for c in (0.02, 0.3)],
         confusable=("plant.sqrt_outflow", "actuator.nonlinear_gain", "sensor.nonlinear_gain"),
         odds={"thermal": 0.05},
+        in_equations=InEquations(
+            acts="force",
+            text="-coefficient*((X + zero)^4 - surroundings^4)",
+            on=HEATED,
+            trials=_radiation_tried,
+            defaults={"zero": 0.0, "surroundings": 293.15},
+            given=("zero",),
+            either_sign=("surroundings",),
+            spread={"surroundings": lambda s: _SURROUNDINGS_SD},
+        ),
         reference="Stefan and Boltzmann",
     ),
     EffectKind(
         name="plant.nonlinear_loss",
+        words=("growing loss", "the loss grows faster than the difference that drives it"),
         equation="tau dx/dt = -x - coefficient x |x| + gain w: a loss that grows faster than its difference",
         parameters=(Quantity(name="coefficient", unit="1/({y})", role="amplitude"),),
         lines=(Line(stage="force", does=rising),),
@@ -358,10 +532,17 @@ PLANT = (
         starts=lambda s: [(0.05 / s.x,), (0.5 / s.x,)],
         confusable=("plant.radiation_loss", "actuator.nonlinear_gain"),
         odds={"thermal": 0.03},
+        in_equations=InEquations(
+            acts="force",
+            text="-coefficient*V*abs(V)",
+            on=(*STORED, *HEATED),
+            trials=lambda a: [Tried({"coefficient": a.force / a.largest**2}, ("coefficient",))],
+        ),
         reference="Incropera and DeWitt, Fundamentals of Heat and Mass Transfer, ch. 9: free convection",
     ),
     EffectKind(
         name="plant.leak",
+        words=("leak", "the plant loses what it has stored"),
         equation="force = -rate x / gain: the plant loses what it has stored",
         parameters=(Quantity(name="rate", unit="{v}/({y})", role="amplitude", sign="real"), *ends("{y}")),
         lines=(Line(stage="force", does=leaked),),
@@ -370,10 +551,17 @@ PLANT = (
         starts=lambda s: [(0.02 * abs(s.f * s.gain) / s.x,)],
         confusable=("plant.position_dependent_gain", "plant.cubic_stiffness"),
         odds={"lifted": 0.3, "carriage": 0.05, "level": 0.3, "process": 0.1},
+        in_equations=InEquations(
+            acts="force",
+            text="-rate*X",
+            on=(*STORED, *HEATED),
+            trials=lambda a: [Tried({"rate": a.force / a.largest}, ("rate",))],
+        ),
         reference=_KHALIL,
     ),
     EffectKind(
         name="plant.sine_torque",
+        words=("periodic force", "a force repeats over the position, as gravity does on an arm"),
         equation="force = -amplitude sin(2 pi x / period + phase); as gravity it carries the stiffness",
         parameters=(
             Quantity(name="amplitude", unit="{f}", role="amplitude", sign="real", held=_is_gravity),
@@ -388,10 +576,22 @@ PLANT = (
         stand_in=_is_slope,
         confusable=("plant.cubic_stiffness",),
         odds={"arm": 1.5, "shaft": 0.03, "carriage": 0.01},
+        in_equations=InEquations(
+            acts="force",
+            text="-amplitude*sin(2*pi*X/period + phase)",
+            on=MOVING,
+            trials=_sines_tried,
+            held=lambda given: () if "phase" in given else ("period",),  # gravity on an angle
+            spread={"phase": lambda s: 1.0},
+            plainer=lambda values: (
+                ("plant.sine_torque", gravity(abs(values["amplitude"]))) if "phase" in values else None
+            ),
+        ),
         reference=_KHALIL,
     ),
     EffectKind(
         name="plant.slow_mode",
+        words=("slow mode", "a second, slow mode follows behind the first"),
         equation="times ((1 - share) time_constant s + 1) / (time_constant s + 1)",
         parameters=(
             Quantity(name="share", unit="", role="amplitude", sign="real"),
@@ -404,6 +604,12 @@ PLANT = (
         confusable=("plant.hysteresis", "environment.step_load", "environment.drifting_load"),
         places=("plant", "sensor"),
         odds={"thermal": 0.01, "level": 0.005, "process": 0.005},
+        in_equations=InEquations(
+            acts="reading",
+            text="(1 - share)*value + share*memory",
+            memory=(("memory", "(value - memory)/time_constant"),),
+            follows=True,
+        ),
         reference="Ljung, System Identification, 2nd ed., sec. 16.4: the order of a linear model",
     ),
 )

@@ -7,6 +7,7 @@ import math
 from autotune.arrays import FloatArray
 from autotune.effects.actuator import limit_starts, rises
 from autotune.effects.base import NEVER, EffectKind, Quantity, ends
+from autotune.effects.in_equations import InEquations, Tried, curves
 from autotune.effects.stages import Blocks, Line, LinearPart, Values
 from autotune.models import Block, TransferFunction
 
@@ -55,6 +56,7 @@ def _last_outputs(u: FloatArray, y: FloatArray, values: Values) -> FloatArray:
 SENSOR = (
     EffectKind(
         name="sensor.lag",
+        words=("a lag", "the reading passes a lag that the model does not have"),
         equation="time_constant dy/dt = z - y",
         parameters=(Quantity(name="time_constant", unit="s", role="amplitude"),),
         linear=LinearPart(blocks=_with_lag, states=1, start=_last_outputs),
@@ -64,10 +66,18 @@ SENSOR = (
         recoordinates=True,
         places=("sensor", "actuator", "plant"),
         odds={"any": 0.2, "damper": 0.05},
+        in_equations=InEquations(
+            acts="reading",
+            text="memory",
+            memory=(("memory", "(value - memory)/time_constant"),),
+            follows=True,
+            trials=lambda a: [Tried({"time_constant": min(c * a.dt_s, a.slow_s)}) for c in (3.0, 15.0)],
+        ),
         reference=_LJUNG,
     ),
     EffectKind(
         name="sensor.nonlinear_gain",
+        words=("curved sensor", "the sensor's gain changes with what it reads"),
         equation="y = y0 + z + second_order z^2 + third_order z^3",
         parameters=(
             Quantity(name="second_order", unit="1/{y}", role="amplitude", sign="real", neutral=0.0),
@@ -80,10 +90,19 @@ SENSOR = (
         confusable=("actuator.nonlinear_gain", "plant.position_dependent_gain"),
         recoordinates=True,
         odds={"any": 0.002, "level": 0.03},
+        in_equations=InEquations(
+            acts="reading",
+            text="value + second_order*(value - origin)^2 + third_order*(value - origin)^3",
+            defaults={"origin": 0.0},
+            either_sign=("origin",),
+            spread={"origin": lambda s: s.y},
+            trials=lambda a: curves(a.y),
+        ),
         reference=_LJUNG,
     ),
     EffectKind(
         name="sensor.drift",
+        words=("drift", "the reading drifts with time"),
         equation="y = z + rate t",
         parameters=(Quantity(name="rate", unit="{y}/s", role="amplitude", sign="real"),),
         lines=(Line(stage="sensor", does=drifted),),
@@ -92,19 +111,27 @@ SENSOR = (
         same=("environment.drifting_load",),
         at_a_time=True,
         odds={"any": 0.02, "damper": 0},
+        in_equations=InEquations(
+            acts="reading",
+            text="value + rate*t",
+            trials=lambda a: [Tried({"rate": a.force / a.duration_s}, ("rate",))],
+        ),
         reference=_LJUNG,
     ),
     EffectKind(
         name="sensor.absolute_value",
+        words=("no sign", "the sensor cannot tell the sign"),
         equation="y = fold + |z - fold|, fold = 0 for a sensor that cannot tell the sign",
         parameters=(Quantity(name="fold", unit="{y}", role="threshold", sign="real"),),
         lines=(Line(stage="reading", does=folded),),
         starts=lambda s: [(s.y_low + c * (s.y_high - s.y_low),) for c in (0.005, 0.03, 0.1)],
         confusable=("sensor.nonlinear_gain",),
+        in_equations=InEquations(acts="reading", text="fold + abs(value - fold)", defaults={"fold": 0.0}),
         reference="a sensor that cannot tell the sign, as an encoder without direction",
     ),
     EffectKind(
         name="sensor.saturation",
+        words=("sensor limits", "the sensor reads no further than its limits"),
         equation="y = min(max(z, low), high)",
         parameters=(
             Quantity(name="low", unit="{y}", role="limit", sign="real", neutral=-NEVER),
@@ -115,10 +142,12 @@ SENSOR = (
         confusable=("plant.hard_stop",),
         flattens=True,
         odds={"any": 0.03, "lifted": 0.01},
+        in_equations=InEquations(acts="reading", text="min(max(value, low), high)"),
         reference=_LJUNG,
     ),
     EffectKind(
         name="sensor.quantisation",
+        words=("steps", "the reading comes in steps"),
         equation="y = step round(z / step)",
         parameters=(Quantity(name="step", unit="{y}", role="threshold", nonzero=True),),
         lines=(Line(stage="reading", does=rounded),),
@@ -126,20 +155,24 @@ SENSOR = (
         steps=True,
         # a reading that was rounded is off by less where it stands still: that is no jitter
         excludes=("timing.jitter",),
+        in_equations=InEquations(acts="converter"),
         reference=_LJUNG,
     ),
     EffectKind(
         name="sensor.dropout",
+        words=("missing samples", "samples are missing and the last reading is repeated"),
         equation="y repeats its last value while a sample is missing",
         parameters=(
             Quantity(name="share", unit="-", role="observed"),
             Quantity(name="rows", unit="-", role="observed"),
         ),
         sought="samples",
+        in_equations=InEquations(acts="nothing"),
         reference=_LJUNG,
     ),
     EffectKind(
         name="sensor.outliers",
+        words=("outliers", "single readings are far off"),
         equation="y = z + spikes of either sign at single rows",
         parameters=(
             Quantity(name="share", unit="-", role="observed"),
@@ -147,6 +180,7 @@ SENSOR = (
         ),
         sought="samples",
         uneven=True,
+        in_equations=InEquations(acts="nothing"),
         reference="Ljung, System Identification, 2nd ed., sec. 15.2",
     ),
 )

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from autotune.effects.base import EffectKind, Quantity
+from autotune.effects.in_equations import InEquations, Tried
 from autotune.effects.stages import Blocks, Line, LinearPart, Values
 from autotune.errors import InputError
 
@@ -27,6 +28,7 @@ def _with_delay(blocks: Blocks, values: Values) -> Blocks:
 TIMING = (
     EffectKind(
         name="timing.dead_time",
+        words=("dead time", "the command acts later than the model says"),
         equation="u(t - delay)",
         parameters=(Quantity(name="delay", unit="s", role="amplitude"),),
         linear=LinearPart(blocks=_with_delay),
@@ -34,10 +36,15 @@ TIMING = (
         confusable=("sensor.lag", "actuator.lag", "actuator.backlash"),
         places=("timing", "actuator", "sensor"),
         odds={"any": 0.2, "damper": 0.05},
+        in_equations=InEquations(
+            acts="delay",
+            trials=lambda a: [Tried({"delay": min(c * a.dt_s, a.slow_s)}) for c in (2.0, 8.0, 30.0)],
+        ),
         reference=_LJUNG,
     ),
     EffectKind(
         name="timing.clock_error",
+        words=("clock error", "the clock of the stamps runs at another rate"),
         equation="the command at stamp t acts at t (1 + error)",
         parameters=(Quantity(name="error", unit="", role="amplitude", sign="real"),),
         lines=(Line(stage="clock", does=stretched),),
@@ -47,11 +54,13 @@ TIMING = (
     ),
     EffectKind(
         name="timing.jitter",
+        words=("jitter", "samples are not taken when their stamps say"),
         equation="y is taken at t + d, d random from row to row",
         parameters=(Quantity(name="sd", unit="s", role="observed"),),
         sought="residual",
         uneven=True,
         late_stamps=True,
+        in_equations=InEquations(acts="nothing"),
         reference=_LJUNG,
     ),
 )

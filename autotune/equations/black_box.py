@@ -13,7 +13,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from autotune.arrays import FloatArray
-from autotune.equations.effects import OUTPUTS, apply
+from autotune.equations.effects import apply, at_reading
 from autotune.equations.expressions import Name
 from autotune.equations.model import EquationModel, Extension, InputColumn, ModelParameter, State
 from autotune.equations.simulate import Drive, compile_model, simulate
@@ -167,4 +167,4 @@ def run_closed(box: BlackBox, recording: Recording) -> FloatArray:
     at_input = [one for one in applied.extensions if one.output is None]
     arriving = driven(box, at_input, applied.delays, applied.before(drive))
     y = box.simulation({p.name: p.value for p in box.parameters}, arriving)
-    return applied.after(read_out(y, drive, [e for e in box.effects if e.name in OUTPUTS]))
+    return applied.after(read_out(y, drive, at_reading(shell, box.effects)))

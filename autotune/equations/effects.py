@@ -1,4 +1,4 @@
-"""Effects of the catalogue in models of equations: each in the model's own language, or on samples, or as dead time.
+"""Effects of the catalogue in models of equations, as their records state them (:mod:`autotune.effects`).
 
 Where it acts is said by the effect itself: ``state`` (added to its derivative, in the derivative's unit), ``port``
 (a force, torque, flow or heat of the port's unit), ``input`` (a column), or nothing for the output and the first
@@ -14,91 +14,23 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from autotune.arrays import FloatArray
+from autotune.effects import KINDS
+from autotune.effects.in_equations import InEquations
 from autotune.equations.expressions import Call, Expression, Name, parse, substituted, to_text
 from autotune.equations.model import EquationModel, Extension, ModelParameter, State
-from autotune.equations.samples import BEFORE, quantised
+from autotune.equations.samples import OPERATIONS, quantised
 from autotune.equations.simulate import Compiled, Drive, Held, compile_model
 from autotune.errors import InputError
 from autotune.models import Effect, Parameter
 
-#: Forces, torques, flows and heats: what is added to a derivative or at a port.
-FORCES: Mapping[str, str] = {
-    "plant.coulomb_friction": "-level*sign(V)",
-    "plant.stribeck_friction": "-(level + (breakaway - level)*exp(-(V/stribeck_speed)^2))*sign(V)",
-    "plant.viscous_friction": "-coefficient*V",
-    "plant.quadratic_drag": "-coefficient*V*abs(V)",
-    "plant.nonlinear_loss": "-coefficient*V*abs(V)",
-    "plant.cubic_stiffness": "-coefficient*X^3",
-    "plant.sine_torque": "-amplitude*sin(2*pi*X/period + phase)",
-    "plant.leak": "-rate*X",
-    "plant.sqrt_outflow": "-coefficient*sqrt(max(X, 0))",
-    "plant.radiation_loss": "-coefficient*((X + zero)^4 - surroundings^4)",
-    "plant.hysteresis": "-amplitude*memory",
-    "plant.hard_stop": "if(X > high, -stiffness*(X - high) - damping*max(V, 0), 0)"
-    " + if(X < low, -stiffness*(X - low) - damping*min(V, 0), 0)",
-    "environment.step_load": "if(t >= time, if(t < end, amplitude, 0), 0)",
-    "environment.periodic_load": "in_phase*sin(2*pi*frequency*t) + quadrature*cos(2*pi*frequency*t)",
-    "environment.drifting_load": "rate*t",
-}
-#: What the equations receive in place of a column, which is ``value``.
-INPUTS: Mapping[str, str] = {
-    "actuator.saturation": "min(max(value, low), high)",
-    "actuator.dead_zone": "value - min(max(value, -half_width), half_width)",
-    "actuator.nonlinear_gain": "value + second_order*(value - origin)^2 + third_order*(value - origin)^3",
-    "actuator.offset": "value + offset",
-    "actuator.gain_drift": "value*(1 + rate*t)",
-    "actuator.lag": "memory",
-    "actuator.asymmetric_lag": "memory",
-    "actuator.rate_limit": "memory",
-    "plant.position_dependent_gain": "value*(1 + slope*X)",
-}
-#: The reading in place of the undisturbed output, which is ``value``.
-OUTPUTS: Mapping[str, str] = {
-    "sensor.saturation": "min(max(value, low), high)",
-    "sensor.nonlinear_gain": "value + second_order*(value - origin)^2 + third_order*(value - origin)^3",
-    "sensor.absolute_value": "fold + abs(value - fold)",
-    "sensor.drift": "value + rate*t",
-    "sensor.lag": "memory",
-    "plant.slow_mode": "(1 - share)*value + share*memory",
-    "plant.resonance": "memory",
-}
-#: What is added wherever it acts: at a state, a port, an input, or to the reading.
-ADDED: Mapping[str, str] = {"environment.measured_input": "gain*(column - reference)"}
-#: The same where a parameter of the effect's memory is given; otherwise it has none.
-DELAYED: Mapping[str, str] = {"environment.measured_input": "gain*memory"}
-#: States that effects bring: name, derivative, and whether it starts at the undisturbed value.
-MEMORIES: Mapping[str, Sequence[tuple[str, str]]] = {
-    "plant.hysteresis": (("memory", "(V - abs(V)*memory)/width"),),
-    "actuator.lag": (("memory", "(value - memory)/time_constant"),),
-    "actuator.asymmetric_lag": (
-        ("memory", "(value - memory)/if(value > memory, time_constant_up, time_constant_down)"),
-    ),
-    "actuator.rate_limit": (("memory", "rate*sign(value - memory)"),),
-    "sensor.lag": (("memory", "(value - memory)/time_constant"),),
-    "environment.measured_input": (("memory", "(column - reference - memory)/time_constant"),),
-    "plant.slow_mode": (("memory", "(value - memory)/time_constant"),),
-    "plant.resonance": (
-        ("memory", "memory_rate"),
-        ("memory_rate", "(2*pi*frequency)^2*(value - memory) - 2*damping*(2*pi*frequency)*memory_rate"),
-    ),
-}
-#: Parameters that may be left out, with the value that they then have.
-DEFAULTS: Mapping[str, float] = {
-    "low": -1e300, "high": 1e300, "second_order": 0.0, "third_order": 0.0, "origin": 0.0, "end": 1e300, "phase": 0.0,
-    "zero": 0.0, "surroundings": 293.15, "damping": 0.0, "fold": 0.0, "reference": 0.0,
-}  # fmt: skip
 #: What a name in the expressions stands for that a model may lack, and how to add it.
 WANTED: Mapping[str, tuple[str, str]] = {
     "V": ("speed", 'say of the states what they are: kind = "position", "speed" with of, "level"'),
     "X": ("position", 'say of the states what they are: kind = "position", "speed" with of, "level"'),
     "column": ("column", 'name a column of the recording that is a further [[input]]: column = "NAME"'),
 }
-#: Effects on the samples of the reading.
-AFTER = ("sensor.quantisation",)
-#: Effects that lie in the recorded samples or the law alone: a simulation stays as it is.
-IDLE = ("sensor.dropout", "sensor.outliers", "timing.jitter", "controller.law")
-#: All that a model of equations can be simulated with.
-KNOWN = frozenset({*FORCES, *INPUTS, *OUTPUTS, *ADDED, *BEFORE, *AFTER, *IDLE, "timing.dead_time"})
+#: A number that nothing reaches, in place of one that expressions cannot hold.
+FARTHEST = 1e300
 
 #: Width of belief about an effect's parameter, on a logarithmic scale: it may well be three times as large or small.
 EFFECT_SPREAD = 1.0
@@ -152,27 +84,25 @@ def apply(model: EquationModel, effects: Sequence[Effect] | None = None) -> Appl
     before: list[tuple[int, Effect]] = []
     steps = []
     for number, effect in enumerate(acting):
-        if effect.name not in KNOWN:
-            raise InputError(
-                f"effect {effect.name!r} cannot be simulated in equations", where=model.name,
-                remedy=f"use one of {', '.join(sorted(KNOWN))}",
-            )  # fmt: skip
-        if effect.name == "timing.dead_time":
-            delays = delays + np.where(_acts_on(model, effect), _value(effect, "delay", model), 0.0)
-        elif effect.name in BEFORE:
-            before.append((int(np.argmax(_acts_on(model, effect))), effect))
-        elif effect.name in AFTER:
-            steps.append(_value(effect, "step", model))
-        elif effect.name not in IDLE:
-            extensions.append(extension_of(model, effect, number))
+        match form_of(effect, model).acts:
+            case "delay":
+                delays = delays + np.where(_acts_on(model, effect), _value(effect, _key(effect), model), 0.0)
+            case "held":
+                before.append((int(np.argmax(_acts_on(model, effect))), effect))
+            case "converter":
+                steps.append(_value(effect, _key(effect), model))
+            case "nothing":
+                pass
+            case _:
+                extensions.append(extension_of(model, effect, number))
     if np.any(delays < 0.0):
-        raise InputError("the dead time is negative", where=f"{model.name}: timing.dead_time")
+        raise InputError("the dead time is negative", where=model.name, remedy="check inputs and effects")
 
     def on_drive(drive: Drive) -> Drive:
         inputs = drive.inputs.copy()
         for column, effect in before:
-            keys, transform = BEFORE[effect.name]
-            inputs[:, column] = transform(drive.t, inputs[:, column], *(_value(effect, key, model) for key in keys))
+            transform = OPERATIONS[form_of(effect, model).samples]
+            inputs[:, column] = transform(drive.t, inputs[:, column], _value(effect, _key(effect), model))
         return replace(drive, inputs=inputs)
 
     def on_reading(y: FloatArray) -> FloatArray:
@@ -207,17 +137,16 @@ def compile_with(model: EquationModel, effects: Sequence[Effect], signals: Seque
     """
     held = []
     for number, effect in enumerate(effects):
-        late = effect.name == "timing.dead_time"
-        if not late and effect.name not in BEFORE:
+        form = form_of(effect, model)
+        if form.acts not in ("held", "delay"):
             continue
-        (key,), transform = (("delay",), None) if late else BEFORE[effect.name]
+        key = _key(effect)
         unit = effect.parameters[key].unit if key in effect.parameters else ""
         parameter = ModelParameter(
-            name=f"{effect.name.split('.')[1]}_{number}_{key}", value=_value(effect, key, model), unit=unit,
-            spread=EFFECT_SPREAD,
-        )  # fmt: skip
+            name=prefix_of(effect, number) + key, value=_value(effect, key, model), unit=unit, spread=EFFECT_SPREAD
+        )
         column = int(np.argmax(_acts_on(model, effect)))
-        held.append(Held(column=column, parameter=parameter, transform=transform))
+        held.append(Held(column=column, parameter=parameter, transform=OPERATIONS.get(form.samples)))
     return compile_model(model, apply(model, effects).extensions, signals, held)
 
 
@@ -229,8 +158,8 @@ def extension_of(model: EquationModel, effect: Effect, number: int = 0) -> Exten
     InputError
         Nowhere to act, or a parameter that is missing.
     """
-    prefix = f"{effect.name.split('.')[1]}_{number}_"
-    text = text_of(effect)
+    form, prefix = form_of(effect, model), prefix_of(effect, number)
+    text = _text_of(form, effect)
     local = _local(model, effect)
     parameters: dict[str, ModelParameter] = {}
 
@@ -257,17 +186,15 @@ def extension_of(model: EquationModel, effect: Effect, number: int = 0) -> Exten
         return substituted(parse(text, effect.name), replaced)
 
     tree = bound(text)
-    states = tuple(
-        State(name=prefix + name, derivative=bound(slope)) for name, slope in MEMORIES.get(effect.name, ())
-        if effect.name not in ADDED or text == DELAYED[effect.name]
-    )  # fmt: skip
+    memory = form.memory if form.remembers(effect.parameters) else ()
+    states = tuple(State(name=prefix + name, derivative=bound(slope)) for name, slope in memory)
     made = Extension(name=effect.name, states=states, parameters=tuple(parameters.values()))
-    if effect.name in ADDED and not (effect.state or effect.port):
+    if form.acts == "anywhere" and not (effect.state or effect.port):
         whole = Call("+", (Name("value"), tree))
         return replace(made, input={effect.input: whole}) if effect.input else replace(made, output=whole)
-    if effect.name in OUTPUTS:
+    if form.acts == "reading":
         return replace(made, output=tree)
-    if effect.name in INPUTS:
+    if form.acts == "input":
         return replace(made, input={effect.input or model.columns[0]: tree})
     if effect.port:
         return replace(made, port={effect.port: tree})
@@ -277,11 +204,47 @@ def extension_of(model: EquationModel, effect: Effect, number: int = 0) -> Exten
     return replace(made, derivative={effect.state: tree})
 
 
-def text_of(effect: Effect) -> str:
-    """Return what an effect does, as text; a lag of what is added is left out where its parameters are."""
-    if effect.name in ADDED:
-        return (DELAYED if "time_constant" in effect.parameters else ADDED)[effect.name]
-    return {**FORCES, **INPUTS, **OUTPUTS}[effect.name]
+def form_of(effect: Effect, model: EquationModel) -> InEquations:
+    """Return how an effect acts in a model of equations.
+
+    Raises
+    ------
+    InputError
+        An effect that does not act there.
+    """
+    form = KINDS[effect.name].in_equations if effect.name in KINDS else None
+    if form is None:
+        there = (name for name, kind in KINDS.items() if kind.in_equations is not None)
+        raise InputError(
+            f"effect {effect.name!r} cannot be simulated in equations", where=model.name,
+            remedy=f"use one of {', '.join(sorted(there))}",
+        )  # fmt: skip
+    return form
+
+
+def at_reading(model: EquationModel, effects: Sequence[Effect]) -> list[Effect]:
+    """Return those of the effects that act on the reading."""
+    acts = ((e, form_of(e, model).acts) for e in effects)
+    return [e for e, how in acts if how == "reading" or (how == "anywhere" and not where_of(e))]
+
+
+def where_of(effect: Effect) -> str:
+    """Return the state, port or input that an effect acts on; nothing for the reading."""
+    return effect.state or effect.port or effect.input
+
+
+def prefix_of(effect: Effect, number: int) -> str:
+    """Return what the names of an effect's parameters and states begin with."""
+    return f"{effect.name.split('.')[1]}_{number}_"
+
+
+def _key(effect: Effect) -> str:
+    """Return the one number of an effect on samples or of a dead time."""
+    return KINDS[effect.name].parameters[0].name
+
+
+def _text_of(form: InEquations, effect: Effect) -> str:
+    return form.text if not form.at_once or form.remembers(effect.parameters) else form.at_once
 
 
 def _local(model: EquationModel, effect: Effect) -> dict[str, Expression | None]:
@@ -335,17 +298,19 @@ def _acts_on(model: EquationModel, effect: Effect) -> np.ndarray[tuple[int], np.
 def _value(effect: Effect, key: str, model: EquationModel) -> float:
     if key in effect.parameters:
         return effect.parameters[key].value
-    if key in DEFAULTS:
-        return DEFAULTS[key]
-    raise InputError(f"{effect.name} lacks {key}", where=model.name, remedy=f"add {key} to its parameters")
+    quantity, neutral = KINDS[effect.name].quantity(key), form_of(effect, model).defaults.get(key)
+    if neutral is None and quantity is not None:
+        neutral = quantity.neutral
+    if neutral is None:
+        raise InputError(f"{effect.name} lacks {key}", where=model.name, remedy=f"add {key} to its parameters")
+    return min(max(neutral, -FARTHEST), FARTHEST)
 
 
 def with_values(effects: Sequence[Effect], values: Mapping[str, tuple[float, float]]) -> tuple[Effect, ...]:
     """Return effects with fitted values: ``values`` maps ``EFFECT_NUMBER_KEY`` to (value, standard deviation)."""
     found = []
     for number, effect in enumerate(effects):
-        prefix = f"{effect.name.split('.')[1]}_{number}_"
-        parameters = {}
+        prefix, parameters = prefix_of(effect, number), {}
         for key, old in effect.parameters.items():
             value, sd = values.get(prefix + key, (old.value, old.sd))
             parameters[key] = Parameter(value=value, unit=old.unit, sd=sd)
@@ -355,23 +320,21 @@ def with_values(effects: Sequence[Effect], values: Mapping[str, tuple[float, flo
 
 def where_told(effect: Effect) -> str:
     """Return where an effect acts, for a reader."""
-    place = effect.state or effect.port or effect.input or "the reading"
+    place = where_of(effect) or "the reading"
     return f"{place} from column {effect.column}" if effect.column else place
 
 
 def equation_of(model: EquationModel, effect: Effect) -> str:
     """Return an effect's equation for a reader, with the names of its states and parameters."""
-    if effect.name == "timing.dead_time":
-        return f"{effect.input or model.columns[0]}(t - delay)"
-    if effect.name not in {*FORCES, *INPUTS, *OUTPUTS, *ADDED}:
+    form, column = form_of(effect, model), effect.input or model.columns[0]
+    if form.acts == "delay":
+        return f"{column}(t - {_key(effect)})"
+    if not form.text:
         return ""
-    tree = substituted(parse(text_of(effect)), _local(model, effect).get)
-    column = effect.input or model.columns[0]
-    if effect.name in ADDED and not (effect.state or effect.port):
+    tree = substituted(parse(_text_of(form, effect)), _local(model, effect).get)
+    if form.acts == "anywhere" and not (effect.state or effect.port):
         return f"{effect.input or 'y'} -> {effect.input or 'y'} + {to_text(tree)}"
-    if effect.name in INPUTS:
-        text = to_text(substituted(tree, lambda name: Name(column) if name == "value" else None))
-        return f"{column} -> {text}"
-    if effect.name in OUTPUTS:
-        return f"y -> {to_text(substituted(tree, lambda name: Name('y') if name == 'value' else None))}"
+    if form.acts in ("input", "reading"):
+        signal = column if form.acts == "input" else "y"
+        return f"{signal} -> {to_text(substituted(tree, lambda name: Name(signal) if name == 'value' else None))}"
     return f"{effect.port} = {to_text(tree)}" if effect.port else f"d {effect.state}/dt: + {to_text(tree)}"

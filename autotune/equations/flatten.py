@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 
-from autotune.equations.effects import AFTER, IDLE, apply
+from autotune.equations.effects import apply, form_of
 from autotune.equations.expressions import Call, Expression, Name, Number, substituted
 from autotune.equations.model import EquationModel
-from autotune.equations.samples import BEFORE
 from autotune.errors import InputError
 
 
@@ -31,12 +30,12 @@ def flattened(model: EquationModel) -> EquationModel:
         An effect on samples (play, a converter's steps), which no differential equation says.
     """
     for effect in model.effects:
-        if effect.name in BEFORE or effect.name in AFTER:
+        if form_of(effect, model).acts in ("held", "converter"):
             raise InputError(
                 f"{effect.name} acts on samples and is no differential equation", where=model.name,
                 remedy="take it out of the file for the export",
             )  # fmt: skip
-    acting = [effect for effect in model.effects if effect.name not in IDLE]
+    acting = [effect for effect in model.effects if form_of(effect, model).acts != "nothing"]
     applied = apply(model, acting)
     now: dict[str, Expression] = {
         one.column: Call("-", (Name(one.column), Number(one.offset))) if one.offset else Name(one.column)

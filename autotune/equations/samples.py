@@ -42,9 +42,9 @@ def _converter(t: FloatArray, u: FloatArray, step: float) -> FloatArray:
     return quantised(u, step)
 
 
-#: Effects on the held samples of an input: their parameters, and what they do.
-BEFORE: Mapping[str, tuple[tuple[str, ...], Callable[..., FloatArray]]] = {
-    "actuator.backlash": (("width",), backlash),
-    "actuator.stiction": (("band",), stiction),
-    "actuator.quantisation": (("step",), _converter),
+#: What may be done to the held samples of an input, by one number.
+OPERATIONS: Mapping[str, Callable[[FloatArray, FloatArray, float], FloatArray]] = {
+    "play": backlash,
+    "stick": stiction,
+    "steps": _converter,
 }

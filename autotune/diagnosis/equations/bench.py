@@ -115,10 +115,6 @@ class Bench(Protocol):
         """Return what the recordings show under a fit."""
         ...
 
-    def periodic(self, outcome: Outcome, signals: Signals) -> list[Trial]:
-        """Return loads at the frequencies that stand out of a residual."""
-        ...
-
     def held_out_error(self, outcome: Outcome, refits: bool) -> float:
         """Return the rms error on the last third of every recording, the numbers fitted to the rest."""
         ...

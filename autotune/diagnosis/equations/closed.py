@@ -13,8 +13,9 @@ from autotune.diagnosis.equations.candidates import Signals, Trial
 from autotune.diagnosis.equations.held_out import HELD_OUT
 from autotune.diagnosis.equations.sought import jumping, sought
 from autotune.diagnosis.evidence.stretches import stretches_in
+from autotune.effects.in_equations import Scales
 from autotune.equations.black_box import BlackBox, driven, read_out
-from autotune.equations.effects import OUTPUTS, apply, compile_with, with_values
+from autotune.equations.effects import apply, at_reading, compile_with, with_values
 from autotune.equations.fit_data import Fitted
 from autotune.equations.model import EquationModel
 from autotune.equations.parameter_scales import slopes_of, values_of
@@ -73,10 +74,9 @@ class ClosedBench:
         y = np.concatenate([r.y for r in self._recordings])
         span = max(float(d.t[-1] - d.t[0]) for d in self._drives)
         size = float(np.std(u))
-        spreads = {"high": size, "low": size, "time": 0.2 * span, "phase": 1.0, "origin of u": size,
-                   "origin of y": float(np.nanstd(y))}  # fmt: skip
+        scales = Scales(u=size, y=float(np.nanstd(y)), duration_s=span, size=size, span=0.0, column=0.0)
         # a step of the finite differences is wide enough for what moves by jumps
-        inside = tuple(p if p in jumping(compiled, effects) else sought(p, effects, spreads)
+        inside = tuple(p if p in jumping(compiled, effects) else sought(p, effects, lambda effect: scales)
                        for p in compiled.parameters)  # fmt: skip
         return replace(compiled, parameters=(*self._box.parameters, *inside))
 
@@ -92,7 +92,7 @@ class ClosedBench:
         for drive in self._drives:
             arriving = driven(self._box, at_input, applied.delays, applied.before(drive))
             y = self._box.simulation(own, arriving)
-            found.append(applied.after(read_out(y, drive, [e for e in now if e.name in OUTPUTS])))
+            found.append(applied.after(read_out(y, drive, at_reading(self._shell, now))))
         return found
 
     def _fit(
@@ -239,12 +239,8 @@ class ClosedBench:
         dt = float(np.median(np.concatenate([np.diff(d.t) for d in self._drives])))
         duration = max(float(d.t[-1] - d.t[0]) for d in self._drives)
         sizes = {one.column: float(np.std(u)) for one in self._box.inputs if one.kind}
-        return Signals(u=u, y=np.concatenate(outcome.fitted.simulated), values={}, sizes=sizes, columns={}, dt_s=dt,
-                       duration_s=duration, slow_s=0.05 * duration)  # fmt: skip
-
-    def periodic(self, outcome: Outcome, signals: Signals) -> list[Trial]:
-        """Return none: a load of free frequency needs a place inside."""
-        return []
+        return Signals(u=u, y=np.concatenate(outcome.fitted.simulated), values={}, sizes=sizes, columns={}, lines=(),
+                       dt_s=dt, duration_s=duration, slow_s=0.05 * duration)  # fmt: skip
 
     def left_out_squares(self, outcome: Outcome) -> FloatArray:
         """Return squared errors on stretches, the numbers fitted to the other ones."""

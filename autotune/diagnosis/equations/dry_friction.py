@@ -13,12 +13,10 @@ from types import MappingProxyType
 import numpy as np
 
 from autotune.diagnosis.equations.bench import Bench, Outcome
+from autotune.diagnosis.equations.candidates import form_of
 from autotune.diagnosis.equations.scores import attempt
 from autotune.models import Effect
 
-#: Numbers that are dry friction's force.
-FORCES = ("level", "breakaway")
-DRY = frozenset({"plant.coulomb_friction", "plant.stribeck_friction"})
 #: From one level to the next, in each direction so many at most, each with so many iterations.
 FACTOR, LEVELS, ITERATIONS = 1.5, 4, 8
 #: Times the least squared error, from which on a direction is left.
@@ -27,9 +25,10 @@ TOO_FAR = 1.2
 
 def with_force(effect: Effect, times: float) -> Effect:
     """Return dry friction with so many times its force, any other effect as it is."""
-    if effect.name not in DRY:
+    levels = form_of(effect).levels
+    if not levels:
         return effect
-    forces = {key: replace(q, value=times * q.value) for key, q in effect.parameters.items() if key in FORCES}
+    forces = {key: replace(q, value=times * q.value) for key, q in effect.parameters.items() if key in levels}
     return replace(effect, parameters=MappingProxyType({**effect.parameters, **forces}))
 
 
@@ -49,7 +48,7 @@ def swept(bench: Bench, one: Outcome) -> list[Outcome]:
         The one given first; what runs away, or leaves far more than the best, ends a direction.
     """
     found = [one]
-    if not any(effect.name in DRY for effect in one.effects):
+    if not any(form_of(effect).levels for effect in one.effects):
         return found
     for factor in (FACTOR, 1.0 / FACTOR):
         at: Outcome | None = min(found, key=lambda other: other.rss)
@@ -88,7 +87,7 @@ def settled_among(bench: Bench, fits: Sequence[Outcome], rows: float, ratio: flo
     effects = []
     for i, effect in enumerate(best.effects):
         parameters = dict(effect.parameters)
-        for key in FORCES if effect.name in DRY else ():
+        for key in form_of(effect).levels:
             if key in parameters:
                 q = parameters[key]
                 far = max(abs(one.effects[i].parameters[key].value - q.value) for one in near)

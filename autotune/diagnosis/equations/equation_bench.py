@@ -4,30 +4,33 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
+from functools import cached_property
 from types import MappingProxyType
 
 import numpy as np
 
 from autotune.arrays import BoolArray, FloatArray
 from autotune.diagnosis.equations.bench import Bench, Outcome
-from autotune.diagnosis.equations.candidates import Signals, Trial, place_of
+from autotune.diagnosis.equations.candidates import Signals, Trial, form_of, values_of
 from autotune.diagnosis.equations.first_order import explained, start_bases, without_starts
 from autotune.diagnosis.equations.followed import followed, positions_of, sizes_of
 from autotune.diagnosis.equations.further import further_columns
 from autotune.diagnosis.equations.held_out import HELD_OUT, forecast_errors, free_run_errors, until
-from autotune.diagnosis.equations.parts import beyond, telling_windows
-from autotune.diagnosis.equations.sought import LEAST_WIDTH, OUTER, changed, sought
+from autotune.diagnosis.equations.parts import standing_out, telling_windows
+from autotune.diagnosis.equations.sought import changed, outer, sought
 from autotune.diagnosis.evidence.stretches import stretches_in
-from autotune.equations.effects import compile_with, with_values
+from autotune.effects import KINDS
+from autotune.effects.in_equations import Scales
+from autotune.equations.effects import compile_with, where_of, with_values
 from autotune.equations.fit import LEAST_ROWS, fit, retune
 from autotune.equations.fit_data import Fitted
 from autotune.equations.left_out import left_out_squares
 from autotune.equations.model import EquationModel, InputColumn
-from autotune.equations.parameter_scales import values_of
+from autotune.equations.parameter_scales import values_of as natural
 from autotune.equations.sensitivity import Windows, side_by_side
 from autotune.equations.simulate import Compiled, drive_of, simulate
 from autotune.errors import InputError
-from autotune.models import Effect, Parameter
+from autotune.models import Effect
 from autotune.recording import Recording
 
 #: Steps between two rows, on average, that a simulation with effects may take, and times those of the model without.
@@ -42,8 +45,6 @@ FAR, NEAR = 2.0, 1.2
 WINDOWS = 3
 #: Rows of such a window at most: in longer ones fits take more steps, and say no more.
 MOST_ROWS = 500
-#: How far a position may go beyond a hard stop, of what it moves through: what gives way by more is no stop.
-BEYOND = 0.15
 #: A search works on a part of the rows where there are this many times as many.
 PARTED = 1.5
 #: Shares of the search's length, where a fit to short windows is carried on to long ones, and iterations on each.
@@ -96,7 +97,7 @@ class EquationBench:
 
     def retuned(self) -> Outcome:
         """Return the model with its own numbers retuned, on windows of the search's length."""
-        compiled = self._compiled(self.model.effects, {})
+        compiled = self._compiled(self.model.effects)
         found = retune(compiled, self.recordings, longest_s=self.length_s)
         self._most_steps = max(STEPS, TIMES_STEPS * self._steps(found))
         return self._outcome(tuple(self.model.effects), found)
@@ -110,7 +111,7 @@ class EquationBench:
 
     def as_it_is(self, retuned: Outcome) -> Outcome:
         """Return the model with its nominal numbers, only start states fitted."""
-        compiled = self._compiled(self.model.effects, {})
+        compiled = self._compiled(self.model.effects)
         none = np.zeros(len(compiled.parameters), dtype=bool)
         try:
             found = fit(compiled, self.recordings, free=none, windows=retuned.fitted.windows, iterations=4)
@@ -120,7 +121,7 @@ class EquationBench:
 
     def held_out_error(self, outcome: Outcome, refits: bool) -> float:
         """Return the rms error on the last third of every recording, the numbers fitted to the rest."""
-        compiled = self._compiled(outcome.effects, self._spreads())
+        compiled = self._compiled(outcome.effects)
         cuts = [int((1.0 - HELD_OUT) * len(r)) for r in self.recordings]
         z = np.zeros(len(compiled.parameters))
         own = len(self.model.parameters)
@@ -133,7 +134,7 @@ class EquationBench:
                 first = [replace(r, y=np.where(np.arange(len(r)) < k, r.y, np.nan)) for r, k, _ in each]
                 found = fit(compiled, first, z=z, windows=windows, iterations=8)
                 z, windows = found.z, list(found.windows)
-            p = values_of(compiled, z)
+            p = natural(compiled, z)
             for (r, k, _), drive, w in zip(each, self._drives, windows, strict=True):
                 if self.model.horizon_s is not None:
                     errors.append(forecast_errors(compiled, p, drive, r.y, k, self.model.horizon_s))
@@ -151,54 +152,33 @@ class EquationBench:
         labels = stretches_in(rows, [w.starts for w in windows], [w.stops for w in windows])
         return left_out_squares(outcome.fitted, self.recordings, labels)
 
-    def periodic(self, outcome: Outcome, signals: Signals) -> list[Trial]:
-        """Return loads at the frequencies that stand out of a residual."""
-        residual = max(outcome.fitted.residuals, key=len)
-        e = np.nan_to_num(residual - np.nanmean(residual)) * np.hanning(residual.size)
-        power = np.abs(np.fft.rfft(e))
-        power[:3] = 0.0
-        found = []
-        for k in np.argsort(-power)[:3]:
-            frequency = float(np.fft.rfftfreq(e.size, signals.dt_s)[k])
-            for name, size in signals.sizes.items():
-                state = next((s for s in self.model.states if s.name == name), None)
-                if (self.model.ports and state) or (state and state.kind not in ("speed", "level", "temperature")):
-                    continue
-                for key in ("in_phase", "quadrature"):
-                    values = {"in_phase": 1e-6 * size, "quadrature": 1e-6 * size, key: 0.05 * size}
-                    parameters = {k: Parameter(value=v) for k, v in (values | {"frequency": frequency}).items()}
-                    where = {"state" if state else "port": name}
-                    effect = Effect(name="environment.periodic_load", parameters=parameters, **where)
-                    found.append(Trial(effect=effect, scaled=(key,)))
-        return found
-
-    def _compiled(self, effects: Sequence[Effect], spreads: Mapping[str, float]) -> Compiled:
+    def _compiled(self, effects: Sequence[Effect]) -> Compiled:
         compiled, own = compile_with(self.model, effects), len(self.model.parameters)
-        scaled_for_search = tuple(sought(p, effects, spreads) for p in compiled.parameters[own:])
+        scaled_for_search = tuple(sought(p, effects, self._scales) for p in compiled.parameters[own:])
         parameters = (*compiled.parameters[:own], *scaled_for_search)
         most, spare = min(self._most_steps, compiled.most_steps), SPARE_ROWS * self._most_steps
         return replace(compiled, parameters=parameters, most_steps=most, spare_steps=min(spare, compiled.spare_steps))
 
-    def _spreads(self) -> dict[str, float]:
-        u = np.concatenate([r[self.model.columns[0]] for r in self.recordings])
-        span = max(float(r.t[-1] - r.t[0]) for r in self.recordings)
-        y = np.concatenate([r.y for r in self.recordings])
-        size = {"high": float(np.std(u)), "low": float(np.std(u)), "time": 0.2 * span, "phase": 1.0,
-                "origin of y": float(np.nanstd(y)), "origin of u": float(np.std(u))}  # fmt: skip
-        for name in self._further:
-            size[f"reference of {name}"] = float(np.sqrt(np.mean([np.mean(r[name] ** 2) for r in self.recordings])))
-        spread = max(float(np.max(s)) for s in self._sizes.values()) if self._sizes else 0.0
-        size |= {f"width at {place}": LEAST_WIDTH * span for place, span in self._spans.items()}
-        size |= {f"stiffness at {place}": self._sizes.get(place, 0.0) / max(span, 1e-300)
-                 for place, span in self._spans.items()}  # fmt: skip
-        return size | ({"in_phase": spread, "quadrature": spread} if spread else {})
+    @cached_property
+    def _columns(self) -> dict[str, FloatArray]:
+        names = ("y", self.model.columns[0], *self._further)
+        return {name: np.concatenate([r[name] for r in self.recordings]) for name in names}
+
+    def _scales(self, effect: Effect) -> Scales:
+        """Return what the numbers of an effect are measured by."""
+        place, column = where_of(effect), self._columns.get(effect.column, np.zeros(1))
+        return Scales(
+            u=float(np.std(self._columns[self.model.columns[0]])), y=float(np.nanstd(self._columns["y"])),
+            duration_s=max(float(r.t[-1] - r.t[0]) for r in self.recordings), size=self._sizes.get(place, 0.0),
+            span=self._spans.get(place, 0.0), column=float(np.sqrt(np.mean(column**2))),
+        )  # fmt: skip
 
     def fitted(self, effects: Sequence[Effect], start: Outcome, iterations: int = 15) -> Outcome:
         """Return the model fitted with effects; what moves by jumps is sought by a direct search around."""
-        outer = [(i, key) for i, e in enumerate(effects) for key in e.parameters if (e.name, key) in OUTER]
-        if not outer or iterations < LEAST_SOUGHT:
+        jumps = outer(effects)
+        if not jumps or iterations < LEAST_SOUGHT:
             return self._inner(effects, start, iterations)
-        i, key = outer[-1]
+        i, key = jumps[-1]
         best, tried = None, float(effects[i].parameters[key].value)
         factor = NEAR if i < len(start.effects) and start.effects[i].name == effects[i].name else FAR
         while factor > 1.03:
@@ -223,7 +203,7 @@ class EquationBench:
         readings = np.concatenate([r.y[ok] for r, ok in zip(self.recordings, self._rows, strict=True)])
         left: list[tuple[float, float]] = []
         for value in (tried / factor, tried, tried * factor):
-            y = self._simulated(self._compiled(changed(best.effects, i, key, value), {}), best)
+            y = self._simulated(self._compiled(changed(best.effects, i, key, value)), best)
             if y is not None:
                 e = self.without_starts(best, readings - y)
                 e = e - basis @ (basis.T @ e)
@@ -231,7 +211,7 @@ class EquationBench:
         return [value for _, value in sorted(left)[:1] if value != tried]
 
     def _inner(self, effects: Sequence[Effect], start: Outcome, iterations: int) -> Outcome:
-        compiled = self._compiled(effects, self._spreads())
+        compiled = self._compiled(effects)
         z = np.zeros(len(compiled.parameters))
         own = len(self.model.parameters)
         z[:own] = start.fitted.z[:own]
@@ -244,7 +224,7 @@ class EquationBench:
 
     def shortened(self, outcome: Outcome) -> Outcome | None:
         """Return the same effects on short windows, from the nominal numbers; nothing where there are none."""
-        compiled = self._compiled(outcome.effects, self._spreads())
+        compiled = self._compiled(outcome.effects)
         length = self.length_s / SHORTER
         dt = max(float(np.median(np.diff(r.t))) for r in self.recordings)
         if length / dt < LEAST_ROWS:
@@ -285,7 +265,7 @@ class EquationBench:
 
     def _on(self, outcome: Outcome, length_s: float, iterations: int) -> Outcome:
         """Return the same effects fitted on windows of a length, from where a fit is, its states taken over."""
-        compiled = self._compiled(outcome.effects, self._spreads())
+        compiled = self._compiled(outcome.effects)
         z = np.zeros(len(compiled.parameters))
         own = len(self.model.parameters)
         z[:own] = outcome.fitted.z[:own]
@@ -295,21 +275,19 @@ class EquationBench:
 
     def is_sought_outside(self, effect: Effect) -> bool:
         """Whether a direct search around the fits seeks one of the effect's numbers."""
-        return any((effect.name, key) in OUTER for key in effect.parameters)
+        return bool(outer([effect]))
 
     def _states(self, compiled: Compiled, start: Outcome, w: Windows, number: int) -> FloatArray:
         """Return start states by name, those of new effects at what they would hold at rest."""
         known = dict(zip(start.fitted.compiled.states, w.states.T, strict=True))
         u = self._drives[number].inputs[np.maximum(w.starts - 1, 0), 0] - self.model.inputs[0].offset
         y = np.nan_to_num(start.fitted.simulated[number][w.starts])
-        columns = []
-        for name in compiled.states:
-            at_command = name.startswith(("lag_", "asymmetric_lag_", "rate_limit_"))
-            at_reading = name.startswith(("slow_mode_", "resonance_")) and name.endswith("memory")
-            fresh = u if at_command else y if at_reading else np.zeros(w.starts.size)
-            if at_command and any(e.name == "sensor.lag" for e in start.effects):
-                fresh = y
-            columns.append(known.get(name, fresh))
+        fresh = {one.name: np.zeros(w.starts.size) for e in compiled.extensions for one in e.states}
+        for extension in compiled.extensions:
+            form = KINDS[extension.name].in_equations
+            if form is not None and form.follows:
+                fresh[extension.states[0].name] = u if form.acts == "input" else y
+        columns = [known[name] if name in known else fresh[name] for name in compiled.states]
         return np.column_stack(columns)
 
     def _outcome(self, effects: tuple[Effect, ...], found: Fitted) -> Outcome:
@@ -318,8 +296,7 @@ class EquationBench:
             for p, v, s in zip(found.compiled.parameters, found.parameters, found.sd, strict=True)
         }
         residual = np.concatenate([r[ok] for r, ok in zip(found.residuals, self._rows, strict=True)])
-        outer = sum((e.name, key) in OUTER for e in effects for key in e.parameters)
-        count = sum(p.spread > 0.0 for p in found.compiled.parameters) + outer
+        count = sum(p.spread > 0.0 for p in found.compiled.parameters) + len(outer(effects))
         return Outcome(effects=with_values(effects, values), fitted=found, count=count, residual=residual)
 
     def _simulated(self, compiled: Compiled, outcome: Outcome) -> FloatArray | None:
@@ -338,9 +315,9 @@ class EquationBench:
     def with_trial(self, outcome: Outcome, effect: Effect) -> FloatArray | None:
         """Return how the readings change with one more effect, everything else as it is."""
         if self._base_of is not outcome:
-            self._base_of, self._base = outcome, self._simulated(self._compiled(outcome.effects, {}), outcome)
+            self._base_of, self._base = outcome, self._simulated(self._compiled(outcome.effects), outcome)
         base = self._base
-        new = self._simulated(self._compiled((*outcome.effects, effect), {}), outcome)
+        new = self._simulated(self._compiled((*outcome.effects, effect)), outcome)
         return None if base is None or new is None else new - base
 
     def each(self, one: Callable[[Trial], FloatArray | None], found: Sequence[Trial]) -> Iterable[FloatArray | None]:
@@ -374,11 +351,12 @@ class EquationBench:
 
     def is_stand_in(self, outcome: Outcome) -> bool:
         """Whether one of the effects is no longer what its name says: a stop that the position goes far beyond."""
-        stops = [e for e in outcome.effects[len(self.model.effects) :] if e.name == "plant.hard_stop"]
-        if not stops:
+        added = outcome.effects[len(self.model.effects) :]
+        seen = [(e, judge) for e in added if (judge := form_of(e).stand_in) is not None]
+        if not seen:
             return False
         values, at = self._followed(outcome)[1], positions_of(self.model)
-        return any(beyond(values[at[place_of(e)]], e) > BEYOND for e in stops if at[place_of(e)] in values)
+        return any(judge(values_of(e), values[at[where_of(e)]]) for e, judge in seen if at[where_of(e)] in values)
 
     def signals(self, outcome: Outcome) -> Signals:
         """Return states, differences across ports, and sizes of derivatives under a fit."""
@@ -391,6 +369,7 @@ class EquationBench:
         }  # fmt: skip
         duration = max(float(r.t[-1] - r.t[0]) for r in self.recordings)
         u = np.concatenate([d.inputs[:, 0] for d in self._drives])
-        columns = {name: np.concatenate([r[name] for r in self.recordings]) for name in self._further}
-        return Signals(u=u, y=y, values=values, sizes=self._sizes, columns=columns, dt_s=dt, duration_s=duration,
-                       slow_s=0.05 * duration)  # fmt: skip
+        columns = {name: self._columns[name] for name in self._further}
+        lines = standing_out(max(outcome.fitted.residuals, key=len), dt)
+        return Signals(u=u, y=y, values=values, sizes=self._sizes, columns=columns, lines=lines, dt_s=dt,
+                       duration_s=duration, slow_s=0.05 * duration)  # fmt: skip

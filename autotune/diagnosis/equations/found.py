@@ -16,7 +16,7 @@ import numpy as np
 from autotune.arrays import BoolArray
 from autotune.controller import Controller
 from autotune.diagnosis.equations.bench import Bench, Outcome
-from autotune.diagnosis.equations.candidates import LOADS
+from autotune.diagnosis.equations.candidates import is_free_load
 from autotune.diagnosis.equations.closed import ClosedBench
 from autotune.diagnosis.equations.equation_bench import EquationBench
 from autotune.diagnosis.equations.probable import candidates_of, probability_of, without_improbable
@@ -28,7 +28,7 @@ from autotune.diagnosis.evidence.samples import SampleEffect, inspect, outliers_
 from autotune.diagnosis.result import NextExperiment
 from autotune.diagnosis.selection.probability import Candidate
 from autotune.diagnosis.thresholds import IN_USE, Thresholds
-from autotune.effects import KINDS, kind_of
+from autotune.effects import kind_of
 from autotune.equations.black_box import BlackBox
 from autotune.equations.effects import equation_of, where_told
 from autotune.equations.identifiability import undetermined
@@ -146,13 +146,13 @@ def _sample_table(s: SampleEffect, whole: list[list[float]]) -> dict[str, Any]:
 
 
 def _places(name: str) -> tuple[str, ...]:
-    return kind_of(name).may_sit if name in KINDS else (name.split(".")[0],)
+    return kind_of(name).may_sit
 
 
 def _sits(effect: Effect, found: Searched) -> tuple[str, ...]:
     """Return where an effect may sit, and where one does that is the same as it on these recordings."""
     places, best = dict.fromkeys(_places(effect.name)), found.score(found.chosen)
-    same = kind_of(effect.name).same if effect.name in KINDS else ()
+    same = kind_of(effect.name).same
     for one in found.tried:
         if one.effects and one.effects[-1].name in same and found.score(one) - best < found.limits.equation_lead:
             places |= dict.fromkeys(_places(one.effects[-1].name))
@@ -232,12 +232,10 @@ def _searched(
         return bench, without_improbable(search(bench, [*without, *(s.name for s in seen)], progress, limits))
 
     bench, found = searched()
-    if "sensor.outliers" in (*without, *(effect.name for effect in model.effects)):
-        return bench, found, seen
     left = found.chosen.fitted.residuals
     known = [ok & np.isfinite(e) for ok, e in zip(good, left, strict=True)]
     outliers = outliers_in(left, recordings, known, limits)
-    if outliers is None:
+    if outliers is None or outliers.name in (*without, *(effect.name for effect in model.effects)):
         return bench, found, seen
     beside = [struck(e, ok, limits.spike) for e, ok in zip(left, known, strict=True)]
     outliers = replace(outliers, rows=tuple(a | b for a, b in zip(outliers.rows, beside, strict=True)))
@@ -257,7 +255,7 @@ def _judged(
     explains = left < limits.equation_explained - 1.0 or left < (1.0 - limits.equation_most) * before
     better = errors[2] < errors[1] or errors[2] < limits.equation_held_out * errors[3]
     # a load of free timing explains a part of everything
-    loads = any(one.name in LOADS for one in added)
+    loads = any(is_free_load(one) for one in added)
     mostly = not explains and not loads and _explains_most(errors, limits)
     verdict: Literal["none", "parameters", "effect", "unexplained"]
     if (added and (explains or mostly) and better) or (seen and left < 1.0):

@@ -1,4 +1,4 @@
-"""Which part of long recordings a search works on, and how far a position goes beyond a stop."""
+"""Which part of long recordings a search works on, and what stands out of a residual."""
 
 from __future__ import annotations
 
@@ -6,7 +6,9 @@ import numpy as np
 
 from autotune.arrays import BoolArray, FloatArray
 from autotune.equations.fit_data import Fitted
-from autotune.models import Effect
+
+#: Lines of a residual at which a periodic load is tried.
+LINES = 3
 
 
 def telling_windows(fitted: Fitted, rows: int) -> list[BoolArray]:
@@ -25,8 +27,9 @@ def telling_windows(fitted: Fitted, rows: int) -> list[BoolArray]:
     return kept
 
 
-def beyond(x: FloatArray, stop: Effect) -> float:
-    """Return how far a position goes beyond a stop, as a share of what it moves through."""
-    high = stop.parameters["high"].value if "high" in stop.parameters else np.inf
-    low = stop.parameters["low"].value if "low" in stop.parameters else -np.inf
-    return float(max(np.max(x) - high, low - np.min(x), 0.0) / max(float(np.ptp(x)), 1e-300))
+def standing_out(residual: FloatArray, dt_s: float) -> tuple[float, ...]:
+    """Return the frequencies at which a residual has most [Hz]."""
+    e = np.nan_to_num(residual - np.nanmean(residual)) * np.hanning(residual.size)
+    power = np.abs(np.fft.rfft(e))
+    power[:3] = 0.0
+    return tuple(float(np.fft.rfftfreq(e.size, dt_s)[k]) for k in np.argsort(-power)[:LINES])

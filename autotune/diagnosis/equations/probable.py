@@ -11,7 +11,7 @@ from autotune.diagnosis.equations.bench import Outcome
 from autotune.diagnosis.equations.candidates import key_of
 from autotune.diagnosis.equations.search import Searched
 from autotune.diagnosis.selection.probability import Candidate, weighed
-from autotune.effects import KINDS, kind_of
+from autotune.effects import kind_of
 from autotune.models import Effect
 
 
@@ -41,7 +41,7 @@ def _charge(one: Outcome, found: Searched) -> float:
 
 def probability_of(effect: Effect, candidates: Sequence[Candidate]) -> float:
     """Return the probability that an effect acts, or one that recordings cannot tell from it."""
-    same = set(kind_of(effect.name).same) if effect.name in KINDS else set()
+    same = set(kind_of(effect.name).same)
     total = sum(c.probability for c in candidates if {effect.name, *same} & set(c.name.split("+")))
     return float(min(max(total, 0.0), 0.99))
 

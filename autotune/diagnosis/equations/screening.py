@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence, Set
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from autotune.arrays import FloatArray
 from autotune.diagnosis.equations.bench import Bench, Outcome
-from autotune.diagnosis.equations.candidates import Trial, key_of, plainer, trials
+from autotune.diagnosis.equations.candidates import Trial, is_signed, key_of, plainer, trials
 from autotune.diagnosis.equations.sought import scaled
 from autotune.diagnosis.thresholds import IN_USE, Thresholds
 from autotune.errors import InputError
@@ -22,7 +22,7 @@ PARALLEL = 1.0 - 1e-6
 
 def screened(
     bench: Bench, base: Outcome, without: Sequence[str], progress: Progress, limits: Thresholds = IN_USE,
-    only: Set[str] = frozenset(),
+    only: Callable[[Effect], bool] = lambda effect: True,
 ) -> list[tuple[float, Effect]]:  # fmt: skip
     """Return for every effect and place the decrease that first order predicts, with the values that bring it.
 
@@ -36,8 +36,8 @@ def screened(
         Told what is being done and the share done.
     limits : Thresholds
         What decides.
-    only : set of str
-        Effects that are tried; all where it is empty.
+    only : callable
+        Whether an effect is tried; by default all are.
 
     Returns
     -------
@@ -47,9 +47,7 @@ def screened(
     signals = bench.signals(base)
     present = {key_of(effect) for effect in base.effects}
     tried = trials(bench.model, signals, without, bench.is_closed)
-    tried += bench.periodic(base, signals) if "environment.periodic_load" not in without else []
-    tried = [one for one in tried if not only or one.effect.name in only]
-    all_trials = [one for one in tried if key_of(one.effect) not in present]
+    all_trials = [one for one in tried if only(one.effect) and key_of(one.effect) not in present]
     basis, e = bench.explained(base), bench.without_starts(base, base.residual)
     e = e - basis @ (basis.T @ e)
     best: dict[tuple[str, str, str, bool], tuple[float, Effect, FloatArray]] = {}
@@ -103,11 +101,7 @@ def predicted(e: FloatArray, d: FloatArray, trial: Trial) -> tuple[float, float]
         return 0.0, 1.0
     factor = float(e @ d) / size
     if trial.scaled:
-        name = trial.effect.name
-        signed = name.startswith(("environment", "actuator", "sensor")) or name in (
-            "plant.sine_torque", "plant.cubic_stiffness", "plant.leak",
-        )  # fmt: skip
-        if factor <= 0.0 and not signed:
+        if factor <= 0.0 and not any(is_signed(trial.effect, key) for key in trial.scaled):
             return 0.0, 1.0
         factor = float(np.clip(factor, -60.0, 60.0))
         return 2.0 * factor * float(e @ d) - factor**2 * size, factor

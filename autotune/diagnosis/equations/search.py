@@ -13,11 +13,9 @@ import numpy as np
 
 from autotune.diagnosis.equations.bench import Bench, Outcome
 from autotune.diagnosis.equations.candidates import (
-    LOADS,
-    USUAL,
-    gravity,
-    is_gravity,
+    is_free_load,
     is_plainer,
+    is_usual,
     key_of,
     plainer,
 )
@@ -144,8 +142,7 @@ def _simplified(
             continue
         effects = [*one.effects[:i], less, *one.effects[i + 1 :]]
         fits = [attempt(bench, effects, one, LAST)]
-        if is_gravity(less):  # a spring that a bent torque has moved away from is far from where gravity leaves it
-            effects[i] = gravity(less, abs(less.parameters["amplitude"].value))
+        if less.name == one.effects[i].name:  # what a bent torque moved away from is far from where gravity leaves it
             fits.append(attempt(bench, effects, retuned, FINAL))
         simple = least(fits)
         if simple is not None:
@@ -177,7 +174,7 @@ def _larger(
     best = best and _plainest(bench, best, tried, rows, limits)
     if best is not None and _is_needed(bench, parent, best, own, rows, limits):
         return best
-    usual = (one for one in new if one.effects[-1].name in USUAL)
+    usual = (one for one in new if is_usual(one.effects[-1]))
     return next((one for one in usual if _is_usual(bench, parent, one, rows, limits)), None)
 
 
@@ -222,7 +219,7 @@ def _leading(
         fits: list[Outcome | None] = []
         with suppress(InputError):
             fits.append(bench.carried(one, LAST if carried else 2 * LAST))
-        if one.effects[-1].name in USUAL:  # with start states that hold without it
+        if is_usual(one.effects[-1]):  # with start states that hold without it
             fits.append(attempt(bench, one.effects, base, LAST))
         best = least(fits)
         carried += [] if best is None else [_elsewhere(bench, best, limits)]
@@ -239,14 +236,14 @@ def _usual_beside(
     if is_noise(bench, min([base, *found], key=lambda one: one.rss), limits.equation_astray, limits):
         return []
     have = {key_of(one.effects[-1]) for one in found}
-    usual = [e for _, e in screened(bench, base, without, quiet, limits, USUAL) if key_of(e) not in have]
+    usual = [e for _, e in screened(bench, base, without, quiet, limits, is_usual) if key_of(e) not in have]
     fits = (attempt(bench, (*base.effects, effect), base, LAST) for effect in usual)
     return [_elsewhere(bench, one, limits) for one in fits if one is not None]
 
 
 def _elsewhere(bench: Bench, one: Outcome, limits: Thresholds) -> Outcome:
     """Return a fit from wherever it ends best, where a usual effect makes many minima and more than noise is left."""
-    if one.effects[-1].name not in USUAL or is_noise(bench, one, limits.equation_astray, limits):
+    if not is_usual(one.effects[-1]) or is_noise(bench, one, limits.equation_astray, limits):
         return one
     return least(swept(bench, one)) or one
 
@@ -288,7 +285,7 @@ def _grown(
     Beside a large effect whose own numbers are not right yet, what these leave looks like more than the next effect.
     """
     ranked = screened(bench, base, without, lambda what, done: told(what, 0.4 * done), limits)
-    tried = [e for k, (_, e) in enumerate(ranked) if k < count or (usual and e.name in USUAL)]
+    tried = [e for k, (_, e) in enumerate(ranked) if k < count or (usual and is_usual(e))]
     return _fitted(bench, base, tried, lambda what: told(what, 0.6), limits)
 
 
@@ -320,7 +317,7 @@ def _pruned(
 def _lacks_usual(smaller: Outcome, larger: Outcome) -> bool:
     """Whether what a hypothesis has beyond another one is a usual effect."""
     have = {key_of(e) for e in smaller.effects}
-    return any(e.name in USUAL and key_of(e) not in have for e in larger.effects)
+    return any(is_usual(e) and key_of(e) not in have for e in larger.effects)
 
 
 def _is_needed(bench: Bench, before: Outcome, after: Outcome, own: int, rows: float, limits: Thresholds) -> bool:
@@ -334,7 +331,7 @@ def _is_needed(bench: Bench, before: Outcome, after: Outcome, own: int, rows: fl
     if len(before.effects) <= own and (worth or is_noise(bench, after, limits.equation_astray, limits)):
         return worth
     had = {key_of(e) for e in before.effects}
-    loads = any(e.name in LOADS and key_of(e) not in had for e in after.effects)
+    loads = any(is_free_load(e) and key_of(e) not in had for e in after.effects)
     if loads and before.effects[own:] and not is_noise(bench, after, limits.equation_noise, limits):
         return False
     if not worth and variance_ratio(after, noise_of(bench, after)) < limits.equation_astray:
@@ -353,7 +350,7 @@ def _predicts(bench: Bench, smaller: Outcome, error: float, limits: Thresholds) 
 
 def _is_partial_load(bench: Bench, one: Outcome, limits: Thresholds) -> bool:
     """Whether the last effect is a load, and more than noise is left beside it."""
-    return one.effects[-1].name in LOADS and not is_noise(bench, one, limits.equation_noise, limits)
+    return is_free_load(one.effects[-1]) and not is_noise(bench, one, limits.equation_noise, limits)
 
 
 def _is_earned(bench: Bench, before: Outcome, after: Outcome, limits: Thresholds) -> bool:
@@ -419,7 +416,7 @@ def _leaves_nothing(bench: Bench, one: Outcome, effect: Effect, limits: Threshol
 
 def _ends_usual(one: Outcome) -> bool:
     """Whether the last effect is a usual one beside others."""
-    return len(one.effects) > 1 and one.effects[-1].name in USUAL
+    return len(one.effects) > 1 and is_usual(one.effects[-1])
 
 
 def _lengthened(bench: Bench, fits: Sequence[Outcome], limits: Thresholds) -> list[Outcome]:

@@ -16,11 +16,11 @@ from autotune.diagnosis.diagnose import diagnose
 from autotune.diagnosis.findings import sentences_of
 from autotune.diagnosis.result import Diagnosis
 from autotune.diagnosis.verdict import Evidence
-from autotune.effects import ALL, CATALOGUE
+from autotune.effects import ALL, CATALOGUE, kind_of
 from autotune.models import Block, Effect, Model, Parameter, Port, TransferFunction
 from autotune.report.chain_diagram import chain_diagram
 from autotune.report.diagnosis_page import write_diagnosis_page
-from autotune.report.effect_words import WORDS, clause, joined, number, of_candidate, with_spread
+from autotune.report.effect_words import clause, joined, number, of_candidate, with_spread
 from autotune.report.law_figures import file_names
 from tests.autotune.diagnosis.servo_rigs import GAIN, servo_model, servo_recording
 
@@ -31,7 +31,7 @@ TEXT = st.text(st.characters(codec="utf-8", exclude_categories=("Cc", "Cs")), ma
 
 @pytest.mark.parametrize("name", [kind.name for kind in ALL])
 def test_every_effect_of_the_catalogue_has_words(name: str) -> None:
-    short, said = WORDS[name]
+    short, said = kind_of(name).words
     assert 0 < len(short) <= 20
     assert said[0].islower()
     assert not said.endswith(".")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from autotune.diagnosis.equations.equation_bench import EquationBench
-from autotune.diagnosis.equations.sought import LEAST_WIDTH
+from autotune.effects.plant import LEAST_WIDTH
 from autotune.equations import Drive, compile_model, simulate
 from autotune.models import Effect, Parameter
 from autotune.recording import Recording
