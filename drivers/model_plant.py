@@ -41,7 +41,13 @@ def model_plant(settings: PlantSettings, path: str, *, u_start: float) -> ModelP
             remedy="name the model without them, or write them as equations",
         )
     equations = from_chain(model) if isinstance(model, Model) else model
-    return ModelPlant(equations, u_start=u_start, noise=settings.noise or 0.0, seed=settings.seed)
+    return ModelPlant(
+        equations,
+        u_start=u_start,
+        noise=settings.noise or 0.0,
+        resolution=settings.resolution or 0.0,
+        seed=settings.seed,
+    )
 
 
 class ModelPlant:
@@ -56,16 +62,20 @@ class ModelPlant:
         the model's own offset of the command, and its states at their starts, 0 where the model says none.
     noise : float
         Half-width of the uniform noise of a measurement [y unit].
+    resolution : float
+        Step of the converter that measures [y unit]; 0 for none.
     seed : int
         Draws the noise.
     """
 
-    def __init__(self, model: EquationModel, *, u_start: float, noise: float = 0.0, seed: int = 0) -> None:
+    def __init__(
+        self, model: EquationModel, *, u_start: float, noise: float = 0.0, resolution: float = 0.0, seed: int = 0
+    ) -> None:
         self._model = model
         self._compiled = compile_model(model)
         self._parameters = self._compiled.parameter_vector
         self._others = [one.offset for one in model.inputs[1:]]
-        self._noise = noise
+        self._noise, self._resolution = noise, resolution
         self._random = np.random.default_rng((seed, 2))
         self._time_s = 0.0
         given = np.array([0.0 if state.start is None else state.start for state in model.states])
@@ -119,7 +129,8 @@ class ModelPlant:
 
     def measure(self) -> float:
         """Return one measurement [y unit]; every call draws new noise."""
-        return self.y_true + self._noise * float(self._random.uniform(-1.0, 1.0))
+        y = self.y_true + self._noise * float(self._random.uniform(-1.0, 1.0))
+        return self._resolution * round(y / self._resolution) if self._resolution else y
 
     def response(self, omega_rad_s: FloatArray) -> ComplexArray:
         """Truth: complex gain at rest under the command, same shape as ``omega_rad_s``; integrating: at the output."""

@@ -25,6 +25,9 @@ Plant = Literal["ball", "servo", "two_tank", "thermal"]
 #: samples of a sweep: some 15 to 40 a period, a few periods for each of five points, and the way there
 SWEEP_SAMPLES = 1e4
 
+#: half-width of the noise of a twin's sensor, over the range of y, and steps of its converter over that range
+NOISE, CONVERTER = 1e-3, 4096
+
 #: what is known of the simulated plants
 PLANTS: Mapping[Plant, Table] = {
     "ball": {
@@ -168,7 +171,7 @@ def init(
             "u": questions.ask("--u", u, "command that holds it there, about", float),
         }
         questions.require()
-        played = _played(twin, config)
+        played = _played(twin, config, answers)
         content = _real(reached | (played if simulated else {"twin": played} if played else {}), answers)
     content = {"name": config.stem, **content}
     set_keys(content, keys or ())
@@ -203,10 +206,15 @@ def _plant_or_model(answer: str) -> str | ModelOfRig:
         ) from None
 
 
-def _played(twin: Plant | ModelOfRig | None, config: Path) -> Table:
-    """Return what a simulated rig, or the twin of a real one, is to play."""
+def _played(twin: Plant | ModelOfRig | None, config: Path, answers: Table) -> Table:
+    """Return what a simulated rig, or the twin of a real one, is to play: of a model with the usual sensor."""
     if isinstance(twin, ModelOfRig):
-        return {"model": twin.path(config)}
+        span = abs(answers["y_range"][1] - answers["y_range"][0])
+        return {
+            "model": twin.path(config),
+            "noise": _rounded(NOISE * span),
+            "resolution": _rounded(span / CONVERTER),
+        }
     return {} if twin is None else {"plant": twin, **PLANTS[twin].get("rig", {})}
 
 

@@ -23,12 +23,17 @@ class PlantSettings(Section):
     ] = None
     seed: Annotated[int, Field(ge=0, description="draws the hover voltage and the noise")] = 0
     noise: Annotated[float | None, Field(ge=0, description="half-width of the uniform noise on y [y unit]")] = None
+    resolution: Annotated[
+        float | None, Field(gt=0, description="step of the converter of y, of a model's plant [y unit]")
+    ] = None
     start: Annotated[str | None, Field(description='where it starts, "floor" or "afloat" for the ball')] = None
 
     @model_validator(mode="after")
     def _one_plant(self) -> PlantSettings:
         if (self.plant is None) == (self.model is None):
             raise ValueError("give plant or model, and not both")
+        if self.plant is not None and self.resolution is not None:
+            raise ValueError("resolution is of a model's plant; the four plants bring their own converters")
         if self.model is not None and self.start is not None:
             raise ValueError("start is of the four plants; a model starts at rest, or where its states say")
         return self

@@ -292,3 +292,28 @@ def test_a_compiler_that_cannot_keep_its_code_is_told(tmp_path: Path, monkeypatc
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "missing"))
     assert "set NUMBA_CACHE_DIR to a folder you may write" in command("doctor")
+
+
+@pytest.mark.parametrize("kind", ["simulated", "serial"])
+def test_a_twin_of_a_transfer_function_has_a_sensor_as_rigs_have(tmp_path: Path, kind: str) -> None:
+    """A noise-free one that rests sent the same reading again and again, which is a stale sensor."""
+    path = tmp_path / "rig.toml"
+    reach = SERIAL if kind == "serial" else []
+    command("init", path, "--kind", kind, *reach, "--model", "2/((s+1)(0.5s+1))", *REAL)
+    rig = load_config(path).rig
+    twin = rig if isinstance(rig, SimulatedRigSettings) else rig.twin
+    assert twin.noise == pytest.approx(0.001 * 80.0)
+    assert twin.resolution == pytest.approx(80.0 / 4096.0, rel=0.05)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1200)
+@pytest.mark.parametrize("written", ["2/((s+1)(0.5s+1))", "2/(s(0.3s+1))"])
+def test_a_plant_as_people_write_it_runs_from_init_to_accepted(tmp_path: Path, written: str) -> None:
+    path = tmp_path / "rig.toml"
+    command(
+        "init", path, "--kind", "simulated", "--model", written, "--sample-time", "0.025", "--u-unit", "V",
+        "--y-unit", "V", "--u-range", "0", "10", "--u-safe", "5" if "/(s(" in written else "4",
+        "--y-range", "-20", "20", "--y", "0", "--u", "5",
+    )  # fmt: skip
+    assert "Accepted" in command("run", path, "--out", tmp_path / "out")

@@ -187,3 +187,16 @@ def test_a_run_is_rehearsed_on_the_rigs_own_kind_and_served_as_it(tmp_path: Path
     device = device_of(load_config(config))
     assert isinstance(device.plant, ModelPlant)
     assert device.output == 10.0
+
+
+def test_a_sensor_has_the_steps_of_its_converter(tmp_path: Path) -> None:
+    (tmp_path / "heater.toml").write_text(HEATER)
+    given = {"kind": "simulated", "model": str(tmp_path / "heater.toml"), "noise": 0.02, "resolution": 0.25}
+    settings = SimulatedRigSettings.model_validate(given)
+    plant = model_plant(settings, str(tmp_path / "heater.toml"), u_start=10.0)
+    for _ in range(20):
+        plant.advance(60.0, 0.1)
+        assert plant.measure() % 0.25 == 0.0
+        assert abs(plant.measure() - plant.y_true) <= 0.125 + 0.02
+    with pytest.raises(ValueError, match="resolution is of a model's plant"):
+        SimulatedRigSettings.model_validate({"kind": "simulated", "plant": "ball", "resolution": 0.1})
