@@ -18,7 +18,7 @@ import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 from autotune.errors import InputError
 from autotune.interrupts import interrupt_deferred
@@ -155,6 +155,34 @@ class Output:
             else:
                 _move(folder / self.path.name, self.path, self._overwrite)
 
+    @contextmanager
+    def growing(self) -> Iterator[TextIO]:
+        """Yield a text that grows while the work goes on; it is moved to its place when the block ends, if not empty.
+
+        Ctrl-C is such an end; what was there before stays where the work failed.
+
+        Raises
+        ------
+        InputError
+            It cannot be written; what was there before still is.
+        """
+        if _is_special(self.path):
+            with _told(self.path), self.path.open("w", encoding="utf-8") as stream:
+                yield stream
+            return
+        with _beside(_folder(self.path.parent)) as folder:
+            part = folder / self.path.name
+            stopped: KeyboardInterrupt | None = None
+            with part.open("x", encoding="utf-8") as stream:
+                try:
+                    yield stream
+                except KeyboardInterrupt as error:
+                    stopped = error
+            if part.stat().st_size:
+                _move(part, self.path, self._overwrite)
+            if stopped is not None:
+                raise stopped
+
     def text(self, content: str) -> None:
         """Write a text."""
         self.by(lambda part: part.write_text(content, encoding="utf-8"))
@@ -200,7 +228,7 @@ class OutputFolder:
                     _move(folder / name, self.path / name, self._overwrite)
 
 
-def claim(out: Path, *, inputs: Sequence[Path | None] = (), overwrite: bool = False) -> None:
+def claim(out: Path, *, inputs: Sequence[Path | None] = ()) -> None:
     """Refuse a place for a file that grows while the work goes on, as :class:`Output` does, before the work.
 
     Raises
@@ -208,12 +236,9 @@ def claim(out: Path, *, inputs: Sequence[Path | None] = (), overwrite: bool = Fa
     InputError
         The place is taken, is an input, or cannot be written.
     """
-    _claim(out, inputs, overwrite)
+    _claim(out, inputs, overwrite=False)
     with _beside(_folder(out.parent)):
         pass
-    if overwrite:
-        with _told(out):
-            out.unlink(missing_ok=True)
 
 
 def _claim(out: Path, inputs: Sequence[Path | None], overwrite: bool) -> None:

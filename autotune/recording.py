@@ -27,6 +27,8 @@ from autotune.text_files import printable, read_toml
 #: Largest size of a value that is computed with: far beyond every unit, far from where squares overflow.
 LARGEST = 1e15
 
+#: An even grid may have so many rows, and ten times those of the recording.
+_MOST_NEW_ROWS = 100_000
 _REQUIRED = ("t", "u", "y")
 
 
@@ -135,6 +137,14 @@ class Recording:
         Interpolation filters the noise of ``y`` and attenuates content near the Nyquist frequency; use the
         recorded stamps wherever a method can.
         """
+        rows = (float(self.t[-1]) - float(self.t[0])) / dt_s + 1.0
+        if rows > _MOST_NEW_ROWS + 10.0 * len(self):
+            longest = float(np.max(np.diff(self.t)))
+            raise InputError(
+                f"an even grid of {dt_s:g} s needs {rows:.3g} rows for {len(self)}: the longest gap has {longest:g} s",
+                where=self.name,
+                remedy="cut the recording at the gap",
+            )
         t = self.t[0] + dt_s * np.arange(int(np.floor((self.t[-1] - self.t[0]) / dt_s + 1e-9)) + 1)
         held = np.clip(np.searchsorted(self.t, t + 1e-9 * dt_s, side="right") - 1, 0, None)
         extra = {
@@ -321,7 +331,19 @@ def read_sidecar(path: Path) -> Mapping[str, Any]:
     sidecar = path.with_suffix(".toml")
     if not sidecar.is_file():
         return MappingProxyType({})
-    return MappingProxyType(read_toml(sidecar))
+    content = read_toml(sidecar)
+    model = next((key for key in ("block", "state", "fmu") if key in content), None)
+    if model is not None:
+        raise InputError(
+            f"is a model ({model}), and no sidecar",
+            where=str(sidecar),
+            remedy="give the model another name than the CSV",
+        )
+    if content.get("hold", "zero") not in ("zero", "linear"):
+        raise InputError(
+            f"hold = {content['hold']!r}", where=str(sidecar), remedy='write hold = "zero" or hold = "linear"'
+        )
+    return MappingProxyType(content)
 
 
 def as_written(value: float) -> float:

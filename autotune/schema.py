@@ -6,6 +6,7 @@ Every file that can reach a rig goes through here: configurations, campaigns, co
 from __future__ import annotations
 
 import difflib
+import json
 from collections.abc import Mapping
 from typing import Annotated, Any, TypeVar
 
@@ -24,7 +25,7 @@ SHORTEST_S, LONGEST_S = 1e-6, 1e9
 
 
 class Section(BaseModel):
-    """A table of settings: frozen, a key it does not know is refused, and so are NaN and infinity."""
+    """A table of settings: frozen; a key it does not know is refused, NaN and infinity, and a value of another type."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
@@ -37,7 +38,7 @@ Time = Annotated[float, Field(ge=SHORTEST_S, le=LONGEST_S)]
 Text = Annotated[str, Field(max_length=200)]
 
 
-def validated(root: type[Root], content: Mapping[str, Any], where: str) -> Root:
+def validated(root: type[Root], content: Mapping[str, Any], where: str, *, texts: bool = False) -> Root:
     """Return the settings that a table of keys holds.
 
     Parameters
@@ -48,6 +49,8 @@ def validated(root: type[Root], content: Mapping[str, Any], where: str) -> Root:
         Keys and values, as TOML gives them.
     where : str
         The file, for messages.
+    texts : bool
+        Whether all values are texts, as the cells of a table are, and numbers are to be read from them.
 
     Raises
     ------
@@ -55,7 +58,10 @@ def validated(root: type[Root], content: Mapping[str, Any], where: str) -> Root:
         The first key that was refused: its path, the allowed range, the nearest known key.
     """
     try:
-        return root.model_validate(content)
+        # strict as of JSON: an array is a tuple, and a whole number is a number; a text or true is none
+        if texts:
+            return root.model_validate(content)
+        return root.model_validate_json(json.dumps(content, default=str), strict=True)
     except ValidationError as error:
         raise _refusal(error, root, where) from None
 

@@ -17,11 +17,12 @@ import pyarrow.parquet
 from autotune.batch.export import to_parquet
 from autotune.batch.loop import Finding, Row, Work
 from autotune.batch.settings import CampaignSettings, LoopSettings, matches
-from autotune.outputs import Output, write_whole
+from autotune.errors import InputError
+from autotune.outputs import Output, unwritable, write_whole
 from autotune.progress import Progress
 from autotune.version import __version__
 
-RESULTS = "results.parquet"
+RESULTS, REPORT = "results.parquet", "report.html"
 
 _ARROW = {"str": pa.string(), "float": pa.float64(), "int": pa.int64(), "bool": pa.bool_(), "Attention": pa.string()}
 
@@ -50,6 +51,25 @@ class Campaign:
         if len(name) > 200:  # a file's name has at most 255 bytes
             name = f"{name[:160]}-{hashlib.sha256(loop.encode()).hexdigest()[:16]}"
         return self.out / "loops" / f"{name}.json"
+
+    def claim(self) -> None:
+        """Make the folder a campaign's, which has ``loops/`` from its first moment on.
+
+        Raises
+        ------
+        InputError
+            It cannot be made, or holds a report or a table that is not a campaign's.
+        """
+        loops = self.out / "loops"
+        foreign = [name for name in (RESULTS, REPORT) if not loops.is_dir() and (self.out / name).exists()]
+        if foreign:
+            raise InputError(
+                f"holds {foreign[0]}, which is not a campaign's", where=str(self.out), remedy="choose another --out"
+            )
+        try:
+            loops.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise unwritable(error, self.out) from None
 
     def done(self) -> dict[str, Row]:
         """Return the rows that lie there and still answer what the campaign asks, by loop."""

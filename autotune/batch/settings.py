@@ -160,7 +160,7 @@ def read_campaign(path: str | os.PathLike[str]) -> tuple[CampaignSettings, tuple
         (where, {key: value for key, value in (file.defaults | row).items() if value != ""})
         for where, row in _rows(file, path)
     ]
-    loops = tuple(validated(LoopSettings, row, where) for where, row in rows)
+    loops = tuple(validated(LoopSettings, row, where, texts=bool(file.loops)) for where, row in rows)
     if not loops:
         raise InputError("no loop", where=str(path), remedy=f"nothing matches {file.folder or file.loops}")
     twice = [name for name, times in Counter(loop.name for loop in loops).items() if times > 1]

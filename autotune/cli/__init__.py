@@ -119,7 +119,8 @@ _arrange()
 
 def _guard() -> None:
     """Let every command end in one place."""
-    for one in (*app.registered_commands, *identify.registered_commands):
+    groups = [group.typer_instance for group in app.registered_groups if group.typer_instance is not None]
+    for one in (*app.registered_commands, *(one for group in groups for one in group.registered_commands)):
         one.cls = GuardedCommand
 
 

@@ -29,7 +29,7 @@ def batch(
     from autotune.errors import InputError, OperatorStop, require_extra
 
     require_extra("batch", "distributed", "pyarrow")
-    from autotune.batch.campaign import RESULTS, Campaign, failed, write_results
+    from autotune.batch.campaign import REPORT, RESULTS, Campaign, failed, write_results
     from autotune.batch.engine import cluster, run_all
     from autotune.batch.loop import ATTENTION, analyse_loop
     from autotune.batch.settings import read_campaign
@@ -37,11 +37,8 @@ def batch(
     from autotune.report.page import write_page
 
     settings, loops = read_campaign(campaign)
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"cannot be made ({error.strerror})", where=str(out), remedy="choose another --out") from None
     work = Campaign(settings=settings, loops=loops, out=out.absolute())
+    work.claim()
     rows = work.done()
     console = Console(highlight=False, soft_wrap=True)
     bars = Console(stderr=True)
@@ -73,14 +70,14 @@ def batch(
                 ) from None
     ordered = write_results(rows.values(), work.out / RESULTS)
     page = campaign_page(settings, ordered)
-    write_page(page, work.out / "report.html")
+    write_page(page, work.out / REPORT)
     counts = Counter(row.attention for row in ordered)
     for row in [row for row in ordered if row.attention != "fine"][:10]:
         console.print(f"{row.attention:7s} {row.loop}: {row.reason}", markup=False)
     if sum(counts[attention] for attention in ATTENTION[:3]) > 10:
         console.print("and more, in the report", markup=False)
     console.print(page.verdict, markup=False)
-    console.print(f"report: {out / 'report.html'}, table: {out / RESULTS}", markup=False)
+    console.print(f"report: {out / REPORT}, table: {out / RESULTS}", markup=False)
     if counts["failed"] == len(ordered):
         raise InputError(
             "no loop could be analysed", where=str(campaign), remedy="the reason of each is above and in the report"

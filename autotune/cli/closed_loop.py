@@ -76,10 +76,12 @@ def closed_loop(
     """Identify the plant from r, u and y recorded while its loop is closed."""
     from autotune.controller import read_controller
     from autotune.identification.closed_loop.identify import identify_closed_loop
+    from autotune.identification.dependence import require_answer
 
     console = Console(stderr=True, highlight=False)
     place = Output(out, inputs=(recording, controller, config), overwrite=overwrite)
     data = read_one(recording, signal_names(t, u, y, r))
+    require_answer([data])
     law = None if controller is None else read_controller(controller)
     if method is not ClosedLoopMethod.prediction_error or more_u or more_y:
         model = _by_method(data, method.value, order, law, (more_u or [], more_y or [], more_r or []))
@@ -234,7 +236,8 @@ def dither(
         float | None, typer.Option(min=1.0, help="time under dither [s]; experiment.budget_s when absent")
     ] = None,
     amplitude: Annotated[
-        float | None, typer.Option(help="half-amplitude of the dither [u unit]; found on the rig when absent")
+        float | None,
+        typer.Option(min=1e-12, help="half-amplitude of the dither [u unit]; found on the rig when absent"),
     ] = None,
     dwell: Annotated[
         tuple[float, float] | None,

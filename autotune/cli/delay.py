@@ -13,7 +13,7 @@ import typer
 from autotune.cli import app, identify
 from autotune.cli.common import OVERWRITE
 from autotune.cli.recordings import R, T, U, Y, read_one, signal_names
-from autotune.outputs import Output, claim
+from autotune.outputs import Output
 
 if TYPE_CHECKING:
     from autotune.config.loader import Config
@@ -53,7 +53,7 @@ def identify_delay_command(
     out: Annotated[Path, typer.Option(help="file to write the model to, delay.json")],
     order: Annotated[int, typer.Option(min=1, max=4, help="order n of the model, 1 to 4")] = 2,
     max_delay: Annotated[
-        float | None, typer.Option(help="largest delay considered [s]; default half the record")
+        float | None, typer.Option(min=0.0, help="largest delay considered [s]; default half the record")
     ] = None,
     hold: Annotated[
         Hold | None, typer.Option(help="u between rows; default the sidecar's hold, else zero (held command)")
@@ -78,13 +78,15 @@ def identify_delay_command(
         int, typer.Option(min=1, max=2, help="2: x'' + a x(t - h1) = b u(t - h2), the output is delayed as well")
     ] = 1,
     interval: Annotated[
-        float | None, typer.Option(help="length of the modulated intervals [s]; default a seventh of the record")
+        float | None,
+        typer.Option(min=1e-6, help="length of the modulated intervals [s]; default a seventh of the record"),
     ] = None,
     forgetting: Annotated[
-        float | None, typer.Option(help="of --method online: rate of the kernels [1/s]; default 100 over the record")
+        float | None,
+        typer.Option(min=1e-9, help="of --method online: rate of the kernels [1/s]; default 100 over the record"),
     ] = None,
     start_delay: Annotated[
-        float | None, typer.Option(help="starting value of the delay [s]; found when absent")
+        float | None, typer.Option(min=0.0, help="starting value of the delay [s]; found when absent")
     ] = None,
     t: T = None,
     u: U = None,
@@ -97,9 +99,11 @@ def identify_delay_command(
 
     from autotune.identification.delay.identify import identify_delay
     from autotune.identification.delay.model import write_delay_model
+    from autotune.identification.dependence import require_answer
 
     place = Output(out, inputs=(recording,), overwrite=overwrite)
     record = read_one(recording, signal_names(t, u, y, r))
+    require_answer([record if hold is None else replace(record, metadata={**record.metadata, "hold": hold.value})])
     if delays == 2:
         place.json(_two_delays(record, interval))
         typer.echo(f"wrote {out}")
@@ -199,17 +203,26 @@ def watch(
         Path | None, typer.Option(help="the deployed controller, TOML; its margins are judged on the tracked model")
     ] = None,
     order: Annotated[int, typer.Option(min=1, max=4, help="order n of the tracked model, 1 to 4")] = 2,
-    window: Annotated[float | None, typer.Option(help="length of y each fit uses [s]; default a fifth of it")] = None,
-    every: Annotated[float | None, typer.Option(help="time between fits [s]; default a quarter of the window")] = None,
-    max_delay: Annotated[float | None, typer.Option(help="largest delay considered [s]; default half a window")] = None,
-    modulus_margin: Annotated[float, typer.Option(help="modulus margin to be kept, 0 to 1")] = 0.5,
-    phase_margin: Annotated[float, typer.Option(help="phase margin to be kept [deg]")] = 45.0,
+    window: Annotated[
+        float | None, typer.Option(min=1e-6, help="length of y each fit uses [s]; default a fifth of it")
+    ] = None,
+    every: Annotated[
+        float | None, typer.Option(min=1e-6, help="time between fits [s]; default a quarter of the window")
+    ] = None,
+    max_delay: Annotated[
+        float | None, typer.Option(min=0.0, help="largest delay considered [s]; default half a window")
+    ] = None,
+    modulus_margin: Annotated[float, typer.Option(min=0.01, max=0.99, help="modulus margin to be kept, 0 to 1")] = 0.5,
+    phase_margin: Annotated[float, typer.Option(min=0.1, max=89.9, help="phase margin to be kept [deg]")] = 45.0,
     hold: Annotated[Hold | None, typer.Option(help="u between rows; default the sidecar's hold, else zero")] = None,
     integrator: Annotated[bool, typer.Option("--integrator", help="the plant integrates: a0 = 0")] = False,
     follow: Annotated[
-        float, typer.Option(help="go on while the recording grows, until it has not for this long [s]; 0: do not wait")
+        float,
+        typer.Option(
+            min=0.0, max=1e6, help="go on while the recording grows, until it has not for this long [s]; 0: do not wait"
+        ),
     ] = 0.0,
-    duration: Annotated[float, typer.Option(help="with CONFIG: time on the rig [s]")] = 300.0,
+    duration: Annotated[float, typer.Option(min=1.0, max=1e7, help="with CONFIG: time on the rig [s]")] = 300.0,
     dither: Annotated[
         float | None, typer.Option(help="with CONFIG: half-amplitude added to the command [u unit]; found when absent")
     ] = None,
@@ -240,8 +253,7 @@ def watch(
         names=signal_names(t, u, y, r),
     )
     if source.suffix.lower() != ".toml":
-        claim(out, inputs=(source, controller), overwrite=overwrite)
-        _follow(source, out, settings, follow)
+        _follow(source, Output(out, inputs=(source, controller), overwrite=overwrite), settings, follow)
         return
     from autotune.config import load_config
 
@@ -266,7 +278,7 @@ def _watch_rig(config: Config, out: Path, settings: _Tracking, duration_s: float
     recording = out / "recording.csv"
     quiet_s = max(5.0, 20.0 * config.signals.sample_time_s)
     fits = multiprocessing.get_context("spawn").Process(
-        target=_follow, args=(recording, out / "watch.csv", settings, quiet_s)
+        target=_follow, args=(recording, Output(out / "watch.csv"), settings, quiet_s)
     )
     with interrupt_held():  # Ctrl-C is for this process, which ends the recording, which ends the fits
         fits.start()
@@ -278,7 +290,7 @@ def _watch_rig(config: Config, out: Path, settings: _Tracking, duration_s: float
         fits.join()
 
 
-def _follow(recording: Path, out: Path, settings: _Tracking, quiet_s: float) -> None:
+def _follow(recording: Path, out: Output, settings: _Tracking, quiet_s: float) -> None:
     """Fit window after window of a recording that may be growing, until it has been quiet for so long [s]."""
     import time
 
@@ -286,9 +298,9 @@ def _follow(recording: Path, out: Path, settings: _Tracking, quiet_s: float) -> 
 
     while quiet_s > 0.0 and not recording.exists():
         time.sleep(0.1)
-    done, retune_at, rows, size = -math.inf, None, -1, -1
+    after, done, retune_at, rows, size = -math.inf, -math.inf, None, -1, -1
     quiet_since = time.monotonic()
-    with out.open("x", encoding="utf-8") as table:
+    with out.growing() as table:
         while True:
             if recording.stat().st_size > size:  # it may grow for long before the loop is in operation
                 size, quiet_since = recording.stat().st_size, time.monotonic()
@@ -305,10 +317,10 @@ def _follow(recording: Path, out: Path, settings: _Tracking, quiet_s: float) -> 
                         max_delay_s=settings.max_delay_s,
                         hold=settings.hold,
                         integrator=settings.integrator,
-                        after_s=done,
+                        after_s=after,
                     ):
                         verdict = _report(fitted, settings, table)
-                        done = fitted.end_s
+                        after, done = fitted.end_s, max(done, fitted.end_s if fitted.model else done)
                         if verdict == "retune" and retune_at is None:
                             retune_at = fitted.end_s
             if time.monotonic() - quiet_since >= quiet_s:
@@ -316,7 +328,8 @@ def _follow(recording: Path, out: Path, settings: _Tracking, quiet_s: float) -> 
             time.sleep(0.2)
     if retune_at is not None:
         typer.echo(f"retune: the controller misses its margins on the tracked model since t = {retune_at:.4g} s")
-    typer.echo(f"wrote {out}")
+    nothing = f"no window determined the model; {out.path} was not written"
+    typer.echo(f"wrote {out.path}" if done > -math.inf else nothing)
 
 
 def _in_operation(record: Recording) -> Recording | None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import math
 import os
 import sys
 import tempfile
@@ -41,6 +42,7 @@ class GuardedCommand(TyperCommand):
         """Run the command."""
         began_s, before = time.time(), _RIG_IN_COMMAND.set(False)
         try:
+            _require_finite(ctx)
             return super().invoke(ctx)
         except (AutotuneError, _CLICK_EXCEPTION, typer.Exit):
             raise
@@ -61,6 +63,18 @@ class GuardedCommand(TyperCommand):
             raise _unforeseen(error, ctx) from error
         finally:
             _RIG_IN_COMMAND.reset(before)
+
+
+def _require_finite(ctx: Any) -> None:
+    """Refuse options that are no numbers: a comparison with NaN is always false, and no range would catch it."""
+    for name, value in ctx.params.items():
+        given = ctx.get_parameter_source(name)
+        values = value if isinstance(value, list | tuple) else (value,)
+        wrong = next((one for one in values if isinstance(one, float) and not math.isfinite(one)), None)
+        if wrong is not None and given is not None and given.name == "COMMANDLINE":
+            raise InputError(
+                f"{wrong} is no finite number", where=f"--{name.replace('_', '-')}", remedy="give a number"
+            )
 
 
 def mark_rig_in_command() -> None:

@@ -22,16 +22,15 @@ Form = Literal["toml", "text", "latex", "modelica", "python"]
 OUT = Annotated[Path, typer.Option(help="model file to write", metavar="M.toml")]
 
 
-def _write(model: Model | EquationModel, out: Path, overwrite: bool) -> None:
+def _write(model: Model | EquationModel, place: Output) -> None:
     from autotune.equations import write_equations
     from autotune.models import Model, write_model
 
-    place = Output(out, overwrite=overwrite)
     if isinstance(model, Model):
         place.by(lambda part: write_model(model, part))
     else:
         place.by(lambda part: write_equations(model, part))
-    typer.echo(f"wrote {out}")
+    typer.echo(f"wrote {place.path}")
 
 
 @model_app.command("from-control")
@@ -43,7 +42,8 @@ def from_control(
     """Write the model file of a python-control system."""
     from autotune.equations.imports import from_python_file
 
-    _write(from_python_file(system), out, overwrite)
+    place = Output(out, inputs=(Path(system.rpartition(":")[0] or system),), overwrite=overwrite)
+    _write(from_python_file(system), place)
 
 
 @model_app.command("from-matlab", context_settings={"ignore_unknown_options": True})
@@ -57,7 +57,7 @@ def from_matlab(
     """Write the model file of a transfer function as MATLAB prints it."""
     from autotune.equations.imports import from_matlab as made
 
-    _write(made(num, den, delay, name=out.stem), out, overwrite)
+    _write(made(num, den, delay, name=out.stem), Output(out, overwrite=overwrite))
 
 
 @model_app.command("from-text", context_settings={"ignore_unknown_options": True})
@@ -71,7 +71,7 @@ def from_text(
     from autotune.equations.transfer_text import parse_transfer_function
 
     tf = parse_transfer_function(text)
-    _write(from_coefficients(tf.num, tf.den, tf.delay_s, name=out.stem), out, overwrite)
+    _write(from_coefficients(tf.num, tf.den, tf.delay_s, name=out.stem), Output(out, overwrite=overwrite))
 
 
 @model_app.command("from-fmu")
@@ -87,9 +87,10 @@ def from_fmu(
 
     from autotune.equations.fmu import template
 
+    place = Output(out, inputs=(fmu,), overwrite=overwrite)
     content = template(fmu)
     content["fmu"] = os.path.relpath(fmu.resolve(), out.resolve().parent)
-    Output(out, overwrite=overwrite).by(lambda part: Path(part).write_bytes(tomli_w.dumps(content).encode()))
+    place.by(lambda part: Path(part).write_bytes(tomli_w.dumps(content).encode()))
     typer.echo(f"wrote {out}")
 
 
@@ -128,12 +129,13 @@ def export(
     from autotune.equations.exports import as_latex, as_modelica, as_python, as_text
     from autotune.equations.flatten import flattened
 
+    place = Output(out, inputs=(model,), overwrite=overwrite)
     equations = _equations(model)
     if form == "toml":
-        _write(flattened(equations), out, overwrite)
+        _write(flattened(equations), place)
         return
     text = {"text": as_text, "latex": as_latex, "modelica": as_modelica, "python": as_python}[form](equations)
-    Output(out, overwrite=overwrite).by(lambda part: Path(part).write_text(text, encoding="utf-8"))
+    place.text(text)
     typer.echo(f"wrote {out}")
 
 
@@ -152,6 +154,7 @@ def linearise(
     from autotune.equations.linearise import linearise as linear
     from autotune.errors import InputError
 
+    place = Output(out, inputs=(model,), overwrite=overwrite)
     equations = _equations(model)
     try:
         given = {k: float(v) for k, v in (part.split("=") for part in at.replace(",", " ").split())}
@@ -161,7 +164,7 @@ def linearise(
     if unknown:
         raise InputError(f"no input {unknown[0]!r}", where="--at", remedy=f"it has {', '.join(equations.columns)}")
     point = np.array([given.get(column, 0.0) for column in equations.columns])
-    _write(as_chain(equations, linear(equations, point, y)), out, overwrite)
+    _write(as_chain(equations, linear(equations, point, y)), place)
 
 
 def _equations(path: Path) -> EquationModel:

@@ -41,7 +41,7 @@ def relay(
         Path | None, typer.Option(help="controller file (TOML); the PI designed on the reduced model when absent")
     ] = None,
     beside: Annotated[list[Path] | None, typer.Option(help="a further controller file; may be repeated")] = None,
-    noise_gain: Annotated[float, typer.Option(help="N_max of the design and of (26) [u/y unit]")] = 0.1,
+    noise_gain: Annotated[float, typer.Option(min=1e-9, help="N_max of the design and of (26) [u/y unit]")] = 0.1,
     overwrite: OVERWRITE = False,
 ) -> None:
     """Tables I and II and figures 6 to 9 of Le & Mendes, for a run's points, a known plant, or the paper's ball."""
@@ -55,7 +55,7 @@ def relay(
     from autotune.report.page import write_page
     from autotune.report.relay_figures import relay_page
 
-    place = Output(out, inputs=(points, plant, controller), overwrite=overwrite)
+    place = Output(out, inputs=(points, plant, controller, *(beside or [])), overwrite=overwrite)
     measured = Points([] if points is None else read_points(points))
     known = as_plant(plant) if plant is not None else fit_plant(measured).plant if measured else BALL
     reduced = reduce(measured if measured else known)
@@ -78,7 +78,7 @@ def relay(
 @paper.command("delay")
 def delay(
     out: Annotated[Path, typer.Option(help="page to write (HTML)")],
-    sets: Annotated[int, typer.Option(min=2, help="noisy recordings of each of the paper's examples")] = 40,
+    sets: Annotated[int, typer.Option(min=2, max=10_000, help="noisy recordings of each of the paper's examples")] = 40,
     overwrite: OVERWRITE = False,
 ) -> None:
     """Tables 1 and 2 of Ollivier et al.: one delay and two by modulating functions, on the paper's examples."""
@@ -113,7 +113,9 @@ def delay(
 @paper.command("closed-loop")
 def closed_loop(
     out: Annotated[Path, typer.Option(help="page to write (HTML)")],
-    sets: Annotated[int, typer.Option(min=1, help="data sets of 1229 samples of the paper's example")] = 100,
+    sets: Annotated[
+        int, typer.Option(min=1, max=10_000, help="data sets of 1229 samples of the paper's example")
+    ] = 100,
     overwrite: OVERWRITE = False,
 ) -> None:
     """Figures 2 to 5 of Pouliquen et al.: poles by each method and the noise models, on the paper's example."""

@@ -212,24 +212,30 @@ def tune(
     from autotune.points import read_points
     from autotune.report.page import write_page
     from autotune.report.run_page import analysis_page
+    from autotune.schema import validated
 
     recordings, files = recordings or [], points or []
     if not recordings and not files:
         raise InputError("give recordings or --points", where="autotune tune")
     place = OutputFolder(out, (RESULT, "report.html"), inputs=(*recordings, *files), overwrite=overwrite)
+    options = {
+        "modulus_margin": modulus_margin,
+        "phase_margin_deg": phase_margin,
+        "noise_gain": noise_gain,
+        "noise_frequency_rad_s": noise_frequency,
+    }
+    given_options = {name: value for name, value in options.items() if value is not None}
+    asked = validated(
+        DesignSettings,
+        {"kind": kind, "specification": specification, "source": source, **given_options},
+        "autotune tune",
+    )
     read = read_all(recordings, signal_names(t, u, y, r))
     given = [point for path in files for point in read_points(path)]
     found = measured_of(read, given)
     notes = found.notes
-    settings = DesignSettings(
-        kind=kind,
-        specification=specification,
-        modulus_margin=modulus_margin,
-        phase_margin_deg=phase_margin,
-        noise_gain=noise_gain,
-        noise_frequency_rad_s=noise_frequency,
-        criterion=criterion if criterion != "auto" else "h2" if found.fit is None else "iae",
-        source=source,
+    settings = asked.model_copy(
+        update={"criterion": criterion if criterion != "auto" else "h2" if found.fit is None else "iae"}
     )
     analysis = analyse(found.points, settings, fit=found.fit, facts=found.facts)
     units = read[0].metadata.get("units", {}) if read else {}

@@ -119,7 +119,16 @@ def split(lines: Iterable[str], delimiter: str) -> Iterator[list[str]]:
     """Yield the cells of each line."""
     if delimiter == " ":
         return (line.split() for line in lines)
-    return csv.reader(lines, delimiter=delimiter, skipinitialspace=True)
+    return _cells_of(lines, delimiter)
+
+
+def _cells_of(lines: Iterable[str], delimiter: str) -> Iterator[list[str]]:
+    try:
+        yield from csv.reader(lines, delimiter=delimiter, skipinitialspace=True)
+    except csv.Error as error:
+        raise InputError(
+            f"a row cannot be parted ({error})", where="text file", remedy="close its quotation marks"
+        ) from None
 
 
 def _stripped(row: Sequence[str]) -> list[str]:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import datetime
+import re
+import zipfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -19,6 +21,9 @@ from autotune.files.text_file import text_table
 PARQUET = (".parquet", ".pq")
 WORKBOOKS = (".xlsx", ".xlsm", ".xlsb", ".xls", ".ods")
 _LOOKED_AT = 300
+#: Of a workbook: cells of a sheet from its first to its farthest, bytes unpacked.
+_MOST_CELLS, _MOST_BYTES = 20_000_000, 1_000_000_000
+_REFERENCE = re.compile(rb'<c [^>]{0,80}?r="([A-Z]+)(\d+)"')
 
 
 def open_table(path: Path, form: FileForm | None = None) -> Table:
@@ -41,14 +46,22 @@ def open_table(path: Path, form: FileForm | None = None) -> Table:
 def _of_workbook(path: Path, form: FileForm) -> Table:
     import python_calamine
 
+    _require_bounded(path)
     try:
         book = python_calamine.CalamineWorkbook.from_path(path)
         names = book.sheet_names if form.sheet is None else [form.sheet]
         if form.sheet is not None and form.sheet not in book.sheet_names:
             raise InputError(f"no sheet {form.sheet!r}", where=str(path), remedy=f"it has {listed(book.sheet_names)}")
         sheets = {name: book.get_sheet_by_name(name).to_python() for name in names}
-    except (python_calamine.CalamineError, OSError) as error:
-        raise InputError(f"cannot be read as a workbook ({error})", where=str(path), remedy="save it as CSV") from None
+    except InputError:
+        raise
+    except BaseException as error:  # what is written in Rust panics outside of Exception
+        if isinstance(error, KeyboardInterrupt | SystemExit | MemoryError):
+            raise
+        said = str(error).strip().splitlines()[:1] or [type(error).__name__]
+        raise InputError(
+            f"cannot be read as a workbook ({said[0]})", where=str(path), remedy="save it as CSV"
+        ) from None
     found: dict[str, tuple[Header, list[list[str]]]] = {}
     for name, content in sheets.items():
         rows = [[_as_text(cell) for cell in row] for row in content]
@@ -60,6 +73,40 @@ def _of_workbook(path: Path, form: FileForm) -> Table:
         raise InputError("no sheet holds rows of numbers", where=str(path), remedy="give a sheet with a row of names")
     name = max(found, key=lambda one: len(found[one][1]))
     return _sheet(path, name, *found[name])
+
+
+def _require_bounded(path: Path) -> None:
+    """Refuse a workbook whose sheets would take more memory than a table has: a stray cell far out, a bomb.
+
+    A sheet is held whole, from its first cell to the row and the column of its farthest.
+    """
+    if not zipfile.is_zipfile(path):
+        return
+    with zipfile.ZipFile(path) as archive:
+        if sum(part.file_size for part in archive.infolist()) > _MOST_BYTES:
+            raise InputError("is larger than 1 GB unpacked", where=str(path), remedy="save the sheet as CSV")
+        for part in archive.namelist():
+            if part.startswith("xl/worksheets/") and part.endswith(".xml"):
+                rows, columns = _extent(archive, part)
+                if rows * columns > _MOST_CELLS:
+                    raise InputError(
+                        f"{part.rpartition('/')[2]} reaches to row {rows} and column {columns}", where=str(path),
+                        remedy="delete the stray cell far from the table, or save the table as CSV",
+                    )  # fmt: skip
+
+
+def _extent(archive: zipfile.ZipFile, part: str) -> tuple[int, int]:
+    """Return the farthest row and column of a sheet of an Excel workbook."""
+    row = column = 0
+    kept = b""
+    with archive.open(part) as file:
+        while block := file.read(1 << 20):
+            text = kept + block
+            for letters, digits in _REFERENCE.findall(text):
+                row = max(row, int(digits[:9]))
+                column = max(column, sum(26**i * (code - 64) for i, code in enumerate(reversed(letters[:4]))))
+            kept = text[-40:]
+    return row, column
 
 
 def _as_text(cell: Any) -> str:
@@ -114,19 +161,28 @@ def parquet_table(paths: Sequence[Path]) -> Table:
     schema = data.schema
     stamped = {field.name for field in schema if pa.types.is_timestamp(field.type) or pa.types.is_date(field.type)}
 
-    def load(wanted: Sequence[str]) -> dict[str, Cells]:
-        table = data.to_table(columns=list(wanted))
-        return {name: _cells(table[name]) for name in wanted}
+    plain = [field.name for field in schema if not pa.types.is_nested(field.type)]
 
-    sample = {
-        name: _cells(column) for name, column in zip(schema.names, data.head(2 * _LOOKED_AT).columns, strict=True)
-    }
-    units = {name: unit for name in schema.names if (unit := bare_and_unit(name)[1])}
+    def load(wanted: Sequence[str]) -> dict[str, Cells]:
+        try:
+            table = data.to_table(columns=list(wanted))
+            return {name: _cells(table[name]) for name in wanted}
+        except (pa.ArrowException, UnicodeDecodeError, OSError) as error:
+            said = str(error).strip().splitlines()[0]
+            raise InputError(f"cannot be read ({said})", where=str(paths[0]), remedy="write the file anew") from None
+
+    try:
+        head = data.head(2 * _LOOKED_AT, columns=plain)
+        sample = {name: _cells(column) for name, column in zip(plain, head.columns, strict=True)}
+    except (pa.ArrowException, UnicodeDecodeError, OSError) as error:
+        said = str(error).strip().splitlines()[0]
+        raise InputError(f"cannot be read ({said})", where=str(paths[0]), remedy="write the file anew") from None
+    units = {name: unit for name in plain if (unit := bare_and_unit(name)[1])}
     for field in schema:
         if field.metadata and b"unit" in field.metadata:
-            units[field.name] = field.metadata[b"unit"].decode()
+            units[field.name] = field.metadata[b"unit"].decode(errors="replace")
     return Table(
-        path=str(paths[0]), names=tuple(schema.names), units=units, labels={}, form="Parquet", decimal=".",
+        path=str(paths[0]), names=tuple(plain), units=units, labels={}, form="Parquet", decimal=".",
         in_seconds=frozenset(stamped), sample=sample, load=load,
     )  # fmt: skip
 

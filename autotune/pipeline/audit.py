@@ -13,9 +13,12 @@ from pathlib import Path
 
 from autotune.config import Config
 from autotune.controller import PIDController
+from autotune.errors import InputError
 from autotune.run_log import jsonable
 
 AUDIT = "audit.jsonl"
+#: Of every line.
+_BEGINNING = b'{"at": "'
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,14 +87,34 @@ class AuditLog:
 
 
 def audit_log(config: Config, folder: Path, command: str) -> AuditLog:
-    """Return the log that the configuration names; by default ``audit.jsonl`` in the folder of the journal."""
+    """Return the log that the configuration names; by default ``audit.jsonl`` in the folder of the journal.
+
+    Raises
+    ------
+    InputError
+        What is there is not a file of such lines: nothing is appended to somebody else's.
+    """
+    path = Path(config.audit_log) if config.audit_log else folder / AUDIT
+    if not _is_own(path):
+        raise InputError("is not an audit log", where=str(path), remedy="give audit_log another name")
     canonical = json.dumps(config.model_dump(mode="json"), sort_keys=True, ensure_ascii=False)
     return AuditLog(
-        path=Path(config.audit_log) if config.audit_log else folder / AUDIT,
+        path=path,
         rig=config.name,
         configuration=hashlib.sha256(canonical.encode()).hexdigest(),
         command=command,
     )
+
+
+def _is_own(path: Path) -> bool:
+    """Return whether nothing is there, or a file whose first line is one of such a log."""
+    if not path.exists():
+        return True
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        line = file.read(len(_BEGINNING))  # shorter where a full disk cut it off
+    return _BEGINNING.startswith(line)
 
 
 def user() -> str:

@@ -9,6 +9,7 @@ import numpy as np
 
 from autotune.design.noise import LoopFacts, noise_of
 from autotune.errors import AutotuneError
+from autotune.identification.dependence import require_answer
 from autotune.identification.frequency.recorded import FrequencyEstimate, combine, session_points, sessions
 from autotune.identification.parametric import PlantFit
 from autotune.identification.recorded_plant import fit_recordings
@@ -54,8 +55,10 @@ def measured_of(recordings: Sequence[Recording], given: Sequence[FrequencyPoint]
     Raises
     ------
     AutotuneError
-        Neither points nor a fit can be had of them.
+        y does not answer u beyond chance, or neither points nor a fit can be had of them.
     """
+    if recordings:
+        require_answer(recordings)
     estimates: list[FrequencyEstimate] = []
     notes: list[str] = []
     reason: AutotuneError | None = None

@@ -14,6 +14,7 @@ from autotune.identification.delay.drift import mean_over_window
 from autotune.identification.delay.identify import identify_delay
 from autotune.identification.delay.model import DelayModel
 from autotune.identification.delay.output_error import Structure
+from autotune.identification.dependence import require_answer
 from autotune.models import Hold
 from autotune.recording import Recording
 
@@ -121,6 +122,7 @@ def track(
             )
 
         try:
+            require_answer([part])
             last = _fit_window(fit, last)
             data = prepare(part, hold=hold, start_s=at - window_s, skip_missing=True)
             structure = Structure(order=order, integrator=integrator)

@@ -1,0 +1,269 @@
+"""Whether y has anything to do with u: the question before every fit, since a fit always finds something.
+
+Where y ran on by itself, what its own past does not foretell of it is white, and no past command can foretell it
+either. So y and u are each whitened by their own past, and the innovations of y are compared with those of u, alone and
+summed over 2, 4, ..., 256 rows, at all lags up to a quarter of the record. Only lags at which u came first count: what
+a controller makes of y follows y, and a loop that its own noise alone drives says nothing of the plant.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from autotune.arrays import FloatArray
+from autotune.errors import IdentificationError
+from autotune.recording import Recording
+
+#: A probability below this is no chance.
+CHANCE = 1e-3
+#: More rows are averaged; a smooth input, held linearly, needs fewer.
+_MOST_ROWS, _MOST_SMOOTH_ROWS = 16384, 4096
+_ORDERS = (1, 2, 4, 8, 16, 32)
+_LEAST_ROWS = 20
+#: Beyond so many standard deviations the innovations of one row belong together.
+_SAME_ROW = 4.0
+#: The spread of what whitening cannot take out, over the signal's own: noise of rounding, and of commands without any.
+_ROUNDING, _COMMAND = 1e-6, 1e-3
+#: u is fed back where y foretells more than half of its innovations' variance, and nothing but that where this is left.
+_FEEDBACK, _LEAST_OWN = 0.7, 3e-4
+_LEAST_RIDGE = 1e-10
+#: Of the cause's energy, so much has to be left at a lag.
+_LEAST_ENERGY = 0.05
+#: One column is a copy of the other, in another unit, where less than this part of its spread is left.
+_COPY = 1e-6
+
+
+@dataclass(frozen=True, kw_only=True)
+class Dependence:
+    """How likely chance alone would give so close a relation.
+
+    Attributes
+    ----------
+    forward : float
+        Of y to what u was in earlier rows.
+    backward : float
+        Of u to what y was in earlier rows: a feedback, or a swapped pair.
+    same_row : float
+        Of the two innovations in one row, in standard deviations: a controller's, since y is measured before u acts.
+    lag : int
+        Rows by which u came first where the relation forward is closest.
+    sign : {1, -1}
+        Sign of that relation.
+    """
+
+    forward: float
+    backward: float
+    same_row: float
+    lag: int
+    sign: int
+
+    @property
+    def answers(self) -> bool:
+        """Whether y answers u, beyond chance."""
+        return self.forward < CHANCE
+
+
+def recorded_dependence(recording: Recording) -> Dependence:
+    """Return how likely chance alone relates y so closely to u, or to a set-point that moves and acts by way of u."""
+    found = dependence(recording.u, recording.y, first_lag=0 if recording.metadata.get("hold") == "linear" else 1)
+    r = recording.extra.get("r")
+    if found.answers or r is None or np.ptp(_bridged(r)) == 0.0:
+        return found
+    by_setpoint = dependence(r, recording.y, fed_back=False)
+    return replace(found, forward=by_setpoint.forward, lag=by_setpoint.lag, sign=found.sign)
+
+
+def require_answer(recordings: Sequence[Recording]) -> None:
+    """Refuse recordings in which y has nothing to do with u, and those whose columns say something else.
+
+    Parameters
+    ----------
+    recordings : sequence of Recording
+        Of one plant, at least one; it is enough if y answers in one of them.
+
+    Raises
+    ------
+    IdentificationError
+        u never changes, y is a copy of u, the two are swapped, u does nothing but follow y, or y does not answer u
+        beyond chance (1 in 1,000).
+    """
+    moving = [recording for recording in recordings if not _is_constant(_bridged(recording.u))]
+    if not moving:
+        raise IdentificationError(
+            "the command never changes", where=recordings[0].name, remedy="record an experiment that moves u"
+        )
+    for recording in moving:
+        _require_two_signals(recording)
+    found = [recorded_dependence(recording) for recording in moving]
+    if min(one.forward for one in found) * len(found) < CHANCE:
+        return
+    where = ", ".join(recording.name for recording in recordings)
+    in_row = max(abs(one.same_row) for one in found) > _SAME_ROW
+    if min(one.backward for one in found) * len(found) < CHANCE and not in_row:
+        raise IdentificationError(
+            "u and y seem swapped: u answers y, and y does not answer u",
+            where=where,
+            remedy="name the columns the other way round with --u and --y",
+        )
+    if in_row:
+        raise IdentificationError(
+            "u does nothing but follow y, as a controller does that nobody disturbs: this says nothing of the plant, "
+            "unless u and y are swapped",
+            where=where, remedy="record a set-point or a dither that moves the loop, or steps of u in open loop",
+        )  # fmt: skip
+    raise IdentificationError(
+        f"y has nothing to do with u beyond chance (probability {min(one.forward for one in found):.2g}, "
+        f"{CHANCE:g} is asked for)",
+        where=where, remedy="check the columns; record larger or longer moves of u, after some rest",
+    )  # fmt: skip
+
+
+def _is_constant(values: FloatArray) -> bool:
+    return bool(np.ptp(values) <= 1e-12 * np.max(np.abs(values)))
+
+
+def _require_two_signals(recording: Recording) -> None:
+    u, y = _bridged(recording.u), _bridged(recording.y)
+    v, w = u - u.mean(), y - y.mean()
+    apart = w - (float(v @ w) / float(v @ v)) * v
+    if not _is_constant(y) and float(np.linalg.norm(apart)) <= _COPY * float(np.linalg.norm(w)):
+        raise IdentificationError(
+            "y is u, in every row, up to unit and offset: one signal under two names",
+            where=recording.name,
+            remedy="name the column of the measurement with --y",
+        )
+
+
+def dependence(u: FloatArray, y: FloatArray, *, first_lag: int = 1, fed_back: bool = True) -> Dependence:
+    """Return how likely chance alone relates two signals so closely.
+
+    Parameters
+    ----------
+    u, y : array, shape (n,)
+        Rows in order of time; NaN is bridged.
+    first_lag : int
+        Least number of rows by which u comes first; 0 where ``u`` is a prediction of ``y``.
+    fed_back : bool
+        Whether u may be what a controller makes of y; not of a set-point.
+
+    Returns
+    -------
+    Dependence
+        Probabilities are bounds (Bonferroni over lags and sums).
+
+    Notes
+    -----
+    The closest relation is judged without the one product that adds most to it: a single jump of y may follow a single
+    step of u by chance. Linear: a y that
+    answers to both signs of u alike is not seen to answer.
+
+    References
+    ----------
+    Haugh, Checking the independence of two covariance-stationary time series, JASA 71, 1976.
+    """
+    u, y, first = _thinned(_bridged(u), _bridged(y), first_lag)
+    if min(u.size, y.size) < _LEAST_ROWS or np.ptp(u) == 0.0 or np.ptp(y) == 0.0:
+        return Dependence(forward=1.0, backward=1.0, same_row=0.0, lag=0, sign=1)
+    e_u, e_y = _innovations(u, _COMMAND), _innovations(y, _ROUNDING)
+    forward, lag, sign = _closest(_own_moves(u, y, e_u) if first and fed_back else e_u, e_y, first)
+    backward, _, _ = _closest(_innovations(y, _COMMAND), _innovations(u, _ROUNDING), 1)
+    size = float(np.linalg.norm(e_u) * np.linalg.norm(e_y))
+    same = float(e_u @ e_y) / size * math.sqrt(e_u.size) if size > 0.0 else 0.0
+    return Dependence(forward=forward, backward=backward, same_row=same, lag=lag, sign=sign)
+
+
+def _bridged(values: FloatArray) -> FloatArray:
+    known = np.isfinite(values)
+    if known.all() or not known.any():
+        return np.where(known, values, 0.0)
+    rows = np.arange(values.size)
+    return np.asarray(np.interp(rows, rows[known], values[known]))
+
+
+def _own_moves(u: FloatArray, y: FloatArray, e_u: FloatArray) -> FloatArray:
+    """Return the innovations of u, without what y foretells where that is much: what a controller did not make of y.
+
+    The row's own y counts, since a controller saw it before it gave u.
+    """
+    most = max(order for order in _ORDERS if order <= u.size // 16)
+    v, y = (u - u.mean()) / np.std(u), (y - y.mean()) / np.std(y)
+    seen = np.column_stack([_past(v, most), y[most:], _past(y, most), np.ones(u.size - most)])
+    gram = seen.T @ seen + _LEAST_RIDGE * seen.shape[0] * np.eye(seen.shape[1])
+    own = np.zeros_like(e_u)
+    own[most:] = (v[most:] - seen @ np.linalg.solve(gram, seen.T @ v[most:])) * np.std(u)
+    part = float(np.linalg.norm(own) / max(float(np.linalg.norm(e_u[most:])), 1e-300))
+    if part > _FEEDBACK:
+        return e_u
+    return own if part > _LEAST_OWN else np.zeros_like(own)
+
+
+def _past(x: FloatArray, order: int) -> FloatArray:
+    return np.column_stack([x[order - k : x.size - k] for k in range(1, order + 1)])
+
+
+def _thinned(u: FloatArray, y: FloatArray, first_lag: int) -> tuple[FloatArray, FloatArray, int]:
+    """Return at most so many rows: means of both, so that a row of u is before the next of y."""
+    every = -(-u.size // (_MOST_ROWS if first_lag else _MOST_SMOOTH_ROWS))
+    if every <= 1:
+        return u, y, first_lag
+    rows = u.size // every * every
+    return u[:rows].reshape(-1, every).mean(axis=1), y[:rows].reshape(-1, every).mean(axis=1), first_lag
+
+
+def _innovations(x: FloatArray, floor: float) -> FloatArray:
+    """Return what an autoregression leaves, its order by Akaike's criterion, with noise of so much of x's spread."""
+    x = x - x.mean()
+    noise = floor * float(np.std(x))
+    orders = [order for order in _ORDERS if order <= x.size // 8]
+    most = orders[-1]
+    past = np.column_stack([_past(x, most), np.full(x.size - most, np.std(x))])
+    gram, right = past.T @ past, past.T @ x[most:]
+    best, found = math.inf, (1, np.zeros(2))
+    for order in orders:
+        used = [*range(order), most]
+        ridge = noise**2 * past.shape[0] * np.eye(order + 1)
+        weights = np.linalg.solve(gram[np.ix_(used, used)] + ridge, right[used])
+        left = x[most:] - past[:, used] @ weights
+        criterion = left.size * math.log(float(np.mean(left**2)) + noise**2) + 2.0 * order
+        if criterion < best:
+            best, found = criterion, (order, weights)
+    order, weights = found
+    innovations = x[order:] - _past(x, order) @ weights[:-1] - weights[-1] * np.std(x)
+    return np.concatenate([np.zeros(order), innovations])
+
+
+def _closest(cause: FloatArray, effect: FloatArray, first: int) -> tuple[float, int, int]:
+    """Return the probability of the closest relation of an effect to sums of an earlier cause, its lag and sign.
+
+    Every octave of lags and every length of the sums is looked at for the same part of the error probability.
+    """
+    from scipy.stats import norm
+
+    n = effect.size
+    sd = float(np.sqrt(np.mean(effect[np.flatnonzero(effect)] ** 2))) if effect.any() else 0.0
+    if sd == 0.0 or not cause.any():
+        return 1.0, 0, 1
+    spectrum, total = np.fft.rfft(effect, 2 * n), np.concatenate([[0.0], np.cumsum(cause)])
+    lags = np.arange(first, n // 4 + 1)
+    widths = [width for width in 2 ** np.arange(9) if width <= n // 8]
+    each = 2.0 * len(widths) * math.log2(2.0 * lags[-1])
+    best, lag, sign = 1.0, 0, 1
+    for width in widths:
+        sums = np.concatenate([np.zeros(width - 1), total[width:] - total[:-width]])
+        products = np.fft.irfft(np.fft.rfft(sums, 2 * n).conj() * spectrum, 2 * n)[lags]
+        energy = np.concatenate([[0.0], np.cumsum(sums**2)])
+        left = energy[n - lags]
+        scale = np.where(left > _LEAST_ENERGY * energy[n], sd * np.sqrt(left), math.inf)
+        looks = each * np.maximum(1.0, lags / width)
+        chance = np.log(looks) + norm.logsf(np.abs(products) / scale)
+        at = int(np.argmin(chance))
+        pairs = sums[: n - lags[at]] * effect[lags[at] :] * np.sign(products[at])
+        size = float(np.sum(pairs) - np.max(pairs)) / float(scale[at])
+        found = float(min(1.0, 2.0 * norm.sf(size) * looks[at]))
+        if found < best:
+            best, lag, sign = found, int(lags[at]), 1 if products[at] > 0.0 else -1
+    return best, lag, sign

@@ -1,0 +1,121 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+import autotune as at
+from autotune.arrays import FloatArray
+from autotune.errors import IdentificationError
+from autotune.identification.dependence import dependence, recorded_dependence, require_answer
+from autotune.recording import Recording
+
+ROWS = 800
+
+
+def recorded(u: FloatArray, y: FloatArray, **columns: FloatArray) -> Recording:
+    return Recording(t=np.arange(u.size, dtype=float), u=u, y=y, extra=columns, name="r")
+
+
+def moves(rng: np.random.Generator) -> dict[str, FloatArray]:
+    return {
+        "white": rng.standard_normal(ROWS),
+        "steps": np.repeat(rng.choice([4.5, 5.5], ROWS // 20), 20),
+        "random walk": np.cumsum(rng.standard_normal(ROWS)),
+        "square": np.sign(np.sin(np.arange(ROWS) / 6.0)),
+        "multisine": sum((np.cos(0.03 * k * np.arange(ROWS) + k * k) for k in (1, 3, 5, 7)), np.zeros(ROWS)),
+    }
+
+
+def strangers(rng: np.random.Generator) -> dict[str, FloatArray]:
+    w = rng.standard_normal
+    return {
+        "white": w(ROWS),
+        "autoregressive": lfilter([1.0], [1.0, -0.95], w(ROWS)),
+        "resonant": lfilter([1.0], [1.0, -1.9, 0.95], w(ROWS)),
+        "random walk": np.cumsum(w(ROWS)),
+        "drifting": np.linspace(0.0, 5.0, ROWS) + 0.3 * w(ROWS),
+        "quantised": np.round(lfilter([1.0], [1.0, -0.98], w(ROWS))),
+    }
+
+
+def test_a_y_that_runs_on_by_itself_is_never_held_for_an_answer() -> None:
+    """300 pairs at 1 in 1,000 each; the bound over lags and sums is far from reached."""
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        for u in moves(rng).values():
+            for y in strangers(rng).values():
+                assert not dependence(u, y).answers
+
+
+@pytest.mark.parametrize("name", ["oven", "loop", "delay", "two delays"])
+def test_the_examples_answer(name: str) -> None:
+    require_answer([at.example(name)])
+
+
+@pytest.mark.parametrize("kind", ["white", "steps", "random walk"])
+@pytest.mark.parametrize("gain", [2.0, -2.0])
+def test_a_plant_under_its_own_noise_answers_with_its_sign_at_its_delay(kind: str, gain: float) -> None:
+    rng = np.random.default_rng(3)
+    u = moves(rng)[kind]
+    late = np.concatenate([np.full(5, u[0]), u[:-5]])
+    y = gain * lfilter([0.1], [1.0, -0.9], late - u[0]) + 0.05 * rng.standard_normal(ROWS)
+    found = dependence(u, y)
+    assert found.answers
+    assert found.sign == np.sign(gain)
+    assert 1 <= found.lag <= 12
+
+
+def closed_loop(seed: int, setpoint: bool) -> Recording:
+    """Simulate a PI loop of a lag and dead time of 3 rows under coloured noise."""
+    rng = np.random.default_rng(seed)
+    r = np.repeat(rng.choice([-1.0, 1.0], ROWS // 40), 40) if setpoint else np.zeros(ROWS)
+    u, y = np.zeros(ROWS), np.zeros(ROWS)
+    x = noise = total = 0.0
+    for k in range(ROWS):
+        x = 0.9 * x + 0.1 * (u[k - 4] if k > 3 else 0.0)
+        noise = 0.9 * noise + 0.1 * rng.standard_normal()
+        y[k] = x + noise
+        total += 0.05 * (r[k] - y[k])
+        u[k] = r[k] - y[k] + total
+    return recorded(u, y, r=r)
+
+
+def test_a_loop_that_only_its_own_noise_drives_says_nothing_of_the_plant() -> None:
+    for seed in range(10):
+        with pytest.raises(IdentificationError, match="u does nothing but follow y"):
+            require_answer([closed_loop(seed, setpoint=False)])
+
+
+def test_a_loop_whose_setpoint_moves_answers() -> None:
+    loop = closed_loop(1, setpoint=True)
+    require_answer([loop])
+    assert recorded_dependence(loop).answers
+
+
+def test_what_the_columns_say_instead_is_said() -> None:
+    oven = at.example("oven")
+    with pytest.raises(IdentificationError, match=r"seem swapped.*--u and --y"):
+        require_answer([replace(oven, u=oven.y, y=oven.u)])
+    with pytest.raises(IdentificationError, match="one signal under two names"):
+        require_answer([replace(oven, y=7.0 - 3.0 * oven.u)])
+    with pytest.raises(IdentificationError, match="the command never changes"):
+        require_answer([replace(oven, u=np.ones(len(oven)))])
+    with pytest.raises(IdentificationError, match="nothing to do with u beyond chance"):
+        require_answer([replace(oven, y=np.random.default_rng(1).standard_normal(len(oven)))])
+
+
+def test_one_recording_that_answers_is_enough() -> None:
+    oven = at.example("oven")
+    require_answer([oven, replace(oven, u=np.ones(len(oven)))])
+
+
+@pytest.mark.parametrize("factor", [1e-9, 1.0, 1e9])
+def test_the_answer_does_not_hang_on_units_or_the_last_digits(factor: float) -> None:
+    oven = at.example("oven")
+    here = dependence(oven.u, oven.y)
+    there = dependence(oven.u * factor, np.round(oven.y, 8) / factor)
+    assert there.lag == here.lag
+    assert abs(np.log(there.forward) - np.log(here.forward)) < 0.01 * abs(np.log(here.forward))

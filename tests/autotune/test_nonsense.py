@@ -1,0 +1,119 @@
+"""What makes no sense is refused in one line, before it takes memory and before it reaches a rig."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from autotune.batch.campaign import REPORT, RESULTS, Campaign
+from autotune.batch.settings import CampaignSettings
+from autotune.config import load_config
+from autotune.errors import InputError
+from autotune.files.workbook import open_table
+from autotune.pipeline.audit import audit_log
+from autotune.recording import Recording, read_recording
+
+ROOT = Path(__file__).parents[2]
+BALL = (ROOT / "configs" / "ball_sim.toml").read_text()
+
+
+@pytest.mark.parametrize("value", ["true", '"0.02"', "[0.02]"])
+def test_a_number_of_another_type_is_none(tmp_path: Path, value: str) -> None:
+    lines = [f"sample_time_s = {value}" if line.startswith("sample_time_s") else line for line in BALL.splitlines()]
+    (tmp_path / "c.toml").write_text("\n".join(lines))
+    with pytest.raises(InputError, match=r"signals\.sample_time_s.*valid number"):
+        load_config(tmp_path / "c.toml")
+
+
+def test_a_gap_of_years_takes_no_memory() -> None:
+    t = np.concatenate([np.arange(200.0) * 0.01, [1e6]])
+    recording = Recording(t=t, u=np.sin(t), y=np.cos(t), name="r.csv")
+    with pytest.raises(InputError, match=r"r\.csv: an even grid of 0\.01 s needs 1e\+08 rows.*cut the recording"):
+        recording.resampled(0.01)
+
+
+@pytest.mark.parametrize(
+    ("sidecar", "said"), [('hold = "first"', "hold = 'first'"), ('[[block]]\nname = "a"', "is a model")]
+)
+def test_a_sidecar_that_is_none_is_refused(tmp_path: Path, sidecar: str, said: str) -> None:
+    (tmp_path / "r.csv").write_text("t,u,y\n0,1,2\n1,2,3\n")
+    (tmp_path / "r.toml").write_text(sidecar)
+    with pytest.raises(InputError, match=said):
+        read_recording(tmp_path / "r.csv")
+
+
+@pytest.mark.parametrize("cell", ["XFD1048576", "A99999999999999999999"])
+def test_a_stray_cell_far_from_the_table_takes_no_memory(tmp_path: Path, cell: str) -> None:
+    with zipfile.ZipFile(tmp_path / "r.xlsx", "w") as book:
+        book.writestr(
+            "xl/worksheets/sheet1.xml",
+            f'<worksheet><row r="1"><c r="A1"><v>1</v></c><c s="1" r="{cell}"><v>1</v></c></row></worksheet>',
+        )
+    with pytest.raises(InputError, match=r"sheet1\.xml reaches to row .* stray cell"):
+        open_table(tmp_path / "r.xlsx")
+
+
+def test_parquet_columns_of_lists_are_left_out_and_texts_that_are_none_are_refused(tmp_path: Path) -> None:
+    pa = pytest.importorskip("pyarrow")
+    import pyarrow.parquet
+
+    numbers = [0.0, 1.0, 2.0]
+    pyarrow.parquet.write_table(pa.table({"t": numbers, "l": [[1]] * 3, "y": numbers}), tmp_path / "l.parquet")
+    assert open_table(tmp_path / "l.parquet").names == ("t", "y")
+    wrong = pa.Array.from_buffers(
+        pa.utf8(), 1, [None, pa.py_buffer(np.array([0, 2], np.int32)), pa.py_buffer(b"\xff\xfe")]
+    )
+    pyarrow.parquet.write_table(pa.table({"t": [1.0], "w": wrong}), tmp_path / "w.parquet")
+    with pytest.raises(InputError, match="cannot be read"):
+        open_table(tmp_path / "w.parquet").load(["w"])
+
+
+def test_a_cell_longer_than_any_is_one_line(tmp_path: Path) -> None:
+    (tmp_path / "r.csv").write_text('a;u;y\n0;1;2\n1;2;3\n2;"' + "x" * 200_000 + "\n")
+    with pytest.raises(InputError, match="cannot be parted"):
+        open_table(tmp_path / "r.csv").load(["a"])
+
+
+def test_a_campaign_does_not_replace_what_is_not_its_own(tmp_path: Path) -> None:
+    work = Campaign(settings=CampaignSettings(name="c", task="identify"), loops=(), out=tmp_path)
+    for name in (REPORT, RESULTS):
+        (tmp_path / name).write_text("another's")
+        with pytest.raises(InputError, match=f"holds {name}, which is not a campaign's"):
+            work.claim()
+        (tmp_path / name).unlink()
+    work.claim()
+    (tmp_path / REPORT).write_text("its own")
+    work.claim()
+
+
+def test_nothing_is_appended_to_a_file_that_is_no_audit_log(tmp_path: Path) -> None:
+    config = load_config(ROOT / "configs" / "ball_sim.toml")
+    (tmp_path / "notes.txt").write_text("my notes\n")
+    with pytest.raises(InputError, match=r"notes\.txt: is not an audit log"):
+        audit_log(config.model_copy(update={"audit_log": str(tmp_path / "notes.txt")}), tmp_path, "deploy")
+    (tmp_path / "audit.jsonl").write_text('{"at": "1", "who": "a", "rig": "b", "verdict": "kept"}\n')
+    audit_log(config, tmp_path, "deploy")
+
+
+OPTIONS = {
+    "--follow": ["watch", "r.csv", "--follow", "nan", "--out", "o.csv"],
+    "--noise-frequency": ["tune", "r.csv", "--noise-frequency", "inf", "--out", "o"],
+    "noise_gain": ["tune", "r.csv", "--noise-gain", "-1", "--out", "o"],
+    "phase_margin_deg": ["tune", "r.csv", "--phase-margin", "91", "--out", "o"],
+}
+
+
+@pytest.mark.parametrize("named", OPTIONS)
+def test_an_option_beyond_its_range_is_one_line_that_names_it(tmp_path: Path, named: str) -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "autotune", *OPTIONS[named]], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 2
+    assert named in done.stderr
+    assert done.stderr.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
