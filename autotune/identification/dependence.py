@@ -94,7 +94,9 @@ def require_answer(recordings: Sequence[Recording]) -> None:
     moving = [recording for recording in recordings if not _is_constant(_bridged(recording.u))]
     if not moving:
         raise IdentificationError(
-            "the command never changes", where=recordings[0].name, remedy="record an experiment that moves u"
+            "u is constant: the command never changes",
+            where=recordings[0].name,
+            remedy="record an experiment that moves u",
         )
     for recording in moving:
         _require_two_signals(recording)
