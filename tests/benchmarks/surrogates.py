@@ -1,0 +1,183 @@
+"""What is found where nothing is to be found: noise, swapped columns, a constant command, a loop driven by noise.
+
+``SURROGATES=N,COMMAND+COMMAND`` in the environment sets inputs per family and the commands; 200 and all when absent.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable
+
+import numpy as np
+from scipy.signal import lfilter
+
+from autotune.arrays import FloatArray
+from autotune.errors import AutotuneError
+from autotune.models import Block, Model, Port, TransferFunction
+from autotune.recording import Recording
+
+COUNT = 200
+#: Rows of an input: short, usual and long records take turns.
+_ROWS = (300, 800, 2000)
+#: A finding counts from this probability on, where a command states one.
+_PROBABLE = 0.5
+
+
+def _commands(rng: np.random.Generator, rows: int) -> FloatArray:
+    return np.repeat(rng.choice([4.5, 5.5], rows // 20 + 1), 20)[:rows]
+
+
+def _driven(rng: np.random.Generator, u: FloatArray, gain: float = 2.0) -> FloatArray:
+    late = np.concatenate([np.full(3, u[0]), u[:-3]]) - 5.0
+    return 50.0 + gain * lfilter([0.1], [1.0, -0.9], late) + 0.05 * rng.standard_normal(u.size)
+
+
+def _white(rng: np.random.Generator, rows: int) -> tuple[FloatArray, FloatArray]:
+    return rng.standard_normal(rows), rng.standard_normal(rows)
+
+
+def _stepping(rng: np.random.Generator, rows: int) -> tuple[FloatArray, FloatArray]:
+    return _commands(rng, rows), rng.standard_normal(rows)
+
+
+def _autoregressive(rng: np.random.Generator, rows: int) -> tuple[FloatArray, FloatArray]:
+    return lfilter([1.0], [1.0, -0.9], rng.standard_normal(rows)), lfilter(
+        [1.0], [1.0, -0.95], rng.standard_normal(rows)
+    )
+
+
+def _walk(rng: np.random.Generator, rows: int) -> tuple[FloatArray, FloatArray]:
+    return np.cumsum(rng.standard_normal(rows)), np.cumsum(rng.standard_normal(rows))
+
+
+def _swapped(rng: np.random.Generator, rows: int) -> tuple[FloatArray, FloatArray]:
+    u = _commands(rng, rows)
+    return _driven(rng, u), u
+
+
+def _wrong_sign(rng: np.random.Generator, rows: int) -> tuple[FloatArray, FloatArray]:
+    u = _commands(rng, rows)
+    return u, _driven(rng, u, -2.0)
+
+
+def _constant(rng: np.random.Generator, rows: int) -> tuple[FloatArray, FloatArray]:
+    return np.full(rows, 5.0), 50.0 + np.cumsum(rng.standard_normal(rows))
+
+
+def _loop(rng: np.random.Generator, rows: int, limit: float = np.inf) -> tuple[FloatArray, FloatArray]:
+    """Return u and y of a PI loop that only its own coloured noise drives, the command limited or not."""
+    gain, reset, delay = rng.uniform(0.2, 2.0), rng.uniform(5.0, 50.0), int(rng.integers(1, 8))
+    colour, lag = rng.uniform(0.0, 0.98), float(np.exp(-1.0 / rng.uniform(5.0, 50.0)))
+    u, y = np.zeros(rows + 200), np.zeros(rows + 200)
+    x = noise = total = 0.0
+    for k in range(y.size):
+        x = lag * x + (1.0 - lag) * (u[k - delay] if k >= delay else 0.0)
+        noise = colour * noise + 0.1 * rng.standard_normal()
+        y[k] = x + noise
+        total += -gain / reset * y[k]
+        wanted = -gain * y[k] + total
+        u[k] = np.clip(wanted, -limit, limit)
+        total += u[k] - wanted
+    return u[200:], y[200:]
+
+
+def _limited(rng: np.random.Generator, rows: int) -> tuple[FloatArray, FloatArray]:
+    return _loop(rng, rows, 0.3)
+
+
+FAMILIES: dict[str, Callable[[np.random.Generator, int], tuple[FloatArray, FloatArray]]] = {
+    "white": _white, "white under steps": _stepping, "autoregressive": _autoregressive, "random walk": _walk,
+    "swapped": _swapped, "wrong sign": _wrong_sign, "constant u": _constant, "linear loop": _loop,
+    "linear loop, limited": _limited,
+}  # fmt: skip
+
+
+def surrogate(family: str, seed: int) -> Recording:
+    """Return one input of a family."""
+    rows = _ROWS[seed % len(_ROWS)]
+    u, y = FAMILIES[family](np.random.default_rng(seed), rows)
+    return Recording(t=np.arange(rows, dtype=np.float64), u=u, y=y, name=f"{family} {seed}")
+
+
+def _tune(recording: Recording) -> bool:
+    from autotune.config.procedure import DesignSettings
+    from autotune.pipeline import analyse, measured_of
+
+    found = measured_of([recording])
+    analyse(found.points, DesignSettings(criterion="iae"), fit=found.fit, facts=found.facts, compare=False)
+    return True
+
+
+def _delay(recording: Recording) -> bool:
+    from autotune.identification.delay.identify import identify_delay
+    from autotune.identification.dependence import require_answer
+
+    require_answer([recording])
+    identify_delay(recording, 2)
+    return True
+
+
+def _closed_loop(recording: Recording) -> bool:
+    from autotune.identification.closed_loop.identify import identify_closed_loop
+    from autotune.identification.dependence import require_answer
+
+    require_answer([recording])
+    identify_closed_loop(recording)
+    return True
+
+
+def _watch(recording: Recording) -> bool:
+    from autotune.identification.delay.tracking import track
+
+    length = recording.duration_s
+    windows = track(recording, 2, window_s=0.4 * length, every_s=0.3 * length, max_delay_s=0.1 * length)
+    return any(window.model is not None for window in windows)
+
+
+def _routine(recording: Recording) -> bool:
+    from autotune.diagnosis.routine import diagnose_routine
+
+    return diagnose_routine([recording]).verdict in ("stiction", "backlash")
+
+
+def _diagnose(recording: Recording) -> bool:
+    from autotune.diagnosis.diagnose import diagnose
+
+    lag = Block(name="plant", place="plant", dynamics=TransferFunction(num=(2.0,), den=(9.5, 1.0), delay_s=3.0))
+    nominal = Model(name="nominal", blocks=(lag,), input=Port(unit="", offset=5.0), output=Port(unit="", offset=50.0))
+    return any(effect.probability >= _PROBABLE for effect in diagnose(nominal, [recording]).effects)
+
+
+COMMANDS: dict[str, Callable[[Recording], bool]] = {
+    "tune": _tune, "identify delay": _delay, "identify closed-loop": _closed_loop, "watch": _watch,
+    "diagnose --routine": _routine, "diagnose": _diagnose,
+}  # fmt: skip
+#: A wrong sign is one beside a model only.
+_RIGHT = {("wrong sign", name) for name in COMMANDS if name != "diagnose"}
+
+
+def is_finding(command: str, recording: Recording) -> bool:
+    """Return whether a command finds something in a recording; a refusal finds nothing."""
+    try:
+        return COMMANDS[command](recording)
+    except AutotuneError:
+        return False
+
+
+def main() -> None:
+    """Print how many findings each command makes in each family, and the worst share."""
+    count, _, names = os.environ.get("SURROGATES", str(COUNT)).partition(",")
+    commands = names.split("+") if names else list(COMMANDS)
+    print(f"| false findings of {count} | {' | '.join(commands)} |\n|{'---|' * (len(commands) + 1)}")
+    for family in FAMILIES:
+        cells = []
+        for command in commands:
+            if (family, command) in _RIGHT:
+                cells.append("")
+                continue
+            found = [seed for seed in range(int(count)) if is_finding(command, surrogate(family, seed))]
+            cells.append(str(len(found)))
+            if found:
+                print(f"{command} on {family}: seeds {found}", file=sys.stderr, flush=True)
+        print(f"| {family} | {' | '.join(cells)} |", flush=True)
