@@ -136,6 +136,11 @@ def is_control(character: str) -> bool:
     return unicodedata.category(character) in ("Cc", "Cf", "Cs") and character not in "\n\t\u00ad\u200b\u200c\u200d"
 
 
+def shown(text: str) -> str:
+    """Return a text with what commands a terminal, hides text or turns its direction written out; lines stay."""
+    return "".join(c.encode("unicode_escape").decode() if is_control(c) else c for c in text)
+
+
 def printable(text: str) -> str:
     """Return a text with its control characters written out, line ends and tabs included."""
     if text.isprintable():

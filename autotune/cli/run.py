@@ -12,7 +12,7 @@ from rich.console import Console
 
 from autotune.cli import app
 from autotune.cli.common import OVERWRITE, ProgressBar, new_folder, rig_of, unguarded
-from autotune.cli.live import LISTEN, PORT, TOKEN
+from autotune.cli.live import LISTEN, PORT, TOKEN_FILE
 from autotune.cli.recordings import R, T, U, Y, read_all, signal_names
 from autotune.errors import ExperimentStopped, InputError
 from autotune.outputs import OutputFolder, write_json
@@ -48,10 +48,10 @@ def run(
     ] = False,
     listen: LISTEN = "127.0.0.1",
     port: PORT = 0,
-    token: TOKEN = None,
+    token_file: TOKEN_FILE = None,
 ) -> None:
     """Commission a rig: relay sweep, Bode points, reduced model, controller, verification, report."""
-    from autotune.live.session import LivePage
+    from autotune.live.session import LivePage, given_token
     from autotune.pipeline import tune
     from autotune.pipeline.folder import FILES_OF_A_RUN, may_store
     from autotune.recording import read_recording
@@ -67,7 +67,7 @@ def run(
     console = Console(highlight=False, soft_wrap=True)
     if warning := unguarded(content):
         console.print(f"warning: {warning}", markup=False)
-    with LivePage(folder, listen, port, token) if live else nullcontext() as onlooker:
+    with LivePage(folder, listen, port, given_token(token_file)) if live else nullcontext() as onlooker:
         keep = onlooker.keep if onlooker is not None else None
         with _page_where_stopped(content, folder), ProgressBar() as bar:
             tuning = tune(

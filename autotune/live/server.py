@@ -10,6 +10,7 @@ import socket
 import sys
 import threading
 import time
+from collections.abc import Callable
 from http.cookies import CookieError, SimpleCookie
 from pathlib import Path
 from urllib.parse import parse_qs, urlsplit
@@ -38,6 +39,10 @@ POLICY = (
 )
 
 
+#: wrong tokens that are looked at, and the time [s] in which so many close the door to further ones
+MOST_GUESSES, LOCKED_S = 20, 60.0
+
+
 class Guard:
     """Lets requests through that come from the page itself and from whoever has the token.
 
@@ -53,6 +58,8 @@ class Guard:
         What must be in the address once; it is kept in a cookie then.
     loopback : bool
         Whether the page is served on loopback only.
+    clock : callable
+        Time [s]; after :data:`MOST_GUESSES` wrong tokens within :data:`LOCKED_S` none is looked at.
 
     Attributes
     ----------
@@ -60,8 +67,11 @@ class Guard:
         Requests that were refused.
     """
 
-    def __init__(self, inner: ASGIApp, token: str, *, loopback: bool) -> None:
+    def __init__(
+        self, inner: ASGIApp, token: str, *, loopback: bool, clock: Callable[[], float] = time.monotonic
+    ) -> None:
         self._inner, self._token, self._loopback = inner, token, loopback
+        self._clock, self._wrong_s = clock, list[float]()
         self.refused = 0
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -99,10 +109,19 @@ class Guard:
         if origin is not None and urlsplit(origin).netloc != host:
             return False
         cookie = SimpleCookie(headers.get("cookie", "")).get(_cookie(host))
-        return any(
-            secrets.compare_digest(word.encode(), self._token.encode())
-            for word in (given, cookie.value if cookie is not None else "")
-        )
+        if cookie is not None and self._is_token(cookie.value):
+            return True  # who is in stays in, whoever guesses
+        return bool(given) and self._is_heard() and self._is_token(given)
+
+    def _is_token(self, word: str) -> bool:
+        right = secrets.compare_digest(word.encode(), self._token.encode())
+        if not right and word:
+            self._wrong_s = [*self._wrong_s[1 - MOST_GUESSES :], self._clock()]
+        return right
+
+    def _is_heard(self) -> bool:
+        """Return whether a guess is looked at: not after so many wrong ones within a minute."""
+        return len(self._wrong_s) < MOST_GUESSES or self._clock() - self._wrong_s[0] > LOCKED_S
 
 
 class Refusals(logging.Handler):
@@ -138,8 +157,8 @@ def token_for(given: str | None) -> str:
     """
     if given is None:
         return secrets.token_urlsafe(16)
-    if not re.fullmatch(r"[A-Za-z0-9_-]{8,200}", given):
-        raise InputError("cannot be used", where="--token", remedy="give 8 to 200 letters, digits, - and _")
+    if not re.fullmatch(r"[A-Za-z0-9_-]{16,200}", given):
+        raise InputError("cannot be used", where="the token", remedy="give 16 to 200 letters, digits, - and _")
     return given
 
 
@@ -149,8 +168,13 @@ def listening(host: str, port: int) -> socket.socket:
     Raises
     ------
     InputError
-        The address is not this machine's, or the port is taken.
+        The address is beyond loopback, not this machine's, or the port is taken.
     """
+    if host not in LOOPBACK:
+        raise InputError(
+            "the page is plain HTTP, which anybody between could read", where=f"--listen {host}",
+            remedy=f"leave it out and come by way of ssh -L {port or 'PORT'}:127.0.0.1:{port or 'PORT'}",
+        )  # fmt: skip
     try:
         family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
         return socket.create_server((host, port), family=family)

@@ -22,9 +22,20 @@ from rich.console import Console
 from autotune.errors import InputError, require_extra
 from autotune.experiment.loop import ABORT
 from autotune.interrupts import raise_interrupt
+from autotune.text_files import read_text
 
 #: what the page may ask; anything else on the pipe is no action
 ACTIONS = ("abort", "keep", "restore")
+
+
+def given_token(file: Path | None) -> str | None:
+    """Return the word that visitors need, from a file or the environment, None where neither has one.
+
+    Never from the command line, which every user of the machine can read.
+    """
+    if file is None:
+        return os.environ.get("AUTOTUNE_LIVE_TOKEN")
+    return read_text(file).strip()
 
 
 class LivePage:

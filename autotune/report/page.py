@@ -7,6 +7,7 @@ import functools
 import gzip
 import html
 import os
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.resources import files
@@ -17,6 +18,7 @@ import numpy as np
 from autotune.arrays import FloatArray
 from autotune.outputs import write_whole
 from autotune.report.chart import Chart, Scatter
+from autotune.text_files import shown
 
 Tone: TypeAlias = Literal["good", "warn", "bad"]
 
@@ -176,9 +178,11 @@ def write_page(page: Page, path: str | os.PathLike[str]) -> None:
         body.append(f'<nav aria-label="Contents">{"".join(links)}</nav>')
     for i, section in enumerate(page.sections):
         body.append(_section(section, i))
-    shell = _SHELL.replace("@TITLE@", _text(page.title)).replace("@BODY@", "\n".join(body))
     drawn = any(section.figures for section in page.sections)
-    write_whole(path, shell.replace("@CHARTS@", _CHARTS if drawn else "").replace("@PLOTLY@", _plotly()))
+    charts = _CHARTS.replace("@PLOTLY@", _plotly()) if drawn else ""
+    parts = {"TITLE": _text(page.title), "BODY": "\n".join(body), "CHARTS": charts}
+    # in one pass: what a part says is never looked at for the name of another
+    write_whole(path, re.sub("@(TITLE|BODY|CHARTS)@", lambda found: parts[found[1]], _SHELL))
 
 
 @functools.cache
@@ -194,7 +198,7 @@ def _answers(answers: tuple[tuple[str, str], ...]) -> str:
 
 
 def _text(text: str) -> str:
-    return html.escape(text, quote=False)
+    return html.escape(shown(text), quote=False)
 
 
 def _section(section: Section, number: int) -> str:

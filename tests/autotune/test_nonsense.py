@@ -117,3 +117,15 @@ def test_an_option_beyond_its_range_is_one_line_that_names_it(tmp_path: Path, na
     assert named in done.stderr
     assert done.stderr.count("\n") == 1
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_name_neither_breaks_the_page_nor_turns_its_text(tmp_path: Path) -> None:
+    from autotune.report.page import Page, write_page
+
+    page = Page(title="@CHARTS@ @PLOTLY@ @BODY@", tone="good", verdict="a\u202eb", summary=("\x1b[31m",))
+    write_page(page, tmp_path / "p.html")
+    text = (tmp_path / "p.html").read_text()
+    assert len(text) < 50_000
+    assert "<title>@CHARTS@ @PLOTLY@ @BODY@</title>" in text
+    assert "a\\u202eb" in text
+    assert "\\x1b[31m" in text

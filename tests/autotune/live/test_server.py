@@ -57,12 +57,12 @@ def gets_in(kind: str, *, token: str = TOKEN, **asked: Any) -> bool:
 
 
 def test_there_is_always_a_token_and_one_that_cannot_be_guessed() -> None:
-    assert token_for("word-of-mine") == "word-of-mine"
+    assert token_for("word-of-mine-alone") == "word-of-mine-alone"
     made = {token_for(None) for _ in range(100)}
     assert len(made) == 100
     assert min(map(len, made)) >= 20
-    for poor in ("", "short", "with blank in it", "semi;colon-in-it", "x" * 300):
-        with pytest.raises(InputError, match="--token"):
+    for poor in ("", "short", "fifteen-letters", "with blank in it all", "semi;colon-in-it-all", "x" * 300):
+        with pytest.raises(InputError, match="the token"):
             token_for(poor)
 
 
@@ -169,3 +169,37 @@ def test_a_served_page_refuses_other_users_counts_them_and_stays_quiet(tmp_path:
     process.send_signal(signal.SIGINT)
     said = process.communicate()[1]
     assert said.strip() in ("", "autotune: stopped by the operator; nothing was written")
+
+
+def test_after_twenty_wrong_tokens_none_is_looked_at_for_a_minute_and_who_is_in_stays_in() -> None:
+    now = [0.0]
+    guard = Guard(inner, TOKEN, loopback=True, clock=lambda: now[0])
+
+    def status(query: str = "", cookie: str = "") -> int:
+        sent: list[Message] = []
+
+        async def send(message: Message) -> None:
+            sent.append(message)
+
+        async def receive() -> Message:
+            return {"type": "http.request"}
+
+        headers = {"host": "127.0.0.1:8080", "cookie": cookie}
+        scope = {
+            "type": "http",
+            "query_string": query.encode(),
+            "headers": [(name.encode(), value.encode()) for name, value in headers.items()],
+        }
+        asyncio.run(guard(scope, receive, send))
+        return int(sent[0]["status"])
+
+    assert {status(f"token=guess-{i}") for i in range(20)} == {403}
+    assert status(f"token={TOKEN}") == 403
+    assert status(cookie=f"autotune_live_8080={TOKEN}") == 200
+    now[0] = 61.0
+    assert status(f"token={TOKEN}") == 200
+
+
+def test_plain_http_is_not_served_beyond_loopback() -> None:
+    with pytest.raises(InputError, match=r"plain HTTP.*ssh -L 8080:127\.0\.0\.1:8080"):
+        listening("0.0.0.0", 8080)
