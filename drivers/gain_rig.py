@@ -134,6 +134,7 @@ class GainRegisterRig(RegisterRig):
             raise InputError(self.not_startable, where=self._link.where, remedy=f"map {remedy}")
         self._require(self._is_commanding, "the host is not in command", "open the rig first")
         self._release(setpoint)
+        self._trial_setpoint = setpoint
         self._is_commanding, self._released_s = False, self._clock.now()
         return self._held("setpoint", setpoint)
 

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import math
+from collections import deque
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 from autotune.config.registers import RegisterMap
 from autotune.config.rig import PermissiveSettings
@@ -23,6 +25,12 @@ _SCAN_S, _SCANS_LATE = 0.02, 5
 _TAKE_S = 0.25
 #: how long the safe output is written again where the device does not take it, and the first wait between [s]
 _SAFE_S, _SAFE_WAIT_S = 2.0, 0.05
+#: time between two looks whether the command is still ours [s]
+_LOOK_S = 0.2
+#: longest time of a reading on a line that has the time for such looks [s]
+_QUICK_S = 0.005
+#: so many foreign commands within this time end the session [s]
+_FOREIGN, _FOREIGN_S = 2, 30.0
 #: how long another master's heartbeat is looked for, in times between two of our own
 _WATCH_FEEDS = 3
 
@@ -101,6 +109,10 @@ class RegisterRig:
         self._is_open = False
         self._is_taken = False  # whether anything was written in this session
         self._is_commanding = False
+        self._opened_s = 0.0
+        self._trial_setpoint = math.nan  # of the device's own controller, as a trial began
+        self._looks_s = math.inf  # when it was last looked whether the command is still ours; never where it cannot be
+        self._foreign: deque[tuple[float, float]] = deque(maxlen=_FOREIGN)  # when it was not, and what was there
         self._released_s = math.nan  # when this session gave the actuator to the device's own controller
 
     @property
@@ -144,6 +156,8 @@ class RegisterRig:
             self.close()
             raise NotTaken(error.what, where=error.where, remedy=error.remedy) from None
         self._former = Former(setpoint=setpoint) if runs else None
+        self._opened_s, self._looks_s, self._trial_setpoint = self._clock.now(), math.inf, math.nan
+        self._foreign.clear()
         self._is_taken = True
         if held.get("enable", 0.0) != 0.0:  # a session that was killed left it; a device's trip clears on its edge
             self._put("enable", 0.0)
@@ -159,6 +173,8 @@ class RegisterRig:
         elif runs:
             self._put("automatic", 0.0)
         self._await_command(1.0)
+        # a device that holds another value than it was sent, or another's, has its command looked at no more
+        self._looks_s = self._clock.now() if self._shown_command() == self._command_held else math.inf
 
     def read(self) -> Reading:
         """Take one sample; feeds the dead-man when that is due.
@@ -176,6 +192,7 @@ class RegisterRig:
         reading, values = self._sample()
         self._check_permissives(values)
         self._check_released(values)
+        reading = self._looked_for_master(reading)
         if self._is_commanding and values.get("in_command") == 0.0:
             self._is_commanding = False
             raise LinkError(
@@ -288,6 +305,8 @@ class RegisterRig:
         for name in ("automatic", "enable", "load"):
             if name in self._codecs:
                 self._put(name, 0.0)
+        if math.isfinite(self._trial_setpoint):  # whoever puts it in automatic next finds the operating point
+            self._put("setpoint", self._trial_setpoint)
         self._await_echo()
 
     def _await_echo(self) -> None:
@@ -318,6 +337,44 @@ class RegisterRig:
                 f"another master commands the rig: its heartbeat went from {before:g} to {beat:g}",
                 "end the other session; only one master may command",
             )
+
+    @property
+    def _command_held(self) -> float:
+        """The command as its register holds it."""
+        return self._codecs["u"].decode(self._codecs["u"].encode_within(self._u, *self._u_range))
+
+    def _shown_command(self) -> float:
+        """Return what the command's register holds now; NaN where a device refuses to say it."""
+        try:
+            return self._read(("u",))["u"]
+        except LinkError:
+            return math.nan
+
+    def _looked_for_master(self, reading: Reading) -> Reading:
+        """Look now and then whether the command is still ours, and mark a sample before which it was not.
+
+        Raises
+        ------
+        LinkError
+            It was another's several times within a short while.
+        """
+        now_s = self._clock.now()
+        if not self._is_commanding or now_s - self._looks_s < _LOOK_S:
+            return reading
+        if reading.suspect or reading.latency_s > _QUICK_S:
+            return reading
+        self._looks_s = now_s
+        held, own = self._shown_command(), self._command_held
+        if held == own or math.isnan(held):
+            return reading
+        self._foreign.append((now_s, held))
+        told = ", ".join(f"{value:g} at {t_s - self._opened_s:.3g} s" for t_s, value in self._foreign)
+        self._require(
+            len(self._foreign) < _FOREIGN or now_s - self._foreign[0][0] > _FOREIGN_S,
+            f"another master writes the command: its register held {told} of this session, {own:g} was written last",
+            "end the other session; only one master may command",
+        )
+        return replace(reading, suspect=True)
 
     def _check_permissives(self, values: Mapping[str, float]) -> None:
         for name, condition in self._permissives.items():

@@ -15,7 +15,7 @@ import tomli_w
 from autotune.config import Config, load_config
 from autotune.config.registers import RegisterMap
 from autotune.controller import PIDController
-from autotune.errors import AutotuneError, ExperimentStopped
+from autotune.errors import AutotuneError, ExperimentStopped, LinkError
 from autotune.experiment.judgement import Verification
 from autotune.experiment.verify import run_verification
 from autotune.models import TransferFunction
@@ -76,6 +76,7 @@ def test_the_devices_own_law_is_what_is_verified(tmp_path: Path) -> None:
     assert found.running_law.Ti_s == pytest.approx(PI.Ti_s, rel=0.1)
     assert device.output == SAFE
     assert device.value["load"] == 0.0
+    assert device.value["setpoint"] == BALL.operating_point.y  # what the next one in automatic goes to
 
 
 def test_without_a_register_for_the_load_the_set_point_comes_back_and_that_is_all(tmp_path: Path) -> None:
@@ -140,6 +141,37 @@ def test_a_controller_that_ran_before_has_its_set_point_again_and_no_load(tmp_pa
     found = run_verification(rig, BALL, rig.read_gains(), BALL_FIT, tmp_path / "trial.csv", on_device=True)
     assert found.by == "device"
     assert (device.value["automatic"], device.value["setpoint"], device.value["load"]) == (1.0, 4.5, 0.0)
+
+
+def commanding(foreign_s: tuple[float, ...]) -> tuple[Any, list[bool]]:
+    """Command for ten seconds while another master writes the command now and then; return its error, if any."""
+    rig, device = virtual_rig(make_plant("ball", seed=1), registers=REGISTERS)
+    left, suspect = list(foreign_s), []
+    rig.open()
+    start_s, at = rig.clock.now(), device.registers["u"]
+    try:
+        while rig.clock.now() - start_s < 10.0:
+            rig.write(4.0)
+            rig.clock.sleep_until(rig.clock.now() + 0.01)
+            if left and rig.clock.now() - start_s > left[0]:
+                left.pop(0)
+                device.write("holding", at.address, [0x3F80, 0], rig.clock.now())  # 1.0
+            suspect.append(rig.read().suspect)
+    except LinkError as error:
+        return error, suspect
+    return None, suspect
+
+
+def test_a_second_master_that_writes_now_and_then_is_found_and_told_with_its_times() -> None:
+    error, _ = commanding(tuple(0.2 * k for k in range(50)))
+    assert error is not None
+    assert re.search(r"another master writes the command: its register held 1 at [\d.]+ s, 1 at [\d.]+ s", str(error))
+
+
+def test_alone_nothing_is_said_of_another_master() -> None:
+    error, suspect = commanding(())
+    assert error is None
+    assert not any(suspect)
 
 
 # a controller in C that is nobody's own code here: positional form, its plant and its clock its own
