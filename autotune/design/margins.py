@@ -196,7 +196,8 @@ def _roots(f: Callable[[FloatArray], FloatArray], omega: FloatArray, values: Flo
         return omega[np.flatnonzero(values == 0.0)]
     a, b, fa, fb = omega[i], omega[i + 1], values[i], values[i + 1]
     for _ in range(_SECANTS):
-        x = (a * fb - b * fa) / (fb - fa)
+        ends = fb - fa
+        x = np.where(ends == 0.0, b, (a * fb - b * fa) / np.where(ends == 0.0, 1.0, ends))  # both ends are on the root
         fx = f(x)
         same = np.sign(fx) == np.sign(fb)
         # Illinois: the end that stays counts half, so that neither end is kept for ever

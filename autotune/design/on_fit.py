@@ -15,8 +15,7 @@ import numpy as np
 
 from autotune.arrays import FloatArray
 from autotune.controller import PIDController
-from autotune.design.figures import columns
-from autotune.design.kernels import SampledPlant, evaluate_grid, sampled_plant
+from autotune.design.members import members_of
 from autotune.design.specification import Design, Kind, Specification
 from autotune.design.synthesis import design
 from autotune.errors import DesignError
@@ -24,11 +23,11 @@ from autotune.identification.parametric import PlantFit
 from autotune.models import TransferFunction
 
 PROBABILITY = 0.95
-_ROUNDS = 8
+ROUNDS = 8
 #: probability below which the points contradict a fit's structure
 CONTRADICTED = 1e-3
 #: a plant of the region that misses a constraint by less is not worth another round; the answer says what is kept
-_TOLERANCE = 2e-3
+TOLERANCE = 2e-3
 
 
 def design_on_fit(
@@ -69,17 +68,8 @@ def design_on_fit(
             where="fitted plant",
             remedy="record the plant under steps of the command, which shows resonances, or design on a model of it",
         )
-    members = fit.border(probability)
-    sampled = [sampled_plant(one, specification.largest_gain) for one in members]
-    chosen: list[int] = []
-    for _ in range(_ROUNDS):
-        found = design(fit.plant, specification, kind, also=[members[i] for i in chosen], certificate=False)
-        slack = _slacks(sampled, found.controller, specification)
-        worst = {int(i) for i in np.argmin(slack, axis=0) if np.min(slack[i]) < -_TOLERANCE}
-        if worst <= set(chosen):
-            break
-        chosen += sorted(worst - set(chosen))
-    if np.min(slack) < -2.0 * _TOLERANCE:
+    found, worst = design_on_plants(fit.plant, fit.border(probability), specification, kind)
+    if worst < -2.0 * TOLERANCE:
         raise DesignError(
             "no controller was found that keeps the margins on the whole region of the fitted plant",
             where="synthesis",
@@ -92,21 +82,38 @@ def design_on_fit(
     )
 
 
+def design_on_plants(
+    nominal: TransferFunction, members: Sequence[TransferFunction], specification: Specification, kind: Kind
+) -> tuple[Design, float]:
+    """Return the controller of least norm on ``nominal`` that all members keep, and the least slack among them.
+
+    Members that miss a constraint become constraints of the next round, until none does.
+
+    Raises
+    ------
+    DesignError
+        Nothing of this structure keeps the constraints on the members that were violated so far.
+    """
+    every = members_of(members, specification)
+    chosen: list[int] = []
+    for _ in range(ROUNDS):
+        found = design(nominal, specification, kind, also=[members[i] for i in chosen], certificate=False)
+        slack = every.slacks(found.controller, specification)
+        worst = missed(slack)
+        if worst <= set(chosen):
+            break
+        chosen += sorted(worst - set(chosen))
+    return found, float(np.min(slack))
+
+
+def missed(slack: FloatArray) -> set[int]:
+    """Return which plants miss a margin most, given their (S, 3) slacks: what a next round must keep as well."""
+    return {int(i) for i in np.argmin(slack, axis=0) if np.min(slack[i]) < -TOLERANCE}
+
+
 def worst_of(
     members: Sequence[TransferFunction], controller: PIDController, specification: Specification
 ) -> tuple[TransferFunction, ...]:
     """Return the members on which one margin or another is smallest with the controller, three at most."""
-    sampled = [sampled_plant(one, specification.largest_gain) for one in members]
-    slack = _slacks(sampled, controller, specification)
+    slack = members_of(members, specification).slacks(controller, specification)
     return tuple(members[i] for i in sorted({int(i) for i in np.argmin(slack, axis=0)}))
-
-
-def _slacks(sampled: Sequence[SampledPlant], controller: PIDController, specification: Specification) -> FloatArray:
-    """Return (S, 3) slacks of the margins (modulus, phase, delay) of one controller on sampled plants."""
-    c = controller
-    rows = []
-    for s in sampled:
-        grid = np.array([[c.K * s.sign, c.Ti_s, c.Td_s, c.Tf_s]])
-        figures = columns(evaluate_grid(s.omega, s.h, s.weights, s.turn, grid, -1.0))
-        rows.append(specification.slacks(figures)[0, [0, 1, 3]])
-    return np.array(rows)

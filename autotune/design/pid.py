@@ -1,45 +1,81 @@
 """PID with a first-order measurement filter: the same criterion and constraints, searched from several starts.
 
-There is no certificate here: with four gains the norm has several basins (real and complex controller zeros), and the
-best of the local optima is what is returned.
+With four gains the norm has several basins (real and complex controller zeros). Two coarse grids are looked at, one
+over all gains that the specification allows and one around the best PI where there is one, and the best of the local
+optima is what is returned: no proof of a global one.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
+from autotune.arrays import FloatArray
 from autotune.controller import PIDController
-from autotune.design.search import Problem, polished, separate
+from autotune.design.search import Problem, admissible, polished, separate
 from autotune.errors import DesignError
 
-_STARTS = 6
+_STARTS = 8
+#: of each grid's nodes that keep nothing, so many are led towards what is asked for
+_LED = 6
 
 
-def best_pid(problem: Problem, pi: PIDController) -> PIDController:
-    """Return the PID with filter of the smallest norm (11) that was found, never worse than the PI.
+def best_pid(problem: Problem, pi: PIDController | None, largest: float, omega_ref: float) -> PIDController | None:
+    """Return the PID with filter of the smallest norm (11) that was found, never worse than the PI; None where none is.
 
     Parameters
     ----------
     problem : Problem
         Plants and specification.
-    pi : PIDController
-        The best PI, around which the coarse grid lies.
+    pi : PIDController or None
+        The best PI, which is a PID with T_d = 0; None where no PI keeps the constraints.
+    largest : float
+        Largest gain worth looking at.
+    omega_ref : float
+        Frequency [rad/s] about which the integral times lie.
     """
-    K = abs(pi.K) * np.geomspace(0.05, 8.0, 12)
-    Ti = pi.Ti_s * np.geomspace(0.1, 3.0, 9)
-    Td_share = np.geomspace(0.03, 1.5, 9)
-    ratio = np.array([0.5, 1.0, 2.0, 5.0, 12.0, 30.0])
-    mesh = np.stack([axis.ravel() for axis in np.meshgrid(K, Ti, Td_share, ratio, indexing="ij")], axis=1)
-    grid = np.stack((mesh[:, 0], mesh[:, 1], mesh[:, 1] * mesh[:, 2], mesh[:, 1] * mesh[:, 2] / mesh[:, 3]), axis=1)
+    grid = _everywhere(largest, omega_ref)
+    if pi is not None:
+        grid = np.vstack((grid, _around(pi)))
     norms, slacks = problem.norms_and_slacks(grid, thin=4)
-    feasible = np.min(slacks, axis=(1, 2)) >= 0.0
-    if not np.any(feasible):
+    slack = np.min(slacks, axis=(1, 2))
+    kept = slack >= 0.0
+    if np.any(kept):
+        nodes = separate(grid[kept][np.argsort(norms[kept])], 0.7, _STARTS)
+    else:
+        nodes = admissible(problem, separate(grid[np.argsort(-slack)], 0.5, _LED))
+    if not len(nodes):
         return pi
-    nodes = grid[feasible][np.argsort(norms[feasible])]
     try:
-        best = polished(problem, separate(nodes, 0.9, _STARTS))
+        best = polished(problem, nodes)
     except DesignError:  # no PID was found between the frequencies of the grid: the PI is one with T_d = 0
         return pi
+    if pi is None:
+        return best
     both = np.array([(abs(c.K), c.Ti_s, c.Td_s, c.Tf_s) for c in (pi, best)])
     norms, _ = problem.norms_and_slacks(both)
     return pi if norms[0] <= norms[1] else best
+
+
+def _everywhere(largest: float, omega_ref: float) -> FloatArray:
+    # with a filter the gain that noise sees is K T_d/T_f, so that K itself may be far below what is allowed
+    return _mesh(
+        largest * np.geomspace(1e-4, 1.0, 15),
+        np.geomspace(0.05, 100.0, 12) / omega_ref,
+        np.geomspace(0.03, 4.0, 7),
+        np.array([0.5, 1.0, 2.0, 5.0, 12.0, 30.0]),
+    )
+
+
+def _around(pi: PIDController) -> FloatArray:
+    return _mesh(
+        abs(pi.K) * np.geomspace(0.05, 8.0, 12),
+        pi.Ti_s * np.geomspace(0.1, 3.0, 9),
+        np.geomspace(0.03, 1.5, 9),
+        np.array([0.5, 1.0, 2.0, 5.0, 12.0, 30.0]),
+    )
+
+
+def _mesh(K: FloatArray, Ti: FloatArray, share: FloatArray, ratio: FloatArray) -> FloatArray:
+    """Return the (M, 4) controllers of all gains, integral times, T_d/T_I and T_d/T_f."""
+    mesh = np.stack([axis.ravel() for axis in np.meshgrid(K, Ti, share, ratio, indexing="ij")], axis=1)
+    return np.stack((mesh[:, 0], mesh[:, 1], mesh[:, 1] * mesh[:, 2], mesh[:, 1] * mesh[:, 2] / mesh[:, 3]), axis=1)

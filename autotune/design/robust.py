@@ -9,26 +9,33 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from scipy.optimize import minimize
 
-from autotune.arrays import ComplexArray, FloatArray
+from autotune.arrays import BoolArray, ComplexArray, FloatArray
 from autotune.controller import PIDController
 from autotune.design.figures import columns
 from autotune.design.kernels import evaluate, evaluate_grid
 from autotune.design.load_error import least_error, load_step
 from autotune.design.margins import Margins
+from autotune.design.members import members_of
+from autotune.design.on_fit import ROUNDS, missed
+from autotune.design.on_structures import design_on_structures, require_kept
 from autotune.design.search import minimised
 from autotune.design.specification import UNCERTAIN, Design, Kind, Specification
 from autotune.design.uncertain import UncertainPlant, guaranteed, uncertain_plant
 from autotune.errors import DesignError
+from autotune.identification.consistent_structures import consistent_structures
 from autotune.points import FrequencyPoint
 
 #: the search begins on every so many-th frequency
 _THIN = 4
 #: from so many nodes of the coarse grid, apart from each other in log gains
 _STARTS, _APART = 2, 0.25
+#: where no node is kept: so many are looked at, and the best of them led towards what is asked for, a little inside
+_LOOKED, _LED, _INSIDE = 300, 3, 0.002
 #: slope of the wall that a simplex meets at a constraint, norm (log) per relative slack
 _WALL = 1e4
 
@@ -73,15 +80,41 @@ def design_on_points(
     The guarantee is conditional on the class: aperiodic processes with dead time, at most one integrator. Sets at
     different frequencies are treated as independent, which can only make it stricter.
     """
-    plant = uncertain_plant(points, probability=probability, inverse_response=inverse_response)
-    parameters = _search(plant, specification, kind)
-    return _answer(plant, specification, kind, parameters, probability)
+    if len(points) < 3:
+        raise DesignError(f"{len(points)} points", where="points", remedy="a design on points needs at least three")
+    of_low_order = consistent_structures(points)
+    try:
+        plant = uncertain_plant(points, probability=probability, inverse_response=inverse_response)
+    except DesignError:
+        if not of_low_order.plants:
+            raise
+        return design_on_structures(of_low_order, specification, kind)
+    members = members_of(of_low_order.plants, specification)
+    chosen: list[int] = []
+    for _ in range(ROUNDS):
+        held = replace(plant, members=members.chosen(chosen).sampled)
+        found = _answer(held, specification, kind, _search(held, specification, kind), probability)
+        if not members.plants:
+            return found
+        slack = members.slacks(found.controller, specification)
+        worst = missed(slack) - set(chosen)
+        if not worst:
+            break
+        chosen += sorted(worst)
+    require_kept(slack, of_low_order, specification)
+    return replace(found, margins=members.least(found.margins, found.controller))
 
 
 def _slacks(plant: UncertainPlant, specification: Specification, p: FloatArray) -> FloatArray:
-    """Return (4,) relative slacks that every plant of the set has."""
+    """Return (4,) relative slacks that every plant of the set has, and the margins that its members have."""
     figures, _ = guaranteed(plant.omega, plant.supports, p[0], p[1], p[2], p[3], _omega_n(specification))
-    return np.minimum(specification.slacks(figures), 10.0)
+    slacks = np.minimum(specification.slacks(figures), 10.0)
+    for s in plant.members:
+        other = evaluate(s.omega, s.h, s.weights, s.turn, p[0], p[1], p[2], p[3], -1.0)
+        beside = specification.slacks(other)
+        beside[2] = np.inf  # the noise gain is the set's
+        slacks = np.minimum(slacks, beside)
+    return np.asarray(slacks)
 
 
 def _omega_n(specification: Specification) -> float:
@@ -96,6 +129,22 @@ def _norm(plant: UncertainPlant, p: FloatArray) -> float:
 
 
 def _search(plant: UncertainPlant, specification: Specification, kind: Kind) -> FloatArray:
+    """Return the best controller of the structure; a PI is a PID with T_d = 0."""
+    found: list[FloatArray] = []
+    refused: DesignError | None = None
+    structures: tuple[Kind, ...] = ("pi",) if kind == "pi" else ("pid", "pi")
+    for structure in structures:
+        try:
+            found.append(_search_structure(plant, specification, structure))
+        except DesignError as error:
+            refused = refused or error
+    if not found:
+        assert refused is not None
+        raise refused
+    return min(found, key=lambda p: _norm(plant, p))
+
+
+def _search_structure(plant: UncertainPlant, specification: Specification, kind: Kind) -> FloatArray:
     """Coarse grid on the nominal plant, the best node that the whole set keeps, then local searches, coarse to fine."""
     coarse = plant.thinned(_THIN)
     grid = _coarse_grid(plant, specification, kind)
@@ -103,7 +152,7 @@ def _search(plant: UncertainPlant, specification: Specification, kind: Kind) -> 
     figures = columns(evaluate_grid(n.omega, n.h, n.weights, n.turn, grid, _omega_n(specification)))
     promising = np.flatnonzero(np.min(specification.slacks(figures)[:, :2], axis=1) >= -0.05)
     order = promising[np.argsort(np.asarray(figures.squared_norm)[promising])]
-    starts = _first_kept(coarse, specification, grid[order])
+    starts = _first_kept(coarse, specification, grid[order]) or _led(coarse, specification, grid[order])
     if not starts:
         raise _unreachable(plant, specification, kind, grid)
     # a simplex is not caught by the kinks of the least slack, which the quadratic programme sometimes is; in four
@@ -133,6 +182,30 @@ def _first_kept(plant: UncertainPlant, specification: Specification, nodes: Floa
         if len(kept) == _STARTS:
             break
     return kept
+
+
+def _led(plant: UncertainPlant, specification: Specification, nodes: FloatArray) -> list[FloatArray]:
+    """Return the controller at which the whole set keeps all constraints, from the nodes that miss them least."""
+    looked = nodes[:: max(1, len(nodes) // _LOOKED)]
+    least = np.array([np.min(_slacks(plant, specification, node)) for node in looked])
+    for node in looked[np.argsort(-least)][:_LED]:
+        free = node > 0.0
+        size = int(np.sum(free))
+
+        def missed(x: FloatArray, node: FloatArray = node, free: BoolArray = free) -> float:
+            p = node.copy()
+            p[free] = node[free] * np.exp(x)
+            return -min(float(np.min(_slacks(plant, specification, p))), _INSIDE)
+
+        simplex = 0.3 * (np.vstack((np.zeros(size), np.eye(size))) - 0.5 / size)
+        result = minimize(
+            missed, np.zeros(size), method="Nelder-Mead", options={"initial_simplex": simplex, "maxfev": 120 * size}
+        )
+        if result.fun <= 0.0:
+            reached = node.copy()
+            reached[free] = node[free] * np.exp(result.x)
+            return [reached]
+    return []
 
 
 def _inwards(plant: UncertainPlant, specification: Specification, p: FloatArray) -> FloatArray:

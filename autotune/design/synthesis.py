@@ -18,11 +18,13 @@ from autotune.design.kernels import SampledPlant, sampled_plant
 from autotune.design.load_error import least_error, load_step
 from autotune.design.loop import Plant, transfer_function_of
 from autotune.design.margins import margins
-from autotune.design.search import Problem, polished, separate
+from autotune.design.search import Problem, admissible, polished, separate
 from autotune.design.specification import Design, Kind, Specification
 from autotune.errors import DesignError
 
-_STARTS = 2
+_STARTS = 4
+#: nodes that keep nothing and are led towards what is asked for
+_LED = 4
 #: how much more than asked for is kept on the grid of frequencies, so that it is kept between them
 _TIGHTER = (1e-5, 1e-4, 1e-3, 5e-3)
 #: margins between the grid's frequencies are exact to this; what is missed by more is never handed out
@@ -83,12 +85,9 @@ def design(
     )
     if len({one.sign for one in problem.sampled}) > 1:
         raise DesignError("the plants' gains are of both signs", where="synthesis", remedy="measure the gain better")
-    controller = _best_pi(problem)
+    controller = _best_pi(problem) if kind == "pi" else _best_pid(problem)
     bound, statement = None, "no lower bound asked for"
     if kind == "pid":
-        from autotune.design.pid import best_pid
-
-        controller = best_pid(problem, controller)
         statement = "no lower bound: four gains are searched locally from several starts"
     if specification.criterion == "iae":
         controller = _least_error(problem, controller)
@@ -166,11 +165,31 @@ def _best_pi(problem: Problem) -> PIDController:
     grid = np.array([(k, t, 0.0, 0.0) for k in K for t in Ti])
     norms, slacks = problem.norms_and_slacks(grid, thin=4)
     slack = np.min(slacks, axis=1)
-    feasible = np.min(slack, axis=1) >= -1e-12
-    if not np.any(feasible):
+    least = np.min(slack, axis=1)
+    feasible = least >= -1e-12
+    if np.any(feasible):
+        return polished(problem, separate(grid[feasible][np.argsort(norms[feasible])], 0.8, _STARTS))
+    starts = admissible(problem, separate(grid[np.argsort(-least)], 0.4, _LED))
+    if not len(starts):
         raise _unreachable(problem.specification, slack)
-    starts = grid[feasible][np.argsort(norms[feasible])]
-    return polished(problem, separate(starts, 0.8, _STARTS))
+    return polished(problem, starts)
+
+
+def _best_pid(problem: Problem) -> PIDController:
+    """Return the best PID; a PI is one of them, and where there is none a PID may still be."""
+    from autotune.design.pid import best_pid
+
+    pi, refused = None, None
+    try:
+        pi = _best_pi(problem)
+    except DesignError as error:
+        refused = error
+    largest, omega_ref, _ = gain_range(problem.sampled[0], problem.specification)
+    found = best_pid(problem, pi, largest, omega_ref)
+    if found is not None:
+        return found
+    assert refused is not None
+    raise DesignError(f"{refused.what}, and no PID was found that does", where=refused.where, remedy=refused.remedy)
 
 
 def _unreachable(specification: Specification, slack: FloatArray) -> DesignError:

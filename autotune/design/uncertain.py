@@ -34,12 +34,15 @@ class UncertainPlant:
         The member without a zero that is closest to the points, for the norm.
     processes : ConsistentProcesses
         Where it comes from.
+    members : tuple of SampledPlant
+        Plants beside the set, resonant ones among them, that a controller must suit as well.
     """
 
     omega: FloatArray
     supports: FloatArray
     nominal: SampledPlant
     processes: ConsistentProcesses
+    members: tuple[SampledPlant, ...] = ()
 
     def thinned(self, step: int) -> UncertainPlant:
         """Return the set at every ``step``-th frequency and the last, for a coarse look."""
@@ -49,6 +52,7 @@ class UncertainPlant:
             supports=self.supports[kept],
             nominal=self.nominal.thinned(step),
             processes=self.processes,
+            members=self.members,
         )
 
 

@@ -15,12 +15,14 @@ from autotune.design.checks import Check, checks, on_plants
 from autotune.design.margins import Margins, margins
 from autotune.design.noise import LoopFacts, default_noise_gain
 from autotune.design.nugap import Validation, loop_scaling, validate
-from autotune.design.on_fit import CONTRADICTED, PROBABILITY, design_on_fit
+from autotune.design.on_fit import CONTRADICTED, PROBABILITY, design_on_fit, worst_of
 from autotune.design.on_reduced import design_on_reduced
 from autotune.design.plausibility import implausible
+from autotune.design.process_class import consistent_processes
 from autotune.design.robust import design_on_points
 from autotune.design.specification import UNCERTAIN, Design, Kind, Specification
 from autotune.errors import AutotuneError, DesignError
+from autotune.identification.consistent_structures import consistent_structures
 from autotune.identification.parametric import PlantFit, fit_plant
 from autotune.identification.reduction import ReducedModel, reduce_points
 from autotune.points import FrequencyPoint
@@ -273,6 +275,9 @@ def _first_kept(
 ) -> tuple[Source, Design, tuple[Check, ...]]:
     """Return the first design whose margins are kept on everything measured; refuse where there is none."""
     names = list(bases) if wanted == "auto" else [wanted]
+    if wanted == "auto" and fit.source == "points":
+        # nothing but the points is known: what they refuse, a model through them is no licence for
+        names = ["points"]
     reason: AutotuneError | None = None
     for name in names:
         try:
@@ -283,8 +288,7 @@ def _first_kept(
         looked = _checks(name, points, fit, found.controller, found.specification)
         missed = [check for check in looked if not check.kept]
         if not missed:
-            refused = reason if fit.source == "points" else None
-            return name, found if refused is None else _less_certain(found, name, refused), looked
+            return name, found, looked
         reason = reason or DesignError(
             f"the controller designed on the {name} misses the margins: " + "; ".join(one.sentence for one in missed),
             where="last check",
@@ -294,22 +298,36 @@ def _first_kept(
     raise reason
 
 
-def _less_certain(design: Design, source: Source, refused: AutotuneError) -> Design:
-    """Return a design on less than all plants through the points, with what it leaves open in its certificate."""
-    said = f"{UNCERTAIN} the points allow more plants than the {source} does, and a design on all of them was refused"
-    return replace(design, certificate=f"{design.certificate}; {said} ({refused.what})")
-
-
 def _checks(
     source: Source, points: Sequence[FrequencyPoint], fit: PlantFit, controller: PIDController, asked: Specification
 ) -> tuple[Check, ...]:
     region = PROBABILITY if source == "fitted plant" else None  # the others bound more than the fit's structure
     found = checks(points, fit, controller, asked, probability=region)
+    if source != "points" and fit.source == "points":
+        found = (*found, *_on_structures(points, controller, asked))
     if source == "points" and fit.source == "points" and fit.p_value < CONTRADICTED:
         # two lags and a dead time that the points contradict (as they do where there are nine lags) are no evidence
         # against a controller whose margins every process through the points keeps
         return found[1:]
     return found
+
+
+def _on_structures(
+    points: Sequence[FrequencyPoint], controller: PIDController, asked: Specification
+) -> tuple[Check, ...]:
+    """Return the check on the plants of low order through the points; none where aperiodic ones of any order remain.
+
+    Raises
+    ------
+    DesignError
+        No plant at all passes through the points.
+    """
+    plants = consistent_structures(points).plants
+    if not plants:
+        consistent_processes(points, inverse_response=True)
+        return ()
+    worst = worst_of(plants, controller, asked)
+    return (on_plants(worst, controller, asked, "the plants of low order through the points"),)
 
 
 def looked_at(analysis: Analysis, controller: PIDController) -> tuple[Check, ...]:

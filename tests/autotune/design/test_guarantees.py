@@ -32,15 +32,15 @@ ROOMY = spec1(10.0)
 @pytest.mark.parametrize("kind", CLASSES)
 def test_a_controller_designed_on_points_keeps_its_margins_on_the_plant_they_come_from(kind: str) -> None:
     plant = next(iter(plants(kind, 1)))
-    what, reason, _ = outcome(plant, makers(plant, 1, "pi")["points"])
-    assert what in ("kept", "refused"), reason
+    row = outcome(plant, makers(plant, 1, "pi")["points"], lambda: None)
+    assert row["what"] in ("kept", "refused"), row["reason"]
 
 
 def test_a_structure_that_the_points_contradict_is_no_evidence_against_a_design_on_them() -> None:
     """Nine lags, of which the fit has two and a dead time: the design was refused for missing the fit's margins."""
     plant = next(iter(plants("high order", 1)))
-    what, reason, share = outcome(plant, makers(plant, 0, "pid")["points"])
-    assert (what, share >= 0.0) == ("kept", True), reason
+    row = outcome(plant, makers(plant, 0, "pid")["points"], lambda: None)
+    assert (row["what"], row["shortfall"] >= 0.0) == ("kept", True), row["reason"]
 
 
 @pytest.mark.slow
@@ -52,13 +52,12 @@ def test_no_result_claims_a_margin_that_the_true_plant_misses_by_more_than_a_hun
     assert sum(row.what == "kept" for row in rows) >= len(rows) // 2  # what is refused claims nothing
 
 
-def test_a_design_on_less_than_all_plants_through_the_points_says_so() -> None:
-    """No PI keeps these margins on all of them; one does on the fitted plant's region, which is no more than that."""
+def test_what_not_all_plants_through_the_points_keep_is_refused() -> None:
+    """No PI keeps these margins on all of them; that one does on a fitted plant is no licence."""
     points = measured(FOPDT, None, gain_sd=0.05, phase_sd_deg=4.0)
     asked = DesignSettings(specification="Spec2", noise_gain=5.0)
-    found = analyse(points, asked, compare=False)
-    assert found.source == "fitted plant"
-    assert any("not certain: the points allow more plants" in said and "no PI keeps" in said for said in found.warnings)
+    with pytest.raises(DesignError, match="no PI keeps"):
+        analyse(points, asked, compare=False)
 
 
 @given(ratio=st.one_of(st.floats(0.5, 10.0), st.floats(31.0, 200.0)), lag=st.floats(0.1, 10.0))

@@ -10,6 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from autotune.api.methods import tune
+from autotune.arrays import FloatArray
 from autotune.design.margins import margins
 from autotune.design.process_class import DIRECTIONS, consistent_processes
 from autotune.design.robust import design_on_points
@@ -17,8 +19,9 @@ from autotune.design.specification import Kind, Specification, spec1
 from autotune.design.synthesis import design
 from autotune.errors import DesignError
 from autotune.models import TransferFunction
+from autotune.points import FrequencyPoint
 from tests.autotune.design.plants import BALL, EIGHT_LAGS, REDUCED, measured
-from tests.benchmarks.guarantees import asked_of, plants, relay_points, slow_points
+from tests.benchmarks.guarantees import asked_of, falling, plants, relay_points, slow_points
 
 
 def _lags(constants: list[float], delay_s: float, integrator: bool) -> TransferFunction:
@@ -101,21 +104,48 @@ def test_points_that_contradict_each_other_are_refused_by_name() -> None:
         design_on_points(points, spec1(0.1))
 
 
-def test_a_resonant_plant_is_outside_the_class() -> None:
-    plant = TransferFunction(num=(1.0,), den=(1.0, 0.1, 1.0), delay_s=0.3)
-    omega = np.array([0.5, 0.9, 1.0, 1.1, 1.5])
-    template = measured(BALL, None)
-    points = [
-        replace(
-            point,
-            omega_rad_s=float(w),
-            response=complex(plant.response(np.array([w]))[0]),
-            covariance=((1e-6, 0.0), (0.0, 1e-6)),
-        )
-        for point, w in zip(template, omega, strict=True)
-    ]
-    with pytest.raises(DesignError, match="aperiodic"):
-        design_on_points(points, spec1(0.1))
+def relative_points(plant: TransferFunction, omega: FloatArray, sd: float, seed: int | None) -> list[FrequencyPoint]:
+    """Points with circular regions of relative standard deviation ``sd``, exact without a seed."""
+    rng = None if seed is None else np.random.default_rng(seed)
+    points = []
+    for w, true in zip(omega, plant.response(omega), strict=True):
+        spread = sd * abs(true)
+        error = 0.0 if rng is None else spread * complex(*rng.normal(size=2))
+        covariance = ((spread**2, 0.0), (0.0, spread**2))
+        points.append(FrequencyPoint(omega_rad_s=float(w), response=complex(true + error), covariance=covariance))
+    return points
+
+
+@pytest.mark.parametrize(("damping", "seed", "sign"), [(0.02, None, 1.0), (0.05, 1, -1.0), (0.2, 1, 1.0)])
+def test_printed_margins_hold_on_a_resonant_plant(damping: float, seed: int | None, sign: float) -> None:
+    """An unstable controller of the wrong sign was handed out: a model through the points had stood for them."""
+    plant = TransferFunction(num=(sign,), den=(1.0, 2.0 * damping, 1.0))
+    points = relative_points(plant, falling(plant, -165.0), 0.002, seed)
+    found = tune(points, noise_gain=5.0)
+    true = margins(plant, found.controller)
+    assert found.controller.K * sign > 0.0
+    assert true.stable
+    assert true.modulus >= found.margins.modulus * 0.999 >= 0.49
+    assert true.phase_rad >= found.margins.phase_rad * 0.999
+    assert true.delay_s >= found.margins.delay_s * 0.999
+    assert true.gain >= found.margins.gain * 0.999
+
+
+def test_the_margins_of_an_unstable_plant_are_not_those_of_an_aperiodic_one_through_its_points() -> None:
+    plant = TransferFunction(num=(1.0,), den=(1.0, -1.0), delay_s=0.1)
+    points = relative_points(plant, falling(plant, -165.0), 0.004, 1)
+    found = design_on_points(points, Specification(noise_gain=60.0))
+    true = margins(plant, found.controller)
+    assert true.stable
+    assert true.phase_rad >= math.radians(45.0) * 0.995
+    assert true.gain_reduction <= found.margins.gain_reduction * 1.001
+
+
+def test_plants_that_do_not_agree_are_answered_with_the_frequency_to_measure() -> None:
+    plant = next(iter(plants("resonance behind a lag", 1)))
+    points = relay_points(plant, np.random.default_rng(0))
+    with pytest.raises(DesignError, match=r"measure a point at \S+ rad/s"):
+        design_on_points(points, asked_of(plant))
 
 
 @pytest.mark.parametrize(("number", "kind"), [(7, "pi"), (19, "pi"), (29, "pi"), (29, "pid")])
@@ -174,3 +204,5 @@ def test_wide_regions_are_answered_with_what_can_be_kept() -> None:
 def test_too_few_points_are_refused() -> None:
     with pytest.raises(DesignError, match="at least three"):
         design_on_points(measured(BALL, 0)[:2], spec1(0.1))
+    with pytest.raises(DesignError, match="at least three"):
+        design_on_points([], spec1(0.1))

@@ -1,0 +1,102 @@
+"""Synthesis on plants of low order through measured points, where no aperiodic process passes through them.
+
+A resonance, a lead or an unstable pole makes points that the class of :mod:`autotune.design.process_class` contradicts.
+Then the margins are required of every sampled plant of low order that the points leave possible, in all structures.
+Where these plants do not agree on a controller, the answer is the frequency at which they disagree most.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from autotune.arrays import FloatArray
+from autotune.design.members import members_of
+from autotune.design.on_fit import TOLERANCE, design_on_plants
+from autotune.design.specification import Design, Kind, Specification
+from autotune.errors import DesignError
+from autotune.identification.consistent_structures import ConsistentStructures
+
+#: how far beyond the points a frequency is looked for at which the plants disagree
+_REACH = 4.0
+
+
+def design_on_structures(structures: ConsistentStructures, specification: Specification, kind: Kind = "pi") -> Design:
+    """Return the controller of least norm on the closest plant that all plants of low order through the points keep.
+
+    Parameters
+    ----------
+    structures : ConsistentStructures
+        Plants through the points, at least one.
+    specification : Specification
+        Constraints (18).
+    kind : {"pi", "pid"}
+        Structure of the controller.
+
+    Returns
+    -------
+    Design
+        Its margins are those that every one of the plants has at least; its norm and crossover are the closest one's.
+
+    Raises
+    ------
+    DesignError
+        The plants do not agree on a controller; names the frequency to measure.
+
+    Notes
+    -----
+    The guarantee is that of the structures, sampled: see :mod:`autotune.identification.consistent_structures`.
+    """
+    assert structures.nominal is not None
+    try:
+        found, _ = design_on_plants(structures.nominal, structures.plants, specification, kind)
+    except DesignError as error:
+        raise DesignError(
+            f"no {kind.upper()} was found that all plants through the points keep ({error.what})",
+            where="points",
+            remedy=f"{error.remedy}; or {where_to_measure(structures)}",
+        ) from None
+    members = members_of(structures.plants, specification)
+    require_kept(members.slacks(found.controller, specification), structures, specification)
+    return replace(
+        found,
+        margins=members.least(found.margins, found.controller),
+        certificate=(
+            "margins hold for every sampled plant of low order (lags, a resonance, a lead or a zero in the right half "
+            "plane, one unstable pole, dead time) through the joint region of the points, none of which is an "
+            "aperiodic process; no lower bound on the norm"
+        ),
+    )
+
+
+def require_kept(slack: FloatArray, structures: ConsistentStructures, specification: Specification) -> None:
+    """Refuse a controller that plants through the points do not keep, given their (S, 3) slacks.
+
+    Raises
+    ------
+    DesignError
+        A margin is missed; names the frequency to measure.
+    """
+    if np.min(slack) >= -2.0 * TOLERANCE:
+        return
+    raise DesignError(
+        f"no controller was found that keeps M_m {specification.modulus_margin:g} and "
+        f"{np.degrees(specification.phase_margin_rad):g} deg on all plants of low order through the points",
+        where="points",
+        remedy=f"relax the margins, or {where_to_measure(structures)}",
+    )
+
+
+def where_to_measure(structures: ConsistentStructures) -> str:
+    """Return in words at which frequency a further point would tell the plants through the points apart."""
+    first, last = structures.omega_points[0], structures.omega_points[-1]
+    omega = np.geomspace(first / _REACH, last * _REACH, 121)
+    response = np.array([plant.response(omega) for plant in structures.plants])
+    spread = np.ptp(np.log(np.maximum(np.abs(response), 1e-300)), axis=0)
+    turn = np.ptp(np.unwrap(np.angle(response / response[:1]), axis=0), axis=0)
+    most = int(np.argmax(spread + turn))
+    return (
+        f"measure a point at {omega[most]:.3g} rad/s, where the plants that pass through the points differ by a factor "
+        f"of {np.exp(spread[most]):.2g} in gain and {np.degrees(turn[most]):.0f} deg in phase"
+    )
