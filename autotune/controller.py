@@ -38,6 +38,11 @@ class PIDController:
         Derivative time and time constant of the measurement filter [s].
     setpoint_weight : float
         Share of the set-point in the proportional part, 0 to 1; it leaves feedback and margins alone.
+
+    Raises
+    ------
+    InputError
+        A number that is not finite, or a time that is negative or, of T_I, 0.
     """
 
     K: float
@@ -45,6 +50,16 @@ class PIDController:
     Td_s: float = 0.0
     Tf_s: float = 0.0
     setpoint_weight: float = 1.0
+
+    def __post_init__(self) -> None:
+        if not math.isfinite(self.K):
+            raise InputError(f"K = {self.K:g}", where="controller", remedy="it must be a finite number")
+        if not self.Ti_s > 0.0:
+            remedy = "a positive time; infinite for no integral action"
+            raise InputError(f"Ti_s = {self.Ti_s:g}", where="controller", remedy=remedy)
+        for name, value in (("Td_s", self.Td_s), ("Tf_s", self.Tf_s), ("setpoint_weight", self.setpoint_weight)):
+            if not 0.0 <= value < math.inf:
+                raise InputError(f"{name} = {value:g}", where="controller", remedy="it must be finite and not negative")
 
     @property
     def kind(self) -> Literal["pi", "pid"]:

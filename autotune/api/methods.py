@@ -4,25 +4,30 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 
+from autotune.api.arguments import number, one_of, settings_of
 from autotune.api.plants import as_controller, as_plant, as_reduced
 from autotune.api.points import as_points
 from autotune.api.recordings import Source, read
 from autotune.controller import Controller
+from autotune.errors import InputError
 
 if TYPE_CHECKING:
     from autotune.design.margins import Margins
     from autotune.design.nugap import Validation
     from autotune.design.reference import Trajectory
-    from autotune.design.specification import Design
+    from autotune.design.specification import Design, Specification
     from autotune.identification.closed_loop.identify import ClosedLoopIdentification
     from autotune.identification.closed_loop.state_space import InnovationModel
     from autotune.identification.delay.model import DelayModel
     from autotune.identification.delay.two_delays import TwoDelays
     from autotune.identification.reduction import ReducedModel
+
+KINDS = ("pi", "pid")
+DELAY_METHODS = ("output-error", "algebraic", "online")
 
 
 def reduce(source: Any, **settings: Any) -> ReducedModel:
@@ -47,10 +52,19 @@ def reduce(source: Any, **settings: Any) -> ReducedModel:
     >>> round(model.G_r, 1), model.integrating
     (-65.5, True)
     """
-    from autotune.identification.reduction import reduce_points, reduce_transfer_function
+    from autotune.identification.reduction import Conditions, Kind, reduce_points, reduce_transfer_function
 
     points = as_points(source)
-    return reduce_transfer_function(as_plant(source)) if points is None else reduce_points(points, **settings)
+    if points is None:
+        if settings:
+            settings_of(reduce_transfer_function, settings, where="reduce, of a known plant")
+        return reduce_transfer_function(as_plant(source))
+    asked = settings_of(reduce_points, settings, where="reduce")
+    if asked.get("kind") is not None:
+        asked["kind"] = one_of(asked["kind"], get_args(Kind), name="kind", where="reduce")
+    if "conditions" in asked:
+        asked["conditions"] = one_of(asked["conditions"], get_args(Conditions), name="conditions", where="reduce")
+    return reduce_points(points, **asked)
 
 
 def tune(
@@ -100,33 +114,44 @@ def tune(
     >>> found.margins.modulus >= 0.499
     True
     """
-    from autotune.design.specification import Specification
-
-    wanted = Specification(
-        modulus_margin=modulus_margin,
-        phase_margin_rad=math.radians(phase_margin_deg),
-        noise_gain=noise_gain,
-        **settings,
-    )
+    structure = one_of(kind, KINDS, name="kind", where="tune")
+    wanted = _specification(modulus_margin, phase_margin_deg, noise_gain, settings)
     points = as_points(plant)
     if points is not None:
         from autotune.identification.parametric import fit_plant
         from autotune.pipeline.analysis import of_use, on_measured
 
         measured = of_use(points)
-        return on_measured(measured, fit_plant(measured), wanted, _kind(kind))[1]
+        return on_measured(measured, fit_plant(measured), wanted, structure)[1]
     reduced = as_reduced(plant)
     if reduced is not None:
         from autotune.pipeline.analysis import on_reduced_model
 
-        return on_reduced_model(reduced, wanted, _kind(kind), certificate=certificate)[0]
+        return on_reduced_model(reduced, wanted, structure, certificate=certificate)[0]
     from autotune.design.synthesis import design as on_model
 
-    return on_model(as_plant(plant), wanted, _kind(kind), certificate=certificate)
+    return on_model(as_plant(plant), wanted, structure, certificate=certificate)
 
 
-def _kind(kind: str) -> Any:
-    return kind.lower()
+def _specification(
+    modulus_margin: float, phase_margin_deg: float, noise_gain: float, settings: dict[str, Any]
+) -> Specification:
+    from autotune.design.specification import Specification
+
+    asked = settings_of(Specification, settings, where="tune")
+    for name in ("delay_margin_s", "setpoint_command", "noise_frequency_rad_s"):
+        value = asked.get(name)
+        if value is not None and not (name == "setpoint_command" and value == math.inf):
+            asked[name] = number(value, name=name, where="tune")
+    for name, words in (("criterion", ("h2", "iae")), ("noise", ("true", "bound"))):
+        if name in asked:
+            asked[name] = one_of(asked[name], words, name=name, where="tune")
+    return Specification(
+        modulus_margin=number(modulus_margin, name="modulus_margin", where="tune"),
+        phase_margin_rad=math.radians(number(phase_margin_deg, name="phase_margin_deg", where="tune")),
+        noise_gain=number(noise_gain, name="noise_gain", where="tune"),
+        **asked,
+    )
 
 
 def margins(plant: Any, controller: Any) -> Margins:
@@ -148,7 +173,12 @@ def margins(plant: Any, controller: Any) -> Margins:
     """
     from autotune.design.margins import margins as of_loop
 
-    return of_loop(as_plant(plant), as_controller(controller))
+    H, C = as_plant(plant), as_controller(controller)
+    with np.errstate(all="ignore"):
+        found = of_loop(H, C)
+    if math.isnan(found.modulus + found.phase_rad):
+        raise InputError("the loop's response leaves the range of numbers", where="margins", remedy="check its units")
+    return found
 
 
 def validate(plant: Any, model: Any, controller: Any = None, *, scaling: float | None = None) -> Validation:
@@ -177,6 +207,8 @@ def validate(plant: Any, model: Any, controller: Any = None, *, scaling: float |
 
     reduced = as_plant(model)
     law: Controller = tune(reduced).controller if controller is None else as_controller(controller)
+    if scaling is not None:
+        scaling = number(scaling, name="scaling", where="validate", above=0.0)
     k = loop_scaling(reduced, law) if scaling is None else scaling
     return compare(as_plant(plant), reduced, law, scaling=k)
 
@@ -254,21 +286,33 @@ def delay(
     >>> abs(model.delay_s - 0.5) < 0.05
     True
     """
+    way = one_of(method, DELAY_METHODS, name="method", where="delay")
+    order = int(number(order, name="order", where="delay", above=0, whole=True))
+    if interval_s is not None:
+        interval_s = number(interval_s, name="interval_s", where="delay", above=0.0)
+    if delays not in (1, 2) or isinstance(delays, bool):
+        raise InputError(f"delays = {delays!r}", where="delay", remedy="1, or 2 for x'' + a x(t - h_1) = b u(t - h_2)")
     record = read(recording)
     if delays == 2:
         from autotune.identification.delay.two_delays import intervals_of, two_delays
 
-        return two_delays(record, intervals_of(record, interval_s), **settings)
-    if method == "output-error":
+        asked = settings_of(two_delays, settings, where="delay, delays = 2")
+        return two_delays(record, intervals_of(record, interval_s), **asked)
+    if way == "output-error":
         from autotune.identification.delay.identify import identify_delay
 
-        return identify_delay(record, order, **settings)
+        if interval_s is not None:
+            raise InputError("interval_s is of the modulating functions", where="delay", remedy='method="algebraic"')
+        return identify_delay(record, order, **settings_of(identify_delay, settings, where="delay"))
     from autotune.identification.delay.methods import algebraic_delay, online_delay
 
-    if method == "online" and "start_s" in settings:
-        return online_delay(record, order, **settings)
-    found = algebraic_delay(record, order, interval_s=interval_s)
-    return found if method == "algebraic" else online_delay(record, order, start_s=found.delay_s, **settings)
+    if way == "algebraic":
+        asked = settings_of(algebraic_delay, {"interval_s": interval_s, **settings}, where="delay, algebraic")
+        return algebraic_delay(record, order, **asked)
+    asked = settings_of(online_delay, settings, where="delay, online")
+    if "start_s" not in asked:
+        asked["start_s"] = algebraic_delay(record, order, interval_s=interval_s).delay_s
+    return online_delay(record, order, **asked)
 
 
 def closed_loop(
@@ -305,21 +349,25 @@ def closed_loop(
     >>> len(found.poles)
     5
     """
+    from autotune.identification.closed_loop.methods import METHODS
+
+    way = one_of(method, METHODS, name="method", where="closed_loop")
+    if order is not None:
+        order = int(number(order, name="order", where="closed_loop", above=0, whole=True))
     record = read(recording)
     law = None if controller is None else as_controller(controller)
-    if method == "prediction-error" and not any(more):
+    if way == "prediction-error" and not any(more):
         from autotune.identification.closed_loop.identify import identify_closed_loop
 
-        return identify_closed_loop(record, order=order, controller=law, **settings)
-    from autotune.identification.closed_loop.methods import METHODS
+        asked = settings_of(identify_closed_loop, settings, where="closed_loop")
+        return identify_closed_loop(record, order=order, controller=law, **asked)
     from autotune.identification.closed_loop.signals import model_of_recording
 
-    named = next((known for known in METHODS if known == method), None)
-    if named is None:
-        from autotune.errors import InputError
-
-        raise InputError(f"method {method!r}", where="closed_loop", remedy=f"one of {', '.join(METHODS)}")
-    return model_of_recording(record, method=named, order=order, controller=law, more=more)
+    if settings:
+        raise InputError(
+            f"no setting {next(iter(settings))!r}", where=f"closed_loop, {way}", remedy="it has order, controller, more"
+        )
+    return model_of_recording(record, method=way, order=order, controller=law, more=more)
 
 
 def simulate(model: Any, recording: Source, *, horizon_s: float | None = None) -> Any:
@@ -345,6 +393,8 @@ def simulate(model: Any, recording: Source, *, horizon_s: float | None = None) -
     """
     from autotune.api.diagnosing import simulated
 
+    if horizon_s is not None:
+        horizon_s = number(horizon_s, name="horizon_s", where="simulate", above=0.0)
     return np.asarray(simulated(model, read(recording), horizon_s))
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from autotune.api.python_control import from_control
 from autotune.controller import Controller, DiscreteController, PIDController, read_controller
 from autotune.errors import InputError
-from autotune.models import Model, TransferFunction, read_model
+from autotune.models import LARGEST, SMALLEST, Model, TransferFunction, read_model
 
 if TYPE_CHECKING:
     from autotune.identification.reduction import ReducedModel
@@ -23,9 +23,9 @@ def as_plant(source: Any) -> TransferFunction:
         Nothing of these, or a system in discrete time.
     """
     if isinstance(source, TransferFunction):
-        return source
+        return _checked(source)
     if isinstance(source, str | os.PathLike):
-        return read_model(source).transfer_function()
+        return _checked(read_model(source).transfer_function())
     if isinstance(source, Model) or hasattr(source, "transfer_function"):
         return _checked(source.transfer_function())
     if hasattr(source, "dt"):  # python-control's mark of a system
@@ -40,6 +40,19 @@ def as_plant(source: Any) -> TransferFunction:
 def _checked(plant: Any) -> TransferFunction:
     if not isinstance(plant, TransferFunction):
         raise InputError("a system in discrete time", where="plant", remedy="give the plant in continuous time")
+    if not plant.is_proper:
+        raise InputError(
+            f"a numerator of degree {len(plant.num) - 1} over a denominator of degree {len(plant.den) - 1}",
+            where="plant",
+            remedy="no plant differentiates: add the lag that is missing",
+        )
+    sizes = [abs(value) for value in (*plant.num, *plant.den, plant.delay_s) if value != 0.0]
+    if sizes and not (min(sizes) >= SMALLEST and max(sizes) <= LARGEST):
+        raise InputError(
+            f"numbers from {min(sizes):.3g} to {max(sizes):.3g}",
+            where="plant",
+            remedy=f"write it in other units: coefficients lie between {SMALLEST:g} and {LARGEST:g}",
+        )
     return plant
 
 

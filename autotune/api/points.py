@@ -77,5 +77,10 @@ def as_points(source: Any) -> Points | None:
         return source
     if isinstance(source, list | tuple) and source and isinstance(source[0], FrequencyPoint):
         return Points(source)
+    if hasattr(source, "frdata"):  # python-control's mark of a frequency response
+        from autotune.api.python_control import from_control
+
+        converted = from_control(source)
+        return converted if isinstance(converted, Points) else None
     measured = getattr(source, "design_points", None)
     return Points(measured) if measured else None

@@ -65,7 +65,7 @@ def _(result: ReducedModel) -> tuple[str, Row, list[Row]]:
     values = [("G_r", result.G_r, result.sd[0]), ("w_d [rad/s]", result.omega_d_rad_s, result.sd[2])]
     if result.omega_0r_rad_s is not None:
         values.insert(1, ("w_0 [rad/s]", result.omega_0r_rad_s, result.sd[1]))
-    rows = [(name, _number(value), f"{100 * sd:.2g} %" if sd else "exact") for name, value, sd in values]
+    rows = [(name, _number(value), _share(sd) if sd else Cell("exact", 0.0)) for name, value, sd in values]
     return f"Reduced model {form}", ("", "value", "sd"), [*rows, *((text,) for text in result.warnings)]
 
 
@@ -211,12 +211,35 @@ def _cells(row: Row, width: int) -> list[str]:
     return [f'<td style="text-align: left">{first}</td>', *(f"<td>{cell}</td>" for cell in others)]
 
 
-def _pole(pole: complex) -> str:
-    return f"{pole.real:.5g} {pole.imag:+.5g}i" if pole.imag else f"{pole.real:.5g}"
+class Cell(str):
+    """A number as a table shows it, which remembers the whole of it.
+
+    Attributes
+    ----------
+    value : float or complex
+        All of its digits.
+    """
+
+    value: float | complex
+
+    def __new__(cls, text: str, value: float | complex) -> Cell:
+        """Return the text with the number that it stands for."""
+        made = super().__new__(cls, text)
+        made.value = value
+        return made
 
 
-def _number(value: Any) -> str:
-    return f"{float(value):.5g}"
+def _pole(pole: complex) -> Cell:
+    return Cell(f"{pole.real:.5g} {pole.imag:+.5g}i" if pole.imag else f"{pole.real:.5g}", complex(pole))
+
+
+def _number(value: Any) -> Cell:
+    return Cell(f"{float(value):.5g}", float(value))
+
+
+def _share(value: float) -> Cell:
+    """Return a relative standard deviation, shown in per cent."""
+    return Cell(f"{100 * value:.2g} %", float(value))
 
 
 def to_pandas(result: Any) -> Any:
@@ -226,7 +249,8 @@ def to_pandas(result: Any) -> Any:
     ----------
     result : object
         A recording has its time [s] as index and a column each; points have their gain, phase and standard deviations;
-        a transition its time, y and u; another result the rows of its table.
+        a transition its time, y and u; another result the rows of its table, numbers with all of their digits and
+        relative standard deviations as shares. Remarks on all of a table are in ``attrs["remarks"]``.
 
     Returns
     -------
@@ -270,8 +294,12 @@ def to_pandas(result: Any) -> Any:
             index=pd.Index([point.omega_rad_s for point in points], name="omega_rad_s"),
         )
     _, header, rows = rows_of(result)
-    padded = [(*row, *[""] * (len(header) - len(row))) for row in rows]
-    return pd.DataFrame(padded, columns=[name or str(i) for i, name in enumerate(header)])
+    wide = max(len(header), 2)
+    numbers = [[getattr(cell, "value", cell if cell else None) for cell in row] for row in rows if len(row) > 1]
+    padded = [[*row, *[None] * (wide - len(row))] for row in numbers]
+    frame = pd.DataFrame(padded, columns=[name or str(i) for i, name in enumerate(header)])
+    frame.attrs["remarks"] = [str(row[0]) for row in rows if len(row) == 1]
+    return frame
 
 
 for _shown in SHOWN:

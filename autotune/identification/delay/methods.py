@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from autotune.arrays import FloatArray
-from autotune.errors import IdentificationError
+from autotune.errors import IdentificationError, InputError
 from autotune.identification.delay.data import DelayData, prepare
 from autotune.identification.delay.model import DelayModel
 from autotune.identification.delay.modulated_delay import ModulatedDelay, modulated_delay
@@ -17,6 +17,8 @@ from autotune.recording import Recording
 #: Intervals in a record where no length is given, and how many of them overlap at any time.
 _INTERVALS, _OVERLAP = 7.0, 3
 _JACKKNIFE = 12
+#: Rows that an interval has for each derivative, and most intervals, which are then spaced out over the record.
+_ROWS_PER_DERIVATIVE, _MOST_INTERVALS = 8, 2000
 #: Kernels forget this many times in a record, where no rate is given; the first half of it is run in.
 _FORGETS = 100.0
 
@@ -46,6 +48,8 @@ def algebraic_delay(
 
     Raises
     ------
+    InputError
+        Intervals of too few rows, or as long as the record.
     IdentificationError
         No fixed point of the iteration is the delay.
 
@@ -58,7 +62,8 @@ def algebraic_delay(
     centred = _centred(recording, data)
     span = float(centred.t[-1] - centred.t[0])
     length = span / _INTERVALS if interval_s is None else interval_s
-    count = max(2, int((span - length) / length * _OVERLAP) + 1)
+    _require_length(length, order, centred)
+    count = min(max(2, int((span - length) / length * _OVERLAP) + 1), _MOST_INTERVALS)
     begins = centred.t[0] + (span - length) * np.arange(count) / (count - 1)
     intervals = [(float(at), float(at + length)) for at in begins]
     found = _converged(
@@ -81,6 +86,18 @@ def algebraic_delay(
     # neighbouring stretches share intervals: the overlap counts as so many fewer independent ones
     covariance = (len(spread) - 1) / len(spread) * off.T @ off * min(_OVERLAP, 2)
     return _model(data, order, values, covariance)
+
+
+def _require_length(length: float, order: int, recording: Recording) -> None:
+    """Refuse intervals that hold too few rows for the derivatives of the modulating functions, or the whole record."""
+    span = float(recording.t[-1] - recording.t[0])
+    least = _ROWS_PER_DERIVATIVE * (order + 1) * span / (len(recording.t) - 1)
+    if not least <= length < span:
+        raise InputError(
+            f"intervals of {length:.4g} s",
+            where="--interval",
+            remedy=f"between {least:.3g} s ({_ROWS_PER_DERIVATIVE * (order + 1)} rows) and the record's {span:.4g} s",
+        )
 
 
 def _converged(found: ModulatedDelay, recording: Recording) -> ModulatedDelay:

@@ -31,6 +31,8 @@ _SAMPLES = 100
 _HARMONICS = 2
 #: Intervals in a record and their overlap, where none are given.
 _LENGTHS, _OVERLAP = 8.0, 5
+#: rows of an interval at least, and intervals at most, which are then spaced out over the record
+_ROWS, _MOST = 16, 2000
 #: Starting delays, in intervals, and how far below zero a fixed point may lie because of noise.
 _STARTS = (0.0, 0.2, 0.4, 0.6)
 _EARLY = 0.02
@@ -102,14 +104,16 @@ def intervals_of(recording: Recording, length_s: float | None = None) -> list[In
     """
     begin, end = float(recording.t[0]), float(recording.t[-1])
     length = (end - begin) / _LENGTHS if length_s is None else length_s
-    if not 0.0 < length < 0.4 * (end - begin):
+    least = _ROWS * (end - begin) / max(len(recording.t) - 1, 1)
+    if not least <= length < 0.4 * (end - begin):
         raise InputError(
             f"intervals of {length:g} s in a record of {end - begin:.4g} s",
             where=recording.name,
-            remedy="give a positive length of at most two fifths of the record",
+            remedy=f"give a length of at least {least:.3g} s ({_ROWS} rows) and at most two fifths of the record",
         )
     count = int((end - begin - 2.5 * length) / length * _OVERLAP) + 1
-    return [(at, at + length) for at in np.linspace(begin + length, end - 1.5 * length, count).tolist()]
+    starts = np.linspace(begin + length, end - 1.5 * length, min(count, _MOST))
+    return [(at, at + length) for at in starts.tolist()]
 
 
 def two_delays(
