@@ -70,7 +70,7 @@ class OperatingPointSettings(Section):
         Field(
             gt=0,
             le=LARGEST,
-            description="change of the command on a ramp [u unit/s]; default 2.4 u_uncertainty in 0.08 limits.time_s",
+            description="change of the command on a ramp [u unit/s]; default u_uncertainty in 600 samples of >= 20 ms",
         ),
     ] = None
 

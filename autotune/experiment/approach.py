@@ -30,8 +30,8 @@ LOOK_BACK = 8
 FIRST_SMOOTHING = 5
 #: how far below the lower end of the hover's bracket the ramp starts, and above the upper it ends, in u_uncertainty
 BRACKET = 1.2
-#: part of limits.time_s that a ramp through the whole bracket takes: that says how slow the plant is, a sample time not
-RAMP_SHARE = 0.08
+#: samples in which a ramp goes through one u_uncertainty, and the sample time [s] below which a host ramps no faster
+RAMP_SAMPLES, RAMP_SAMPLE_S = 600.0, 0.02
 #: least share of readings in preflight that differ from the one before, for a sensor of which that can be expected
 RESTLESS = 0.05
 SMALL = 1e-9
@@ -213,7 +213,7 @@ def _ramp(
 ) -> Known:
     """Ramp the command through the bracket until y leaves its rest."""
     limits = loop.envelope.settings
-    usual = 2.0 * BRACKET * point.u_uncertainty / (RAMP_SHARE * limits.time_s)
+    usual = point.u_uncertainty / (RAMP_SAMPLES * max(loop.sample_time_s, RAMP_SAMPLE_S))
     rate = point.ramp_rate if point.ramp_rate is not None else usual
     low, high = max(bracket[0], limits.u_min), min(bracket[1], limits.u_max)
     while abs(loop.tick.u - low) > rate * loop.sample_time_s + loop.envelope.u_step:

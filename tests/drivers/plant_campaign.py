@@ -155,7 +155,8 @@ PLANT_FAULTS = (
     PlantFault(name="rig process gone", ends=_RESET, strike=lambda plc: plc.gone()),
     PlantFault(
         name="rig process restarts",
-        ends=("took the actuator back", "echoes heartbeat", *_RESET),
+        # once it is back its safe output is seen, and nobody need go to the rig
+        ends=("took the actuator back", "echoes heartbeat", "connection was lost", "no connection"),
         strike=_meanwhile(PlcProcess.restart),
     ),
     PlantFault(

@@ -303,7 +303,7 @@ def test_all_cycles_are_estimated_together_once_the_rig_is_safe(
 
 
 @pytest.mark.parametrize("sample_time_s", [0.005, 0.02])
-def test_the_ramp_is_per_second_whatever_the_sample_time(tmp_path: Path, sample_time_s: float) -> None:
+def test_a_faster_host_ramps_no_faster(tmp_path: Path, sample_time_s: float) -> None:
     config = ball_config()
     config = config.model_copy(
         update={"signals": config.signals.model_copy(update={"sample_time_s": sample_time_s, "u_step": 0.0})}
@@ -315,5 +315,4 @@ def test_the_ramp_is_per_second_whatever_the_sample_time(tmp_path: Path, sample_
     begun = int(np.argmax(u > 4.3))
     climbing = slice(begun, begun + round(0.5 / sample_time_s))  # half a second of the ramp, before the ball moves
     rate = float(np.polyfit(t[climbing], u[climbing], 1)[0])
-    limits, point = config.limits, config.operating_point
-    assert rate == pytest.approx(2.4 * point.u_uncertainty / (0.08 * limits.time_s), rel=0.05)
+    assert rate == pytest.approx(config.operating_point.u_uncertainty / 12.0, rel=0.05)
