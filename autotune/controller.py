@@ -42,7 +42,7 @@ class PIDController:
     Raises
     ------
     InputError
-        A number that is not finite, or a time that is negative or, of T_I, 0.
+        A number that is not finite, or a time that is negative or, of T_I beside a gain, 0.
     """
 
     K: float
@@ -54,7 +54,7 @@ class PIDController:
     def __post_init__(self) -> None:
         if not math.isfinite(self.K):
             raise InputError(f"K = {self.K:g}", where="controller", remedy="it must be a finite number")
-        if not self.Ti_s > 0.0:
+        if not self.Ti_s > 0.0 and self.K != 0.0:  # a device as delivered may hold zeros: there is no law in it
             remedy = "a positive time; infinite for no integral action"
             raise InputError(f"Ti_s = {self.Ti_s:g}", where="controller", remedy=remedy)
         for name, value in (("Td_s", self.Td_s), ("Tf_s", self.Tf_s), ("setpoint_weight", self.setpoint_weight)):
