@@ -1,35 +1,25 @@
-"""The diagnosis from recordings and a nominal model: samples, search, what is beside the chain, tests, verdict."""
+"""The diagnosis from recordings and a nominal model: what the whole shows, what its parts agree on, what is said."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from autotune.controller import Controller
-from autotune.diagnosis.evidence.adequacy import residual_tests
-from autotune.diagnosis.evidence.beside_chain import beside_chain
+from autotune.diagnosis.agreement import Part, Said, agreement, parts_of
 from autotune.diagnosis.evidence.description import describe
-from autotune.diagnosis.evidence.held_out import held_out
-from autotune.diagnosis.evidence.late_rows import JITTER, late_rows
-from autotune.diagnosis.evidence.operating_point import offset_of, unmoved
-from autotune.diagnosis.evidence.own_noise import OwnNoise, own_noise
-from autotune.diagnosis.evidence.sample_gain import is_material, supported
-from autotune.diagnosis.evidence.samples import SampleEffect, inspect, outliers_in, spared
-from autotune.diagnosis.evidence.stamps import evened
 from autotune.diagnosis.extended import extended_model
-from autotune.diagnosis.findings import found_effects, places_of, sentences_of
-from autotune.diagnosis.fitting.fit import RUNAWAY
-from autotune.diagnosis.fitting.retuning import prepare
-from autotune.diagnosis.result import Diagnosis
-from autotune.diagnosis.selection.rig_search import search_rig
-from autotune.diagnosis.selection.search import search
-from autotune.diagnosis.selection.searched import Search
+from autotune.diagnosis.findings import OFFSET, found_effects, places_of, said_by, sentences_of
+from autotune.diagnosis.gathering import evidence_of, keeping
+from autotune.diagnosis.result import Diagnosis, FoundEffect, Verdict
+from autotune.diagnosis.safe_extension import safe_extension
+from autotune.diagnosis.simulation.chain import build_chain
+from autotune.diagnosis.simulation.forecast import forecast
 from autotune.diagnosis.thresholds import IN_USE, Thresholds
 from autotune.diagnosis.verdict import Evidence, judged
-from autotune.effects import kind_of, require_known
+from autotune.effects import KINDS, kind_of, require_known
 from autotune.errors import InputError
 from autotune.models import Model
 from autotune.progress import Progress, quiet
@@ -37,6 +27,8 @@ from autotune.recording import Recording
 
 #: Rows that a diagnosis needs.
 LEAST_ROWS = 100
+#: Share of the work that the whole recordings take; parts of them are searched among fewer effects.
+WHOLE = 0.6
 
 
 def diagnose(
@@ -78,11 +70,22 @@ def diagnose(
     """
     require_known(model.effects, model.name)
     _require_rows(recordings)
-    without = [*without, *(effect.name for effect in model.effects), *unmoved(recordings)]
-    evidence = _gathered(model, recordings, controller, without, progress, thresholds)
-    evidence = _of_rig(evidence, model, without, progress)
+    without = [*without, *(effect.name for effect in model.effects)]
+
+    def told(what: str, done: float) -> None:
+        progress(what, WHOLE * done)
+
+    evidence = evidence_of(model, recordings, controller, without, told, thresholds)
+    whole = said_by(evidence)
+    begins = {e.name: _begins(e, recordings) for e in found_effects(evidence, judged(evidence))}
+    parts = parts_of(recordings, LEAST_ROWS) if whole.named else ()
+    said = _on_parts(evidence, model, controller, without, progress, thresholds)
+    agreed = agreement(whole, begins, parts, said) if whole.named else {}
+    evidence = keeping(evidence, agreed)
     found, verdict = evidence.search, judged(evidence)
-    effects, plain = found_effects(evidence, verdict), replace(found.data, thresholds=thresholds)
+    named = [e for e in found_effects(evidence, verdict) if e.name in agreed]
+    effects = tuple(replace(e, probability=agreed[e.name]) for e in named)
+    plain = replace(found.data, thresholds=thresholds)
     description = describe(found.retuned.fit, plain) if verdict == "unexplained" else None
     places = places_of(evidence, effects, description)
     sentences = sentences_of(verdict, effects, evidence, places)
@@ -93,7 +96,7 @@ def diagnose(
         places=places,
         fit=evidence.quality,
         next_experiment=None,
-        extended_model=extended_model(evidence, verdict, model),
+        extended_model=_handed_out(evidence, verdict, model),
         sentences=sentences,
         residual=evidence.residual,
         description=description,
@@ -101,151 +104,41 @@ def diagnose(
     )
 
 
-def _gathered(
+def _begins(effect: FoundEffect, recordings: Sequence[Recording]) -> list[tuple[int, float]]:
+    """Return recordings and times [s] at which an effect begins to act, if it does not from the first row on."""
+    return [(i, start) for i, start, _ in effect.windows if start > float(recordings[i].t[0])]
+
+
+def _handed_out(evidence: Evidence, verdict: Verdict, nominal: Model) -> Model:
+    """Return the model to go on with: what was found, where that is no danger; else retuned numbers, or the nominal."""
+    extended, fitted = extended_model(evidence, verdict, nominal), evidence.search.retuned.fit.model
+    if extended is nominal:
+        return nominal
+    # a model without what happened at a time of these recordings cannot follow them to their end
+    lasting = not any(kind_of(name).at_a_time for name in evidence.search.chosen.names)
+    comparable = lasting and bool(np.all(np.linalg.eigvals(build_chain(nominal).A).real < 0.0))
+    recordings = evidence.search.data.driving
+    return safe_extension((extended, fitted), nominal, recordings, forecast, comparable=comparable)
+
+
+def _on_parts(
+    evidence: Evidence,
     model: Model,
-    recordings: Sequence[Recording],
     controller: Controller | None,
     without: Sequence[str],
     progress: Progress,
     thresholds: Thresholds,
-) -> Evidence:
-    """Return all that the verdict rests on: samples, search, what is beside the chain, the residual, held-out rows."""
-    progress("looking at the samples", 0.0)
-    if any(kind_of(effect.name).late_stamps for effect in model.effects):
-        recordings, late = [r.at_even_times() for r in recordings], None
-    else:
-        recordings, late = evened(model, recordings, thresholds)
-    own = {effect.name for effect in model.effects}
-    seen = _seen(model, recordings, [name for name in without if name not in own], thresholds)
-    found, seen = _searched(model, recordings, seen, without, progress, thresholds)
-    seen = [s for s in seen if s.name not in own]
-    beside = beside_chain(found.retuned.fit, found.data, found.gained, recordings, controller, seen)
-    others = [s for s in beside if s.name not in without]
-    others = others if late is None else [late, *(s for s in others if s.name != late.name)]
-    # where single rows are disturbed, what is left beside them must explain more to be named; beside jitter nothing is
-    if any(kind_of(s.name).sought == "residual" for s in others if s is not late):
-        found = found.asking(math.inf)
-    elif seen:
-        found = found.asking(thresholds.samples_sure)
-    progress("checking on held-out rows", 0.9)
-    chosen = found.chosen.fit
-    samples = (*supported(seen, chosen, found.data), *others)
-    uneven = any(kind_of(s.name).uneven for s in samples)
-    return Evidence(
-        search=found,
-        samples=samples,
-        residual=residual_tests(chosen, found.data, found.gained, uneven=uneven),
-        quality=held_out(found.retuned.fit, chosen, found.data),
-        offset=None if unmoved(recordings) else offset_of(chosen, thresholds.offset_sigmas),
-        evened=late is not None,
-    )
+) -> Callable[[Part], Said]:
+    """Return what a part of the recordings says of what the whole made a candidate."""
+    search = evidence.search
+    known = {name for h in search.all for name in h.names} | {s.name for s in evidence.samples} | {OFFSET}
+    others = [*without, *(name for name in KINDS if name not in known)]
 
+    def said(part: Part) -> Said:
+        progress("once more on a part of the rows", WHOLE)
+        return said_by(evidence_of(model, part.recordings, controller, others, quiet, thresholds))
 
-def _seen(
-    model: Model, recordings: Sequence[Recording], without: Sequence[str], limits: Thresholds
-) -> list[SampleEffect]:
-    """Return what the samples show where the retuned model speaks for it clearly.
-
-    Rows at rest and turning points at one level are readings like any other: what spoils none leaves them to the fits.
-    """
-    good, seen = inspect(recordings, without, limits)
-    if not any(s.rows for s in seen):
-        return seen
-    try:
-        data, retuned = prepare(model, recordings, good, 1, limits)
-    except RUNAWAY:
-        return seen
-    return [s for s in supported(seen, retuned, data) if s.speaks > limits.samples_clear]
-
-
-def _searched(
-    model: Model,
-    recordings: Sequence[Recording],
-    seen: list[SampleEffect],
-    without: Sequence[str],
-    progress: Progress,
-    limits: Thresholds,
-) -> tuple[Search, list[SampleEffect]]:
-    """Return the search, and what the samples show; searched again without spikes that its residual alone shows."""
-
-    def searched() -> Search:
-        names = [*without, *(effect.name for effect in seen)]
-        return search(model, recordings, spared(recordings, seen), names, progress, limits)
-
-    found = searched()
-    if "sensor.outliers" in without or any(s.name == "sensor.outliers" for s in seen):
-        return found, seen
-    data, chosen = found.data, found.chosen.fit
-    left = [r.y - signals[:, 0] for r, signals in zip(data.recordings, chosen.signals, strict=True)]
-    good = [g & np.isfinite(e) for g, e in zip(data.good, left, strict=True)]
-    outliers = outliers_in(left, recordings, good, limits)
-    confirmed = [] if outliers is None else supported([outliers], chosen, data)
-    if not confirmed:
-        return found, seen
-    seen = [*seen, *confirmed]
-    return searched(), seen
-
-
-def _of_rig(evidence: Evidence, model: Model, without: Sequence[str], progress: Progress) -> Evidence:
-    """Return the evidence of left-out stretches where the model's own error and not noise is what remains."""
-    limits, recordings, found = evidence.limits, evidence.search.data.recordings, evidence.search
-    barely = bool(found.chosen.names) and evidence.unknown_odds > limits.barely_noise
-    if evidence.residual.is_noise and not barely:
-        return evidence
-    late = _late_rows(evidence, without)
-    if late is not None:
-        return late
-    own = own_noise(found.retuned.fit, found.data)
-    good = spared(recordings, evidence.samples)
-    seen = [s.name for s in evidence.samples]
-    try:
-        # a likelihood of noise that is nearly white says nothing beside a disturbance
-        known = found.chosen.fit if own is None and evidence.explains_most and found.chosen.names else None
-        rig = search_rig(model, recordings, good, [*without, *seen], progress, limits, known)
-    except RUNAWAY:
-        return evidence
-    if not rig.chosen.names and own is not None:
-        return _disturbed(evidence, own)
-    if not rig.chosen.names and evidence.residual.has_no_slow_part:
-        return _without_effects(evidence)
-    fit, data = rig.chosen.fit, rig.chosen.data
-    samples = tuple(s for s in supported(evidence.samples, fit, data) if is_material(s, fit, data))
-    quality = rig.quality(evidence.quality.noise_floor)
-    return replace(evidence, search=rig.as_search(), samples=samples, quality=quality, offset=None, rig=rig)
-
-
-def _without_effects(evidence: Evidence) -> Evidence:
-    """Return the evidence where stretches that were left out speak for no effect beside a line in the residual."""
-    found, limits = evidence.search.asking(math.inf), evidence.limits
-    retuned, uneven = found.retuned.fit, evidence.residual.uneven
-    return replace(
-        evidence,
-        search=found,
-        residual=residual_tests(retuned, found.data, 0.0, uneven=uneven),
-        quality=held_out(retuned, retuned, found.data),
-        offset=None if evidence.offset is None else offset_of(retuned, limits.offset_sigmas),
-    )
-
-
-def _late_rows(evidence: Evidence, without: Sequence[str]) -> Evidence | None:
-    """Return the evidence where rows that are late, and their commands with them, leave noise alone."""
-    found, excluded = evidence.search, {name for s in evidence.samples for name in kind_of(s.name).excludes}
-    if evidence.evened or JITTER in (*without, *excluded):
-        return None
-    late = late_rows(found.retuned.fit, found.data)
-    if late is None or late.evidence < found.gained:
-        return None
-    plain = _without_effects(evidence)
-    samples = (*(s for s in evidence.samples if s.name != JITTER), late)
-    return replace(plain, samples=samples, residual=replace(plain.residual, accounted=True), offset=None)
-
-
-def _disturbed(evidence: Evidence, own: OwnNoise) -> Evidence:
-    """Return the evidence where what is left is noise of its own, and stretches that were left out show no effect.
-
-    Such a disturbance has a mean of its own in every recording: it is no offset.
-    """
-    return replace(_without_effects(evidence), residual=own.residual, offset=None, own=own)
+    return said
 
 
 def _require_rows(recordings: Sequence[Recording]) -> None:

@@ -8,6 +8,7 @@ from types import MappingProxyType
 
 import numpy as np
 
+from autotune.diagnosis.agreement import Said
 from autotune.diagnosis.evidence.description import Description
 from autotune.diagnosis.evidence.operating_point import Offset
 from autotune.diagnosis.evidence.samples import SampleEffect
@@ -17,8 +18,8 @@ from autotune.diagnosis.selection.hypothesis import penalised
 from autotune.diagnosis.selection.probability import Candidate
 from autotune.diagnosis.selection.searched import Search
 from autotune.diagnosis.thresholds import Thresholds
-from autotune.diagnosis.verdict import Evidence
-from autotune.effects import kind_of
+from autotune.diagnosis.verdict import Evidence, judged
+from autotune.effects import KINDS, STRUCTURES, counted_as, kind_of
 from autotune.models import Effect, Parameter
 
 #: The effect that every fit has as a free number.
@@ -27,8 +28,8 @@ Window = tuple[int, float, float]
 
 
 def probability_of(name: str, candidates: Sequence[Candidate], most: float = Thresholds.most_probable) -> float:
-    """Return the probability that an effect, or one that cannot be told from it, is part of the truth."""
-    group = {name, *kind_of(name).same}
+    """Return the probability that an effect is part of the truth: as such, in a larger one, or as one like it."""
+    group = counted_as(name)
     total = sum(c.probability for c in candidates if group & set(c.name.split("+")))
     return min(max(total, 0.0), most)
 
@@ -47,11 +48,21 @@ def found_effects(evidence: Evidence, verdict: Verdict) -> tuple[FoundEffect, ..
     effects += [(s.evidence, _of_samples(s, everywhere, evidence.limits)) for s in evidence.samples]
     # what is surer comes first; about as sure ones by how much they explain
     ranked = [e for _, e in sorted(effects, key=lambda pair: (-round(pair[1].probability, 1), -pair[0]))]
-    surest = max((e.probability for e in ranked), default=0.0)
-    ranked = [e for e in ranked if e.probability >= min(evidence.limits.least_named, surest)]
     if evidence.offset is not None and not any(e.name in kind_of(OFFSET).same for e in ranked):
         ranked.append(_of_offset(evidence.offset, evidence, everywhere))
     return tuple(ranked)
+
+
+def said_by(evidence: Evidence) -> Said:
+    """Return what evidence says: probabilities of all effects that are in a hypothesis, and those it would name."""
+    verdict = judged(evidence)
+    most, candidates = evidence.limits.most_probable, evidence.candidates
+    names = {name for c in candidates for name in c.name.split("+") if name in KINDS}
+    allowed = names - evidence.contradicted - STRUCTURES.keys()
+    shown = {e.name: e.probability for e in found_effects(evidence, verdict)}
+    # rows that leave too much open for a verdict still weigh what it may be
+    probabilities = {name: probability_of(name, candidates, most) for name in allowed} | shown
+    return Said(probabilities=probabilities, named=frozenset(shown))
 
 
 def _of_samples(s: SampleEffect, everywhere: tuple[Window, ...], limits: Thresholds) -> FoundEffect:
@@ -138,14 +149,12 @@ def places_of(evidence: Evidence, effects: Sequence[FoundEffect], description: D
 
 
 def beside(effects: Sequence[FoundEffect], evidence: Evidence) -> str:
-    """Return what is said of effects that predict, and are too improbable or contradicted to be named."""
-    unnamed = [name for name in evidence.search.chosen.names if name not in {e.name for e in effects}]
+    """Return what is said of effects that predict, and that readings contradict."""
+    unnamed = evidence.contradicted - {e.name for e in effects}
     if not unnamed:
         return ""
-    what = "may be something else"
-    if evidence.contradicted & set(unnamed):
-        what = "must be something else: readings scatter on where it would hold them still"
-    return f" The extended model predicts with {' and '.join(unnamed)} as well, which {what}."
+    what = "must be something else: readings scatter on where it would hold them still"
+    return f" The extended model predicts with {' and '.join(sorted(unnamed))} as well, which {what}."
 
 
 def sentences_of(

@@ -44,6 +44,12 @@ def kind_of(name: str, where: str = "catalogue") -> EffectKind:
     return KINDS[name]
 
 
+def counted_as(name: str) -> frozenset[str]:
+    """Return the effects whose finding is one of an effect: itself, one like it, and larger ones that include it."""
+    larger = (kind.name for kind in KINDS.values() if name in kind.includes)
+    return frozenset((name, *KINDS[name].same, *larger))
+
+
 def taken_by(names: Iterable[str]) -> set[str]:
     """Return the effects that are not added beside others: these, what they include, and what includes them."""
     given = set(names)

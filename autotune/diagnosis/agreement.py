@@ -1,0 +1,110 @@
+"""How often another campaign on this rig would say the same: parts of the recordings, diagnosed as the whole was.
+
+A search among a hundred effects always finds the one that suits these rows best, and a likelihood of these rows is sure
+of it. Whether the rig or these rows chose it shows where other rows are searched: each part leaves a fifth of every
+recording out, and is searched among what the whole recordings made a candidate. What another physics explains as well
+changes its name from part to part.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+
+from autotune.effects import counted_as
+from autotune.recording import Recording
+
+#: Share of every recording that a part leaves out, at its beginning or at its end.
+LEFT_OUT = 0.2
+#: Probability, as a mean over all rows and the parts, from which on an effect is likelier than not.
+NAMED = 0.5
+
+
+#: When effects begin: recording and time [s].
+Begins: TypeAlias = Mapping[str, Sequence[tuple[int, float]]]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Said:
+    """What a diagnosis of some rows says.
+
+    Attributes
+    ----------
+    probabilities : mapping of str to float
+        Of effects, all hypotheses counted that have them.
+    named : frozenset of str
+        Effects of the best hypothesis, where these rows bear a verdict.
+    """
+
+    probabilities: Mapping[str, float]
+    named: frozenset[str]
+
+    def names(self, effect: str) -> bool:
+        """Whether an effect is named, as such, in a larger one, or as one that no recording tells from it."""
+        return bool(self.named & counted_as(effect))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Part:
+    """Recordings with a share of their rows left out."""
+
+    recordings: tuple[Recording, ...]
+
+    def tells(self, began: Sequence[tuple[int, float]]) -> bool:
+        """Whether an effect that begins at given times, if any, begins in the part: else no change is seen there."""
+        spans = [(float(r.t[0]), float(r.t[-1])) for r in self.recordings]
+        return not began or any(spans[i][0] < start < spans[i][1] for i, start in began)
+
+
+def parts_of(recordings: Sequence[Recording], least_rows: int) -> tuple[Part, ...]:
+    """Return the recordings without their first fifth, and without their last one.
+
+    Parameters
+    ----------
+    recordings : sequence of Recording
+        What was measured.
+    least_rows : int
+        Rows that a diagnosis needs; where a part of a recording has fewer than twice that there are no parts.
+    """
+    if any((1.0 - LEFT_OUT) * np.isfinite(r.y).sum() < 2 * least_rows for r in recordings):
+        return ()
+    cuts = ((LEFT_OUT, 1.0), (0.0, 1.0 - LEFT_OUT))
+    return tuple(
+        Part(recordings=tuple(r.only(np.arange(int(a * len(r)), int(b * len(r)))) for r in recordings)) for a, b in cuts
+    )
+
+
+def agreement(whole: Said, begins: Begins, parts: Sequence[Part], said: Callable[[Part], Said]) -> Mapping[str, float]:
+    """Return the effects that are named, with their mean probability over all rows and the parts that tell of them.
+
+    Parameters
+    ----------
+    whole : Said
+        What the whole recordings say.
+    begins : mapping of str to sequence of (int, float)
+        When effects begin, where they do not act from the first row on.
+    parts : sequence of Part
+        What is diagnosed again.
+    said : callable
+        Returns what a part says.
+
+    Returns
+    -------
+    mapping of str to float
+        Effects that are likelier than not in the mean, or that the whole and every part name.
+
+    References
+    ----------
+    Meinshausen and Buhlmann, J. R. Statist. Soc. B 72, 2010: stability selection.
+    """
+    heard = [(part, said(part)) for part in parts] if whole.probabilities else []
+    agreed = {}
+    for name in whole.probabilities:
+        all_said = [whole, *(one for part, one in heard if part.tells(begins.get(name, ())))]
+        mean = float(np.mean([one.probabilities.get(name, 0.0) for one in all_said]))
+        if mean >= NAMED or all(one.names(name) for one in all_said):
+            agreed[name] = mean
+    return agreed

@@ -1,0 +1,25 @@
+"""What recordings show with fewer effects: the largest hypothesis that has no others."""
+
+from __future__ import annotations
+
+from autotune.diagnosis.gathering import evidence_of, keeping
+from autotune.diagnosis.thresholds import IN_USE
+from autotune.diagnosis.verdict import judged
+from autotune.effects import CATALOGUE
+from autotune.progress import quiet
+from tests.autotune.diagnosis.servo_rigs import servo_model, servo_recording
+
+DRAG = "plant.quadratic_drag"
+
+
+def test_an_effect_that_is_not_kept_is_missing_from_search_and_verdict() -> None:
+    recordings = [servo_recording(seed, lambda x, v: -0.03 * v * abs(v)) for seed in (1, 2)]
+    rest = [name for name in CATALOGUE if name not in (DRAG, "actuator.rate_limit")]
+    evidence = evidence_of(servo_model(), recordings, None, rest, quiet, IN_USE)
+    assert evidence.search.chosen.names == (DRAG,)
+    assert judged(evidence) == "effect"
+    assert judged(keeping(evidence, {DRAG})) == "effect"
+    without = keeping(evidence, set())
+    assert without.search.chosen.names == ()
+    assert without.quality.extended == without.quality.retuned > evidence.quality.extended
+    assert judged(without) == "unexplained"
