@@ -128,7 +128,6 @@ def test_a_pid_in_plain_registers() -> None:
         (registers_of("parallel", "Kp", "Ki_per_s"), PID, "map the register of Kd_s"),
         (registers_of("isa", "K"), PI, "needs Ti_s = 90"),
         (registers_of("isa", "K", "Ti_s", fixed={"reverse_acting": 1.0}), PIDController(K=-1.0, Ti_s=1.0), "action"),
-        (registers_of("isa", "K", "Ti_s"), PIDController(K=math.nan, Ti_s=1.0), "not a value"),
         (registers_of("isa", "K", "Ti_s"), PIDController(K=1e39, Ti_s=1.0), "does not fit"),
     ],
 )
@@ -241,3 +240,8 @@ def test_what_a_register_can_hold_is_held_unchanged(K: float, Ti_s: float, scale
     if rig.coarse(PIDController(K=K, Ti_s=Ti_s)) == ():
         assert pytest.approx(K, rel=0.0051) == held.K
         assert held.Ti_s == pytest.approx(Ti_s, rel=0.0051)
+
+
+def test_a_gain_that_is_no_number_is_refused_before_any_register_is_asked() -> None:
+    with pytest.raises(InputError, match="finite"):
+        PIDController(K=math.nan, Ti_s=1.0)
