@@ -70,7 +70,7 @@ class OperatingPointSettings(Section):
         Field(
             gt=0,
             le=LARGEST,
-            description="change of the command on a ramp [u unit/s]; default u_uncertainty in 600 samples of >= 20 ms",
+            description="change of the command on a ramp [u unit/s]; default u_uncertainty in 600 samples of >= 10 ms",
         ),
     ] = None
 

@@ -31,7 +31,7 @@ FIRST_SMOOTHING = 5
 #: how far below the lower end of the hover's bracket the ramp starts, and above the upper it ends, in u_uncertainty
 BRACKET = 1.2
 #: samples in which a ramp goes through one u_uncertainty, and the sample time [s] below which a host ramps no faster
-RAMP_SAMPLES, RAMP_SAMPLE_S = 600.0, 0.02
+RAMP_SAMPLES, RAMP_SAMPLE_S = 600.0, 0.01
 #: least share of readings in preflight that differ from the one before, for a sensor of which that can be expected
 RESTLESS = 0.05
 SMALL = 1e-9

@@ -38,7 +38,7 @@ _PERCENT = (100.0, 0.01)
 #: an output that swings faster than the loop should is looked at once more with this part of the smoothing
 FINER = 4
 #: misreadings that are named where they cannot be told apart
-MOST_NAMED = 2
+MOST_NAMED = 4
 #: departure relative to the least one that explains the output as well
 ALIKE = 1.3
 
@@ -132,6 +132,7 @@ class _Law:
     Tf_s: float = 0.0
     weight: float = 1.0
     setpoint: Callable[[float], float] = float
+    fitted: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -199,14 +200,15 @@ def identify_running_law(
 
 def _alike(record: LawRecord, candidates: Mapping[str, _Law], own: _Law, estimate: _Estimate | None) -> tuple[str, ...]:
     """Return the laws that explain the output much better than the given one, none of them better than the others."""
-    found = {name: _departure(record, law, own) for name, law in candidates.items()}
+    found = {name: _beyond_noise(record, law, own) for name, law in candidates.items()}
     best = min(found.values(), default=math.inf)
-    good = [name for name, value in found.items() if value <= max(ALIKE * best, 0.1 * AGREES)]
-    if best > BETTER * _departure(record, own, own):
+    if best > min(AGREES, BETTER * _beyond_noise(record, own, own)):
         return ()
-    credible = [name for name in good if found[name] <= math.hypot(AGREES, _noise(record, candidates[name], own))]
-    near = [name for name in credible if estimate is not None and estimate.allows(candidates[name])]
-    return tuple((near or credible)[:MOST_NAMED])
+    good = [name for name, value in found.items() if value <= min(AGREES, max(ALIKE * best, 0.1 * AGREES))]
+    near = [name for name in good if estimate is not None and estimate.allows(candidates[name])]
+    # a factor that was fitted to the output explains it by right; a usual misreading that does as well is said first
+    usual = [name for name in near or good if not candidates[name].fitted]
+    return tuple((usual or near or good)[:MOST_NAMED])
 
 
 def _law(controller: PIDController) -> _Law:
@@ -245,14 +247,15 @@ def _misreadings(
         if given.Td_s:
             series = 1.0 + given.Td_s / Ti
             found["the series form and not the ideal one"] = replace(law, P=law.P * series)
-    factors = list(_PERCENT)
+    factors = dict.fromkeys(_PERCENT, False)
     if estimate is not None:  # the slow part knows it best, where there is one
         pairs = ((estimate.law.P, law.P), (estimate.law.I, law.I))
         ratios = [found / given for found, given in pairs if given and found / given > 0.0]
-        factors += [one for one in ratios if all(abs(one / usual - 1.0) > UNLIKE for usual in (1.0, *_PERCENT))]
-    for factor in factors:
+        unusual = [one for one in ratios if all(abs(one / usual - 1.0) > UNLIKE for usual in (1.0, *_PERCENT))]
+        factors |= dict.fromkeys(unusual, True)
+    for factor, fitted in factors.items():
         said = f"percent for engineering units, or a wrong scale of the gain: K acts {factor:.3g} times"
-        found[said] = replace(law, P=factor * law.P, I=factor * law.I, D=factor * law.D)
+        found[said] = replace(law, P=factor * law.P, I=factor * law.I, D=factor * law.D, fitted=fitted)
     found["no proportional action on the set-point"] = replace(law, weight=0.0)
     for scale in _SCALES:
         said = f"a wrong scale of the set-point: the device holds y at {scale:g} times it"
@@ -275,6 +278,11 @@ def _departure(record: LawRecord, law: _Law, given: _Law) -> float:
         own = _smooth(_ran(record, law, _late(r, late), _late(record.y, late)), record.smoothing)
         found.append(float(np.std(own - measured)))
     return min(found) / _movement(record, given)
+
+
+def _beyond_noise(record: LawRecord, law: _Law, given: _Law) -> float:
+    """Return a law's departure without what noise of the device's own measurement causes: that grows with its gain."""
+    return math.sqrt(max(0.0, _departure(record, law, given) ** 2 - _noise(record, law, given) ** 2))
 
 
 def _movement(record: LawRecord, given: _Law) -> float:

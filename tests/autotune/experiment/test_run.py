@@ -302,7 +302,7 @@ def test_all_cycles_are_estimated_together_once_the_rig_is_safe(
     assert held == [0.0]
 
 
-@pytest.mark.parametrize("sample_time_s", [0.005, 0.02])
+@pytest.mark.parametrize("sample_time_s", [0.005, 0.01])
 def test_a_faster_host_ramps_no_faster(tmp_path: Path, sample_time_s: float) -> None:
     config = ball_config()
     config = config.model_copy(
@@ -315,4 +315,4 @@ def test_a_faster_host_ramps_no_faster(tmp_path: Path, sample_time_s: float) -> 
     begun = int(np.argmax(u > 4.3))
     climbing = slice(begun, begun + round(0.5 / sample_time_s))  # half a second of the ramp, before the ball moves
     rate = float(np.polyfit(t[climbing], u[climbing], 1)[0])
-    assert rate == pytest.approx(config.operating_point.u_uncertainty / 12.0, rel=0.05)
+    assert rate == pytest.approx(config.operating_point.u_uncertainty / 6.0, rel=0.05)
