@@ -12,7 +12,7 @@ from autotune.api.arguments import number, one_of, settings_of
 from autotune.api.plants import as_controller, as_plant, as_reduced
 from autotune.api.points import as_points
 from autotune.api.recordings import Source, read
-from autotune.controller import Controller
+from autotune.controller import Controller, PIDController
 from autotune.errors import InputError
 
 if TYPE_CHECKING:
@@ -174,6 +174,8 @@ def margins(plant: Any, controller: Any) -> Margins:
     from autotune.design.margins import margins as of_loop
 
     H, C = as_plant(plant), as_controller(controller)
+    if isinstance(C, PIDController) and C.K == 0.0 or not any(H.num):
+        raise InputError("there is no loop: a gain is 0", where="margins", remedy="give a plant and a controller")
     with np.errstate(all="ignore"):
         found = of_loop(H, C)
     if math.isnan(found.modulus + found.phase_rad):

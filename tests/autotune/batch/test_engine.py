@@ -131,7 +131,7 @@ def test_nobody_at_the_address_is_said_at_once(monkeypatch):
         cluster(scheduler="tcp://127.0.0.1:9"),
     ):
         pass
-    assert clients() == before
+    assert clients() <= before  # one of an earlier test may be collected meanwhile
 
 
 def test_a_scheduler_without_workers_is_said(monkeypatch):
