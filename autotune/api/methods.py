@@ -174,7 +174,7 @@ def margins(plant: Any, controller: Any) -> Margins:
     from autotune.design.margins import margins as of_loop
 
     H, C = as_plant(plant), as_controller(controller)
-    if isinstance(C, PIDController) and C.K == 0.0 or not any(H.num):
+    if (isinstance(C, PIDController) and C.K == 0.0) or not any(H.num):
         raise InputError("there is no loop: a gain is 0", where="margins", remedy="give a plant and a controller")
     with np.errstate(all="ignore"):
         found = of_loop(H, C)
