@@ -41,8 +41,8 @@ class Around:
         Whether ``x`` is a position of its own.
     is_angle : bool
         Whether ``x`` may be an angle in rad.
-    unit : str
-        Unit of the state.
+    unit, kind : str
+        Unit and kind of the state; empty elsewhere.
     per_rate : float
         At a port, the force that changes the state by one unit a second; 1 at a state.
     u, y : (rows,) array
@@ -63,6 +63,7 @@ class Around:
     has_position: bool
     is_angle: bool
     unit: str
+    kind: str
     per_rate: float
     u: FloatArray
     y: FloatArray

@@ -220,10 +220,17 @@ def _cubes_tried(a: Around) -> list[Tried]:
 
 
 def _stops_tried(a: Around) -> list[Tried]:
-    """Return stops on either side of a position, that turn what moves round within a few samples."""
+    """Return stops on either side of a position, that turn what moves round within a few samples.
+
+    A level has no speed of its own: beyond its stop it flows off within a few samples.
+    """
+    if not (a.has_position or a.kind == "level"):
+        return []
     stiffness = (0.5 / a.dt_s) ** 2 * a.per_rate
     give = {"stiffness": stiffness, "damping": 2.0 * a.dt_s * stiffness}
-    at = [(side, share) for share in _STOPS for side in ("high", "low") if a.has_position]
+    if not a.has_position:
+        give = {"stiffness": 0.5 / a.dt_s}
+    at = [(side, share) for share in _STOPS for side in ("high", "low")]
     return [Tried({side: float(np.quantile(a.x, c if side == "high" else 1.0 - c)), **give}) for side, c in at]
 
 
@@ -385,7 +392,15 @@ PLANT = (
         starts=lambda s: [(0.02 / s.x,), (-0.02 / s.x,)],
         confusable=("plant.leak", "actuator.nonlinear_gain", "sensor.nonlinear_gain"),
         odds={"lifted": 0.2, "level": 0.02, "carriage": 0.003, "arm": 0.003, "shaft": 0.003},
-        in_equations=InEquations(acts="input", text="value*(1 + slope*X)"),
+        in_equations=InEquations(
+            acts="input",
+            text="value*(1 + slope*X)",
+            trials=lambda a: (
+                [Tried({"slope": 0.05 / float(np.max(np.abs(a.x)))}, ("slope",))]
+                if a.has_position and np.any(a.x)
+                else []
+            ),
+        ),
         reference=_KHALIL,
     ),
     EffectKind(
@@ -408,11 +423,11 @@ PLANT = (
             acts="force",
             text="if(X > high, -stiffness*(X - high) - damping*max(V, 0), 0)"
             " + if(X < low, -stiffness*(X - low) - damping*min(V, 0), 0)",
-            on=MOVING,
+            on=(*MOVING, "level"),
             trials=_stops_tried,
             further=("stiffness",),
             defaults={"damping": 0.0},
-            spread={"low": lambda s: s.u, "high": lambda s: s.u},
+            spread={"low": lambda s: s.span, "high": lambda s: s.span},
             # softer than what it turns round moves by itself it would be no stop, its damping a loss of free place
             least={"stiffness": lambda s: s.size / max(s.span, 1e-300)},
             stand_in=_gives_way,

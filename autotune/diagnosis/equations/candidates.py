@@ -173,11 +173,13 @@ def _around(model: EquationModel, s: Signals, key: str, name: str) -> Around:
         v, size = s.y, float(np.nanstd(s.y)) + 1e-300
     elif name == model.columns[0]:
         v, size = u, float(np.std(u)) + 1e-300
-    of = f"{name}:position" if key == "port" else state.of if state else ""
+    held = next((one.name for one in model.states if one.kind in ("position", "level", "temperature")), "")
+    of = f"{name}:position" if key == "port" else state.of if state else held if key == "input" else ""
     rate = float(np.std(np.diff(v) / s.dt_s)) if key == "port" else 0.0
     return Around(
         size=size, v=v, x=s.values.get(of, v), has_position=of in s.values, is_angle=_is_angle(model, key, name),
-        unit=state.unit if state else "", per_rate=size / rate if rate > 0.0 else 1.0, u=u, y=s.y,
+        unit=state.unit if state else "", kind=state.kind if state else "",
+        per_rate=size / rate if rate > 0.0 else 1.0, u=u, y=s.y,
         offset=model.inputs[0].offset, dt_s=s.dt_s, duration_s=s.duration_s, slow_s=s.slow_s, lines=s.lines,
         columns=s.columns,
     )  # fmt: skip

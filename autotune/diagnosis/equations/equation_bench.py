@@ -364,8 +364,7 @@ class EquationBench:
         dt = float(np.median(np.concatenate([np.diff(r.t) for r in self.recordings])))
         self._sizes = sizes_of(self.model, outcome.fitted.parameters, values, self._drives[0].inputs[:1], dt)
         self._spans = {
-            place: float(np.ptp(values[name])) for place, name in positions_of(self.model).items()
-            if name in values and name != place
+            place: float(np.ptp(values[name])) for place, name in positions_of(self.model).items() if name in values
         }  # fmt: skip
         duration = max(float(r.t[-1] - r.t[0]) for r in self.recordings)
         u = np.concatenate([d.inputs[:, 0] for d in self._drives])

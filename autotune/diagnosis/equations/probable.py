@@ -34,9 +34,13 @@ def candidates_of(found: Searched, unknown: float) -> tuple[Candidate, ...]:
 
 
 def _charge(one: Outcome, found: Searched) -> float:
-    """Return what a larger hypothesis that is not needed pays: what it is ahead of the chosen one, and more."""
+    """Return what a hypothesis of needless further effects pays: what it is ahead of the chosen one, and more.
+
+    Other forms of the effects that were chosen pay nothing: which of them is true is what a probability says.
+    """
     ahead = found.score(found.chosen) - found.score(one)
-    return ahead + found.limits.equation_decrease if one.count > found.chosen.count and ahead > 0.0 else 0.0
+    more = len(one.effects) > len(found.chosen.effects)
+    return ahead + found.limits.equation_decrease if more and ahead > 0.0 else 0.0
 
 
 def probability_of(effect: Effect, candidates: Sequence[Candidate]) -> float:

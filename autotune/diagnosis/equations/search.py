@@ -377,6 +377,9 @@ def _plainest(bench: Bench, best: Outcome, tried: list[Outcome], rows: float, li
     if is_plainer(last):
         tried[:] = [other for other in tried if not (other.effects and is_plainer(other.effects[-1]))]
         return one
+    if variance_ratio(best, noise_of(bench, best)) < limits.equation_noise:
+        # two forms of one effect: noise alone is left, so that rows are witnesses, and it is not the best of many
+        return best if penalised(best, rows, limits) < penalised(one, rows, limits) else one
     return best if is_worth(one, best, rows, limits) and _is_earned(bench, one, best, limits) else one
 
 

@@ -44,8 +44,9 @@ def tank(seed: int, lag_s: float, at: str, rows: int = 1500) -> Recording:
     h, passed, y = 1.0, flow[0], np.empty(rows)
     for k in range(rows):
         y[k] = h + (GAIN * (passed - 3.0) if at == "reading" else 0.0)
-        for _ in range(20):
-            passed += 0.01 * (flow[k] - passed) / lag_s if lag_s else flow[k] - passed
+        for i in range(1, 21):  # what is measured runs straight from row to row
+            now = flow[k] + i / 20 * (flow[min(k + 1, rows - 1)] - flow[k])
+            passed += 0.01 * (now - passed) / lag_s if lag_s else now - passed
             h += 0.01 * ((u[k] - h) / 5.0 + (GAIN * (passed - 3.0) if at == "x" else 0.0))
     extra = {"flow": flow, "other": slow_noise(seed + 90, rows), "level_mm": 1000.0 * y, "still": np.full(rows, 4.0)}
     return Recording(t=t, u=u, y=y + 0.005 * random.normal(size=rows), extra=extra, name=f"rec{seed}.csv")
