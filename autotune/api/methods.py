@@ -11,7 +11,7 @@ import numpy as np
 from autotune.api.arguments import number, one_of, settings_of
 from autotune.api.plants import as_controller, as_plant, as_reduced
 from autotune.api.points import as_points
-from autotune.api.recordings import Source, read
+from autotune.api.recordings import Source, as_recordings, read
 from autotune.controller import Controller, PIDController
 from autotune.errors import InputError
 
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from autotune.identification.delay.model import DelayModel
     from autotune.identification.delay.two_delays import TwoDelays
     from autotune.identification.reduction import ReducedModel
+    from autotune.recording import Recording
 
 KINDS = ("pi", "pid")
 DELAY_METHODS = ("output-error", "algebraic", "online")
@@ -72,7 +73,7 @@ def tune(
     *,
     modulus_margin: float = 0.5,
     phase_margin_deg: float = 45.0,
-    noise_gain: float = 0.1,
+    noise_gain: float | None = None,
     kind: str = "pi",
     certificate: bool = True,
     **settings: Any,
@@ -81,21 +82,24 @@ def tune(
 
     Parameters
     ----------
-    plant : points, TransferFunction, model or its file, reduced or delay model, python-control system
-        On points the margins hold for every plant that fits them; on a reduced model, a PI's are kept on what was
-        reduced as well.
+    plant : recording, its file, points, TransferFunction, model, reduced or delay model, python-control system
+        A recording, a list of them, a DataFrame or the file of one is tuned as ``autotune tune FILE`` does. On points
+        the margins hold for every plant that fits them; on a reduced model, a PI's are kept on what was reduced as
+        well.
     modulus_margin : float
         Smallest distance of the Nyquist curve from -1, 0 to 1.
     phase_margin_deg : float
         Smallest phase margin [deg].
-    noise_gain : float
-        Largest amplification of measurement noise to the command, N_max [u unit/y unit].
+    noise_gain : float, optional
+        Largest amplification of measurement noise to the command, N_max [u unit/y unit]. Of a recording from its noise
+        and the span of u when absent, else 0.1.
     kind : {"pi", "pid"}
         Structure.
     certificate : bool
         Whether a lower bound of the norm is proven (PI on a model).
     **settings
-        Further ones of :class:`autotune.design.specification.Specification`, such as ``delay_margin_s``.
+        Further ones of :class:`autotune.design.specification.Specification`, such as ``delay_margin_s``; of a
+        recording ``criterion``, ``source`` and ``noise_frequency_rad_s``.
 
     Returns
     -------
@@ -115,7 +119,11 @@ def tune(
     True
     """
     structure = one_of(kind, KINDS, name="kind", where="tune")
-    wanted = _specification(modulus_margin, phase_margin_deg, noise_gain, settings)
+    records = as_recordings(plant)
+    if records is not None:
+        margins_asked = {"modulus_margin": modulus_margin, "phase_margin_deg": phase_margin_deg}
+        return _of_recordings(records, {"kind": structure, "noise_gain": noise_gain, **margins_asked, **settings})
+    wanted = _specification(modulus_margin, phase_margin_deg, 0.1 if noise_gain is None else noise_gain, settings)
     points = as_points(plant)
     if points is not None:
         from autotune.identification.parametric import fit_plant
@@ -131,6 +139,16 @@ def tune(
     from autotune.design.synthesis import design as on_model
 
     return on_model(as_plant(plant), wanted, structure, certificate=certificate)
+
+
+def _of_recordings(records: list[Recording], settings: dict[str, Any]) -> Design:
+    from autotune.config.procedure import DesignSettings
+    from autotune.pipeline import analyse, measured_of
+    from autotune.schema import validated
+
+    asked = validated(DesignSettings, settings, "tune, of a recording")
+    found = measured_of(records)
+    return analyse(found.points, asked, fit=found.fit, facts=found.facts, compare=False).design
 
 
 def _specification(

@@ -10,10 +10,12 @@ import numpy as np
 
 from autotune.arrays import FloatArray
 from autotune.errors import InputError
-from autotune.recording import Recording
+from autotune.recording import Recording, usable
 
 #: A path, a pandas DataFrame, a mapping of arrays, or a recording.
 Source: TypeAlias = Any
+#: files of models, points and controllers, which are no recordings
+_OTHER_FILES = ("", ".toml", ".json", ".fmu")
 
 
 def read(source: Source, *, t: str = "", u: str = "", y: str = "", r: str = "", name: str = "") -> Recording:
@@ -105,3 +107,18 @@ def recordings(source: Source, **names: str) -> list[Recording]:
     """Return one or several recordings; a list or tuple is several."""
     several = source if isinstance(source, list | tuple) else [source]
     return [read(one, **names) for one in several]
+
+
+def as_recordings(source: Any) -> list[Recording] | None:
+    """Return all stretches of a recording, a list of them, a DataFrame or a file of one; None where it is none."""
+    if isinstance(source, Recording):
+        return [source]
+    if isinstance(source, list | tuple):
+        return list(source) if source and all(isinstance(one, Recording) for one in source) else None
+    if hasattr(source, "columns") and hasattr(source, "index"):
+        return [read(source)]
+    if isinstance(source, str | os.PathLike) and os.path.splitext(source)[1].lower() not in _OTHER_FILES:
+        from autotune.files import read_recordings
+
+        return [usable(one) for one in read_recordings(source).recordings]
+    return None

@@ -17,6 +17,7 @@ from autotune.batch.plant_figures import plant_figures
 from autotune.batch.settings import CampaignSettings, LoopSettings
 from autotune.controller import Controller, PIDController, read_controller
 from autotune.design.margins import Margins, margins
+from autotune.design.noise import LoopFacts
 from autotune.diagnosis.diagnose import diagnose
 from autotune.diagnosis.result import Diagnosis
 from autotune.errors import AutotuneError, IdentificationError
@@ -24,7 +25,7 @@ from autotune.experiment_design.next_experiment import with_next_experiment
 from autotune.identification.closed_loop.identify import identify_closed_loop
 from autotune.identification.frequency.recorded import FrequencyEstimate, combine, frequency_points
 from autotune.model_file import read_model
-from autotune.pipeline import Analysis, analyse, analysis_json
+from autotune.pipeline import Analysis, Measured, analyse, analysis_json, measured_of
 from autotune.points import FrequencyPoint, points_to_json
 from autotune.recording import Recording
 from autotune.run_log import jsonable
@@ -224,13 +225,19 @@ def _finding(work: Work, row: Row) -> Finding:
     if settings.task == "diagnose":
         found = with_next_experiment(diagnose(read_model(loop.model), record.pieces, present))
         return Finding(row=_diagnosed(row, found), result=found.as_json())
-    points, notes = _points(record, settings, present)
-    row = _with_notes(row, notes)
-    omega = [point.omega_rad_s for point in points]
-    row = replace(row, points=len(points), omega_low_rad_s=min(omega), omega_high_rad_s=max(omega))
+    if settings.task == "design" and settings.method == "frequency":
+        measured = measured_of(record.pieces)
+    else:
+        points, notes = _points(record, settings, present)
+        measured = Measured(points=points, fit=None, facts=LoopFacts(), notes=notes)
+    points, row = measured.points, _with_notes(row, measured.notes)
+    row = replace(row, points=len(points))
+    if points:
+        omega = [point.omega_rad_s for point in points]
+        row = replace(row, omega_low_rad_s=min(omega), omega_high_rad_s=max(omega))
     if settings.task == "identify":
         return Finding(row=row, points=points_to_json(points))
-    analysis = analyse(points, settings.design, compare=False)
+    analysis = analyse(points, settings.design, fit=measured.fit, facts=measured.facts, compare=False)
     return Finding(
         row=_designed(row, analysis, present, settings), points=points_to_json(points), result=analysis_json(analysis)
     )

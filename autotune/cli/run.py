@@ -227,17 +227,14 @@ def tune(
     given_options = {name: value for name, value in options.items() if value is not None}
     asked = validated(
         DesignSettings,
-        {"kind": kind, "specification": specification, "source": source, **given_options},
+        {"kind": kind, "specification": specification, "source": source, "criterion": criterion, **given_options},
         "autotune tune",
     )
     read = read_all(recordings, signal_names(t, u, y, r))
     given = [point for path in files for point in read_points(path)]
     found = measured_of(read, given)
     notes = found.notes
-    settings = asked.model_copy(
-        update={"criterion": criterion if criterion != "auto" else "h2" if found.fit is None else "iae"}
-    )
-    analysis = analyse(found.points, settings, fit=found.fit, facts=found.facts)
+    analysis = analyse(found.points, asked, fit=found.fit, facts=found.facts)
     units = read[0].metadata.get("units", {}) if read else {}
     signals = SignalSettings(
         sample_time_s=read[0].sample_time_s if read else 1.0,  # the page shows units only

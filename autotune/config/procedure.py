@@ -129,9 +129,12 @@ class DesignSettings(Section):
         float | None, Field(gt=0, description="lowest frequency of the noise [rad/s]; the crossover when absent")
     ] = None
     criterion: Annotated[
-        Literal["h2", "iae"],
-        Field(description="minimised after a step of load: the norm (11), or the integral of the absolute error"),
-    ] = "h2"
+        Literal["auto", "h2", "iae"],
+        Field(
+            description="minimised after a step of load: the norm (11), or the integral of the absolute error; auto"
+            " takes iae for a plant fitted to plain recordings, h2 for points"
+        ),
+    ] = "auto"
     source: Annotated[
         Literal["auto", "reduced model", "points", "fitted plant"],
         Field(

@@ -77,6 +77,14 @@ def recorded_dependence(recording: Recording) -> Dependence:
     return replace(found, forward=by_setpoint.forward, lag=by_setpoint.lag, sign=found.sign)
 
 
+def is_fed_back(recording: Recording) -> bool:
+    """Return whether a controller makes u of y: a set-point moves, or u follows y within its row."""
+    r = recording.extra.get("r")
+    if r is not None and np.ptp(_bridged(r)) > 0.0:
+        return True
+    return abs(dependence(recording.u, recording.y).same_row) > _SAME_ROW
+
+
 def require_answer(recordings: Sequence[Recording]) -> None:
     """Refuse recordings in which y has nothing to do with u, and those whose columns say something else.
 
@@ -101,7 +109,7 @@ def require_answer(recordings: Sequence[Recording]) -> None:
     for recording in moving:
         _require_two_signals(recording)
     found = [recorded_dependence(recording) for recording in moving]
-    if min(one.forward for one in found) * len(found) < CHANCE:
+    if min(one.forward for one in found) * len(found) < CHANCE or any(map(_answers_a_test, moving, found)):
         return
     where = ", ".join(recording.name for recording in recordings)
     in_row = max(abs(one.same_row) for one in found) > _SAME_ROW
@@ -122,6 +130,15 @@ def require_answer(recordings: Sequence[Recording]) -> None:
         f"{CHANCE:g} is asked for)",
         where=where, remedy="check the columns; record larger or longer moves of u, after some rest",
     )  # fmt: skip
+
+
+def _answers_a_test(recording: Recording, found: Dependence) -> bool:
+    """Return whether y answers a few steps or ramps as a plant does, beyond what any colour of noise explains."""
+    from autotune.identification.plant_evidence import NEEDED, explained_by_plant, is_simple_test
+
+    if abs(found.same_row) > _SAME_ROW or not is_simple_test(_bridged(recording.u)):
+        return False
+    return explained_by_plant(recording) > NEEDED
 
 
 def _is_constant(values: FloatArray) -> bool:

@@ -10,16 +10,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
+from scipy.optimize import minimize_scalar
 
 from autotune.arrays import FloatArray
 from autotune.errors import AutotuneError, IdentificationError
 from autotune.identification.delay.identify import identify_delay
 from autotune.identification.delay.model import DelayModel
-from autotune.identification.parametric import PlantFit, not_excluded
+from autotune.identification.dependence import is_fed_back
+from autotune.identification.parametric import EXCLUDED, PlantFit, not_excluded
 from autotune.models import TransferFunction
 from autotune.recording import Recording
 
@@ -28,10 +30,36 @@ _ORDERS = (1, 2, 3)
 _LEAST_SHARE = 0.02
 
 
+#: a zero is looked for on each side where so small a part of the lags' sum as its time constant already fits better
+_FIRST_ZERO = 0.1
+_ZEROS = (0.25, 0.5, 1.0, 2.0)
+_ZERO_STEPS = 12
+
+
 @dataclass(frozen=True, kw_only=True)
 class _Structure:
     order: int
     integrator: bool
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Fitted:
+    """One structure fitted to every recording, for a zero at s = -1/tau, tau = 0 where there is none."""
+
+    structure: _Structure
+    models: tuple[DelayModel, ...]
+    tau_s: float = 0.0
+
+    @property
+    def coefficients(self) -> int:
+        """How many there are, with the constant and the initial state of each recording."""
+        each = 1 + self.structure.order
+        return self.structure.order + 2 - self.structure.integrator + (self.tau_s != 0.0) + each * len(self.models)
+
+    def criterion(self, rows: Sequence[int]) -> float:
+        """Return the Bayesian criterion if each recording had so many rows: what a delay leaves out differs."""
+        likelihood = sum(n * 2.0 * math.log(model.noise_sd) for n, model in zip(rows, self.models, strict=True))
+        return likelihood + self.coefficients * math.log(sum(rows))
 
 
 def fit_recordings(recordings: Sequence[Recording]) -> PlantFit:
@@ -55,29 +83,118 @@ def fit_recordings(recordings: Sequence[Recording]) -> PlantFit:
 
     Notes
     -----
-    Resonances are in the class, zeros are not: inverse response is fitted as dead time and lags.
+    Resonances are in the class, and in open loop one zero of a plant of order 2 (inverse response, overshoot); under
+    feedback a zero would take up what the noise model leaves of the load that the controller answers.
     """
-    models: dict[_Structure, list[DelayModel]] = {}
+    found: list[_Fitted] = []
     reason: AutotuneError | None = None
     for order, integrator in product(_ORDERS, (False, True)):
         structure = _Structure(order=order, integrator=integrator)
         try:
-            models[structure] = [identify_delay(one, order, integrator=integrator) for one in recordings]
+            models = tuple(identify_delay(one, order, integrator=integrator) for one in recordings)
         except AutotuneError as error:  # the order is more than the record determines
             reason = reason or error
-    if not models:
+            continue
+        found.append(_Fitted(structure=structure, models=models))
+    if not found:
         raise IdentificationError(
             f"no differential equation with dead time is determined: {reason}",
             where=recordings[0].name,
             remedy="record steps of the command, up and down, each until y has settled",
         )
-    return not_excluded([_joined(structure, found) for structure, found in models.items()])
+    if not any(is_fed_back(one) for one in recordings):
+        found += [zero for one in found if one.structure.order == 2 and (zero := _zero(recordings, one)) is not None]
+    rows = [min(one.models[i].rows for one in found) for i in range(len(recordings))]
+    return not_excluded([_with_zero(recordings, one, rows) if one.tau_s else _joined(one, rows) for one in found])
 
 
-def _joined(structure: _Structure, models: Sequence[DelayModel]) -> PlantFit:
+def _leading(recording: Recording, tau_s: float) -> Recording:
+    """Return the recording with the command (1 + tau s) u: a jump of u acts once more, over the rows around it."""
+    return replace(recording, u=recording.u + tau_s * np.gradient(recording.u, recording.t))
+
+
+def _at_zero(recordings: Sequence[Recording], near: _Fitted, tau_s: float) -> _Fitted | None:
+    """Return the fit with this zero that lies near another; None where it is not determined."""
+    n, integrator = near.structure.order, near.structure.integrator
+    try:
+        models = tuple(
+            identify_delay(_leading(one, tau_s), n, integrator=integrator, start=model)
+            for one, model in zip(recordings, near.models, strict=True)
+        )
+    except AutotuneError:
+        return None
+    return replace(near, models=models, tau_s=tau_s)
+
+
+def _zero(recordings: Sequence[Recording], without: _Fitted) -> _Fitted | None:
+    """Return the structure with the zero that fits best; None where none fits better than no zero at all."""
+    rows = [model.rows for model in without.models]
+    model = max(without.models, key=lambda one: one.rows)
+    scale = sum(1.0 / abs(pole) for pole in model.poles if pole) + model.delay_s
+    least, best = without.criterion(rows), without
+    for side in (-scale, scale):
+        near = without
+        for share in (_FIRST_ZERO, *_ZEROS):
+            at = _at_zero(recordings, near, share * side)
+            if at is None or at.criterion(rows) > near.criterion(rows) + EXCLUDED:
+                break
+            near = at
+            if at.criterion(rows) < least:
+                least, best = at.criterion(rows), at
+    if best is without:
+        return None
+    tried: list[tuple[float, _Fitted]] = [(least, best)]
+
+    def cost(tau_s: float) -> float:
+        one = _at_zero(recordings, best, tau_s)
+        tried.append((math.inf if one is None else one.criterion(rows), one or best))
+        return tried[-1][0]
+
+    low, high = sorted((0.4 * best.tau_s, 1.8 * best.tau_s))
+    near_s = 0.01 * abs(best.tau_s)
+    minimize_scalar(cost, bounds=(low, high), method="bounded", options={"maxiter": _ZERO_STEPS, "xatol": near_s})
+    return min(tried, key=lambda pair: pair[0])[1]
+
+
+def _with_zero(recordings: Sequence[Recording], found: _Fitted, rows: Sequence[int]) -> PlantFit:
+    """Return the fit with tau among its parameters; its variance is the curvature of what is left beside it."""
+    unit = _largest_term(max(found.models, key=lambda model: model.rows))
+    middle = _joined(found, rows, unit)
+    way = 0.1 * found.tau_s
+    slope, variance = np.zeros(middle.parameters.size), (0.5 * found.tau_s) ** 2
+    for _ in range(2):
+        beside = [_at_zero(recordings, found, found.tau_s + step) for step in (-way, way)]
+        if beside[0] is None or beside[1] is None:
+            break
+        low, high = (_joined(one, rows, unit) for one in beside if one is not None)
+        curvature = (low.criterion + high.criterion - 2.0 * middle.criterion) / way**2
+        slope = (high.parameters - low.parameters) / (2.0 * way)
+        variance = min(2.0 / curvature if curvature > 0.0 else math.inf, (0.5 * found.tau_s) ** 2)
+        way = 2.0 * math.sqrt(variance)
+    along = np.append(slope, 1.0)
+    covariance = variance * np.outer(along, along)
+    covariance[:-1, :-1] += middle.covariance
+    ends = found.tau_s * np.array([_LEAST_SHARE, 2.0])
+
+    def build(parameters: FloatArray) -> TransferFunction:
+        plant = middle.build(parameters[:-1])
+        return replace(plant, num=(float(parameters[-1]) * plant.num[0], plant.num[0]))
+
+    x = np.append(middle.parameters, found.tau_s)
+    return replace(
+        middle,
+        plant=build(x),
+        parameters=x,
+        covariance=covariance,
+        bounds=np.column_stack((middle.bounds, np.sort(ends))),
+        build=build,
+    )
+
+
+def _joined(found: _Fitted, common: Sequence[int], unit: int | None = None) -> PlantFit:
     """Return the fit of one structure to all recordings: information adds, and so do the criteria."""
-    n = structure.order
-    unit = _largest_term(max(models, key=lambda model: model.rows))
+    structure, models, n = found.structure, found.models, found.structure.order
+    unit = _largest_term(max(models, key=lambda model: model.rows)) if unit is None else unit
     free = [i for i in range(n + 2) if not (structure.integrator and i == 0)]
     forms = [_over(model, unit) for model in models]
     information = [np.linalg.pinv(covariance[np.ix_(free, free)]) for _, covariance in forms]
@@ -99,18 +216,17 @@ def _joined(structure: _Structure, models: Sequence[DelayModel]) -> PlantFit:
             num=(b / den[-1],), den=tuple(value / den[-1] for value in den[::-1]), delay_s=max(0.0, h)
         )
 
-    coefficients = len(free) + 1 + n  # with the constant and the initial state
     return PlantFit(
         plant=build(x),
         integrating=structure.integrator,
         parameters=x,
         covariance=full,
         sign=1 if x[n] > 0.0 else -1,
-        chi_square=float(rows - coefficients) + apart,
-        degrees_of_freedom=rows - coefficients + freedom,
+        chi_square=float(rows - found.coefficients) + apart,
+        degrees_of_freedom=rows - found.coefficients + freedom,
         bounds=np.stack((lower, upper)),
         build=build,
-        criterion=sum(model.rows * 2.0 * math.log(model.noise_sd) for model in models) + coefficients * math.log(rows),
+        criterion=found.criterion(common) + apart,
         source="recording",
     )
 

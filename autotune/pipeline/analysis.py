@@ -96,13 +96,16 @@ def specification(
     noise_gain, words = settings.noise_gain, "asked for"
     if noise_gain is None:
         noise_gain, words = default_noise_gain(plant.plant, facts, highest_rad_s)
+    criterion = settings.criterion
+    if criterion == "auto":
+        criterion = "iae" if plant.source == "recording" else "h2"
     asked = Specification(
         modulus_margin=modulus,
         phase_margin_rad=phase_rad,
         noise_gain=noise_gain,
         noise_frequency_rad_s=settings.noise_frequency_rad_s,
         delay_margin_s=_SAMPLES_OF_DELAY * (facts.sample_time_s or 0.0),
-        criterion=settings.criterion,
+        criterion=criterion,
     )
     return asked, words
 

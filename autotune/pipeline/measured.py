@@ -16,8 +16,10 @@ from autotune.identification.recorded_plant import fit_recordings
 from autotune.points import FrequencyPoint
 from autotune.recording import Recording
 
-#: recordings whose points say less than a fit of the whole record does
-_PLAIN = ("random or steps", "repeated command")
+#: recordings whose points say less than a fit of the whole record does; a relay's say more
+_PLAIN = ("random or steps", "repeated command", "closed loop by way of r")
+#: a plant is fitted to so many points at least
+_LEAST_POINTS = 3
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,7 +79,7 @@ def measured_of(recordings: Sequence[Recording], given: Sequence[FrequencyPoint]
             notes.append(str(error))
             reason = reason or error
     points = (*(combined.points if combined else ()), *given)
-    if fit is None and not points and reason is not None:
+    if fit is None and len(points) < _LEAST_POINTS and reason is not None:
         raise reason
     return Measured(
         points=points, fit=fit, facts=_facts(recordings), notes=(*notes, *(combined.notes if combined else ()))

@@ -36,6 +36,7 @@ _UNDETERMINED = {1: 0.5, 2: 0.5, 3: 0.2, 4: 0.2}
 #: relative standard deviation of b below which the sum of squares is a paraboloid as far as the intervals reach
 _LINEAR = 0.01
 _MINIMA = 4
+_AT_REST = 3  # rows in which u stays as it is
 _COMPARED_ORDER = 3
 #: rise of the sum of squares, in residual variances and logarithms of the rows, that an order must be worth: what the
 #: Bayes information criterion asks for a coefficient and an initial state
@@ -128,15 +129,29 @@ def identify_delay(
         near = Point(a=start.a, h=start.delay_s, theta=np.zeros(2 + order), cost=np.inf, rows=0)
         return _polish_on_all_rows(data, data, structure, near, largest, coloured)
     progress("searching the delay", 0.0)
-    candidates = search(data, structure, max_delay_s=largest)
+    searched = _as_if_held(data)
+    candidates = search(searched, structure, max_delay_s=largest)
     finest = min(c.rows_per_bin for c in candidates)
-    middle = binned(data, max(_MIDDLE_BINS, 10 * data.ty.size // finest))
+    bins = max(_MIDDLE_BINS, 10 * data.ty.size // finest)
+    middle = binned(searched, bins)
     best = _best_on_common_rows(middle, structure, [c.point for c in candidates], largest)
     if _is_ambiguous(middle, structure, best):
         progress("comparing delays", 0.6)
         best = scan(binned(middle, _SCANNED_BINS), structure, best, max_delay_s=largest)
+    middle = binned(data, bins)
     progress("fitting", 0.8)
     return _polish_on_all_rows(data, middle, structure, best, largest, coloured)
+
+
+def _as_if_held(data: DelayData) -> DelayData:
+    """Return the record with u held before it began as it rests in its first rows, where nobody knows what it was.
+
+    What a delay cannot explain for want of that past would be left out of its cost, and a delay as long as half of a
+    step test leaves out the step: every delay would explain the rest. The minimum so found is fitted without it.
+    """
+    if data.before is not None or float(np.ptp(data.u[:_AT_REST])) > 0.0:
+        return data
+    return replace(data, before=float(data.u[0]))
 
 
 def _largest_delay(data: DelayData, max_delay_s: float | None) -> float:

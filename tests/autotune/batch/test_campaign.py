@@ -207,7 +207,7 @@ def test_the_example_reads_a_historian_with_german_numbers_quality_flags_and_a_f
 def test_a_closed_loop_whose_set_point_rests_gives_no_points(tmp_path):
     t, u, y = signals(0)
     path = write(tmp_path / "a.csv", {"t": t, "u": u, "y": y, "r": np.full(t.size, 20.0)})
-    work = Work(loop=LoopSettings(name="a", file=str(path)), settings=CampaignSettings(name="a"))
+    work = Work(loop=LoopSettings(name="a", file=str(path)), settings=CampaignSettings(name="a", task="identify"))
     assert "the set-point never moves" in analyse_loop(work).row.reason
 
 

@@ -54,8 +54,9 @@ def test_the_region_is_no_wider_than_the_record_where_a_controller_works(seed: i
         return float(np.sum((error - np.mean(error)) ** 2)) / NOISE**2
 
     # a fast lag may be anything near its estimate, but then the dead time is what their sum, which is known, leaves
-    lags = np.array([1.0 / np.max(-plant.poles.real) for plant in plants])
-    sums = lags + np.array([plant.delay_s for plant in plants])
+    of_two = [plant for plant in plants if plant.poles.size == 2]  # one lag with a longer dead time may be left too
+    lags = np.array([1.0 / np.max(-plant.poles.real) for plant in of_two])
+    sums = lags + np.array([plant.delay_s for plant in of_two])
     assert np.ptp(sums) < 0.5 * np.ptp(lags)
     omega = np.array([0.03])  # crossover of a PI for this plant
     turned = [float(np.angle(plant.response(omega) / fit.plant.response(omega), deg=True)[0]) for plant in plants]

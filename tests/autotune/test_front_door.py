@@ -1,0 +1,94 @@
+"""Files as people have them go to a controller by one command, near the best PI of the plant they were made from."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import autotune as at
+from autotune.batch.loop import Work, analyse_loop
+from autotune.batch.settings import CampaignSettings, LoopSettings
+from autotune.design.margins import margins
+from autotune.errors import IdentificationError
+from autotune.identification.dependence import require_answer
+from autotune.identification.recorded_plant import fit_recordings
+from autotune.recording import Recording
+from tests.benchmarks._front_door_files import BOILER, DOORS, OVEN, Rows, levels, open_loop
+from tests.benchmarks.front_door import best, load_error, tuned
+
+FILES = {door.name: door for door in DOORS}
+
+
+@pytest.mark.parametrize(
+    ("name", "worst"),
+    # the region of the closed loop's short record is wide, and margins are kept over all of it
+    [("oven_step.csv", 1.1), ("doublet.csv", 1.1), ("inverse.csv", 1.1), ("closed_loop.csv", 1.3)],
+)
+def test_a_recording_goes_to_a_controller_with_margins_near_the_best(name: str, worst: float, tmp_path: Path) -> None:
+    door = FILES[name]
+    door.write(tmp_path / name)
+    found = tuned(tmp_path / name, tmp_path / "out")
+    assert not isinstance(found, str), found
+    kept = margins(door.plant, found)
+    assert kept.modulus > 0.495
+    assert kept.phase_rad > np.radians(44.5)
+    assert load_error(door.plant, found) < worst * load_error(door.plant, best(door.plant))
+
+
+@pytest.mark.parametrize(
+    ("name", "columns"),
+    [
+        ("oven_step.csv", ("heater", "temperature", "")),
+        ("german.csv", ("Stellgröße", "Istwert", "")),
+        ("closed_loop.csv", ("u", "y", "r")),
+        ("historian.csv", ("FIC7.OP", "FIC7.PV", "")),
+    ],
+)
+def test_tune_batch_and_python_give_the_same_gains(name: str, columns: tuple[str, str, str], tmp_path: Path) -> None:
+    file = tmp_path / name
+    FILES[name].write(file)
+    found = tuned(file, tmp_path / "out")
+    assert not isinstance(found, str), found
+    u, y, r = columns
+    work = Work(loop=LoopSettings(name="a", file=str(file), u=u, y=y, r=r), settings=CampaignSettings(name="all"))
+    row = analyse_loop(work).row
+    assert row.K is not None, row.reason
+    here = at.tune(file).controller
+    assert [row.K, row.Ti_s] == pytest.approx([found.K, found.Ti_s], rel=1e-4)
+    assert [here.K, here.Ti_s] == pytest.approx([found.K, found.Ti_s], rel=1e-4)
+
+
+def _recording(rows: Rows) -> Recording:
+    return Recording(t=rows.t, u=rows.u, y=rows.y, name="test")
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_one_step_gives_gain_lag_and_dead_time(seed: int) -> None:
+    u = levels(1.0, (60.0, 0.0), (540.0, 10.0))
+    recording = _recording(open_loop(OVEN, u, 1.0, 0.1, 22.0, 30.0, seed))
+    require_answer([recording])
+    plant = fit_recordings([recording]).plant
+    assert plant.num[-1] / plant.den[-1] == pytest.approx(0.8, rel=0.02)
+    assert plant.den[0] / plant.den[1] == pytest.approx(90.0, rel=0.05)
+    assert plant.delay_s == pytest.approx(8.1, abs=1.5)
+
+
+def test_inverse_response_is_fitted_with_its_zero() -> None:
+    u = levels(1.0, (40.0, 0.0), *((90.0, level) for level in (8.0, 0.0, -8.0, 0.0)))
+    fit = fit_recordings([_recording(open_loop(BOILER, u, 1.0, 0.05, 100.0, 50.0, 3))])
+    assert len(fit.plant.num) == 2
+    zero_s = -fit.plant.num[0] / fit.plant.num[1]
+    assert zero_s == pytest.approx(5.0, abs=4.0 * float(np.sqrt(fit.covariance[-1, -1])))
+    omega = np.array([0.05])
+    assert abs(fit.plant.response(omega) / BOILER.response(omega) - 1.0)[0] < 0.05
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_noise_under_one_step_is_still_refused(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    u = levels(1.0, (200.0, 0.0), (400.0, 10.0))
+    y = np.cumsum(rng.standard_normal(u.size))
+    with pytest.raises(IdentificationError, match="beyond chance"):
+        require_answer([Recording(t=np.arange(u.size, dtype=np.float64), u=u, y=y, name="walk")])
