@@ -17,7 +17,7 @@ from scipy.linalg import expm
 
 from autotune.arrays import ComplexArray, FloatArray
 from autotune.controller import Controller, DiscreteController, PIDController
-from autotune.errors import DesignError
+from autotune.errors import DesignError, InputError
 from autotune.models import Model, TransferFunction
 
 Plant: TypeAlias = TransferFunction | Model
@@ -129,7 +129,13 @@ class ContinuousLoop:
         """Logarithmic grid over all features, dense around resonances and as fine as the dead time asks."""
         L = self.transfer_function
         corners = characteristic_frequencies(self.plant, self.controller, L)
-        low, high = corners[0] * 1e-3, corners[-1] * 1e3
+        low, high = float(corners[0]) * 1e-3, float(corners[-1]) * 1e3
+        if low == 0.0 or math.isinf(high / low):
+            raise InputError(
+                f"the loop's corners, {corners[0]:.3g} to {corners[-1]:.3g} rad/s, leave the range of numbers",
+                where="closed loop",
+                remedy="check the units of gains and times",
+            )
         count = int(_POINTS_PER_DECADE * math.log10(high / low)) + 1
         parts = [np.geomspace(low, high, count)]
         closed = np.roots(np.polyadd(L.num, L.den)) if L.delay_s == 0.0 else np.zeros(0)

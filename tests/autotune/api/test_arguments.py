@@ -54,6 +54,8 @@ def points(gain: float = 1.0) -> list[FrequencyPoint]:
         (lambda: at.tune(at.TransferFunction(num=(1.0, 0.0, 1.0), den=(1.0, 1.0))), "no plant differentiates"),
         (lambda: at.margins(PLANT, at.PI(K=0.0, Ti_s=0.0)), "no loop"),
         (lambda: at.margins(PLANT, at.PI(K=1.0, Ti_s=1e-320)), "other units"),
+        (lambda: at.margins(PLANT, at.PI(K=1e300, Ti_s=1e300)), "range of numbers"),
+        (lambda: at.margins(PLANT, at.PI(K=1e-300, Ti_s=1e-300)), "range of numbers"),
         (lambda: at.validate(PLANT, PLANT, at.PI(K=1.0, Ti_s=1.0), scaling=0.0), "scaling = 0.0"),
     ],
 )
