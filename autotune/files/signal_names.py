@@ -15,6 +15,7 @@ from autotune.files.cells import numbers
 from autotune.files.header import words as vocabulary
 from autotune.files.stamps import StampForm, detect_form, is_milliseconds
 from autotune.files.table import Table
+from autotune.files.tags import follower, instrument
 
 _TIME = vocabulary(
     "t time zeit timestamp datetime date datum uhrzeit zeitstempel stamp timestring zeitpunkt datenum elapsed temps"
@@ -49,7 +50,7 @@ _WORDS: Mapping[str, Mapping[str, int]] = {
 }
 #: what a PLC's programmer writes before a name for its type: rActualValue is a REAL, not a set-point r
 _TYPE_PREFIX = re.compile(r"(?<![A-Za-z])(?:l?r|u?[dsl]?int|u?[dsl]?i|f|b|x|d?w|n)(?=[A-Z][a-z])")
-_WEAKEST_SURE = 2
+_USUAL = _WEAKEST_SURE = 2
 _STEM_BONUS = 2.0
 
 
@@ -120,8 +121,9 @@ def find_roles(table: Table, given: SignalNames) -> Roles:
         weak = [role for role, name in (("u", u), ("y", y)) if role not in named and not _stands(points, role, name)]
         if len(weak) == 1 and len([name for name in free if name != r]) == 1 + ("u" not in named) - ("u" in named):
             weak = []  # the other is known and no further column is left
-        if din := _either_way(table, numeric, named):
-            u, y, weak = *din, ["u", "y"]
+        if either := _either_way(table, numeric, named, r):
+            u, y, sure = either
+            weak = [] if sure else ["u", "y"]
         unsure += [role for role, name in (("u", u), ("y", y)) if role not in named and (tie or role in weak)]
     else:
         u, y = named.get("u", ""), named.get("y", "")
@@ -132,19 +134,26 @@ def find_roles(table: Table, given: SignalNames) -> Roles:
     return Roles(time=time, names=names, unsure=tuple(unsure), others=tuple(n for n in numeric if n not in taken))
 
 
-def _either_way(table: Table, numeric: Sequence[str], named: Mapping[str, str]) -> tuple[str, str] | None:
-    """Return command and measurement where a file may write y for the command and x for what is controlled.
+def _either_way(table: Table, numeric: Sequence[str], named: Mapping[str, str], r: str) -> tuple[str, str, bool] | None:
+    """Return command and measurement where their names are used both ways round, and whether the values decide.
 
-    That is the notation of DIN 19226 and IEC 60050-351 with w for the set-point; elsewhere y is the measurement. In and
-    out alone, as ports of a block diagram are called, are the plant's or the controller's: the plant's are proposed.
+    y for the command and x for what is controlled is the notation of DIN 19226 and IEC 60050-351 with w for the
+    set-point; elsewhere y is the measurement. In and out are ports of the plant or of the controller. The one that
+    keeps to the set-point is the measurement; where none does, or there is no set-point, DIN's and the plant's are
+    proposed. Input and output without a set-point are the plant's.
     """
     letters = {table.bare(name).lower(): name for name in numeric}
     if {"u", "y"} & set(named) or "u" in letters:
         return None
-    return next(
-        ((letters[u], letters[y]) for u, y in (("y", "x"), ("in", "out"), ("in1", "out1")) if {u, y} <= set(letters)),
-        None,
+    pairs = [("y", "x"), ("in", "out"), ("in1", "out1")]
+    pair = next((names for names in [*pairs, *[("input", "output")] * bool(r)] if {*names} <= set(letters)), None)
+    if pair is None:
+        return None
+    u, y = (letters[name] for name in pair)
+    nearer = (
+        None if r in ("", u, y) else follower(*(numbers(table.sample[name], table.decimal)[0] for name in (r, u, y)))
     )
+    return (y, u, True) if nearer == 0 else (u, y, nearer == 1)
 
 
 def _time(table: Table, taken: set[str]) -> tuple[tuple[str, ...], bool]:
@@ -216,12 +225,15 @@ def _words(name: str, table: Table) -> set[str]:
 
 def _points(table: Table, name: str, role: str) -> float:
     words = _words(name, table)
+    tag = _USUAL * (instrument(table.bare(name)) == role)
     best = max((value for word, value in _WORDS[role].items() if word in words), default=0)
+    if any(word in words for known in _WORDS.values() for word in known):
+        return float(max(best, tag))  # in "inflow valve" the valve is what is said, and not the flow
     compound = max(
         (value for word, value in _WORDS[role].items() for own in words if len(word) > 3 and own.endswith(word)),
         default=0,
     )
-    return float(max(best, compound))
+    return float(max(compound, tag))
 
 
 def _only_best(points: Mapping[str, float], least: float) -> str:

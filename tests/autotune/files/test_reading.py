@@ -198,6 +198,39 @@ def test_what_names_leave_open_is_asked_for_and_never_guessed(tmp_path, header, 
     assert read_recordings(path, named).names.y == named.y
 
 
+def _columns(path, header, *columns):
+    rows = (";".join(f"{value:.4f}" for value in row) for row in zip(*columns, strict=True))
+    path.write_text("\n".join([header, *rows]) + "\n")
+    return path
+
+
+@pytest.mark.parametrize(
+    "header",
+    ["time [s];level [%];inflow valve [%]", "t_ms;PT101_mA;YV101_pct", "Time;LIT-3;FCV-2", "t;FT1;XV1"],
+)
+def test_the_words_of_a_column_and_the_letters_of_its_tag_say_what_it_is(tmp_path, header):
+    (recording,) = read_recordings(_columns(tmp_path / "a.csv", header, T, Y, U)).recordings
+    np.testing.assert_allclose(recording.u, U)
+
+
+@pytest.mark.parametrize("header", ["Time;Input;Output;Setpoint", "t;in;out;sp", "Zeit;y;x;w"])
+@pytest.mark.parametrize("swapped", [False, True])
+def test_the_signal_that_keeps_to_the_set_point_is_the_measurement(tmp_path, header, swapped):
+    rng = np.random.default_rng(4)
+    w = np.repeat(rng.choice([58.0, 62.0], 4), 100)
+    x = np.round(w + rng.normal(0.0, 0.2, N), 3)
+    signals = (U, x) if swapped else (x, U)
+    (recording,) = read_recordings(_columns(tmp_path / "a.csv", header, T, *signals, w)).recordings
+    np.testing.assert_allclose(recording.y, x)
+    np.testing.assert_allclose(recording.u, U)
+
+
+def test_a_pid_block_whose_signals_both_leave_the_set_point_is_asked_about(tmp_path):
+    path = _columns(tmp_path / "a.csv", "Time;Input;Output;Setpoint", T, Y, Y[::-1], np.full(N, 80.0))
+    with pytest.raises(InputError, match="command and measurement is not sure"):
+        read_recordings(path)
+
+
 def test_columns_without_a_header_are_named_by_number(tmp_path):
     path = tmp_path / "a.txt"
     path.write_text(no_header())
