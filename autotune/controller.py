@@ -21,7 +21,7 @@ from autotune.errors import InputError
 from autotune.models import TransferFunction
 from autotune.outputs import write_whole
 from autotune.schema import LONGEST_S, SHORTEST_S, Number, Section, Time, shortened, validated
-from autotune.text_files import read_toml
+from autotune.text_files import read_json, read_toml
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -163,6 +163,7 @@ class _DesignedPID(_PID):
     binding: Any = None
     margins: Any = None
     certificate: Any = None
+    is_integral: Any = None
 
 
 _Coefficients = Annotated[tuple[Annotated[Number, Field(strict=True)], ...], Field(min_length=1, max_length=100)]
@@ -189,14 +190,24 @@ class _Rational(Section):
 
 
 def read_controller(path: str | os.PathLike[str]) -> Controller:
-    """Read a controller file.
+    """Read a controller: its file (TOML), or the result that it is in (JSON), or the folder of that result.
+
+    Parameters
+    ----------
+    path : path
+        ``controller.toml``, ``design.json``, ``result.json`` or the file of one loop of a campaign, or a folder that
+        holds a ``result.json``.
 
     Raises
     ------
     InputError
-        No such file, not TOML, or keys that make no controller; names the key.
+        No such file, neither TOML nor JSON, or keys that make no controller; names the key.
     """
     where = str(path)
+    if os.path.isdir(path):
+        return read_controller(os.path.join(path, "result.json"))
+    if os.path.splitext(path)[1].lower() == ".json":
+        return read_designed(path)
     content = read_toml(path)
     if isinstance(content.get("kind"), str):
         content["kind"] = content["kind"].lower()
@@ -206,6 +217,20 @@ def read_controller(path: str | os.PathLike[str]) -> Controller:
         kind = shortened(repr(content.get("kind")))
         raise InputError(f"kind = {kind}", where=where, remedy='write kind = "pi" or "pid", or num and den')
     return _pid(validated(_PID, content, where))
+
+
+def read_designed(path: str | os.PathLike[str]) -> PIDController:
+    """Return the PI or PID of a ``design.json``, of a ``result.json``, or of the file of one loop of a campaign.
+
+    Raises
+    ------
+    InputError
+        No such file, or no PI or PID in it that could run a loop; names the key.
+    """
+    table = read_json(path)
+    for key in ("result", "controller"):
+        table = table.get(key, table) if isinstance(table, dict) else table
+    return pid_from_table(table, str(path))
 
 
 def pid_from_table(table: Any, where: str) -> PIDController:

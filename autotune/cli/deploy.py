@@ -152,8 +152,8 @@ def verify(
 
 def _gains(controller: Path | None, design: Path | None, run: Path | None) -> PIDController:
     """Return the gains of the one source that was given."""
-    from autotune.controller import PIDController, read_controller
-    from autotune.pipeline.folder import RESULT, read_designed
+    from autotune.controller import PIDController, read_controller, read_designed
+    from autotune.pipeline.folder import RESULT
 
     if controller is not None and design is not None:
         raise InputError("both --controller and --design", where="gains", remedy="give one of them")

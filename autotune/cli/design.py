@@ -133,6 +133,8 @@ def design_command(
 def _sentence(designed: Design) -> str:
     c, m = designed.controller, designed.margins
     gains = f"K = {c.K:.5g}, Ti = {c.Ti_s:.4g} s"
+    if designed.is_integral:
+        gains = f"acts as an integral controller, K/Ti = {c.K / c.Ti_s:.5g} per s: {gains}"
     if designed.kind == "pid":
         gains += f", Td = {c.Td_s:.4g} s, Tf = {c.Tf_s:.3g} s"
     if c.setpoint_weight != 1.0:
@@ -148,7 +150,7 @@ def _sentence(designed: Design) -> str:
 @app.command("margins")
 def margins_command(
     model: Annotated[Path, typer.Option(help="model file (TOML)")],
-    controller: Annotated[Path, typer.Option(help="controller file (TOML)")],
+    controller: Annotated[Path, typer.Option(help="controller file (TOML), or a result.json")],
     out: Annotated[Path, typer.Option(help="file to write the margins to (JSON)")],
     noise_frequency: Annotated[
         float | None, typer.Option(help="lowest frequency of the noise [rad/s]; default the crossover")
@@ -184,7 +186,7 @@ else:
 
 @app.command("controller")
 def controller_command(
-    controller: Annotated[Path, typer.Option(help="controller file (TOML) of kind pi or pid")],
+    controller: Annotated[Path, typer.Option(help="controller file (TOML) of kind pi or pid, or a result.json")],
     form: Annotated[Target, typer.Option(help="a maker's form, or c or st for the law as code")] = "isa",
     sample_time: Annotated[float, typer.Option(help="time between samples, for velocity, c and st [s]")] = 0.01,
     u_span: Annotated[float, typer.Option(help="engineering span of the output, for percent forms [u unit]")] = 1.0,

@@ -38,7 +38,8 @@ def relay(
         Path | None, typer.Option(help="model file (TOML) of the plant, where it is known; fitted to the points else")
     ] = None,
     controller: Annotated[
-        Path | None, typer.Option(help="controller file (TOML); the PI designed on the reduced model when absent")
+        Path | None,
+        typer.Option(help="controller file (TOML) or result.json; the PI designed on the reduced model when absent"),
     ] = None,
     beside: Annotated[list[Path] | None, typer.Option(help="a further controller file; may be repeated")] = None,
     noise_gain: Annotated[float, typer.Option(min=1e-9, help="N_max of the design and of (26) [u/y unit]")] = 0.1,

@@ -24,7 +24,7 @@ def validate_command(
     against: Annotated[Path, typer.Option(help="model file (TOML) of the plant")],
     out: Annotated[Path, typer.Option(help="file to write the comparison to (JSON)")],
     controller: Annotated[
-        Path | None, typer.Option(help="controller file (TOML); the PI designed on --model when absent")
+        Path | None, typer.Option(help="controller file (TOML) or result.json; the PI designed on --model when absent")
     ] = None,
     scaling: Annotated[
         float | None,
@@ -59,7 +59,8 @@ def reference_command(
     out: Annotated[Path, typer.Option(help="CSV t,r,u_ff to write; with --controller the prefilter (TOML)")],
     model: Annotated[Path | None, typer.Option(help="model file (TOML) or delay.json that u is computed with")] = None,
     controller: Annotated[
-        Path | None, typer.Option(help="controller file (TOML): write the prefilter of its set-point weight instead")
+        Path | None,
+        typer.Option(help="controller file (TOML) or result.json: write the prefilter of its set-point weight instead"),
     ] = None,
     begin: Annotated[float, typer.Option("--from", help="y at rest before [y unit]")] = 0.0,
     end: Annotated[float, typer.Option("--to", help="y at rest after [y unit]")] = 1.0,

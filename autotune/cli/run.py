@@ -208,7 +208,8 @@ def tune(
 ) -> None:
     """Design a controller from recordings and points, without a rig: model, controller, checks, report."""
     from autotune.config.procedure import DesignSettings, SignalSettings
-    from autotune.pipeline import RESULT, analyse, analysis_json, measured_of
+    from autotune.controller import write_controller
+    from autotune.pipeline import CONTROLLER, RESULT, analyse, analysis_json, measured_of
     from autotune.points import read_points
     from autotune.report.page import write_page
     from autotune.report.run_page import analysis_page
@@ -217,7 +218,7 @@ def tune(
     recordings, files = recordings or [], points or []
     if not recordings and not files:
         raise InputError("give recordings or --points", where="autotune tune")
-    place = OutputFolder(out, (RESULT, "report.html"), inputs=(*recordings, *files), overwrite=overwrite)
+    place = OutputFolder(out, (RESULT, CONTROLLER, "report.html"), inputs=(*recordings, *files), overwrite=overwrite)
     options = {
         "modulus_margin": modulus_margin,
         "phase_margin_deg": phase_margin,
@@ -244,9 +245,10 @@ def tune(
     page = analysis_page(", ".join(path.stem for path in (*recordings, *files)), signals, read, analysis, notes)
     with place.filled() as folder:
         write_json(folder / RESULT, analysis_json(analysis))
+        write_controller(analysis.controller, folder / CONTROLLER)
         write_page(page, folder / "report.html")
     console = Console(highlight=False, soft_wrap=True)
     for note in (*notes, *analysis.warnings, *analysis.notes):
         console.print(f"note: {note}", markup=False)
     console.print(page.verdict, markup=False)
-    console.print(f"report: {out / 'report.html'}", markup=False)
+    console.print(f"report: {out / 'report.html'}, controller: {out / CONTROLLER}", markup=False)

@@ -150,6 +150,8 @@ class Design:
         Margins with the plant that was designed on.
     certificate : str
         In a sentence, what the lower bound covers or why there is none.
+    is_integral : bool
+        The proportional part does nothing; K and T_I are a PI's that acts as an integral controller of K/T_I.
     """
 
     kind: Kind
@@ -160,6 +162,7 @@ class Design:
     binding: tuple[str, ...]
     margins: Margins
     certificate: str
+    is_integral: bool = False
 
     @property
     def gap(self) -> float | None:
@@ -181,4 +184,5 @@ class Design:
             "margins": self.margins.to_json(),
             "setpoint_weight": c.setpoint_weight,
             "certificate": self.certificate,
+            **({"is_integral": True} if self.is_integral else {}),
         }

@@ -29,6 +29,10 @@ _LED = 4
 _TIGHTER = (1e-5, 1e-4, 1e-3, 5e-3)
 #: margins between the grid's frequencies are exact to this; what is missed by more is never handed out
 _MISSED = 1e-3
+#: a proportional part that is nowhere more than this of the loop does nothing: the controller is an integral one
+_NO_PROPORTION = 5e-3
+#: what is given of the integral gain so that a proportional part of that size keeps the constraints
+_GIVEN = (1.0, 0.999, 0.997, 0.99, 0.97)
 
 
 def design(
@@ -91,6 +95,8 @@ def design(
         statement = "no lower bound: four gains are searched locally from several starts"
     if specification.criterion == "iae":
         controller = _least_error(problem, controller)
+    integral = as_integral(problem, controller)
+    controller = controller if integral is None else integral
     found = [margins(one, controller, noise_frequency_rad_s=specification.noise_frequency_rad_s) for one in plants]
     slacks = [float(np.min(problem.slacks_of(i, m.figures))) for i, m in enumerate(found)]
     worst = found[int(np.argmin(slacks))]
@@ -114,7 +120,27 @@ def design(
         binding=tuple(dict.fromkeys(name for m in found for name in specification.binding(m.figures))),
         margins=worst,
         certificate=statement,
+        is_integral=integral is not None,
     )
+
+
+def as_integral(problem: Problem, controller: PIDController) -> PIDController | None:
+    """Return an integral controller as a PI that a device can hold; None where the proportional part does something.
+
+    On a plant with a resonance or little but dead time the best PI has K = 0. A search in logarithms of the gains comes
+    as near to that as it has steps, and its K says nothing; this one's is as large as can be without changing the loop.
+    """
+    if controller.kind != "pi":
+        return None
+    largest = max(float(np.max(np.abs(one.h))) for one in problem.sampled)
+    K = math.copysign(_NO_PROPORTION / largest, controller.K)
+    if abs(controller.K) >= abs(K):
+        return None
+    for share in _GIVEN:
+        Ti = K / (share * controller.K / controller.Ti_s)
+        if problem.kept(np.array([abs(K), Ti, 0.0, 0.0])):
+            return PIDController(K=K, Ti_s=Ti)
+    return None
 
 
 def _least_error(problem: Problem, controller: PIDController) -> PIDController:

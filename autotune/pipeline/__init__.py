@@ -2,12 +2,13 @@
 
 from autotune.pipeline.analysis import Analysis, analyse
 from autotune.pipeline.deployment import hand_over
-from autotune.pipeline.folder import JOURNAL, PROGRESS, RECORDING, RESULT, VERIFICATION, recordings
+from autotune.pipeline.folder import CONTROLLER, JOURNAL, PROGRESS, RECORDING, RESULT, VERIFICATION, recordings
 from autotune.pipeline.measured import Measured, measured_of
 from autotune.pipeline.result import analysis_json, write_result
 from autotune.pipeline.run import DECISION_S, Tuning, tune
 
 __all__ = [
+    "CONTROLLER",
     "DECISION_S",
     "JOURNAL",
     "PROGRESS",

@@ -11,7 +11,6 @@ from typing import Any
 import tomli_w
 
 from autotune.config import Config, load_config
-from autotune.controller import PIDController, pid_from_table
 from autotune.errors import InputError
 from autotune.experiment.cycles import Earlier, read_earlier
 from autotune.outputs import write_whole
@@ -19,10 +18,10 @@ from autotune.points import FrequencyPoint, read_points
 from autotune.text_files import read_json
 
 RECORDING, VERIFICATION, RESULT, JOURNAL = "recording.csv", "verification.csv", "result.json", "journal.jsonl"
-PROGRESS, CONFIG, REPORT = "progress.jsonl", "config.toml", "report.html"
+PROGRESS, CONFIG, REPORT, CONTROLLER = "progress.jsonl", "config.toml", "report.html", "controller.toml"
 
 #: what a new run writes, its configuration apart, which may be the one that it was given
-FILES_OF_A_RUN = (RECORDING, VERIFICATION, RESULT, JOURNAL, PROGRESS, REPORT)
+FILES_OF_A_RUN = (RECORDING, VERIFICATION, RESULT, JOURNAL, PROGRESS, REPORT, CONTROLLER)
 
 #: registers that no point depends on: a scale that turned out to be too coarse for the gains may be changed
 _OF_GAINS = tuple(f"rig.registers.{name}" for name in ("K", "Ti", "Td", "Tf", "gains", "unlock"))
@@ -119,18 +118,6 @@ def read_measured(folder: Path) -> Measured:
             "the run measured no points", where=str(folder / RESULT), remedy="autotune run CONFIG --resume"
         )
     return Measured(points=points, noise_sd=experiment.get("noise_sd"), u_rest=experiment.get("u_rest"))
-
-
-def read_designed(path: Path) -> PIDController:
-    """Return the controller of a ``design.json``, or of a run's ``result.json``.
-
-    Raises
-    ------
-    InputError
-        No such file, or no PI or PID in it that could run a loop; names the key.
-    """
-    content = _read_json(path)
-    return pid_from_table(content.get("controller", content), str(path))
 
 
 def _read_json(path: Path) -> dict[str, Any]:

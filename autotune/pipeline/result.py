@@ -7,6 +7,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from autotune.controller import write_controller
 from autotune.design.nugap import Validation
 from autotune.diagnosis.result import Diagnosis
 from autotune.experiment.judgement import Verification
@@ -14,6 +15,7 @@ from autotune.experiment.result import ExperimentResult
 from autotune.experiment.running_law import RunningLaw
 from autotune.outputs import write_whole
 from autotune.pipeline.analysis import Analysis
+from autotune.pipeline.folder import CONTROLLER
 from autotune.points import points_to_json
 from autotune.run_log import jsonable
 
@@ -26,7 +28,7 @@ def write_result(
     *,
     reason: str,
 ) -> None:
-    """Write ``result.json``: every part that was reached, the others null."""
+    """Write ``result.json``, every part that was reached, the others null, and beside it the file of the controller."""
     content: dict[str, Any] = {
         "points": points_to_json(experiment.points) if experiment else [],
         "reduced_model": None,
@@ -38,6 +40,7 @@ def write_result(
     }
     if analysis is not None:
         content |= analysis_json(analysis)
+        write_controller(analysis.controller, path.with_name(CONTROLLER))
     if verification is not None:
         content["verification"] = verification_json(verification)
     write_json(content, path)

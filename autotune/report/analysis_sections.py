@@ -14,6 +14,7 @@ from autotune.config.procedure import SignalSettings
 from autotune.controller import PIDController
 from autotune.design.margins import margins
 from autotune.design.nugap import Validation
+from autotune.design.specification import Design
 from autotune.experiment.result import ExperimentResult
 from autotune.identification.parametric import PlantFit
 from autotune.pipeline import Analysis
@@ -370,6 +371,15 @@ def gains_text(controller: PIDController, signals: SignalSettings) -> str:
     unit = f" {signals.u_unit}/{signals.y_unit}" if signals.u_unit and signals.y_unit else ""
     derivative = f", T_d = {controller.Td_s:.4g} s, T_f = {controller.Tf_s:.3g} s" if controller.kind == "pid" else ""
     return f"{controller.kind.upper()} with K = {controller.K:.4g}{unit}, T_I = {controller.Ti_s:.4g} s{derivative}"
+
+
+def designed_text(design: Design, signals: SignalSettings) -> str:
+    """Return the gains of a design in words; an integral controller as what it is, and as the PI that acts like it."""
+    c, words = design.controller, gains_text(design.controller, signals)
+    if not design.is_integral:
+        return words
+    unit = f" {signals.u_unit}/({signals.y_unit} s)" if signals.u_unit and signals.y_unit else " per s"
+    return f"I controller with K_I = {c.K / c.Ti_s:.4g}{unit} (where only a PI is at hand: {words})"
 
 
 def based_on(analysis: Analysis) -> str:

@@ -18,7 +18,7 @@ from autotune.experiment.step_test import StepTest
 from autotune.pipeline import Analysis, Tuning
 from autotune.pipeline.deployment import Deployment
 from autotune.recording import Recording
-from autotune.report.analysis_sections import analysis_sections, based_on, gains_text, margins_sentence
+from autotune.report.analysis_sections import analysis_sections, based_on, designed_text, gains_text, margins_sentence
 from autotune.report.chart import Chart, make_subplots
 from autotune.report.figures import axis_title, ratio_title, recording_figure
 from autotune.report.page import BLUE, GREEN, GREY, ORANGE, PURPLE, RED, Figure, Page, Section, Table, add_line, thinned
@@ -97,10 +97,10 @@ def analysis_page(
     )
     return Page(
         title=f"Controller from recordings: {name}",
-        verdict=f"{gains_text(analysis.controller, signals)}: not yet tried on the rig.",
+        verdict=f"{designed_text(analysis.design, signals)}: not yet tried on the rig.",
         tone="warn",
         answers=(
-            ("Found", f"{gains_text(analysis.controller, signals)}, {based_on(analysis)}."),
+            ("Found", f"{designed_text(analysis.design, signals)}, {based_on(analysis)}."),
             ("How sure", margins_sentence(analysis, signals)),
             (
                 "What to do",
@@ -236,7 +236,7 @@ def _next_step(verification: Verification | None) -> str:
 
 
 def _verdict(tuning: Tuning, signals: SignalSettings, dry_run: bool) -> tuple[str, bool]:
-    gains = gains_text(tuning.analysis.controller, signals)
+    gains = designed_text(tuning.analysis.design, signals)
     if tuning.verification is None:
         return f"{gains}: designed, not verified on the rig.", False
     if tuning.verification.accepted:
@@ -255,7 +255,7 @@ def _answers(tuning: Tuning, signals: SignalSettings, diagnosis: Diagnosis | Non
         f" ({experiment.rig_time_s:.0f} s on the rig in all)."
     )
     if old is not None:
-        new, before = gains_text(tuning.analysis.controller, signals), gains_text(old, signals)
+        new, before = designed_text(tuning.analysis.design, signals), gains_text(old, signals)
         found += f" Before: {before}. Now: {new}." if tuning.deployed else f" The rig holds {before}; designed: {new}."
     sure = margins_sentence(tuning.analysis, signals)
     if tuning.verification is not None:

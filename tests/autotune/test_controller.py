@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import json
 import math
 from pathlib import Path
 
@@ -92,3 +93,20 @@ def test_a_design_of_this_tool_is_read_with_what_stands_beside_its_gains() -> No
     table = {"kind": "pi", "K": -0.02, "Ti_s": 3, "Td_s": 0.0, "Tf_s": 0.0, "h2": 0.1, "binding": [], "margins": {}}
     assert pid_from_table(table, "design.json") == PIDController(K=-0.02, Ti_s=3.0)
     assert pid_from_table({"K": 1.0, "Ti_s": None}, "design.json").Ti_s == math.inf
+
+
+@pytest.mark.parametrize("name", ["design.json", "result.json", "loop.json", "folder"])
+def test_the_controller_of_every_kind_of_result_is_read(tmp_path: Path, name: str) -> None:
+    design = {"kind": "pi", "K": -0.02, "Ti_s": 3, "h2": 0.1, "is_integral": True}
+    whole = {"points": [], "controller": design, "margins": {"modulus": 0.5}}
+    content = {"design.json": design, "loop.json": {"row": {"name": "a"}, "result": whole}}.get(name, whole)
+    path = tmp_path / ("result.json" if name == "folder" else name)
+    path.write_text(json.dumps(content))
+    assert read_controller(tmp_path if name == "folder" else path) == PIDController(K=-0.02, Ti_s=3.0)
+
+
+def test_a_result_without_a_controller_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "result.json"
+    path.write_text(json.dumps({"points": [], "controller": None}))
+    with pytest.raises(InputError, match="holds no K and Ti_s"):
+        read_controller(path)

@@ -10,6 +10,7 @@ import pytest
 import autotune as at
 from autotune.batch.loop import Work, analyse_loop
 from autotune.batch.settings import CampaignSettings, LoopSettings
+from autotune.controller import read_controller
 from autotune.design.margins import margins
 from autotune.errors import IdentificationError
 from autotune.identification.dependence import require_answer
@@ -31,6 +32,8 @@ def test_a_recording_goes_to_a_controller_with_margins_near_the_best(name: str, 
     door.write(tmp_path / name)
     found = tuned(tmp_path / name, tmp_path / "out")
     assert not isinstance(found, str), found
+    written = read_controller(tmp_path / "out" / "controller.toml")
+    assert written == found == read_controller(tmp_path / "out")
     kept = margins(door.plant, found)
     assert kept.modulus > 0.495
     assert kept.phase_rad > np.radians(44.5)

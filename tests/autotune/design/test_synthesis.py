@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -247,3 +248,19 @@ def test_a_plant_without_low_frequency_gain_is_refused() -> None:
 def test_specifications_outside_their_range_are_refused(wrong: dict[str, float]) -> None:
     with pytest.raises(DesignError, match="must be"):
         Specification(**wrong)
+
+
+@pytest.mark.parametrize("criterion", ["h2", "iae"])
+def test_a_plant_whose_best_pi_has_no_proportional_part_gets_an_integral_controller(
+    criterion: Literal["h2", "iae"],
+) -> None:
+    # damping 0.02: any proportional gain worth its name drives the resonance
+    servo = TransferFunction(num=(2.0,), den=(0.04, 0.008, 1.0), delay_s=0.02)
+    found = design(servo, Specification(noise_gain=10.0, criterion=criterion), certificate=False)
+    assert found.is_integral
+    assert found.margins.modulus > 0.5 - 1e-6
+    c = found.controller
+    largest = float(np.max(np.abs(servo.response(np.geomspace(4.0, 6.0, 9999)))))
+    assert abs(c.K) * largest == pytest.approx(5e-3, rel=1e-2)
+    assert 0.03 < c.K / c.Ti_s < 0.06
+    assert not design(FOPDT, Specification(noise_gain=10.0, criterion=criterion), certificate=False).is_integral
