@@ -88,7 +88,10 @@ def sampled_plant(plant: TransferFunction, largest_gain: float = 1.0) -> Sampled
             where="plant",
             remedy="check the model's units and the noise gain that is asked for",
         )
-    omega = np.geomspace(low, high, int(_POINTS_PER_DECADE * math.log10(high / low)) + 1)
+    # the plant's own grid, whatever the gains: they decide how far it reaches, and no digit of what is read between
+    own = characteristic_frequencies(plant)[0]
+    first, last = (_POINTS_PER_DECADE * math.log10(end / own) for end in (low, high))
+    omega = own * 10.0 ** (np.arange(math.floor(first), math.ceil(last) + 1) / _POINTS_PER_DECADE)
     if plant.delay_s > 0.0:
         step = 0.1 / plant.delay_s
         fine = np.arange(step * _POINTS_PER_DECADE / math.log(10.0), 80.0 / plant.delay_s, step)

@@ -198,9 +198,6 @@ def test_a_runs_recordings_give_its_own_points_and_gains_to_the_last_digit(
     done = autotune("tune", *recordings, "--out", tmp_path / "again")
     assert done.returncode == 0, done.stderr
     run, again = (json.loads((folder / "result.json").read_text()) for folder in (out, tmp_path / "again"))
-    # a supremum over frequencies that a search refines: its last digits go with the plants through the points
-    bounds = [one["controller"]["margins"].pop("noise_gain_bound") for one in (again, run)]
-    assert bounds[0] == pytest.approx(bounds[1], rel=1e-6)
     for part in ("points", "reduced_model", "controller", "margins", "validation"):
         assert again[part] == run[part], part
     assert autotune("identify", "frequency", *recordings, "--out", tmp_path / "p.json").returncode == 0

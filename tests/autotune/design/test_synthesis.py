@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from autotune.controller import PIDController
 from autotune.design.margins import margins
+from autotune.design.members import members_of
 from autotune.design.specification import Design, Specification, spec1, spec2
 from autotune.design.synthesis import design
 from autotune.errors import DesignError
@@ -264,3 +265,11 @@ def test_a_plant_whose_best_pi_has_no_proportional_part_gets_an_integral_control
     assert abs(c.K) * largest == pytest.approx(5e-3, rel=1e-2)
     assert 0.03 < c.K / c.Ti_s < 0.06
     assert not design(FOPDT, Specification(noise_gain=10.0, criterion=criterion), certificate=False).is_integral
+
+
+def test_figures_of_a_loop_do_not_hang_on_how_much_noise_is_allowed() -> None:
+    controller = PIDController(K=-0.03, Ti_s=3.3)
+    figures = [members_of([BALL, REDUCED], spec1(noise)).figures(controller) for noise in (0.1, 0.5, 0.5154)]
+    for others in figures[1:]:
+        np.testing.assert_array_equal(others.controller_gain, figures[0].controller_gain)
+        np.testing.assert_array_equal(others.phase_rad, figures[0].phase_rad)
