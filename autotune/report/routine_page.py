@@ -1,4 +1,4 @@
-"""The look at a loop in operation as a page: verdict, free runs on stretches left out, u over y, what was compared."""
+"""The look at a loop in operation as a page: verdict, what a faulty valve explains, u over y, what was compared."""
 
 from __future__ import annotations
 
@@ -7,11 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from autotune.arrays import FloatArray
-from autotune.diagnosis.routine.fitting import Family
-from autotune.diagnosis.routine.result import Comparison, RoutineDiagnosis
+from autotune.diagnosis.routine.result import RoutineDiagnosis
 from autotune.diagnosis.routine.thresholds import table
-from autotune.report.chart import Bar, Chart, make_subplots
+from autotune.report.chart import make_subplots
 from autotune.report.page import (
     BLUE,
     GREEN,
@@ -31,7 +29,6 @@ _TONES: dict[str, Tone] = {
     "stiction": "bad", "backlash": "bad", "tight_tuning": "warn", "outside_oscillation": "warn", "none": "good",
     "abstain": "warn",
 }  # fmt: skip
-_NAMES: dict[Family, str] = {"linear": "linear valve", "play": "play", "stiction": "stiction"}
 #: What is drawn at once, where every turn is seen: periods in the middle of the record, and rows at most.
 _PERIODS, _ROWS = 14, 600
 
@@ -48,71 +45,58 @@ def write_routine_page(found: RoutineDiagnosis, path: str | os.PathLike[str]) ->
     """
     errors = " ".join(found.sentences[1:])
     page = Page(
-        title=f"Loop in operation: {', '.join(Path(name).name for name in found.bench.of.names)}",
+        title=f"Loop in operation: {', '.join(Path(name).name for name in found.operation.names)}",
         verdict=found.sentences[0],
         tone=_TONES[found.verdict],
         answers=(("How sure", errors), ("What to do", found.following)),
-        sections=(_runs(found), _curve(found), _comparison(found), _method()),
+        sections=(_signals(found), _evidence(found), _curve(found), _comparison(found), _method()),
     )
     write_page(page, path)
 
 
-def _shown(found: RoutineDiagnosis) -> Family:
-    """Return the faulty family that is drawn beside the linear one."""
-    if found.family != "linear":
-        return found.family
-    return min(("play", "stiction"), key=lambda name: float(found.runs[name].errors.sum()))
-
-
-def _left_out(found: RoutineDiagnosis, family: Family) -> tuple[FloatArray, FloatArray]:
-    """Return output and valve position of a family, every stretch by the candidate that was fitted to the others."""
-    operation, bench = found.bench.of, found.bench
-    y, x = np.full(operation.u.size, np.nan), np.full(operation.u.size, np.nan)
-    for number, fitted in enumerate(found.runs[family].fits):
-        run, position = bench.free_run(fitted.at, fitted.delay, fitted.gain), bench.position(fitted.at)
-        for first, end in operation.windows[operation.stretch_of == number]:
-            y[first:end], x[first:end] = run[first:end], position[first:end]
-    return y, x
-
-
 def _section_of(found: RoutineDiagnosis) -> slice:
-    rows = found.bench.of.rows_of(0)
-    size, period = rows.stop - rows.start, found.bench.of.period_rows
+    rows = found.operation.rows_of(0)
+    size, period = rows.stop - rows.start, found.operation.period_rows
     drawn = min(_ROWS, int(_PERIODS * period)) if np.isfinite(period) else _ROWS
     first = rows.start + max(0, (size - drawn) // 2)
     return slice(first, min(first + drawn, rows.stop))
 
 
-def _runs(found: RoutineDiagnosis) -> Section:
-    operation, part, family = found.bench.of, _section_of(found), _shown(found)
+def _signals(found: RoutineDiagnosis) -> Section:
+    operation, part = found.operation, _section_of(found)
     t = operation.t[part]
     figure = make_subplots(rows=2, shared_xaxes=True, vertical_spacing=0.05)
-    faulty, position = _left_out(found, family)
-    linear, _ = _left_out(found, "linear")
     add_line(figure, t, operation.y[part], "y recorded", GREY, row=1, col=1)
-    add_line(figure, t, linear[part], "linear valve", ORANGE, row=1, col=1)
-    add_line(figure, t, faulty[part], f"with {_NAMES[family]}", BLUE, row=1, col=1)
     add_line(figure, t, operation.u[part], "u recorded", GREY, dash="dot", row=2, col=1)
-    add_line(figure, t, position[part], "valve as fitted", GREEN, row=2, col=1)
+    add_line(figure, t, found.valves.position[part], "best faulty valve", GREEN, row=2, col=1)
     figure.update_yaxes(title="y", row=1, col=1)
     figure.update_yaxes(title="u and valve", row=2, col=1)
     figure.update_xaxes(title="t [s]", row=2, col=1)
     caption = (
-        f"Free runs on stretches that were not fitted. Normalised error: linear valve {found.error_of('linear'):.3g},"
-        f" {_NAMES[family]} {found.error_of(family):.3g}. Below, the command and the valve that follows it."
+        "The middle of the record. Below, the command and the position of the faulty valve that predicts y best: where"
+        " it is the cause, y moves when this valve slips and rests while it rests."
     )
-    return Section(
-        title="Free runs on stretches left out", figures=(Figure(figure=figure, caption=caption, height_px=560),)
+    return Section(title="Command, valve and answer", figures=(Figure(figure=figure, caption=caption, height_px=560),))
+
+
+def _evidence(found: RoutineDiagnosis) -> Section:
+    valves = found.valves
+    figure = lines_figure("t [s]", "squared error")
+    whole = max(float(valves.linear @ valves.linear), 1e-300)
+    for errors, name, colour in ((valves.linear, "by the command", ORANGE), (valves.faulty, "by the valve", BLUE)):
+        add_line(figure, valves.t, np.cumsum(errors**2) / whole, name, colour)
+    caption = (
+        "Squared errors of both predictions of y, added up from the start, over the whole of the linear one. A faulty"
+        " valve parts the curves a little at every slip; one that parts them once is an incident, and not a valve."
     )
+    return Section(title="Evidence, slip by slip", figures=(Figure(figure=figure, caption=caption, height_px=320),))
 
 
 def _curve(found: RoutineDiagnosis) -> Section:
-    operation, part, family = found.bench.of, _section_of(found), _shown(found)
-    faulty, position = _left_out(found, family)
-    left, right = lines_figure("u", "y"), lines_figure("u", "valve as fitted")
+    operation, part = found.operation, _section_of(found)
+    left, right = lines_figure("u", "y"), lines_figure("u", "best faulty valve")
     add_line(left, operation.u[part], operation.y[part], "recorded", GREY, width=1.0)
-    add_line(left, operation.u[part], faulty[part], f"with {_NAMES[family]}, not fitted there", BLUE, width=1.0)
-    add_line(right, operation.u[part], position[part], "valve", GREEN, width=1.2)
+    add_line(right, operation.u[part], found.valves.position[part], "valve", GREEN, width=1.2)
     ends = np.array([operation.u[part].min(), operation.u[part].max()])
     add_line(right, ends, ends, "a valve that follows", GREY, dash="dash")
     return Section(
@@ -120,21 +104,19 @@ def _curve(found: RoutineDiagnosis) -> Section:
         figures=(
             Figure(figure=left, caption="y over u: a faulty valve leaves a parallelogram, a lag an ellipse.",
                    square=True),
-            Figure(figure=right, caption="Position of the valve over u, as fitted: flat where it does not follow.",
-                   square=True),
+            Figure(figure=right, caption="Position of the valve over u: flat where it does not follow.", square=True),
         ),
     )  # fmt: skip
 
 
 def _comparison(found: RoutineDiagnosis) -> Section:
-    rows = [(_NAMES["linear"], f"{found.error_of('linear'):.3g}", "", "", "")]
-    stretches = found.spread.size
-    for name, one in found.against_linear.items():
-        rows.append((_NAMES[name], f"{found.error_of(name):.3g}", *_cells(one, stretches)))
-    rows += [(f"{_NAMES[name]}, wide bands only", "", *_cells(one, stretches)) for name, one in found.wide.items()]
-    header = ("valve", "normalised error", "ln of squared error, linear over it", "stretches won", "chance")
-    seen, answer = found.oscillation, found.answer
+    valves, seen, answer = found.valves, found.oscillation, found.answer
     facts = [
+        ("ln of squared error, by the command over by the best faulty valve", f"{valves.decrease:+.2f}"),
+        ("chance of as much in the same loop with a linear valve", f"{valves.chance:.2g}"),
+        ("reversals of the command", f"{valves.reversals}"),
+        ("band S over u's range", f"{valves.valve.S / valves.span:.2f}"),
+        ("slip jump J over S", f"{valves.valve.J / max(valves.valve.S, 1e-300):.2f}"),
         ("period of the dominant oscillation [s]", f"{seen.period_s:.4g}"),
         ("periods in the record", f"{seen.periods:.0f}"),
         ("regularity of y (over 1: it oscillates)", f"{seen.regularity:.3g}"),
@@ -144,34 +126,17 @@ def _comparison(found: RoutineDiagnosis) -> Section:
     if answer is not None:
         facts.append(("damping ratio of the answer to the set-point", f"{answer.damping:g}"))
         facts.append(("share of y on stretches left out that the set-point predicts", f"{answer.explained:.2f}"))
-    return Section(
-        title="What was compared",
-        tables=(Table(header=header, rows=tuple(rows)), Table(header=("oscillation", "value"), rows=tuple(facts))),
-        figures=(Figure(figure=_bars(found), height_px=300,
-                        caption="Every stretch left out: error of the free run over the spread of y there."),),
-    )  # fmt: skip
-
-
-def _cells(one: Comparison, stretches: int) -> tuple[str, str, str]:
-    return f"{one.decrease:+.2f}", f"{one.won} of {stretches}", f"{one.chance:.2g}"
-
-
-def _bars(found: RoutineDiagnosis) -> Chart:
-    figure = lines_figure("stretch", "normalised error")
-    colours: dict[Family, str] = {"linear": ORANGE, "play": BLUE, "stiction": GREEN}
-    for family, run in found.runs.items():
-        errors = np.sqrt(run.errors / np.maximum(found.spread, 1e-300))
-        figure.add_trace(
-            Bar(x=np.arange(1, errors.size + 1), y=errors, name=_NAMES[family], marker={"color": colours[family]})
-        )
-    return figure
+    return Section(title="What was compared", tables=(Table(header=("quantity", "value"), rows=tuple(facts)),))
 
 
 def _method() -> Section:
     rows = tuple((name, f"{value:g}", unit, meaning, origin) for name, value, unit, meaning, origin in table())
     return Section(
         title="Method",
-        text=("Valve and plant are driven by the recorded command. Each family is fitted to all stretches but one and"
-              " runs free on that one; only a constant, a slope and the decay of an unknown start are free there.",),
+        text=("y is predicted one step ahead, linearly, from its own past, a sine of the dominant period and the past"
+              " of the command; then with a faulty valve's position in place of the command, for every valve of a"
+              " grid. How much the best of them gains"
+              " in the same loop with a linear valve is counted: the linear prediction, with its own errors, each with"
+              " a random sign, is searched in the same way.",),
         detail_tables=(Table(header=("threshold", "value", "unit", "meaning", "origin"), rows=rows),),
     )  # fmt: skip

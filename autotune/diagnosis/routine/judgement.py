@@ -1,4 +1,4 @@
-"""The verdict on a loop in operation: what the free runs on stretches left out, the phase and the set-point say."""
+"""The verdict on a loop in operation: what the test of the valve, the phase and the set-point say."""
 
 from __future__ import annotations
 
@@ -11,8 +11,6 @@ from scipy.stats import t as students_t
 
 from autotune.arrays import FloatArray
 from autotune.diagnosis.routine import sentences
-from autotune.diagnosis.routine.candidates import LEAST_BAND, Bench, Point, bench_of, replace_filter, whitening
-from autotune.diagnosis.routine.fitting import Family, Fitted, LeftOut, band_step, fit, left_out, resampled_bands
 from autotune.diagnosis.routine.operation import Operation, operation_of
 from autotune.diagnosis.routine.oscillation import (
     SetpointAnswer,
@@ -21,11 +19,10 @@ from autotune.diagnosis.routine.oscillation import (
     regularity,
     setpoint_answer,
 )
-from autotune.diagnosis.routine.result import Comparison, Interval, Oscillation, RoutineDiagnosis, Verdict
+from autotune.diagnosis.routine.result import Oscillation, RoutineDiagnosis, Verdict
 from autotune.diagnosis.routine.thresholds import RoutineThresholds
+from autotune.diagnosis.routine.valves import ValveComparison, compare_valves
 from autotune.recording import Recording
-
-_FAULTS: tuple[Family, ...] = ("play", "stiction")
 
 
 def diagnose_routine(
@@ -35,8 +32,8 @@ def diagnose_routine(
 ) -> RoutineDiagnosis:
     """Say why a loop in operation oscillates: its valve, its tuning, something outside, or that the record cannot tell.
 
-    A plant of one or two lags (or an integrator) with dead time is fitted together with the valve, driven by the
-    recorded command; each family of valves is judged by its free run on stretches that were not fitted.
+    A faulty valve is named where the past of its position predicts y clearly better than the past of the command, and
+    better than it would in the same loop with a linear valve.
 
     Parameters
     ----------
@@ -58,35 +55,18 @@ def diagnose_routine(
 
     Notes
     -----
-    Bias: load that the controller answers stands in u as well as in y, so gain, lag and a narrow band are drawn
-    towards the controller's inverse. The band's interval is a bootstrap over stretches and does not hold that bias.
+    Bias: the band's interval is a bootstrap over half cycles of the command, and no narrower than the grid of bands.
     """
     limits = thresholds or RoutineThresholds()
     operation = operation_of(recordings, limits)
-    bench = bench_of(operation)
-    runs: dict[Family, LeftOut] = {}
-    for number, family in enumerate(("linear", *_FAULTS)):
-        progress(f"free runs, {family}", number / 5)
-        runs[family] = left_out(bench, family)
-    linear, least = runs["linear"].errors, band_step(limits.wide_band)
-    progress("free runs, wide bands", 0.6)
-    wide = {family: compared(linear, left_out(bench, family, least).errors) for family in _FAULTS}
-    progress("oscillation", 0.9)
+    valves = compare_valves(operation, limits, lambda share: progress("valves", 0.8 * share))
+    progress("oscillation", 0.8)
     answer, seen = setpoint_answer(operation, limits.badly_damped), _oscillation(operation)
-    verdict, apart = _verdict(runs, wide, seen, answer, limits)
     found = RoutineDiagnosis(
-        verdict=verdict, band=None, jump=None, kinds_apart=apart, runs=runs, wide=wide, oscillation=seen,
-        fits={family: fit(bench, family, np.ones(operation.stretches)) for family in runs},
-        spread=bench.sums(Point())[0, :, 2],
-        against_linear={family: compared(linear, runs[family].errors) for family in _FAULTS},
-        answer=answer, sentences=(), following="", bench=bench,
+        verdict=_verdict(valves, seen, answer, limits),
+        kinds_apart=min(valves.sticks, 1.0 - valves.sticks) < limits.kinds_apart,
+        valves=valves, oscillation=seen, answer=answer, sentences=(), following="", operation=operation,
     )  # fmt: skip
-    if found.family != "linear":
-        band, jump = _bands(bench, found.family, found.fits[found.family], limits)
-        if band.low < limits.least_band * bench.span:
-            found = replace(found, verdict="abstain", kinds_apart=False)
-        else:
-            found = replace(found, band=band, jump=jump)
     return replace(found, sentences=sentences.said(found, limits), following=sentences.following(found))
 
 
@@ -99,66 +79,27 @@ def _oscillation(operation: Operation) -> Oscillation:
     )  # fmt: skip
 
 
-def compared(first: FloatArray, second: FloatArray) -> Comparison:
-    """Return how the squared errors of a second family compare with those of a first, stretch by stretch."""
-    ratios = np.log(np.maximum(first, 1e-300) / np.maximum(second, 1e-300))
+def chance_of(ratios: FloatArray) -> float:
+    """Return the probability that values of mean 0 have a mean as large by chance: Student's t, one-sided."""
     spread = float(np.std(ratios, ddof=1)) / math.sqrt(ratios.size)
     mean = float(np.mean(ratios))
     t = mean / spread if spread > 0.0 else math.copysign(math.inf, mean) if mean else 0.0
-    return Comparison(decrease=mean, chance=float(students_t.sf(t, ratios.size - 1)), won=int(np.sum(ratios > 0.0)))
+    return float(students_t.sf(t, ratios.size - 1))
 
 
 def _verdict(
-    runs: dict[Family, LeftOut],
-    wide: dict[Family, Comparison],
-    seen: Oscillation,
-    answer: SetpointAnswer | None,
-    limits: RoutineThresholds,
-) -> tuple[Verdict, bool]:
-    """Return the verdict, and whether sticking and play are told apart."""
-    clear = [f for f in _FAULTS if wide[f].chance < limits.chance and wide[f].decrease > limits.least_decrease]
-    if clear:
-        sticks = compared(runs["play"].errors, runs["stiction"].errors)
-        plays = compared(runs["stiction"].errors, runs["play"].errors)
-        if "play" not in clear or (sticks.chance < limits.kinds_apart and "stiction" in clear):
-            return "stiction", sticks.chance < limits.kinds_apart
-        return "backlash", "stiction" not in clear or plays.chance < limits.kinds_apart
+    valves: ValveComparison, seen: Oscillation, answer: SetpointAnswer | None, limits: RoutineThresholds
+) -> Verdict:
+    clear = valves.chance <= limits.chance and valves.decrease > limits.least_decrease
+    if clear and valves.reversals >= limits.least_reversals:
+        return "stiction" if valves.valve.J > 0.0 else "backlash"
     if answer is not None and answer.explained > limits.least_answer:
         moved = answer.ratios[np.abs(answer.ratios) > 1e-9]  # elsewhere the set-point says nothing
-        damped = compared(np.exp(moved), np.ones(moved.size)) if moved.size > 3 else None
-        if (
-            damped is not None
-            and damped.chance < limits.chance
-            and float(np.max(answer.dampings)) <= limits.badly_damped
-        ):
-            return "tight_tuning", False
-    follows = all(one.chance > limits.unlikely for one in wide.values())
+        damped = moved.size > 3 and chance_of(moved) < limits.chance
+        if damped and float(np.max(answer.dampings)) <= limits.badly_damped:
+            return "tight_tuning"
+    follows = valves.decrease <= limits.least_decrease or valves.chance > limits.unlikely
     if seen.phase_kept > limits.least_phase and seen.periods >= limits.least_periods and follows:
-        return "outside_oscillation", False
+        return "outside_oscillation"
     oscillates = seen.regularity > limits.regular and seen.share > limits.oscillating
-    return ("abstain" if oscillates else "none"), False
-
-
-def _bands(bench: Bench, family: Family, fitted: Fitted, limits: RoutineThresholds) -> tuple[Interval, Interval]:
-    """Return S and J with their intervals.
-
-    The free run and the prediction with a model of the noise err in different directions where the controller answers
-    a load: the value is the second's, the interval holds the bootstrap over the stretches of both.
-    """
-    operation, random = bench.of, np.random.default_rng(0)
-    share = np.full(operation.stretches, 1.0 / operation.stretches)
-    counts = random.multinomial(operation.stretches, share, size=limits.resamplings)
-    order = min(limits.whitening_order, int(np.min(np.diff(operation.windows, axis=1))) // 4)
-    residual = operation.y - bench.free_run(fitted.at, fitted.delay, fitted.gain)
-    white = replace_filter(bench, whitening(bench, residual, order))
-    # no narrower than a third of the free run's: a narrow band and a slow plant imitate noise
-    second = fit(white, family, np.ones(operation.stretches), max(0, fitted.at.band - band_step(3.0 * LEAST_BAND)))
-    drawn = [resampled_bands(bench, family, fitted, counts), resampled_bands(white, family, second, counts)]
-    chosen = white.valve(second.at)
-    found = []
-    for number in (0, 1):
-        value = float(chosen[number])
-        ends = [float(q) for one in drawn for q in np.quantile(one[:, number], (0.025, 0.975))]
-        step = 0.03 * value  # of the grid
-        found.append(Interval(value=value, low=max(min(*ends, value) - step, 0.0), high=max(*ends, value) + step))
-    return found[0], found[1]
+    return "abstain" if oscillates else "none"

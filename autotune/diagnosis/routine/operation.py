@@ -13,6 +13,9 @@ from autotune.diagnosis.routine.thresholds import RoutineThresholds
 from autotune.errors import InputError
 from autotune.recording import Recording
 
+#: Values beyond this have squares of squares that no number holds.
+_LARGEST = 1e70
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Operation:
@@ -77,7 +80,7 @@ def operation_of(recordings: Sequence[Recording], limits: RoutineThresholds) -> 
     Raises
     ------
     InputError
-        Too few rows, a command that never moves or has gaps, or recordings of different sample times.
+        Too few rows, u or y that never moves, values beyond 1e70, gaps in u, or recordings of different sample times.
     """
     even = [_even(recording, limits) for recording in recordings]
     steps = np.array([recording.sample_time_s for recording in even])
@@ -138,6 +141,17 @@ def _even(recording: Recording, limits: RoutineThresholds) -> Recording:
             f"u is constant ({recording.u[0]:g}): a valve that is not moved shows nothing", where=recording.name,
             remedy="check the column, or give a record of the loop in automatic mode",
         )  # fmt: skip
+    readings = recording.y[np.isfinite(recording.y)]
+    if readings.size == 0 or float(np.ptp(readings)) <= 1e-12 * float(np.max(np.abs(readings))):
+        raise InputError(
+            f"y is constant ({readings[0]:g})" if readings.size else "y has no reading", where=recording.name,
+            remedy="check the column and the sensor: what never answers shows nothing of the valve",
+        )  # fmt: skip
+    largest = float(max(np.max(np.abs(recording.u)), np.max(np.abs(readings))))
+    if largest > _LARGEST:
+        raise InputError(
+            f"values up to {largest:g}", where=recording.name, remedy="check the columns and their units"
+        )  # fmt: skip
     return recording if recording.is_uniform else recording.resampled(recording.sample_time_s)
 
 
@@ -183,7 +197,12 @@ def _period(us: Sequence[FloatArray], ys: Sequence[FloatArray], followed: bool) 
     least = 4 * 3  # at least three periods in the record
     if not crossed[least:].max() > 0.0:
         return float("nan")
-    return float(4 * n / (least + int(np.argmax(crossed[least:]))))
+    peak = least + int(np.argmax(crossed[least:]))
+    around = crossed[peak - 1 : peak + 2]
+    if around.size == 3 and 0.0 < around[0] <= around[1]:  # a line between the grid's: a parabola through the three
+        before, top, after = np.log(np.maximum(around, 1e-300))
+        return float(4 * n / (peak + 0.5 * (after - before) / max(2.0 * top - before - after, 1e-12)))
+    return float(4 * n / peak)
 
 
 def _windows(sizes: Sequence[int], period: float, limits: RoutineThresholds) -> tuple[IntArray, IntArray]:

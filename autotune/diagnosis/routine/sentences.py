@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 from autotune.diagnosis.routine.result import RoutineDiagnosis
 from autotune.diagnosis.routine.thresholds import RoutineThresholds
 
@@ -27,19 +29,20 @@ def said(found: RoutineDiagnosis, limits: RoutineThresholds) -> tuple[str, ...]:
                 " damped loop nor a valve that sticks explains."
             )
         case "none":
-            first = "Nothing found: no regular oscillation, and no fault of the valve that the free runs would show."
+            first = "Nothing found: no regular oscillation, and no fault of the valve that its slips would show."
         case _:
-            valve = "" if ruled_out(found, limits) else ", its valve"
-            first = f"The loop oscillates with a period of {period}, and this record does not tell whether"
-            first += f" by its tuning{valve} or from outside."
-    return (first, _runs(found), *_reservations(found, limits))
+            first = (
+                f"The loop oscillates with a period of {period}, and this record does not tell whether by its tuning,"
+                " its valve or from outside."
+            )
+    return (first, _compared(found), *_reservations(found, limits))
 
 
 def _valve(found: RoutineDiagnosis) -> str:
     assert found.band is not None
     assert found.jump is not None
-    band, jump, span = found.band, found.jump, found.bench.span
-    unit = found.bench.of.u_unit or "unit of u"
+    band, jump, span = found.band, found.jump, found.valves.span
+    unit = found.operation.u_unit or "unit of u"
     name = "Stiction" if found.verdict == "stiction" else "Play (backlash)"
     said = (
         f"{name} in the valve: the command must turn by {band.value:.3g} ({band.low:.3g} to {band.high:.3g}, {unit};"
@@ -50,23 +53,25 @@ def _valve(found: RoutineDiagnosis) -> str:
     return said + ("." if found.kinds_apart else "; sticking and play are not told apart here.")
 
 
-def _runs(found: RoutineDiagnosis) -> str:
-    runs = ", ".join(f"{name} {found.error_of(name):.3g}" for name in found.runs)
-    won = max(c.won for c in found.wide.values())
+def _compared(found: RoutineDiagnosis) -> str:
+    valves = found.valves
+    change = abs(1.0 - math.exp(-valves.decrease))
+    less = "less" if valves.decrease >= 0.0 else "more"
     return (
-        f"Error of the free runs on {found.spread.size} stretches left out, over the spread of y: {runs};"
-        f" a valve with a wide band is better than a linear one on {won} of them."
+        f"The position of the best faulty valve predicts y with {change:.0%} {less} squared"
+        f" error than the command does, over {valves.reversals} reversals of the command; by chance it gains as much"
+        f" with a probability of {valves.chance:.2g}."
     )
 
 
 def _reservations(found: RoutineDiagnosis, limits: RoutineThresholds) -> tuple[str, ...]:
-    part = found.bench.of.seen
+    part = found.operation.seen
     said = (f"Looked at: the {part:.0%} of the recorded time in which u travels furthest.",) if part < 1.0 else ()
     return (*_reasons(found, limits), *said)
 
 
 def _reasons(found: RoutineDiagnosis, limits: RoutineThresholds) -> tuple[str, ...]:
-    seen = found.oscillation
+    seen, valves = found.oscillation, found.valves
     if found.verdict == "abstain":
         reasons = []
         if found.answer is None:
@@ -77,20 +82,12 @@ def _reasons(found: RoutineDiagnosis, limits: RoutineThresholds) -> tuple[str, .
             reasons.append("its phase lasts, and a valve that sticks is not ruled out")
         else:
             reasons.append("its phase does not last")
-        best = max(found.wide.values(), key=lambda c: c.decrease)
-        if best.decrease > 0.0:
+        if valves.reversals < limits.least_reversals:
+            reasons.append(f"{valves.reversals} reversals of the command are too few to see a valve by")
+        elif valves.decrease > 0.0:
             reasons.append("a faulty valve is better than a linear one, but not clearly, or its band may be narrow")
-        elif ruled_out(found, limits):
-            reasons.append("a valve with a wide band is clearly worse than a linear one, so it is not the valve")
         return (f"Why not: {'; '.join(reasons)}.",)
-    if found.verdict in ("stiction", "backlash") and found.bench.of.stretches < 2 * limits.least_stretches:
-        return (f"The record holds {found.bench.of.stretches} stretches only; a longer one narrows the interval.",)
     return ()
-
-
-def ruled_out(found: RoutineDiagnosis, limits: RoutineThresholds) -> bool:
-    """Return whether valves with a wide band are clearly worse than a linear one."""
-    return all(one.decrease < 0.0 and one.chance > 1.0 - limits.unlikely for one in found.wide.values())
 
 
 def following(found: RoutineDiagnosis) -> str:
