@@ -14,37 +14,18 @@ from typing import TypeAlias
 
 import numpy as np
 
-from autotune.effects import counted_as
 from autotune.recording import Recording
 
 #: Share of every recording that a part leaves out, at its beginning or at its end.
 LEFT_OUT = 0.2
 #: Probability, as a mean over all rows and the parts, from which on an effect is likelier than not.
 NAMED = 0.5
+#: Probability at least of an effect in a part: no search of some rows rules an effect out.
+LEAST = 0.01
 
 
 #: When effects begin: recording and time [s].
 Begins: TypeAlias = Mapping[str, Sequence[tuple[int, float]]]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Said:
-    """What a diagnosis of some rows says.
-
-    Attributes
-    ----------
-    probabilities : mapping of str to float
-        Of effects, all hypotheses counted that have them.
-    named : frozenset of str
-        Effects of the best hypothesis, where these rows bear a verdict.
-    """
-
-    probabilities: Mapping[str, float]
-    named: frozenset[str]
-
-    def names(self, effect: str) -> bool:
-        """Whether an effect is named, as such, in a larger one, or as one that no recording tells from it."""
-        return bool(self.named & counted_as(effect))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -77,34 +58,38 @@ def parts_of(recordings: Sequence[Recording], least_rows: int) -> tuple[Part, ..
     )
 
 
-def agreement(whole: Said, begins: Begins, parts: Sequence[Part], said: Callable[[Part], Said]) -> Mapping[str, float]:
-    """Return the effects that are named, with their mean probability over all rows and the parts that tell of them.
+def agreement(
+    whole: Mapping[str, float], begins: Begins, parts: Sequence[Part], said: Callable[[Part], Mapping[str, float]]
+) -> Mapping[str, float]:
+    """Return the effects that are likelier than not, with their probabilities.
 
     Parameters
     ----------
-    whole : Said
-        What the whole recordings say.
+    whole : mapping of str to float
+        Probabilities of effects by the whole recordings, all hypotheses counted that have them.
     begins : mapping of str to sequence of (int, float)
         When effects begin, where they do not act from the first row on.
     parts : sequence of Part
         What is diagnosed again.
     said : callable
-        Returns what a part says.
+        Returns the probabilities by a part.
 
     Returns
     -------
     mapping of str to float
-        Effects that are likelier than not in the mean, or that the whole and every part name.
+        The geometric mean over all rows and the parts that tell of an effect, where it is at least a half: what a part
+        contradicts is not named, however sure the others are.
 
     References
     ----------
-    Meinshausen and Buhlmann, J. R. Statist. Soc. B 72, 2010: stability selection.
+    Meinshausen and Buhlmann, J. R. Statist. Soc. B 72, 2010: stability selection; Genest and Zidek, Statist. Sci. 1,
+    1986: the logarithmic pool of probabilities.
     """
-    heard = [(part, said(part)) for part in parts] if whole.probabilities else []
+    heard = [(part, said(part)) for part in parts] if whole else []
     agreed = {}
-    for name in whole.probabilities:
+    for name in whole:
         all_said = [whole, *(one for part, one in heard if part.tells(begins.get(name, ())))]
-        mean = float(np.mean([one.probabilities.get(name, 0.0) for one in all_said]))
-        if mean >= NAMED or all(one.names(name) for one in all_said):
+        mean = float(np.exp(np.mean([np.log(max(one.get(name, 0.0), LEAST)) for one in all_said])))
+        if mean >= NAMED:
             agreed[name] = mean
     return agreed

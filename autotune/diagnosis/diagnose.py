@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from autotune.controller import Controller
-from autotune.diagnosis.agreement import Part, Said, agreement, parts_of
+from autotune.diagnosis.agreement import Part, agreement, parts_of
 from autotune.diagnosis.evidence.description import describe
+from autotune.diagnosis.evidence.misread import misread_columns
 from autotune.diagnosis.extended import extended_model
 from autotune.diagnosis.findings import OFFSET, found_effects, places_of, said_by, sentences_of
 from autotune.diagnosis.gathering import evidence_of, keeping
@@ -76,11 +77,12 @@ def diagnose(
         progress(what, WHOLE * done)
 
     evidence = evidence_of(model, recordings, controller, without, told, thresholds)
-    whole = said_by(evidence)
+    if columns := misread_columns(model, recordings, evidence.quality, thresholds):
+        return _of_columns(model, evidence, columns)
     begins = {e.name: _begins(e, recordings) for e in found_effects(evidence, judged(evidence))}
-    parts = parts_of(recordings, LEAST_ROWS) if whole.named else ()
+    parts = parts_of(recordings, LEAST_ROWS) if begins else ()
     said = _on_parts(evidence, model, controller, without, progress, thresholds)
-    agreed = agreement(whole, begins, parts, said) if whole.named else {}
+    agreed = agreement(said_by(evidence), begins, parts, said) if begins else {}
     evidence = keeping(evidence, agreed)
     found, verdict = evidence.search, judged(evidence)
     named = [e for e in found_effects(evidence, verdict) if e.name in agreed]
@@ -101,6 +103,23 @@ def diagnose(
         residual=evidence.residual,
         description=description,
         search=found,
+    )
+
+
+def _of_columns(model: Model, evidence: Evidence, sentence: str) -> Diagnosis:
+    """Return the diagnosis where u or y is not what the model takes it for: then no physics is said to be missing."""
+    return Diagnosis(
+        verdict="unexplained",
+        effects=(),
+        candidates=(),
+        places=(),
+        fit=evidence.quality,
+        next_experiment=None,
+        extended_model=model,
+        sentences=(sentence,),
+        residual=evidence.residual,
+        description=None,
+        search=evidence.search,
     )
 
 
@@ -128,13 +147,13 @@ def _on_parts(
     without: Sequence[str],
     progress: Progress,
     thresholds: Thresholds,
-) -> Callable[[Part], Said]:
+) -> Callable[[Part], Mapping[str, float]]:
     """Return what a part of the recordings says of what the whole made a candidate."""
     search = evidence.search
     known = {name for h in search.all for name in h.names} | {s.name for s in evidence.samples} | {OFFSET}
     others = [*without, *(name for name in KINDS if name not in known)]
 
-    def said(part: Part) -> Said:
+    def said(part: Part) -> Mapping[str, float]:
         progress("once more on a part of the rows", WHOLE)
         return said_by(evidence_of(model, part.recordings, controller, others, quiet, thresholds))
 

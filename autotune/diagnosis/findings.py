@@ -8,7 +8,6 @@ from types import MappingProxyType
 
 import numpy as np
 
-from autotune.diagnosis.agreement import Said
 from autotune.diagnosis.evidence.description import Description
 from autotune.diagnosis.evidence.operating_point import Offset
 from autotune.diagnosis.evidence.samples import SampleEffect
@@ -53,16 +52,14 @@ def found_effects(evidence: Evidence, verdict: Verdict) -> tuple[FoundEffect, ..
     return tuple(ranked)
 
 
-def said_by(evidence: Evidence) -> Said:
-    """Return what evidence says: probabilities of all effects that are in a hypothesis, and those it would name."""
-    verdict = judged(evidence)
+def said_by(evidence: Evidence) -> Mapping[str, float]:
+    """Return the probabilities of all effects that are in a hypothesis, and of those that samples show."""
     most, candidates = evidence.limits.most_probable, evidence.candidates
     names = {name for c in candidates for name in c.name.split("+") if name in KINDS}
     allowed = names - evidence.contradicted - STRUCTURES.keys()
-    shown = {e.name: e.probability for e in found_effects(evidence, verdict)}
+    shown = {e.name: e.probability for e in found_effects(evidence, judged(evidence))}
     # rows that leave too much open for a verdict still weigh what it may be
-    probabilities = {name: probability_of(name, candidates, most) for name in allowed} | shown
-    return Said(probabilities=probabilities, named=frozenset(shown))
+    return {name: probability_of(name, candidates, most) for name in allowed} | shown
 
 
 def _of_samples(s: SampleEffect, everywhere: tuple[Window, ...], limits: Thresholds) -> FoundEffect:
@@ -167,6 +164,8 @@ def sentences_of(
         f"extended {q.extended:.3g}, noise {q.noise_floor:.3g}."
     )
     match verdict:
+        case "none" if not evidence.follows:
+            first = "Nothing contradicts the simulation, and nothing bears it out: these recordings show noise alone."
         case "none":
             first = "The simulation explains the recordings to within noise."
         case "parameters":
@@ -180,6 +179,11 @@ def sentences_of(
             clean = residual.is_noise or q.comes_down_to_noise
             rest = "" if clean else " What is left is not noise: something smaller is missing as well."
             first = f"Physics was left out: {names}.{beside(effects, evidence)}{rest}"
+        case _ if not evidence.follows:
+            first = (
+                "The simulation follows nothing of these recordings: on rows that were left out it errs by as much as "
+                "y varies. Look whether the columns are u and y of this model, and whether anything but noise moved y."
+            )
         case _:
             first = (
                 f"Something is missing that no candidate explains to within noise; it shows at the {', '.join(places)}."

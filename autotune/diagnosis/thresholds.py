@@ -152,9 +152,7 @@ class Thresholds:
     usual: float = known(0.15, "prior odds", "from which on an effect is always fitted", "convention")
     out_of_phase: float = known(0.3, "of the spread", "held-out error from which on a free run may be out of phase", "convention")
     nominal_too: float = known(1.5, "prior sd", "of a retuned number from which on effects are looked for beside the nominal ones too", "convention")
-    rig_temperature: float = known(1.5, "2 ln odds", "that counts as one: stretches of one recording have much in common", "real rigs")
     least_named: float = known(1 / 3, "probability", "of an effect beside the leading one that is named; a less probable one is told, not named", "convention")
-    rig_unknown_odds: float = known(0.08, "odds", "prior, of a cause outside the catalogue in a rig", "real rigs")
     # equations: any model, judged as it runs freely through windows of a third of a recording
     equation_lead: float = known(6.0, "chi2", "that a number of an effect pays beyond Schwarz's criterion", "counted")
     equation_decrease: float = known(30.0, "chi2", "penalised, that an effect must bring", "chance")

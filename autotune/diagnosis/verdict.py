@@ -19,6 +19,9 @@ from autotune.diagnosis.selection.searched import Search
 from autotune.diagnosis.thresholds import Thresholds
 from autotune.effects import STRUCTURES, kind_of
 
+#: Held-out error, as a share of the spread of y, from which on a simulation follows nothing: 1 is y's mean.
+ASTRAY = 0.9
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Evidence:
@@ -67,6 +70,11 @@ class Evidence:
         loads = all(kind_of(name).place == "environment" for name in self.search.chosen.names)
         return dominates(self.quality, self.limits) and self.residual.is_lesser and not loads
 
+    @property
+    def follows(self) -> bool:
+        """Whether the simulation follows y at all: its mean alone errs by the whole spread."""
+        return self.quality.extended < ASTRAY
+
     @cached_property
     def unknown_odds(self) -> float:
         """Prior odds of a cause outside the catalogue, beside 1 of all hypotheses together."""
@@ -100,6 +108,7 @@ class Evidence:
         # a clock that jitters disturbs commands too, which leaves something slow: what varies is weighed against it
         jitter = sum(s.evidence for s in self.samples if kind_of(s.name).sought == "residual")
         holds = {
+            "follows": self.follows,
             "effects": bool(set(found.chosen.names) - self.contradicted),
             "rig": self.rig is not None,
             "varies more": self.rig is not None and self.rig.varies_more(limits.varies_more),
@@ -132,6 +141,7 @@ def odds_of_unknown(residual: ResidualTests, explains_most: bool, limits: Thresh
 
 #: Each row: what must hold, what must not, and the verdict. The first row that fits decides.
 TABLE: tuple[tuple[set[str], set[str], Verdict], ...] = (
+    ({"effects"}, {"follows"}, "unexplained"),
     ({"rig", "effects"}, {"varies more"}, "effect"),
     ({"rig", "late stamps"}, set(), "effect"),
     ({"rig"}, {"jitter explains more"}, "unexplained"),
@@ -142,7 +152,8 @@ TABLE: tuple[tuple[set[str], set[str], Verdict], ...] = (
     (set(), {"constant"}, "unexplained"),
     ({"missing"}, {"adequate"}, "unexplained"),
     ({"samples"}, set(), "effect"),
-    ({"offset", "adequate"}, set(), "effect"),
+    ({"offset", "adequate", "follows"}, set(), "effect"),
+    ({"wrong numbers"}, {"follows"}, "unexplained"),
     ({"wrong numbers"}, set(), "parameters"),
     (set(), set(), "none"),
 )

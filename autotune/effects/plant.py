@@ -496,6 +496,7 @@ PLANT = (
         nudge=0.06,
         stand_in=_is_friction_or_spring,
         confusable=("plant.coulomb_friction", "actuator.backlash"),
+        includes=("plant.coulomb_friction",),
         odds={"valve": 0.05, "carriage": 0.01, "arm": 0.01, "shaft": 0.02, "damper": 0},
         in_equations=InEquations(
             acts="force",

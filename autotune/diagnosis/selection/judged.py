@@ -133,7 +133,7 @@ class RigSearch:
             scores[name] = min(scores.get(name, math.inf), worst(one, rivals))
         chosen = "+".join(self.chosen.names) if self.chosen.names else "none"
         scores[chosen] = min(scores.values())  # what was more, and not material, speaks for it too
-        return weighed(scores, limits.rig_temperature, limits.rig_unknown_odds)
+        return weighed(scores, 1.0, limits.unknown_odds)
 
     def quality(self, noise_floor: float) -> FitQuality:
         """Return errors of free runs through stretches that were left out."""

@@ -12,7 +12,7 @@ from autotune.diagnosis.evidence.stretches import held_out_squares, rms
 from autotune.diagnosis.fitting.data import Data, as_white
 from autotune.diagnosis.fitting.fit import RUNAWAY, Fit, fit, start_states
 from autotune.diagnosis.fitting.parameters import Parametrisation
-from autotune.diagnosis.selection.hypothesis import hypothesis
+from autotune.diagnosis.selection.hypothesis import hypothesis, is_stand_in
 from autotune.diagnosis.selection.judged import Judged
 from autotune.diagnosis.thresholds import Thresholds
 from autotune.effects.base import EffectKind
@@ -127,7 +127,9 @@ class RigBench:
         return replace(one, fit=result, short=short, data=self.long, few=self.near)
 
     def judged(self, result: Fit, log_odds: float) -> Judged | None:
-        """Return a fit to long windows with its errors on left-out stretches; nothing where it runs away."""
+        """Return a fit to long windows, judged; nothing where it runs away, or where an effect stands for another."""
+        if is_stand_in(hypothesis(result), self.long):
+            return None
         try:
             squares = held_out_squares(result, self.long)
             short = result

@@ -341,7 +341,7 @@ def _on_from(best: Judged, larger: Judged, bench: RigBench) -> Judged | None:
         result = fit(p, bench.long, theta, states, iterations=LAST_STEPS, inherit=best.fit)
     except RUNAWAY:
         return None
-    if is_stand_in(hypothesis(result), bench.long) or result.cost >= larger.fit.cost:
+    if result.cost >= larger.fit.cost:
         return None
     return bench.finite(result, larger.log_odds)
 

@@ -195,6 +195,7 @@ def test_a_ball_that_lies_on_the_floor_for_a_third_of_the_time_leaves_open_how_i
     assert "plant.leak" in {name for c in found.candidates for name in c.name.split("+")}
 
 
+@pytest.mark.timeout(900)  # three searches with blows, minutes on a busy machine
 def test_what_a_blow_makes_of_the_least_change_is_no_second_effect(shared: Path) -> None:
     case = shared / "practice_cases" / "case_005"
     found = diagnose(read_model(case / "model.toml"), [read_recording(case / f"rec{k}.csv") for k in (1, 2)])

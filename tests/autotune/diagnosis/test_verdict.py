@@ -32,15 +32,22 @@ def test_every_set_of_facts_has_one_verdict_and_every_row_decides_some() -> None
 
 @pytest.mark.parametrize("samples", [frozenset(), frozenset({"samples"})])
 def test_what_samples_show_switches_no_test_off(samples: frozenset[str]) -> None:
-    assert verdict_of(samples | {"effects", "constant"}) == "unexplained"
+    assert verdict_of(samples | {"effects", "follows", "constant"}) == "unexplained"
     assert verdict_of(samples | {"missing", "constant"}) == "unexplained"
     assert verdict_of(samples | {"adequate"}) == "unexplained"  # something varies in what is left
-    assert verdict_of(samples | {"effects", "adequate", "constant"}) == "effect"
+    assert verdict_of(samples | {"effects", "follows", "adequate", "constant"}) == "effect"
 
 
 def test_a_rigs_effects_are_not_named_where_what_varies_beside_them_explains_more() -> None:
-    assert verdict_of(frozenset({"rig", "effects"})) == "effect"
-    assert verdict_of(frozenset({"rig", "effects", "varies more"})) == "unexplained"
+    assert verdict_of(frozenset({"rig", "follows", "effects"})) == "effect"
+    assert verdict_of(frozenset({"rig", "follows", "effects", "varies more"})) == "unexplained"
+
+
+@pytest.mark.parametrize(
+    "known", [{"effects"}, {"rig", "effects"}, {"rig", "effects", "late stamps"}, {"wrong numbers"}]
+)
+def test_what_follows_nothing_of_the_recordings_names_nothing(known: set[str]) -> None:
+    assert verdict_of(frozenset(known | {"constant"})) == "unexplained"
 
 
 def residual_with(reduced_chi2: float, *, uneven: bool = False, varies: float = 5.0) -> ResidualTests:

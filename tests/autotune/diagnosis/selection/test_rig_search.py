@@ -10,11 +10,15 @@ import pytest
 
 from autotune.diagnosis import diagnose
 from autotune.diagnosis.agreement import NAMED
+from autotune.diagnosis.fitting.fit import fit
+from autotune.diagnosis.fitting.retuning import prepare
+from autotune.diagnosis.selection.prediction import extended
 from autotune.diagnosis.selection.rig_search import search_rig
 from autotune.diagnosis.simulation.chain import build_chain
+from autotune.diagnosis.thresholds import IN_USE
 from autotune.effects import ALL, taken_by
 from autotune.effects.rigs import rig_kind
-from autotune.models import Block, Model, Port, TransferFunction
+from autotune.models import Block, Effect, Model, Parameter, Port, TransferFunction
 from autotune.recording import Recording
 
 
@@ -67,7 +71,8 @@ def test_the_extended_model_has_what_is_named_and_nothing_else():
 def test_dry_friction_that_drops_with_speed_is_not_added_beside_plain_dry_friction():
     laws = {"plant.coulomb_friction", "plant.stribeck_friction"}
     for law in laws:
-        assert taken_by([law, "actuator.lag"]) == {*laws, "actuator.lag"}
+        assert taken_by([law, "actuator.lag"]) >= {*laws, "actuator.lag"}
+    assert "plant.hysteresis" in taken_by(["plant.coulomb_friction"])  # dry friction where its width is 0
 
 
 def test_a_linear_oscillation_is_given_no_effect():
@@ -140,3 +145,26 @@ def test_an_effect_that_explains_less_than_what_swings_beside_it_is_not_all_that
     with_lag = next(j for j in found.judged if j.names == ("sensor.lag",))
     assert replace(found, chosen=with_lag).varies_more(3.0)
     assert not replace(found, chosen=found.retuned).varies_more(3.0)
+
+
+def test_what_stands_for_something_else_once_it_is_fitted_to_the_end_is_not_judged():
+    """Three lags warm up where the model has one: a mode whose damping ends above 1 is no resonance."""
+    t = np.arange(800.0)
+    taus = 170.0, 70.0, 19.0
+    y = np.zeros(t.size)
+    for k, tau in enumerate(taus):
+        others = np.prod([tau - other for j, other in enumerate(taus) if j != k])
+        y += tau**2 / others * (1.0 - np.exp(-t / tau))
+    y = 20.9 + 35.0 * y + 0.15 * np.random.default_rng(4).normal(size=t.size)
+    dynamics = TransferFunction(num=(0.7,), den=(170.0, 1.0))
+    heater = Block(name="heater", place="plant", dynamics=dynamics, output="temperature", unit="degC")
+    port = Port(unit="degC", offset=20.9)
+    model = Model(name="oven", input=Port(unit="%"), output=port, blocks=(heater,))
+    recording = Recording(t=t, u=np.full(t.size, 50.0), y=y)
+    data, start = prepare(model, [recording], good(recording), 1, IN_USE)
+    values = {"frequency": Parameter(value=0.0044), "damping": Parameter(value=0.9)}
+    p, theta, states = extended(start, Effect(name="plant.resonance", parameters=values), data)
+    known = fit(p, data, theta, states)
+    assert known.model.effects[0].parameters["damping"].value > 1.0
+    found = search_rig(model, [recording], good(recording), known=known)
+    assert all("plant.resonance" not in one.names for one in found.judged)

@@ -1,0 +1,58 @@
+"""Where y has nothing to do with u, or is not y, no physics is said to be missing."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from autotune.diagnosis import Diagnosis, diagnose
+from autotune.models import Block, Model, Port, TransferFunction
+from autotune.recording import Recording
+
+OVEN = Model(
+    name="oven",
+    input=Port(unit="%", offset=5.0),
+    output=Port(unit="degC", offset=50.0),
+    blocks=(Block(name="oven", place="plant", dynamics=TransferFunction(num=(2.0,), den=(9.5, 1.0), delay_s=3.0)),),
+)
+
+
+def oven(seed: int, rows: int = 800, gain: float = 2.0) -> Recording:
+    rng = np.random.default_rng(seed)
+    u = np.repeat(rng.choice([4.5, 5.5], rows // 20 + 1), 20)[:rows]
+    late = np.concatenate([np.full(3, u[0]), u[:-3]]) - 5.0
+    y = 50.0 + gain * lfilter([0.1], [1.0, -0.9], late) + 0.05 * rng.standard_normal(rows)
+    return Recording(t=np.arange(rows, dtype=np.float64), u=u, y=y)
+
+
+def first_words(found: Diagnosis) -> str:
+    assert not found.effects
+    assert found.verdict == "unexplained"
+    return found.sentences[0]
+
+
+@pytest.mark.parametrize("seed", [101, 102])
+def test_a_reversed_sign_is_said_first_and_is_no_physics(seed: int) -> None:
+    assert "the sign of u, or of the model's gain, is reversed" in first_words(diagnose(OVEN, [oven(seed, gain=-2.0)]))
+
+
+@pytest.mark.parametrize("seed", [101, 102])
+def test_exchanged_columns_are_said_first(seed: int) -> None:
+    right = oven(seed)
+    assert "the columns u and y are exchanged" in first_words(diagnose(OVEN, [replace(right, u=right.y, y=right.u)]))
+
+
+def test_columns_as_they_should_be_are_not_accused() -> None:
+    found = diagnose(OVEN, [oven(103)])
+    assert found.verdict in ("none", "parameters")
+    assert not any("reversed" in sentence or "exchanged" in sentence for sentence in found.sentences)
+
+
+def test_white_noise_for_u_and_y_is_missing_no_physics() -> None:
+    rng = np.random.default_rng(2)
+    u, y = 5.0 + rng.standard_normal(2000), 50.0 + rng.standard_normal(2000)
+    found = diagnose(OVEN, [Recording(t=np.arange(2000.0), u=u, y=y)])
+    assert "follows nothing" in first_words(found)
