@@ -99,7 +99,7 @@ def tune(
         Whether a lower bound of the norm is proven (PI on a model).
     **settings
         Further ones of :class:`autotune.design.specification.Specification`, such as ``delay_margin_s``; of a
-        recording ``criterion``, ``source`` and ``noise_frequency_rad_s``.
+        recording ``criterion``, ``source``, ``noise_frequency_rad_s`` and ``sample_time_s``, the controller's period.
 
     Returns
     -------

@@ -188,6 +188,9 @@ def tune(
     noise_frequency: Annotated[
         float | None, typer.Option(help="lowest frequency of the noise [rad/s]; default the crossover")
     ] = None,
+    sample_time: Annotated[
+        float | None, typer.Option(help="period of the controller that is to run [s]; default the recording's")
+    ] = None,
     kind: Annotated[Literal["pi", "pid"], typer.Option(help="structure of the controller")] = "pi",
     criterion: Annotated[
         Literal["auto", "iae", "h2"],
@@ -224,6 +227,7 @@ def tune(
         "phase_margin_deg": phase_margin,
         "noise_gain": noise_gain,
         "noise_frequency_rad_s": noise_frequency,
+        "sample_time_s": sample_time,
     }
     given_options = {name: value for name, value in options.items() if value is not None}
     asked = validated(

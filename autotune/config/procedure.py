@@ -128,6 +128,15 @@ class DesignSettings(Section):
     noise_frequency_rad_s: Annotated[
         float | None, Field(gt=0, description="lowest frequency of the noise [rad/s]; the crossover when absent")
     ] = None
+    sample_time_s: Annotated[
+        float | None,
+        Field(
+            ge=SHORTEST_S,
+            le=3600,
+            description="period of the controller that is to run [s], two of which the delay margin has at least; the"
+            " recording's, or the rig's, when absent",
+        ),
+    ] = None
     criterion: Annotated[
         Literal["auto", "h2", "iae"],
         Field(

@@ -21,10 +21,12 @@ from autotune.design.plausibility import implausible
 from autotune.design.process_class import consistent_processes
 from autotune.design.robust import design_on_points
 from autotune.design.specification import UNCERTAIN, Design, Kind, Specification
+from autotune.design.synthesis import design as synthesised
 from autotune.errors import AutotuneError, DesignError
 from autotune.identification.consistent_structures import consistent_structures
 from autotune.identification.parametric import PlantFit, fit_plant
 from autotune.identification.reduction import ReducedModel, reduce_points
+from autotune.pipeline.one_thread import on_one_thread
 from autotune.points import FrequencyPoint
 
 #: Below this phase [deg] a PI has no use for a point, and another turn could not be told from a rise.
@@ -104,12 +106,13 @@ def specification(
         phase_margin_rad=phase_rad,
         noise_gain=noise_gain,
         noise_frequency_rad_s=settings.noise_frequency_rad_s,
-        delay_margin_s=_SAMPLES_OF_DELAY * (facts.sample_time_s or 0.0),
+        delay_margin_s=_SAMPLES_OF_DELAY * _period(settings, facts),
         criterion=criterion,
     )
     return asked, words
 
 
+@on_one_thread
 def analyse(
     points: Sequence[FrequencyPoint],
     settings: DesignSettings,
@@ -143,14 +146,15 @@ def analyse(
     left_out = len(measured) - len(usable)
     beyond = (f"{left_out} points past {LOWEST_PHASE_DEG:g} deg were left out: a PI has no use for them",)
     fit = fit_plant(usable) if fit is None else fit
-    asked, noise_source = specification(settings, fit, facts or LoopFacts(), _highest(usable, fit, facts))
+    facts = facts or LoopFacts()
+    asked, noise_source = specification(settings, fit, facts, _highest(usable, fit, facts))
     reduced = _reduced(usable, fit)
     bases = _bases(usable, fit, lambda: reduced, asked, settings.kind)
     source, found, looked = _first_kept(bases, settings.source, usable, fit)
     model = reduced if isinstance(reduced, ReducedModel) else None
     H_r = None if model is None else model.transfer_function()
     controller = found.controller
-    odd = implausible(fit.plant, controller, found.binding, (facts or LoopFacts()).sample_time_s or 0.0)
+    odd = implausible(fit.plant, controller, found.binding, _period(settings, facts))
     others = tuple((name, _or_reason(make)) for name, make in bases.items() if name != source) if compare else ()
     return Analysis(
         points=tuple(measured),
@@ -170,7 +174,7 @@ def analyse(
             *([odd] if odd is not None else []),
             *([found.certificate] if UNCERTAIN in found.certificate else []),
         ),
-        notes=_binding_words(found, noise_source),
+        notes=_binding_words(found, noise_source, fit, settings),
     )
 
 
@@ -236,9 +240,14 @@ def on_reduced_model(
     return found, (on_plants((known,), found.controller, asked, "the plant that was reduced"),)
 
 
-def _highest(points: Sequence[FrequencyPoint], fit: PlantFit, facts: LoopFacts | None) -> float:
+def _period(settings: DesignSettings, facts: LoopFacts) -> float:
+    """Return the period of the controller [s], 0 where it is not known."""
+    return settings.sample_time_s or facts.sample_time_s or 0.0
+
+
+def _highest(points: Sequence[FrequencyPoint], fit: PlantFit, facts: LoopFacts) -> float:
     """Return the highest frequency [rad/s] at which something is known of the plant: a tenth of the sampling rate."""
-    if fit.source == "recording" and facts is not None and facts.sample_time_s:
+    if fit.source == "recording" and facts.sample_time_s:
         return 0.2 * math.pi / facts.sample_time_s
     return points[-1].omega_rad_s
 
@@ -339,7 +348,7 @@ def looked_at(analysis: Analysis, controller: PIDController) -> tuple[Check, ...
     return _checks(analysis.source, of_use(analysis.points), analysis.fit, controller, asked)
 
 
-def _binding_words(design: Design, noise_source: str) -> tuple[str, ...]:
+def _binding_words(design: Design, noise_source: str, fit: PlantFit, settings: DesignSettings) -> tuple[str, ...]:
     """Return what to say of the constraints that hold the controller back."""
     if not design.binding:
         return ()
@@ -347,8 +356,28 @@ def _binding_words(design: Design, noise_source: str) -> tuple[str, ...]:
     if "noise gain" in design.binding:
         words += f" (at most {design.specification.noise_gain:.4g}: {noise_source}; --noise-gain sets another)"
     if "delay margin" in design.binding:
-        words += f" ({_SAMPLES_OF_DELAY:g} samples: a faster sample time would allow more)"
+        words += _delay_words(design, fit, settings)
     return (words,)
+
+
+def _delay_words(design: Design, fit: PlantFit, settings: DesignSettings) -> str:
+    """Return what the controller's period costs, and where it was taken from where nobody said it."""
+    asked = design.specification
+    words = f"{_SAMPLES_OF_DELAY:g} periods of {asked.delay_margin_s / _SAMPLES_OF_DELAY:.4g} s"
+    kept, free = (_norm(fit, one, design.kind) for one in (asked, replace(asked, delay_margin_s=0.0)))
+    if kept is not None and free is not None:
+        words += f" cost {100.0 * (kept / free - 1.0):.0f} % in the response to load"
+    if settings.sample_time_s is None and fit.source == "recording":
+        words += "; the period is the recording's, --sample-time says the controller's own"
+    return f" ({words})"
+
+
+def _norm(fit: PlantFit, asked: Specification, kind: Kind) -> float | None:
+    """Return the norm (11) of the best controller for the estimate alone; None where there is none."""
+    try:
+        return synthesised(fit.plant, asked, kind, certificate=False).h2
+    except DesignError:
+        return None
 
 
 def of_use(points: Sequence[FrequencyPoint]) -> list[FrequencyPoint]:

@@ -13,6 +13,7 @@ from autotune.identification.dependence import require_answer
 from autotune.identification.frequency.recorded import FrequencyEstimate, combine, session_points, sessions
 from autotune.identification.parametric import PlantFit
 from autotune.identification.recorded_plant import fit_recordings
+from autotune.pipeline.one_thread import on_one_thread
 from autotune.points import FrequencyPoint
 from autotune.recording import Recording
 
@@ -44,6 +45,7 @@ class Measured:
     notes: tuple[str, ...]
 
 
+@on_one_thread
 def measured_of(recordings: Sequence[Recording], given: Sequence[FrequencyPoint] = ()) -> Measured:
     """Return what recordings and given points say about their plant.
 

@@ -10,11 +10,14 @@ import pytest
 import autotune as at
 from autotune.batch.loop import Work, analyse_loop
 from autotune.batch.settings import CampaignSettings, LoopSettings
+from autotune.config.procedure import DesignSettings
 from autotune.controller import read_controller
 from autotune.design.margins import margins
 from autotune.errors import IdentificationError
 from autotune.identification.dependence import require_answer
 from autotune.identification.recorded_plant import fit_recordings
+from autotune.models import TransferFunction
+from autotune.pipeline import analyse, measured_of
 from autotune.recording import Recording
 from tests.benchmarks._front_door_files import BOILER, DOORS, OVEN, Rows, levels, open_loop
 from tests.benchmarks.front_door import best, load_error, tuned
@@ -47,6 +50,10 @@ def test_a_recording_goes_to_a_controller_with_margins_near_the_best(name: str, 
         ("german.csv", ("Stellgröße", "Istwert", "")),
         ("closed_loop.csv", ("u", "y", "r")),
         ("historian.csv", ("FIC7.OP", "FIC7.PV", "")),
+        ("pid_block.csv", ("Output", "Input", "Setpoint")),
+        ("tank.csv", ("inflow valve [%]", "level [%]", "")),
+        ("utf16.csv", ("u", "y", "")),  # the campaign finds its columns out
+        ("milliseconds.parquet", ("valve", "temperature", "")),
     ],
 )
 def test_tune_batch_and_python_give_the_same_gains(name: str, columns: tuple[str, str, str], tmp_path: Path) -> None:
@@ -61,6 +68,26 @@ def test_tune_batch_and_python_give_the_same_gains(name: str, columns: tuple[str
     here = at.tune(file).controller
     assert [row.K, row.Ti_s] == pytest.approx([found.K, found.Ti_s], rel=1e-4)
     assert [here.K, here.Ti_s] == pytest.approx([found.K, found.Ti_s], rel=1e-4)
+
+
+def test_what_the_period_of_the_file_costs_is_said_and_another_may_be_given(tmp_path: Path) -> None:
+    fast = TransferFunction(num=(1.5,), den=(3.0, 1.0), delay_s=0.3)  # in a historian of one row a second
+    u = levels(1.0, (60.0, 0.0), *((40.0 + 20.0 * (i % 3), 6.0 * (i % 2)) for i in range(12)))
+    rows = open_loop(fast, u, 1.0, 0.05, 30.0, 50.0, 5)
+    recordings = [_recording(rows)]
+    found = measured_of(recordings)
+    slow, quick = (
+        analyse(found.points, DesignSettings(sample_time_s=period), fit=found.fit, facts=found.facts, compare=False)
+        for period in (None, 0.1)
+    )
+    assert slow.design.margins.delay_s >= 2.0 * (1.0 - 2e-3)
+    (note,) = slow.notes
+    assert "2 periods of 1 s cost" in note
+    assert "the period is the recording's" in note
+    assert load_error(fast, quick.controller) < 0.5 * load_error(fast, slow.controller)
+    assert margins(fast, quick.controller).modulus > 0.495
+    same = at.tune(recordings[0], sample_time_s=0.1).controller
+    assert (same.K, same.Ti_s) == (quick.controller.K, quick.controller.Ti_s)
 
 
 def _recording(rows: Rows) -> Recording:
