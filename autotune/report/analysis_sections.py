@@ -31,6 +31,9 @@ from autotune.report.figures import (
 )
 from autotune.report.page import BLUE, GREEN, GREY, ORANGE, PURPLE, RED, Figure, Section, Table
 
+#: a modulus margin that is less by this share cannot be seen in the figure
+_DRAWN = 0.01
+
 
 @dataclass(frozen=True, kw_only=True)
 class _Loop:
@@ -102,8 +105,8 @@ def _points_section(analysis: Analysis, signals: SignalSettings, experiment: Exp
                 figure=bode_figure(estimates, curves, omega, sign, gain_unit),
                 caption=("Gain and phase, the phase for the positive gain." if sign < 0 else "Gain and phase.")
                 + (
-                    " The reduced model lies above the gain and below the phase of the plant, which makes its margins a"
-                    " guarantee."
+                    " The reduced model lies above the gain and below the phase of the points: margins that a"
+                    " controller keeps on it hold for the plant."
                     if analysis.reduced is not None
                     else ""
                 ),
@@ -248,7 +251,7 @@ def _loop_section(analysis: Analysis, signals: SignalSettings) -> Section:
             if analysis.reduced is None
             else [
                 Curve(
-                    name="reduced model",
+                    name="reduced model" if (_reduced_modulus(analysis) or 0.0) > 0.0 else "reduced model (unstable)",
                     system=_Loop(plant=analysis.reduced, controller=controller),
                     colour=GREEN,
                     dash="dash",
@@ -305,15 +308,27 @@ def _loop_section(analysis: Analysis, signals: SignalSettings) -> Section:
     )
 
 
-def _outside(analysis: Analysis) -> str:
-    """Return which loops stay outside the circle of the modulus margin."""
+def _reduced_modulus(analysis: Analysis) -> float | None:
+    """Return the modulus margin of the loop with the reduced model; negative where it is unstable, None without one."""
     if analysis.reduced is None:
+        return None
+    found = margins(analysis.reduced.transfer_function(), analysis.controller)
+    return found.modulus if found.stable else -found.modulus
+
+
+def _outside(analysis: Analysis) -> str:
+    """Return which loops stay outside the circle of the modulus margin, and what the others mean."""
+    modulus, asked = _reduced_modulus(analysis), analysis.design.specification.modulus_margin
+    if modulus is None:
         return "the loop stays outside the circle of the modulus margin"
-    if analysis.source == "reduced model":
+    if modulus > asked * (1.0 - _DRAWN):
         return "the loops stay outside the circle of the modulus margin"
+    words = f"the plant's loop stays outside the circle of the modulus margin; the controller was {based_on(analysis)}"
+    if modulus > 0.0:
+        return f"{words}; the reduced model, which is more cautious, enters it (modulus margin {modulus:.2f})"
     return (
-        f"the plant's loop stays outside the circle of the modulus margin; the controller was {based_on(analysis)},"
-        " and the more cautious reduced model is shown beside it, whose loop may enter the circle"
+        f"{words}; the reduced model beside it has more gain or lag than the plant and would be unstable with this"
+        " controller: its curve passes -1 on the other side, and guarantees nothing here"
     )
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -10,10 +12,14 @@ from hypothesis import strategies as st
 from autotune.batch.loop import Row
 from autotune.batch.plant_figures import plant_figures
 from autotune.batch.settings import CampaignSettings
+from autotune.config.procedure import DesignSettings, SignalSettings
 from autotune.models import TransferFunction
+from autotune.pipeline import analyse
+from autotune.points import FrequencyPoint
 from autotune.report.campaign_page import campaign_page
 from autotune.report.page import write_page
 from autotune.report.proof_page import proof_page
+from autotune.report.run_page import analysis_page
 from sim.score import wilson
 
 
@@ -31,6 +37,34 @@ def test_an_oscillating_pair_is_told_by_its_frequency_and_damping():
     found = plant_figures(TransferFunction(num=(8.0,), den=(1.0, 0.4, 4.0, 0.0)))
     assert found["lags_s"] == "2 rad/s with damping 0.1"
     assert (found["integrators"], found["gain"]) == (1, 2.0)
+
+
+@pytest.mark.parametrize(
+    ("gain", "said", "name"),
+    [
+        (0.2, "the loops stay outside the circle", "reduced model"),
+        (1.0, "more cautious, enters it", "reduced model"),
+        (6.0, "unstable with this controller", "reduced model (unstable)"),
+    ],
+)
+def test_the_nyquist_curve_of_the_reduced_model_is_called_what_it_is(gain, said, name):
+    plant = TransferFunction(num=(1.0,), den=(6.0, 11.0, 6.0, 1.0), delay_s=0.2)
+    points = [
+        FrequencyPoint(
+            omega_rad_s=w, response=complex(value), covariance=((s := abs(2e-3 * value) ** 2, 0.0), (0.0, s))
+        )
+        for w, value in zip((0.3, 0.5, 0.7, 0.9, 1.1), plant.response(np.array([0.3, 0.5, 0.7, 0.9, 1.1])), strict=True)
+    ]
+    found = analyse(points, DesignSettings(source="points"), compare=False)
+    law = found.controller
+    controller = replace(law, K=gain * law.K, Ti_s=max(law.Ti_s, law.Ti_s / gain))
+    page = analysis_page(
+        "a", SignalSettings(sample_time_s=0.1), [], replace(found, design=replace(found.design, controller=controller))
+    )
+    figures = [figure for section in page.sections for figure in section.figures]
+    nyquist = next(figure for figure in figures if figure.caption.startswith("Nyquist"))
+    assert said in nyquist.caption
+    assert name in [trace["name"] for trace in nyquist.figure.data]
 
 
 def test_a_campaigns_page_shows_every_loops_plant_and_says_what_to_do(tmp_path):
