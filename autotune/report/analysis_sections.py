@@ -29,6 +29,7 @@ from autotune.report.figures import (
     ratio_title,
     sensitivity_figure,
 )
+from autotune.report.maker_forms import maker_table
 from autotune.report.page import BLUE, GREEN, GREY, ORANGE, PURPLE, RED, Figure, Section, Table
 
 #: a modulus margin that is less by this share cannot be seen in the figure
@@ -287,6 +288,7 @@ def _loop_section(analysis: Analysis, signals: SignalSettings) -> Section:
                 header=("", "designed on", "fitted plant"),
                 rows=rows,
             ),
+            maker_table(controller),
         ),
         details=(_certificate(analysis),),
         detail_tables=(_price_table(analysis, signals),),

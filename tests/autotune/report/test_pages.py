@@ -13,10 +13,12 @@ from autotune.batch.loop import Row
 from autotune.batch.plant_figures import plant_figures
 from autotune.batch.settings import CampaignSettings
 from autotune.config.procedure import DesignSettings, SignalSettings
+from autotune.controller import PIDController
 from autotune.models import TransferFunction
 from autotune.pipeline import analyse
 from autotune.points import FrequencyPoint
 from autotune.report.campaign_page import campaign_page
+from autotune.report.maker_forms import maker_table
 from autotune.report.page import write_page
 from autotune.report.proof_page import proof_page
 from autotune.report.run_page import analysis_page
@@ -65,6 +67,17 @@ def test_the_nyquist_curve_of_the_reduced_model_is_called_what_it_is(gain, said,
     nyquist = next(figure for figure in figures if figure.caption.startswith("Nyquist"))
     assert said in nyquist.caption
     assert name in [trace["name"] for trace in nyquist.figure.data]
+
+
+def test_a_page_gives_the_gains_as_makers_blocks_take_them():
+    table = maker_table(PIDController(K=-1.2, Ti_s=90.0))
+    said = dict(table.rows)
+    assert said["ISA (ideal, standard)"] == "K = 1.2, Ti_s = 90, Td_s = 0, Tf_s = 0, Ti_min = 1.5"
+    assert said["parallel (independent gains)"].startswith("Kp = 1.2, Ki_per_s = 0.01333")
+    assert said["Siemens PID_Compact"].startswith("Gain = 1.2, Ti = 90")
+    assert "direct" in table.caption
+    pid = PIDController(K=1.0, Ti_s=3.0, Td_s=1.0, Tf_s=0.1)
+    assert "complex" in dict(maker_table(pid).rows)["series (interacting)"]
 
 
 def test_a_campaigns_page_shows_every_loops_plant_and_says_what_to_do(tmp_path):
