@@ -237,9 +237,10 @@ def tune(
     )
     read = read_all(recordings, signal_names(t, u, y, r))
     given = [point for path in files for point in read_points(path)]
-    found = measured_of(read, given)
+    with ProgressBar() as bar:
+        found = measured_of(read, given, bar.work)
+        analysis = analyse(found.points, asked, fit=found.fit, facts=found.facts, progress=bar.work)
     notes = found.notes
-    analysis = analyse(found.points, asked, fit=found.fit, facts=found.facts)
     units = read[0].metadata.get("units", {}) if read else {}
     signals = SignalSettings(
         sample_time_s=read[0].sample_time_s if read else 1.0,  # the page shows units only

@@ -23,6 +23,7 @@ from autotune.identification.delay.model import DelayModel
 from autotune.identification.dependence import is_fed_back
 from autotune.identification.parametric import EXCLUDED, PlantFit, not_excluded
 from autotune.models import TransferFunction
+from autotune.progress import Progress, quiet
 from autotune.recording import Recording
 
 _ORDERS = (1, 2, 3)
@@ -62,13 +63,15 @@ class _Fitted:
         return likelihood + self.coefficients * math.log(sum(rows))
 
 
-def fit_recordings(recordings: Sequence[Recording]) -> PlantFit:
+def fit_recordings(recordings: Sequence[Recording], progress: Progress = quiet) -> PlantFit:
     """Fit the differential equation with dead time that the recordings determine, with its region.
 
     Parameters
     ----------
     recordings : sequence of Recording
         Of one plant, with a command that moves; what was measured with feedback needs a delay in the loop.
+    progress : Progress
+        Told which structure is being fitted.
 
     Returns
     -------
@@ -88,7 +91,9 @@ def fit_recordings(recordings: Sequence[Recording]) -> PlantFit:
     """
     found: list[_Fitted] = []
     reason: AutotuneError | None = None
-    for order, integrator in product(_ORDERS, (False, True)):
+    kinds = list(product(_ORDERS, (False, True)))
+    for i, (order, integrator) in enumerate(kinds):
+        progress(f"fitting order {order}{', integrating' if integrator else ''}", i / (len(kinds) + 1))
         structure = _Structure(order=order, integrator=integrator)
         try:
             models = tuple(identify_delay(one, order, integrator=integrator) for one in recordings)
@@ -102,6 +107,7 @@ def fit_recordings(recordings: Sequence[Recording]) -> PlantFit:
             where=recordings[0].name,
             remedy="record steps of the command, up and down, each until y has settled",
         )
+    progress("looking for a zero", len(kinds) / (len(kinds) + 1))
     if not any(is_fed_back(one) for one in recordings):
         found += [zero for one in found if one.structure.order == 2 and (zero := _zero(recordings, one)) is not None]
     rows = [min(one.models[i].rows for one in found) for i in range(len(recordings))]

@@ -28,6 +28,7 @@ from autotune.identification.parametric import PlantFit, fit_plant
 from autotune.identification.reduction import ReducedModel, reduce_points
 from autotune.pipeline.one_thread import on_one_thread
 from autotune.points import FrequencyPoint
+from autotune.progress import Progress, quiet
 
 #: Below this phase [deg] a PI has no use for a point, and another turn could not be told from a rise.
 LOWEST_PHASE_DEG = -270.0
@@ -120,6 +121,7 @@ def analyse(
     fit: PlantFit | None = None,
     facts: LoopFacts | None = None,
     compare: bool = True,
+    progress: Progress = quiet,
 ) -> Analysis:
     """Fit, reduce, design and check.
 
@@ -135,6 +137,8 @@ def analyse(
         Noise, range and sample time, for what the settings leave open.
     compare : bool
         Whether to design on the other bases too; the design on the points takes more than all the rest.
+    progress : Progress
+        Told what is being done.
 
     Raises
     ------
@@ -150,11 +154,13 @@ def analyse(
     asked, noise_source = specification(settings, fit, facts, _highest(usable, fit, facts))
     reduced = _reduced(usable, fit)
     bases = _bases(usable, fit, lambda: reduced, asked, settings.kind)
+    progress("designing", 0.0)
     source, found, looked = _first_kept(bases, settings.source, usable, fit)
     model = reduced if isinstance(reduced, ReducedModel) else None
     H_r = None if model is None else model.transfer_function()
     controller = found.controller
     odd = implausible(fit.plant, controller, found.binding, _period(settings, facts))
+    progress("designing on the other bases, for comparison", 0.5)
     others = tuple((name, _or_reason(make)) for name, make in bases.items() if name != source) if compare else ()
     return Analysis(
         points=tuple(measured),

@@ -15,6 +15,7 @@ from autotune.identification.parametric import PlantFit
 from autotune.identification.recorded_plant import fit_recordings
 from autotune.pipeline.one_thread import on_one_thread
 from autotune.points import FrequencyPoint
+from autotune.progress import Progress, quiet
 from autotune.recording import Recording
 
 #: recordings whose points say less than a fit of the whole record does; a relay's say more
@@ -46,7 +47,9 @@ class Measured:
 
 
 @on_one_thread
-def measured_of(recordings: Sequence[Recording], given: Sequence[FrequencyPoint] = ()) -> Measured:
+def measured_of(
+    recordings: Sequence[Recording], given: Sequence[FrequencyPoint] = (), progress: Progress = quiet
+) -> Measured:
     """Return what recordings and given points say about their plant.
 
     Parameters
@@ -55,6 +58,8 @@ def measured_of(recordings: Sequence[Recording], given: Sequence[FrequencyPoint]
         Relay experiments, closed loops with a set-point that moves, or plain recordings with a command that moves.
     given : sequence of FrequencyPoint
         Points of other files.
+    progress : Progress
+        Told what is being done.
 
     Raises
     ------
@@ -62,6 +67,7 @@ def measured_of(recordings: Sequence[Recording], given: Sequence[FrequencyPoint]
         y does not answer u beyond chance, or neither points nor a fit can be had of them.
     """
     if recordings:
+        progress("asking whether y answers u", 0.0)
         require_answer(recordings)
     estimates: list[FrequencyEstimate] = []
     notes: list[str] = []
@@ -76,7 +82,7 @@ def measured_of(recordings: Sequence[Recording], given: Sequence[FrequencyPoint]
     fit: PlantFit | None = None
     if recordings and not given and all(one.excitation in _PLAIN for one in estimates):
         try:
-            fit = fit_recordings(recordings)
+            fit = fit_recordings(recordings, progress)
         except AutotuneError as error:
             notes.append(str(error))
             reason = reason or error

@@ -75,7 +75,9 @@ def test_what_the_period_of_the_file_costs_is_said_and_another_may_be_given(tmp_
     u = levels(1.0, (60.0, 0.0), *((40.0 + 20.0 * (i % 3), 6.0 * (i % 2)) for i in range(12)))
     rows = open_loop(fast, u, 1.0, 0.05, 30.0, 50.0, 5)
     recordings = [_recording(rows)]
-    found = measured_of(recordings)
+    told: list[str] = []
+    found = measured_of(recordings, progress=lambda what, share: told.append(what))
+    assert {"asking whether y answers u", "fitting order 1", "fitting order 3, integrating"} <= set(told)
     slow, quick = (
         analyse(found.points, DesignSettings(sample_time_s=period), fit=found.fit, facts=found.facts, compare=False)
         for period in (None, 0.1)
