@@ -78,7 +78,7 @@ def diagnose(
 
     evidence = evidence_of(model, recordings, controller, without, told, thresholds)
     if columns := misread_columns(model, recordings, evidence.quality, thresholds):
-        return _of_columns(model, evidence, columns)
+        return _of_columns(model, keeping(evidence, ()), columns)
     begins = {e.name: _begins(e, recordings) for e in found_effects(evidence, judged(evidence))}
     parts = parts_of(recordings, LEAST_ROWS) if begins else ()
     said = _on_parts(evidence, model, controller, without, progress, thresholds)

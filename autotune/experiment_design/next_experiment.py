@@ -35,7 +35,7 @@ def next_experiment(found: Diagnosis) -> NextExperiment | None:
     found : Diagnosis
         Its verdict, effects, candidates and search.
     """
-    if found.verdict in ("none", "parameters"):
+    if found.verdict in ("none", "parameters") or not found.places:
         return None
     for effect in found.effects:
         if len(effect.places) > 1:

@@ -51,6 +51,8 @@ def answers(found: Diagnosis, run: UnseenRun | None) -> tuple[tuple[str, str], .
 
 
 def _found(found: Diagnosis) -> str:
+    if found.verdict == "unexplained" and not found.places:
+        return found.sentences[0]
     if not found.effects:
         return {
             "none": "Nothing: neither the structure nor the numbers need a change.",
@@ -98,6 +100,8 @@ def _percent(share: float) -> str:
 
 def _to_do(found: Diagnosis) -> str:
     following = found.next_experiment
+    if found.verdict == "unexplained" and not found.places:
+        return "Put the columns, or the sign, right and diagnose again."
     first = {
         "none": "Go on with the model as it is.",
         "parameters": "Go on with extended_model.toml, which has the new numbers.",

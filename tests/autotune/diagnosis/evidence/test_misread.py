@@ -9,8 +9,10 @@ import pytest
 from scipy.signal import lfilter
 
 from autotune.diagnosis import Diagnosis, diagnose
+from autotune.experiment_design import next_experiment
 from autotune.models import Block, Model, Port, TransferFunction
 from autotune.recording import Recording
+from autotune.report.diagnosis_words import answers
 
 OVEN = Model(
     name="oven",
@@ -30,13 +32,17 @@ def oven(seed: int, rows: int = 800, gain: float = 2.0) -> Recording:
 
 def first_words(found: Diagnosis) -> str:
     assert not found.effects
+    assert found.fit.extended == found.fit.retuned  # nothing is put into the model that is handed out
     assert found.verdict == "unexplained"
     return found.sentences[0]
 
 
 @pytest.mark.parametrize("seed", [101, 102])
 def test_a_reversed_sign_is_said_first_and_is_no_physics(seed: int) -> None:
-    assert "the sign of u, or of the model's gain, is reversed" in first_words(diagnose(OVEN, [oven(seed, gain=-2.0)]))
+    found = diagnose(OVEN, [oven(seed, gain=-2.0)])
+    assert "the sign of u, or of the model's gain, is reversed" in first_words(found)
+    assert next_experiment(found) is None  # a better recording of the wrong sign tells no more
+    assert dict(answers(found, None))["What was found"] == found.sentences[0]
 
 
 @pytest.mark.parametrize("seed", [101, 102])
