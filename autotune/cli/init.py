@@ -16,6 +16,7 @@ from autotune.cli.init_keys import REGISTER, Table, add_registers, register, set
 from autotune.cli.init_model import EXAMPLE, ModelOfRig, model_of_rig
 from autotune.cli.init_questions import Questions, one_of, pair
 from autotune.errors import InputError
+from autotune.outputs import Output
 
 if TYPE_CHECKING:
     from drivers.kinds import Kind
@@ -176,14 +177,9 @@ def init(
     content = {"name": config.stem, **content}
     set_keys(content, keys or ())
     validated(Config, content, str(config))
+    place = Output(config)
     written = twin.write(config, answers) if isinstance(twin, ModelOfRig) else None
-    try:
-        with config.open("x", encoding="utf-8") as file:
-            file.write(_text(content, config))
-    except OSError as error:
-        raise InputError(
-            f"cannot be written ({error.strerror})", where=str(config), remedy="check the folder"
-        ) from None
+    place.text(_text(content, config))
     console = Console(highlight=False, soft_wrap=True)
     console.print(f"wrote {config}" + (f" and {written}" if written else ""), markup=False)
     if simulated:
