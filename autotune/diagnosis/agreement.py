@@ -8,6 +8,7 @@ changes its name from part to part.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TypeAlias
@@ -72,7 +73,7 @@ def agreement(
     parts : sequence of Part
         What is diagnosed again.
     said : callable
-        Returns the probabilities by a part.
+        Returns the probabilities by a part, NaN of an effect that it cannot tell.
 
     Returns
     -------
@@ -89,7 +90,8 @@ def agreement(
     agreed = {}
     for name in whole:
         all_said = [whole, *(one for part, one in heard if part.tells(begins.get(name, ())))]
-        mean = float(np.exp(np.mean([np.log(max(one.get(name, 0.0), LEAST)) for one in all_said])))
+        told = [max(p, LEAST) for p in (one.get(name, 0.0) for one in all_said) if not math.isnan(p)]
+        mean = float(np.exp(np.mean(np.log(told))))
         if mean >= NAMED:
             agreed[name] = mean
     return agreed

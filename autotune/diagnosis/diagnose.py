@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
@@ -11,6 +12,7 @@ from autotune.controller import Controller
 from autotune.diagnosis.agreement import Part, agreement, parts_of
 from autotune.diagnosis.evidence.description import describe
 from autotune.diagnosis.evidence.misread import misread_columns
+from autotune.diagnosis.evidence.operating_point import unmoved
 from autotune.diagnosis.extended import extended_model
 from autotune.diagnosis.findings import OFFSET, found_effects, places_of, said_by, sentences_of
 from autotune.diagnosis.gathering import evidence_of, keeping
@@ -155,7 +157,8 @@ def _on_parts(
 
     def said(part: Part) -> Mapping[str, float]:
         progress("once more on a part of the rows", WHOLE)
-        return said_by(evidence_of(model, part.recordings, controller, others, quiet, thresholds))
+        cannot_tell = dict.fromkeys(unmoved(model, part.recordings), math.nan)
+        return said_by(evidence_of(model, part.recordings, controller, others, quiet, thresholds)) | cannot_tell
 
     return said
 

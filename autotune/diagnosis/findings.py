@@ -52,7 +52,7 @@ def found_effects(evidence: Evidence, verdict: Verdict) -> tuple[FoundEffect, ..
     return tuple(ranked)
 
 
-def said_by(evidence: Evidence) -> Mapping[str, float]:
+def said_by(evidence: Evidence) -> dict[str, float]:
     """Return the probabilities of all effects that are in a hypothesis, and of those that samples show."""
     most, candidates = evidence.limits.most_probable, evidence.candidates
     names = {name for c in candidates for name in c.name.split("+") if name in KINDS}

@@ -61,7 +61,7 @@ def evidence_of(
     thresholds : Thresholds
         What decides between two findings.
     """
-    without = [*without, *unmoved(recordings)]
+    without = [*without, *unmoved(model, recordings)]
     evidence = _gathered(model, recordings, controller, without, progress, thresholds)
     return _of_rig(evidence, model, without, progress)
 
@@ -101,7 +101,7 @@ def _gathered(
         samples=samples,
         residual=residual_tests(chosen, found.data, found.gained, uneven=uneven),
         quality=held_out(found.retuned.fit, chosen, found.data),
-        offset=None if unmoved(recordings) else offset_of(chosen, thresholds.offset_sigmas),
+        offset=None if unmoved(model, recordings) else offset_of(chosen, thresholds.offset_sigmas),
         evened=late is not None,
     )
 

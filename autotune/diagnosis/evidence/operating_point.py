@@ -13,7 +13,11 @@ from autotune.diagnosis.evidence.residual import shifts_by_window
 from autotune.diagnosis.fitting.fit import Fit
 from autotune.diagnosis.thresholds import Thresholds
 from autotune.effects import ALL
+from autotune.models import Model
 from autotune.recording import Recording
+
+#: Share of its whole travel within which a recording's first reading is at the model's rest.
+AT_REST = 0.02
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,15 +28,21 @@ class Offset:
     sd: float
 
 
-def unmoved(recordings: Sequence[Recording]) -> tuple[str, ...]:
+def unmoved(model: Model, recordings: Sequence[Recording]) -> tuple[str, ...]:
     """Return the effects that are not told from others where no command moves.
 
     Those that act on the command are a constant there, and what only bends or delays the reading is the plant in other
-    coordinates.
+    coordinates. A recording that begins at the model's rest under another command begins with a step.
     """
-    if any(float(np.ptp(r.u)) > 0.0 for r in recordings):
+    if any(float(np.ptp(r.u)) > 0.0 or _begins_with_a_step(model, r) for r in recordings):
         return ()
     return tuple(k.name for k in ALL if k.place == "actuator" or k.name == "timing.dead_time" or k.recoordinates)
+
+
+def _begins_with_a_step(model: Model, recording: Recording) -> bool:
+    readings = recording.y[np.isfinite(recording.y)]
+    at_rest = abs(float(readings[0]) - model.output.offset) <= AT_REST * float(np.ptp(readings))
+    return at_rest and float(recording.u[0]) != model.input.offset
 
 
 def offset_of(result: Fit, sigmas: float = Thresholds.offset_sigmas) -> Offset | None:

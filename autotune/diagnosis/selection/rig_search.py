@@ -112,7 +112,7 @@ def _odds(
 ) -> tuple[tuple[EffectKind, float], ...]:
     """Return the effects that a rig of the model's kind may lack, with their prior odds."""
     kind = rig_kind(model, build_chain(model))
-    left_out = {*left_out, *unmoved(recordings)}
+    left_out = {*left_out, *unmoved(model, recordings)}
     odds = ((k, k.odds.get(kind, k.odds.get("any", 0.0))) for k in ALL if k.odds and k.name not in left_out)
     return tuple(pair for pair in odds if pair[1] > 0.0)
 

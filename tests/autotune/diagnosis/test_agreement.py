@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import TypeAlias
@@ -38,6 +39,7 @@ def test_what_is_likelier_than_not_is_named_and_what_a_part_contradicts_is_not()
     assert shares({DRY: 0.9}, [{DRY: 0.4}, {DRY: 0.6}]) == {DRY: pytest.approx(0.6)}
     assert shares({DRY: 0.97}, [{DRY: 0.97}, {}]) == {}
     assert shares({DRY: 0.4}, [{DRY: 0.45}, {DRY: 0.4}]) == {}
+    assert shares({DRY: 0.9}, [{DRY: math.nan}, {DRY: 0.9}]) == {DRY: pytest.approx(0.9)}  # one cannot tell
 
 
 def test_a_part_without_the_moment_at_which_an_effect_begins_is_not_asked() -> None:

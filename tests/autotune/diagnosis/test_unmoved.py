@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from autotune.diagnosis import diagnose
+from autotune.diagnosis.evidence.operating_point import unmoved
 from autotune.models import Block, Model, Port, TransferFunction
 from autotune.recording import Recording
 
@@ -29,3 +31,18 @@ def test_a_bent_reading_is_not_told_from_the_plant_where_the_command_stands() ->
     model = Model(name="swing", input=Port(), output=Port(), blocks=(arm,))
     found = diagnose(model, [Recording(t=t, u=np.zeros(t.size), y=y)])
     assert not [e.name for e in found.effects if e.name.startswith(("actuator.", "sensor."))]
+
+
+def test_a_recording_that_begins_at_rest_under_another_command_begins_with_a_step() -> None:
+    """A heater switched on at the first row, behind a lag that the model lacks: later rows alone cannot tell of it."""
+    t = np.arange(900.0)
+    warm = 1.0 - (170.0 * np.exp(-t / 170.0) - 20.0 * np.exp(-t / 20.0)) / 150.0
+    y = 21.0 + 35.0 * warm + 0.05 * np.random.default_rng(3).normal(size=t.size)
+    dynamics = TransferFunction(num=(0.7,), den=(150.0, 1.0))
+    heater = Block(name="heater", place="plant", dynamics=dynamics, output="temperature", unit="degC")
+    model = Model(name="oven", input=Port(unit="%"), output=Port(unit="degC", offset=21.0), blocks=(heater,))
+    found = diagnose(model, [Recording(t=t, u=np.full(t.size, 50.0), y=y)])
+    assert [e.name for e in found.effects] == ["sensor.lag"]
+    assert found.effects[0].parameters["time_constant"].value == pytest.approx(20.0, rel=0.1)
+    assert set(found.effects[0].places) >= {"sensor", "actuator"}
+    assert "actuator.lag" in unmoved(model, [Recording(t=t, u=np.zeros(t.size), y=y)])
