@@ -17,6 +17,9 @@ if TYPE_CHECKING:
     from autotune.design.rst import RST
     from autotune.models import TransferFunction
 
+#: Rows of a reference, a file of 40 MB.
+_MOST_ROWS = 1e6
+
 
 @app.command("validate")
 def validate_command(
@@ -69,7 +72,9 @@ def reference_command(
     u_max: Annotated[float | None, typer.Option(help="highest command [u unit]")] = None,
     u_rate: Annotated[float | None, typer.Option(help="fastest change of the command [u unit/s]")] = None,
     y_speed: Annotated[float | None, typer.Option(help="fastest change of y [y unit/s]")] = None,
-    sample_time: Annotated[float | None, typer.Option(help="time between rows [s]; 200 rows when absent")] = None,
+    sample_time: Annotated[
+        float | None, typer.Option(min=1e-6, help="time between rows [s]; 200 rows when absent")
+    ] = None,
     overwrite: OVERWRITE = False,
 ) -> None:
     """Plan the fastest smooth transition within limits with the command that follows it, or write a prefilter."""
@@ -83,11 +88,13 @@ def reference_command(
     import numpy as np
 
     from autotune.api.methods import transition
+    from autotune.api.plants import as_plant
     from autotune.identification.delay.model import read_delay_model
 
     assert model is not None
+    plant = as_plant(read_delay_model(model) if model.suffix == ".json" else model)
     found = transition(
-        read_delay_model(model) if model.suffix == ".json" else model,
+        plant,
         y_start=begin,
         y_end=end,
         u_rest=rest,
@@ -97,9 +104,16 @@ def reference_command(
         y_speed=math.inf if y_speed is None else y_speed,
     )
     step = found.duration_s / 200.0 if sample_time is None else sample_time
+    if found.duration_s > _MOST_ROWS * step:
+        raise InputError(
+            f"--sample-time {step:g} s makes {found.duration_s / step:.3g} rows of {found.duration_s:.4g} s",
+            where="autotune reference", remedy=f"at most {_MOST_ROWS:g} are written",
+        )  # fmt: skip
     t = step * np.arange(math.ceil(found.duration_s / step - 1e-9) + 1)
     rows = np.column_stack([t, np.interp(t, found.t_s, found.y), np.interp(t, found.t_s, found.u)])
     place.by(lambda part: np.savetxt(part, rows, fmt="%.10g", delimiter=",", header="t,r,u_ff", comments=""))
+    if (plant.poles.real > 0.0).any():
+        typer.echo("warning: the plant is unstable: u_ff holds it only beside a controller that does", err=True)
     typer.echo(f"{found.duration_s:.4g} s from {begin:g} to {end:g}, decided by {found.binding}; wrote {out}")
 
 

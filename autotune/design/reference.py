@@ -14,7 +14,7 @@ import numpy as np
 
 from autotune.arrays import FloatArray
 from autotune.controller import PIDController
-from autotune.errors import DesignError
+from autotune.errors import DesignError, InputError
 from autotune.models import TransferFunction
 from autotune.poles import slowest_lag_s
 
@@ -101,6 +101,8 @@ def flat_transition(
 
     Raises
     ------
+    InputError
+        A limit of change that is not positive.
     DesignError
         Zeros in the plant, or limits that even an infinitely slow transition breaks; names the output that can be
         reached.
@@ -114,6 +116,9 @@ def flat_transition(
         raise DesignError(
             "a plant with zeros is not flat in its output", where="reference", remedy="leave the zeros out"
         )
+    for name, limit in (("u_rate", u_rate), ("y_speed", y_speed)):
+        if not limit > 0.0:
+            raise InputError(f"{name} = {limit:g}", where="reference", remedy="a limit of change is positive")
     order = len(plant.den) - 1
     shape = _smooth_step(2 * order + 3)
     _reachable(plant, y_start, y_end, u_rest, u_min, u_max)

@@ -119,6 +119,41 @@ def test_an_option_beyond_its_range_is_one_line_that_names_it(tmp_path: Path, na
     assert list(tmp_path.iterdir()) == []
 
 
+LAG = '[[block]]\nname = "p"\nplace = "plant"\nnum = [2.0]\nden = [1.0, {last}]\n'
+REFERENCES = {
+    "u_rate = 0": ["--u-rate", "0"],
+    "y_speed = -1": ["--y-speed", "-1"],
+    "--sample-time": ["--sample-time", "0"],
+    "rows of": ["--sample-time", "1e-6", "--u-rate", "1e-3"],
+}
+
+
+@pytest.mark.parametrize("named", REFERENCES)
+def test_a_reference_of_no_limit_or_too_many_rows_is_refused(tmp_path: Path, named: str) -> None:
+    (tmp_path / "m.toml").write_text('name = "lag"\n' + LAG.format(last=1.0))
+    line = ["reference", "--model", "m.toml", "--u-min", "-3", "--u-max", "3", "--out", "r.csv", *REFERENCES[named]]
+    done = subprocess.run(
+        [sys.executable, "-m", "autotune", *line], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 2, done.stderr
+    assert named in done.stderr
+    assert done.stderr.count("\n") == 1
+    assert [file.name for file in tmp_path.iterdir()] == ["m.toml"]
+
+
+@pytest.mark.parametrize(("last", "warned"), [(1.0, False), (-1.0, True)])
+def test_a_command_computed_for_an_unstable_plant_is_said_to_need_a_controller(
+    tmp_path: Path, last: float, warned: bool
+) -> None:
+    (tmp_path / "m.toml").write_text('name = "lag"\n' + LAG.format(last=last))
+    line = ["reference", "--model", "m.toml", "--u-min", "-3", "--u-max", "3", "--out", "r.csv"]
+    done = subprocess.run(
+        [sys.executable, "-m", "autotune", *line], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert ("the plant is unstable" in done.stderr) == warned
+
+
 def test_a_name_neither_breaks_the_page_nor_turns_its_text(tmp_path: Path) -> None:
     from autotune.report.page import Page, write_page
 
