@@ -29,6 +29,8 @@ LARGEST = 1e15
 
 #: An even grid may have so many rows, and ten times those of the recording.
 _MOST_NEW_ROWS = 100_000
+#: Times its rows that a recording's time may hold where it is simulated from end to end.
+_MOST_GAPS = 100
 _REQUIRED = ("t", "u", "y")
 
 
@@ -114,6 +116,23 @@ class Recording:
         if column not in columns:
             raise InputError(f"no column {column!r}", where=self.name, remedy=f"it has {', '.join(columns)}")
         return columns[column]
+
+    def require_dense(self) -> None:
+        """Refuse a recording whose time is nearly all gaps: a free run through them takes as long as if it were rows.
+
+        Raises
+        ------
+        InputError
+            Its time would hold a hundred times the rows that it has, or more.
+        """
+        rows = self.duration_s / self.sample_time_s
+        if rows > _MOST_GAPS * len(self):
+            longest = float(np.max(np.diff(self.t)))
+            raise InputError(
+                f"{len(self)} rows in a time that would hold {rows:.3g}: the longest gap has {longest:g} s",
+                where=self.name,
+                remedy="cut the recording at the gap and give both parts",
+            )
 
     def between(self, start_s: float, end_s: float) -> Recording:
         """Return the rows with ``start_s <= t < end_s``, time stamps unchanged."""

@@ -69,7 +69,8 @@ def diagnose(
     Raises
     ------
     InputError
-        No recording, fewer than 100 rows, u that is not finite, or an effect of the model that no catalogue has.
+        No recording, fewer than 100 rows, u that is not finite, a time that is nearly all gaps, or an effect of the
+        model that no catalogue has.
     """
     require_known(model.effects, model.name)
     _require_rows(recordings)
@@ -168,5 +169,6 @@ def _require_rows(recordings: Sequence[Recording]) -> None:
         raise InputError("no recording", where="diagnose", remedy="give at least one")
     for r in recordings:
         r.require_finite(("u",))
+        r.require_dense()
         if len(r) < LEAST_ROWS or np.isfinite(r.y).sum() < LEAST_ROWS:
             raise InputError(f"{len(r)} rows", where=r.name, remedy="a diagnosis needs at least 100 finite readings")

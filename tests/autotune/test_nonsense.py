@@ -13,8 +13,10 @@ import pytest
 from autotune.batch.campaign import REPORT, RESULTS, Campaign
 from autotune.batch.settings import CampaignSettings
 from autotune.config import load_config
+from autotune.diagnosis import diagnose
 from autotune.errors import InputError
 from autotune.files.workbook import open_table
+from autotune.models import Block, Model, Port, TransferFunction
 from autotune.pipeline.audit import audit_log
 from autotune.recording import Recording, read_recording
 
@@ -35,6 +37,18 @@ def test_a_gap_of_years_takes_no_memory() -> None:
     recording = Recording(t=t, u=np.sin(t), y=np.cos(t), name="r.csv")
     with pytest.raises(InputError, match=r"r\.csv: an even grid of 0\.01 s needs 1e\+08 rows.*cut the recording"):
         recording.resampled(0.01)
+
+
+def test_a_recording_that_is_nearly_all_gap_is_not_simulated_through_it() -> None:
+    """One wrong date in a file: a diagnosis ran for minutes."""
+    t = np.arange(400.0)
+    t[200:] += 1e6
+    rng = np.random.default_rng(1)
+    recording = Recording(t=t, u=rng.normal(size=400), y=rng.normal(size=400), name="r.csv")
+    lag = Block(name="lag", place="plant", dynamics=TransferFunction(num=(1.0,), den=(9.0, 1.0)))
+    model = Model(name="lag", input=Port(), output=Port(), blocks=(lag,))
+    with pytest.raises(InputError, match=r"r\.csv: 400 rows in a time .* 1e\+06 s; cut the recording at the gap"):
+        diagnose(model, [recording])
 
 
 @pytest.mark.parametrize(

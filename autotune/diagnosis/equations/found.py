@@ -199,6 +199,7 @@ def diagnose_equations(
     for one in recordings:
         if np.isfinite(one.y).sum() < 100:
             raise InputError(f"{len(one)} rows", where=one.name, remedy="a diagnosis needs at least 100 readings")
+        one.require_dense()
     good, seen = inspect(recordings, without, thresholds)
     if converter_step(np.concatenate([r.y for r in recordings])) > 0.0:
         # no simulation is asked here, and behind a converter equal readings are no dropout
