@@ -152,14 +152,15 @@ def _on_parts(
     thresholds: Thresholds,
 ) -> Callable[[Part], Mapping[str, float]]:
     """Return what a part of the recordings says of what the whole made a candidate."""
-    search = evidence.search
+    search, begun = evidence.search, None if evidence.rig is None else evidence.rig.chosen
     known = {name for h in search.all for name in h.names} | {s.name for s in evidence.samples} | {OFFSET}
     others = [*without, *(name for name in KINDS if name not in known)]
 
     def said(part: Part) -> Mapping[str, float]:
         progress("once more on a part of the rows", WHOLE)
         cannot_tell = dict.fromkeys(unmoved(model, part.recordings), math.nan)
-        return said_by(evidence_of(model, part.recordings, controller, others, quiet, thresholds)) | cannot_tell
+        part_shows = evidence_of(model, part.recordings, controller, others, quiet, thresholds, begun)
+        return said_by(part_shows) | cannot_tell
 
     return said
 

@@ -24,6 +24,7 @@ from autotune.diagnosis.fitting.data import as_white
 from autotune.diagnosis.fitting.fit import RUNAWAY, fit
 from autotune.diagnosis.fitting.long_windows import cut, lengths_of
 from autotune.diagnosis.fitting.retuning import prepare
+from autotune.diagnosis.selection.judged import Judged
 from autotune.diagnosis.selection.rig_bench import STEPS
 from autotune.diagnosis.selection.rig_search import search_rig
 from autotune.diagnosis.selection.search import search
@@ -43,6 +44,7 @@ def evidence_of(
     without: Sequence[str],
     progress: Progress,
     thresholds: Thresholds,
+    begun: Judged | None = None,
 ) -> Evidence:
     """Return all that recordings show, near the noise or far from it.
 
@@ -60,10 +62,12 @@ def evidence_of(
         Told what is being done and the share done, 0 to 1.
     thresholds : Thresholds
         What decides between two findings.
+    begun : Judged, optional
+        What predicted best on more rows: it is judged as well, with its odds, from the numbers that it had there.
     """
     without = [*without, *unmoved(model, recordings)]
     evidence = _gathered(model, recordings, controller, without, progress, thresholds)
-    return _of_rig(evidence, model, without, progress)
+    return _of_rig(evidence, model, without, progress, begun)
 
 
 def _gathered(
@@ -151,7 +155,9 @@ def _searched(
     return searched(), seen
 
 
-def _of_rig(evidence: Evidence, model: Model, without: Sequence[str], progress: Progress) -> Evidence:
+def _of_rig(
+    evidence: Evidence, model: Model, without: Sequence[str], progress: Progress, begun: Judged | None
+) -> Evidence:
     """Return the evidence of left-out stretches where the model's own error and not noise is what remains."""
     limits, recordings, found = evidence.limits, evidence.search.data.recordings, evidence.search
     barely = bool(found.chosen.names) and evidence.unknown_odds > limits.barely_noise
@@ -168,7 +174,7 @@ def _of_rig(evidence: Evidence, model: Model, without: Sequence[str], progress: 
         # a likelihood of noise that is nearly white says nothing beside a disturbance
         stands = bool(found.chosen.names) and evidence.explains_most and not refuted
         known = found.chosen.fit if own is None and stands else None
-        rig = search_rig(model, recordings, good, [*without, *seen], progress, limits, known)
+        rig = search_rig(model, recordings, good, [*without, *seen], progress, limits, known, begun)
     except RUNAWAY:
         return evidence
     if not rig.chosen.names and own is not None:

@@ -53,6 +53,7 @@ def search_rig(
     progress: Progress = quiet,
     limits: Thresholds = IN_USE,
     known: Fit | None = None,
+    begun: Judged | None = None,
 ) -> RigSearch:
     """Search for the physics that is missing in a rig that no explanation describes to within noise.
 
@@ -68,6 +69,8 @@ def search_rig(
         What decides between findings.
     known : Fit, optional
         What the search beside the noise found to explain most: it is judged as well, and not as something rare.
+    begun : Judged, optional
+        What predicted best on more rows of these recordings: it is judged as well, from the numbers that it had there.
 
     Returns
     -------
@@ -101,7 +104,9 @@ def search_rig(
         beam = [retuned, nominal] if float(np.max(away)) > limits.nominal_too else [retuned]
         bench = replace(bench, lasting=tuple(_lasting(retuned, bench)))
         bench, found = _grown(retuned, beam, bench, progress, limits)
-        found = _regrown(_finished(_pruned([*found, *_known(known, bench)], bench), bench), bench)
+        found = _regrown(
+            _finished(_pruned([*found, *_known(known, bench), *_begun(begun, bench)], bench), bench), bench
+        )
         chosen = bench.with_both_scales(simplest(found, limits.material))
         nominal, retuned, chosen = (one.spread_out() for one in (nominal, retuned, chosen))
         return RigSearch(nominal=nominal, retuned=retuned, judged=tuple(found), chosen=chosen)
@@ -294,6 +299,18 @@ def _known(known: Fit | None, bench: RigBench) -> list[Judged]:
     except RUNAWAY:
         return []
     judged = bench.finite(result, math.log(odds))
+    return [] if judged is None else [judged]
+
+
+def _begun(begun: Judged | None, bench: RigBench) -> list[Judged]:
+    """Return what predicted best on more rows, judged on these: a search of fewer rows may miss where it lies."""
+    if begun is None:
+        return []
+    try:
+        result = fit(begun.fit.parametrisation, bench.long, begun.fit.theta, iterations=LAST_STEPS)
+    except RUNAWAY:
+        return []
+    judged = bench.finite(result, begun.log_odds)
     return [] if judged is None else [judged]
 
 
