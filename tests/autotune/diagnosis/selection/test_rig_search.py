@@ -168,3 +168,13 @@ def test_what_stands_for_something_else_once_it_is_fitted_to_the_end_is_not_judg
     assert known.model.effects[0].parameters["damping"].value > 1.0
     found = search_rig(model, [recording], good(recording), known=known)
     assert all("plant.resonance" not in one.names for one in found.judged)
+
+
+def test_what_predicted_best_on_more_rows_is_judged_on_fewer_though_their_own_search_misses_it():
+    recording = swing(gravity=22.0, friction=0.25, damping=0.02)
+    model = pendulum(20.0, 0.1)
+    whole = search_rig(model, [recording], good(recording)).chosen
+    part = recording.only(np.arange(int(0.8 * len(recording))))
+    found = search_rig(model, [part], good(part), left_out=whole.names, begun=whole)
+    assert found.chosen.names == whole.names
+    assert found.chosen.log_odds == whole.log_odds
