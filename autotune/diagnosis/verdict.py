@@ -75,6 +75,11 @@ class Evidence:
         """Whether the simulation follows y at all: its mean alone errs by the whole spread."""
         return self.quality.extended < ASTRAY
 
+    @property
+    def predicts(self) -> bool:
+        """Whether the chosen effects leave held-out rows no farther off than the model without them was."""
+        return self.quality.extended <= max(self.quality.nominal, self.quality.retuned)
+
     @cached_property
     def unknown_odds(self) -> float:
         """Prior odds of a cause outside the catalogue, beside 1 of all hypotheses together."""
@@ -109,7 +114,7 @@ class Evidence:
         jitter = sum(s.evidence for s in self.samples if kind_of(s.name).sought == "residual")
         holds = {
             "follows": self.follows,
-            "effects": bool(set(found.chosen.names) - self.contradicted),
+            "effects": self.predicts and bool(set(found.chosen.names) - self.contradicted),
             "rig": self.rig is not None,
             "varies more": self.rig is not None and self.rig.varies_more(limits.varies_more),
             "late stamps": self.evened,
