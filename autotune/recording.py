@@ -127,12 +127,12 @@ class Recording:
         """
         rows = self.duration_s / self.sample_time_s
         if rows > _MOST_GAPS * len(self):
-            longest = float(np.max(np.diff(self.t)))
-            raise InputError(
-                f"{len(self)} rows in a time that would hold {rows:.3g}: the longest gap has {longest:g} s",
-                where=self.name,
-                remedy="cut the recording at the gap and give both parts",
-            )
+            raise self._mostly_gap(f"{len(self)} rows in a time that would hold {rows:.3g}", " and give both parts")
+
+    def _mostly_gap(self, said: str, further: str = "") -> InputError:
+        longest = float(np.max(np.diff(self.t)))
+        what = f"{said}: the longest gap has {longest:g} s"
+        return InputError(what, where=self.name, remedy=f"cut the recording at the gap{further}")
 
     def between(self, start_s: float, end_s: float) -> Recording:
         """Return the rows with ``start_s <= t < end_s``, time stamps unchanged."""
@@ -158,12 +158,7 @@ class Recording:
         """
         rows = (float(self.t[-1]) - float(self.t[0])) / dt_s + 1.0
         if rows > _MOST_NEW_ROWS + 10.0 * len(self):
-            longest = float(np.max(np.diff(self.t)))
-            raise InputError(
-                f"an even grid of {dt_s:g} s needs {rows:.3g} rows for {len(self)}: the longest gap has {longest:g} s",
-                where=self.name,
-                remedy="cut the recording at the gap",
-            )
+            raise self._mostly_gap(f"an even grid of {dt_s:g} s needs {rows:.3g} rows for {len(self)}")
         t = self.t[0] + dt_s * np.arange(int(np.floor((self.t[-1] - self.t[0]) / dt_s + 1e-9)) + 1)
         held = np.clip(np.searchsorted(self.t, t + 1e-9 * dt_s, side="right") - 1, 0, None)
         extra = {

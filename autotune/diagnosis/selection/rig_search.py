@@ -11,7 +11,7 @@ The steps of one search: the file is a little longer than others.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
@@ -294,23 +294,23 @@ def _known(known: Fit | None, bench: RigBench) -> list[Judged]:
         odds = max(odds, bench.limits.known_odds)
     if odds <= 0.0:
         return []
-    try:
-        result = bench.settled(known.parametrisation, known.theta)
-    except RUNAWAY:
-        return []
-    judged = bench.finite(result, math.log(odds))
-    return [] if judged is None else [judged]
+    return _brought(lambda: bench.settled(known.parametrisation, known.theta), math.log(odds), bench)
 
 
 def _begun(begun: Judged | None, bench: RigBench) -> list[Judged]:
     """Return what predicted best on more rows, judged on these: a search of fewer rows may miss where it lies."""
     if begun is None:
         return []
+    p, theta = begun.fit.parametrisation, begun.fit.theta
+    return _brought(lambda: fit(p, bench.long, theta, iterations=LAST_STEPS), begun.log_odds, bench)
+
+
+def _brought(fitted: Callable[[], Fit], log_odds: float, bench: RigBench) -> list[Judged]:
+    """Return a hypothesis that was found elsewhere, fitted and judged here; nothing where it runs away."""
     try:
-        result = fit(begun.fit.parametrisation, bench.long, begun.fit.theta, iterations=LAST_STEPS)
+        judged = bench.finite(fitted(), log_odds)
     except RUNAWAY:
         return []
-    judged = bench.finite(result, begun.log_odds)
     return [] if judged is None else [judged]
 
 
