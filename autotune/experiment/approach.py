@@ -59,6 +59,8 @@ class Known:
         Mean measurement in preflight [y unit].
     plant_sign : int
         Sign of the plant's gain, 0 while unknown.
+    sign_seen : bool
+        Whether that was seen on the rig, and the mid-point roughly with it, and not only said.
     midpoint : float
         Command that holds the plant, as far as known [u unit].
     first_move_s : float
@@ -79,6 +81,7 @@ class Known:
     noise_half: float = 0.0
     y_rest: float = math.nan
     plant_sign: int = 0
+    sign_seen: bool = False
     midpoint: float = math.nan
     first_move_s: float = 0.0
     y_moved: float = math.nan
@@ -239,6 +242,7 @@ def _ramp(
     return replace(
         known,
         plant_sign=sign,
+        sign_seen=True,
         midpoint=loop.tick.u - rate * since,
         first_move_s=loop.tick.t_s - since,
         y_moved=known.y_rest + moved,
@@ -289,7 +293,7 @@ def _find_sign(loop: ControlLoop, point: OperatingPointSettings, known: Known, t
     # the command between the two at which y would have stood still
     balance = -(slopes[0] + slopes[1]) / (slopes[0] - slopes[1])
     midpoint = known.midpoint + push * min(max(balance, -2.0), 2.0)
-    return replace(known, plant_sign=1 if slopes[0] > slopes[1] else -1, midpoint=midpoint)
+    return replace(known, plant_sign=1 if slopes[0] > slopes[1] else -1, sign_seen=True, midpoint=midpoint)
 
 
 def find_midpoint(
@@ -315,7 +319,7 @@ def find_midpoint(
     tell("catching the plant and finding the relay's mid-point")
     room = min(known.midpoint - limits.u_min, limits.u_max - known.midpoint)
     # where ramp or pushes have told the mid-point roughly, the relay need not reach across all of its uncertainty
-    reach = 0.4 if point.approach == "ramp" or point.plant_sign == 0 else BRACKET
+    reach = 0.4 if known.sign_seen else BRACKET
     amplitude = min(largest or reach * point.u_uncertainty, 0.9 * room)
     if amplitude <= 0.0:
         raise ExperimentStopped(
@@ -331,13 +335,12 @@ def find_midpoint(
         smoothing=FIRST_SMOOTHING,
         plant_sign=1 if known.plant_sign > 0 else -1,
     )
-    seen = point.approach == "ramp" or point.plant_sign == 0
     oscillation = Oscillation(
         loop,
         settings,
         patience_s=PATIENCE_SHARE * limits.time_s,
         nudge_s=NUDGE_SHARE * limits.time_s,
-        sign_is_sure=seen,
+        sign_is_sure=known.sign_seen,
     )
     _lead(oscillation, point.y, known)
     loop.watch = Watch(y_centre=point.y, in_range=True)

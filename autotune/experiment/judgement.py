@@ -113,6 +113,11 @@ class Verification:
         return f"host's law verified; the device's own law not tried ({self.untried})"
 
 
+def contradict(fit: PlantFit) -> bool:
+    """Return whether the points contradict the fitted structure by more than their covariance and a tolerance."""
+    return fit.p_value < CONTRADICTED and fit.largest_residual > RESIDUAL
+
+
 def require_predictable(fit: PlantFit, controller: PIDController) -> Margins:
     """Refuse to predict a loop from points that leave open whether it is stable, or that contradict one another.
 
@@ -143,7 +148,7 @@ def require_predictable(fit: PlantFit, controller: PIDController) -> Margins:
     gains, crossover = f"K = {controller.K:.4g}, T_I = {controller.Ti_s:.4g} s", expected.crossover_rad_s
     if not expected.stable or not math.isfinite(crossover):
         refuse(f"on the measured plant {gains} make no stable loop", "design the controller on this rig's points")
-    if fit.p_value < CONTRADICTED and fit.largest_residual > RESIDUAL:
+    if contradict(fit):
         refuse(
             f"the points contradict their covariance: chi-square {fit.chi_square:.3g} at {fit.degrees_of_freedom}"
             f" degrees of freedom, a point is {100 * fit.largest_residual:.2g} % from the fitted plant",

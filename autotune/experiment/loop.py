@@ -20,7 +20,7 @@ from autotune.errors import AutotuneError, ExperimentStopped, LinkError, Operato
 from autotune.experiment.leaving import leave, say, verdict_on
 from autotune.experiment.limits import Envelope, Watch
 from autotune.experiment.monitor import ReadingMonitor
-from autotune.experiment.priority import undisturbed
+from autotune.experiment.priority import GoesOn, undisturbed
 from autotune.experiment.rig import Exchanges, Feeds, Reading, Rig, Row
 from autotune.experiment.rows import KEPT_ROWS, RecentRows
 from autotune.experiment.timing import Tick, Timing
@@ -102,6 +102,9 @@ class ControlLoop:
         self._lateness: deque[float] = deque(maxlen=KEPT_ROWS)
         self._exchange = rig.exchange if isinstance(rig, Exchanges) else None
         self._feed = rig.feed if isinstance(rig, Feeds) else None
+        # a virtual clock lets nobody wait for a signal: slices would only be work for the plant
+        waits = self._feed is not None or (isinstance(rig.clock, GoesOn) and rig.clock.goes_on)
+        self._slice_s = SLICE_S if waits else math.inf
         self._missed, self._slots = 0, 1
         self._recent_slots: deque[int] = deque(maxlen=LOOK_BACK_ROWS)
         self._stop_signal = ""
@@ -307,7 +310,7 @@ class ControlLoop:
         self._deadline_s += step * lost
         while True:
             self._look_for_stop()
-            clock.sleep_until(min(self._deadline_s, clock.now() + SLICE_S))
+            clock.sleep_until(min(self._deadline_s, clock.now() + self._slice_s))
             if clock.now() >= self._deadline_s - 1e-9:
                 break
             if self._feed is not None:

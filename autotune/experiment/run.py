@@ -20,6 +20,7 @@ from autotune.experiment.limits import Envelope, Watch
 from autotune.experiment.loop import ControlLoop, Timing
 from autotune.experiment.relay import RelaySettings
 from autotune.experiment.result import ExperimentResult, Part, Segment, State, Status
+from autotune.experiment.return_to_setpoint import return_by_relay, setpoint_before
 from autotune.experiment.rig import Rig, RunsLaws, ShowsOutput
 from autotune.experiment.sweep import missing_phases, sweep, sweep_warnings
 from autotune.identification.frequency.windows import Rows
@@ -164,6 +165,11 @@ def experiment_on(
     journal.enter(State.HAND_BACK)
     journal.show("all points measured", 0.0, known)
     loop.watch = Watch(in_range=True)
+    setpoint = setpoint_before(loop.rig, point.y, config.limits.swing)
+    if math.isfinite(setpoint) and not return_by_relay(loop, oscillation, known, setpoint):
+        journal.tell(
+            f"y is at {loop.tick.y:.4g} and not at the set-point {setpoint:.4g} of the controller that takes over"
+        )
     loop.step(loop.nearest(float(np.mean([segment.u_mean for segment in segments]))))
     return Swept(segments=segments, known=known, part=part)
 
@@ -198,7 +204,9 @@ def wait_for_rest(loop: ControlLoop) -> None:
     )
 
 
-def bring_to_operating_point(loop: ControlLoop, config: Config, *, u_rest: float | None = None) -> Known:
+def bring_to_operating_point(
+    loop: ControlLoop, config: Config, *, u_rest: float | None = None, plant_sign: int = 0
+) -> Known:
     """Bring the plant from rest to its operating point on an open loop: for a verification after an experiment.
 
     Parameters
@@ -209,6 +217,9 @@ def bring_to_operating_point(loop: ControlLoop, config: Config, *, u_rest: float
         The same configuration.
     u_rest : float, optional
         Command that holds the operating point, where it is known already [u unit].
+    plant_sign : {-1, 0, 1}
+        Sign of the plant's gain, where the experiment has seen it: a plant that still rings from before would have it
+        measured wrongly.
 
     Returns
     -------
@@ -220,7 +231,10 @@ def bring_to_operating_point(loop: ControlLoop, config: Config, *, u_rest: float
         return
 
     point, wanted = config.operating_point, config.experiment
-    known = approach(loop, point, preflight(loop, point, wanted.gain_sd, silent), silent, u_rest=u_rest)
+    known = preflight(loop, point, wanted.gain_sd, silent)
+    if plant_sign and u_rest is not None:
+        known = replace(known, plant_sign=plant_sign, sign_seen=True)
+    known = approach(loop, point, known, silent, u_rest=u_rest)
     known, _ = find_midpoint(loop, point, wanted.relay_amplitude, known, silent)
     return known
 

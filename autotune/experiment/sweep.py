@@ -15,7 +15,7 @@ from autotune.experiment.cycles import Earlier, measured
 from autotune.experiment.limits import Envelope
 from autotune.experiment.loop import ControlLoop
 from autotune.experiment.oscillation import PATIENCE, Oscillation, mean_command
-from autotune.experiment.plan import Choice, Goal, allot, choose, phase_targets, time_s
+from autotune.experiment.plan import Choice, Goal, allot, choose, phase_targets, time_s, within_reach
 from autotune.experiment.relay import RelaySettings
 from autotune.experiment.result import Cycle, Segment, State
 from autotune.identification.frequency.limit_cycle import WholePeriods
@@ -68,7 +68,10 @@ def sweep(
     ExperimentStopped
         A limit, no oscillation, an asymmetry that does not go away, or an oscillation drowned in noise.
     """
-    targets = missing_phases(wanted, earlier)
+    ends = _ends_deg(wanted, earlier)
+    if not earlier.segments:
+        ends = within_reach(ends, known.points[0], known.plant_sign)
+    targets = _missing(ends, wanted, earlier)
     end_s = known.first_move_s + wanted.budget_s - earlier.swept_s
     part, count = len(earlier.recordings), len(earlier.segments)
     segments = list(earlier.segments)
@@ -79,7 +82,7 @@ def sweep(
             swept=True,
             warnings=sweep_warnings(segments, wanted, known.link_rad_s),
         )
-    loop.note(first_move_s=known.first_move_s)
+    loop.note(first_move_s=known.first_move_s, phases_deg=list(ends))
     for i, target in enumerate(targets):
         goal = _goal(loop.envelope, wanted.relay_amplitude, known)
         choices = [_choice(goal, point.y, known, one) for one in targets[i:]]
@@ -123,8 +126,19 @@ def sweep(
 
 def missing_phases(wanted: ExperimentSettings, earlier: Earlier) -> tuple[float, ...]:
     """Return the phases of the positive-gain plant that no finished cycle has aimed at, in their order [rad]."""
+    return _missing(_ends_deg(wanted, earlier), wanted, earlier)
+
+
+def _ends_deg(wanted: ExperimentSettings, earlier: Earlier) -> tuple[float, float]:
+    """Return the range of phases: that of an earlier sitting, else the wanted one [deg]."""
+    noted = [one.metadata["phases_deg"] for one in earlier.recordings if "phases_deg" in one.metadata]
+    first, last = noted[0] if noted and earlier.segments else wanted.phases_deg
+    return float(first), float(last)
+
+
+def _missing(ends_deg: tuple[float, float], wanted: ExperimentSettings, earlier: Earlier) -> tuple[float, ...]:
     done = [one.phase_rad for one in earlier.segments]
-    targets = phase_targets(*wanted.phases_deg, wanted.points)
+    targets = phase_targets(*ends_deg, wanted.points)
     return tuple(phase for phase in targets if not any(math.isclose(phase, other) for other in done))
 
 

@@ -13,7 +13,7 @@ from autotune.arrays import FloatArray
 from autotune.config import Config
 from autotune.config.procedure import LimitSettings
 from autotune.controller import PIDController
-from autotune.design.law import PILaw
+from autotune.design.law import LawState, PILaw
 from autotune.errors import DesignError
 from autotune.experiment.device import try_on_device
 from autotune.experiment.judgement import REMEDY, Expectation, Verification, expectation, judge, require_predictable
@@ -21,6 +21,7 @@ from autotune.experiment.limits import Watch
 from autotune.experiment.loop import ControlLoop
 from autotune.experiment.own_law import law_of, try_own_law
 from autotune.experiment.result import State, Status
+from autotune.experiment.return_to_setpoint import is_near, setpoint_before
 from autotune.experiment.rig import Exchanges, HoldsGains, Rig, RunsLaws, RunsOwnController
 from autotune.experiment.run import (
     OnStatus,
@@ -91,7 +92,20 @@ def run_test(
         loop.step(loop.nearest(u[k] + load[k]), extra={"r": float(setpoint[k])})
         before = k
     u[before + 1 :] = u[before]
+    _return_by_law(loop, law, state, operating_y, test.settle)
     return y[test.settle :], u[test.settle :]
+
+
+def _return_by_law(loop: ControlLoop, law: PILaw, state: LawState, operating_y: float, most: int) -> None:
+    """Bring y to the set-point of the controller that takes over, where one does, within so many samples at most."""
+    setpoint = setpoint_before(loop.rig, operating_y, loop.envelope.settings.swing)
+    left = int((loop.envelope.settings.time_s - loop.tick.t_s) / loop.sample_time_s) - 1
+    for k in range(min(most, left) if math.isfinite(setpoint) else 0):
+        # not at once: y goes through the set-point before it stays there
+        if k > most // 4 and is_near(loop, setpoint):
+            return
+        u, state = law.step(state, setpoint, loop.tick.y)
+        loop.step(loop.nearest(u), extra={"r": setpoint})
 
 
 def _hold(loop: ControlLoop, u: float) -> None:
@@ -168,7 +182,7 @@ def run_verification(
         loop.metadata["controller"] = {"kind": controller.kind, "K": controller.K, "Ti_s": controller.Ti_s}
         if config.operating_point.approach == "ramp":
             wait_for_rest(loop)
-        known = bring_to_operating_point(loop, config, u_rest=u_rest)
+        known = bring_to_operating_point(loop, config, u_rest=u_rest, plant_sign=1 if controller.K > 0.0 else -1)
         loop.note(test_start_s=loop.tick.t_s)
         if own is None:
             y, u = run_test(loop, law, test, y_rest, known.midpoint, on_status)

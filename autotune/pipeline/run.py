@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,13 +14,13 @@ from autotune.design.noise import LoopFacts
 from autotune.errors import AutotuneError, ExperimentStopped, OperatorStop
 from autotune.experiment.cycles import Earlier
 from autotune.experiment.judgement import Verification
-from autotune.experiment.result import ExperimentResult
+from autotune.experiment.result import ExperimentResult, State, Status
 from autotune.experiment.rig import HoldsGains, Rig, RunsOwnController
 from autotune.experiment.run import OnStatus, run_experiment
 from autotune.experiment.sweep import missing_phases
 from autotune.experiment.verify import run_verification
 from autotune.outputs import unwritable
-from autotune.pipeline.analysis import Analysis, analyse
+from autotune.pipeline.analysis import Analysis
 from autotune.pipeline.audit import audit_log
 from autotune.pipeline.deployment import deploy as deploy_and_try
 from autotune.pipeline.deployment import hand_over, restore_interrupted
@@ -35,6 +36,7 @@ from autotune.pipeline.folder import (
 )
 from autotune.pipeline.held_gains import held_by, on_registers
 from autotune.pipeline.result import write_result
+from autotune.pipeline.swept import analyse_sweep
 from autotune.run_log import RunLog
 
 #: how long an operator may ask for the old gains after new ones were handed over [s]; then the new ones stay
@@ -145,7 +147,9 @@ def _tune(
         if missing_phases(config.experiment, earlier):
             log.recording(recording)
         experiment = run_experiment(rig, config, recording, earlier=earlier, on_status=on_status)
-        analysis = analyse(experiment.points, config.design, facts=_facts(config, experiment))
+        analysis = analyse_sweep(
+            experiment, config.design, _facts(config, experiment), out, _teller(on_status, experiment.rig_time_s)
+        )
         if deploy:  # what the rig can hold is what is verified, reported and handed over
             held = held_by(rig, analysis.controller, config.design, fit=analysis.fit)
             analysis = on_registers(analysis, held)
@@ -240,6 +244,15 @@ def _hand_over(
     said = f"{verification.whose}; {verification.reason}" if verification is not None else ""
     old = hand_over(rig, analysis.controller if accepted and deploy else None, out / JOURNAL, audit=audit, why=said)
     return _Handed(verification=verification, old=old, deployed=accepted and deploy)
+
+
+def _teller(on_status: OnStatus, elapsed_s: float) -> Callable[[str], None]:
+    """Return what says a sentence where the rig is done with and the design is not."""
+
+    def tell(message: str) -> None:
+        on_status(Status(state=State.HAND_BACK, elapsed_s=elapsed_s, remaining_s=math.nan, message=message))
+
+    return tell
 
 
 def _facts(config: Config, experiment: ExperimentResult) -> LoopFacts:

@@ -23,6 +23,7 @@ from autotune.equations.transfer_text import parse_transfer_function
 from autotune.errors import InputError
 from autotune.models import read_model
 from drivers.kinds import KINDS
+from tests.benchmarks.twins import PLANTS, REACHED, TextbookPlant, run_twin
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 REAL = [
@@ -306,14 +307,23 @@ def test_a_twin_of_a_transfer_function_has_a_sensor_as_rigs_have(tmp_path: Path,
     assert twin.resolution == pytest.approx(80.0 / 4096.0, rel=0.05)
 
 
+@pytest.mark.parametrize("plant", [PLANTS[0], PLANTS[18]], ids=lambda plant: plant.name)
+def test_one_lag_and_a_plant_that_rings_run_from_init_to_accepted(tmp_path: Path, plant: TextbookPlant) -> None:
+    outcome = run_twin(plant, tmp_path)
+    assert outcome.accepted, outcome.said
+
+
 @pytest.mark.slow
 @pytest.mark.timeout(1200)
-@pytest.mark.parametrize("written", ["2/((s+1)(0.5s+1))", "2/(s(0.3s+1))"])
-def test_a_plant_as_people_write_it_runs_from_init_to_accepted(tmp_path: Path, written: str) -> None:
-    path = tmp_path / "rig.toml"
-    command(
-        "init", path, "--kind", "simulated", "--model", written, "--sample-time", "0.025", "--u-unit", "V",
-        "--y-unit", "V", "--u-range", "0", "10", "--u-safe", "5" if "/(s(" in written else "4",
-        "--y-range", "-20", "20", "--y", "0", "--u", "5",
-    )  # fmt: skip
-    assert "Accepted" in command("run", path, "--out", tmp_path / "out")
+@pytest.mark.parametrize("plant", PLANTS, ids=lambda plant: plant.name)
+def test_a_plant_as_people_write_it_runs_from_init_to_accepted(tmp_path: Path, plant: TextbookPlant) -> None:
+    outcome = run_twin(plant, tmp_path)
+    assert outcome.accepted, outcome.said
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1200)
+@pytest.mark.parametrize("kind", REACHED)
+def test_the_twin_of_a_rig_that_init_described_is_rehearsed_to_accepted(tmp_path: Path, kind: str) -> None:
+    outcome = run_twin(PLANTS[2], tmp_path, kind)
+    assert outcome.accepted, outcome.said

@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import tomli_w
 
@@ -17,9 +18,11 @@ from autotune.config.registers import RegisterMap
 from autotune.controller import PIDController
 from autotune.errors import AutotuneError, ExperimentStopped, LinkError
 from autotune.experiment.judgement import Verification
+from autotune.experiment.run import run_experiment
 from autotune.experiment.verify import run_verification
 from autotune.models import TransferFunction
 from autotune.pipeline.deployment import deploy
+from autotune.recording import read_recording
 from drivers import open_rig
 from sim.plant import make_plant
 from tests.autotune.experiment.test_verify import CONFIG as BALL
@@ -141,6 +144,50 @@ def test_a_controller_that_ran_before_has_its_set_point_again_and_no_load(tmp_pa
     found = run_verification(rig, BALL, rig.read_gains(), BALL_FIT, tmp_path / "trial.csv", on_device=True)
     assert found.by == "device"
     assert (device.value["automatic"], device.value["setpoint"], device.value["load"]) == (1.0, 4.5, 0.0)
+
+
+def regulating(rig: Any, setpoint: float = 5.0) -> None:
+    """Leave the device's own controller in automatic at a set-point, the ball afloat there."""
+    for name, value in (("setpoint", setpoint), ("automatic", 1.0)):
+        rig._put(name, value)
+    rig.clock.sleep_until(rig.clock.now() + 60.0)
+
+
+def afloat(device: Any) -> Any:
+    """Return the operating point of a ball that is held where it is."""
+    known = {"approach": "hold", "plant_sign": -1, "u_guess": device.plant.u_rest, "u_uncertainty": 0.15}
+    return BALL.operating_point.model_copy(update=known)
+
+
+@pytest.mark.parametrize("setpoint", [5.0, 5.4])
+def test_after_a_sweep_the_controller_takes_over_at_its_set_point(tmp_path: Path, setpoint: float) -> None:
+    """The sweep ends at an extremum of y, which was .9 V off."""
+    rig, device = virtual_rig(
+        make_plant("ball", seed=1, noise=0.1, start="afloat"), registers=REGISTERS, gains=(PI.K, PI.Ti_s)
+    )
+    regulating(rig, setpoint)
+    at = afloat(device)
+    wanted = BALL.experiment.model_copy(update={"points": 3, "budget_s": 20.0})
+    config = BALL.model_copy(update={"operating_point": at, "experiment": wanted})
+    result = run_experiment(rig, config, tmp_path / "sweep.csv")
+    assert result.output == f"handed back to its own controller: automatic at set-point {setpoint:g}"
+    y = read_recording(tmp_path / "sweep.csv").y
+    assert np.ptp(y[len(y) // 2 :]) > 2.0  # the sweep's swing
+    assert np.mean(y[-6:-1]) == pytest.approx(setpoint, abs=0.25)
+    assert device.value["setpoint"] == setpoint
+
+
+def test_after_a_trial_of_the_hosts_law_the_controller_takes_over_at_its_set_point(tmp_path: Path) -> None:
+    rig, device = virtual_rig(
+        make_plant("ball", seed=1, noise=0.1, start="afloat"), registers=REGISTERS, gains=(PI.K, PI.Ti_s)
+    )
+    regulating(rig)
+    config = BALL.model_copy(update={"operating_point": afloat(device)})
+    found = run_verification(rig, config, PI, BALL_FIT, tmp_path / "trial.csv")
+    assert found.accepted, found.reason
+    recording = read_recording(tmp_path / "trial.csv")
+    assert recording.extra["r"][-2] == 5.0
+    assert np.mean(recording.y[-6:-1]) == pytest.approx(5.0, abs=0.25)
 
 
 def commanding(foreign_s: tuple[float, ...]) -> tuple[Any, list[bool]]:

@@ -184,3 +184,20 @@ def test_a_missed_sample_is_counted_and_the_grid_kept(recording: Path) -> None:
     assert loop.timing.missed == 2
     assert late.t_s == pytest.approx(0.045)
     assert after.t_s == pytest.approx(0.05)
+
+
+def test_a_virtual_clock_is_waited_on_once_per_sample(recording: Path) -> None:
+    """At a sample a minute, slices of a tenth of a second made a simulated rig 600 times as slow."""
+    rig, waits = ball_rig(), []
+    sleep_until = rig.clock.sleep_until
+
+    def look_and_sleep(t_s: float) -> None:
+        waits.append(t_s)
+        sleep_until(t_s)
+
+    rig.clock.sleep_until = look_and_sleep  # type: ignore[method-assign]  # the real one, seen from outside
+    config = ball_config(signals={"sample_time_s": 2.0})
+    with open_loop(rig, recording, config) as loop:
+        for _ in range(5):
+            loop.step(loop.nearest(0.0))
+    assert waits == pytest.approx([2.0, 4.0, 6.0, 8.0, 10.0])

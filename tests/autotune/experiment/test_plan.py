@@ -19,8 +19,10 @@ from autotune.experiment.plan import (
     phase_targets,
     predicted,
     time_s,
+    within_reach,
 )
 from autotune.experiment.relay import RelaySettings
+from autotune.models import TransferFunction
 from autotune.points import FrequencyPoint
 from sim.ball import linear_ball
 
@@ -83,6 +85,38 @@ def test_a_plant_that_does_not_lag_is_refused() -> None:
     leading = FrequencyPoint(omega_rad_s=1.0, response=1.0 + 0.1j, covariance=NO_DOUBT)
     with pytest.raises(IdentificationError, match="between -90 and -180"):
         predicted([leading], 1, math.radians(-120.0))
+
+
+def points_of(plant: TransferFunction, *omegas: float) -> list[FrequencyPoint]:
+    responses = plant.response(np.array(omegas))
+    return [
+        FrequencyPoint(omega_rad_s=w, response=complex(r), covariance=NO_DOUBT)
+        for w, r in zip(omegas, responses, strict=True)
+    ]
+
+
+def test_one_lag_is_measured_where_its_phases_are() -> None:
+    lag = TransferFunction(num=(2.0,), den=(1.0, 1.0))
+    first = points_of(lag, 12.0)
+    high, low = within_reach((-105.0, -160.0), first[0], 1)
+    assert math.degrees(np.angle(first[0].response)) == pytest.approx(low)
+    assert -60.0 < high < -30.0
+    for phase_deg in (high, 0.5 * (high + low)):
+        foreseen, model = predicted(first, 1, math.radians(phase_deg))
+        truth = lag.response(np.array([foreseen]))[0]
+        assert math.degrees(np.angle(truth)) == pytest.approx(phase_deg, abs=0.1)
+        assert model.gain(foreseen) == pytest.approx(abs(truth), rel=0.02)
+    assert within_reach((-105.0, -160.0), known(2.0)[0], -1) == (-105.0, -160.0)
+
+
+def test_where_one_point_is_known_the_gain_is_foreseen_rather_too_large() -> None:
+    """Under a dead time it stays: an integrator's fall upwards let a relay leave the swing."""
+    lag = TransferFunction(num=(0.5,), den=(2.0, 1.0), delay_s=6.0)
+    first = points_of(lag, 0.3)
+    for phase_deg in (-155.0, -150.0, -145.0):
+        foreseen, model = predicted(first, 1, math.radians(phase_deg))
+        assert foreseen > 0.3
+        assert model.gain(foreseen) >= abs(lag.response(np.array([foreseen]))[0])
 
 
 def test_a_first_setting_that_may_swing_less_than_foreseen_gets_periods_for_that() -> None:
