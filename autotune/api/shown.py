@@ -121,8 +121,9 @@ def _(result: Validation) -> tuple[str, Row, list[Row]]:
 def _(result: DelayModel) -> tuple[str, Row, list[Row]]:
     n, sd = result.order, result.standard_deviations
     names = [*(f"a{i}" for i in range(n)), "b", "delay [s]", "constant"]
-    # what a method estimates without a standard deviation has 0 there, which is not one
-    rows = [(name, _number(v), _number(s) if s else "") for name, v, s in zip(names, result.values, sd, strict=False)]
+    # what a method estimates without a standard deviation has 0 or NaN there, which is none
+    known = zip(names, result.values, sd, strict=False)
+    rows = [(name, _number(v), _number(s) if s > 0.0 else "") for name, v, s in known]
     rows.append(("noise sd", _number(result.noise_sd), ""))
     return f"x^({n}) = sum a_i x^(i) + b u(t - h)", ("", "value", "sd"), [*rows]
 

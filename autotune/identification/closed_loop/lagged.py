@@ -66,7 +66,10 @@ def lagged_range(signals: Sequence[tuple[FloatArray, Sequence[int]]]) -> tuple[i
 
 
 def lagged_factor(*stretches: Sequence[tuple[FloatArray, Sequence[int]]]) -> tuple[FloatArray, int]:
-    """Return the upper triangular R of the QR decomposition of the lagged data, and the number of rows.
+    """Return the upper triangular R of the QR decomposition of the lagged data about their means, and its rows.
+
+    Every lag has a mean of its own over the rows: what is linear about any operating point is then exactly linear. The
+    mean of the whole record taken from every lag leaves the ends of the record, a share of one in its length.
 
     Parameters
     ----------
@@ -76,7 +79,7 @@ def lagged_factor(*stretches: Sequence[tuple[FloatArray, Sequence[int]]]) -> tup
     Returns
     -------
     R : (columns, columns) array
-        R^T R is the sum of lagged products; its transpose is the L of the papers' LQ (there: M).
+        R^T R is the sum of lagged products about the means; its transpose is the L of the papers' LQ (there: M).
     rows : int
         Number of rows j of the data.
 
@@ -88,15 +91,16 @@ def lagged_factor(*stretches: Sequence[tuple[FloatArray, Sequence[int]]]) -> tup
     ranges = [lagged_range(signals) for signals in stretches]
     width = sum(signal.shape[1] * len(offsets) for signal, offsets in stretches[0])
     rows = sum(max(end - start, 0) for start, end in ranges)
-    if rows < width:
+    if rows <= width:
         raise IdentificationError(
             f"the record is too short: {rows} usable rows for {width} lagged columns",
             remedy="record longer, or ask for a lower order",
         )
-    R = np.zeros((0, width))
+    R = np.zeros((0, 1 + width))  # a row of ones comes first, and what lies along it goes
     step = max(BLOCK_ROWS, 4 * width)
     for signals, (start, end) in zip(stretches, ranges, strict=True):
         for at in range(start, end, step):
-            block = lagged_rows(signals, at, min(at + step, end))
+            lags = lagged_rows(signals, at, min(at + step, end))
+            block = np.hstack([np.ones((len(lags), 1)), lags])
             R = triangle(np.vstack([R, block]) if len(R) else block)
-    return R, rows
+    return R[1:, 1:], rows

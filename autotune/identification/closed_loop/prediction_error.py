@@ -15,7 +15,12 @@ import numpy as np
 from autotune.arrays import FloatArray
 from autotune.errors import IdentificationError
 from autotune.identification.closed_loop.damped_step import damped_step, improved, log_determinant, whitened_equations
-from autotune.identification.closed_loop.predictor_directions import Predictor, behaviour_directions, regressors
+from autotune.identification.closed_loop.predictor_directions import (
+    Predictor,
+    behaviour_directions,
+    constant_directions,
+    regressors,
+)
 from autotune.identification.closed_loop.series import Series
 from autotune.identification.closed_loop.state_space import InnovationModel, balancing
 
@@ -27,6 +32,9 @@ _NEAR = 1.0
 #: constant and the dynamics hang together. A constant comes with it, for a sample mean is not the equilibrium. Smaller
 #: means are left to the test: those of a slow loop stray by tenths of its motion, and a constant costs precision.
 _OPERATING_POINT = 1.0
+#: A constant that leaves less than this share of the start's innovations' variance is taken along from the beginning: a
+#: search without it would go far away to explain it.
+_EVIDENT_CONSTANT = 0.5
 #: Smaller innovations, relative to the output, are rounding.
 _NOISE_FREE = 1e-11
 #: Innovations this small say that the record has no noise in it.
@@ -143,14 +151,13 @@ def prediction_error(
     u_level, y_level = (_level(column) if offset else np.zeros(column.shape[1]) for column in (series.u, series.y))
     series = series.less(u_level, y_level)
     predictor = _initial_predictor(start, feedthrough=feedthrough, n_y=y.shape[1])
-    if not series.is_cut:
-        predictor = _with_initial_state(predictor, series)
+    predictor, evident = _linear_start(predictor, series, offset=offset)
     search = _search(
         predictor,
         series,
         feedthrough=feedthrough,
         offset=offset,
-        constant=bool(np.any(u_level) or np.any(y_level)),
+        constant=evident or bool(np.any(u_level) or np.any(y_level)),
         max_iterations=max_iterations,
     )
     return _estimate(start, search, series, u_level, y_level)
@@ -168,15 +175,28 @@ def _initial_predictor(start: InnovationModel, *, feedthrough: bool, n_y: int) -
     return Predictor.of(model, np.zeros(n), np.zeros(n_y), np.zeros(n))
 
 
-def _with_initial_state(predictor: Predictor, series: Series) -> Predictor:
-    """Return the predictor with its initial state fitted: the errors are linear in it."""
-    n = len(predictor.x0)
-    series = series.head(_LINEAR_ROWS)
+def _linear_start(predictor: Predictor, series: Series, *, offset: bool) -> tuple[Predictor, bool]:
+    """Return the predictor with what its errors are linear in fitted, and whether a constant is evident.
+
+    That is the initial state, where there is one only, and a constant where one is allowed and clearly there.
+    """
+    n, few = len(predictor.x0), series.head(_LINEAR_ROWS)
     entries = predictor.packed().size
-    directions = np.eye(entries, n, n - entries)
-    nothing = np.zeros((0, predictor.F.shape[1]))
-    total = whitened_equations(predictor, directions, series, series.scatter(predictor), nothing)
-    return predictor.moved(damped_step(total[:-1, :-1], total[:-1, -1], 0.0)[0], directions)
+    of_state = np.eye(entries, n, n - entries)
+    prompt = predictor if few.is_cut else _moved_along(predictor, few, of_state)
+    if not offset:
+        return prompt, False
+    loaded = _moved_along(predictor, few, np.hstack([of_state, constant_directions(predictor)]))
+    fall = log_determinant(few.scatter(prompt)) - log_determinant(few.scatter(loaded))
+    return (loaded, True) if fall > -math.log(_EVIDENT_CONSTANT) else (prompt, False)
+
+
+def _moved_along(predictor: Predictor, series: Series, directions: FloatArray) -> Predictor:
+    """Return the predictor at the least squares along directions that its errors are linear in."""
+    one = np.eye(predictor.F.shape[1])[-1:]  # the regressor of a load; the state has none
+    total = whitened_equations(predictor, directions, series, series.scatter(predictor), one)
+    step = damped_step(total[:-1, :-1], total[:-1, -1], 0.0)[0]
+    return predictor.moved(step, series.moving(predictor, directions))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -14,14 +14,14 @@ from autotune.identification.closed_loop.subspace_direct import with_stable_pred
 
 
 def refit_inputs(model: InnovationModel, u: FloatArray, y: FloatArray, *, feedthrough: bool = False) -> InnovationModel:
-    """Return the model with B, D and the initial state refitted by one linear least squares on its prediction errors.
+    """Return the model with B, D, initial state and a load refitted by linear least squares on its prediction errors.
 
     Parameters
     ----------
     model : InnovationModel
         A, C and K are kept (K is replaced first where its predictor is not stable).
     u, y : (N, n_u), (N, n_y) arrays
-        Command and measurement, zero mean.
+        Command and measurement about any operating point: a load is fitted as well.
     feedthrough : bool
         Estimate D; otherwise it is zero.
 
@@ -40,6 +40,8 @@ def refit_inputs(model: InnovationModel, u: FloatArray, y: FloatArray, *, feedth
     delay = model.input_delay
     u, y = u[: len(u) - delay], np.ascontiguousarray(y[delay:])
     columns = [_response(model, np.zeros((n, 0)), np.zeros((len(y), 0)), np.eye(n)[i], len(y)) for i in range(n)]
+    columns += [_response(model, load[:, None], np.ones((len(y), 1)), np.zeros(n), len(y)) for load in _loads(model)]
+    first = len(columns)
     for q in range(n_u):
         signal = np.ascontiguousarray(u[:, q : q + 1])
         columns += [_response(model, np.eye(n)[:, i : i + 1], signal, np.zeros(n), len(y)) for i in range(n)]
@@ -54,13 +56,19 @@ def refit_inputs(model: InnovationModel, u: FloatArray, y: FloatArray, *, feedth
         R = triangle(np.vstack([R, np.stack(part, axis=1)]))
     theta = -least_squares(R[:, :-1], R[:, -1])
     rest = base + sum(column * value for column, value in zip(columns, theta, strict=True))
-    by_input = theta[n:].reshape(n_u, -1)
+    by_input = theta[first:].reshape(n_u, -1)
     return replace(
         model,
         B=by_input[:, :n].T.copy(),
         D=by_input[:, n:].T.copy() if feedthrough else np.zeros((n_y, n_u)),
         innovation_covariance=rest.T @ rest / max(len(y) - len(theta), 1),
     )
+
+
+def _loads(model: InnovationModel) -> FloatArray:
+    """Return the loads on the states that shift the predictions most, (n_y, n)."""
+    F = model.A - model.K @ model.C
+    return np.asarray(np.linalg.qr(np.linalg.solve(np.eye(model.order) - F.T, model.C.T))[0].T, dtype=np.float64)
 
 
 def _state_map(model: InnovationModel, B: FloatArray) -> FloatArray:

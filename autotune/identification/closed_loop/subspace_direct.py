@@ -68,11 +68,14 @@ def lagged_data(u: FloatArray, y: FloatArray, p: int, starts: tuple[int, ...] = 
     """
     series, past = Series(u=u, y=y, starts=starts), range(-1, -p - 1, -1)
     R, rows = lagged_factor(*([(np.hstack(one), past), (one[0], [0]), (one[1], [0])] for one in series.stretches))
-    width = p * (u.shape[1] + y.shape[1])
+    R = _with_trace_of_noise(R, p * (u.shape[1] + y.shape[1]))
+    return LaggedData(R=R, rows=rows, p=p, n_u=u.shape[1], n_y=y.shape[1])
+
+
+def _with_trace_of_noise(R: FloatArray, width: int) -> FloatArray:
     trace = np.zeros((width, R.shape[1]))
     np.fill_diagonal(trace, _TRACE_OF_NOISE * np.linalg.norm(R[:, :width], axis=0))
-    R = triangle(np.vstack([R, trace]))
-    return LaggedData(R=R, rows=rows, p=p, n_u=u.shape[1], n_y=y.shape[1])
+    return triangle(np.vstack([R, trace]))
 
 
 def autoregression(data: LaggedData, *, feedthrough: bool) -> tuple[FloatArray, FloatArray]:
@@ -252,7 +255,7 @@ def ssarx(u: FloatArray, y: FloatArray, order: int, *, p: int, f: int) -> Innova
     n_u, n_y, n_z = data.n_u, data.n_y, data.n_u + data.n_y
     z = np.hstack([u, y])
     R, _ = lagged_factor([(z, range(-1, -p - 1, -1)), (z, range(f))])
-    width = p * n_z
+    R, width = _with_trace_of_noise(R, R.shape[1]), p * n_z  # without noise the future has exact dependencies as well
     past, future = R[:, :width], R[:, width:].reshape(len(R), f, n_z)
     freed = future[:, :, n_u:].copy()
     for i in range(f):

@@ -33,7 +33,8 @@ class DelayModel:
     initial_time_s, initial_state : float, tuple of n floats
         Time stamp [s] and x, x', .. at that time [y unit/s^i].
     covariance : (2n+3, 2n+3) array
-        Of (a_0.., b, delay, constant, initial state); zero rows for what was fixed.
+        Of (a_0.., b, delay, constant, initial state); zero rows for what was fixed,
+        NaN for what has a value but no covariance.
     noise_sd : float
         Standard deviation of the noise on y, or of its innovation where it is coloured [y unit].
     noise_ar : tuple of float
@@ -88,15 +89,20 @@ class DelayModel:
             "b": [self.b],
             "delay_s": self.delay_s,
             "initial_state": list(self.initial_state),
-            "sd": {"a": sd[:n].tolist(), "b": [float(sd[n])], "delay_s": float(sd[n + 1])},
+            "sd": {"a": _or_null(sd[:n]), "b": _or_null(sd[n : n + 1]), "delay_s": _or_null(sd)[n + 1]},
             "constant": self.constant,
-            "constant_sd": float(sd[n + 2]),
+            "constant_sd": _or_null(sd)[n + 2],
             "initial_time_s": self.initial_time_s,
-            "initial_state_sd": sd[n + 3 :].tolist(),
-            "covariance": self.covariance.tolist(),
+            "initial_state_sd": _or_null(sd[n + 3 :]),
+            "covariance": [_or_null(row) for row in self.covariance],
             "noise": {"sd": self.noise_sd, "ar": list(self.noise_ar)},
             "rows": self.rows,
         }
+
+
+def _or_null(values: FloatArray) -> list[float | None]:
+    """Return numbers for JSON, null for what has none."""
+    return [float(value) if math.isfinite(value) else None for value in values]
 
 
 def write_delay_model(model: DelayModel, path: str | os.PathLike[str]) -> None:
@@ -121,7 +127,7 @@ def read_delay_model(path: str | os.PathLike[str]) -> DelayModel:
         sd = [*content["sd"]["a"], *content["sd"]["b"], content["sd"]["delay_s"]]
         initial_state = tuple(float(value) for value in content.get("initial_state", [0.0] * len(a)))
         diagonal = np.array([*sd, *[0.0] * (1 + len(a))], dtype=np.float64) ** 2
-        covariance = np.array(content.get("covariance", np.diag(diagonal)), dtype=np.float64)
+        covariance = np.array(content.get("covariance", np.diag(diagonal)), dtype=np.float64)  # null is NaN
         noise = content.get("noise", {})
         rest = {key: float(content.get(key, 0.0)) for key in ("constant", "initial_time_s")}
         noise_sd, noise_ar = float(noise.get("sd") or math.nan), tuple(float(value) for value in noise.get("ar", ()))

@@ -4,6 +4,9 @@ For every interval (T_1, T_2) of length L the equation of the system, multiplied
 parts, is linear in a_i, b and, after an expansion in the remaining delay, in a correction of the delay. u is then
 shifted by the delay found, and the step repeated to a fixed point.
 
+This is the paper's own estimate, biased by noise; without that bias it is
+:func:`autotune.identification.delay.methods.algebraic_delay`.
+
 Misprint of the paper: its example prints h_0 + a cos(b_2/b_0); the step that has the fixed point is
 (L/2 pi) atan2(b_2, b_1), which also takes about five iterations where an unscaled arctangent takes fifty.
 """
@@ -15,6 +18,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import minimize_scalar
+from scipy.stats import f as f_distribution
 
 from autotune.arrays import BoolArray
 from autotune.errors import IdentificationError, InputError
@@ -29,11 +33,11 @@ from autotune.recording import Recording
 
 #: Fixed points this far below zero, in intervals, are noise about a delay of zero; further below they are none.
 _EARLY = 0.02
-#: A fixed point is another delay's where the equations at some delay of a grid leave so many times less.
-_BETTER = 4.0
+#: A fixed point is another delay's where the equations at some delay of a grid leave so much less that noise alone
+#: does it once in so many times (F test).
+_BY_CHANCE = 1e-6
 #: what the integrals' own errors may leave
 _EXACT = 1e-6
-_AS_GOOD = 1.5  # up to here nothing else is tried
 _GRID = 32  # delays per interval
 _RESTARTS = 6
 
@@ -53,7 +57,7 @@ class ModulatedDelay:
     converged : bool
         Whether a delay was found at which nothing is lacking: the last step was below a millionth of the intervals'
         length, the delay is not negative, b has the sign that the step took it to have, and no other delay explains
-        the intervals clearly better. What is not converged is no estimate.
+        the intervals better than noise does by chance. What is not converged is no estimate.
     residual : float
         What the equations leave at the delay and with one gain, as a share of the mean square of their right-hand side,
         degrees of freedom counted.
@@ -146,14 +150,16 @@ def modulated_delay(
     two_signs = isinstance(window, SinePower) and window.m % 2 == 0 and expansion is None
     signs = (1.0, -1.0) if two_signs else (0.0,)  # the wrong sign has its fixed point half a window away
     starts = _best_of_a_grid(recording, intervals, modulated)
-    least = min((residual for _, residual in starts), default=0.0)
+    freedom = len(intervals) - unknowns
+    clearly = float(f_distribution.isf(_BY_CHANCE, freedom, freedom)) if freedom > 0 else np.inf
+    most = clearly * min((residual for _, residual in starts), default=0.0) + _EXACT
     found: list[ModulatedDelay] = []
     for start in (delay_s, *(h for h, _ in starts)):
         for sign in signs:
             result = _iterate(recording, intervals, modulated, start, sign, iterations)
-            found.append(replace(result, converged=result.converged and result.residual <= _BETTER * least + _EXACT))
-            if result.converged and result.residual <= _AS_GOOD * least + _EXACT:
-                return result
+            found.append(replace(result, converged=result.converged and result.residual <= most))
+            if found[-1].converged:
+                return found[-1]
     return min(found, key=lambda result: (not result.converged, result.residual))
 
 

@@ -74,7 +74,7 @@ def modulated_by_fourier_sums(
             for (L, rows), running in zip(groups, sums, strict=True):
                 first, last = starts[rows] - h, ends[rows] - h
                 for q, (_, omega) in enumerate(terms):
-                    part = _interpolated(t, running[q], last) - _interpolated(t, running[q], first)
+                    part = interpolated(t, running[q], last) - interpolated(t, running[q], first)
                     result[rows, q] = part * np.exp(-1j * omega / L * first)
             return result
 
@@ -161,7 +161,8 @@ def running_fourier(t: FloatArray, values: FloatArray, omega: float, held: bool)
     return result
 
 
-def _interpolated(t: FloatArray, running: ComplexArray, at: FloatArray) -> ComplexArray:
+def interpolated(t: FloatArray, running: ComplexArray, at: FloatArray) -> ComplexArray:
+    """Return a running integral at any times, linear between its rows."""
     row = np.clip(np.searchsorted(t, at) - 1, 0, t.size - 2)
     share = (at - t[row]) / (t[row + 1] - t[row])
     return np.asarray(running[row] + share * (running[row + 1] - running[row]), dtype=np.complex128)

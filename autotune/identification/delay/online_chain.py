@@ -147,16 +147,52 @@ def step_row(
             C = whole
         _averaged(C, D, A, R, slow, spread, scalars, step, n, lam, memory_s, offset)
     if delayed and t[k] - scalars[FIRST_T] > after and A[n] != 0.0:
-        moved = step * rate * A[n + 1] / A[n]
+        lacking = A[n + 1] / A[n]
+        moved = max(step * rate * lacking, -scalars[H])  # u is not known ahead of its time
         scalars[H] += moved
         if gain <= 0.0:
             A[n + 1] -= A[n] * moved  # b_1 = b (h - h_hat) has got smaller by what h_hat moved
-        if not 0.0 <= scalars[H] <= t[k] - scalars[FIRST_T]:
+        if not (scalars[H] > 0.0 or lacking * lam > -1.0) or not scalars[H] <= t[k] - scalars[FIRST_T]:
             return np.zeros(n), R, False
     scalars[LAST_T], scalars[LAST_U], scalars[LAST_Y] = t[k], u[k], y
     state = _state(A, _derivatives(Jy, n, lam), _derivatives(Jh, 1, lam), n, lam, offset)
     covariance = _covariance(R, spread, scalars[WEIGHT], scalars[SPREAD], memory_s, _corner(kernels, lam))
     return state, covariance, True
+
+
+@njit(cache=True)
+def step_rows(
+    t: FloatArray,
+    u: FloatArray,
+    past: FloatArray,
+    y: FloatArray,
+    Jy: FloatArray,
+    Ju: FloatArray,
+    A: FloatArray,
+    R: FloatArray,
+    slow: FloatArray,
+    spread: FloatArray,
+    scalars: FloatArray,
+    n: int,
+    lam: float,
+    gain: float,
+    memory_s: float,
+    linear: bool,
+    delayed: bool,
+    offset: bool,
+    after: float,
+    rate: float,
+) -> tuple[FloatArray, FloatArray, int]:
+    """Carry everything over all rows after the first; return state, covariance and the row where lock was lost or 0."""
+    state, covariance = np.full(n, np.nan), np.full(R.shape, np.nan)
+    for k in range(1, t.size):
+        state, covariance, locked = step_row(
+            k, t, u, past, y[k], Jy, Ju, A, R, slow, spread, scalars, n, lam, gain, memory_s, linear, delayed, offset,
+            after, rate,
+        )  # fmt: skip
+        if not locked:
+            return state, covariance, k
+    return state, covariance, 0
 
 
 @njit(cache=True)

@@ -184,20 +184,48 @@ class OnlineEstimator:
         self._rows += 1
         self._taken += 1
         if self._taken == 1:
-            self._first_t = t
-            for place, value in ((chain.LAST_T, t), (chain.LAST_U, u), (chain.LAST_Y, y), (chain.FIRST_T, t)):
-                self._scalars[place] = value
+            self._begin(t, u, y)
             return self._sample(t, np.full(n, np.nan), np.full((len(self._averages[0]),) * 2, np.nan))
         state, covariance, locked = chain.step_row(
-            k, self._t, self._u, self._past, y, *self._chains, *self._averages, self._scalars, n, self._forgetting,
-            self._gain, self._memory_s, self._linear, self._delay is not None, self._offset,
-            self._delay.after_s if self._delay else np.inf, self._delay.rate if self._delay else 0.0,
-        )  # fmt: skip
+            k, self._t, self._u, self._past, y, *self._chains, *self._averages, self._scalars, *self._settings()
+        )
         if not locked:
-            raise IdentificationError(
-                f"the delay estimate left the record at t = {t:g} s: lock was lost",
-                remedy="start nearer to the delay, later, or with a lower rate; identify_delay finds a start",
-            )
+            raise _lost(t)
+        return self._filled_sample(t, state, covariance)
+
+    def run(self, t: FloatArray, u: FloatArray, y: FloatArray) -> OnlineSample:
+        """Take all rows of a record at once, as the first ones, and return the estimates after the last.
+
+        Parameters
+        ----------
+        t, u, y : (N,) arrays
+            As of :meth:`step`, in order.
+        """
+        self._t, self._u, self._past = t, u, np.zeros((t.size, self._past.shape[1]))
+        self._rows = self._taken = t.size
+        self._begin(t[0], u[0], y[0])
+        state, covariance, lost = chain.step_rows(
+            t, u, self._past, y, *self._chains, *self._averages, self._scalars, *self._settings()
+        )
+        if lost:
+            raise _lost(float(t[lost]))
+        return self._filled_sample(float(t[-1]), state, covariance)
+
+    def _begin(self, t: float, u: float, y: float) -> None:
+        self._first_t = float(t)
+        for place, value in ((chain.LAST_T, t), (chain.LAST_U, u), (chain.LAST_Y, y), (chain.FIRST_T, t)):
+            self._scalars[place] = value
+
+    def _settings(self) -> tuple[int, float, float, float, bool, bool, bool, float, float]:
+        follows, delay = self._delay is not None, self._delay
+        return (
+            self._n, self._forgetting, self._gain, self._memory_s, self._linear, follows, self._offset,
+            delay.after_s if delay else np.inf, delay.rate if delay else 0.0,
+        )  # fmt: skip
+
+    def _filled_sample(self, t: float, state: FloatArray, covariance: FloatArray) -> OnlineSample:
+        """Return the estimates, the state only once the kernels have filled."""
+        n = self._n
         age = t - self._first_t
         filled = age > (n + 2) / self._forgetting + 10.0 * age / (self._taken - 1)
         return self._sample(t, state if filled else np.full(n, np.nan), covariance)
@@ -219,6 +247,12 @@ class OnlineEstimator:
         self._rows = k - first
         self._scalars[chain.ROW] = max(self._scalars[chain.ROW] - first, 0)
 
+    def _delay_s(self, t: float) -> float:
+        """Return the delay: the followed one, or what is lacking below zero, where u is not known yet."""
+        h, A = float(self._scalars[chain.H]), self._averages[0]
+        followed = self._delay is not None and t - self._first_t > self._delay.after_s and A[self._n] != 0.0
+        return h if h > 0.0 or not followed else min(float(A[self._n + 1] / A[self._n]), 0.0)
+
     def _sample(self, t: float, state: FloatArray, covariance: FloatArray) -> OnlineSample:
         n, A = self._n, self._averages[0]
         jacobian = np.zeros((n + 2, A.size))
@@ -232,10 +266,17 @@ class OnlineEstimator:
             t=float(t),
             a=A[:n].copy(),
             b=float(A[n]),
-            delay_s=float(self._scalars[chain.H]),
+            delay_s=self._delay_s(t),
             state=state,
             covariance=jacobian @ covariance @ jacobian.T,
         )
+
+
+def _lost(t: float) -> IdentificationError:
+    return IdentificationError(
+        f"the delay estimate left the record at t = {t:g} s: lock was lost",
+        remedy="start nearer to the delay, later, or with a lower rate; identify_delay finds a start",
+    )
 
 
 def follow(

@@ -19,11 +19,13 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.linalg import cholesky, solve_triangular
+from scipy.linalg import LinAlgError
+from threadpoolctl import threadpool_limits
 
-from autotune.arrays import FloatArray
+from autotune.arrays import ComplexArray, FloatArray
 from autotune.errors import IdentificationError, InputError
 from autotune.identification.delay.modulated_integrals import Interval
+from autotune.identification.delay.weighted_equations import Windows, minimise_weighted
 from autotune.recording import Recording
 
 #: Samples of an interval in the polish, and harmonics of its length that modulate it besides.
@@ -36,10 +38,7 @@ _ROWS, _MOST = 16, 2000
 #: Starting delays, in intervals, and how far below zero a fixed point may lie because of noise.
 _STARTS = (0.0, 0.2, 0.4, 0.6)
 _EARLY = 0.02
-#: Combinations of the equations with less of the noise than this share say what the others say: windows overlap.
-_OWN = 1e-4
-#: Steps of the polish, and the condition of its scaled equations above which they leave something open.
-_ROUNDS = 3
+#: Condition of the scaled equations above which they leave something open.
 _DETERMINED = 1e6
 
 
@@ -222,95 +221,64 @@ def _iterated(
 
 
 def _polished(recording: Recording, starts: FloatArray, L: float, start: TwoDelays) -> TwoDelays:
-    """Maximise the likelihood of the modulated equations, y being the output with white noise."""
-    equations = _Equations.of(recording, starts, L, start.values)
-    values = start.values
-    for _ in range(_ROUNDS):  # Gauss-Newton steps of generalised least squares
-        errors, factor = equations.errors(values)
-        step = 1e-4 * np.maximum(np.abs(values), [1e-2, 1e-2, 0.1 * L, 0.1 * L])
-        ahead = [equations.left(values + step * unit) for unit in np.eye(4)]
-        jacobian = (np.column_stack(ahead) - errors[:, None]) / step
-        whitened = solve_triangular(factor, np.column_stack([jacobian, errors]), lower=True)
-        size = np.linalg.norm(whitened[:, :4], axis=0)
-        if not np.linalg.cond(whitened[:, :4] / size) < _DETERMINED:
-            raise IdentificationError(
-                "the record does not determine both delays", where=recording.name, remedy="excite more frequencies"
-            )
-        values = values - np.linalg.lstsq(whitened[:, :4], whitened[:, 4], rcond=None)[0]
-    left = solve_triangular(factor, equations.left(values), lower=True)
-    variance = float(left @ left) / max(left.size - 4, 1)
-    information = whitened[:, :4] / size
-    covariance = variance * np.linalg.inv(information.T @ information) / np.outer(size, size)
-    a, b, h1, h2 = (float(value) for value in values)
+    """Return the minimum of the weighted equations, y being the output with white noise."""
+    try:
+        equations = _Equations.of(recording, Windows(starts, L, _HARMONICS), start.values)
+        with threadpool_limits(1):
+            found = minimise_weighted(equations, start.values)
+    except LinAlgError:
+        found = None
+    if found is None or not np.all(np.isfinite(found.covariance)) or found.condition > _DETERMINED:
+        raise IdentificationError(
+            "the record does not determine both delays", where=recording.name, remedy="excite more frequencies"
+        )
+    a, b, h1, h2 = (float(value) for value in found.values)
     return replace(
-        start, a=a, b=b, h1_s=h1, h2_s=h2, covariance=covariance,
-        noise_sd=float(np.sqrt(equations.rows_per_bin * variance)),
+        start, a=a, b=b, h1_s=h1, h2_s=h2, covariance=found.covariance,
+        noise_sd=float(np.sqrt(equations.rows_per_sample * found.variance)),
     )  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Equations:
-    """The record in bins of a fraction of an interval, and the intervals it is modulated on."""
+    """Equations of (a, b, h_1, h_2): :class:`autotune.identification.delay.weighted_equations.Equations`."""
 
+    windows: Windows
     t: FloatArray
-    u: FloatArray
-    y: FloatArray
-    starts: FloatArray
-    L: float
-    rows_per_bin: float
-    kept: FloatArray
+    of_u: list[ComplexArray]
+    of_y: list[ComplexArray]
+    samples: FloatArray
+    rows_per_sample: float
 
     @classmethod
-    def of(cls, recording: Recording, starts: FloatArray, L: float, values: FloatArray) -> _Equations:
-        """Average the record into bins, and keep those combinations of equations that say something of their own."""
-        width = L / _SAMPLES
-        at = np.floor((recording.t - recording.t[0]) / width).astype(np.int64)
-        rows = np.bincount(at)
-        kept = rows > 0
-        t, u, y = (np.bincount(at, values)[kept] / rows[kept] for values in (recording.t, recording.u, recording.y))
-        made = cls(t=t, u=u, y=y, starts=starts, L=L, rows_per_bin=float(np.mean(rows[kept])), kept=np.eye(0))
-        of_y, _ = made._of_signals(values)
-        sizes, vectors = np.linalg.eigh(of_y @ of_y.T)
-        return replace(made, kept=vectors[:, sizes > _OWN * sizes[-1]].T)
-
-    def _of_signals(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return what multiplies y and u in the equations."""
-        a, b, h1, h2 = values
-        return self._weights(0.0, True) + a * self._weights(h1, False), -b * self._weights(h2, False)
-
-    def _weights(self, h: float, second: bool) -> FloatArray:
-        """Return the windows (or their second derivatives) shifted by h on every bin, (equations, bins)."""
-        s = (self.t + h - self.starts[:, None]) / self.L
-        inside = (s > 0.0) & (s < 1.0)
-        step = np.gradient(self.t)
-        rows = [np.where(inside, window, 0.0) * step for window in _windows(s, second)]
-        return np.vstack(rows) / (self.L**2 if second else 1.0)
-
-    def errors(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return what the equations leave, and the factor of its covariance for noise of variance 1 in a bin."""
-        of_y, of_u = self._of_signals(values)
-        noisy = self.kept @ of_y
-        return noisy @ self.y + self.kept @ (of_u @ self.u), np.asarray(cholesky(noisy @ noisy.T, lower=True))
+    def of(cls, recording: Recording, windows: Windows, values: FloatArray) -> _Equations:
+        width = max(windows.length_s / _SAMPLES, recording.sample_time_s)
+        first = max(windows.starts[0] - 2.0 * max(float(values[2]), 0.0), recording.t[0])
+        return cls(
+            windows=windows,
+            t=recording.t,
+            of_u=windows.running(recording.t, recording.u, False),
+            of_y=windows.running(recording.t, recording.y, False),
+            samples=np.arange(first + 0.5 * width, windows.starts[-1] + windows.length_s, width),
+            rows_per_sample=width / recording.sample_time_s,
+        )
 
     def left(self, values: FloatArray) -> FloatArray:
-        """Return what the equations leave."""
-        of_y, of_u = self._of_signals(values)
-        return np.asarray(self.kept @ (of_y @ self.y + of_u @ self.u), dtype=np.float64)
+        """Return x'' + a x(t - h_1) - b u(t - h_2) over every window."""
+        a, b, h1, h2 = values.tolist()
+        of = self.windows.of_signal
+        x, late = of(self.t, self.of_y, 0.0, 2), of(self.t, self.of_y, h1, 0)
+        return np.asarray(x + a * late - b * of(self.t, self.of_u, h2, 0), dtype=np.float64)
 
+    def of_noise(self, values: FloatArray) -> FloatArray:
+        """Return what samples of noise on y add."""
+        on, width = self.windows.on, self.samples[1] - self.samples[0]
+        return np.asarray(width * (on(self.samples, 0.0, 2) + values[0] * on(self.samples, float(values[2]), 0)))
 
-def _windows(s: FloatArray, second: bool) -> list[FloatArray]:
-    """Return (1 - cos)^2 (1, cos q, sin q ..) of 2 pi s, or their second derivatives by s: smooth at the ends."""
-    angles = 2.0 * np.pi * s
-    waves = {q: (np.cos(q * angles), np.sin(q * angles)) for q in range(_HARMONICS + 3)}
-    windows = []
-    for q in range(_HARMONICS + 1):
-        for sine in (False, True)[: 2 if q else 1]:
-            total = np.zeros(s.shape)
-            for weight, j in ((1.5, 0), (-1.0, 1), (-1.0, -1), (0.25, 2), (0.25, -2)):
-                wave = waves[abs(q + j)][int(sine)] * (np.sign(q + j) if sine else 1.0)
-                total += weight * wave * (-((2.0 * np.pi * (q + j)) ** 2) if second else 1.0)
-            windows.append(total)
-    return windows
+    def steps(self, values: FloatArray) -> FloatArray:
+        """Return the steps of difference quotients."""
+        small = 1e-6 * self.windows.length_s
+        return np.array([max(abs(values[0]), 1e-3), max(abs(values[1]), 1e-3), small, small])
 
 
 def _shifted(recording: Recording, values: FloatArray, starts: FloatArray, offsets: FloatArray, h: float) -> FloatArray:
