@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, get_args
 import numpy as np
 
 from autotune.api.arguments import number, one_of, settings_of
-from autotune.api.plants import as_controller, as_plant, as_reduced
+from autotune.api.plants import as_controller, as_loop_plant, as_plant, as_reduced
 from autotune.api.points import as_points
 from autotune.api.recordings import Source, as_recordings, read
 from autotune.controller import Controller, PIDController
@@ -84,8 +84,8 @@ def tune(
     ----------
     plant : recording, its file, points, TransferFunction, model, reduced or delay model, python-control system
         A recording, a list of them, a DataFrame or the file of one is tuned as ``autotune tune FILE`` does. On points
-        the margins hold for every plant that fits them; on a reduced model, a PI's are kept on what was reduced as
-        well.
+        the margins hold for every plant that fits them; on a loop's identification on the joint region of its
+        coefficients; on a reduced model, a PI's are kept on what was reduced as well.
     modulus_margin : float
         Smallest distance of the Nyquist curve from -1, 0 to 1.
     phase_margin_deg : float
@@ -124,6 +124,11 @@ def tune(
         margins_asked = {"modulus_margin": modulus_margin, "phase_margin_deg": phase_margin_deg}
         return _of_recordings(records, {"kind": structure, "noise_gain": noise_gain, **margins_asked, **settings})
     wanted = _specification(modulus_margin, phase_margin_deg, 0.1 if noise_gain is None else noise_gain, settings)
+    of_loop = as_loop_plant(plant)
+    if of_loop is not None:
+        from autotune.design.on_fit import design_on_fit
+
+        return design_on_fit(of_loop, wanted, structure)
     points = as_points(plant)
     if points is not None:
         from autotune.identification.parametric import fit_plant

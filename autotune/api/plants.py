@@ -11,6 +11,7 @@ from autotune.errors import InputError
 from autotune.models import LARGEST, SMALLEST, Model, TransferFunction, read_model
 
 if TYPE_CHECKING:
+    from autotune.identification.parametric import PlantFit
     from autotune.identification.reduction import ReducedModel
 
 
@@ -64,6 +65,17 @@ def as_reduced(source: Any) -> ReducedModel | None:
     if isinstance(source, ReducedModel):
         return source
     return read_reduced(source) if isinstance(source, str | os.PathLike) else None
+
+
+def as_loop_plant(source: Any) -> PlantFit | None:
+    """Return the plant of a loop's identification with its region; None for everything else."""
+    from autotune.identification.closed_loop.identify import ClosedLoopIdentification
+
+    if not isinstance(source, ClosedLoopIdentification):
+        return None
+    from autotune.identification.closed_loop.loop_plant import loop_plant
+
+    return loop_plant(source.estimate)
 
 
 def as_controller(source: Any) -> Controller:

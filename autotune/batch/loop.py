@@ -23,7 +23,9 @@ from autotune.diagnosis.result import Diagnosis
 from autotune.errors import AutotuneError, IdentificationError
 from autotune.experiment_design.next_experiment import with_next_experiment
 from autotune.identification.closed_loop.identify import identify_closed_loop
+from autotune.identification.closed_loop.loop_plant import loop_plant
 from autotune.identification.frequency.recorded import FrequencyEstimate, combine, frequency_points
+from autotune.identification.parametric import PlantFit
 from autotune.model_file import read_model
 from autotune.pipeline import Analysis, Measured, analyse, analysis_json, measured_of
 from autotune.points import FrequencyPoint, points_to_json
@@ -228,8 +230,8 @@ def _finding(work: Work, row: Row) -> Finding:
     if settings.task == "design" and settings.method == "frequency":
         measured = measured_of(record.pieces)
     else:
-        points, notes = _points(record, settings, present)
-        measured = Measured(points=points, fit=None, facts=LoopFacts(), notes=notes)
+        points, fit, notes = _points(record, settings, present)
+        measured = Measured(points=points, fit=fit, facts=LoopFacts(), notes=notes)
     points, row = measured.points, _with_notes(row, measured.notes)
     row = replace(row, points=len(points))
     if points:
@@ -255,8 +257,8 @@ def _with_notes(row: Row, notes: Sequence[str]) -> Row:
 
 def _points(
     record: Record, settings: CampaignSettings, present: Controller | None
-) -> tuple[tuple[FrequencyPoint, ...], tuple[str, ...]]:
-    """Return the points of all pieces together; a piece that tells nothing is a note while another one tells."""
+) -> tuple[tuple[FrequencyPoint, ...], PlantFit | None, tuple[str, ...]]:
+    """Return the points of all pieces together and a loop's plant; what tells nothing is a note beside others."""
     if settings.method == "closed-loop":
         longest = max(record.pieces, key=len)
         found = identify_closed_loop(longest, controller=present)
@@ -264,7 +266,7 @@ def _points(
             raise IdentificationError(
                 found.excitation.sentence, where=longest.name, remedy="move the set-point, or dither"
             )
-        return found.design_points, found.warnings
+        return found.design_points, loop_plant(found.estimate), found.warnings
     estimates, refusals = [], []
     for piece in record.pieces:
         try:
@@ -275,9 +277,9 @@ def _points(
         raise refusals[0]
     combined = combine(estimates)
     if not refusals:
-        return combined.points, combined.notes
+        return combined.points, None, combined.notes
     left_out = f"{len(refusals)} of {len(record.pieces)} pieces gave no points, the first: {refusals[0]}"
-    return combined.points, (*combined.notes, left_out)
+    return combined.points, None, (*combined.notes, left_out)
 
 
 def _opened(piece: Recording) -> FrequencyEstimate:

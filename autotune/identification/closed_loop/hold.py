@@ -34,7 +34,7 @@ def without_hold(model: InnovationModel, response: tuple[FrequencyPoint, ...]) -
         the Nyquist frequency. Points known to less than 50 % are left out.
     """
     dt_s = model.sample_time_s
-    continuous = _continuous(model)
+    continuous = continuous_form(model)
     points = []
     for point in response:
         omega = point.omega_rad_s
@@ -55,7 +55,7 @@ def without_hold(model: InnovationModel, response: tuple[FrequencyPoint, ...]) -
     return tuple(points)
 
 
-def _continuous(model: InnovationModel) -> tuple[FloatArray, FloatArray] | None:
+def continuous_form(model: InnovationModel) -> tuple[FloatArray, FloatArray] | None:
     """Return (A, B) of the continuous model with the same samples under a held input, None where there is none."""
     poles = model.poles
     if np.any((np.abs(poles.imag) <= 1e-9) & (poles.real <= 1e-9)):
