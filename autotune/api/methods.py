@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from autotune.identification.delay.model import DelayModel
     from autotune.identification.delay.two_delays import TwoDelays
     from autotune.identification.reduction import ReducedModel
+    from autotune.models import TransferFunction
     from autotune.recording import Recording
 
 KINDS = ("pi", "pid")
@@ -91,8 +92,8 @@ def tune(
     phase_margin_deg : float
         Smallest phase margin [deg].
     noise_gain : float, optional
-        Largest amplification of measurement noise to the command, N_max [u unit/y unit]. Of a recording from its noise
-        and the span of u when absent, else 0.1.
+        Largest amplification of measurement noise to the command, N_max [u unit/y unit]. When absent, of a recording
+        from its noise and the span of u, else ten over the plant's gain where its phase is -135 degrees.
     kind : {"pi", "pid"}
         Structure.
     certificate : bool
@@ -123,27 +124,36 @@ def tune(
     if records is not None:
         margins_asked = {"modulus_margin": modulus_margin, "phase_margin_deg": phase_margin_deg}
         return _of_recordings(records, {"kind": structure, "noise_gain": noise_gain, **margins_asked, **settings})
-    wanted = _specification(modulus_margin, phase_margin_deg, 0.1 if noise_gain is None else noise_gain, settings)
+
+    def wanted(of: TransferFunction, highest_rad_s: float | None = None) -> Specification:
+        from autotune.design.noise import LoopFacts, default_noise_gain
+
+        most = default_noise_gain(of, LoopFacts(), highest_rad_s)[0] if noise_gain is None else noise_gain
+        return _specification(modulus_margin, phase_margin_deg, most, settings)
+
     of_loop = as_loop_plant(plant)
     if of_loop is not None:
         from autotune.design.on_fit import design_on_fit
 
-        return design_on_fit(of_loop, wanted, structure)
+        return design_on_fit(of_loop, wanted(of_loop.plant), structure)
     points = as_points(plant)
     if points is not None:
         from autotune.identification.parametric import fit_plant
         from autotune.pipeline.analysis import of_use, on_measured
 
         measured = of_use(points)
-        return on_measured(measured, fit_plant(measured), wanted, structure)[1]
+        fit = fit_plant(measured)
+        return on_measured(measured, fit, wanted(fit.plant, measured[-1].omega_rad_s), structure)[1]
     reduced = as_reduced(plant)
     if reduced is not None:
         from autotune.pipeline.analysis import on_reduced_model
 
-        return on_reduced_model(reduced, wanted, structure, certificate=certificate)[0]
+        of = wanted(reduced.transfer_function())
+        return on_reduced_model(reduced, of, structure, certificate=certificate)[0]
     from autotune.design.synthesis import design as on_model
 
-    return on_model(as_plant(plant), wanted, structure, certificate=certificate)
+    H = as_plant(plant)
+    return on_model(H, wanted(H), structure, certificate=certificate)
 
 
 def _of_recordings(records: list[Recording], settings: dict[str, Any]) -> Design:

@@ -72,7 +72,7 @@ def design_command(
     if (model is None) == (points is None):
         raise InputError("give one of --model and --points", where="autotune design")
 
-    def asked(plant: TransferFunction, highest_rad_s: float) -> Specification:
+    def asked(plant: TransferFunction, highest_rad_s: float | None = None) -> Specification:
         allowed = noise_gain
         if allowed is None:
             allowed, words = default_noise_gain(plant, LoopFacts(), highest_rad_s)
@@ -91,14 +91,14 @@ def design_command(
     place = Output(out, inputs=(model, points), overwrite=overwrite)
     law = None if controller is None else Output(controller, inputs=(model, points, out), overwrite=overwrite)
     if model is not None:
-        from autotune.design.loop import characteristic_frequencies, transfer_function_of
+        from autotune.design.loop import transfer_function_of
         from autotune.design.synthesis import design
         from autotune.identification.reduced_file import read_reduced
         from autotune.model_file import read_model
         from autotune.pipeline.analysis import on_reduced_model
 
         H = transfer_function_of(read_model(model))
-        wanted = asked(H, float(10.0 * characteristic_frequencies(H)[-1]))
+        wanted = asked(H)
         reduced = read_reduced(model)
         if reduced is None:
             designed = design(H, wanted, kind.value, certificate=certificate)

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from autotune.arrays import FloatArray
+from autotune.design.loop import characteristic_frequencies
 from autotune.models import TransferFunction
 
 #: noise on the command [standard deviation] as a share of the command's range, from u_min to u_max
@@ -40,7 +41,9 @@ class LoopFacts:
     sample_time_s: float | None = None
 
 
-def default_noise_gain(plant: TransferFunction, facts: LoopFacts, highest_rad_s: float) -> tuple[float, str]:
+def default_noise_gain(
+    plant: TransferFunction, facts: LoopFacts, highest_rad_s: float | None = None
+) -> tuple[float, str]:
     """Return the noise gain N_max [u unit/y unit] of (15), and where it comes from.
 
     Parameters
@@ -49,8 +52,8 @@ def default_noise_gain(plant: TransferFunction, facts: LoopFacts, highest_rad_s:
         Fitted plant.
     facts : LoopFacts
         Noise and range of the command.
-    highest_rad_s : float
-        Highest frequency that is known of the plant [rad/s].
+    highest_rad_s : float, optional
+        Highest frequency that is known of the plant [rad/s]; ten times its fastest corner when absent.
 
     Notes
     -----
@@ -58,6 +61,8 @@ def default_noise_gain(plant: TransferFunction, facts: LoopFacts, highest_rad_s:
     of a test where the range is not known. Without noise, or for a plant so slow that it would not matter, the limit is
     ten times what the plant's gain at -135 degrees, or at the highest known frequency, lets a PI use.
     """
+    if highest_rad_s is None:
+        highest_rad_s = 10.0 * float(characteristic_frequencies(plant)[-1])
     omega = np.geomspace(1e-4 * highest_rad_s, highest_rad_s, 800)
     response = plant.response(omega)
     turned = np.abs(np.unwrap(np.angle(response)) - np.angle(response[0]))

@@ -128,6 +128,17 @@ def test_points_go_to_python_control_and_back_through_tune() -> None:
     assert at.margins(PLANT, found).modulus >= 0.495
 
 
+@pytest.mark.parametrize("unit", [1e-3, 50.0])
+def test_without_a_noise_gain_no_unit_of_y_changes_a_design(unit: float) -> None:
+    """The default is a share of the plant's own gain; a number would have been in somebody's units."""
+    plant = at.TransferFunction(num=(2.0,), den=(6.0, 5.0, 1.0))
+    scaled = at.TransferFunction(num=(2.0 * unit,), den=(6.0, 5.0, 1.0))
+    own, other = (at.tune(one, certificate=False).controller for one in (plant, scaled))
+    assert other.K * unit == pytest.approx(own.K, rel=1e-2)
+    assert other.Ti_s == pytest.approx(own.Ti_s, rel=1e-2)
+    assert at.validate(scaled, at.reduce(scaled)).holds == at.validate(plant, at.reduce(plant)).holds
+
+
 def test_a_table_is_of_numbers_with_all_of_their_digits() -> None:
     pytest.importorskip("pandas")
     m = at.margins(PLANT, at.PI(K=0.5, Ti_s=4.0))
