@@ -13,6 +13,7 @@ from autotune.outputs import Output
 
 if TYPE_CHECKING:
     from autotune.identification.closed_loop.state_space import InnovationModel
+    from autotune.recording import Recording
 
 paper = typer.Typer(help="Draw the figures and tables of the papers.", no_args_is_help=True)
 app.add_typer(paper, name="paper")
@@ -82,31 +83,17 @@ def delay(
     sets: Annotated[int, typer.Option(min=2, max=10_000, help="noisy recordings of each of the paper's examples")] = 40,
     overwrite: OVERWRITE = False,
 ) -> None:
-    """Tables 1 and 2 of Ollivier et al.: one delay and two by modulating functions, on the paper's examples."""
-    import numpy as np
+    """Tables 1 and 2 and figures 1 to 3 of Ollivier et al.: printed, recomputed by the paper's way, and weighted."""
     from rich.progress import track
 
-    from autotune.api.examples import example
-    from autotune.identification.delay.modulated_delay import modulated_delay
-    from autotune.identification.delay.two_delays import two_delays
-    from autotune.recording import Recording
+    from autotune.cli.paper_delay import followed_examples, one_delay_estimates, two_delay_estimates
     from autotune.report.delay_tables import delay_page
     from autotune.report.page import write_page
 
     place = Output(out, inputs=(), overwrite=overwrite)
-    single, double = (example(name, noise=0.0) for name in ("delay", "two delays"))
-    one, two = [], []
-    for seed in track(range(sets), description="recordings", transient=True):
-        rng = np.random.default_rng(seed)
-        noisy = [
-            Recording(t=clean.t, u=clean.u, y=clean.y + sd * rng.standard_normal(len(clean)))
-            for clean, sd in ((single, 5.0), (double, 0.1))
-        ]
-        found = modulated_delay(noisy[0], 2, [(10.0 * k, 10.0 * k + 15.0) for k in range(1, 10)])
-        one.append([found.a[1], found.a[0], found.b, found.delay_s])
-        intervals = [(15.0 + 2.0 * k, 25.0 + 2.0 * k) for k in range(20)]
-        two.append(two_delays(noisy[1], intervals, polish=False).values)
-    page = delay_page(np.array(one), np.array(two))
+    one = one_delay_estimates(track(range(sets), description="one delay", transient=True))
+    two = two_delay_estimates(track(range(sets), description="two delays", transient=True))
+    page = delay_page(one, two, followed_examples())
     place.by(lambda part: write_page(page, part))
     typer.echo(f"{page.verdict} wrote {out}")
 
@@ -120,35 +107,43 @@ def closed_loop(
     overwrite: OVERWRITE = False,
 ) -> None:
     """Figures 2 to 5 of Pouliquen et al.: poles by each method and the noise models, on the paper's example."""
+    import numpy as np
     from rich.progress import track
     from threadpoolctl import threadpool_limits
 
-    from autotune.api.examples import LOOP_NOISE, LOOP_PLANT
+    from autotune.api.examples import LOOP_NOISE, LOOP_PLANT, example
+    from autotune.identification.closed_loop.confidence import pole_covariance
+    from autotune.identification.closed_loop.prediction_error import prediction_error
     from autotune.identification.closed_loop.state_space import from_polynomials
     from autotune.report.loop_figures import loop_page
     from autotune.report.page import write_page
 
     place = Output(out, inputs=(), overwrite=overwrite)
     models: dict[str, list[InnovationModel]] = {title: [] for title in _DRAWN}
+    truth = from_polynomials(*LOOP_PLANT, LOOP_NOISE, variance=1.0 / 9.0)
+    squares = []
     with threadpool_limits(1):
         for seed in track(range(sets), description="data sets", transient=True):
-            _estimate(seed, models)
-    truth = from_polynomials(*LOOP_PLANT, LOOP_NOISE, variance=1.0 / 9.0)
-    place.by(lambda part: write_page(loop_page(models, truth, sets), part))
+            data = example("loop", seed=seed)
+            _estimate(data, models)
+            at_truth = prediction_error(truth, data.u[:, None], data.y[:, None], offset=False, max_iterations=0)
+            of_poles = np.trace(pole_covariance(at_truth), axis1=1, axis2=2)[truth.poles.imag >= 0.0]
+            squares.append(of_poles * (1.0 - at_truth.parameters / at_truth.rows))
+    bound = np.sqrt(np.mean(squares, axis=0))
+    place.by(lambda part: write_page(loop_page(models, truth, sets, bound), part))
     found = ", ".join(f"{title} {len(every)}" for title, every in models.items())
     typer.echo(f"models of {sets} sets: {found}; wrote {out}")
 
 
-def _estimate(seed: int, models: dict[str, list[InnovationModel]]) -> None:
+def _estimate(data: Recording, models: dict[str, list[InnovationModel]]) -> None:
     """Add every method's model of one data set; a method without a model of it is left out."""
     import contextlib
 
-    from autotune.api.examples import LOOP_CONTROLLER, example
+    from autotune.api.examples import LOOP_CONTROLLER
     from autotune.controller import DiscreteController
     from autotune.errors import IdentificationError
     from autotune.identification.closed_loop.methods import closed_loop_model, markov_of
 
-    data = example("loop", seed=seed)
     law = DiscreteController(num=LOOP_CONTROLLER[0], den=LOOP_CONTROLLER[1], sample_time_s=1.0)
     for title, (method, window) in _DRAWN.items():
         with contextlib.suppress(IdentificationError):

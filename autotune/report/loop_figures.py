@@ -14,10 +14,13 @@ from autotune.arrays import ComplexArray, FloatArray
 from autotune.identification.closed_loop.state_space import InnovationModel
 from autotune.report import chart as go
 from autotune.report.chart import make_subplots
-from autotune.report.page import BLUE, GREY, ORANGE, Figure, Page, Section, add_line
+from autotune.report.page import BLUE, GREY, ORANGE, Figure, Page, Section, Table, add_line
 
 #: Frequencies of the noise model's response [rad/sample].
 OMEGA = np.geomspace(0.01, np.pi, 300)
+
+#: Mean of the estimated variances that the paper prints.
+_VARIANCE = 0.1023
 
 Models = Mapping[str, Sequence[InnovationModel]]
 
@@ -72,8 +75,29 @@ def _spectrum(model: InnovationModel) -> FloatArray:
     return np.asarray(sd * np.abs(model.noise_response(OMEGA)[:, 0, 0]), dtype=np.float64)
 
 
-def loop_page(models: Models, truth: InnovationModel, count: int) -> Page:
-    """Return the page with the figures.
+def _table(models: Models, truth: InnovationModel, bound: FloatArray) -> Table:
+    """Return root mean square errors of the poles and mean variances, the paper's one printed number beside them."""
+    targets = truth.poles[truth.poles.imag >= 0.0]
+    rows = []
+    for title, found in models.items():
+        errors = np.array([[np.min(np.abs(model.poles - pole)) for pole in targets] for model in found])
+        variances = [float(model.innovation_covariance[0, 0]) for model in found]
+        rms = [f"{value:.4f}" for value in np.sqrt(np.mean(errors**2, axis=0))] if found else [""] * targets.size
+        printed = f"{_VARIANCE:g}" if title == "this paper" else ""
+        mean = f"{np.mean(variances):.4f}" if any(variances) else ""  # some methods have no noise model
+        rows.append((title, str(len(found)), *rms, printed, mean))
+    rows.append(("Cramer-Rao bound", "", *(f"{value:.4f}" for value in bound), "", ""))
+    poles = (f"{pole.real:.4f}" + (f" + {pole.imag:.4f}i" if pole.imag else "") for pole in targets)
+    return Table(
+        header=("method", "models", *(f"rms error at {pole}" for pole in poles), "variance, printed", "variance, here"),
+        rows=tuple(rows),
+        caption="Mean of the innovations' variance, true value 0.1111; the printed mean is not reached by the printed"
+        " formula. The paper prints no errors of the poles.",
+    )
+
+
+def loop_page(models: Models, truth: InnovationModel, count: int, bound: FloatArray) -> Page:
+    """Return the page with the table and the figures.
 
     Parameters
     ----------
@@ -84,6 +108,8 @@ def loop_page(models: Models, truth: InnovationModel, count: int) -> Page:
         The plant that made them.
     count : int
         Number of data sets.
+    bound : (P,) array
+        Cramer-Rao bound of the poles in the upper half plane.
     """
 
     def poles(title: str, caption: str, *names: str) -> Section:
@@ -98,6 +124,7 @@ def loop_page(models: Models, truth: InnovationModel, count: int) -> Page:
         tone="good",
         summary=("The lower half of the z plane is its mirror image.",),
         sections=(
+            Section(title="Errors of the poles and the variance", tables=(_table(models, truth, bound),)),
             poles("Figure 2: the indirect method", "Beside it the default on the same sets.", "this paper", "default"),
             poles(
                 "Figure 3: the other indirect methods",
