@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Callable, Iterator
+
 import numpy as np
+from scipy.signal import lfilter
+from scipy.stats import norm
+from scipy.stats import t as student
 
 from autotune.arrays import FloatArray
-from autotune.errors import InputError
+from autotune.errors import IdentificationError, InputError
 from autotune.identification.delay.data import DelayData, prepare
 from autotune.identification.delay.model import DelayModel
 from autotune.identification.delay.online_modulating import DelayTracking, OnlineEstimator, OnlineSample
-from autotune.identification.delay.output_error import Structure, parameters, residuals, solve_linear
+from autotune.identification.delay.output_error import Structure, parameters, residuals, solve_linear, whitening_filter
 from autotune.identification.delay.weighted_delay import weighted_delay
 from autotune.models import Hold
 from autotune.recording import Recording
@@ -22,6 +28,8 @@ _ROWS_PER_DERIVATIVE = 8
 _FORGETS = 100.0
 #: Times that the on-line estimate is compared with what it makes of its own model's response.
 _SIMULATIONS = 12
+#: Draws of noise on its own model's response, from which the covariance comes, rows before each, and times.
+_DRAWS, _SETTLING, _MATCHES = 24, 200, 2
 #: Change that ends this, as a share of the values: rounding, or what is small beside the noise.
 _ROUNDING, _SHARE_OF_NOISE = 1e-10, 1e-4
 
@@ -111,12 +119,14 @@ def online_delay(
     Returns
     -------
     DelayModel
-        The last row's estimates with their covariance.
+        The last row's estimates, with the covariance of what is followed on the model's own response under noise of the
+        residual's variance and colour. The mean that noise moves these by is taken off twice; what it differed by is
+        counted as uncertainty besides.
 
     Raises
     ------
     IdentificationError
-        Lock was lost.
+        Lock was lost, or noise as it is here would make it lost.
     """
     data = prepare(recording, hold=hold)
     span = float(data.ty[-1] - data.ty[0])
@@ -128,22 +138,67 @@ def online_delay(
         return estimator.run(data.tu, data.u, y)
 
     last = followed(data.y, start_s)
-    seen = np.array([*last.a, last.b, last.delay_s])
-    values = seen
+    seen = values = _values(last)
     for _ in range(_SIMULATIONS):  # what it makes of its own model's response, which is known, is taken off
         response = _response(data, order, values)
         if response is None:
-            break
-        own, y, noise = response
-        again = followed(y, start_s)
-        values, before = seen - np.array([*again.a, again.b, again.delay_s]) + own, values
+            return _model(data, order, values, last.covariance)
+        own, y, residual = response
+        values, before = seen - _values(followed(y, start_s)) + own, values
+        noise = float(np.std(residual) / np.std(data.y))
         if np.all(np.abs(values - before) <= max(_ROUNDING, _SHARE_OF_NOISE * noise) * np.abs(values)):
             break
-    return _model(data, order, values, last.covariance)
+    corrected, bias = values, np.zeros(values.size)
+    for _ in range(_MATCHES):  # the bias of least squares with noise in its regressors, at the estimate that it leaves
+        draws = _under_noise(lambda y: followed(y, start_s), y, residual, recording.name)
+        bias, before = np.mean(draws, axis=0) - _values(followed(y, start_s)), bias
+        corrected = values - bias
+        response = _response(data, order, corrected)
+        if response is None:
+            break
+        own, y, residual = response
+    return _model(data, order, corrected, _spread(draws) + np.outer(bias - before, bias - before))
 
 
-def _response(data: DelayData, order: int, values: FloatArray) -> tuple[FloatArray, FloatArray, float] | None:
-    """Return the best model with these a and h, its response and the residual's share of y; None if it overflows."""
+def _under_noise(
+    followed: Callable[[FloatArray], OnlineSample], y: FloatArray, residual: FloatArray, name: str
+) -> FloatArray:
+    """Return what is followed on a response under drawn noise, (draws, values); draws that lose lock are left out."""
+    draws = []
+    for drawn in _noise_like(residual, len(y)):
+        with contextlib.suppress(IdentificationError):
+            draws.append(_values(followed(y + drawn)))
+    if len(draws) < _DRAWS // 2:
+        raise IdentificationError(
+            "under noise as it is here the delay cannot be followed",
+            where=name,
+            remedy="start nearer to the delay, forget more slowly, or take --method algebraic",
+        )
+    return np.array(draws)
+
+
+def _values(sample: OnlineSample) -> FloatArray:
+    return np.array([*sample.a, sample.b, sample.delay_s])
+
+
+def _noise_like(residual: FloatArray, rows: int) -> Iterator[FloatArray]:
+    """Yield records of noise with the residual's variance and colour."""
+    colour = np.array([1.0, *whitening_filter(residual)])
+    innovations = lfilter(colour, [1.0], residual)[colour.size - 1 :]
+    rng = np.random.default_rng(0)
+    for _ in range(_DRAWS):
+        white = float(np.std(innovations)) * rng.standard_normal(rows + _SETTLING)
+        yield np.asarray(lfilter([1.0], colour, white)[_SETTLING:])
+
+
+def _spread(draws: FloatArray) -> FloatArray:
+    """Return the covariance of estimates, larger by what few draws leave open: 1.96 sd are a 95 % interval."""
+    open_left = float(student.ppf(0.975, len(draws) - 1) / norm.ppf(0.975)) ** 2
+    return np.asarray(np.cov(draws.T) * open_left)
+
+
+def _response(data: DelayData, order: int, values: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray] | None:
+    """Return the best model with these a and h, its response and what that leaves of y; None if it overflows."""
     a, h = tuple(values[:order].tolist()), max(float(values[order + 1]), 0.0)
     usable = data.usable_from(h)
     point = solve_linear(usable, Structure(order=order), a, h)
@@ -151,7 +206,7 @@ def _response(data: DelayData, order: int, values: FloatArray) -> tuple[FloatArr
         return None
     y, residual = data.y.copy(), residuals(usable, point)
     y[-usable.y.size :] -= residual
-    return np.array([*a, point.theta[0], h]), y, float(np.std(residual) / np.std(usable.y))
+    return np.array([*a, point.theta[0], h]), y, residual
 
 
 def _model(data: DelayData, order: int, values: FloatArray, covariance: FloatArray) -> DelayModel:
