@@ -120,8 +120,8 @@ def online_delay(
     -------
     DelayModel
         The last row's estimates, with the covariance of what is followed on the model's own response under noise of the
-        residual's variance and colour. The mean that noise moves these by is taken off twice; what it differed by is
-        counted as uncertainty besides.
+        residual's variance and colour. The mean that noise moves these by is taken off, and counted as
+        uncertainty besides, which makes intervals rather too wide than too narrow.
 
     Raises
     ------
@@ -148,16 +148,16 @@ def online_delay(
         noise = float(np.std(residual) / np.std(data.y))
         if np.all(np.abs(values - before) <= max(_ROUNDING, _SHARE_OF_NOISE * noise) * np.abs(values)):
             break
-    corrected, bias = values, np.zeros(values.size)
+    corrected = values
     for _ in range(_MATCHES):  # the bias of least squares with noise in its regressors, at the estimate that it leaves
         draws = _under_noise(lambda y: followed(y, start_s), y, residual, recording.name)
-        bias, before = np.mean(draws, axis=0) - _values(followed(y, start_s)), bias
+        bias = np.mean(draws, axis=0) - _values(followed(y, start_s))
         corrected = values - bias
         response = _response(data, order, corrected)
         if response is None:
             break
         own, y, residual = response
-    return _model(data, order, corrected, _spread(draws) + np.outer(bias - before, bias - before))
+    return _model(data, order, corrected, _spread(draws) + np.outer(bias, bias))
 
 
 def _under_noise(
