@@ -9,7 +9,7 @@ What can go wrong, and what is done about it:
   anything but a clean answer (also an interrupted request) the line is resynchronised, see :meth:`ModbusLink._flush`.
 - Every answer is checked against its request: function code, number of registers, echoed address and value.
 - An open but silent peer costs (retries + 1) x timeout_s, plus late_reply_s each on RTU; no wait is without end.
-- A peer that says that it is busy (exceptions 5 and 6) is asked again after waits that double, for as long as a silent
+- A peer that says that it is busy (exceptions 5 and 6) is asked again after waits that grow, for as long as a silent
   one would cost.
 """
 
@@ -51,8 +51,8 @@ _EXCEPTIONS = {
     11: ("does not answer its gateway", "check unit_id and the gateway"),
 }
 _BUSY = (5, 6)
-#: first wait before a busy device is asked again [s]
-_BUSY_WAIT_S = 0.005
+#: first and longest wait before a busy device is asked again [s]: its dead-man runs meanwhile
+_BUSY_WAIT_S, _LONGEST_BUSY_WAIT_S = 0.005, 0.05
 #: what the library raises where the line is gone, beside the line's own errors
 _LOST = (ConnectionException,)
 _READ = {
@@ -283,7 +283,7 @@ class ModbusLink:
                 raise DeviceRefused(what, where=f"{self.where}, {table} {address}", remedy=remedy)
             if (room_s := busy_until_s - time.monotonic()) > 0.0:
                 time.sleep(min(wait_s, room_s))
-                wait_s, left = 2.0 * wait_s, max(left, 1)
+                wait_s, left = min(2.0 * wait_s, _LONGEST_BUSY_WAIT_S), max(left, 1)
         raise LinkError(what, where=f"{self.where}, {table} {address}", remedy=remedy)
 
     def _attempt(self, ask: Callable[[Any], ModbusPDU]) -> ModbusPDU:

@@ -100,6 +100,7 @@ class ControlLoop:
         self._rows = RecentRows(writer.path)
         self._latency: deque[float] = deque(maxlen=KEPT_ROWS)
         self._lateness: deque[float] = deque(maxlen=KEPT_ROWS)
+        self._decisions: deque[float] = deque(maxlen=KEPT_ROWS)
         self._exchange = rig.exchange if isinstance(rig, Exchanges) else None
         self._feed = rig.feed if isinstance(rig, Feeds) else None
         # a virtual clock lets nobody wait for a signal: slices would only be work for the plant
@@ -179,6 +180,7 @@ class ControlLoop:
             return self.tick
         self._write_row(u, extra or {})
         self.rig.write(u)
+        self._decisions.append(self.rig.clock.now() - self._reading.t_s)
         self._wait()
         self._reading = self.rig.read()
         self.tick = self._judged(self._reading, u=u)
@@ -251,6 +253,7 @@ class ControlLoop:
         return Timing(
             latency_s=spread(self._latency),
             lateness_s=spread(self._lateness),
+            decision_s=spread(self._decisions),
             missed=self._missed,
             unusable=self._rows.unusable,
             rows=len(self._rows),

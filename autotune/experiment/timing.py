@@ -44,6 +44,8 @@ class Timing:
     ----------
     latency_s, lateness_s : (float, float, float)
         Time of a reading on the link, and from a sample's deadline to when the loop woke for it [s].
+    decision_s : (float, float, float)
+        Time from a sample's stamp to its command in the device, acknowledged [s]; NaN where nobody has measured it.
     missed, unusable, rows : int
         Sample times without a row, rows whose reading was not used, rows.
     """
@@ -53,6 +55,7 @@ class Timing:
     missed: int
     unusable: int
     rows: int = 0
+    decision_s: tuple[float, float, float] = (math.nan, math.nan, math.nan)
 
     @property
     def missed_share(self) -> float:
@@ -64,6 +67,7 @@ class Timing:
         return {
             "latency_s": [value for value in self.latency_s if math.isfinite(value)],
             "lateness_s": [value for value in self.lateness_s if math.isfinite(value)],
+            "decision_s": [value for value in self.decision_s if math.isfinite(value)],
             "missed_samples": self.missed,
             "unusable_samples": self.unusable,
             "rows": self.rows,
@@ -79,4 +83,5 @@ class Timing:
             missed=table.get("missed_samples", 0),
             unusable=table.get("unusable_samples", 0),
             rows=table.get("rows", 0),
+            decision_s=tuple(table.get("decision_s") or unknown),
         )

@@ -297,7 +297,8 @@ def _experiment_section(
             f" {signals.u_unit}; the measurement's noise has a standard deviation of {experiment.noise_sd:.3g}"
             f" {signals.y_unit}.",
             f"It ended because: {experiment.reason}; {sentence(experiment.output)}.",
-            f"Link latency {_milliseconds(timing.latency_s)}, lateness of the loop {_milliseconds(timing.lateness_s)}"
+            f"Link latency {_milliseconds(timing.latency_s)}, lateness of the loop {_milliseconds(timing.lateness_s)},"
+            f"{_decision(timing.decision_s)}"
             f" (median, 99 %, worst); {timing.missed} sample(s) missed, {timing.unusable} unusable.",
         ),
         tables=(sittings,) if len(parts) > 1 else (),
@@ -310,6 +311,11 @@ def _experiment_section(
             ),
         ),
     )
+
+
+def _decision(values: tuple[float, float, float]) -> str:
+    """Return the time from a reading to its command, where the host computes it."""
+    return f" from a reading to its command {_milliseconds(values)}" if math.isfinite(values[0]) else ""
 
 
 def _milliseconds(values: tuple[float, float, float]) -> str:

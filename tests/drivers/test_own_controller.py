@@ -245,7 +245,12 @@ PEER: dict[str, Any] = {
 
 @pytest.fixture(scope="session")
 def controller_program(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    program = tmp_path_factory.mktemp("controller") / "controller"
+    return compiled_controller(tmp_path_factory.mktemp("controller"))
+
+
+def compiled_controller(folder: Path) -> Path:
+    """Compile the controller in C, and return the program."""
+    program = folder / "controller"
     source = Path(__file__).with_name("libmodbus_controller.c")
     command = ["gcc", "-O2", "-Wall", "-Wextra", "-I/usr/include/modbus", "-o", program, source, "-lmodbus", "-lm"]
     subprocess.run(command, check=True)

@@ -10,7 +10,7 @@ import pytest
 
 from autotune.errors import ExperimentStopped, LinkError, OperatorStop
 from autotune.experiment.limits import Watch
-from autotune.experiment.loop import ControlLoop, Tick
+from autotune.experiment.loop import ControlLoop, Tick, Timing
 from autotune.recording import read_recording
 from sim.imperfections import Fault
 from tests.autotune.experiment.rigs import ball_config, ball_rig, open_loop
@@ -201,3 +201,20 @@ def test_a_virtual_clock_is_waited_on_once_per_sample(recording: Path) -> None:
         for _ in range(5):
             loop.step(loop.nearest(0.0))
     assert waits == pytest.approx([2.0, 4.0, 6.0, 8.0, 10.0])
+
+
+def test_the_time_from_a_reading_to_its_command_is_kept(recording: Path) -> None:
+    rig = ball_rig()
+    write = rig.write
+
+    def slow_write(u: float) -> None:
+        rig.clock.sleep_until(rig.clock.now() + 0.003)
+        write(u)
+
+    rig.write = slow_write  # type: ignore[method-assign]  # the real write, on a line that takes 3 ms
+    with open_loop(rig, recording) as loop:
+        for _ in range(5):
+            loop.step(loop.nearest(1.0))
+    assert loop.timing.decision_s == pytest.approx((0.003, 0.003, 0.003))
+    assert Timing.from_table(loop.timing.to_table()) == loop.timing
+    assert loop.timing.missed == 0

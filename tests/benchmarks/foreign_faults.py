@@ -1,0 +1,186 @@
+"""Faults of a controller in C that is not the project's own code: is each safe, named, and never called verified?
+
+The device (``tests/drivers/libmodbus_controller.c``: its own plant, clock and positional PI, on libmodbus) understands
+the gains otherwise, or the line to it fails, while a hand-over tries them. A line says whether they were kept, which K
+the device holds afterwards, what it puts out when the host has gone, and what was said.
+``FAULTS=minutes`` runs those whose name has the pattern in it.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+import struct
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pyModbusTCP.client import ModbusClient
+
+from autotune.controller import PIDController
+from autotune.errors import AutotuneError
+from autotune.experiment.judgement import Verification
+from autotune.experiment.verify import run_verification
+from autotune.pipeline.deployment import deploy
+from drivers import open_rig
+from tests.autotune.experiment.test_verify import fitted
+from tests.drivers.tcp_relay import Direction, Tamper, TcpRelay, unharmed
+from tests.drivers.test_own_controller import GAINS, LAGS, compiled_controller, controller, peer_config
+
+#: moment of a fault on the line [s], in the middle of the trial
+MOMENT_S = 8.0
+SAFE_U = 4.5
+OLD_K = 0.1
+#: after which the device takes its own safe output, and a little [s]
+DEADMAN_S = 1.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outcome:
+    """What became of a hand-over: whether the new gains were kept, what was said, K and output of the device."""
+
+    kept: bool
+    said: str
+    K: float
+    output: float
+
+
+@dataclass(frozen=True)
+class Fault:
+    """A fault: its name, how the device understands its gains, what has to be said, and what happens on the line."""
+
+    name: str
+    law: str
+    named: str
+    kept: bool = False
+    strike: Callable[[TcpRelay], None] | None = None
+
+    def is_right(self, outcome: Outcome) -> bool:
+        """Return whether it was named, the device is at its safe output, and its gains are said as they are."""
+        holds_new = abs(outcome.K - GAINS.K) < 1e-6
+        told = outcome.kept or abs(outcome.K - OLD_K) < 1e-6 or "may hold old, new or mixed gains" in outcome.said
+        safe = abs(outcome.output - SAFE_U) < 1e-3
+        return (
+            bool(re.search(self.named, outcome.said))
+            and outcome.kept == self.kept
+            and safe
+            and (holds_new if self.kept else told)
+        )
+
+
+def _reset(line: TcpRelay) -> None:
+    line.reset()
+
+
+def _for_a_while(tamper: Tamper, seconds: float) -> Callable[[TcpRelay], None]:
+    def strike(line: TcpRelay) -> None:
+        line.tamper = tamper
+        if math.isfinite(seconds):
+            time.sleep(seconds)
+            line.tamper = unharmed
+
+    return strike
+
+
+def _silent(frame: bytes, direction: Direction) -> Sequence[tuple[float, bytes]]:
+    return ()
+
+
+def _late(frame: bytes, direction: Direction) -> Sequence[tuple[float, bytes]]:
+    return ((1.3, frame),) if direction == "to host" else ((0.0, frame),)
+
+
+def _refusal(code: int) -> Tamper:
+    """Return a device that answers everything with an exception."""
+
+    def tamper(frame: bytes, direction: Direction) -> Sequence[tuple[float, bytes]]:
+        if direction == "to device":
+            return ((0.0, frame),)
+        return ((0.0, frame[:4] + bytes((0, 3, frame[6], frame[7] | 0x80, code))),)
+
+    return tamper
+
+
+FAULTS = (
+    Fault("none", "ideal", "behaves as predicted", kept=True),
+    Fault("wrong word order", "swapped", "wrong word_order of rig.registers.K"),
+    Fault("minutes for seconds", "minutes", "times in minutes for seconds"),
+    Fault("percent", "percent", "percent for engineering units"),
+    Fault("parallel form", "parallel", "parallel form"),
+    Fault("wrong sign", "reversed", "the wrong sign"),
+    Fault("connection reset", "ideal", "behaves as predicted", kept=True, strike=_reset),
+    Fault("busy for .35 s", "ideal", "behaves as predicted", kept=True, strike=_for_a_while(_refusal(6), 0.35)),
+    Fault("silent for .1 s", "ideal", "behaves as predicted", kept=True, strike=_for_a_while(_silent, 0.1)),
+    Fault("answers too late for good", "ideal", "no answer|link too slow", strike=_for_a_while(_late, math.inf)),
+    Fault("silent for good", "ideal", "no answer", strike=_for_a_while(_silent, math.inf)),
+    Fault("fails for good", "ideal", "failed to do it", strike=_for_a_while(_refusal(4), math.inf)),
+)
+
+
+def run_fault(fault: Fault, program: Path, folder: Path) -> Outcome:
+    """Hand gains over to the device, with the fault in the middle of their trial."""
+    fit = fitted(LAGS, 1.5, 3.0, 5.0, 8.0)
+    with controller(program, fault.law) as port, TcpRelay(port) as line:
+        config = peer_config(line.port, folder)
+        # shorter than the device's dead-man, as on any rig that is to ride through a lost answer
+        config = config.model_copy(update={"rig": config.rig.model_copy(update={"timeout_s": 0.2})})
+        rig: Any = open_rig(config.rig, u_range=(0.0, 10.0), u_safe=SAFE_U)
+        striker = threading.Timer(MOMENT_S, fault.strike, (line,)) if fault.strike is not None else None
+
+        def trial(gains: PIDController) -> Verification:
+            if striker is not None:
+                striker.start()
+            return run_verification(
+                rig, config, gains, fit, folder / "trial.csv", u_rest=5.0, noise_sd=1e-3, on_device=True
+            )
+
+        kept = False
+        try:
+            done = deploy(rig, GAINS, folder / "journal.jsonl", agree=lambda *_: None, try_out=trial)
+            assert done.verification is not None
+            said, kept = done.verification.reason, done.kept
+        except AutotuneError as error:
+            said = str(error)
+        finally:
+            rig.close()
+            if striker is not None:
+                striker.join()
+        time.sleep(DEADMAN_S)
+        return Outcome(kept=kept, said=said, K=_float(port, "holding", 10), output=_float(port, "input", 2))
+
+
+def _float(port: int, table: str, address: int) -> float:
+    """Return a float of the device, by another library and past the harmed line."""
+    client = ModbusClient(host="127.0.0.1", port=port, timeout=2.0)
+    words = (client.read_input_registers if table == "input" else client.read_holding_registers)(address, 2)
+    client.close()
+    return float(struct.unpack(">f", struct.pack(">2H", *words))[0])
+
+
+def main() -> None:
+    """Print a line for each fault, and how many were as they should be."""
+    faults = [fault for fault in FAULTS if re.search(os.environ.get("FAULTS", ""), fault.name)]
+    right = 0
+    with tempfile.TemporaryDirectory() as place:
+        program = compiled_controller(Path(place))
+        for fault in faults:
+            folder = Path(place) / fault.name.replace(" ", "_")
+            folder.mkdir()
+            outcome = run_fault(fault, program, folder)
+            is_right = fault.is_right(outcome)
+            right += is_right
+            print(
+                f"{'right' if is_right else 'WRONG'}  {fault.name}: {'kept' if outcome.kept else 'not kept'},"
+                f" K = {outcome.K:.3g}, output {outcome.output:.3g}: {outcome.said[:220]}",
+                flush=True,
+            )
+    print(f"safe, named and not called verified: {right} of {len(faults)}")
+
+
+if __name__ == "__main__":
+    main()
