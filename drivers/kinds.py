@@ -21,6 +21,7 @@ from autotune.config.rig import (
     ModbusRtuSettings,
     ModbusTcpSettings,
     ModbusTlsSettings,
+    OpcUaSettings,
     ReplaySettings,
     SerialSettings,
     SimulatedRigSettings,
@@ -137,6 +138,7 @@ KINDS = (
     Kind(ModbusTcpSettings, "drivers.modbus_rig", has_registers=True),
     Kind(ModbusTlsSettings, "drivers.modbus_rig", has_registers=True),
     Kind(ModbusRtuSettings, "drivers.modbus_rig", has_registers=True),
+    Kind(OpcUaSettings, "drivers.opcua_rig"),
     Kind(SerialSettings, "drivers.device_rig"),
 )
 

@@ -45,9 +45,10 @@ def unguarded(config: Config) -> str:
     registers = getattr(config.rig, "registers", None)
     if registers is None or registers.heartbeat is not None:
         return ""
+    place = "nodes" if hasattr(config.rig, "nodes") else "registers"
     return (
         "no dead-man is mapped: if this computer or the line fails, the device may hold the last command for ever;"
-        " map rig.registers.heartbeat, or stand at the rig's stop"
+        f" map rig.{place}.heartbeat, or stand at the rig's stop"
     )
 
 

@@ -59,10 +59,15 @@ def deploy(
     y_span: Annotated[float, typer.Option(help="engineering span of the measurement [y unit]")] = 1.0,
     verify: Annotated[bool, typer.Option(help="try the new gains on the rig and take them back if they fail")] = True,
     yes: Annotated[bool, typer.Option("--yes", help="do not ask")] = False,
+    approved_by: Annotated[
+        str | None, typer.Option(metavar="NAME", help="second person who approves, where [approval] asks for one")
+    ] = None,
+    reason: Annotated[str | None, typer.Option(metavar="TEXT", help="why that person approves")] = None,
 ) -> None:
     """Write gains into the rig's own controller, read them back, verify the loop; else restore the old gains."""
     from autotune.config import load_config
     from autotune.experiment.judgement import require_predictable
+    from autotune.pipeline.approval import approval_of
     from autotune.pipeline.audit import audit_log
     from autotune.pipeline.deployment import deploy as hand_over
     from autotune.pipeline.folder import JOURNAL, next_free
@@ -72,6 +77,7 @@ def deploy(
     from autotune.report.run_page import deployment_page
 
     content = load_config(config)
+    approval = approval_of(content, approved_by, reason)
     new = _gains(controller, design, run)
     measured, fit = _plant(run, points) if verify else (None, None)
     rig = _with_gains(rig_of(content))
@@ -84,7 +90,7 @@ def deploy(
         )
     folder = _folder(config, run, out)
     console = Console(highlight=False, soft_wrap=True)
-    audit = audit_log(content, folder, "deploy")
+    audit = audit_log(content, folder, "deploy", asdict(approval) if approval is not None else None)
     _restore_interrupted(rig, folder / JOURNAL, console, yes, audit)
 
     def agree(old: PIDController, to_be: PIDController) -> None:

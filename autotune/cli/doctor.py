@@ -280,7 +280,7 @@ def _rig(content: Config) -> Iterator[Check]:
 def _file(name: str) -> Check:
     if os.access(name, os.R_OK):
         return Check(subject=name, found="may be read")
-    remedy = "give its path as seen from this folder; docs/modbus_tls.md makes certificates"
+    remedy = "give its path as seen from this folder; docs/modbus_tls.md and docs/opcua.md make certificates"
     return Check(subject=name, found="cannot be read", verdict="wrong", remedy=remedy)
 
 

@@ -80,6 +80,9 @@ def init(
     ] = None,
     host: Annotated[str | None, typer.Option(help="address of a Modbus TCP or TLS device")] = None,
     device: Annotated[str | None, typer.Option(help="serial device, see autotune ports")] = None,
+    endpoint: Annotated[str | None, typer.Option(help="address of an OPC UA server, opc.tcp://HOST:4840")] = None,
+    y_node: Annotated[str | None, typer.Option(metavar="NODE", help="node of y on it, e.g. ns=2;s=Ball.y")] = None,
+    u_node: Annotated[str | None, typer.Option(metavar="NODE", help="node of u on it")] = None,
     recording: Annotated[str | None, typer.Option(help="recording that is replayed as a rig")] = None,
     y_register: Annotated[
         str | None, typer.Option(metavar=REGISTER, help="Modbus register of y, e.g. input:0:int16,scale=0.01")
@@ -157,6 +160,7 @@ def init(
         content = _simulated(twin)
     else:
         given = {"host": host, "device": device, "recording": recording, "y_span": y_span, "u_span": u_span}
+        given |= {"endpoint": endpoint, "y_node": y_node, "u_node": u_node}
         reached = _reached(questions, chosen, given | {"y": y_register, "u": u_register})
         if registers and not chosen.has_registers:
             raise InputError(f'kind = "{chosen.name}" has no registers', where="--register", remedy="leave it out")
@@ -217,6 +221,7 @@ def _played(twin: Plant | ModelOfRig | None, config: Path, answers: Table) -> Ta
 #: what a kind may have to be told, in the order in which it is asked: its key, the question
 _ASKED = {
     "host": "address of the device",
+    "endpoint": "address of the OPC UA server, opc.tcp://HOST:4840",
     "device": "serial device (autotune ports lists them)",
     "recording": "recording to replay, NAME.csv",
     "y_span": "y at count 0 and at the converter's full scale",
@@ -224,7 +229,7 @@ _ASKED = {
 }
 #: answers that follow a custom, to be looked at in the file
 _CUSTOM = {f"{which}_file": f"certificates/{name}" for which, name in
-           {"ca": "ca.pem", "cert": "host.pem", "key": "host.key"}.items()}  # fmt: skip
+           {"ca": "ca.pem", "cert": "host.pem", "key": "host.key", "server_cert": "server.pem"}.items()}  # fmt: skip
 
 
 def _reached(questions: Questions, kind: Kind, given: Mapping[str, Any]) -> Table:
@@ -235,6 +240,10 @@ def _reached(questions: Questions, kind: Kind, given: Mapping[str, Any]) -> Tabl
         if key in keys:
             convert = pair if key.endswith("_span") else str
             rig[key] = questions.ask(f"--{key.replace('_', '-')}", given[key], question, convert)
+    if "nodes" in keys:
+        asked = "node of {}, its id or path of browse names, e.g. ns=2;s=Ball.{}"
+        rig["nodes"] = {one: questions.ask(f"--{one}-node", given[f"{one}_node"], asked.format(one, one), str)
+                        for one in ("y", "u")}  # fmt: skip
     if kind.has_registers:
         asked = "register of {}, TABLE:ADDRESS:TYPE, e.g. {}:0:int16"
         y = questions.ask("--y-register", given["y"], asked.format("y", "input"), register)
@@ -305,7 +314,7 @@ def _section(path: str, model: type[BaseModel], given: Mapping[str, Any] | None)
     given_here = given or {}
     written, after = [], []
     for name, field in sorted(model.model_fields.items(), key=lambda named: named[0] != "kind"):
-        inner = None if path.endswith("registers") else _model(field.annotation, {})
+        inner = None if path.endswith(("registers", "nodes")) else _model(field.annotation, {})
         if inner is not None and not isinstance(given_here.get(name), list | tuple):
             if name in given_here:
                 after += _section(f"{path}.{name}", inner, given_here[name])

@@ -28,9 +28,9 @@ _CONFIG = Annotated[Path, typer.Argument(metavar="CONFIG.toml", help="configurat
 @app.command()
 def rig(config: _CONFIG) -> None:
     """Serve the config's simulated plant over its real transport, until stopped by Ctrl-C."""
-    from autotune.cli.served import device_of, modbus_settings, served, served_on_line
+    from autotune.cli.served import device_of, modbus_settings, served, served_on_line, served_opcua
     from autotune.config import load_config
-    from autotune.config.rig import SerialSettings
+    from autotune.config.rig import OpcUaSettings, SerialSettings
 
     content = load_config(config)
     console = Console(highlight=False)
@@ -40,6 +40,12 @@ def rig(config: _CONFIG) -> None:
     if isinstance(content.rig, SerialSettings):
         with served_on_line(content, content.rig):
             console.print(f"serving a microcontroller on {content.rig.device}; Ctrl-C ends it", markup=False)
+            stop.wait()
+        console.print("stopped")
+        return
+    if isinstance(content.rig, OpcUaSettings):
+        with served_opcua(content, content.rig):
+            console.print(f"serving OPC UA on {content.rig.endpoint}; Ctrl-C ends it", markup=False)
             stop.wait()
         console.print("stopped")
         return

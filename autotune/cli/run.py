@@ -90,6 +90,9 @@ def run(
         for note in tuning.analysis.notes:
             console.print(f"note: {note}", markup=False)
         console.print(page.verdict, markup=False)
+        if deploy and content.approval is not None:
+            again = f"autotune deploy CONFIG.toml --run {folder} --approved-by NAME --reason TEXT"
+            console.print(f"not handed over: [approval] asks for a second person: {again}", markup=False)
         for sentence in found.sentences if found is not None else ():
             console.print(sentence, markup=False)
         console.print(f"report: {folder / 'report.html'}", markup=False)

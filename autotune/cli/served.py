@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from autotune.config import Config
 from autotune.config.registers import RegisterMap, RegisterSettings
@@ -15,6 +15,7 @@ from autotune.config.rig import (
     ModbusRtuSettings,
     ModbusTcpSettings,
     ModbusTlsSettings,
+    OpcUaSettings,
     SerialSettings,
     TwinSettings,
 )
@@ -28,6 +29,9 @@ from sim.register_device import RegisterDevice
 from sim.registers import RegisterSpec
 from sim.serial_line import SerialLine
 from sim.serial_rig import SerialRig, device_on_line
+
+if TYPE_CHECKING:
+    from sim.opcua_rig import OpcUaRig
 
 
 def modbus_settings(config: Config) -> AnyModbusSettings:
@@ -78,7 +82,7 @@ def device_of(config: Config, plant: Plant | None = None) -> RegisterDevice:
     InputError
         The dead-man would run out between two samples.
     """
-    settings = modbus_settings(config)
+    settings = config.rig if isinstance(config.rig, OpcUaSettings) else modbus_settings(config)
     twin = _twin(settings)
     if twin.deadman_s <= config.signals.sample_time_s:
         raise InputError(
@@ -90,7 +94,8 @@ def device_of(config: Config, plant: Plant | None = None) -> RegisterDevice:
     specs = {name: spec_of(register) for name, register in registers.mapped().items()}
     if registers.unlock is not None:
         specs["unlock"] = spec_of(registers.unlock)
-    permissives = {f"permissive {one.name!r}": one for one in settings.permissives}
+    conditions = () if isinstance(settings, OpcUaSettings) else settings.permissives
+    permissives = {f"permissive {one.name!r}": one for one in conditions}
     specs |= {name: spec_of(register) for name, register in permissives.items()}
     device = RegisterDevice(
         plant or plant_of(twin, u_safe=config.limits.u_safe),
@@ -152,6 +157,39 @@ def served(config: Config, device: RegisterDevice, *, refuse: Refusal | None = N
 
 
 @contextmanager
+def served_opcua(config: Config, settings: OpcUaSettings, users: Mapping[str, str] | None = None) -> Iterator[OpcUaRig]:
+    """Serve the configuration's twin behind an OPC UA server at its endpoint until the context ends.
+
+    Raises
+    ------
+    InputError
+        There is no twin, the address is taken, or a secured server has no certificate.
+    """
+    from sim.opcua_rig import OpcUaRig, Security, ServedNode
+
+    twin, written = _twin(settings), settings.nodes.registers().mapped()
+    if settings.security_policy != "None" and not (twin.cert_file and twin.key_file):
+        raise InputError("the served twin has no certificate", where="rig.twin", remedy="give cert_file and key_file")
+    nodes = {
+        name: ServedNode(node=one.node, type=settings.nodes.type_of(name), writable=written[name].table == "holding")
+        for name, one in settings.nodes.mapped().items()
+    }
+    security = Security()
+    if settings.security_policy != "None":
+        trusted = str(Path(str(settings.cert_file)).parent)
+        security = Security(cert_file=twin.cert_file, key_file=twin.key_file, trusted=trusted, users=users)
+    rig = OpcUaRig(device_of(config), nodes, settings.endpoint, security)
+    try:
+        rig.__enter__()
+    except ConnectionError as error:
+        raise InputError(str(error), where="rig", remedy="free the address or give another one") from None
+    try:
+        yield rig
+    finally:
+        rig.__exit__(None, None, None)
+
+
+@contextmanager
 def served_on_line(config: Config, settings: SerialSettings) -> Iterator[SerialRig]:
     """Serve the configuration's twin as a microcontroller on a serial line until the context ends.
 
@@ -176,7 +214,7 @@ def served_on_line(config: Config, settings: SerialSettings) -> Iterator[SerialR
             yield rig
 
 
-def _twin(settings: AnyModbusSettings | SerialSettings) -> TwinSettings:
+def _twin(settings: AnyModbusSettings | OpcUaSettings | SerialSettings) -> TwinSettings:
     if settings.twin is None:
         raise InputError(
             "the rig has no simulated twin",

@@ -9,6 +9,7 @@ from typing import Annotated, Any
 from pydantic import Field, model_validator
 
 from autotune.config.procedure import (
+    ApprovalSettings,
     ControllerSettings,
     DesignSettings,
     ExperimentSettings,
@@ -37,6 +38,7 @@ class Config(Section):
     design: DesignSettings = DesignSettings()
     controller: ControllerSettings | None = None
     verification: VerificationSettings = VerificationSettings()
+    approval: ApprovalSettings | None = None
     audit_log: Annotated[
         Text | None,
         Field(

@@ -168,6 +168,12 @@ class ControllerSettings(Section):
     Ti_s: Annotated[Time, Field(description="integral time [s]")]
 
 
+class ApprovalSettings(Section):
+    """Gains are handed over with a second person's name and reason only; absent: whoever runs the tool may."""
+
+    approvers: Annotated[tuple[Text, ...], Field(description="who may approve; empty: anybody but who asks")] = ()
+
+
 class VerificationSettings(Section):
     """Set-point step and input-disturbance step on the rig with the new gains, compared with the prediction."""
 

@@ -7,6 +7,7 @@ from typing import Annotated, Literal, TypeAlias, get_args
 
 from pydantic import Field, model_validator
 
+from autotune.config.opcua import NodeMap
 from autotune.config.registers import RegisterMap, RegisterSettings
 from autotune.errors import InputError
 from autotune.schema import Number, Section
@@ -183,10 +184,64 @@ class SerialSettings(Section):
     twin: TwinSettings | None = None
 
 
+class OpcUaSettings(Section):
+    """A device behind an OPC UA server."""
+
+    kind: Literal["opcua"]
+    endpoint: Annotated[str, Field(pattern=r"^opc\.tcp://", description="address of the server, opc.tcp://HOST:4840")]
+    security_policy: Annotated[
+        Literal["Basic256Sha256", "Aes128Sha256RsaOaep", "Aes256Sha256RsaPss", "None"],
+        Field(description="how messages are secured; None is for a server on this computer"),
+    ] = "Basic256Sha256"
+    security_mode: Annotated[
+        Literal["SignAndEncrypt", "Sign"], Field(description="whether messages are encrypted as well as signed")
+    ] = "SignAndEncrypt"
+    cert_file: Annotated[str | None, Field(description="this host's certificate, PEM or DER")] = None
+    key_file: Annotated[str | None, Field(description="this host's private key, PEM")] = None
+    server_cert_file: Annotated[
+        str | None, Field(description="the server's certificate, PEM or DER: no other is talked to")
+    ] = None
+    user: Annotated[str | None, Field(description="user; absent: anonymous")] = None
+    password_file: Annotated[str | None, Field(description="file whose first line is the user's password")] = None
+    timeout_s: Annotated[float, Field(gt=0, le=60, description="longest wait for one answer [s], up to 60")] = 1.0
+    retries: Annotated[
+        int, Field(ge=0, le=10, description="further attempts of one request, 0..10; such a sample is marked suspect")
+    ] = 1
+    feed_s: Annotated[
+        float, Field(gt=0, le=60, description="longest time between two heartbeats while the host commands [s]")
+    ] = 0.1
+    scan_time_s: Annotated[
+        float | None, Field(gt=0, le=60, description="cycle of the device's program [s]; absent: not known, 0.02")
+    ] = None
+    nodes: NodeMap
+    twin: TwinSettings | None = None
+
+    @property
+    def registers(self) -> RegisterMap:
+        """The nodes as registers."""
+        return self.nodes.registers()
+
+    @model_validator(mode="after")
+    def _secured(self) -> OpcUaSettings:
+        files = {name: getattr(self, name) for name in ("cert_file", "key_file", "server_cert_file")}
+        missing = [name for name, file in files.items() if file is None]
+        if self.security_policy != "None" and missing:
+            raise ValueError(f"security_policy = {self.security_policy!r} needs {', '.join(missing)}")
+        if (self.user is None) != (self.password_file is None):
+            raise ValueError("user and password_file belong together")
+        return self
+
+
 AnyModbusSettings: TypeAlias = ModbusTcpSettings | ModbusTlsSettings | ModbusRtuSettings
 
 RigSettings: TypeAlias = Annotated[
-    SimulatedRigSettings | ReplaySettings | ModbusTcpSettings | ModbusTlsSettings | ModbusRtuSettings | SerialSettings,
+    SimulatedRigSettings
+    | ReplaySettings
+    | ModbusTcpSettings
+    | ModbusTlsSettings
+    | ModbusRtuSettings
+    | OpcUaSettings
+    | SerialSettings,
     Field(discriminator="kind", description="how the rig is reached"),
 ]
 

@@ -7,6 +7,7 @@ import hashlib
 import json
 import os
 import socket
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -35,12 +36,15 @@ class AuditLog:
         SHA-256 of the configuration with every default filled in.
     command : str
         What is done: run, deploy.
+    approval : mapping of str to str, optional
+        Name and reason of the second person who approved it.
     """
 
     path: Path
     rig: str
     configuration: str
     command: str
+    approval: Mapping[str, str] | None = None
 
     def note(self, verdict: str, *, old: PIDController, new: PIDController, why: str = "") -> None:
         """Append a line and bring it to the disk.
@@ -71,6 +75,8 @@ class AuditLog:
             "verdict": verdict,
             "why": why,
         }
+        if self.approval is not None:
+            line["approval"] = dict(self.approval)
         # one write on a file opened for appending: lines of other processes come before or after it, never within
         file = os.open(self.path, os.O_RDWR | os.O_APPEND | os.O_CREAT, 0o644)
         try:
@@ -86,7 +92,7 @@ class AuditLog:
             os.close(file)
 
 
-def audit_log(config: Config, folder: Path, command: str) -> AuditLog:
+def audit_log(config: Config, folder: Path, command: str, approval: Mapping[str, str] | None = None) -> AuditLog:
     """Return the log that the configuration names; by default ``audit.jsonl`` in the folder of the journal.
 
     Raises
@@ -103,6 +109,7 @@ def audit_log(config: Config, folder: Path, command: str) -> AuditLog:
         rig=config.name,
         configuration=hashlib.sha256(canonical.encode()).hexdigest(),
         command=command,
+        approval=approval,
     )
 
 

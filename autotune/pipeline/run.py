@@ -90,7 +90,8 @@ def tune(
     out : Path
         Existing folder.
     verify, deploy : bool
-        Whether to try the new loop on the rig, and to write the gains into the rig's own controller once accepted.
+        Whether to try the new loop on the rig, and to write the gains into the rig's own controller once accepted;
+        not where ``[approval]`` asks for a second person.
     resume : bool
         Whether to go on with what an interrupted run left in ``out``: only the points that are missing are measured.
     on_status : callable, optional
@@ -115,6 +116,7 @@ def tune(
     IdentificationError, DesignError
         The points give no model or no controller; they are in ``out``.
     """
+    deploy = deploy and config.approval is None  # a second person does it with autotune deploy
     earlier = read_interrupted(out, config) if resume else Earlier()
     try:
         store_config(config, out)

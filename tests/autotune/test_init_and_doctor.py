@@ -54,6 +54,7 @@ def test_a_simulated_rig_is_described_as_the_shipped_configuration_does(tmp_path
         ("modbus_tcp", ["--host", "10.0.0.2", *MODBUS]),
         ("modbus_tls", ["--host", "10.0.0.2", *MODBUS]),
         ("modbus_rtu", ["--device", "/dev/ttyUSB0", *MODBUS]),
+        ("opcua", ["--endpoint", "opc.tcp://h:4840", "--y-node", "ns=2;s=y", "--u-node", "2:Rig/2:u"]),
         ("serial", ["--device", "/dev/ttyACM0", "--y-span", "0", "100", "--u-span", "0", "10"]),
         ("replay", ["--recording", "rig.csv"]),
     ],
@@ -72,6 +73,7 @@ def test_what_is_written_loads_and_keeps_the_answers(tmp_path: Path, kind: str, 
 def test_every_kind_that_there_is_a_driver_for_can_be_described(tmp_path: Path) -> None:
     answers = [*MODBUS, *REAL, "--host", "h", "--device", "/dev/ttyS9", "--recording", "r.csv"]
     answers += ["--y-span", "0", "1", "--u-span", "0", "10"]
+    answers += ["--endpoint", "opc.tcp://h:4840", "--y-node", "ns=2;s=y", "--u-node", "2:Rig/2:u"]
     for kind in KINDS:
         path = tmp_path / f"{kind.name}.toml"
         command("init", path, "--kind", kind.name, *answers, *(["--plant", "ball"] if kind.name == "simulated" else []))
@@ -311,6 +313,17 @@ def test_a_twin_of_a_transfer_function_has_a_sensor_as_rigs_have(tmp_path: Path,
 def test_one_lag_and_a_plant_that_rings_run_from_init_to_accepted(tmp_path: Path, plant: TextbookPlant) -> None:
     outcome = run_twin(plant, tmp_path)
     assert outcome.accepted, outcome.said
+
+
+def test_a_run_hands_nothing_over_where_a_second_person_is_asked_for(tmp_path: Path) -> None:
+    path, plant = tmp_path / "rig.toml", PLANTS[2]
+    command("init", path, "--kind", "simulated", "--model", plant.written, *plant.answers)
+    path.write_text(path.read_text() + "\n[approval]\n")
+    said = command("run", path, "--out", tmp_path / "out")
+    assert "Accepted" in said
+    assert "not handed over: [approval] asks for a second person: autotune deploy" in said
+    assert (tmp_path / "out" / "journal.jsonl").read_text().count("gains") == 1  # read, and nothing written
+    assert not (tmp_path / "out" / "audit.jsonl").exists()
 
 
 @pytest.mark.slow

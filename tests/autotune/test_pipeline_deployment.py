@@ -427,6 +427,40 @@ def test_the_audit_log_says_who_changed_what_when_from_where_and_why(line: Line,
     assert (found[-1]["old"]["K"], found[-1]["new"]["K"]) == (held.K, held.K)  # the old gains again
 
 
+def asking(path: Path, table: str) -> list[str]:
+    """Have a configuration ask for a second person; return a call that hands gains over."""
+    path.write_text(path.read_text() + f"\n{table}\n")
+    return ["deploy", str(path), "--controller", str(path.with_name("new.toml")), "--no-verify", "--yes"]
+
+
+@pytest.mark.parametrize(
+    ("table", "given", "said"),
+    [
+        ("[approval]", [], "the hand-over needs a second person's name"),
+        ("[approval]", ["--approved-by", "Ada"], "the hand-over needs a second person's reason"),
+        ("[approval]", ["--approved-by", user(), "--reason", "x"], "asks for the hand-over and cannot approve it"),
+        ('[approval]\napprovers = ["Grace"]', ["--approved-by", "Ada", "--reason", "x"], "none of those who may"),
+    ],
+)
+def test_without_a_second_person_nothing_is_written(
+    line: Line, tmp_path: Path, table: str, given: list[str], said: str
+) -> None:
+    call = asking(config_file(line, tmp_path), table)
+    error = CliRunner().invoke(app, [*call, *given]).exception
+    assert isinstance(error, InputError)
+    assert said in str(error)
+    assert line.gains == OLD
+
+
+def test_a_second_persons_name_and_reason_are_in_the_audit_log_with_the_gains(line: Line, tmp_path: Path) -> None:
+    call = asking(config_file(line, tmp_path), '[approval]\napprovers = ["Ada"]')
+    assert CliRunner().invoke(app, [*call, "--approved-by", "ada", "--reason", "seen at the rig"]).exit_code == 0
+    assert line.gains == NEW
+    lines = [json.loads(text) for text in (tmp_path / "rig-gains" / "audit.jsonl").read_text().splitlines()]
+    assert all(one["approval"] == {"name": "ada", "reason": "seen at the rig"} for one in lines)
+    assert (lines[-1]["old"]["K"], lines[-1]["new"]["K"]) == (OLD.K, NEW.K)
+
+
 def test_one_changed_key_is_another_configuration(tmp_path: Path) -> None:
     config = load_config(ROOT / "configs" / "servo_sim.toml")
     swing = config.limits.model_copy(update={"swing": 0.4})

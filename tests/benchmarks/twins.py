@@ -105,6 +105,7 @@ REACHED = {
     "modbus_tcp": ("--host", "10.0.0.2"),
     "modbus_tls": ("--host", "10.0.0.2"),
     "modbus_rtu": ("--device", "/dev/ttyUSB0"),
+    "opcua": ("--endpoint", "opc.tcp://10.0.0.2:4840", "--y-node", "ns=2;s=y", "--u-node", "ns=2;s=u"),
     "serial": ("--device", "/dev/ttyACM0", "--y-span", "-50", "50", "--u-span", "0", "10"),
 }
 REGISTERS = ("--y-register", "input:0:float32", "--u-register", "holding:0:float32")
@@ -113,7 +114,7 @@ REGISTERS = ("--y-register", "input:0:float32", "--u-register", "holding:0:float
 def run_twin(plant: TextbookPlant, folder: Path, kind: str = "simulated") -> Outcome:
     """Write the plant's configuration with ``init``, run it or its twin, and return what was said."""
     config, began_s = folder / "rig.toml", time.monotonic()
-    reached = (*REACHED.get(kind, ()), *(() if kind in ("simulated", "serial") else REGISTERS))
+    reached = (*REACHED.get(kind, ()), *(REGISTERS if kind.startswith("modbus") else ()))
     written, said = _call("init", str(config), "--kind", kind, *reached, "--model", plant.written, *plant.answers)
     if written:
         dry = () if kind == "simulated" else ("--dry-run",)

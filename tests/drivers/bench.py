@@ -19,6 +19,7 @@ from autotune.config.rig import (
     ModbusRtuSettings,
     ModbusTcpSettings,
     ModbusTlsSettings,
+    OpcUaSettings,
     SerialSettings,
 )
 from autotune.experiment.rig import Rig
@@ -28,6 +29,7 @@ from drivers.replay import ReplayRig
 from drivers.simulated import SimulatedRig
 from sim.imperfections import Fault, FaultyPlant
 from sim.modbus_rig import ModbusRig, Refusal, RtuTransport, TcpTransport
+from sim.opcua_rig import OpcUaRig, ServedNode
 from sim.register_device import OutputChange, RegisterDevice
 from sim.serial_line import SerialLine, Tamper
 from sim.serial_rig import SerialRig, device_on_line
@@ -99,7 +101,7 @@ def register_device(registers: RegisterMap = REGISTERS, plant: Any = None) -> Re
     )
 
 
-def rig_of(settings: AnyModbusSettings | SerialSettings) -> Rig:
+def rig_of(settings: AnyModbusSettings | OpcUaSettings | SerialSettings) -> Rig:
     return open_rig(settings, u_range=U_RANGE, u_safe=U_SAFE)
 
 
@@ -148,6 +150,42 @@ def tls_bench(certificates: Path, **changes: Any) -> Iterator[Bench]:
         serving = stack.enter_context(ExitStack())
         server = serving.enter_context(ModbusRig(device, transport))
         rig = rig_of(tls_settings(server.port, certificates, **changes))
+        stack.callback(rig.close)
+        yield Bench(rig=rig, output=lambda: device.output, cut=serving.close, device=device)
+
+
+#: the same device on nodes: one signal in each form that servers have
+NODES = {
+    "y": "ns=2;s=y",
+    "u_applied": {"node": "ns=2;s=u_applied", "type": "float32"},
+    "heartbeat_echo": "ns=2;s=heartbeat_echo",
+    "in_command": "ns=2;s=in_command",
+    "u": {"node": "ns=2;s=u", "type": "int16", "scale": 1e-3},
+    "heartbeat": "ns=2;s=heartbeat",
+    "safe": {"node": "ns=2;s=safe", "type": "int32", "scale": 1e-3},
+    "enable": "ns=2;s=enable",
+    "automatic": {"node": "ns=2;s=automatic", "type": "boolean"},
+    "K": {"node": "ns=2;s=K", "type": "float32"},
+    "Ti": {"node": "ns=2;s=Ti", "type": "uint32", "scale": 1e-3},
+    "setpoint": {"node": "ns=2;s=setpoint", "type": "int64", "scale": 1e-4},
+}
+
+
+@contextmanager
+def opcua_bench(endpoint: str) -> Iterator[Bench]:
+    settings = OpcUaSettings.model_validate(
+        {"kind": "opcua", "endpoint": endpoint, "security_policy": "None", "nodes": NODES}
+    )
+    nodes, registers = settings.nodes, settings.registers
+    device = register_device(registers)
+    shown = {
+        name: ServedNode(node=one.node, type=nodes.type_of(name), writable=registers.mapped()[name].table == "holding")
+        for name, one in nodes.mapped().items()
+    }
+    with ExitStack() as stack:
+        serving = stack.enter_context(ExitStack())
+        serving.enter_context(OpcUaRig(device, shown, endpoint))
+        rig = rig_of(settings)
         stack.callback(rig.close)
         yield Bench(rig=rig, output=lambda: device.output, cut=serving.close, device=device)
 

@@ -19,6 +19,7 @@ from tests.drivers.bench import (
     U_SAFE,
     Bench,
     firmware_bench,
+    opcua_bench,
     replay_bench,
     rtu_bench,
     serial_bench,
@@ -26,14 +27,15 @@ from tests.drivers.bench import (
     tcp_bench,
     tls_bench,
 )
+from tests.drivers.test_rig_commands import free_port
 
 FIRMWARE = pytest.param(
     "firmware", marks=pytest.mark.system("gcc", "gcc-avr", "avr-libc", "libsimavr-dev", "libelf-dev")
 )
 ON_DEVICE = pytest.param("firmware, laws on the device", marks=FIRMWARE.marks)
-ALL = ("simulated", "replay", "tcp", "rtu", "tls", "serial", FIRMWARE, ON_DEVICE)
-MOVING = ("simulated", "tcp", "rtu", "tls", "serial", FIRMWARE, ON_DEVICE)
-REAL = ("tcp", "rtu", "tls", "serial")
+ALL = ("simulated", "replay", "tcp", "rtu", "tls", "opcua", "serial", FIRMWARE, ON_DEVICE)
+MOVING = ("simulated", "tcp", "rtu", "tls", "opcua", "serial", FIRMWARE, ON_DEVICE)
+REAL = ("tcp", "rtu", "tls", "opcua", "serial")
 
 
 @pytest.fixture
@@ -47,6 +49,8 @@ def bench(request: pytest.FixtureRequest) -> Iterator[Bench]:
             context = tcp_bench()
         case "rtu":
             context = rtu_bench()
+        case "opcua":
+            context = opcua_bench(f"opc.tcp://127.0.0.1:{free_port()}")
         case "serial":
             context = serial_bench()
         case "firmware":

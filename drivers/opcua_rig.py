@@ -1,0 +1,86 @@
+"""Rigs behind an OPC UA server: how they are opened, what has to be there, what can be read first."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from urllib.parse import urlsplit
+
+from autotune.config.rig import OpcUaSettings
+from autotune.controller import PIDController
+from autotune.errors import InputError
+from autotune.experiment.rig import Rig
+from drivers.gain_rig import GainRegisterRig
+from drivers.kinds import Reach, Session
+from drivers.probe import ProbedDevice, ProbedSignal
+from drivers.register_link import RegisterLink
+from drivers.register_rig import RegisterRig
+from drivers.registers import blocks, codecs
+
+#: port where an endpoint names none
+_PORT = 4840
+
+
+def _link(settings: OpcUaSettings, *, exclusive: bool = True) -> RegisterLink:
+    try:
+        from drivers.opcua import OpcUaLink
+    except ModuleNotFoundError as error:
+        raise InputError(
+            f"{error.name} is not installed", where='kind = "opcua"', remedy='pip install "relay-autotune[opcua]"'
+        ) from None
+    return OpcUaLink(settings, exclusive=exclusive)
+
+
+class NodeGainRig(GainRegisterRig):
+    """A device whose own controller's gains are in nodes: their words and bytes are the protocol's matter."""
+
+    def misread(self, controller: PIDController) -> dict[str, PIDController]:
+        """Return nothing: a node has one reading."""
+        return {}
+
+    def misread_setpoint(self, setpoint: float) -> dict[str, float]:
+        """Return nothing: a node has one reading."""
+        return {}
+
+
+def open_kind(settings: OpcUaSettings, session: Session) -> Rig:
+    """Return the rig, with its own controller's gains where they are mapped."""
+    registers = settings.registers
+    kind = RegisterRig if registers.held_gains is None else NodeGainRig
+    return kind(
+        _link(settings),
+        registers,
+        u_range=session.u_range,
+        u_safe=session.u_safe,
+        feed_s=settings.feed_s,
+        scan_time_s=settings.scan_time_s,
+    )
+
+
+def reached_by(settings: OpcUaSettings) -> Reach:
+    """Return the server's address, and the certificates."""
+    parts = urlsplit(settings.endpoint)
+    named = (settings.cert_file, settings.key_file, settings.server_cert_file, settings.password_file)
+    return Reach(
+        files=tuple(file for file in named if file is not None),
+        address=(parts.hostname or "", parts.port or _PORT),
+        timeout_s=settings.timeout_s,
+    )
+
+
+def probe_kind(settings: OpcUaSettings, expected: Mapping[str, tuple[float, float]]) -> ProbedDevice:
+    """Return every mapped node, read once; types and rights are looked at on the way."""
+    link = _link(settings, exclusive=False)
+    link.connect()
+    found = []
+    try:
+        for codec in codecs(settings.registers.mapped()).values():
+            value = codec.decode(link.read(blocks([codec])[0]).words) if codec.name != "device_time" else None
+            if value is None:
+                continue
+            low, high = expected.get(codec.name, (value, value))
+            said = () if low <= value <= high else (f"{value:.6g}, expected {low:g}..{high:g}: check scale and offset",)
+            node = getattr(settings.nodes, codec.name)
+            found.append(ProbedSignal(name=codec.name, raw=node.node, value=value, warnings=said))
+    finally:
+        link.disconnect()
+    return ProbedDevice(description=f"OPC UA server {settings.endpoint}", signals=tuple(found))

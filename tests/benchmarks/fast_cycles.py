@@ -1,0 +1,94 @@
+"""Short cycles on loopback: a relay every 10, 5 and 2 ms on Modbus TCP against the slave in C, and on OPC UA.
+
+OPC UA is served by asyncua in a process of its own, without security and signed and encrypted, every 50 and 20 ms.
+
+*missed* are sample times without a row; *decision* is the time from a sample's stamp to its command in the device,
+acknowledged: the row is on its way to the disk before the command is sent. Figures are of the machine as it is: its
+load is printed beside them. ``FAST_S=60`` runs each for so long; 20 s where nothing is said.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from autotune.config.procedure import LimitSettings
+from autotune.config.rig import ModbusTcpSettings
+from autotune.experiment.limits import Envelope
+from autotune.experiment.loop import ControlLoop
+from autotune.experiment.rig import Rig
+from autotune.experiment.timing import Timing
+from autotune.recording import RecordingWriter
+from drivers import open_rig
+from tests.benchmarks.modbus_cycle import SLAVE, slave
+from tests.drivers.test_opcua import ball, certificates_of_the_page
+
+CYCLES_S, OPC_CYCLES_S = (0.01, 0.005, 0.002), (0.05, 0.02)
+#: rows of a half period of the relay
+HALF = 10
+
+
+def run_cycles(rig: Rig, sample_time_s: float, seconds: float, folder: Path) -> Timing:
+    """Run a relay of no plant's for so long, and return how late it was."""
+    limits = LimitSettings(
+        u_min=0.0, u_max=10.0, u_safe=0.0, y_min=-100.0, y_max=100.0, swing=100.0, time_s=2 * seconds + 10
+    )
+    writer = RecordingWriter(folder / f"{sample_time_s:g}.csv", ("t", "u", "y"))
+    envelope = Envelope(settings=limits, sample_time_s=sample_time_s)
+    with ControlLoop(rig=rig, envelope=envelope, writer=writer) as loop:
+        for k in range(round(seconds / sample_time_s)):
+            loop.step(loop.nearest(3.0 if k // HALF % 2 else 1.0))
+        return loop.timing
+
+
+@contextmanager
+def modbus(folder: Path) -> Iterator[Rig]:
+    """Yield a rig on the slave in C."""
+    with slave("tcp") as port:
+        settings = ModbusTcpSettings(kind="modbus_tcp", port=port, timeout_s=1.0, registers=SLAVE)
+        yield open_rig(settings, u_range=(0.0, 10.0), u_safe=0.0)
+
+
+@contextmanager
+def opc_ua(folder: Path, *, secured: bool) -> Iterator[Rig]:
+    """Yield a rig on the ball behind a server in a process of its own."""
+    certificates_of_the_page(folder)
+    config = ball(folder, secured=secured)
+    with subprocess.Popen(
+        [sys.executable, "-m", "autotune.cli", "rig", str(folder / "ball.toml")], stdout=subprocess.PIPE, text=True
+    ) as server:
+        assert server.stdout is not None
+        server.stdout.readline()  # it serves
+        yield open_rig(config.rig, u_range=(0.0, 10.0), u_safe=0.0)
+        server.terminate()
+
+
+def main() -> None:
+    """Print a line for each link and cycle time."""
+    seconds = float(os.environ.get("FAST_S", "20"))
+    links = [("Modbus TCP", modbus, cycle_s) for cycle_s in CYCLES_S]
+    for secured in (False, True):
+        name = f"OPC UA, {'Basic256Sha256, encrypted' if secured else 'no security'}"
+        links += [(name, partial(opc_ua, secured=secured), cycle_s) for cycle_s in OPC_CYCLES_S]
+    for name, link, sample_time_s in links:
+        with tempfile.TemporaryDirectory() as folder, link(Path(folder)) as rig:
+            timing = run_cycles(rig, sample_time_s, seconds, Path(folder))
+        decision, late = 1e3 * np.array(timing.decision_s), 1e3 * np.array(timing.lateness_s)
+        print(
+            f"{name}, {1e3 * sample_time_s:g} ms: {timing.missed} of {timing.rows + timing.missed} missed;"
+            f" decision {decision[0]:.2f} ms median, {decision[1]:.2f} ms in 99 %, {decision[2]:.2f} ms at worst;"
+            f" woken late by {late[0]:.3f} ms, {late[1]:.2f} ms in 99 %; load average {os.getloadavg()[0]:.1f}",
+            flush=True,
+        )
+
+
+if __name__ == "__main__":
+    main()
