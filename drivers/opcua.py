@@ -25,7 +25,7 @@ from asyncua.crypto.uacrypto import CertProperties
 from asyncua.ua.uaerrors import UaStatusCodeError
 from cryptography import x509
 
-from autotune.config.opcua import SOURCE_TIME
+from autotune.config.opcua import SAMPLE, SOURCE_TIME
 from autotune.config.rig import OpcUaSettings
 from autotune.errors import InputError, LinkError
 from drivers.opcua_errors import refusal, sentence_on
@@ -53,8 +53,6 @@ _NAMES = {variant: name for name, variant in _VARIANTS.items()}
 _DEFECTS = (AssertionError, AttributeError, ImportError, NameError, TypeError)
 #: time-outs of a request that a whole connection may take: hello, channel, session, nodes
 _CONNECT = 5.0
-#: signals that the host never writes
-_ONLY_READ = ("y", "u_applied", "heartbeat_echo", "in_command")
 
 
 class OpcUaLink:
@@ -194,7 +192,7 @@ class OpcUaLink:
                     remedy=f'give rig.nodes.{name} its type = "{told}", and scale and offset' if told else
                     "map a node that holds a number",
                 )  # fmt: skip
-            if name not in _ONLY_READ and ua.AccessLevel.CurrentWrite not in access:
+            if name not in SAMPLE and ua.AccessLevel.CurrentWrite not in access:
                 raise self._refused(name, "BadNotWritable")
             self._nodes[name] = node
 

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import ssl
-import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from types import TracebackType
 from typing import Any, TypeAlias
 
 from pymodbus import FramerType
@@ -19,6 +17,7 @@ from pymodbus.simulator import DataType, SimData, SimDevice
 
 from sim.register_device import IllegalAddress, IllegalValue, RegisterDevice
 from sim.registers import RegisterSpec, Table
+from sim.served_rig import ServedRig
 
 _TABLE: dict[int, Table] = {
     1: "coil",
@@ -33,8 +32,6 @@ _TABLE: dict[int, Table] = {
     23: "holding",
 }
 _TABLES: tuple[Table, ...] = ("coil", "discrete", "holding", "input")
-_LIVE_S = 0.02
-_START_S = 10.0
 
 #: Asked before each request is served (table, address, whether it writes); a code is answered as Modbus exception.
 Refusal: TypeAlias = Callable[[str, int, bool], int | None]
@@ -69,7 +66,7 @@ class RtuTransport:
     stop_bits: int = 1
 
 
-class ModbusRig:
+class ModbusRig(ServedRig):
     """A device served in its own thread until the context ends.
 
     Parameters
@@ -92,49 +89,13 @@ class ModbusRig:
         unit_id: int = 1,
         refuse: Refusal | None = None,
     ) -> None:
-        self.device = device
+        super().__init__(device, transport, "modbus rig")
         self.port = 0
         self._transport = transport
         self._unit_id = unit_id
         self._refuse = refuse
-        self._ready = threading.Event()
-        self._failure: BaseException | None = None
-        self._loop: asyncio.AbstractEventLoop | None = None
-        self._stop: asyncio.Event | None = None
-        self._start_s = 0.0
-        self._thread = threading.Thread(target=self._run, name="modbus rig", daemon=True)
 
-    def __enter__(self) -> ModbusRig:
-        self.device.live(1e-9)  # the plant's first step may have to be compiled: before a port is waited for
-        self._thread.start()
-        if not self._ready.wait(_START_S):
-            self.__exit__(None, None, None)
-            raise ConnectionError(f"cannot serve on {self._transport}: nothing listens after {_START_S:g} s")
-        if self._failure is not None:
-            raise ConnectionError(f"cannot serve on {self._transport}: {self._failure}") from self._failure
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
-        if self._loop is not None and self._stop is not None and self._thread.is_alive():
-            self._loop.call_soon_threadsafe(self._stop.set)
-        self._thread.join(_START_S)
-
-    @property
-    def now_s(self) -> float:
-        """Device time [s]."""
-        return time.perf_counter() - self._start_s
-
-    def _run(self) -> None:
-        try:
-            asyncio.run(self._serve())
-        except Exception as failure:  # whatever it is, the thread that waits raises it
-            self._failure = failure
-        finally:
-            self._ready.set()
-
-    async def _serve(self) -> None:
-        self._loop = asyncio.get_running_loop()
-        self._stop = asyncio.Event()
+    async def _serve(self, stop: asyncio.Event) -> None:
         server = self._server()
         self._start_s = time.perf_counter()
         await server.serve_forever(background=True)
@@ -143,7 +104,7 @@ class ModbusRig:
             self.port = int(listening.sockets[0].getsockname()[1])
         living = asyncio.create_task(self._live())
         self._ready.set()
-        await self._stop.wait()
+        await stop.wait()
         living.cancel()
         connections = [connection.transport for connection in server.active_connections.values()]
         await server.shutdown()  # type: ignore[no-untyped-call]  # the library leaves it untyped
@@ -151,12 +112,6 @@ class ModbusRig:
             if isinstance(connection, asyncio.WriteTransport):
                 connection.abort()
         await asyncio.sleep(0.01)
-
-    async def _live(self) -> None:
-        """Keep the plant close to the wall clock also while nobody asks."""
-        while True:
-            self.device.live(self.now_s)
-            await asyncio.sleep(_LIVE_S)
 
     def _server(self) -> ModbusTcpServer | ModbusSerialServer:
         server = self._library_server(sim_device(self.device.registers, self._unit_id, self._serve_request))

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import threading
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 from asyncua import ua
@@ -23,12 +21,11 @@ from asyncua.server.user_managers import UserManager
 
 from sim.register_device import RegisterDevice
 from sim.registers import from_words, to_words
+from sim.served_rig import ServedRig
 
 logging.getLogger("asyncua").addHandler(logging.NullHandler())
 
-_LIVE_S = 0.02
 _CYCLE_S = 0.002
-_START_S = 20.0
 _VARIANTS = {
     "float64": ua.VariantType.Double, "float32": ua.VariantType.Float, "boolean": ua.VariantType.Boolean,
     "int16": ua.VariantType.Int16, "uint16": ua.VariantType.UInt16, "int32": ua.VariantType.Int32,
@@ -75,7 +72,7 @@ class Security:
     users: Mapping[str, str] | None = None
 
 
-class OpcUaRig:
+class OpcUaRig(ServedRig):
     """A device served in its own thread until the context ends.
 
     Parameters
@@ -90,60 +87,24 @@ class OpcUaRig:
         What it wants of a client.
     """
 
+    start_s = 20.0
+
     def __init__(
         self, device: RegisterDevice, nodes: Mapping[str, ServedNode], endpoint: str, security: Security | None = None
     ) -> None:
-        self.device = device
+        super().__init__(device, endpoint, "opc ua rig")
         self._nodes, self._endpoint, self._security = dict(nodes), endpoint, security or Security()
-        self._ready = threading.Event()
-        self._failure: BaseException | None = None
-        self._stop: asyncio.Event | None = None
-        self._loop: asyncio.AbstractEventLoop | None = None
-        self._start_s = 0.0
         self._taken_s = 0.0
-        self._thread = threading.Thread(target=self._run, name="opc ua rig", daemon=True)
 
-    def __enter__(self) -> OpcUaRig:
-        self.device.live(1e-9)  # the plant's first step may have to be compiled: before a port is waited for
-        self._thread.start()
-        if not self._ready.wait(_START_S) or self._failure is not None:
-            raise ConnectionError(f"cannot serve on {self._endpoint}: {self._failure or 'nothing listens'}")
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
-        if self._loop is not None and self._stop is not None and self._thread.is_alive():
-            self._loop.call_soon_threadsafe(self._stop.set)
-        self._thread.join(_START_S)
-
-    @property
-    def now_s(self) -> float:
-        """Device time [s]."""
-        return time.perf_counter() - self._start_s
-
-    def _run(self) -> None:
-        try:
-            asyncio.run(self._serve())
-        except Exception as failure:  # whatever it is, the thread that waits raises it
-            self._failure = failure
-        finally:
-            self._ready.set()
-
-    async def _serve(self) -> None:
-        self._loop, self._stop = asyncio.get_running_loop(), asyncio.Event()
+    async def _serve(self, stop: asyncio.Event) -> None:
         server = await self._server()
         self._start_s = time.perf_counter()
         await self._add_nodes(server)
         async with server:
             living = asyncio.create_task(self._live())
             self._ready.set()
-            await self._stop.wait()
+            await stop.wait()
             living.cancel()
-
-    async def _live(self) -> None:
-        """Keep the plant close to the wall clock also while nobody asks."""
-        while True:
-            self.device.live(self.now_s)
-            await asyncio.sleep(_LIVE_S)
 
     async def _server(self) -> Server:
         wants = self._security

@@ -5,6 +5,7 @@ from __future__ import annotations
 import signal
 import threading
 from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -37,29 +38,28 @@ def rig(config: _CONFIG) -> None:
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
-    if isinstance(content.rig, SerialSettings):
-        with served_on_line(content, content.rig):
-            console.print(f"serving a microcontroller on {content.rig.device}; Ctrl-C ends it", markup=False)
-            stop.wait()
-        console.print("stopped")
-        return
-    if isinstance(content.rig, OpcUaSettings):
-        with served_opcua(content, content.rig):
-            console.print(f"serving OPC UA on {content.rig.endpoint}; Ctrl-C ends it", markup=False)
-            stop.wait()
-        console.print("stopped")
-        return
-    settings = modbus_settings(content)
-    with served(content, device_of(content)) as server:
-        table = Table("signal", "table", "address", "type", "order", "scale", "offset", title=escape(content.name))
-        for name, register in settings.registers.mapped().items():
-            table.add_row(name, *_row(register))
-        console.print(table)
-        console.print(
-            f"serving {_address(settings, server.port)}, unit {settings.unit_id}; Ctrl-C ends it", markup=False
-        )
+    with ExitStack() as serving:
+        if isinstance(content.rig, SerialSettings):
+            serving.enter_context(served_on_line(content, content.rig))
+            said = f"a microcontroller on {content.rig.device}"
+        elif isinstance(content.rig, OpcUaSettings):
+            serving.enter_context(served_opcua(content, content.rig))
+            said = f"OPC UA on {content.rig.endpoint}"
+        else:
+            settings = modbus_settings(content)
+            server = serving.enter_context(served(content, device_of(content)))
+            console.print(_registers_of(content.name, settings))
+            said = f"{_address(settings, server.port)}, unit {settings.unit_id}"
+        console.print(f"serving {said}; Ctrl-C ends it", markup=False)
         stop.wait()
     console.print("stopped")
+
+
+def _registers_of(name: str, settings: AnyModbusSettings) -> Table:
+    table = Table("signal", "table", "address", "type", "order", "scale", "offset", title=escape(name))
+    for signal_name, register in settings.registers.mapped().items():
+        table.add_row(signal_name, *_row(register))
+    return table
 
 
 @app.command()

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from autotune.config import Config
 from autotune.config.registers import RegisterMap, RegisterSettings
@@ -29,9 +29,12 @@ from sim.register_device import RegisterDevice
 from sim.registers import RegisterSpec
 from sim.serial_line import SerialLine
 from sim.serial_rig import SerialRig, device_on_line
+from sim.served_rig import ServedRig
 
 if TYPE_CHECKING:
     from sim.opcua_rig import OpcUaRig
+
+_Served = TypeVar("_Served", bound=ServedRig)
 
 
 def modbus_settings(config: Config) -> AnyModbusSettings:
@@ -178,15 +181,8 @@ def served_opcua(config: Config, settings: OpcUaSettings, users: Mapping[str, st
     if settings.security_policy != "None":
         trusted = str(Path(str(settings.cert_file)).parent)
         security = Security(cert_file=twin.cert_file, key_file=twin.key_file, trusted=trusted, users=users)
-    rig = OpcUaRig(device_of(config), nodes, settings.endpoint, security)
-    try:
-        rig.__enter__()
-    except ConnectionError as error:
-        raise InputError(str(error), where="rig", remedy="free the address or give another one") from None
-    try:
+    with _started(OpcUaRig(device_of(config), nodes, settings.endpoint, security)) as rig:
         yield rig
-    finally:
-        rig.__exit__(None, None, None)
 
 
 @contextmanager
@@ -225,7 +221,7 @@ def _twin(settings: AnyModbusSettings | OpcUaSettings | SerialSettings) -> TwinS
 
 
 @contextmanager
-def _started(rig: ModbusRig) -> Iterator[ModbusRig]:
+def _started(rig: _Served) -> Iterator[_Served]:
     try:
         rig.__enter__()
     except ConnectionError as error:

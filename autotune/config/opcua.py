@@ -16,7 +16,7 @@ WORDS = {"float64": 4, "float32": 2, "int16": 1, "uint16": 1, "int32": 2, "uint3
 #: signals that are true or false, and those that count
 _LOGICAL, _COUNTED = ("enable", "in_command", "automatic"), ("heartbeat", "heartbeat_echo")
 #: signals that a sample is made of, read in one request; the others are written
-_SAMPLE = ("y", "u_applied", "heartbeat_echo", "in_command")
+SAMPLE = ("y", "u_applied", "heartbeat_echo", "in_command")
 #: the server's time stamp of y
 SOURCE_TIME = "device_time"
 
@@ -90,7 +90,7 @@ class NodeMap(Section):
         at = {"input": 0, "holding": 0}
         for name, node in self.mapped().items():
             kind = self.type_of(name)
-            table = "input" if name in _SAMPLE else "holding"
+            table = "input" if name in SAMPLE else "holding"
             kind_there = "uint16" if kind == "boolean" else kind
             found[name] = {
                 "table": table, "address": at[table], "type": kind_there, "scale": node.scale, "offset": node.offset

@@ -161,7 +161,7 @@ def test_a_map_with_a_heartbeat_may_read_it_back_from_its_own_register() -> None
 
 def test_a_rig_that_does_not_listen_in_time_says_so_instead_of_serving_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     released = threading.Event()
-    monkeypatch.setattr("sim.modbus_rig._START_S", 0.01)
+    monkeypatch.setattr("sim.modbus_rig.ModbusRig.start_s", 0.01)
     monkeypatch.setattr(ModbusRig, "_run", lambda _: released.wait())
     rig = ModbusRig(register_device(), TcpTransport())
     try:
