@@ -152,7 +152,7 @@ def _on_parts(
     thresholds: Thresholds,
 ) -> Callable[[Part], Mapping[str, float]]:
     """Return what a part of the recordings says of what the whole made a candidate."""
-    search, begun = evidence.search, None if evidence.rig is None else evidence.rig.chosen
+    search, begun = evidence.search, None if evidence.found is None else evidence.found.chosen
     known = {name for h in search.all for name in h.names} | {s.name for s in evidence.samples} | {OFFSET}
     others = [*without, *(name for name in KINDS if name not in known)]
 

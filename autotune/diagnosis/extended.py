@@ -57,12 +57,18 @@ def extended_model(evidence: Evidence, verdict: Verdict, nominal: Model) -> Mode
     found = evidence.search
     named = evidence.quality.is_better and verdict in ("effect", "unexplained")
     use = found.chosen if named else found.retuned
-    stands = evidence.rig is not None and evidence.rig.keeps_nominal(evidence.limits.material_numbers)
+    searched = evidence.found
+    stands = searched is not None and searched.keeps_nominal(evidence.limits.material_numbers)
     extended = nominal if verdict == "none" or stands else use.fit.model
     own = {e.name for e in nominal.effects}
-    if evidence.rig is not None and len(found.data.recordings) == 1:
-        # what came at a time of one recording is no property of the rig
-        lasting = tuple(e for e in extended.effects if e.name in own or not kind_of(e.name).at_a_time)
+    if len(found.data.recordings) == 1:
+        # what came at a time of one recording is no property of the rig; a drift goes on while its law holds
+        holds = searched is not None and searched.chosen.leaves_noise
+        lasting = tuple(
+            e
+            for e in extended.effects
+            if e.name in own or not kind_of(e.name).at_a_time or (holds and not kind_of(e.name).is_event)
+        )
         extended = replace(extended, effects=lasting)
     ends = [
         Effect(name=s.name, parameters=s.parameters)

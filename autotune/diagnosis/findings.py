@@ -13,7 +13,6 @@ from autotune.diagnosis.evidence.operating_point import Offset
 from autotune.diagnosis.evidence.samples import SampleEffect
 from autotune.diagnosis.extended import with_uncertainty
 from autotune.diagnosis.result import FoundEffect, OperatingRange, Verdict
-from autotune.diagnosis.selection.hypothesis import penalised
 from autotune.diagnosis.selection.probability import Candidate
 from autotune.diagnosis.selection.searched import Search
 from autotune.diagnosis.thresholds import Thresholds
@@ -41,7 +40,7 @@ def found_effects(evidence: Evidence, verdict: Verdict) -> tuple[FoundEffect, ..
         return tuple(_of_samples(s, everywhere, evidence.limits) for s in evidence.samples)
     effects: list[tuple[float, FoundEffect]] = []
     for effect in with_uncertainty(chosen, chosen.fit.model.effects)[chosen.fit.parametrisation.own :]:
-        if effect.name in evidence.contradicted:
+        if effect.name in evidence.contradicted or effect.name in STRUCTURES:
             continue
         effects.append((_lost_without(search, effect.name), _found_effect(effect, evidence, everywhere)))
     effects += [(s.evidence, _of_samples(s, everywhere, evidence.limits)) for s in evidence.samples]
@@ -56,6 +55,7 @@ def said_by(evidence: Evidence) -> dict[str, float]:
     """Return the probabilities of all effects that are in a hypothesis, and of those that samples show."""
     most, candidates = evidence.limits.most_probable, evidence.candidates
     names = {name for c in candidates for name in c.name.split("+") if name in KINDS}
+    names |= {smaller for name in names for smaller in KINDS[name].includes}
     allowed = names - evidence.contradicted - STRUCTURES.keys()
     shown = {e.name: e.probability for e in found_effects(evidence, judged(evidence))}
     # rows that leave too much open for a verdict still weigh what it may be
@@ -89,7 +89,7 @@ def _of_offset(offset: Offset, evidence: Evidence, everywhere: tuple[Window, ...
 def _lost_without(found: Search, name: str) -> float:
     """Return the penalised chi-square that is lost without a chosen effect, as far as that was fitted."""
     rest = frozenset(found.chosen.names) - {name}
-    known = {frozenset(h.names): h.penalised_chi2 for h in (found.retuned, *found.singles, *found.pairs)}
+    known = {frozenset(h.names): h.penalised_chi2 for h in reversed(found.all)}
     return known.get(rest, found.retuned.penalised_chi2) - found.chosen.penalised_chi2
 
 
@@ -139,7 +139,7 @@ def places_of(evidence: Evidence, effects: Sequence[FoundEffect], description: D
         informative = known if description.explained > evidence.limits.informative else {}
         return tuple(dict.fromkeys(evidence.residual.varies.places) | informative)
     places: dict[str, None] = dict(known)
-    for h in sorted((*evidence.search.singles, *evidence.search.pairs), key=penalised)[:3]:
+    for h in evidence.search.others[:3]:
         for kind in h.kinds:
             places |= dict.fromkeys(kind.may_sit)
     return tuple(places) or ("plant",)

@@ -1,8 +1,8 @@
 """The thresholds of the diagnosis: one table, passed in with the data, read from nowhere else.
 
-Every number that decides between two findings stands here with its unit, its meaning and where its value comes from;
-``python -m tests.benchmarks calibrate`` goes over those that were counted. Numbers that only say how a method computes
-(nodes of a table, damping of a step, frequencies of a scan) stay with the method.
+Every number that decides between two findings stands here with its unit, its meaning and where its value comes from.
+Numbers that only say how a method computes (nodes of a table, damping of a step, frequencies of a scan) stay with the
+method.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, fields
 from typing import Any, Literal, TypeAlias, TypeVar
 
-#: Where a value comes from. ``counted``: on concealed cases, none of them of the proof, see ``calibrate``.
+#: Where a value comes from. ``counted``: on concealed cases, none of them of the proof.
 #: ``real rigs``: on recordings of real rigs, where no model is adequate. ``chance``: a quantile of what noise alone brings.
 #: ``convention``: usual in the field. ``cost``: a compromise between time and what is found.
 Origin: TypeAlias = Literal["counted", "real rigs", "chance", "convention", "cost"]
@@ -34,9 +34,6 @@ class Thresholds:
     least_windows: int = known(6, "windows", "of a recording, where it has the rows; as many stay when data are thinned", "counted")
     unknown_lags: float = known(1.0, "slowest lags", "after the dead time, commands before the recording act no more", "convention")
     most_left_out: float = known(0.03, "of a recording", "that is left out at its beginning at most", "convention")
-    longer_windows: int = known(3, "times", "windows on which what brings the residual to noise must do so too", "cost")
-    near_noise: float = known(1.15, "reduced chi2", "up to which longer windows are asked", "counted")
-    leaves_more: float = known(0.03, "reduced chi2", "that longer windows may leave more; right explanations left up to 0.017", "counted")
     # noise
     largest_correlation: float = known(0.9, "1", "of the noise from row to row: beyond it differences cannot tell it from a slow residual", "convention")
     slow_noise: float = known(0.8, "1", "correlation of the noise from which on it is no matter of single samples", "counted")
@@ -56,7 +53,6 @@ class Thresholds:
     late_rows_beside_load: float = known(10.0, "chi2", "the same beside a load that is noise: right ones bring 60 on, others less than none", "counted")
     samples_clear: float = known(4.0, "2 ln odds", "that runs of spoiled rows give, from which on no fit sees these rows", "convention")
     samples_sure: float = known(60.0, "chi2", "from which on what samples show is sure", "counted")
-    samples_share: float = known(0.2, "of the gained", "that evidence of jitter or law must reach beside effects of the chain", "counted")
     samples_probable: float = known(0.85, "probability", "stated of what samples show with less", "counted")
     uneven_stamps: float = known(0.5, "sample times", "spread of the stamps about even ones from which on even times are tried", "convention")
     even_share: float = known(0.7, "of the residual", "that retuning at even times may leave to say that stamps are wrong", "convention")
@@ -69,53 +65,24 @@ class Thresholds:
     # fits
     prior_spread: float = known(0.2, "of the value", "sd of a nominal number: people's gains and lags are right to tens of percent", "convention")
     far_from_prior: float = known(2.0, "prior sd", "of a number that must stand for something else", "convention")
-    beyond_prior: float = known(4.0, "prior sd", "of a number that is no wrong number: a lag that has to be tripled", "convention")
-    stands_out: float = known(1.5, "times the median", "chi2 of a window that stands out", "counted")
     restart_decrease: float = known(10.0, "chi2", "from which on a restart is taken", "cost")
     # predictions and screening
     linear_share: float = known(0.3, "of chi2", "that an effect's direction may have before it is too large to be linear", "convention")
     impact_decrease: float = known(20.0, "chi2", "predicted at least of an effect that makes impacts and acts", "counted")
-    least_predicted: float = known(3.0, "chi2", "predicted of an effect before it is fitted", "cost")
     searched_rows: int = known(30_000, "rows", "that a search works on at most; the best hypotheses are fitted to all", "cost")
     confirmed: int = known(3, "hypotheses", "leading, that are fitted to all rows where a search worked on some", "cost")
-    screening_rows: int = known(4500, "rows", "on which hypotheses are screened", "cost")
-    screened_effects: int = known(7, "effects", "fitted of those that predict most", "cost")
-    further_effects: int = known(4, "effects", "the same beside other effects", "cost")
-    finished_effects: int = known(4, "effects", "whose fits are finished", "cost")
-    finished_each: int = known(2, "fits", "of one effect that are finished", "cost")
-    finished_near: float = known(0.8, "of the best decrease", "from which on any other fit is finished too", "cost")
-    finished_second: float = known(0.5, "of the best decrease", "from which on a second fit of one effect is finished", "cost")
-    far_behind: float = known(60.0, "chi2", "behind the best with which a hypothesis is not fitted to all rows", "cost")
-    far_behind_share: float = known(0.3, "of the best decrease", "the same", "cost")
     # parsimony
     least_decrease: float = known(30.0, "chi2", "that an effect must bring: chance among two hundred starts brought up to 15", "chance")
-    least_decrease_beyond: float = known(16.0, "chi2", "the same where a number lies beyond its prior without the effect", "counted")
-    simpler_lead: float = known(6.0, "chi2", "that a hypothesis with more numbers must be ahead", "counted")
-    simpler_share: float = known(0.01, "of the explained", "the same where more than noise is left", "counted")
-    noise_alone: float = known(1.02, "reduced chi2", "up to which a residual is noise alone", "counted")
-    simulation_error: float = known(2e-3, "of the explained", "that a simulation may be wrong by", "counted")
-    impact_error: float = known(5e-3, "of the explained", "the same after impacts", "counted")
-    model_error: float = known(2.0, "reduced chi2", "from which on the model's error rules, not noise", "real rigs")
-    model_error_share: float = known(0.12, "of the explained", "that a richer hypothesis must be ahead then", "real rigs")
-    search_on: float = known(1.1, "reduced chi2", "of the retuned model from which on pairs are tried although no single is worth it", "counted")
-    settled: float = known(1.03, "reduced chi2", "of a single up to which one chance for a partner is enough", "cost")
-    pair_decrease: float = known(5.0, "chi2", "that a pair must bring to be fitted to all rows", "cost")
-    three_effects: float = known(1.05, "reduced chi2", "of a pair from which on a third effect is looked for", "cost")
-    noise_left: float = known(0.08, "reduced chi2 - 1", "that an effect may leave to be needed", "counted")
-    half_left: float = known(0.5, "of reduced chi2 - 1", "that an effect may leave to be needed", "counted")
     # adequacy
     adequate: float = known(1.04, "reduced chi2", "up to which a model is adequate, beside one sd of chance", "counted")
     adequate_quick: float = known(1.12, "reduced chi2", "the same of a residual without slow part: physics left out would be slow", "counted")
     quick: float = known(1.0, "slow power", "of the residual over the noise's up to which it has no slow part", "counted")
     white: float = known(1.10, "slow power", "up to which a residual is white, beside two sd of chance", "counted")
     line: float = known(6.0, "log odds", "against chance of the strongest line in the spectrum of noise: one in four hundred", "chance")
-    line_share: float = known(0.01, "of the gained", "chi2 of a line beside effects: right ones leave four thousandths, wrong ones three hundredths", "counted")
     inconstant: float = known(25.0, "chi2", "of the largest of some hundred score tests; right models leave up to 15", "counted")
-    inconstant_share: float = known(0.1, "of the gained", "the same beside effects: right ones leave two hundredths, wrong ones a third", "counted")
     uneven_noise: float = known(4.0, "ratio", "of the variances of innovations along a record up to which a disturbance is steady", "convention")
     lesser_share: float = known(0.5, "of the gained", "from which on what varies weighs as much as the effects; real rigs leave a quarter", "real rigs")
     dominant: float = known(0.35, "of the excess variance", "held out, that effects must explain where nothing explains all", "real rigs")
-    far_from_noise: float = known(8.0, "times the noise", "variance of the retuned model: nearer to the noise adequacy is asked for", "real rigs")
     # verdict and probabilities
     numbers_decrease: float = known(25.0, "chi2", "that wrong numbers must bring to be called wrong", "chance")
     missing: float = known(1.05, "reduced chi2", "of a model without effects from which on something is missing; clean ones leave 1.02", "counted")
@@ -135,14 +102,13 @@ class Thresholds:
     ringing_periods: float = known(8.0, "periods", "length of long windows of a plant that rings", "convention")
     swinging: float = known(0.5, "damping", "below which a fit goes from short to long windows", "convention")
     varies_more: float = known(3.0, "of the gained", "of a rig's effects, from which on what varies beside them is what is missing; real rigs leave up to 1.3", "real rigs")
-    barely_noise: float = known(0.1, "prior odds", "of what is in no catalogue, from which on stretches are asked about effects that leave little more than noise", "convention")
     rig_rows: int = known(9000, "rows", "fitted at most", "cost")
+    foretold: float = known(2.0, "times the fitted rows'", "error of rows that were left out, up to which what leaves noise is taken for true: start states cost up to half as much again", "counted")
     material: float = known(0.1, "of the held-out error", "that one more effect must take away", "convention")
     material_event: float = known(0.3, "of the held-out error", "that something which happens at a found time must take away", "real rigs")
     material_numbers: float = known(0.25, "of the held-out error", "that retuned numbers must take away to replace nominal ones where no effect is found", "convention")
     most_held: float = known(0.5, "of the values", "that stay for more than a row: more of them are a slow converter, no dropout", "convention")
     most_scatter: float = known(0.5, "of the residual's", "variance from row to row that readings may have where a limit of the sensor holds them: a rig's noise is mostly the sensor's, in front of it", "convention")
-    known_odds: float = known(0.3, "prior odds", "at least, of what the search beside the noise found to explain most", "real rigs")
     rig_effects: int = known(4, "effects", "in one hypothesis at most", "cost")
     rig_beam: int = known(2, "hypotheses", "that are built on", "cost")
     rig_judged: int = known(8, "hypotheses", "of each size whose left-out stretches are judged", "cost")

@@ -177,8 +177,7 @@ ACTUATOR = (
         search=converter_steps,
         lasting=True,
         moves=_levels_around,
-        nudge=0.06,
-        confusable=("actuator.stiction",),
+        rough=True,
         in_equations=InEquations(acts="held", samples="steps"),
         reference=_ASTROM,
     ),
@@ -190,8 +189,7 @@ ACTUATOR = (
         lines=(Line(stage="command", does=followed),),
         memory=Memory(name="held", replayed=True),
         starts=lambda s: [(c * s.w,) for c in (0.05, 0.2, 0.5)],
-        nudge=0.06,
-        confusable=("actuator.stiction", "timing.dead_time"),
+        rough=True,
         odds={"any": 0.05, "shaft": 0.1, "carriage": 0.03, "lifted": 0.01, "arm": 0.01, "valve": 0.7, "process": 0.2},
         in_equations=InEquations(
             acts="held",
@@ -213,8 +211,7 @@ ACTUATOR = (
         memory=Memory(name="held", replayed=True),
         search=_bands,
         lasting=True,
-        nudge=0.02,  # its local minima are narrow
-        confusable=("actuator.backlash", "actuator.quantisation"),
+        rough=True,
         odds={"valve": 0.4, "process": 0.15},
         in_equations=InEquations(
             acts="held",
@@ -231,8 +228,7 @@ ACTUATOR = (
         parameters=(Quantity(name="half_width", unit="{u}", role="amplitude"),),
         lines=(Line(stage="command", does=without_zone),),
         starts=lambda s: [(c * s.w,) for c in (0.01, 0.04, 0.12, 0.3)],
-        nudge=0.06,
-        confusable=("plant.coulomb_friction", "actuator.nonlinear_gain"),
+        rough=True,
         odds={"any": 0.15, "level": 0.1, "thermal": 0.05, "valve": 0.1, "damper": 0.0},
         in_equations=InEquations(
             acts="input",
@@ -253,7 +249,6 @@ ACTUATOR = (
         lines=(Line(stage="command", does=curved),),
         goes_on=rises,
         starts=lambda s: [(0.05 / s.w, 1e-3 / s.w**2), (1e-3 / s.w, 0.05 / s.w**2)],
-        confusable=("actuator.saturation", "sensor.nonlinear_gain"),
         odds={"any": 0.1, "arm": 0.5, "speed": 0.15, "carriage": 0.03, "thermal": 0.05, "shaft": 0.05, "valve": 0.05},
         in_equations=InEquations(
             acts="input",
@@ -275,7 +270,6 @@ ACTUATOR = (
         ),
         lines=(Line(stage="command", does=limited),),
         starts=lambda s: limit_starts(s.w_low, s.w_high, (0.05, 0.15, 0.3)),
-        confusable=("actuator.nonlinear_gain", "actuator.rate_limit"),
         odds={"any": 0.15, "level": 0.3},
         in_equations=InEquations(
             acts="input",
@@ -294,7 +288,6 @@ ACTUATOR = (
         memory=Memory(name="before"),
         sub_steps=4,
         starts=lambda s: [(s.w / (c * s.lag_s),) for c in (0.03, 0.06, 0.1, 0.16, 0.25, 0.4, 0.6, 1.0, 1.5)],
-        confusable=("actuator.lag",),
         odds={"any": 0.01, "damper": 0},
         in_equations=InEquations(
             acts="input",
@@ -312,7 +305,6 @@ ACTUATOR = (
         parameters=(Quantity(name="rate", unit="1/s", role="amplitude", sign="real"),),
         lines=(Line(stage="command", does=drifted),),
         starts=lambda s: [(0.01 / s.duration_s,)],
-        confusable=("environment.drifting_load", "sensor.drift"),
         places=("actuator", "plant"),
         at_a_time=True,
         odds={"any": 0.02, "damper": 0, "arm": 0.005, "oscillator": 0.005},
@@ -330,7 +322,6 @@ ACTUATOR = (
         parameters=(Quantity(name="time_constant", unit="s", role="amplitude"),),
         linear=LinearPart(blocks=with_lag, states=1, at="front", start=_last_commands),
         starts=lambda s: [(c * s.lag_s,) for c in (0.05, 0.25)],
-        confusable=("timing.dead_time", "actuator.rate_limit"),
         same=("sensor.lag",),
         places=("actuator", "sensor", "plant"),
         odds={"any": 0.2, "damper": 0.05},
@@ -362,7 +353,6 @@ ACTUATOR = (
         sub_steps=2,
         needs=ACTUATOR_LAG,
         starts=_asymmetric_starts,
-        confusable=("actuator.lag", "actuator.nonlinear_gain"),
         odds={"any": 0.02, "damper": 0},
         in_equations=InEquations(
             acts="input",

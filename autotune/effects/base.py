@@ -318,9 +318,8 @@ class EffectKind:
         Whether that search is long and its result hardly depends on what else is fitted: it is made once.
     moves : callable, optional
         Given values, the span of the commands, and two shares; returns values around them that no derivative leads to.
-    nudge : float
-        Shift of the amplitudes' logarithm that brings a fit out of the local minima that thresholds make; 0 for a
-        smooth criterion.
+    rough : bool
+        Whether thresholds make local minima: a fit takes more steps.
     impacts : bool
         Whether it makes the plant hit something: after an impact no first order tells anything, the least change of any
         number shows, and start states are found anew.
@@ -342,8 +341,6 @@ class EffectKind:
         Whether it says that stamps are wrong where they are uneven: a simulation then runs at even times.
     excludes : tuple of str
         Effects that are not looked for where this one is seen in the samples.
-    confusable : tuple of str
-        Effects that can look alike.
     same : tuple of str
         Effects that cannot be told apart from it with command and measurement alone; itself not counted. Drifts of
         load and sensor are the same on a chain that settles; on others one of them simply explains nothing.
@@ -380,7 +377,7 @@ class EffectKind:
     search: Callable[[Scan], list[tuple[float, ...]]] | None = None
     lasting: bool = False
     moves: Callable[[Values, float, float, float], list[Values]] | None = None
-    nudge: float = 0.0
+    rough: bool = False
     impacts: bool = False
     stand_in: Callable[[Fitted], bool] | None = None
     acts_in: Callable[[Values], tuple[int, float]] | None = None
@@ -391,7 +388,6 @@ class EffectKind:
     uneven: bool = False
     late_stamps: bool = False
     excludes: tuple[str, ...] = ()
-    confusable: tuple[str, ...] = ()
     same: tuple[str, ...] = ()
     recoordinates: bool = False
     includes: tuple[str, ...] = ()
@@ -418,11 +414,6 @@ class EffectKind:
     def is_event(self) -> bool:
         """Whether it happens at a time that is searched."""
         return any(q.is_time_of_change for q in self.parameters)
-
-    @property
-    def is_rough(self) -> bool:
-        """Whether thresholds make the criterion rough."""
-        return self.nudge > 0.0
 
     @cached_property
     def is_signed(self) -> bool:

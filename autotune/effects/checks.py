@@ -61,8 +61,6 @@ def _of(kind: EffectKind) -> Iterator[tuple[str, str]]:
         yield "nothing would be simulated", "add lines=(Line(stage=..., does=...),) or linear=LinearPart(...)"
     if kind.sought in ("hypothesis", "rig", "structure") and not _has_starts(kind):
         yield "no fit would ever start", "give starts=lambda sizes: [...] or search=..."
-    if kind.sought in ("hypothesis", "rig") and not kind.confusable:
-        yield "no effect that it can be taken for", "give confusable=(...,) the names of those that can look alike"
     for rig in kind.odds:
         if rig not in (*get_args(RigKind), "any"):
             yield (
@@ -157,7 +155,7 @@ def _line(kind: EffectKind, line: Line) -> Iterator[tuple[str, str]]:
 def _related(kind: EffectKind, names: Sequence[str]) -> Iterator[tuple[str, str]]:
     if names.count(kind.name) > 1:
         yield "stands twice in the catalogue", "give one of them another name"
-    for key in ("confusable", "same", "excludes", "includes"):
+    for key in ("same", "excludes", "includes"):
         for other in getattr(kind, key):
             if other not in names:
                 yield f"{key} names {other!r}, which does not exist", "use a name of the catalogue"

@@ -33,7 +33,6 @@ TIMING = (
         parameters=(Quantity(name="delay", unit="s", role="amplitude"),),
         linear=LinearPart(blocks=_with_delay),
         starts=lambda s: [(c,) for c in (0.5 * s.dt_s, 2.5 * s.dt_s, 6.0 * s.dt_s, 14.0 * s.dt_s, 0.3 * s.lag_s)],
-        confusable=("sensor.lag", "actuator.lag", "actuator.backlash"),
         places=("timing", "actuator", "sensor"),
         odds={"any": 0.2, "damper": 0.05},
         in_equations=InEquations(
@@ -49,7 +48,6 @@ TIMING = (
         parameters=(Quantity(name="error", unit="", role="amplitude", sign="real"),),
         lines=(Line(stage="clock", does=stretched),),
         starts=lambda s: [(0.2 * s.dt_s / s.duration_s,)],
-        confusable=("timing.dead_time",),
         reference=_LJUNG,
     ),
     EffectKind(

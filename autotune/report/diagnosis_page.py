@@ -227,7 +227,7 @@ def _against(known: _Evidence) -> Section:
     )  # fmt: skip
     base = penalised(s.retuned)
     # pruning and exchanging fit some combinations more than once
-    ranked = merged((*s.singles, *s.pairs, *s.triples))
+    ranked = merged(s.others)
     table = Table(
         header=("hypothesis", "decrease of chi-square, parameters paid for"),
         rows=tuple((" + ".join(h.names), f"{base - penalised(h):.1f}") for h in ranked),

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from autotune.diagnosis.fitting.retuning import prepare
-from autotune.diagnosis.selection.hypothesis import penalised
+from autotune.diagnosis.selection.hypothesis import hypothesis, penalised
 from autotune.diagnosis.selection.search import search
 from autotune.diagnosis.simulation.forecast import forecast
 from autotune.diagnosis.thresholds import IN_USE
@@ -78,7 +78,7 @@ def retuned(case: Case, folder: Path) -> Answer:
     """Refit the nominal structure; it names nothing."""
     recordings = [read_recording(path) for path in case.given]
     good = [np.isfinite(r.y) for r in recordings]
-    _, fit = prepare(read_model(case.model), recordings, good, 1, IN_USE)
+    _, fit = prepare(read_model(case.model), recordings, good, IN_USE)
     return None, _of_model(case, fit.model)
 
 
@@ -89,7 +89,7 @@ def criterion(case: Case, folder: Path) -> Answer:
     """
     recordings = [read_recording(path) for path in case.given]
     found = search(read_model(case.model), recordings, [np.isfinite(r.y) for r in recordings])
-    best = min([found.retuned, *found.singles], key=penalised)
+    best = min((hypothesis(j.fit) for j in found.judged if len(j.names) < 2), key=penalised)
     return best.names, _of_model(case, best.fit.model)
 
 

@@ -21,7 +21,6 @@ from autotune.diagnosis.equations.closed import ClosedBench
 from autotune.diagnosis.equations.equation_bench import EquationBench
 from autotune.diagnosis.equations.probable import candidates_of, probability_of, without_improbable
 from autotune.diagnosis.equations.search import Searched, search
-from autotune.diagnosis.evidence.held_out import FitQuality
 from autotune.diagnosis.evidence.law import law_effect
 from autotune.diagnosis.evidence.readings import converter_step, struck
 from autotune.diagnosis.evidence.samples import SampleEffect, inspect, outliers_in, spared, together
@@ -291,9 +290,9 @@ def _explains_most(errors: tuple[float, float, float, float], limits: Thresholds
 
     On real rigs more than noise is left by every model; what is far from right there explains nothing.
     """
-    nominal, retuned, extended, noise = errors
-    quality = FitQuality(nominal=nominal, retuned=retuned, extended=extended, noise_floor=noise)
-    return quality.gains(limits.dominant) and extended < limits.equation_small
+    _, retuned, extended, noise = errors
+    gains = retuned**2 - extended**2 > limits.dominant * (retuned**2 - noise**2)
+    return gains and extended < limits.equation_small
 
 
 def _with_numbers(model: EquationModel | BlackBox, outcome: Outcome) -> EquationModel | BlackBox:

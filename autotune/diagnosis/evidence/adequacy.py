@@ -17,7 +17,7 @@ from autotune.arrays import FloatArray
 from autotune.diagnosis.evidence.constancy import Variation, largest_variation
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import Fit
-from autotune.diagnosis.fitting.retuning import BLOCKS, reduced_chi2, whiteness
+from autotune.diagnosis.fitting.retuning import BLOCKS, reduced_chi2, under_noise, whiteness
 from autotune.diagnosis.thresholds import Thresholds
 
 
@@ -37,8 +37,6 @@ class ResidualTests:
         Standard deviation that chance gives to it.
     varies : Variation
         What would explain most of it among what swings, bends and goes past the chain.
-    gained : float
-        Penalised chi-square that the effects gained beside the retuned model.
     uneven : bool
         Whether samples show that some rows' noise is larger than others': the variance then says nothing.
     accounted : bool
@@ -52,9 +50,6 @@ class ResidualTests:
     slow: float
     slow_chance: float
     varies: Variation
-    gained: float
-    line: float = 0.0
-    line_gain: float = 0.0
     uneven: bool = False
     accounted: bool = False
     limits: Thresholds = field(default_factory=Thresholds)
@@ -67,23 +62,7 @@ class ResidualTests:
 
     @property
     def is_noise(self) -> bool:
-        """Whether it is noise: no more variance than its jitter shows, no slow part, no line, nothing that varies."""
-        return self.has_no_slow_part and not self.has_line
-
-    @property
-    def has_line(self) -> bool:
-        """Whether it swings with a frequency more than noise does, and than what effects explain is simulated wrong.
-
-        Beside effects alone: coloured noise has lines beyond chance too, and without effects the other tests decide. A
-        line that explains less of the variance than chance does (sqrt(2 / N) for N rows) is a disturbance beside.
-        """
-        gained, by_chance = self.gained, 2.0 / self.reduced_chi2_chance
-        is_line = gained > 0.0 and self.line > self.limits.line
-        return is_line and self.line_gain > max(self.limits.line_share * gained, by_chance)
-
-    @property
-    def has_no_slow_part(self) -> bool:
-        """Whether it is noise but for lines of its spectrum."""
+        """Whether it is noise: no more variance than its jitter shows, no slow part, nothing that varies."""
         even = self.uneven or self.reduced_chi2 < self.allowed
         return self.accounted or (even and self.is_slowly_white and self.is_constant)
 
@@ -99,15 +78,8 @@ class ResidualTests:
 
     @property
     def is_constant(self) -> bool:
-        """Whether nothing swings, bends or goes past the chain in it, beside what the effects gained."""
-        return self.accounted or self.varies.gain < max(
-            self.limits.inconstant, self.limits.inconstant_share * self.gained
-        )
-
-    @property
-    def is_lesser(self) -> bool:
-        """Whether what varies in it is less than half of what the effects gained."""
-        return self.varies.gain < self.limits.lesser_share * self.gained
+        """Whether nothing swings, bends or goes past the chain in it."""
+        return self.accounted or self.varies.gain < self.limits.inconstant
 
     def _is_white(self, bound: float) -> bool:
         return self.slow < bound + 2.0 * self.slow_chance
@@ -122,16 +94,13 @@ class ResidualTests:
             "reduced_chi2_chance": self.reduced_chi2_chance,
             "slow": self.slow,
             "slow_chance": self.slow_chance,
-            "gained": self.gained,
-            "line": self.line,
-            "line_gain": self.line_gain,
             "uneven": self.uneven,
             "accounted": self.accounted,
             "varies": varies,
         }
 
 
-def residual_tests(result: Fit, data: Data, gained: float, *, uneven: bool = False) -> ResidualTests:
+def residual_tests(result: Fit, data: Data, *, uneven: bool = False) -> ResidualTests:
     """Return what a model leaves.
 
     Parameters
@@ -140,28 +109,22 @@ def residual_tests(result: Fit, data: Data, gained: float, *, uneven: bool = Fal
         A fit at its minimum.
     data : Data
         What it was fitted to.
-    gained : float
-        Penalised chi-square that its effects gained beside the retuned model.
     uneven : bool
         Whether samples show that some rows' noise is larger than others'.
     """
-    line, line_gain = strongest_line(result, data)
     return ResidualTests(
         reduced_chi2=reduced_chi2(result, data),
         reduced_chi2_chance=math.sqrt(2.0 / result.rows),
         slow=whiteness(result, data),
         slow_chance=_slow_chance(result),
         varies=largest_variation(result, data),
-        gained=gained,
-        line=line,
-        line_gain=line_gain,
         uneven=uneven,
         limits=data.thresholds,
     )
 
 
-def strongest_line(result: Fit, data: Data) -> tuple[float, float]:
-    """Return the logarithm of the odds against chance of the strongest line in a residual's spectrum, and its chi2.
+def strongest_line(result: Fit, data: Data) -> float:
+    """Return the logarithm of the odds against chance of the strongest line in a residual's spectrum.
 
     Where a signal swings within some rows, what a model lacks swings as fast: differences from row to row take that for
     noise, and blocks of rows do not see it. Noise has no line.
@@ -179,15 +142,14 @@ def strongest_line(result: Fit, data: Data) -> tuple[float, float]:
     return line_in(data.whitened(list(result.residuals)))
 
 
-def line_in(parts: Sequence[FloatArray]) -> tuple[float, float]:
-    """Return the logarithm of the odds against chance, and chi2, of the strongest line in parts that are whitened."""
-    odds = [(0.0, 0.0)]
+def line_in(parts: Sequence[FloatArray]) -> float:
+    """Return the logarithm of the odds against chance of the strongest line in parts that are whitened."""
+    odds = [0.0]
     for e in parts:
         power = np.abs(np.fft.rfft(e * np.hanning(e.size))[2:-1]) ** 2
         middle = float(np.median(power)) / math.log(2.0) if power.size else 0.0
         if middle > 0.0:
-            largest = float(np.max(power)) / middle
-            odds.append((largest - math.log(power.size), 2.0 * largest))
+            odds.append(float(np.max(power)) / middle - math.log(power.size))
     return max(odds)
 
 
@@ -195,6 +157,13 @@ def _slow_chance(result: Fit) -> float:
     return math.sqrt(2.0 / (BLOCKS * len(result.windows)))
 
 
-def is_white(result: Fit, data: Data) -> bool:
-    """Whether a residual has no slow part beyond what chance brings."""
-    return whiteness(result, data) < data.thresholds.white + 2.0 * _slow_chance(result)
+def is_noise(result: Fit, data: Data) -> bool:
+    """Whether a residual has no more variance than its jitter shows and no slow part: its size alone is looked at.
+
+    What is as correlated from row to row as ``slow_noise`` is no noise: a model's error is as slow.
+    """
+    limits, slow, chance = data.thresholds, whiteness(result, data), 2.0 * _slow_chance(result)
+    correlation = max(under_noise(result, data).noise.ar, default=0.0)
+    allowed = limits.adequate_quick if slow < limits.quick + chance else limits.adequate
+    quiet = reduced_chi2(result, data) < allowed + math.sqrt(2.0 / result.rows)
+    return quiet and slow < limits.white + chance and correlation < limits.slow_noise

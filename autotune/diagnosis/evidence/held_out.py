@@ -11,7 +11,6 @@ import numpy as np
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import RUNAWAY, Fit, fit, states_of
 from autotune.diagnosis.fitting.noise import noise_from_differences
-from autotune.diagnosis.thresholds import Thresholds
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,33 +32,18 @@ class FitQuality:
         """Whether nothing larger than the noise is left where the extended model was not fitted."""
         return self.extended <= self.noise_floor
 
-    def gains(self, share: float) -> bool:
-        """Whether the extended model takes a share of the variance away that retuning leaves above the noise."""
-        retuned = self.retuned**2
-        return retuned - self.extended**2 > share * (retuned - self.noise_floor**2)
 
-
-def dominates(quality: FitQuality, limits: Thresholds) -> bool:
-    """Whether the chosen effects explain most of a residual that nothing explains whole.
-
-    On real rigs something always remains; an effect is named all the same when on rows that were not fitted it takes
-    away a share of the variance that retuning leaves above the noise, where that is many times the noise's.
-    """
-    far = quality.retuned**2 > limits.far_from_noise * quality.noise_floor**2
-    return far and quality.gains(limits.dominant)
-
-
-def held_out(retuned: Fit, chosen: Fit, data: Data) -> FitQuality:
+def held_out(retuned: Fit, data: Data) -> FitQuality:
     """Return errors on windows with numbers fitted to the others.
 
     Every second window is left out, then the others: each half is tried with the numbers of the other one.
 
     Parameters
     ----------
-    retuned, chosen : Fit
-        The nominal structure and the extended model; the same object where nothing was added.
+    retuned : Fit
+        The nominal structure, to which nothing was added.
     data : Data
-        What both were fitted to.
+        What it was fitted to.
     """
     halves = _half(data, 0), _half(data, 1)
     y = np.concatenate([r.y[g] for r, g in zip(data.recordings, data.good, strict=True)])
@@ -73,9 +57,8 @@ def held_out(retuned: Fit, chosen: Fit, data: Data) -> FitQuality:
         return math.sqrt(squares / max(freedom, 1)) / spread
 
     nominal, tuned = error(retuned, tune=False), error(retuned, tune=True)
-    extended = tuned if chosen is retuned else error(chosen, tune=True)
-    noise = noise_from_differences(chosen.residuals, data.good, data.thresholds.largest_correlation).total_sd / spread
-    return FitQuality(nominal=nominal, retuned=tuned, extended=extended, noise_floor=noise)
+    noise = noise_from_differences(retuned.residuals, data.good, data.thresholds.largest_correlation).total_sd / spread
+    return FitQuality(nominal=nominal, retuned=tuned, extended=tuned, noise_floor=noise)
 
 
 def _tested(result: Fit, tune: bool, known: Data, unknown: Data) -> Fit:

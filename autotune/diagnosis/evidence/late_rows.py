@@ -243,4 +243,4 @@ def _white(innovations: Sequence[FloatArray], recordings: Sequence[_Rows], line:
             return False
     told = [e * one.slope for e, one in zip(innovations, recordings, strict=True)]
     told += [e * np.append(0.0, one.step[:-1]) for e, one in zip(innovations, recordings, strict=True)]
-    return line_in([*innovations, *told])[0] < line
+    return line_in([*innovations, *told]) < line

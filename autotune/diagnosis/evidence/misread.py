@@ -49,10 +49,10 @@ def misread_columns(model: Model, recordings: Sequence[Recording], quality: FitQ
     for what, changed in readings.items():
         try:
             good, _ = inspect(changed, (), thresholds)
-            data, retuned = prepare(model, changed, good, 1, thresholds)
+            data, retuned = prepare(model, changed, good, thresholds)
         except RUNAWAY:
             continue
-        error = held_out(retuned, retuned, data).retuned
+        error = held_out(retuned, data).retuned
         if 2.0 * error**2 < min(1.0, quality.retuned**2) and error < (1.0 + thresholds.material) * quality.extended:
             return (
                 f"First of all, {what}: so read, the retuned simulation errs by {error:.3g} of the spread of y on rows "

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from autotune.arrays import BoolArray, FloatArray
-from autotune.diagnosis.evidence.adequacy import ResidualTests, line_in, residual_tests
+from autotune.diagnosis.evidence.adequacy import ResidualTests, line_in, residual_tests, strongest_line
 from autotune.diagnosis.evidence.constancy import linear_gain
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import Fit, fit
@@ -86,10 +86,11 @@ def own_noise(retuned: Fit, data: Data) -> OwnNoise | None:
             return None
         coloured = replace(coloured, noise=noise)
         result = fit(result.parametrisation, coloured, result.theta, result.x0, iterations=STEPS)
-    left = residual_tests(result, coloured, 0.0)
+    left = residual_tests(result, coloured)
     innovations = coloured.whitened(list(result.residuals))
     shown = left.varies.gain > limits.inconstant or linear_gain(result, coloured) > limits.inconstant
-    if shown or left.line > limits.line or not left.is_slowly_white or not _is_steady(innovations, limits):
+    rings = strongest_line(result, coloured) > limits.line
+    if shown or rings or not left.is_slowly_white or not _is_steady(innovations, limits):
         return None
     offset = np.array([f.kind == "u_offset" for f in result.parametrisation.free])
     start = np.where(offset, result.theta, result.parametrisation.centre)
@@ -126,7 +127,7 @@ def _is_steady(innovations: Sequence[FloatArray], limits: Thresholds) -> bool:
     A load that sweeps has a line at every moment, and none in the whole.
     """
     parts = [part for e in innovations for part in np.array_split(e[e != 0.0], PARTS) if part.size >= LEAST_PART]
-    if line_in(parts)[0] > limits.line + math.log(max(len(parts), 1)):
+    if line_in(parts) > limits.line + math.log(max(len(parts), 1)):
         return False
     # single rows far off are no louder part: the middle of the sizes is taken
     sizes = [float(np.median(np.abs(part))) ** 2 for part in parts]

@@ -56,7 +56,7 @@ def evened(
     good = [np.isfinite(r.y) for r in recordings]
     try:
         with np.errstate(all="ignore"):
-            stamped, evenly = (prepare(model, rs, good, 1, limits) for rs in (recordings, at_even))
+            stamped, evenly = (prepare(model, rs, good, limits) for rs in (recordings, at_even))
     except RUNAWAY:
         return recordings, None
     if _rms(*evenly) > limits.even_share * _rms(*stamped):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -61,43 +61,23 @@ class Data:
     kept: tuple[IntArray, ...] = ()
     weights: tuple[float, ...] = ()
 
-    def thinned(self, rows: int, informative: Sequence[FloatArray] | None = None) -> Data:
+    def thinned(self, rows: int) -> Data:
         """Return the data with windows left out evenly, until about as many rows count.
 
-        Windows in which u or y is largest or smallest stay, and the most informative of those that have something to
-        tell, up to half of all: a limit that is rarely reached acts only there. ``informative`` says how much each
-        window has to tell, 0 for nothing.
+        Windows in which u or y is largest or smallest stay: a limit that is rarely reached acts only there.
         """
-        chosen = self._thinning(rows, informative)
-        return self if chosen is None else self.only(chosen)
-
-    def in_runs(self, rows: int, count: int) -> Data:
-        """Return the data thinned like :meth:`thinned`, by runs of so many windows, which can be joined still."""
-        chosen = self.joined(count)._thinning(rows)
-        if chosen is None:
-            return self
-        return self.only(
-            [np.isin(np.arange(len(a)) // count, runs) for a, runs in zip(self.starts, chosen, strict=True)]
-        )
-
-    def _thinning(self, rows: int, informative: Sequence[FloatArray] | None = None) -> list[IntArray] | None:
-        """Return the numbers of the windows that stay; nothing where all do."""
         share = max(1.0, self.rows / rows)
-        if share < 1.5:
-            return None
-        if all(len(a) <= self.thresholds.least_windows for a in self.starts):
-            return None
+        least = self.thresholds.least_windows
+        if share < 1.5 or all(len(a) <= least for a in self.starts):
+            return self
         chosen = []
-        told = [np.zeros(len(a)) for a in self.starts] if informative is None else informative
-        for r, a, ok, tells in zip(self.recordings, self.starts, self.good, told, strict=True):
-            count = min(len(a), max(self.thresholds.least_windows, round(len(a) / share)))
+        for r, a, ok in zip(self.recordings, self.starts, self.good, strict=True):
+            count = max(least, round(len(a) / share))
             far = [extreme(np.where(ok, x, np.median(x[ok]))) for x in (r.u, r.y) for extreme in (np.argmin, np.argmax)]
             extremes = np.clip(np.searchsorted(a, far, side="right") - 1, 0, len(a) - 1)
-            most = np.argsort(-tells, kind="stable")[: min(count // 2, np.count_nonzero(tells))]
-            count = max(self.thresholds.least_windows, count - most.size)
             evenly = np.linspace(0, len(a) - 1, min(len(a), count)).round().astype(np.int64)
-            chosen.append(np.unique(np.concatenate([evenly, extremes, most])))
-        return chosen
+            chosen.append(np.unique(np.concatenate([evenly, extremes])))
+        return self.only(chosen)
 
     def only(self, chosen: Iterable[IntArray | BoolArray]) -> Data:
         """Return the data with the chosen windows of every recording, by number or by mask; no other row counts."""
@@ -159,11 +139,6 @@ class Data:
         if self.whole is None:
             return self.starts
         return tuple(k[a] for k, a in zip(self.kept, self.starts, strict=True))
-
-    def joined(self, count: int) -> Data:
-        """Return the data with that many windows, one after the other, made into one; the last may be of fewer."""
-        stops = tuple(np.append(b[count - 1 : -1 : count], b[-1]).astype(np.int64) for b in self.stops)
-        return replace(self, starts=tuple(a[::count] for a in self.starts), stops=stops)
 
     @property
     def rows(self) -> int:

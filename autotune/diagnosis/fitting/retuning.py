@@ -11,7 +11,7 @@ from autotune.arrays import BoolArray
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import RUNAWAY, Fit, fit
 from autotune.diagnosis.fitting.noise import Noise, autoregressive, noise_from_differences
-from autotune.diagnosis.fitting.parameters import Parametrisation, parametrise
+from autotune.diagnosis.fitting.parameters import parametrise
 from autotune.diagnosis.fitting.restarts import renewed
 from autotune.diagnosis.fitting.windows import known_from_s, model_lag_s, window_rows
 from autotune.diagnosis.thresholds import IN_USE, Thresholds
@@ -38,7 +38,6 @@ def prepare(
     model: Model,
     recordings: Sequence[Recording],
     good: Sequence[BoolArray],
-    times: int = 1,
     thresholds: Thresholds = IN_USE,
 ) -> tuple[Data, Fit]:
     """Retune the nominal structure, and estimate the noise from what it leaves.
@@ -51,18 +50,15 @@ def prepare(
         What was measured.
     good : sequence of (N,) bool array
         Rows whose reading counts.
-    times : int
-        How many times as long as usual windows are.
     thresholds : Thresholds
         What decides between two findings.
 
     Returns
     -------
     data, retuned
-        Data with windows and noise, and the fit. Of long recordings windows are left out evenly, in runs of
-        ``longer_windows``.
+        Data with windows and noise, and the fit. Of long recordings windows are left out evenly.
     """
-    length = times * thresholds.lags_per_window * model_lag_s(model)
+    length = thresholds.lags_per_window * model_lag_s(model)
     largest = thresholds.largest_correlation
     noise = floored(noise_from_differences([r.y for r in recordings], good, largest), recordings)
     windows = [window_rows(r, length, known_from_s(model, r, thresholds), thresholds) for r in recordings]
@@ -73,7 +69,7 @@ def prepare(
         stops=tuple(stops for _, stops in windows),
         noise=noise,
         thresholds=thresholds,
-    ).in_runs(thresholds.searched_rows, thresholds.longer_windows)
+    ).thinned(thresholds.searched_rows)
     size = float(np.std(np.concatenate([r.u for r in recordings]))) or 1.0
     p = parametrise(model, [], size, recordings[0].sample_time_s, thresholds.prior_spread)
     result = fit(p, data)
@@ -95,39 +91,16 @@ def _straightened(result: Fit, data: Data) -> Fit:
         return result
 
 
-def holds(result: Fit, data: Data) -> bool:
-    """Whether what brings a residual to noise does so on windows several times as long.
-
-    Start states that are free at every window's beginning forgive much: what only they made possible leaves more on
-    windows that are joined. What is true leaves the same.
-    """
-    before = reduced_chi2(result, data)
-    limits = data.thresholds
-    if before > limits.near_noise:
-        return True
-    joined, p = data.joined(limits.longer_windows), result.parametrisation
-    theta, x0 = result.theta, tuple(x[:: limits.longer_windows] for x in result.x0)
-    for iterations, rounds in ((8, 1), (20, 2)):
-        try:
-            again = fit(p, joined, theta, x0, iterations=iterations, rounds=rounds)
-        except RUNAWAY:
-            return False
-        if reduced_chi2(again, joined) < before + limits.leaves_more:
-            return True
-        theta, x0 = again.theta, again.x0
-    return False
+def under_noise(result: Fit, data: Data) -> Data:
+    """Return data with the noise that the row-to-row jitter of a fit's residual shows."""
+    noise = noise_from_differences(result.residuals, data.good, data.thresholds.largest_correlation)
+    return replace(data, noise=floored(noise, data.recordings))
 
 
 def far_from_prior(result: Fit, sds: float) -> bool:
     """Whether retuning moved a gain or lag by more than some of its prior's standard deviations."""
     away = np.abs(result.theta - result.parametrisation.centre) / result.parametrisation.spreads
     return bool(np.max(away, initial=0.0) > sds)
-
-
-def at_operating_point(p: Parametrisation, data: Data) -> Fit:
-    """Return a fit of the operating point alone, all other numbers at their prior."""
-    free = np.array([f.kind == "u_offset" for f in p.free])
-    return fit(p, data, free=free)
 
 
 def floored(noise: Noise, recordings: Sequence[Recording]) -> Noise:
@@ -139,10 +112,7 @@ def floored(noise: Noise, recordings: Sequence[Recording]) -> Noise:
 
 def reduced_chi2(result: Fit, data: Data) -> float:
     """Return the residual's variance in units of the noise that its own row-to-row jitter shows."""
-    noise = floored(
-        noise_from_differences(result.residuals, data.good, data.thresholds.largest_correlation), data.recordings
-    )
-    e = np.concatenate(replace(data, noise=noise).whitened(list(result.residuals)))
+    e = np.concatenate(under_noise(result, data).whitened(list(result.residuals)))
     freedom = max(data.rows - result.states_told - result.theta.size, 1)
     return float(e @ e / freedom)
 

@@ -49,10 +49,10 @@ def penalised(h: Hypothesis) -> float:
     return h.penalised_chi2
 
 
-def merged(first: Sequence[Hypothesis], second: Sequence[Hypothesis] = ()) -> list[Hypothesis]:
+def merged(found: Sequence[Hypothesis]) -> list[Hypothesis]:
     """Return the better fit of every combination of effects, best first."""
     best: dict[frozenset[str], Hypothesis] = {}
-    for h in (*first, *second):
+    for h in found:
         key = frozenset(h.names)
         if key not in best or penalised(h) < penalised(best[key]):
             best[key] = h

@@ -1,18 +1,25 @@
-"""Hypotheses judged by stretches that were left out: compared in pairs, ranked, weighed."""
+"""Hypotheses judged by what they leave: compared in pairs, ranked, weighed.
+
+Where one of two leaves noise alone, rows are independent witnesses and the likelihood of the rows decides. Where both
+err by more, the model's own error decides and rows are none: then stretches that were left out are what counts.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 from autotune.arrays import FloatArray
+from autotune.diagnosis.evidence.adequacy import is_noise
 from autotune.diagnosis.evidence.constancy import largest_variation
 from autotune.diagnosis.evidence.held_out import FitQuality
 from autotune.diagnosis.evidence.stretches import advantage, judged_rows, rms
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import Fit
 from autotune.diagnosis.fitting.long_windows import spread_of
+from autotune.diagnosis.fitting.retuning import reduced_chi2, under_noise
 from autotune.diagnosis.fitting.spreading import spread_out
 from autotune.diagnosis.selection.hypothesis import Hypothesis, vanished
 from autotune.diagnosis.selection.probability import Candidate, weighed
@@ -51,16 +58,55 @@ class Judged:
     short_squares: FloatArray
     log_odds: float
 
+    @cached_property
+    def leaves_noise(self) -> bool:
+        """Whether what it leaves is noise, at both scales, and rows that were left out are foretold about as well.
+
+        Start states that are free may make noise of anything; then it does not run through what was left out.
+        """
+        both = ((self.fit, self.data, self.long_squares), (self.short, self.few, self.short_squares))
+        return all(
+            is_noise(result, data)
+            and math.sqrt(float(squares.sum()) / judged_rows(data))
+            < data.thresholds.foretold * rms(result.residuals, data.good)
+            for result, data, squares in both
+        )
+
+    @cached_property
+    def variance(self) -> float:
+        """Variance of the innovations of what it leaves, under the noise that this shows from row to row."""
+        return reduced_chi2(self.fit, self.data) * under_noise(self.fit, self.data).noise.sd ** 2
+
     def behind(self, other: Judged) -> float:
         """Return twice the logarithm of the odds that another hypothesis is the better one, priors counted.
+
+        Where both leave noise that is what rows say. Where neither does, the model's error decides, and it is what
+        stretches say that were left out. Where one does, rows may speak for it, but not against it: what leaves more
+        than noise, or foretells nothing, is no better for what it makes of the rows that it was fitted to.
+        """
+        prior = 2.0 * (self.log_odds - other.log_odds)
+        if self.leaves_noise and other.leaves_noise:
+            return self._by_rows(other) - prior
+        if other.leaves_noise:
+            return max(self._by_rows(other), self._by_stretches(other)) - prior
+        if self.leaves_noise:
+            return min(self._by_rows(other), self._by_stretches(other)) - prior
+        return self._by_stretches(other) - prior
+
+    def _by_rows(self, other: Judged) -> float:
+        """Return what the innovations of all rows say for another hypothesis: Schwarz's criterion."""
+        numbers = self.fit.parametrisation.effect_numbers - other.fit.parametrisation.effect_numbers
+        return self.fit.rows * math.log(self.variance / other.variance) + numbers * math.log(self.fit.rows)
+
+    def _by_stretches(self, other: Judged) -> float:
+        """Return what stretches that were left out say for another hypothesis.
 
         The scale, long or short, at which they differ more decides, unless the other one contradicts it. Stretches have
         the rig and its excitation in common: together they speak for no more than ``most_evidence``.
         """
         both = [advantage(self.long_squares, other.long_squares), advantage(self.short_squares, other.short_squares)]
         most = self.data.thresholds.most_evidence
-        evidence = max(both) if sum(both) > 0.0 else min(both)
-        return min(max(evidence, -most), most) - 2.0 * (self.log_odds - other.log_odds)
+        return min(max(max(both) if sum(both) > 0.0 else min(both), -most), most)
 
     def spread_out(self) -> Judged:
         """Return it with all rows of the recordings."""
@@ -77,8 +123,10 @@ class Judged:
 
         What it has beyond the other one may have come to nothing on long windows: then short ones do not speak for it.
         What happens at a time of its own explains a part of everything: it must take away more, and since it lasts,
-        at both scales.
+        at both scales. Near the noise whatever rows speak for is better.
         """
+        if self.leaves_noise or other.leaves_noise:
+            return other.behind(self) > 0.0
         extra = set(self.names) - set(other.names)
         at_nothing = bool(extra) and extra <= vanished(Hypothesis(names=self.names, fit=self.fit))
         long, short = (
@@ -91,8 +139,8 @@ class Judged:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class RigSearch:
-    """What was found in a rig.
+class Found:
+    """What a search found.
 
     Attributes
     ----------
@@ -111,18 +159,20 @@ class RigSearch:
 
     def as_search(self) -> Search:
         """Return the hypotheses in the form that pages and planning know."""
-        sets: dict[int, list[Hypothesis]] = {1: [], 2: [], 3: []}
-        for one in sorted(self.judged, key=lambda j: j.behind(self.chosen)):
-            sets.setdefault(len(one.names), []).append(Hypothesis(names=one.names, fit=one.fit))
+        order = sorted(self.judged, key=lambda j: j.behind(self.chosen))
         return Search(
             data=self.chosen.data,
             nominal=self.nominal.fit,
             retuned=Hypothesis(names=(), fit=self.retuned.fit),
-            singles=tuple(sets[1]),
-            pairs=tuple(sets[2]),
-            triples=tuple(h for size, group in sets.items() if size > 2 for h in group),
+            others=tuple(Hypothesis(names=one.names, fit=one.fit) for one in order if one.names),
             chosen=Hypothesis(names=self.chosen.names, fit=self.chosen.fit),
         )
+
+    @property
+    def gained(self) -> float:
+        """Twice the log likelihood ratio of the chosen hypothesis beside the retuned model, every row a witness."""
+        left, before = (rms(j.fit.residuals, j.data.good) for j in (self.chosen, self.retuned))
+        return 2.0 * self.chosen.fit.rows * math.log(before / left)
 
     def candidates(self, limits: Thresholds) -> tuple[Candidate, ...]:
         """Return every hypothesis with its probability: what chose it weighs here too."""

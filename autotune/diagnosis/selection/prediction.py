@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
@@ -153,6 +154,17 @@ def direction(base: Fit, effect: Effect, data: Data) -> FloatArray:
     if not bounded(moved):
         raise IdentificationError("the simulation runs away", where=effect.name)
     return base.without_states(moved)
+
+
+def distinct(group: Sequence[Prediction]) -> list[Effect]:
+    """Return the starting points of one effect that differ once they have the size that is predicted."""
+    kept: list[Effect] = []
+    for p in group:
+        values = np.array([q.value for q in p.scaled.parameters.values()])
+        known = ([q.value for q in e.parameters.values()] for e in kept)
+        if p.decrease > 0.0 and not any(np.allclose(values, other, rtol=0.2, atol=0.0) for other in known):
+            kept.append(p.scaled)
+    return kept
 
 
 def _predicted(base: Fit, effect: Effect, data: Data) -> tuple[Prediction, float]:

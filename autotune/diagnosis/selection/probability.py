@@ -6,10 +6,6 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from autotune.diagnosis.selection.hypothesis import penalised
-from autotune.diagnosis.selection.parsimony import charge, final_lead
-from autotune.diagnosis.selection.searched import Search
-
 
 @dataclass(frozen=True, kw_only=True)
 class Candidate:
@@ -17,32 +13,6 @@ class Candidate:
 
     name: str
     probability: float
-
-
-def candidates_of(found: Search, unknown_odds: float) -> tuple[Candidate, ...]:
-    """Return every hypothesis's name with its probability among those searched, best first.
-
-    Parameters
-    ----------
-    found : Search
-        Hypotheses with their fits.
-    unknown_odds : float
-        Prior odds of a cause outside the catalogue, beside 1 of all hypotheses together.
-
-    Notes
-    -----
-    The probabilities weigh what the choice weighed, see :func:`autotune.diagnosis.selection.parsimony.charge`.
-    """
-    pool = found.all
-    chosen = found.chosen
-    lead = final_lead(found.retuned.fit, min(pool, key=penalised), found.data)
-    scores: dict[str, float] = {}
-    for h in pool:
-        pays = charge(h, chosen, lead, found.data, found.retuned.fit)
-        name = "+".join(h.names) if h.names else "none"
-        scores[name] = min(scores.get(name, math.inf), penalised(h) + pays)
-    temperature = found.data.thresholds.temperature
-    return weighed(scores, temperature * max(1.0, chosen.fit.chi2 / chosen.fit.rows), unknown_odds)
 
 
 def weighed(scores: Mapping[str, float], scale: float, unknown_odds: float) -> tuple[Candidate, ...]:

@@ -1,8 +1,15 @@
-"""Which physics is missing: the nominal structure retuned, effects added in ones, twos and threes."""
+"""Which physics is missing: effects added one by one, judged by what they leave.
+
+Models run free for as long as the plant allows: short windows with free start states favour whatever bends easily. What
+is usual in a rig of its kind needs less evidence than what is rare.
+
+The steps of one search: the file is a little longer than others.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
@@ -10,228 +17,327 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from autotune.arrays import BoolArray
+from autotune.diagnosis.evidence.operating_point import unmoved
 from autotune.diagnosis.fitting.data import Data
-from autotune.diagnosis.fitting.fit import RUNAWAY, Fit, fit, states_of
-from autotune.diagnosis.fitting.noise import Noise, noise_from_differences
-from autotune.diagnosis.fitting.restarts import standing_out
-from autotune.diagnosis.fitting.retuning import (
-    at_nominal,
-    at_operating_point,
-    far_from_prior,
-    floored,
-    holds,
-    prepare,
-    reduced_chi2,
-)
-from autotune.diagnosis.selection.confirmation import confirmed
-from autotune.diagnosis.selection.growth import exchanged, grown, larger, lasting_starts, polished, pruned
-from autotune.diagnosis.selection.hypothesis import Hypothesis, merged, penalised
-from autotune.diagnosis.selection.parsimony import (
-    final_lead,
-    may_be_needed,
-    needed,
-    settled,
-    simplest,
-    simplicity_lead,
-    worth_adding,
-)
-from autotune.diagnosis.selection.screening import Bench, Width, at_once
-from autotune.diagnosis.selection.searched import Search
+from autotune.diagnosis.fitting.fit import RUNAWAY, Fit, fit
+from autotune.diagnosis.fitting.long_windows import cut, lengths_of
+from autotune.diagnosis.fitting.parameters import parametrise
+from autotune.diagnosis.fitting.restarts import realigned
+from autotune.diagnosis.selection.bench import LAST_STEPS, STEPS, Bench, at_once, residual_sd
+from autotune.diagnosis.selection.hypothesis import hypothesis, is_stand_in
+from autotune.diagnosis.selection.judged import Found, Judged, ranked, simplest
+from autotune.diagnosis.selection.prediction import distinct, extended, predictions, signal_sizes, starting_effects
+from autotune.diagnosis.selection.refits import timed, without
+from autotune.diagnosis.selection.scan import searched
+from autotune.diagnosis.simulation.assembly import input_size
+from autotune.diagnosis.simulation.chain import build_chain
 from autotune.diagnosis.thresholds import IN_USE, Thresholds
-from autotune.effects import CATALOGUE, STRUCTURES
-from autotune.models import Model
+from autotune.effects import ALL, taken_by
+from autotune.effects.base import EffectKind, SignalSizes
+from autotune.effects.rigs import rig_kind
+from autotune.models import Effect, Model
 from autotune.progress import Progress, quiet
 from autotune.recording import Recording
 
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Stage:
-    """What a search has at hand: all data, those it screens on, the retuned model, and what it works with."""
-
-    data: Data
-    few: Data
-    base: Fit
-    bench: Bench
-
-    def polished(self, ranked: Sequence[Hypothesis], count: int) -> list[Hypothesis]:
-        """Return the best hypotheses fitted to all data, best first."""
-        return polished(ranked, count, self.data, self.base, self.bench)
+#: Prior odds, at least, of any effect in any rig.
+RARE = 0.01
+#: Share of the decrease that an effect needs near the noise that the first order must predict before it is fitted.
+PROMISING = 0.5
 
 
 def search(
     model: Model,
     recordings: Sequence[Recording],
     good: Sequence[BoolArray],
-    without: Sequence[str] = (),
+    left_out: Collection[str] = (),
     progress: Progress = quiet,
-    thresholds: Thresholds = IN_USE,
-) -> Search:
+    limits: Thresholds = IN_USE,
+    begun: Judged | None = None,
+) -> Found:
     """Search for the physics that is missing.
 
     Parameters
     ----------
-    model : Model
-        Nominal model.
-    recordings, good : sequences
-        What was measured, and which rows count.
-    without : sequence of str
-        Effects left out of the catalogue.
+    model, recordings, good
+        Nominal model, what was measured, and which rows count.
+    left_out : collection of str
+        Effects that are not looked for.
     progress : callable
         Told what is being done and the share done, 0 to 1.
-    thresholds : Thresholds
-        What decides between two findings.
+    limits : Thresholds
+        What decides between findings.
+    begun : Judged, optional
+        What predicted best on more rows of these recordings: it is judged as well, from the numbers that it had there.
 
     Returns
     -------
-    Search
-        All hypotheses with their fits.
+    Found
+        What was judged, and what predicts best.
+
+    Raises
+    ------
+    AutotuneError, OverflowError, LinAlgError
+        The nominal model runs away on the recordings.
 
     Notes
     -----
-    Forward search with a beam: pairs are built on the best four singles, whether or not these help alone, so that
-    partners that only help together are found as long as one of them is among the four. What brings the residual to
-    noise must do so on longer windows too; else everything is searched again on those. Long recordings are searched in
-    some of their windows, and the best hypotheses are fitted to all of them.
+    Forward search with a beam, then what is not needed is dropped. An effect must be usual in a rig of its kind or the
+    evidence outweigh that it is not. Where the model's error decides, it takes away a tenth of the held-out error, and
+    stretches agree on it: what is excited in no stretch but one is found with less power.
     """
-    kinds = tuple(kind for name, kind in (CATALOGUE | STRUCTURES).items() if name not in without)
     with threadpool_limits(1), ThreadPoolExecutor(2) as pool:
-        bench = Bench(pool=pool, kinds=kinds)
-        progress("retuning", 0.0)
-        found = _searched(*prepare(model, recordings, good, 1, thresholds), bench, progress, again=False)
-        if not holds(found.chosen.fit, found.data):
-            progress("once more, on longer windows", 0.0)
-            longer = prepare(model, recordings, good, thresholds.longer_windows, thresholds)
-            found = _searched(*longer, bench, progress, again=True)
-        return confirmed(found, pool)
+        progress("retuning on long windows", 0.0)
+        lengths = lengths_of(model, recordings, limits)
+        bench = Bench(
+            cuts=tuple(cut(recordings, good, length, limits) for length in lengths.between),
+            few=cut(recordings, good, lengths.short, limits),
+            odds=_odds(model, recordings, left_out),
+            lasting=(),
+            pool=pool,
+        )
+        bench, roots = _roots(model, bench)
+        nominal, retuned = roots
+        away = np.abs(retuned.fit.theta - retuned.fit.parametrisation.centre) / retuned.fit.parametrisation.spreads
+        beam = [retuned, nominal] if float(np.max(away)) > limits.nominal_too else [retuned]
+        bench = replace(bench, lasting=tuple(_lasting(retuned, bench)))
+        bench, found = _grown(retuned, beam, bench, progress, limits)
+        found = _regrown(_finished(_pruned([*found, *_begun(begun, bench)], bench), bench), bench)
+        chosen = bench.with_both_scales(simplest(found, limits.material))
+        nominal, retuned, chosen = (one.spread_out() for one in (nominal, retuned, chosen))
+        return Found(nominal=nominal, retuned=retuned, judged=tuple(found), chosen=chosen)
 
 
-def _searched(data: Data, base: Fit, bench: Bench, progress: Progress, *, again: bool) -> Search:
-    """Search beside a retuned model; what does not hold on longer windows is not built on, but on these ``again``."""
-    nominal = at_nominal(base, data)
+def _odds(
+    model: Model, recordings: Sequence[Recording], left_out: Collection[str]
+) -> tuple[tuple[EffectKind, float], ...]:
+    """Return the effects that may be missing, with their prior odds in a rig of the model's kind."""
+    kind = rig_kind(model, build_chain(model))
+    left_out = {*left_out, *unmoved(model, recordings)}
+    able = [k for k in ALL if k.sought in ("hypothesis", "rig", "structure") and k.name not in left_out]
+    return tuple((k, max(k.odds.get(kind, k.odds.get("any", 0.0)), RARE)) for k in able)
+
+
+def _grown(
+    retuned: Judged, beam: list[Judged], bench: Bench, progress: Progress, limits: Thresholds
+) -> tuple[Bench, list[Judged]]:
+    """Add effects one by one while one of them makes the free run better; return all that was judged."""
+    found, best = [retuned], retuned
+    for size in range(limits.rig_effects):
+        progress("effects one by one", 0.1 + 0.8 * size / limits.rig_effects)
+        larger = _larger(beam, bench)
+        if not larger:
+            break
+        found += larger
+        larger = ranked((best, *larger))
+        leads = larger[0] is not best
+        larger.remove(best)
+        beam = larger[: limits.rig_beam]
+        if leads and larger[0].is_better(best, limits.material):
+            best = larger[0]
+            bench = bench.with_sd(residual_sd(best.fit, best.data), residual_sd(best.short, best.few))
+            beam = [bench.again(j) for j in beam if j.leaves_noise or not best.leaves_noise]
+        elif size > 0:
+            break
+    return bench, found
+
+
+def _roots(model: Model, bench: Bench) -> tuple[Bench, list[Judged]]:
+    """Return the bench with the retuned model's residual, and that model at its nominal numbers and retuned."""
+    recordings = bench.long.driving
+    p = parametrise(model, [], input_size(model, recordings), recordings[0].sample_time_s)
+    result = bench.settled(p, None)
+    for _ in range(2):
+        bench = bench.with_sd(residual_sd(result, bench.long), bench.few.noise.sd)
+        result = bench.settled(p, result.theta)
+    short = bench.shortened(result) if bench.two_scales else result
+    bench = bench.with_sd(bench.long.noise.sd, residual_sd(short, bench.near))
+    retuned = bench.judged(result, 0.0)
+    offset = np.array([f.kind == "u_offset" for f in p.free])
+    at_prior = fit(p, bench.long, result.theta * offset + p.centre * ~offset, free=offset)
+    nominal = bench.judged(at_prior, 0.0)
+    if retuned is None:
+        raise OverflowError("the retuned model runs away")
+    return bench, [nominal if nominal is not None else retuned, retuned]
+
+
+def _lasting(root: Judged, bench: Bench) -> list[Effect]:
+    names = [k.name for k, _ in bench.odds if k.lasting]
+    return [e for name in names for e in searched(name, root.short, root.few, bench.pool)]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Start:
+    """An effect to be added to a hypothesis: where from, at which scale, and what the first order predicts."""
+
+    base: Judged
+    kind: EffectKind
+    odds: float
+    effects: tuple[Effect, ...]
+    near: Fit
+    data: Data
+    decrease: float
+
+
+def _larger(beam: Sequence[Judged], bench: Bench) -> list[Judged]:
+    """Return hypotheses with one effect more than those of a beam, the most promising ones judged."""
+    starts: list[_Start] = []
+    for base in beam:
+        found = _starts(base, bench)
+        if base.leaves_noise:
+            found = [s for s in found if s.decrease > PROMISING * _needed(s, base)]
+        found.sort(key=lambda s: -s.decrease - 2.0 * math.log(s.odds))
+        starts += [s for rank, s in enumerate(found) if rank < bench.limits.rig_tried or s.odds >= bench.limits.usual]
+    fits = bench.pool.map(lambda s: _added(s, bench), starts)
+    best: dict[frozenset[str], tuple[Fit, float]] = {}
+    for s, result in zip(starts, fits, strict=True):
+        if result is None or result.cost > s.base.fit.cost - 0.3:
+            continue
+        key, log_odds = frozenset((*s.base.names, s.kind.name)), s.base.log_odds + math.log(s.odds)
+        if key not in best or result.cost < best[key][0].cost:
+            best[key] = result, log_odds
+    ranked = sorted(best.values(), key=lambda pair: pair[0].cost - 2.0 * pair[1])[: bench.limits.rig_judged]
+    done = bench.pool.map(lambda pair: bench.judged_closely(*pair), ranked)
+    return [j for j in done if j is not None and np.all(np.isfinite(j.long_squares + j.short_squares))]
+
+
+def _needed(start: _Start, base: Judged) -> float:
+    """Return the decrease of chi-square that rows must speak for an effect with, to be the better hypothesis."""
+    fitted = sum(q.is_fitted for q in start.kind.parameters)
+    return fitted * math.log(base.fit.rows) - 2.0 * math.log(start.odds)
+
+
+def _starts(base: Judged, bench: Bench) -> list[_Start]:
+    """Return every effect's starting points from which the first order predicts most, at each scale that helps.
+
+    Where the free run through long windows is out of phase, no derivative there leads anywhere: short ones do.
+    """
+    scales = [(base.fit, bench.long)]
+    if len(bench.cuts) > 1 and base.error > bench.limits.out_of_phase:
+        scales.append((bench.shortened(base.fit), bench.few))
+    taken = taken_by(base.names)
+    tried = [
+        (kind, odds, near, data)
+        for kind, odds in bench.odds
+        for near, data in scales
+        if kind.name not in taken and kind.suits.holds(near.sim.chain)
+    ]
+    sizes = {id(data): signal_sizes(near, data) for near, data in scales}
+    effects = at_once(lambda t: _tried(t[0], t[2], t[3], sizes[id(t[3])], bench), tried)
+    each = [(near, data, e) for (_, _, near, data), group in zip(tried, effects, strict=True) for e in group]
+    predicted = iter(list(bench.pool.map(lambda t: predictions(t[0], t[2], t[1]), each)))
+    found = []
+    for (kind, odds, near, data), group in zip(tried, effects, strict=True):
+        order = sorted((p for _ in group for p in next(predicted)), key=lambda p: -p.decrease)
+        few = tuple(distinct(order)[: bench.limits.rig_starts])
+        if few:
+            found.append(
+                _Start(base=base, kind=kind, odds=odds, effects=few, near=near, data=data, decrease=order[0].decrease)
+            )
+    return found
+
+
+def _tried(kind: EffectKind, near: Fit, data: Data, sizes: SignalSizes, bench: Bench) -> list[Effect]:
+    """Return an effect's starting points: those of its record, and those that a direct search finds."""
+    tried = starting_effects(kind, near, sizes)
+    if kind.lasting:
+        return tried + [e for e in bench.lasting if e.name == kind.name]
+    return tried + (searched(kind.name, near, data, bench.pool) if kind.search is not None else [])
+
+
+def _added(start: _Start, bench: Bench) -> Fit | None:
+    """Return the best fit of a hypothesis with one more effect to long windows; nothing where all run away."""
+    done: list[Fit] = []
+    steps = 2 * STEPS if start.kind.rough else STEPS
+    for effect in start.effects:
+        try:
+            p, theta, states = extended(start.near, effect, start.data)
+            result = fit(p, start.data, theta, states, iterations=steps, inherit=start.near)
+            if start.data is not bench.long:
+                result = bench.settled(p, result.theta)
+        except RUNAWAY:
+            continue
+        if start.kind.moves is not None:
+            result = realigned(result, bench.long)
+        if not is_stand_in(hypothesis(result), bench.long):
+            done.append(result)
+    best = min(done, key=lambda f: f.cost, default=None)
+    return timed(best, bench.long) if best is not None and start.kind.is_event else best
+
+
+def _begun(begun: Judged | None, bench: Bench) -> list[Judged]:
+    """Return what predicted best on more rows, judged on these: a search of fewer rows may miss where it lies."""
+    if begun is None:
+        return []
+    p, theta = begun.fit.parametrisation, begun.fit.theta
+    return _brought(lambda: fit(p, bench.long, theta, iterations=LAST_STEPS), begun.log_odds, bench)
+
+
+def _brought(fitted: Callable[[], Fit], log_odds: float, bench: Bench) -> list[Judged]:
+    """Return a hypothesis that was found elsewhere, fitted and judged here; nothing where it runs away."""
     try:
-        return _extended(data, base, nominal, bench, progress, again)
+        judged = bench.finite(fitted(), log_odds)
     except RUNAWAY:
-        # what breaks off explains nothing: the retuned model stands, and is judged by its residual
-        retuned = Hypothesis(names=(), fit=base)
-        return Search(data=data, nominal=nominal, retuned=retuned, chosen=retuned)
+        return []
+    return [] if judged is None else [judged]
 
 
-def _extended(data: Data, base: Fit, nominal: Fit, bench: Bench, progress: Progress, again: bool) -> Search:
-    """Add effects in ones, twos and threes as far as the residual asks for them."""
-    progress("single effects", 0.1)
-    limits = data.thresholds
-    stage = _Stage(data=data, few=_few(data, base), base=base, bench=bench)
-    candidates = _screened(stage)
-    coarse = reduced_chi2(base, data) > limits.coarse
-    singles = (stage.polished(candidates, 1) if coarse else []) or stage.polished(candidates, 3)
-    if singles and coarse:  # of these the noise alone is taken
-        stage = _finer(singles[0], stage)
-        candidates = [_again(h, stage.few) for h in candidates[:3]]
-        singles = stage.polished(candidates, 3)
-    retuned = chosen = Hypothesis(names=(), fit=stage.base)
-    is_worth = bool(singles) and worth_adding(retuned, singles[0], limits)
-    if not singles or not (is_worth or reduced_chi2(stage.base, stage.data) > limits.search_on):
-        return Search(data=stage.data, nominal=nominal, retuned=retuned, singles=tuple(singles), chosen=retuned)
-    if is_worth:
-        chosen = singles[0]
-        if not again and not holds(chosen.fit, stage.data):
-            return Search(data=stage.data, nominal=nominal, retuned=retuned, singles=tuple(singles), chosen=chosen)
-    progress("pairs of effects", 0.4)
-    pairs, triples = list[Hypothesis](), list[Hypothesis]()
-    if not is_worth or may_be_needed(chosen, stage.data, stage.base):
-        chosen, pairs, triples = _combined(chosen, singles, candidates, stage, progress)
-    if len(chosen.names) > 1:
-        progress("dropping what is not needed", 0.85)
-        chosen, singles = pruned(chosen, singles, stage.data, stage.base, bench)
-    if len(chosen.names) > 1:
-        ranked = sorted((chosen, *exchanged(chosen, stage.data, stage.base, bench)), key=penalised)
-        pairs = [*pairs, *ranked]
-        chosen = simplest(ranked, simplicity_lead(stage.base, ranked[0], stage.data))
-    if reduced_chi2(chosen.fit, stage.data) > limits.model_error:
-        fewer = [h for h in (*singles, *pairs) if h.parameters < chosen.parameters]
-        chosen = simplest([chosen, *fewer], final_lead(stage.base, chosen, stage.data))
-    chosen = settled(chosen, (retuned, *singles, *pairs, *triples), stage.data, stage.base)
-    return Search(
-        data=stage.data,
-        nominal=nominal,
-        retuned=retuned,
-        singles=tuple(singles),
-        pairs=tuple(pairs),
-        triples=tuple(triples),
-        chosen=retuned if STRUCTURES.keys() & set(chosen.names) else chosen,
-    )
+def _pruned(found: Sequence[Judged], bench: Bench) -> list[Judged]:
+    """Return hypotheses with those that the leading ones become when an effect is left out, and again of these.
 
-
-def _few(data: Data, base: Fit) -> Data:
-    """Return the rows on which hypotheses are screened; the best are fitted to all."""
-    return data.thinned(data.thresholds.screening_rows, standing_out(base, data.thresholds.stands_out))
-
-
-def _screened(stage: _Stage) -> list[Hypothesis]:
-    """Return single effects fitted to the rows that are screened on, best first.
-
-    Where retuning went far from the prior, effects are looked for beside the chain at its prior as well.
+    Dry friction has many local minima: one more effect may only have led out of one.
     """
-    base, data, few, bench = stage.base, stage.data, stage.few, stage.bench
-    p, limits = base.parametrisation, data.thresholds
-    wide = Width(effects=limits.screened_effects, starts=4, least=limits.least_predicted)
-    start = Hypothesis(names=(), fit=base if few is data else fit(p, few, base.theta, states_of(base, few)))
-
-    def beside(one: tuple[Hypothesis, Width]) -> list[Hypothesis]:
-        return grown(one[0], few, bench, one[1], lasting_starts(one[0], few, bench, bench.names))
-
-    if not far_from_prior(base, limits.far_from_prior):
-        return beside((start, wide))
-    at_prior = Hypothesis(names=(), fit=at_operating_point(p, few))
-    return merged(*at_once(beside, [(start, wide), (at_prior, replace(wide, starts=2))]))
+    result, done = list(found), set()
+    for _ in range(bench.limits.rig_effects):
+        leading = ranked(result)[: bench.limits.rig_pruned]
+        fresh = [j for j in (*leading, simplest(result, bench.limits.material)) if id(j) not in done]
+        if not fresh:
+            break
+        once = list({id(j): j for j in fresh}.values())
+        done |= {id(j) for j in once}
+        result += [j for group in at_once(lambda j: _smaller(j, bench), once) for j in group]
+    return result
 
 
-def _combined(
-    chosen: Hypothesis,
-    singles: list[Hypothesis],
-    candidates: list[Hypothesis],
-    stage: _Stage,
-    progress: Progress,
-) -> tuple[Hypothesis, list[Hypothesis], list[Hypothesis]]:
-    """Return the choice among singles, pairs and triples, and the pairs and triples fitted."""
-    data, base, retuned = stage.data, stage.base, Hypothesis(names=(), fit=stage.base)
-    wider = _paired(singles, candidates, stage)
-    pairs, triples = stage.polished(wider, 2), list[Hypothesis]()
-    if not (pairs and worth_adding(retuned, pairs[0], data.thresholds) and needed(singles[0], pairs[0], data, base)):
-        return chosen, pairs, triples
-    chosen = pairs[0]
-    if reduced_chi2(chosen.fit, data) > data.thresholds.three_effects:
-        progress("three effects", 0.8)
-        triples = stage.polished(larger(wider[:1], stage.few, stage.bench), 1)
-    if triples and needed(pairs[0], triples[0], data, base):
-        chosen = triples[0]
-    return chosen, pairs, triples
+def _finished(found: Sequence[Judged], bench: Bench) -> list[Judged]:
+    """Return hypotheses and, beside them, the leading ones fitted to the end: the search leaves them before."""
+    leading = ranked(found)[: bench.limits.rig_pruned]
+    leading += [j for j in [simplest(found, bench.limits.material)] if j not in leading]
+    return [*found, *(j for j in bench.pool.map(bench.finished, leading) if j is not None)]
 
 
-def _paired(singles: list[Hypothesis], candidates: list[Hypothesis], stage: _Stage) -> list[Hypothesis]:
-    """Return pairs built on the best singles.
+def _regrown(found: Sequence[Judged], bench: Bench) -> list[Judged]:
+    """Return hypotheses with those that have one effect more than the chosen one, fitted on from where that came to.
 
-    A single effect that leaves noise alone is given one chance to be half of a pair, a bad one three.
+    Fits under dry friction end in local minima: what is larger is compared with what is smaller from the same place.
     """
-    settled = reduced_chi2(singles[0].fit, stage.data) < stage.data.thresholds.settled
-    lead = [h for h in candidates if h.names == singles[0].names]
-    bases = [*lead, *(h for h in candidates[:3] if h not in lead)]
-    wider = larger(bases[: 1 if settled else 3], stage.few, stage.bench)
-    return [h for h in wider if penalised(lead[0]) - penalised(h) > stage.data.thresholds.pair_decrease]
+    best = simplest(found, bench.limits.material)
+    larger = [j for j in ranked(found) if set(j.names) > set(best.names) and len(j.names) == len(best.names) + 1]
+    once = {frozenset(j.names): j for j in reversed(larger)}
+    chosen = sorted(once.values(), key=larger.index)[: bench.limits.rig_pruned]
+    return [*found, *(j for j in bench.pool.map(lambda j: _on_from(best, j, bench), chosen) if j is not None)]
 
 
-def _finer(best: Hypothesis, stage: _Stage) -> _Stage:
-    """Return data with the noise that the best hypothesis leaves, and the retuned model under it."""
-    data, base = stage.data, stage.base
-    noise = noise_from_differences(best.fit.residuals, data.good, data.thresholds.largest_correlation)
-    if reduced_chi2(best.fit, data) > data.thresholds.coarse:
-        noise = Noise(sd=float(np.sqrt(np.mean(np.concatenate(best.fit.residuals) ** 2))))
-    data = replace(data, noise=floored(noise, data.recordings))
-    base = fit(base.parametrisation, data, base.theta, base.x0, iterations=20)
-    # the same windows: what was screened on them goes on
-    return replace(stage, data=data, base=base, few=replace(stage.few, noise=data.noise))
+def _on_from(best: Judged, larger: Judged, bench: Bench) -> Judged | None:
+    """Return a hypothesis fitted from another one's numbers, with the effect that it has besides as it was found."""
+    effect = next(e for e in larger.fit.model.effects if e.name in set(larger.names) - set(best.names))
+    try:
+        p, theta, states = extended(best.fit, effect, bench.long)
+        result = fit(p, bench.long, theta, states, iterations=LAST_STEPS, inherit=best.fit)
+    except RUNAWAY:
+        return None
+    if result.cost >= larger.fit.cost:
+        return None
+    return bench.finite(result, larger.log_odds)
 
 
-def _again(h: Hypothesis, data: Data) -> Hypothesis:
-    """Fit a hypothesis again under another noise."""
-    return replace(h, fit=fit(h.fit.parametrisation, data, h.fit.theta, h.fit.x0, iterations=20))
+def _smaller(best: Judged, bench: Bench) -> list[Judged]:
+    """Return a hypothesis with each of its effects left out: built one by one, one may have stood for another."""
+    given = {k.name: math.log(o) for k, o in bench.odds}
+
+    def left(index: int) -> Judged | None:
+        smaller = without(best.fit, index, best.data)
+        own = sum(given.get(n, -math.inf) for i, n in enumerate(best.names) if i != index)
+        return None if smaller is None else bench.judged(smaller, max(own, best.log_odds))
+
+    indices = range(len(best.names) if len(best.names) > 1 else 0)
+    return [j for j in bench.pool.map(left, indices) if j is not None]

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import Fit
 from autotune.diagnosis.selection.hypothesis import Hypothesis
-from autotune.diagnosis.selection.parsimony import worth_adding
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -22,8 +21,8 @@ class Search:
         Nominal numbers, start states fitted.
     retuned : Hypothesis
         Nominal structure, numbers fitted.
-    singles, pairs, triples : tuple of Hypothesis
-        Hypotheses fitted, best first.
+    others : tuple of Hypothesis
+        Hypotheses with effects, the best first.
     chosen : Hypothesis
         The one that the data ask for; the retuned model where no effect is needed.
     """
@@ -31,24 +30,10 @@ class Search:
     data: Data
     nominal: Fit
     retuned: Hypothesis
-    singles: tuple[Hypothesis, ...] = ()
-    pairs: tuple[Hypothesis, ...] = ()
-    triples: tuple[Hypothesis, ...] = ()
+    others: tuple[Hypothesis, ...] = ()
     chosen: Hypothesis
 
     @property
     def all(self) -> tuple[Hypothesis, ...]:
         """Every hypothesis, the retuned model first."""
-        return (self.retuned, *self.singles, *self.pairs, *self.triples)
-
-    def asking(self, least: float) -> Search:
-        """Return the search with a least decrease that effects must bring, for the choice and for the probabilities."""
-        thresholds = replace(self.data.thresholds, least_decrease=least, least_decrease_beyond=least)
-        keeps = worth_adding(self.retuned, self.chosen, thresholds)
-        chosen = self.chosen if keeps else self.retuned
-        return replace(self, data=replace(self.data, thresholds=thresholds), chosen=chosen)
-
-    @property
-    def gained(self) -> float:
-        """Decrease of the penalised chi-square that the chosen effects bring."""
-        return self.retuned.penalised_chi2 - self.chosen.penalised_chi2
+        return (self.retuned, *self.others)

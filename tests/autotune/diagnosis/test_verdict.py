@@ -32,19 +32,26 @@ def test_every_set_of_facts_has_one_verdict_and_every_row_decides_some() -> None
 
 @pytest.mark.parametrize("samples", [frozenset(), frozenset({"samples"})])
 def test_what_samples_show_switches_no_test_off(samples: frozenset[str]) -> None:
-    assert verdict_of(samples | {"effects", "follows", "constant"}) == "unexplained"
+    assert verdict_of(samples | {"more than noise", "follows", "constant"}) == "unexplained"
     assert verdict_of(samples | {"missing", "constant"}) == "unexplained"
     assert verdict_of(samples | {"adequate"}) == "unexplained"  # something varies in what is left
-    assert verdict_of(samples | {"effects", "follows", "adequate", "constant"}) == "effect"
+    assert verdict_of(samples | {"more than noise", "effects", "follows", "constant"}) == "effect"
 
 
 def test_a_rigs_effects_are_not_named_where_what_varies_beside_them_explains_more() -> None:
-    assert verdict_of(frozenset({"rig", "follows", "effects"})) == "effect"
-    assert verdict_of(frozenset({"rig", "follows", "effects", "varies more"})) == "unexplained"
+    found = frozenset({"more than noise", "follows", "effects"})
+    assert verdict_of(found) == "effect"
+    assert verdict_of(found | {"varies more"}) == "unexplained"
 
 
 @pytest.mark.parametrize(
-    "known", [{"effects"}, {"rig", "effects"}, {"rig", "effects", "late stamps"}, {"wrong numbers"}]
+    "known",
+    [
+        {"effects", "samples"},
+        {"more than noise", "effects"},
+        {"more than noise", "effects", "late stamps"},
+        {"wrong numbers"},
+    ],
 )
 def test_what_follows_nothing_of_the_recordings_names_nothing(known: set[str]) -> None:
     assert verdict_of(frozenset(known | {"constant"})) == "unexplained"
@@ -53,7 +60,7 @@ def test_what_follows_nothing_of_the_recordings_names_nothing(known: set[str]) -
 def residual_with(reduced_chi2: float, *, uneven: bool = False, varies: float = 5.0) -> ResidualTests:
     return ResidualTests(
         reduced_chi2=reduced_chi2, reduced_chi2_chance=0.01, slow=1.0, slow_chance=0.02,
-        varies=Variation(gain=varies, places=("plant",), what="a load", period_s=math.inf), gained=0.0, uneven=uneven,
+        varies=Variation(gain=varies, places=("plant",), what="a load", period_s=math.inf), uneven=uneven,
     )  # fmt: skip
 
 
@@ -66,7 +73,7 @@ def test_the_variance_counts_unless_some_rows_are_noisier_than_others() -> None:
 
 
 def test_the_unknown_weighs_the_more_the_nearer_the_residual_comes_to_the_bound() -> None:
-    odds = [odds_of_unknown(residual_with(r), explains_most=False, limits=IN_USE) for r in (1.0, 1.05, 1.1, 1.3)]
+    odds = [odds_of_unknown(residual_with(r), IN_USE) for r in (1.0, 1.05, 1.1, 1.3)]
     assert odds == sorted(odds)
     assert odds[0] == pytest.approx(IN_USE.unknown_odds)
     assert odds[-1] == 1.0

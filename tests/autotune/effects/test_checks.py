@@ -34,7 +34,6 @@ DRAG = EffectKind(
     reference="Newton",
     lines=(Line(stage="force", does=dragged),),
     starts=lambda sizes: [(1.0,)],
-    confusable=("plant.coulomb_friction",),
 )
 
 
@@ -65,8 +64,6 @@ def test_a_complete_record_is_taken() -> None:
         ({"lines": (Line(stage="nowhere", does=dragged),)}, "no stage 'nowhere'"),  # type: ignore[arg-type]
         ({"lines": (Line(stage="sensor", does=dragged),)}, "takes 'v', which is neither a signal of stage sensor"),
         ({"memory": Memory(name="held")}, "no line takes its memory 'held'"),
-        ({"confusable": ()}, "no effect that it can be taken for; give confusable="),
-        ({"confusable": ("plant.gremlin",)}, r"confusable names 'plant\.gremlin'"),
         ({"places": ("plant", "mars")}, "no place 'mars'"),
         ({"name": "plant.leak"}, "stands twice"),
         ({"parameters": (*DRAG.parameters, Quantity(name="idle", unit="", role="shape"))}, "'idle' acts nowhere"),
@@ -80,7 +77,7 @@ def test_what_is_missing_or_contradicts_itself_is_refused_by_name(change: dict[s
         require_complete((*ALL, replace(DRAG, **change)))
 
 
-@pytest.mark.parametrize("left_out", ["name", "equation", "parameters", "reference", "lines", "starts", "confusable"])
+@pytest.mark.parametrize("left_out", ["name", "equation", "parameters", "reference", "lines", "starts"])
 def test_an_incomplete_record_is_refused_when_the_package_is_imported(tmp_path: Path, left_out: str) -> None:
     """A record as a newcomer writes it into the file of its place, with one of its parts left out."""
     copy = tmp_path / "autotune"
@@ -90,7 +87,7 @@ def test_an_incomplete_record_is_refused_when_the_package_is_imported(tmp_path: 
         "name": 'name="timing.slowness"', "equation": 'equation="w -> w (1 - share)"',
         "parameters": 'parameters=(Quantity(name="share", unit="1", role="amplitude"),)',
         "lines": 'lines=(Line(stage="command", does=slowed),)', "starts": "starts=lambda sizes: [(0.1,)]",
-        "reference": 'reference="Newton"', "confusable": 'confusable=("actuator.nonlinear_gain",)',
+        "reference": 'reference="Newton"',
     }  # fmt: skip
     record = ", ".join(part for key, part in parts.items() if key != left_out)
     line = "def slowed(w: float, share: float) -> float:\n    return w * (1.0 - share)\n\n\n"
@@ -103,8 +100,7 @@ def test_an_incomplete_record_is_refused_when_the_package_is_imported(tmp_path: 
     )
     assert found.returncode != 0
     said = found.stderr.splitlines()[-1]
-    what = {"lines": "nothing would be simulated", "starts": "no fit would ever start", "name": "'name'",
-            "confusable": "no effect that it can be taken for"}  # fmt: skip
+    what = {"lines": "nothing would be simulated", "starts": "no fit would ever start", "name": "'name'"}
     assert what.get(left_out, f"effect timing.slowness: no {left_out}") in said
 
 

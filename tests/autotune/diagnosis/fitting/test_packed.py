@@ -15,7 +15,6 @@ from autotune.diagnosis.fitting.parameters import parametrise
 from autotune.diagnosis.fitting.retuning import reduced_chi2
 from autotune.diagnosis.fitting.spreading import spread_out
 from autotune.diagnosis.simulation.assembly import assemble
-from autotune.diagnosis.thresholds import Thresholds
 from autotune.models import Block, Effect, Model, Parameter, Port, TransferFunction
 from autotune.recording import Recording
 
@@ -81,16 +80,6 @@ def test_a_fit_to_packed_rows_is_the_fit_to_those_rows_in_their_recordings(name:
     np.testing.assert_allclose(spread.jacobian[0], large.jacobian[0], rtol=1e-4, atol=1e-4)
 
 
-def test_windows_that_are_thinned_in_runs_can_be_joined_still() -> None:
-    data = some_windows(effect_of("actuator.backlash"), 6).whole
-    assert data is not None
-    data = replace(data, thresholds=Thresholds(least_windows=2)).in_runs(1500, 3)
-    joined = data.joined(3)
-    for starts, stops in zip(joined.first_rows, (w.stops for w in joined.windows), strict=True):
-        assert np.all((stops - starts == 3 * WINDOW) | (stops == ROWS))
-    assert 0 < data.rows < 0.8 * 2 * ROWS
-
-
 def test_start_states_are_known_by_the_rows_of_the_whole_recordings() -> None:
     packed = some_windows(effect_of("timing.dead_time"), 7)
     result = fit(parametrise(model(), [], 1.0, 0.1), packed, iterations=2)
@@ -105,7 +94,10 @@ def test_a_fit_to_two_divisions_counts_each_by_its_own_noise(packed: bool) -> No
     some = some_windows(effect, 9)
     assert some.whole is not None
     every_other = np.arange(10) % 2 == 0
-    long = replace(some.whole.joined(2).only((every_other, every_other)), noise=Noise(sd=0.03))
+    pairs = replace(
+        some.whole, starts=tuple(a[::2] for a in some.whole.starts), stops=tuple(b[1::2] for b in some.whole.stops)
+    )
+    long = replace(pairs.only((every_other, every_other)), noise=Noise(sd=0.03))
     short = replace(some, noise=Noise(sd=0.01))
     both = long.beside(short) if packed else long.beside(short.spread_out())
     assert (both.whole is not None) == packed

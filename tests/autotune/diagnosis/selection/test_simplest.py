@@ -22,9 +22,9 @@ STRETCHES = np.array([0.9, 1.1, 1.0, 0.95, 1.05, 1.02, 0.98, 1.0])
 
 @pytest.fixture(scope="module")
 def fitted() -> tuple[Data, Fit]:
-    """Return a fit of a lag to noise: names and errors are what is compared here."""
+    """Return a fit of a lag to a walk, which leaves more than noise: names and errors are what is compared here."""
     rng = np.random.default_rng(1)
-    r = Recording(t=0.1 * np.arange(400), u=rng.normal(size=400), y=rng.normal(size=400), name="r")
+    r = Recording(t=0.1 * np.arange(400), u=rng.normal(size=400), y=np.cumsum(rng.normal(size=400)), name="r")
     lag = Block(name="lag", place="plant", dynamics=TransferFunction(num=(1.0,), den=(1.0, 1.0)))
     model = Model(name="lag", input=Port(), output=Port(), blocks=(lag,))
     return prepare(model, [r], inspect([r])[0])

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -11,13 +9,9 @@ from hypothesis import strategies as st
 
 from autotune.diagnosis.fitting.bases import basis, determined
 from autotune.diagnosis.fitting.data import Data
-from autotune.diagnosis.fitting.fit import Fit, fit
 from autotune.diagnosis.fitting.noise import Noise
-from autotune.diagnosis.fitting.parameters import parametrise
-from autotune.diagnosis.selection.hypothesis import hypothesis
-from autotune.diagnosis.selection.parsimony import may_be_needed
-from autotune.diagnosis.selection.rig_search import search_rig
-from autotune.diagnosis.selection.screening import at_once
+from autotune.diagnosis.selection.bench import at_once
+from autotune.diagnosis.selection.search import search
 from autotune.diagnosis.simulation.assembly import assemble
 from autotune.diagnosis.thresholds import IN_USE
 from autotune.effects import ALL
@@ -54,20 +48,6 @@ def cut(recording: Recording) -> Data:
     )  # fmt: skip
 
 
-@given(st.integers(0, 2**32 - 1), st.integers(0, 60))
-def test_windows_that_tell_most_are_screened_on_and_take_up_to_half_of_the_rows(seed: int, telling: int) -> None:
-    data = cut(recorded())
-    tells = np.zeros(ROWS // WINDOW)
-    chosen = np.random.default_rng(seed).permutation(tells.size)[:telling]
-    tells[chosen] = 1.0 + np.arange(telling)
-    few = data.thinned(1000, [tells])
-    kept = few.first_rows[0] // WINDOW
-    most = set(chosen[::-1][:10])
-    assert most <= set(kept)
-    assert few.rows <= 1000 + 4 * WINDOW  # the largest and smallest u and y stay besides
-    assert few.rows >= 0.6 * 1000
-
-
 @given(st.integers(0, 2**32 - 1), st.lists(st.integers(3, 30), min_size=1, max_size=6), st.integers(1, 3))
 def test_as_many_start_states_are_told_as_span_what_they_explain(seed: int, lengths: list[int], states: int) -> None:
     random = np.random.default_rng(seed)
@@ -98,24 +78,10 @@ def test_tasks_side_by_side_keep_their_order() -> None:
     assert at_once(lambda k: k * k, range(20)) == [k * k for k in range(20)]
 
 
-def retuned(recording: Recording) -> tuple[Data, Fit]:
-    data = cut(recording)
-    return data, fit(parametrise(lag(), [], 1.0, 0.05), data)
-
-
-def test_nothing_more_can_be_needed_beside_what_leaves_noise_alone_and_all_can_beside_what_leaves_more() -> None:
-    data, noise_alone = retuned(recorded())
-    base = replace(noise_alone, chi2=noise_alone.chi2 + 1e6)  # what was explained is large
-    assert not may_be_needed(hypothesis(noise_alone), data, base)
-    assert may_be_needed(hypothesis(noise_alone), data, replace(noise_alone, chi2=noise_alone.chi2 + 1e3))
-    data, slow_left = retuned(recorded(added=0.05))
-    assert may_be_needed(hypothesis(slow_left), data, replace(slow_left, chi2=slow_left.chi2 + 1e6))
-
-
 @pytest.mark.parametrize(("sensor_lag_s", "pairs"), [(1e-9, False), (0.2, True)])
 def test_a_rig_is_given_a_second_effect_only_where_more_than_noise_is_left(sensor_lag_s: float, pairs: bool) -> None:
     recording = recorded(drag=1.0, sensor_lag_s=sensor_lag_s)
     names = [k.name for k in ALL if k.name not in ("plant.quadratic_drag", "sensor.lag")]
-    found = search_rig(lag(), [recording], [np.ones(ROWS, dtype=bool)], left_out=names)
+    found = search(lag(), [recording], [np.ones(ROWS, dtype=bool)], left_out=names)
     assert "plant.quadratic_drag" in found.chosen.names
-    assert any(len(j.names) > 1 for j in found.judged) is pairs
+    assert (set(found.chosen.names) == {"plant.quadratic_drag", "sensor.lag"}) is pairs

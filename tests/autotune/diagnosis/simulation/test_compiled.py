@@ -39,7 +39,6 @@ SOFT = EffectKind(
     equation="w = limit tanh(w / limit)",
     parameters=(Quantity(name="limit", unit="{u}", role="threshold"),),
     reference="none",
-    confusable=("actuator.saturation",),
     lines=(Line(stage="command", does=softened),),
     starts=lambda sizes: [(1.0,)],
 )

@@ -1,29 +1,40 @@
-"""What the search in a rig works with: data at both scales, fits that go from short windows to long, judgement."""
+"""What a search works with: data at both scales, fits that go from short windows to long, judgement."""
 
 from __future__ import annotations
 
-from concurrent.futures import Executor
+import math
+from collections.abc import Callable, Sequence
+from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 
 from autotune.arrays import FloatArray
-from autotune.diagnosis.evidence.stretches import held_out_squares, rms
+from autotune.diagnosis.evidence.stretches import correlation_rows, held_out_squares, rms
 from autotune.diagnosis.fitting.data import Data, as_white
 from autotune.diagnosis.fitting.fit import RUNAWAY, Fit, fit, start_states
+from autotune.diagnosis.fitting.long_windows import spread_of
 from autotune.diagnosis.fitting.parameters import Parametrisation
 from autotune.diagnosis.selection.hypothesis import hypothesis, is_stand_in
 from autotune.diagnosis.selection.judged import Judged
+from autotune.diagnosis.selection.refits import timed
 from autotune.diagnosis.thresholds import Thresholds
 from autotune.effects.base import EffectKind
 from autotune.models import Effect
 
 #: Gauss-Newton steps of a fit in the search, and of the leading ones at its end.
 STEPS, LAST_STEPS = 12, 40
+#: Share of the bench's residual below which a fit is made again at its own.
+CLOSER = 0.7
+#: Tasks side by side at most.
+SIDE_BY_SIDE = 4
+_T = TypeVar("_T")
+_R = TypeVar("_R")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class RigBench:
+class Bench:
     """What the search works with.
 
     Attributes
@@ -66,7 +77,7 @@ class RigBench:
         """What hypotheses are judged on beside long windows: short ones, or the same where one scale is enough."""
         return self.few if self.two_scales else self.long
 
-    def with_sd(self, long: float, short: float) -> RigBench:
+    def with_sd(self, long: float, short: float) -> Bench:
         """Return the bench with other standard deviations of the residual."""
         return replace(self, cuts=tuple(as_white(d, long) for d in self.cuts), few=as_white(self.few, short))
 
@@ -117,6 +128,22 @@ class RigBench:
             return None
         return self.finite(result, one.log_odds)
 
+    def judged_closely(self, result: Fit, log_odds: float) -> Judged | None:
+        """Return a fit judged, fitted again first where it leaves far less than the bench's residual.
+
+        Priors weighed too much then, beside rows that tell more than they were taken to.
+        """
+        sd = residual_sd(result, self.long)
+        if sd > CLOSER * self.long.noise.sd:
+            return self.judged(result, log_odds)
+        bench = self.with_sd(sd, self.few.noise.sd * sd / self.long.noise.sd)
+        try:
+            closer = fit(result.parametrisation, bench.long, result.theta, result.x0, iterations=STEPS)
+            closer = timed(closer, bench.long)
+        except RUNAWAY:
+            return self.judged(result, log_odds)
+        return bench.judged(closer, log_odds)
+
     def again(self, one: Judged) -> Judged:
         """Return a hypothesis fitted again, to data with another residual."""
         try:
@@ -154,6 +181,11 @@ class RigBench:
         return judged if judged is not None and np.all(np.isfinite(judged.long_squares)) else None
 
 
+def residual_sd(result: Fit, data: Data) -> float:
+    """Return a residual's standard deviation as of independent rows, at least a millionth of the readings' spread."""
+    return max(rms(result.residuals, data.good) * math.sqrt(correlation_rows(result, data)), 1e-6 * spread_of(data))
+
+
 def _carried(result: Fit, before: Data, data: Data) -> tuple[FloatArray, ...]:
     """Return start states of windows: those of a fit where it had a window there, else rest."""
     states = start_states(result.sim, data)
@@ -161,3 +193,14 @@ def _carried(result: Fit, before: Data, data: Data) -> tuple[FloatArray, ...]:
         same = np.isin(starts, known)
         full[same] = x0[np.searchsorted(known, starts[same])]
     return tuple(states)
+
+
+def at_once(task: Callable[[_T], _R], over: Sequence[_T]) -> list[_R]:
+    """Return a task's results, in order; the tasks go on side by side and leave what takes long to a pool.
+
+    A pool that waits for one task's slowest simulation works on the next task's meanwhile.
+    """
+    if len(over) < 2:
+        return [task(one) for one in over]
+    with ThreadPoolExecutor(min(len(over), SIDE_BY_SIDE)) as threads:
+        return list(threads.map(task, over))
