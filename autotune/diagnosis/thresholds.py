@@ -80,6 +80,7 @@ class Thresholds:
     white: float = known(1.10, "slow power", "up to which a residual is white, beside two sd of chance", "counted")
     line: float = known(6.0, "log odds", "against chance of the strongest line in the spectrum of noise: one in four hundred", "chance")
     inconstant: float = known(25.0, "chi2", "of the largest of some hundred score tests; right models leave up to 15", "counted")
+    inconstant_share: float = known(0.1, "of the gained", "the same beside effects: right ones leave two hundredths, wrong ones a third", "counted")
     uneven_noise: float = known(4.0, "ratio", "of the variances of innovations along a record up to which a disturbance is steady", "convention")
     lesser_share: float = known(0.5, "of the gained", "from which on what varies weighs as much as the effects; real rigs leave a quarter", "real rigs")
     dominant: float = known(0.35, "of the excess variance", "held out, that effects must explain where nothing explains all", "real rigs")

@@ -107,7 +107,7 @@ class Evidence:
             "follows": self.follows,
             "effects": self.predicts and bool(names - self.contradicted),
             "more than noise": self.found is not None,
-            "varies more": self.found is not None and self.found.varies_more(limits.varies_more),
+            "varies more": self.found is not None and self.found.varies_more(limits),
             "late stamps": self.evened,
             "samples": bool(self.samples),
             "adequate": self.residual.is_noise,

@@ -194,13 +194,21 @@ class Found:
             noise_floor=noise_floor,
         )
 
-    def varies_more(self, times: float) -> bool:
-        """Whether what varies beside the chosen effects explains so many times more than they do."""
-        if not self.chosen.names:
+    def varies_more(self, limits: Thresholds) -> bool:
+        """Whether what varies beside the chosen effects explains more than it may where they are what is missing.
+
+        What leaves noise leaves nothing that varies but for a share of what was gained, which simulations are wrong by;
+        where the model's error decides, three times as much is left beside what is true.
+        """
+        chosen, before = self.chosen, rms(self.retuned.fit.residuals, self.retuned.data.good)
+        if not chosen.names:
             return False
-        left, before = (rms(j.fit.residuals, j.data.good) for j in (self.chosen, self.retuned))
-        gained = (before**2 / left**2 - 1.0) * sum(int(g.sum()) for g in self.chosen.data.good)
-        return largest_variation(self.chosen.fit, self.chosen.data).gain > times * max(gained, 0.0)
+        share = before**2 / rms(chosen.fit.residuals, chosen.data.good) ** 2 - 1.0
+        gained = max(share, 0.0) * sum(int(g.sum()) for g in chosen.data.good)
+        if chosen.leaves_noise:
+            left = largest_variation(chosen.fit, under_noise(chosen.fit, chosen.data)).gain
+            return left > max(limits.inconstant, limits.inconstant_share * gained)
+        return largest_variation(chosen.fit, chosen.data).gain > limits.varies_more * gained
 
     def keeps_nominal(self, share: float) -> bool:
         """Whether the nominal numbers predict about as well as those retuned, so that they stand."""

@@ -144,8 +144,8 @@ def test_an_effect_that_explains_less_than_what_swings_beside_it_is_not_all_that
     model = Model(name="drive", input=Port(), output=Port(), blocks=(block,))
     found = search(model, [recording], good(recording), left_out=[k.name for k in ALL if k.name != "sensor.lag"])
     with_lag = next(j for j in found.judged if j.names == ("sensor.lag",))
-    assert replace(found, chosen=with_lag).varies_more(3.0)
-    assert not replace(found, chosen=found.retuned).varies_more(3.0)
+    assert replace(found, chosen=with_lag).varies_more(IN_USE)
+    assert not replace(found, chosen=found.retuned).varies_more(IN_USE)
 
 
 def test_what_stands_for_something_else_once_it_is_fitted_to_the_end_is_not_judged():
