@@ -94,9 +94,13 @@ class Judged:
         return self._by_stretches(other) - prior
 
     def _by_rows(self, other: Judged) -> float:
-        """Return what the innovations of all rows say for another hypothesis: Schwarz's criterion."""
+        """Return what the innovations of all rows say for another hypothesis: Schwarz's criterion, cooled.
+
+        Noise is never ideal: ``temperature`` units of chi-square count as one.
+        """
         numbers = self.fit.parametrisation.effect_numbers - other.fit.parametrisation.effect_numbers
-        return self.fit.rows * math.log(self.variance / other.variance) + numbers * math.log(self.fit.rows)
+        said = self.fit.rows * math.log(self.variance / other.variance) + numbers * math.log(self.fit.rows)
+        return said / self.data.thresholds.temperature
 
     def _by_stretches(self, other: Judged) -> float:
         """Return what stretches that were left out say for another hypothesis.
@@ -162,11 +166,15 @@ class Found:
         order = sorted(self.judged, key=lambda j: j.behind(self.chosen))
         return Search(
             data=self.chosen.data,
-            nominal=self.nominal.fit,
-            retuned=Hypothesis(names=(), fit=self.retuned.fit),
-            others=tuple(Hypothesis(names=one.names, fit=one.fit) for one in order if one.names),
+            nominal=self._scaled(self.nominal),
+            retuned=Hypothesis(names=(), fit=self._scaled(self.retuned)),
+            others=tuple(Hypothesis(names=one.names, fit=self._scaled(one)) for one in order if one.names),
             chosen=Hypothesis(names=self.chosen.names, fit=self.chosen.fit),
         )
+
+    def _scaled(self, one: Judged) -> Fit:
+        """Return a fit with its chi-square in units of the residual that the chosen hypothesis was fitted at."""
+        return replace(one.fit, chi2=one.fit.chi2 * (one.data.noise.sd / self.chosen.data.noise.sd) ** 2)
 
     @property
     def gained(self) -> float:

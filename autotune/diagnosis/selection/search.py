@@ -203,7 +203,8 @@ def _larger(beam: Sequence[Judged], bench: Bench) -> list[Judged]:
 def _needed(start: _Start, base: Judged) -> float:
     """Return the decrease of chi-square that rows must speak for an effect with, to be the better hypothesis."""
     fitted = sum(q.is_fitted for q in start.kind.parameters)
-    return fitted * math.log(base.fit.rows) - 2.0 * math.log(start.odds)
+    limits = base.data.thresholds
+    return fitted * math.log(base.fit.rows) - 2.0 * limits.temperature * math.log(start.odds)
 
 
 def _starts(base: Judged, bench: Bench) -> list[_Start]:
