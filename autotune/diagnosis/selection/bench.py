@@ -118,31 +118,19 @@ class Bench:
         return replace(one, fit=replace(far, covariance=joint.covariance))
 
     def finished(self, one: Judged) -> Judged | None:
-        """Return a hypothesis fitted to the end, at the residual that the best one leaves; nothing if not better so."""
-        p, good = one.fit.parametrisation, self.long.good
+        """Return a hypothesis fitted to the end, at the residual that it leaves; nothing if not better so."""
+        bench = self._at(one.data.noise.sd)
         try:
-            result = fit(p, self.long, one.fit.theta, one.fit.x0, iterations=LAST_STEPS)
+            result = fit(one.fit.parametrisation, bench.long, one.fit.theta, one.fit.x0, iterations=LAST_STEPS)
         except RUNAWAY:
             return None
-        if rms(result.residuals, good) >= rms(one.fit.residuals, good):
+        if rms(result.residuals, self.long.good) >= rms(one.fit.residuals, self.long.good):
             return None
-        return self.finite(result, one.log_odds)
+        return bench.finite(result, one.log_odds)
 
-    def judged_closely(self, result: Fit, log_odds: float) -> Judged | None:
-        """Return a fit judged, fitted again first where it leaves far less than the bench's residual.
-
-        Priors weighed too much then, beside rows that tell more than they were taken to.
-        """
-        sd = residual_sd(result, self.long)
-        if sd > CLOSER * self.long.noise.sd:
-            return self.judged(result, log_odds)
-        bench = self.with_sd(sd, self.few.noise.sd * sd / self.long.noise.sd)
-        try:
-            closer = fit(result.parametrisation, bench.long, result.theta, result.x0, iterations=STEPS)
-            closer = timed(closer, bench.long)
-        except RUNAWAY:
-            return self.judged(result, log_odds)
-        return bench.judged(closer, log_odds)
+    def _at(self, sd: float) -> Bench:
+        """Return the bench at another residual of long windows, that of short ones in proportion."""
+        return self.with_sd(sd, self.few.noise.sd * sd / self.long.noise.sd)
 
     def again(self, one: Judged) -> Judged:
         """Return a hypothesis fitted again, to data with another residual."""
@@ -154,26 +142,36 @@ class Bench:
         return replace(one, fit=result, short=short, data=self.long, few=self.near)
 
     def judged(self, result: Fit, log_odds: float) -> Judged | None:
-        """Return a fit to long windows, judged; nothing where it runs away, or where an effect stands for another."""
+        """Return a fit to long windows, judged; nothing where it runs away, or where an effect stands for another.
+
+        Where it leaves far less than the bench's residual it is fitted again first: priors weighed too much, beside
+        rows that tell more than they were taken to.
+        """
         if is_stand_in(hypothesis(result), self.long):
             return None
+        sd = residual_sd(result, self.long)
+        bench = self if sd > CLOSER * self.long.noise.sd else self._at(sd)
         try:
-            squares = held_out_squares(result, self.long)
-            short = result
-            if self.two_scales:
-                short = self.shortened(result)
-            return Judged(
-                names=hypothesis(result).names,
-                fit=result,
-                short=short,
-                data=self.long,
-                few=self.near,
-                long_squares=squares,
-                short_squares=held_out_squares(short, self.few) if self.two_scales else squares,
-                log_odds=log_odds,
-            )
+            if bench is not self:
+                closer = fit(result.parametrisation, bench.long, result.theta, result.x0, iterations=STEPS)
+                result = timed(closer, bench.long)
+            return bench._judged(result, log_odds)
         except RUNAWAY:
             return None
+
+    def _judged(self, result: Fit, log_odds: float) -> Judged:
+        squares = held_out_squares(result, self.long)
+        short = self.shortened(result) if self.two_scales else result
+        return Judged(
+            names=hypothesis(result).names,
+            fit=result,
+            short=short,
+            data=self.long,
+            few=self.near,
+            long_squares=squares,
+            short_squares=held_out_squares(short, self.few) if self.two_scales else squares,
+            log_odds=log_odds,
+        )
 
     def finite(self, result: Fit, log_odds: float) -> Judged | None:
         """Return a fit judged like :meth:`judged`; nothing where its errors on left-out stretches are not finite."""

@@ -188,7 +188,7 @@ class Found:
         for one in self.judged:
             name = "+".join(one.names) if one.names else "none"
             rivals = [other for other in self.judged if set(other.names) != set(one.names)]
-            scores[name] = min(scores.get(name, math.inf), worst(one, rivals))
+            scores[name] = min(scores.get(name, math.inf), max(worst(one, rivals), 0.0))
         chosen = "+".join(self.chosen.names) if self.chosen.names else "none"
         scores[chosen] = min(scores.values())  # what was more, and not material, speaks for it too
         return weighed(scores, 1.0, limits.unknown_odds)
@@ -234,13 +234,21 @@ def ranked(found: Sequence[Judged]) -> list[Judged]:
     return sorted(found, key=lambda j: worst(j, found))
 
 
+def leading(found: Sequence[Judged], count: int) -> list[Judged]:
+    """Return the first of a ranking, the best one of each set of effects."""
+    best: dict[frozenset[str], Judged] = {}
+    for one in ranked(found):
+        best.setdefault(frozenset(one.names), one)
+    return list(best.values())[:count]
+
+
 def simplest(found: Sequence[Judged], material: float) -> Judged:
     """Return the hypothesis that stretches speak for most, priors counted, without what is not material in any.
 
     Each of the leading ones is first freed of what is not material in it, and they are compared as what they then are.
     """
     order = ranked(found)
-    return min((_freed(one, order, material) for one in order[:LEADING]), key=lambda one: worst(one, found))
+    return min((_freed(one, order, material) for one in leading(found, LEADING)), key=lambda one: worst(one, found))
 
 
 def _freed(best: Judged, order: Sequence[Judged], material: float) -> Judged:

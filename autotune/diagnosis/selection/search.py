@@ -25,7 +25,7 @@ from autotune.diagnosis.fitting.parameters import parametrise
 from autotune.diagnosis.fitting.restarts import realigned
 from autotune.diagnosis.selection.bench import LAST_STEPS, STEPS, Bench, at_once, residual_sd
 from autotune.diagnosis.selection.hypothesis import hypothesis, is_stand_in
-from autotune.diagnosis.selection.judged import Found, Judged, ranked, simplest
+from autotune.diagnosis.selection.judged import Found, Judged, leading, ranked, simplest
 from autotune.diagnosis.selection.prediction import distinct, extended, predictions, signal_sizes, starting_effects
 from autotune.diagnosis.selection.refits import timed, without
 from autotune.diagnosis.selection.scan import searched
@@ -196,7 +196,7 @@ def _larger(beam: Sequence[Judged], bench: Bench) -> list[Judged]:
         if key not in best or result.cost < best[key][0].cost:
             best[key] = result, log_odds
     ranked = sorted(best.values(), key=lambda pair: pair[0].cost - 2.0 * pair[1])[: bench.limits.rig_judged]
-    done = bench.pool.map(lambda pair: bench.judged_closely(*pair), ranked)
+    done = bench.pool.map(lambda pair: bench.judged(*pair), ranked)
     return [j for j in done if j is not None and np.all(np.isfinite(j.long_squares + j.short_squares))]
 
 
@@ -269,8 +269,13 @@ def _begun(begun: Judged | None, bench: Bench) -> list[Judged]:
     """Return what predicted best on more rows, judged on these: a search of fewer rows may miss where it lies."""
     if begun is None:
         return []
-    p, theta = begun.fit.parametrisation, begun.fit.theta
-    return _brought(lambda: fit(p, bench.long, theta, iterations=LAST_STEPS), begun.log_odds, bench)
+    p, held = begun.fit.parametrisation, np.zeros(begun.fit.theta.size, dtype=bool)
+
+    def on_these() -> Fit:
+        there = fit(p, bench.long, begun.fit.theta, free=held, iterations=STEPS)
+        return fit(p, bench.long, there.theta, there.x0, iterations=LAST_STEPS)
+
+    return _brought(on_these, begun.log_odds, bench)
 
 
 def _brought(fitted: Callable[[], Fit], log_odds: float, bench: Bench) -> list[Judged]:
@@ -289,8 +294,8 @@ def _pruned(found: Sequence[Judged], bench: Bench) -> list[Judged]:
     """
     result, done = list(found), set()
     for _ in range(bench.limits.rig_effects):
-        leading = ranked(result)[: bench.limits.rig_pruned]
-        fresh = [j for j in (*leading, simplest(result, bench.limits.material)) if id(j) not in done]
+        first = leading(result, bench.limits.rig_pruned)
+        fresh = [j for j in (*first, simplest(result, bench.limits.material)) if id(j) not in done]
         if not fresh:
             break
         once = list({id(j): j for j in fresh}.values())
@@ -301,9 +306,9 @@ def _pruned(found: Sequence[Judged], bench: Bench) -> list[Judged]:
 
 def _finished(found: Sequence[Judged], bench: Bench) -> list[Judged]:
     """Return hypotheses and, beside them, the leading ones fitted to the end: the search leaves them before."""
-    leading = ranked(found)[: bench.limits.rig_pruned]
-    leading += [j for j in [simplest(found, bench.limits.material)] if j not in leading]
-    return [*found, *(j for j in bench.pool.map(bench.finished, leading) if j is not None)]
+    first = leading(found, bench.limits.rig_pruned)
+    first += [j for j in [simplest(found, bench.limits.material)] if j not in first]
+    return [*found, *(j for j in bench.pool.map(bench.finished, first) if j is not None)]
 
 
 def _regrown(found: Sequence[Judged], bench: Bench) -> list[Judged]:
