@@ -58,7 +58,11 @@ def extended_model(evidence: Evidence, verdict: Verdict, nominal: Model) -> Mode
     named = evidence.quality.is_better and verdict in ("effect", "unexplained")
     use = found.chosen if named else found.retuned
     searched = evidence.found
-    stands = searched is not None and searched.keeps_nominal(evidence.limits.material_numbers)
+    stands = (
+        searched is not None
+        and evidence.more_than_noise
+        and searched.keeps_nominal(evidence.limits.material_numbers)
+    )
     extended = nominal if verdict == "none" or stands else use.fit.model
     own = {e.name for e in nominal.effects}
     if len(found.data.recordings) == 1:

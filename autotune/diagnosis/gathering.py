@@ -158,7 +158,7 @@ def _with_found(evidence: Evidence, found: Found, without: Sequence[str]) -> Evi
     if not chosen.leaves_noise and (late := _late_rows(evidence, found.gained, without)) is not None:
         return late
     if not chosen.names and evidence.residual.is_noise:
-        return evidence
+        return replace(evidence, search=found.as_search(), found=found)
     if not chosen.names and (own := own_noise(near.retuned.fit, near.data)) is not None:
         # such a disturbance has a mean of its own in every recording: it is no offset
         return replace(evidence, residual=own.residual, offset=None, own=own)

@@ -39,7 +39,7 @@ class Evidence:
     offset : Offset, optional
         Shift of the operating point that is far outside its uncertainty.
     found : Found, optional
-        What a search found, where the retuned model alone does not say all.
+        What a search found, where simulations do not run away and what is left is not noise of some rows.
     evened : bool
         Whether stamps were late, so that everything runs at even times.
     own : OwnNoise, optional
@@ -79,8 +79,14 @@ class Evidence:
     def candidates(self) -> tuple[Candidate, ...]:
         """Every hypothesis with its probability, best first."""
         if self.found is not None:
-            return self.found.candidates(self.limits)
+            unknown = self.unknown_odds if self.residual.is_noise else self.limits.unknown_odds
+            return self.found.candidates(unknown)
         return weighed({"none": 0.0}, 1.0, self.unknown_odds)
+
+    @property
+    def more_than_noise(self) -> bool:
+        """Whether something was found, or the retuned model leaves more than noise."""
+        return self.found is not None and (bool(self.found.chosen.names) or not self.residual.is_noise)
 
     @cached_property
     def contradicted(self) -> frozenset[str]:
@@ -106,7 +112,7 @@ class Evidence:
         holds = {
             "follows": self.follows,
             "effects": self.predicts and bool(names - self.contradicted),
-            "more than noise": self.found is not None,
+            "more than noise": self.more_than_noise,
             "varies more": self.found is not None and self.found.varies_more(limits),
             "late stamps": self.evened,
             "samples": bool(self.samples),

@@ -182,7 +182,7 @@ class Found:
         left, before = (rms(j.fit.residuals, j.data.good) for j in (self.chosen, self.retuned))
         return 2.0 * self.chosen.fit.rows * math.log(before / left)
 
-    def candidates(self, limits: Thresholds) -> tuple[Candidate, ...]:
+    def candidates(self, unknown_odds: float) -> tuple[Candidate, ...]:
         """Return every hypothesis with its probability: what chose it weighs here too."""
         scores: dict[str, float] = {}
         for one in self.judged:
@@ -191,7 +191,7 @@ class Found:
             scores[name] = min(scores.get(name, math.inf), max(worst(one, rivals), 0.0))
         chosen = "+".join(self.chosen.names) if self.chosen.names else "none"
         scores[chosen] = min(scores.values())  # what was more, and not material, speaks for it too
-        return weighed(scores, 1.0, limits.unknown_odds)
+        return weighed(scores, 1.0, unknown_odds)
 
     def quality(self, noise_floor: float) -> FitQuality:
         """Return errors of free runs through stretches that were left out."""

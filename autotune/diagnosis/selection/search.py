@@ -41,7 +41,7 @@ from autotune.recording import Recording
 
 #: Prior odds, at least, of any effect in any rig.
 RARE = 0.01
-#: Share of the decrease that an effect needs near the noise that the first order must predict before it is fitted.
+#: Share of what its numbers must bring near the noise that the first order must predict before an effect is fitted.
 PROMISING = 0.5
 
 
@@ -184,7 +184,7 @@ def _larger(beam: Sequence[Judged], bench: Bench) -> list[Judged]:
     for base in beam:
         found = _starts(base, bench)
         if base.leaves_noise:
-            found = [s for s in found if s.decrease > PROMISING * _needed(s, base)]
+            found = [s for s in found if s.decrease > PROMISING * _charge(s)]
         found.sort(key=lambda s: -s.decrease - 2.0 * math.log(s.odds))
         starts += [s for rank, s in enumerate(found) if rank < bench.limits.rig_tried or s.odds >= bench.limits.usual]
     fits = bench.pool.map(lambda s: _added(s, bench), starts)
@@ -200,11 +200,10 @@ def _larger(beam: Sequence[Judged], bench: Bench) -> list[Judged]:
     return [j for j in done if j is not None and np.all(np.isfinite(j.long_squares + j.short_squares))]
 
 
-def _needed(start: _Start, base: Judged) -> float:
-    """Return the decrease of chi-square that rows must speak for an effect with, to be the better hypothesis."""
+def _charge(start: _Start) -> float:
+    """Return the decrease of chi-square that the numbers of an effect must bring, priors apart (Schwarz 1978)."""
     fitted = sum(q.is_fitted for q in start.kind.parameters)
-    limits = base.data.thresholds
-    return fitted * math.log(base.fit.rows) - 2.0 * limits.temperature * math.log(start.odds)
+    return fitted * math.log(start.base.fit.rows)
 
 
 def _starts(base: Judged, bench: Bench) -> list[_Start]:
