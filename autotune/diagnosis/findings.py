@@ -154,6 +154,15 @@ def beside(effects: Sequence[FoundEffect], evidence: Evidence) -> str:
     return f" The extended model predicts with {' and '.join(sorted(unnamed))} as well, which {what}."
 
 
+def left_open(effects: Sequence[FoundEffect], evidence: Evidence) -> tuple[str, ...]:
+    """Return what is said of effects that are not named and that the recordings do not rule out."""
+    named = {like for e in effects for like in counted_as(e.name)}
+    able = {n: p for n, p in said_by(evidence).items() if n not in named and p >= 1.0 - evidence.limits.decided}
+    likeliest = sorted(able, key=lambda name: -able[name])[: evidence.limits.most_open]
+    told = ", ".join(f"{name} ({able[name]:.2f})" for name in likeliest)
+    return (f"Not ruled out, nor agreed on by parts of the recordings: {told}.",) if told else ()
+
+
 def sentences_of(
     verdict: Verdict, effects: Sequence[FoundEffect], evidence: Evidence, places: Sequence[str]
 ) -> tuple[str, ...]:
@@ -163,6 +172,7 @@ def sentences_of(
         f"Held-out error, as a share of the spread of y: nominal {q.nominal:.3g}, retuned {q.retuned:.3g}, "
         f"extended {q.extended:.3g}, noise {q.noise_floor:.3g}."
     )
+    possible = left_open(effects, evidence)
     match verdict:
         case "none" if not evidence.follows:
             first = "Nothing contradicts the simulation, and nothing bears it out: these recordings show noise alone."
@@ -173,7 +183,8 @@ def sentences_of(
                 "The numbers are not right: retuned, the simulation is nearer to the recordings, but not down to noise."
             )
             if residual.is_noise or q.comes_down_to_noise:
-                first = "The structure is right, its numbers are not: retuned, the simulation explains the recordings."
+                structure = "The numbers are not right" if possible else "The structure is right, its numbers are not"
+                first = f"{structure}: retuned, the simulation explains the recordings."
         case "effect":
             names = " and ".join(f"{e.name} (probability {e.probability:.2f})" for e in effects)
             clean = residual.is_noise or q.comes_down_to_noise
@@ -188,6 +199,9 @@ def sentences_of(
             first = (
                 f"Something is missing that no candidate explains to within noise; it shows at the {', '.join(places)}."
             )
+    said = [first, *possible]
     if evidence.own is not None:
-        return (first, evidence.own.sentence, errors)
-    return (first, errors) if residual.is_constant else (first, residual.varies.sentence, errors)
+        said.append(evidence.own.sentence)
+    elif not residual.is_constant:
+        said.append(residual.varies.sentence)
+    return (*said, errors)

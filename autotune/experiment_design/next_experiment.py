@@ -15,7 +15,7 @@ from autotune.diagnosis.result import Diagnosis, FoundEffect, NextExperiment, to
 from autotune.effects import kind_of
 from autotune.errors import InputError
 from autotune.experiment_design.conditions import as_recorded, is_driven
-from autotune.experiment_design.open_hypotheses import open_hypotheses
+from autotune.experiment_design.open_hypotheses import decided, open_hypotheses
 from autotune.experiment_design.plan import plan_in
 
 #: Rows of a planned experiment: enough to rank the kinds.
@@ -35,7 +35,9 @@ def next_experiment(found: Diagnosis) -> NextExperiment | None:
     found : Diagnosis
         Its verdict, effects, candidates and search.
     """
-    if found.verdict in ("none", "parameters") or not found.places:
+    if found.verdict in ("none", "parameters"):
+        return None if decided(found) else _planned(found)
+    if not found.places:
         return None
     for effect in found.effects:
         if len(effect.places) > 1:

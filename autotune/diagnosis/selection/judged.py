@@ -152,13 +152,16 @@ class Found:
         The nominal structure with the operating point fitted alone, and all its numbers.
     judged : tuple of Judged
         All that were judged, the retuned one first.
-    chosen : Judged
+    best : Judged
         The one that predicts best, for what it is.
+    chosen : Judged
+        The one to go on with: the best one, or what is left of it where parts of the recordings do not agree.
     """
 
     nominal: Judged
     retuned: Judged
     judged: tuple[Judged, ...]
+    best: Judged
     chosen: Judged
 
     def as_search(self) -> Search:
@@ -189,8 +192,8 @@ class Found:
             name = "+".join(one.names) if one.names else "none"
             rivals = [other for other in self.judged if set(other.names) != set(one.names)]
             scores[name] = min(scores.get(name, math.inf), max(worst(one, rivals), 0.0))
-        chosen = "+".join(self.chosen.names) if self.chosen.names else "none"
-        scores[chosen] = min(scores.values())  # what was more, and not material, speaks for it too
+        best = "+".join(self.best.names) if self.best.names else "none"
+        scores[best] = min(scores.values())  # what was more, and not material, speaks for it too
         return weighed(scores, 1.0, unknown_odds)
 
     def quality(self, noise_floor: float) -> FitQuality:

@@ -104,7 +104,7 @@ def search(
         found = _regrown(_finished(_pruned([*found, *_begun(begun, bench)], bench), bench), bench)
         chosen = bench.with_both_scales(simplest(found, limits.material))
         nominal, retuned, chosen = (one.spread_out() for one in (nominal, retuned, chosen))
-        return Found(nominal=nominal, retuned=retuned, judged=tuple(found), chosen=chosen)
+        return Found(nominal=nominal, retuned=retuned, judged=tuple(found), best=chosen, chosen=chosen)
 
 
 def _odds(
