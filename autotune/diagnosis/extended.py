@@ -59,9 +59,7 @@ def extended_model(evidence: Evidence, verdict: Verdict, nominal: Model) -> Mode
     use = found.chosen if named else found.retuned
     searched = evidence.found
     stands = (
-        searched is not None
-        and evidence.more_than_noise
-        and searched.keeps_nominal(evidence.limits.material_numbers)
+        searched is not None and evidence.more_than_noise and searched.keeps_nominal(evidence.limits.material_numbers)
     )
     extended = nominal if verdict == "none" or stands else use.fit.model
     own = {e.name for e in nominal.effects}

@@ -96,6 +96,7 @@ class Thresholds:
     term_share: float = known(0.1, "of the residual", "held out, that one more term of a description must take away", "counted")
     # rigs: where the model's error decides, stretches that were left out are what counts
     most_evidence: float = known(6.0, "2 ln odds", "that stretches of one campaign speak for one hypothesis beside another at most", "real rigs")
+    error_witnesses: float = known(3.0, "errors", "of a model, independent, that a rig's recordings show: how much a smaller one says beyond that", "real rigs")
     short_window: float = known(4.0, "slowest times", "length of short windows", "convention")
     least_short_rows: int = known(40, "rows", "of a short window", "convention")
     integrating_window: float = known(8.0, "slowest times", "length of long windows of a plant that integrates", "convention")

@@ -162,6 +162,26 @@ def advantage(squares: FloatArray, other: FloatArray) -> float:
     return max((first, second), key=abs) if first * second > ROUNDING else 0.0
 
 
+def reduction(squares: FloatArray, other: FloatArray) -> float:
+    """Return the logarithm of how many times smaller the other model's mean squared error is.
+
+    Parameters
+    ----------
+    squares, other : (K,) array
+        Squared errors of both on the same stretches.
+
+    Returns
+    -------
+    float
+        Of all stretches together and as a mean of each one's, the one nearer to 0; 0 where they do not agree on the
+        sign.
+    """
+    first, second = (np.minimum(each, FAR_OFF**2 * np.minimum(squares, other)) + TINY for each in (squares, other))
+    together = math.log(float(np.sum(squares) + TINY) / float(np.sum(other) + TINY))
+    each = float(np.mean(np.log(first / second)))
+    return min((together, each), key=abs) if together * each > 0.0 else 0.0
+
+
 def _speaks(differences: FloatArray) -> float:
     """Return twice the log likelihood ratio of a mean that is free to one that is 0, with the mean's sign."""
     count, scatter = differences.size, max(float(differences.std(ddof=1)), LEAST_SCATTER)

@@ -15,7 +15,7 @@ from autotune.arrays import FloatArray
 from autotune.diagnosis.evidence.adequacy import is_noise
 from autotune.diagnosis.evidence.constancy import largest_variation
 from autotune.diagnosis.evidence.held_out import FitQuality
-from autotune.diagnosis.evidence.stretches import advantage, judged_rows, rms
+from autotune.diagnosis.evidence.stretches import advantage, judged_rows, reduction, rms
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import Fit
 from autotune.diagnosis.fitting.long_windows import spread_of
@@ -106,11 +106,17 @@ class Judged:
         """Return what stretches that were left out say for another hypothesis.
 
         The scale, long or short, at which they differ more decides, unless the other one contradicts it. Stretches have
-        the rig and its excitation in common: together they speak for no more than ``most_evidence``.
+        the rig and its excitation in common: together they speak for no more than ``most_evidence``, however well they
+        agree, unless the error is far smaller at both scales: so much that ``error_witnesses`` errors, independent and
+        of unknown size, would say more.
         """
-        both = [advantage(self.long_squares, other.long_squares), advantage(self.short_squares, other.short_squares)]
-        most = self.data.thresholds.most_evidence
-        return min(max(max(both) if sum(both) > 0.0 else min(both), -most), most)
+        scales = ((self.long_squares, other.long_squares), (self.short_squares, other.short_squares))
+        limits = self.data.thresholds
+        agree = [advantage(*pair) for pair in scales]
+        capped = min(max(max(agree) if sum(agree) > 0.0 else min(agree), -limits.most_evidence), limits.most_evidence)
+        smaller = [limits.error_witnesses * reduction(*pair) for pair in scales]
+        least = min(smaller, key=abs) if smaller[0] * smaller[1] > 0.0 else 0.0
+        return least if least * capped > 0.0 and abs(least) > abs(capped) else capped
 
     def spread_out(self) -> Judged:
         """Return it with all rows of the recordings."""
