@@ -22,7 +22,7 @@ from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import RUNAWAY, Fit
 from autotune.diagnosis.fitting.retuning import at_nominal, prepare, under_noise
 from autotune.diagnosis.selection.hypothesis import Hypothesis
-from autotune.diagnosis.selection.judged import Found, Judged
+from autotune.diagnosis.selection.judged_chain import Found, JudgedChain
 from autotune.diagnosis.selection.search import search
 from autotune.diagnosis.selection.searched import Search
 from autotune.diagnosis.thresholds import Thresholds
@@ -40,7 +40,7 @@ def evidence_of(
     without: Sequence[str],
     progress: Progress,
     thresholds: Thresholds,
-    begun: Judged | None = None,
+    begun: JudgedChain | None = None,
 ) -> Evidence:
     """Return all that the verdict rests on: samples, search, what is beside the chain, the residual, held-out rows.
 
@@ -58,7 +58,7 @@ def evidence_of(
         Told what is being done and the share done, 0 to 1.
     thresholds : Thresholds
         What decides between two findings.
-    begun : Judged, optional
+    begun : JudgedChain, optional
         What predicted best on more rows: it is judged as well, with its odds, from the numbers that it had there.
     """
     without = [*without, *unmoved(model, recordings)]
@@ -120,7 +120,7 @@ def _searched(
     without: Sequence[str],
     progress: Progress,
     limits: Thresholds,
-    begun: Judged | None,
+    begun: JudgedChain | None,
 ) -> tuple[Search, Found | None, list[SampleEffect]]:
     """Return the retuned model near the noise, what was found beside it, and what the samples show.
 

@@ -12,7 +12,7 @@ from autotune.diagnosis.evidence.own_noise import OwnNoise
 from autotune.diagnosis.evidence.samples import SampleEffect
 from autotune.diagnosis.result import Verdict
 from autotune.diagnosis.selection.hypothesis import contradicted
-from autotune.diagnosis.selection.judged import Found
+from autotune.diagnosis.selection.judged_chain import Found
 from autotune.diagnosis.selection.probability import Candidate, weighed
 from autotune.diagnosis.selection.searched import Search
 from autotune.diagnosis.thresholds import Thresholds

@@ -17,7 +17,7 @@ from autotune.diagnosis.fitting.fit import RUNAWAY, Fit, fit, start_states
 from autotune.diagnosis.fitting.long_windows import spread_of
 from autotune.diagnosis.fitting.parameters import Parametrisation
 from autotune.diagnosis.selection.hypothesis import hypothesis, is_stand_in
-from autotune.diagnosis.selection.judged import Judged
+from autotune.diagnosis.selection.judged_chain import JudgedChain
 from autotune.diagnosis.selection.refits import timed
 from autotune.diagnosis.thresholds import Thresholds
 from autotune.effects.base import EffectKind
@@ -96,7 +96,7 @@ class Bench:
         begun = fit(p, self.few, result.theta, free=held, iterations=STEPS)
         return fit(p, self.few, begun.theta, begun.x0, iterations=STEPS)
 
-    def with_both_scales(self, one: Judged) -> Judged:
+    def with_both_scales(self, one: JudgedChain) -> JudgedChain:
         """Return a hypothesis with the numbers that suit long and short windows together.
 
         What a plant that integrates lacks piles up in a long run and bends its numbers along a valley that the long run
@@ -117,7 +117,7 @@ class Bench:
             return one
         return replace(one, fit=replace(far, covariance=joint.covariance))
 
-    def finished(self, one: Judged) -> Judged | None:
+    def finished(self, one: JudgedChain) -> JudgedChain | None:
         """Return a hypothesis fitted to the end, at the residual that it leaves; nothing if not better so."""
         bench = self._at(one.data.noise.sd)
         try:
@@ -132,7 +132,7 @@ class Bench:
         """Return the bench at another residual of long windows, that of short ones in proportion."""
         return self.with_sd(sd, self.few.noise.sd * sd / self.long.noise.sd)
 
-    def again(self, one: Judged) -> Judged:
+    def again(self, one: JudgedChain) -> JudgedChain:
         """Return a hypothesis fitted again, to data with another residual."""
         try:
             result = fit(one.fit.parametrisation, self.long, one.fit.theta, one.fit.x0, iterations=STEPS)
@@ -141,7 +141,7 @@ class Bench:
             return one
         return replace(one, fit=result, short=short, data=self.long, few=self.near)
 
-    def judged(self, result: Fit, log_odds: float) -> Judged | None:
+    def judged(self, result: Fit, log_odds: float) -> JudgedChain | None:
         """Return a fit to long windows, judged; nothing where it runs away, or where an effect stands for another.
 
         Where it leaves far less than the bench's residual it is fitted again first: priors weighed too much, beside
@@ -159,10 +159,10 @@ class Bench:
         except RUNAWAY:
             return None
 
-    def _judged(self, result: Fit, log_odds: float) -> Judged:
+    def _judged(self, result: Fit, log_odds: float) -> JudgedChain:
         squares = held_out_squares(result, self.long)
         short = self.shortened(result) if self.two_scales else result
-        return Judged(
+        return JudgedChain(
             names=hypothesis(result).names,
             fit=result,
             short=short,
@@ -173,7 +173,7 @@ class Bench:
             log_odds=log_odds,
         )
 
-    def finite(self, result: Fit, log_odds: float) -> Judged | None:
+    def finite(self, result: Fit, log_odds: float) -> JudgedChain | None:
         """Return a fit judged like :meth:`judged`; nothing where its errors on left-out stretches are not finite."""
         judged = self.judged(result, log_odds)
         return judged if judged is not None and np.all(np.isfinite(judged.long_squares)) else None

@@ -1,4 +1,4 @@
-"""Hypotheses judged by what they leave: compared in pairs, ranked, weighed.
+"""Hypotheses judged by what they leave: compared in pairs, ranked, weighed. Chains and equations are judged alike.
 
 Where one of two leaves noise alone, rows are independent witnesses and the likelihood of the rows decides. Where both
 err by more, the model's own error decides and rows are none: then stretches that were left out are what counts.
@@ -7,23 +7,14 @@ err by more, the model's own error decides and rows are none: then stretches tha
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import dataclass
+from typing import TypeVar
 
 from autotune.arrays import FloatArray
-from autotune.diagnosis.evidence.adequacy import is_noise
-from autotune.diagnosis.evidence.constancy import largest_variation
-from autotune.diagnosis.evidence.held_out import FitQuality
-from autotune.diagnosis.evidence.stretches import advantage, judged_rows, reduction, rms
-from autotune.diagnosis.fitting.data import Data
-from autotune.diagnosis.fitting.fit import Fit
-from autotune.diagnosis.fitting.long_windows import spread_of
-from autotune.diagnosis.fitting.retuning import reduced_chi2, under_noise
-from autotune.diagnosis.fitting.spreading import spread_out
-from autotune.diagnosis.selection.hypothesis import Hypothesis, vanished
+from autotune.diagnosis.evidence.stretches import advantage, reduction
 from autotune.diagnosis.selection.probability import Candidate, weighed
-from autotune.diagnosis.selection.searched import Search
 from autotune.diagnosis.thresholds import Thresholds
 from autotune.effects import kind_of
 
@@ -32,50 +23,58 @@ LEADING = 4
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Judged:
+class Judged(ABC):
     """A hypothesis with its errors on left-out stretches.
 
     Attributes
     ----------
     names : tuple of str
         Its effects.
-    fit, short : Fit
-        Fitted to long and to short windows.
-    data, few : Data
-        What they were fitted to.
     long_squares, short_squares : (K,) array
-        Squared errors of both on left-out stretches.
+        Squared errors on left-out stretches, of fits to long windows and to short ones.
     log_odds : float
         Logarithm of its prior odds.
     """
 
     names: tuple[str, ...]
-    fit: Fit
-    short: Fit
-    data: Data
-    few: Data
     long_squares: FloatArray
     short_squares: FloatArray
     log_odds: float
 
-    @cached_property
+    @property
+    @abstractmethod
+    def limits(self) -> Thresholds:
+        """What decides between two findings."""
+
+    @property
+    @abstractmethod
     def leaves_noise(self) -> bool:
-        """Whether what it leaves is noise, at both scales, and rows that were left out are foretold about as well.
+        """Whether what it leaves is noise, and rows that were left out are foretold about as well."""
 
-        Start states that are free may make noise of anything; then it does not run through what was left out.
-        """
-        both = ((self.fit, self.data, self.long_squares), (self.short, self.few, self.short_squares))
-        return all(
-            is_noise(result, data)
-            and math.sqrt(float(squares.sum()) / judged_rows(data))
-            < data.thresholds.foretold * rms(result.residuals, data.good)
-            for result, data, squares in both
-        )
-
-    @cached_property
+    @property
+    @abstractmethod
     def variance(self) -> float:
-        """Variance of the innovations of what it leaves, under the noise that this shows from row to row."""
-        return reduced_chi2(self.fit, self.data) * under_noise(self.fit, self.data).noise.sd ** 2
+        """Variance of the innovations of what it leaves."""
+
+    @property
+    @abstractmethod
+    def rows(self) -> int:
+        """Rows that it was fitted to."""
+
+    @property
+    @abstractmethod
+    def numbers(self) -> int:
+        """Numbers of its effects that were fitted."""
+
+    @property
+    @abstractmethod
+    def identity(self) -> frozenset[object]:
+        """What tells hypotheses apart that are fitted."""
+
+    @property
+    def vanished(self) -> frozenset[str]:
+        """Effects that came to nothing on long windows."""
+        return frozenset()
 
     def behind(self, other: Judged) -> float:
         """Return twice the logarithm of the odds that another hypothesis is the better one, priors counted.
@@ -98,9 +97,9 @@ class Judged:
 
         Noise is never ideal: ``temperature`` units of chi-square count as one.
         """
-        numbers = self.fit.parametrisation.effect_numbers - other.fit.parametrisation.effect_numbers
-        said = self.fit.rows * math.log(self.variance / other.variance) + numbers * math.log(self.fit.rows)
-        return said / self.data.thresholds.temperature
+        said = self.rows * math.log(self.variance / other.variance)
+        said += (self.numbers - other.numbers) * math.log(self.rows)
+        return said / self.limits.temperature
 
     def _by_stretches(self, other: Judged) -> float:
         """Return what stretches that were left out say for another hypothesis.
@@ -111,22 +110,12 @@ class Judged:
         of unknown size, would say more.
         """
         scales = ((self.long_squares, other.long_squares), (self.short_squares, other.short_squares))
-        limits = self.data.thresholds
+        limits = self.limits
         agree = [advantage(*pair) for pair in scales]
         capped = min(max(max(agree) if sum(agree) > 0.0 else min(agree), -limits.most_evidence), limits.most_evidence)
         smaller = [limits.error_witnesses * reduction(*pair) for pair in scales]
         least = min(smaller, key=abs) if smaller[0] * smaller[1] > 0.0 else 0.0
         return least if least * capped > 0.0 and abs(least) > abs(capped) else capped
-
-    def spread_out(self) -> Judged:
-        """Return it with all rows of the recordings."""
-        result, data = spread_out(self.fit, self.data)
-        return replace(self, fit=result, data=data)
-
-    @property
-    def error(self) -> float:
-        """Held-out error of the free run as a share of the spread of y."""
-        return math.sqrt(float(self.long_squares.sum()) / judged_rows(self.data)) / spread_of(self.data)
 
     def is_better(self, other: Judged, share: float) -> bool:
         """Whether it takes a share of another one's held-out error away, at one of the scales.
@@ -138,99 +127,17 @@ class Judged:
         if self.leaves_noise or other.leaves_noise:
             return other.behind(self) > 0.0
         extra = set(self.names) - set(other.names)
-        at_nothing = bool(extra) and extra <= vanished(Hypothesis(names=self.names, fit=self.fit))
+        at_nothing = bool(extra) and extra <= self.vanished
         long, short = (
             math.sqrt(float(mine.sum() / its.sum()))
             for mine, its in ((self.long_squares, other.long_squares), (self.short_squares, other.short_squares))
         )
         if any(kind_of(name).is_event for name in extra):
-            return max(long, short) < 1.0 - max(share, self.data.thresholds.material_event)
+            return max(long, short) < 1.0 - max(share, self.limits.material_event)
         return (long if at_nothing else min(long, short)) < 1.0 - share
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Found:
-    """What a search found.
-
-    Attributes
-    ----------
-    nominal, retuned : Judged
-        The nominal structure with the operating point fitted alone, and all its numbers.
-    judged : tuple of Judged
-        All that were judged, the retuned one first.
-    best : Judged
-        The one that predicts best, for what it is.
-    chosen : Judged
-        The one to go on with: the best one, or what is left of it where parts of the recordings do not agree.
-    """
-
-    nominal: Judged
-    retuned: Judged
-    judged: tuple[Judged, ...]
-    best: Judged
-    chosen: Judged
-
-    def as_search(self) -> Search:
-        """Return the hypotheses in the form that pages and planning know."""
-        order = sorted(self.judged, key=lambda j: j.behind(self.chosen))
-        return Search(
-            data=self.chosen.data,
-            nominal=self._scaled(self.nominal),
-            retuned=Hypothesis(names=(), fit=self._scaled(self.retuned)),
-            others=tuple(Hypothesis(names=one.names, fit=self._scaled(one)) for one in order if one.names),
-            chosen=Hypothesis(names=self.chosen.names, fit=self.chosen.fit),
-        )
-
-    def _scaled(self, one: Judged) -> Fit:
-        """Return a fit with its chi-square in units of the residual that the chosen hypothesis was fitted at."""
-        return replace(one.fit, chi2=one.fit.chi2 * (one.data.noise.sd / self.chosen.data.noise.sd) ** 2)
-
-    @property
-    def gained(self) -> float:
-        """Twice the log likelihood ratio of the chosen hypothesis beside the retuned model, every row a witness."""
-        left, before = (rms(j.fit.residuals, j.data.good) for j in (self.chosen, self.retuned))
-        return 2.0 * self.chosen.fit.rows * math.log(before / left)
-
-    def candidates(self, unknown_odds: float) -> tuple[Candidate, ...]:
-        """Return every hypothesis with its probability: what chose it weighs here too."""
-        scores: dict[str, float] = {}
-        for one in self.judged:
-            name = "+".join(one.names) if one.names else "none"
-            rivals = [other for other in self.judged if set(other.names) != set(one.names)]
-            scores[name] = min(scores.get(name, math.inf), max(worst(one, rivals), 0.0))
-        best = "+".join(self.best.names) if self.best.names else "none"
-        scores[best] = min(scores.values())  # what was more, and not material, speaks for it too
-        return weighed(scores, 1.0, unknown_odds)
-
-    def quality(self, noise_floor: float) -> FitQuality:
-        """Return errors of free runs through stretches that were left out."""
-        return FitQuality(
-            nominal=self.nominal.error,
-            retuned=self.retuned.error,
-            extended=self.chosen.error,
-            noise_floor=noise_floor,
-        )
-
-    def varies_more(self, limits: Thresholds) -> bool:
-        """Whether what varies beside the chosen effects explains more than it may where they are what is missing.
-
-        What leaves noise leaves nothing that varies but for a share of what was gained, which simulations are wrong by;
-        where the model's error decides, three times as much is left beside what is true.
-        """
-        chosen, before = self.chosen, rms(self.retuned.fit.residuals, self.retuned.data.good)
-        if not chosen.names:
-            return False
-        share = before**2 / rms(chosen.fit.residuals, chosen.data.good) ** 2 - 1.0
-        gained = max(share, 0.0) * sum(int(g.sum()) for g in chosen.data.good)
-        if chosen.leaves_noise:
-            left = largest_variation(chosen.fit, under_noise(chosen.fit, chosen.data)).gain
-            return left > max(limits.inconstant, limits.inconstant_share * gained)
-        return largest_variation(chosen.fit, chosen.data).gain > limits.varies_more * gained
-
-    def keeps_nominal(self, share: float) -> bool:
-        """Whether the nominal numbers predict about as well as those retuned, so that they stand."""
-        ratio = float(self.retuned.long_squares.sum() / self.nominal.long_squares.sum())
-        return not self.chosen.names and math.sqrt(ratio) > 1.0 - share
+_J = TypeVar("_J", bound=Judged)
 
 
 def worst(one: Judged, others: Sequence[Judged]) -> float:
@@ -238,20 +145,20 @@ def worst(one: Judged, others: Sequence[Judged]) -> float:
     return max((one.behind(other) for other in others if other is not one), default=0.0)
 
 
-def ranked(found: Sequence[Judged]) -> list[Judged]:
+def ranked(found: Sequence[_J]) -> list[_J]:
     """Return hypotheses by how far the best rival of each is ahead of it: the first is beaten by none, or by least."""
     return sorted(found, key=lambda j: worst(j, found))
 
 
-def leading(found: Sequence[Judged], count: int) -> list[Judged]:
+def leading(found: Sequence[_J], count: int) -> list[_J]:
     """Return the first of a ranking, the best one of each set of effects."""
-    best: dict[frozenset[str], Judged] = {}
+    best: dict[frozenset[object], _J] = {}
     for one in ranked(found):
-        best.setdefault(frozenset(one.names), one)
+        best.setdefault(one.identity, one)
     return list(best.values())[:count]
 
 
-def simplest(found: Sequence[Judged], material: float) -> Judged:
+def simplest(found: Sequence[_J], material: float) -> _J:
     """Return the hypothesis that stretches speak for most, priors counted, without what is not material in any.
 
     Each of the leading ones is first freed of what is not material in it, and they are compared as what they then are.
@@ -260,11 +167,35 @@ def simplest(found: Sequence[Judged], material: float) -> Judged:
     return min((_freed(one, order, material) for one in leading(found, LEADING)), key=lambda one: worst(one, found))
 
 
-def _freed(best: Judged, order: Sequence[Judged], material: float) -> Judged:
+def _freed(best: _J, order: Sequence[_J], material: float) -> _J:
     """Return a hypothesis without what is not material in it: one of those that were judged."""
     while best.names:
-        lesser = [j for j in order if set(j.names) < set(best.names) and not best.is_better(j, material)]
+        lesser = [j for j in order if j.identity < best.identity and not best.is_better(j, material)]
         if not lesser:
             break
         best = lesser[0]
     return best
+
+
+def probabilities(found: Sequence[_J], best: _J, unknown_odds: float) -> tuple[Candidate, ...]:
+    """Return every hypothesis with its probability, by how far it is behind the one that is farthest ahead of it.
+
+    Parameters
+    ----------
+    found : sequence of Judged
+        All hypotheses.
+    best : Judged
+        The one that was chosen: what was more, and not material, speaks for it too.
+    unknown_odds : float
+        Prior odds of a cause that is none of them.
+    """
+    scores: dict[str, float] = {}
+    for one in found:
+        rivals = [other for other in found if other.identity != one.identity]
+        scores[_called(one)] = min(scores.get(_called(one), math.inf), max(worst(one, rivals), 0.0))
+    scores[_called(best)] = min(scores.values())
+    return weighed(scores, 1.0, unknown_odds)
+
+
+def _called(one: Judged) -> str:
+    return "+".join(one.names) if one.names else "none"

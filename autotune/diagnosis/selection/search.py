@@ -25,7 +25,8 @@ from autotune.diagnosis.fitting.parameters import parametrise
 from autotune.diagnosis.fitting.restarts import realigned
 from autotune.diagnosis.selection.bench import LAST_STEPS, STEPS, Bench, at_once, residual_sd
 from autotune.diagnosis.selection.hypothesis import hypothesis, is_stand_in
-from autotune.diagnosis.selection.judged import Found, Judged, leading, ranked, simplest
+from autotune.diagnosis.selection.judged import leading, ranked, simplest
+from autotune.diagnosis.selection.judged_chain import Found, JudgedChain
 from autotune.diagnosis.selection.prediction import distinct, extended, predictions, signal_sizes, starting_effects
 from autotune.diagnosis.selection.refits import timed, without
 from autotune.diagnosis.selection.scan import searched
@@ -52,7 +53,7 @@ def search(
     left_out: Collection[str] = (),
     progress: Progress = quiet,
     limits: Thresholds = IN_USE,
-    begun: Judged | None = None,
+    begun: JudgedChain | None = None,
 ) -> Found:
     """Search for the physics that is missing.
 
@@ -66,7 +67,7 @@ def search(
         Told what is being done and the share done, 0 to 1.
     limits : Thresholds
         What decides between findings.
-    begun : Judged, optional
+    begun : JudgedChain, optional
         What predicted best on more rows of these recordings: it is judged as well, from the numbers that it had there.
 
     Returns
@@ -118,8 +119,8 @@ def _odds(
 
 
 def _grown(
-    retuned: Judged, beam: list[Judged], bench: Bench, progress: Progress, limits: Thresholds
-) -> tuple[Bench, list[Judged]]:
+    retuned: JudgedChain, beam: list[JudgedChain], bench: Bench, progress: Progress, limits: Thresholds
+) -> tuple[Bench, list[JudgedChain]]:
     """Add effects one by one while one of them makes the free run better; return all that was judged."""
     found, best = [retuned], retuned
     for size in range(limits.rig_effects):
@@ -141,7 +142,7 @@ def _grown(
     return bench, found
 
 
-def _roots(model: Model, bench: Bench) -> tuple[Bench, list[Judged]]:
+def _roots(model: Model, bench: Bench) -> tuple[Bench, list[JudgedChain]]:
     """Return the bench with the retuned model's residual, and that model at its nominal numbers and retuned."""
     recordings = bench.long.driving
     p = parametrise(model, [], input_size(model, recordings), recordings[0].sample_time_s)
@@ -160,7 +161,7 @@ def _roots(model: Model, bench: Bench) -> tuple[Bench, list[Judged]]:
     return bench, [nominal if nominal is not None else retuned, retuned]
 
 
-def _lasting(root: Judged, bench: Bench) -> list[Effect]:
+def _lasting(root: JudgedChain, bench: Bench) -> list[Effect]:
     names = [k.name for k, _ in bench.odds if k.lasting]
     return [e for name in names for e in searched(name, root.short, root.few, bench.pool)]
 
@@ -169,7 +170,7 @@ def _lasting(root: Judged, bench: Bench) -> list[Effect]:
 class _Start:
     """An effect to be added to a hypothesis: where from, at which scale, and what the first order predicts."""
 
-    base: Judged
+    base: JudgedChain
     kind: EffectKind
     odds: float
     effects: tuple[Effect, ...]
@@ -178,7 +179,7 @@ class _Start:
     decrease: float
 
 
-def _larger(beam: Sequence[Judged], bench: Bench) -> list[Judged]:
+def _larger(beam: Sequence[JudgedChain], bench: Bench) -> list[JudgedChain]:
     """Return hypotheses with one effect more than those of a beam, the most promising ones judged."""
     starts: list[_Start] = []
     for base in beam:
@@ -206,7 +207,7 @@ def _charge(start: _Start) -> float:
     return fitted * math.log(start.base.fit.rows)
 
 
-def _starts(base: Judged, bench: Bench) -> list[_Start]:
+def _starts(base: JudgedChain, bench: Bench) -> list[_Start]:
     """Return every effect's starting points from which the first order predicts most, at each scale that helps.
 
     Where the free run through long windows is out of phase, no derivative there leads anywhere: short ones do.
@@ -264,7 +265,7 @@ def _added(start: _Start, bench: Bench) -> Fit | None:
     return timed(best, bench.long) if best is not None and start.kind.is_event else best
 
 
-def _begun(begun: Judged | None, bench: Bench) -> list[Judged]:
+def _begun(begun: JudgedChain | None, bench: Bench) -> list[JudgedChain]:
     """Return what predicted best on more rows, judged on these: a search of fewer rows may miss where it lies."""
     if begun is None:
         return []
@@ -277,7 +278,7 @@ def _begun(begun: Judged | None, bench: Bench) -> list[Judged]:
     return _brought(on_these, begun.log_odds, bench)
 
 
-def _brought(fitted: Callable[[], Fit], log_odds: float, bench: Bench) -> list[Judged]:
+def _brought(fitted: Callable[[], Fit], log_odds: float, bench: Bench) -> list[JudgedChain]:
     """Return a hypothesis that was found elsewhere, fitted and judged here; nothing where it runs away."""
     try:
         judged = bench.finite(fitted(), log_odds)
@@ -286,7 +287,7 @@ def _brought(fitted: Callable[[], Fit], log_odds: float, bench: Bench) -> list[J
     return [] if judged is None else [judged]
 
 
-def _pruned(found: Sequence[Judged], bench: Bench) -> list[Judged]:
+def _pruned(found: Sequence[JudgedChain], bench: Bench) -> list[JudgedChain]:
     """Return hypotheses with those that the leading ones become when an effect is left out, and again of these.
 
     Dry friction has many local minima: one more effect may only have led out of one.
@@ -303,14 +304,14 @@ def _pruned(found: Sequence[Judged], bench: Bench) -> list[Judged]:
     return result
 
 
-def _finished(found: Sequence[Judged], bench: Bench) -> list[Judged]:
+def _finished(found: Sequence[JudgedChain], bench: Bench) -> list[JudgedChain]:
     """Return hypotheses and, beside them, the leading ones fitted to the end: the search leaves them before."""
     first = leading(found, bench.limits.rig_pruned)
     first += [j for j in [simplest(found, bench.limits.material)] if j not in first]
     return [*found, *(j for j in bench.pool.map(bench.finished, first) if j is not None)]
 
 
-def _regrown(found: Sequence[Judged], bench: Bench) -> list[Judged]:
+def _regrown(found: Sequence[JudgedChain], bench: Bench) -> list[JudgedChain]:
     """Return hypotheses with those that have one effect more than the chosen one, fitted on from where that came to.
 
     Fits under dry friction end in local minima: what is larger is compared with what is smaller from the same place.
@@ -322,7 +323,7 @@ def _regrown(found: Sequence[Judged], bench: Bench) -> list[Judged]:
     return [*found, *(j for j in bench.pool.map(lambda j: _on_from(best, j, bench), chosen) if j is not None)]
 
 
-def _on_from(best: Judged, larger: Judged, bench: Bench) -> Judged | None:
+def _on_from(best: JudgedChain, larger: JudgedChain, bench: Bench) -> JudgedChain | None:
     """Return a hypothesis fitted from another one's numbers, with the effect that it has besides as it was found."""
     effect = next(e for e in larger.fit.model.effects if e.name in set(larger.names) - set(best.names))
     try:
@@ -335,11 +336,11 @@ def _on_from(best: Judged, larger: Judged, bench: Bench) -> Judged | None:
     return bench.finite(result, larger.log_odds)
 
 
-def _smaller(best: Judged, bench: Bench) -> list[Judged]:
+def _smaller(best: JudgedChain, bench: Bench) -> list[JudgedChain]:
     """Return a hypothesis with each of its effects left out: built one by one, one may have stood for another."""
     given = {k.name: math.log(o) for k, o in bench.odds}
 
-    def left(index: int) -> Judged | None:
+    def left(index: int) -> JudgedChain | None:
         smaller = without(best.fit, index, best.data)
         own = sum(given.get(n, -math.inf) for i, n in enumerate(best.names) if i != index)
         return None if smaller is None else bench.judged(smaller, max(own, best.log_odds))
