@@ -13,7 +13,7 @@ from autotune.diagnosis.evidence.operating_point import Offset
 from autotune.diagnosis.evidence.samples import SampleEffect
 from autotune.diagnosis.extended import with_uncertainty
 from autotune.diagnosis.result import FoundEffect, OperatingRange, Verdict
-from autotune.diagnosis.selection.probability import Candidate
+from autotune.diagnosis.selection.probability import probability_of
 from autotune.diagnosis.selection.searched import Search
 from autotune.diagnosis.thresholds import Thresholds
 from autotune.diagnosis.verdict import Evidence, judged
@@ -23,13 +23,6 @@ from autotune.models import Effect, Parameter
 #: The effect that every fit has as a free number.
 OFFSET = "actuator.offset"
 Window = tuple[int, float, float]
-
-
-def probability_of(name: str, candidates: Sequence[Candidate], most: float = Thresholds.most_probable) -> float:
-    """Return the probability that an effect is part of the truth: as such, in a larger one, or as one like it."""
-    group = counted_as(name)
-    total = sum(c.probability for c in candidates if group & set(c.name.split("+")))
-    return min(max(total, 0.0), most)
 
 
 def found_effects(evidence: Evidence, verdict: Verdict) -> tuple[FoundEffect, ...]:

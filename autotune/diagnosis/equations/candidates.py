@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
@@ -52,11 +52,6 @@ def values_of(effect: Effect) -> dict[str, float]:
 def is_usual(effect: Effect) -> bool:
     """Whether nearly every machine has it: tried beside a large effect whatever others predict."""
     return form_of(effect).usual
-
-
-def is_free_load(effect: Effect) -> bool:
-    """Whether it is a load of free timing."""
-    return form_of(effect).free_timing
 
 
 def plainer(effect: Effect) -> Effect | None:
@@ -116,7 +111,9 @@ class Signals:
     slow_s: float
 
 
-def trials(model: EquationModel, signals: Signals, without: Sequence[str] = (), black_box: bool = False) -> list[Trial]:
+def trials(
+    model: EquationModel, signals: Signals, without: Collection[str] = (), black_box: bool = False
+) -> list[Trial]:
     """Return every effect with the values it is tried with.
 
     Parameters
@@ -125,7 +122,7 @@ def trials(model: EquationModel, signals: Signals, without: Sequence[str] = (), 
         Says what states, ports and inputs are.
     signals : Signals
         Sizes to try.
-    without : sequence of str
+    without : collection of str
         Effects that are left out.
     black_box : bool
         Whether only inputs and output can be reached.

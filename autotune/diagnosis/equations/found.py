@@ -6,7 +6,7 @@ The steps from what a search found to what is said, and the records of it: the f
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -15,19 +15,20 @@ import numpy as np
 
 from autotune.arrays import BoolArray
 from autotune.controller import Controller
+from autotune.diagnosis.agreement import Part, agreement, parts_of
 from autotune.diagnosis.equations.bench import Bench, Outcome
-from autotune.diagnosis.equations.candidates import is_free_load
 from autotune.diagnosis.equations.closed import ClosedBench
 from autotune.diagnosis.equations.equation_bench import EquationBench
-from autotune.diagnosis.equations.probable import candidates_of, probability_of, without_improbable
-from autotune.diagnosis.equations.search import Searched, search
+from autotune.diagnosis.equations.judged import Searched
+from autotune.diagnosis.equations.search import search
 from autotune.diagnosis.evidence.law import law_effect
 from autotune.diagnosis.evidence.readings import converter_step, struck
 from autotune.diagnosis.evidence.samples import SampleEffect, inspect, outliers_in, spared, together
-from autotune.diagnosis.result import NextExperiment
-from autotune.diagnosis.selection.probability import Candidate
+from autotune.diagnosis.result import NextExperiment, Verdict
+from autotune.diagnosis.selection.judged import worst
+from autotune.diagnosis.selection.probability import Candidate, probability_of
 from autotune.diagnosis.thresholds import IN_USE, Thresholds
-from autotune.effects import kind_of
+from autotune.effects import KINDS, kind_of
 from autotune.equations.black_box import BlackBox
 from autotune.equations.effects import equation_of, where_told
 from autotune.equations.identifiability import undetermined
@@ -36,6 +37,11 @@ from autotune.errors import InputError
 from autotune.models import Effect
 from autotune.progress import Progress, quiet
 from autotune.recording import Recording
+
+#: Finite readings that a diagnosis needs.
+LEAST_ROWS = 100
+#: Held-out error, as a share of the spread of y, from which on a simulation follows nothing: 1 is y's mean.
+ASTRAY = 0.9
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -150,11 +156,10 @@ def _places(name: str) -> tuple[str, ...]:
 
 def _sits(effect: Effect, found: Searched) -> tuple[str, ...]:
     """Return where an effect may sit, and where one does that is the same as it on these recordings."""
-    places, best = dict.fromkeys(_places(effect.name)), found.score(found.chosen)
-    same = kind_of(effect.name).same
-    for one in found.tried:
-        if one.effects and one.effects[-1].name in same and found.score(one) - best < found.limits.equation_lead:
-            places |= dict.fromkeys(_places(one.effects[-1].name))
+    places, same = dict.fromkeys(_places(effect.name)), kind_of(effect.name).same
+    for one in found.judged:
+        if one.names and one.names[-1] in same and one.behind(found.taken) < found.limits.most_evidence:
+            places |= dict.fromkeys(_places(one.names[-1]))
     return tuple(places)
 
 
@@ -196,7 +201,7 @@ def diagnose_equations(
     if not recordings:
         raise InputError("no recording", where="diagnose", remedy="give at least one")
     for one in recordings:
-        if np.isfinite(one.y).sum() < 100:
+        if np.isfinite(one.y).sum() < LEAST_ROWS:
             raise InputError(f"{len(one)} rows", where=one.name, remedy="a diagnosis needs at least 100 readings")
         one.require_dense()
     good, seen = inspect(recordings, without, thresholds)
@@ -209,9 +214,51 @@ def diagnose_equations(
     own = {*without, *(effect.name for effect in model.effects)}
     seen = [one for one in seen if one.name not in own]
     bench, found, seen = _searched(model, recordings, good, seen, without, progress, thresholds)
+    agreed = _agreed(model, bench, found, [*without, *(s.name for s in seen)], progress)
+    found = _keeping(found, agreed)
     progress("checking on held-out rows", 0.95)
     errors = _held_out(bench, found)
-    return _judged(model, recordings, found, tuple(seen), errors)
+    return _judged(model, recordings, found, agreed, tuple(seen), errors)
+
+
+def _bench(model: EquationModel | BlackBox, recordings: Sequence[Recording], good: Sequence[BoolArray]) -> Bench:
+    kind = ClosedBench if isinstance(model, BlackBox) else EquationBench
+    bench: Bench = kind(model, recordings, good)  # type: ignore[arg-type]  # each kind has its bench
+    return bench
+
+
+def _said_by(found: Searched) -> dict[str, float]:
+    """Return the probabilities of all effects that are in a hypothesis."""
+    candidates = found.candidates(found.limits.unknown_odds)
+    return {name: probability_of(name, candidates) for one in found.judged for name in one.names}
+
+
+def _agreed(
+    model: EquationModel | BlackBox, bench: Bench, found: Searched, without: Sequence[str], progress: Progress
+) -> Mapping[str, float]:
+    """Return the effects that all rows and the parts that leave some out agree on, with their probabilities."""
+    whole = _said_by(found)
+    if not found.best.names:
+        return {}
+    others = [*without, *(name for name in KINDS if name not in whole)]
+
+    def said(part: Part) -> Mapping[str, float]:
+        progress("once more on a part of the rows", 0.9)
+        small = _bench(model, part.recordings, [np.isfinite(r.y) for r in part.recordings])
+        try:
+            return _said_by(search(small, others, quiet, found.limits, found.best.outcome))
+        except InputError:  # nothing runs there
+            return {}
+
+    return agreement(whole, {}, parts_of(bench.recordings, LEAST_ROWS), said)
+
+
+def _keeping(found: Searched, names: Collection[str]) -> Searched:
+    """Return a search with no other effects taken than those named: the largest hypothesis of them that was fitted."""
+    if set(found.best.names) <= set(names):
+        return found
+    able = [one for one in found.judged if set(one.names) <= set(names)]
+    return replace(found, taken=min(able, key=lambda one: (-len(one.names), worst(one, able))))
 
 
 def _searched(
@@ -224,12 +271,8 @@ def _searched(
     """
 
     def searched() -> tuple[Bench, Searched]:
-        bench: Bench = (
-            ClosedBench(model, recordings, good)
-            if isinstance(model, BlackBox)
-            else EquationBench(model, recordings, good)
-        )
-        return bench, without_improbable(search(bench, [*without, *(s.name for s in seen)], progress, limits))
+        bench = _bench(model, recordings, good)
+        return bench, search(bench, [*without, *(s.name for s in seen)], progress, limits)
 
     bench, found = searched()
     left = found.chosen.fitted.residuals
@@ -246,53 +289,37 @@ def _searched(
 
 
 def _judged(
-    model: EquationModel | BlackBox, recordings: Sequence[Recording], found: Searched, seen: tuple[SampleEffect, ...],
-    errors: tuple[float, float, float, float],
+    model: EquationModel | BlackBox, recordings: Sequence[Recording], found: Searched, agreed: Mapping[str, float],
+    seen: tuple[SampleEffect, ...], errors: tuple[float, float, float, float],
 ) -> EquationDiagnosis:  # fmt: skip
-    added = found.chosen.effects[len(model.effects) :]
-    left, before = (found.variance_ratio(one) - 1.0 for one in (found.chosen, found.retuned))
-    limits = found.limits
-    explains = left < limits.equation_explained - 1.0 or left < (1.0 - limits.equation_most) * before
-    better = errors[2] < errors[1] or errors[2] < limits.equation_held_out * errors[3]
-    # a load of free timing explains a part of everything
-    loads = any(is_free_load(one) for one in added)
-    mostly = not explains and not loads and _explains_most(errors, limits)
-    verdict: Literal["none", "parameters", "effect", "unexplained"]
-    if (added and (explains or mostly) and better) or (seen and left < 1.0):
+    added, limits, retuned = found.chosen.effects[len(model.effects) :], found.limits, found.judged[0]
+    nominal_error, retuned_error, extended_error, _ = errors
+    predicts = extended_error <= max(nominal_error, retuned_error) and extended_error < ASTRAY
+    verdict: Verdict
+    if (added and predicts) or (seen and found.variance_ratio(found.chosen) < limits.equation_astray):
         verdict = "effect"
-    elif added or left > limits.equation_missing - 1.0:
+    elif added or not retuned.leaves_noise:
         verdict = "unexplained"
     elif found.score(found.nominal) - found.score(found.retuned) > limits.numbers_decrease:
         verdict = "parameters"
     else:
         verdict = "none"
-    odds = limits.half_explained_odds if mostly else limits.unknown_odds
-    candidates = candidates_of(found, 1.0 if verdict == "unexplained" else odds)
+    candidates = found.candidates(1.0 if verdict == "unexplained" else limits.unknown_odds)
     named = tuple(added) if verdict == "effect" else ()
     places = dict.fromkeys(p for e in named for p in _sits(e, found)) | dict.fromkeys(
         kind_of(s.name).place for s in seen
     )
     if verdict == "unexplained":
-        best = min(found.tried, key=found.score, default=None)
-        places = dict.fromkeys(_places(best.effects[-1].name) if best else ("plant",))
-    use = found.chosen if verdict in ("effect", "unexplained") and better else found.retuned
+        places = dict.fromkeys(_places(found.tried[0].effects[-1].name) if found.tried else ("plant",))
+    use = found.chosen if added and predicts else found.retuned
     extended = model if verdict == "none" else _with_numbers(model, use)
+    said = tuple(agreed[e.name] for e in named)
     return EquationDiagnosis(
-        verdict=verdict, effects=named, probabilities=tuple(probability_of(e, candidates) for e in named),
+        verdict=verdict, effects=named, probabilities=said,
         samples=seen if verdict == "effect" else (), candidates=candidates, places=tuple(places), errors=errors,
         extended_model=extended, searched=found, recordings=tuple(recordings),
-        sentences=_sentences(verdict, named, seen, candidates, tuple(places), errors, found),
+        sentences=_sentences(verdict, list(zip(named, said, strict=True)), seen, tuple(places), errors, found),
     )  # fmt: skip
-
-
-def _explains_most(errors: tuple[float, float, float, float], limits: Thresholds) -> bool:
-    """Whether effects take a share of the held-out error away and leave one that is small beside what y does.
-
-    On real rigs more than noise is left by every model; what is far from right there explains nothing.
-    """
-    _, retuned, extended, noise = errors
-    gains = retuned**2 - extended**2 > limits.dominant * (retuned**2 - noise**2)
-    return gains and extended < limits.equation_small
 
 
 def _with_numbers(model: EquationModel | BlackBox, outcome: Outcome) -> EquationModel | BlackBox:
@@ -308,7 +335,7 @@ def _with_numbers(model: EquationModel | BlackBox, outcome: Outcome) -> Equation
 
 
 def _sentences(
-    verdict: str, named: Sequence[Effect], seen: Sequence[SampleEffect], candidates: Sequence[Candidate],
+    verdict: str, named: Sequence[tuple[Effect, float]], seen: Sequence[SampleEffect],
     places: Sequence[str], errors: tuple[float, float, float, float], found: Searched,
 ) -> tuple[str, ...]:  # fmt: skip
     numbers = ("Held-out error, as a share of the spread of y: nominal {:.3g}, retuned {:.3g}, extended {:.3g}, "
@@ -320,8 +347,7 @@ def _sentences(
         case "parameters":
             first = "The structure is right, its numbers are not: retuned, the simulation explains the recordings."
         case "effect":
-            told = [f"{e.name} at {where_told(e)} (probability "
-                    f"{probability_of(e, candidates):.2f})" for e in named]  # fmt: skip
+            told = [f"{e.name} at {where_told(e)} (probability {p:.2f})" for e, p in named]
             first = f"Physics was left out: {' and '.join([*told, *(s.name for s in seen)])}."
         case _:
             first = (

@@ -1,7 +1,8 @@
-"""How hypotheses of a search in equations compare: what they leave beside noise, and what an effect is worth."""
+"""What a fit of equations leaves beside noise, and a criterion that ranks fits before they are judged."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -12,17 +13,15 @@ from autotune.diagnosis.thresholds import Thresholds
 from autotune.errors import InputError
 from autotune.models import Effect
 
-
-def penalised(one: Outcome, rows: float, limits: Thresholds) -> float:
-    """Return rows log(mean square) and what each number pays: Schwarz's criterion with unknown noise, and a lead."""
-    each = float(np.log(rows)) + limits.equation_lead
-    return rows * float(np.log(max(one.rss / one.residual.size, 1e-300))) + one.count * each
+#: Blocks of a recording whose means are compared.
+BLOCKS = 60
 
 
-def is_worth(before: Outcome, after: Outcome, rows: float, limits: Thresholds) -> bool:
-    """Whether the larger of two hypotheses pays for its numbers, and for having been the best of many."""
-    more = penalised(before, rows, limits) - penalised(after, rows, limits) > limits.equation_decrease
-    return more and after.rss < (1.0 - limits.equation_share) * before.rss
+def quick_score(one: Outcome, noise: Noise) -> float:
+    """Return rows log(mean square) and what each number pays: Schwarz's criterion with unknown noise."""
+    rho = noise.ar[0] if noise.ar else 0.0
+    rows = max(one.residual.size * (1.0 - rho) / (1.0 + rho), 20.0)
+    return rows * math.log(max(one.rss / one.residual.size, 1e-300)) + one.count * math.log(rows)
 
 
 def noise_of(bench: Bench, one: Outcome) -> Noise:
@@ -34,10 +33,12 @@ def noise_of(bench: Bench, one: Outcome) -> Noise:
     return found if found.sd > 1e-6 * spread else Noise(sd=max(1e-6 * spread, 1e-300))
 
 
-def independent_rows(one: Outcome, noise: Noise) -> float:
-    """Return as how many rows with independent errors those of a fit count: by the correlation from row to row."""
+def innovations_variance(one: Outcome, noise: Noise) -> float:
+    """Return the mean square of what is left of a residual when its row before foretells what it can."""
     rho = noise.ar[0] if noise.ar else 0.0
-    return max(one.residual.size * (1.0 - rho) / (1.0 + rho), 20.0)
+    squares = [(e[1:] - rho * e[:-1]) ** 2 for e in one.fitted.residuals]
+    found = float(np.nanmean(np.concatenate(squares)))
+    return max(found, 1e-12 * noise.sd**2, 1e-300)
 
 
 def variance_ratio(one: Outcome, noise: Noise) -> float:
@@ -53,22 +54,23 @@ def is_noise(bench: Bench, one: Outcome, most: float, limits: Thresholds) -> boo
 
 def is_settled(bench: Bench, one: Outcome, best: Outcome, limits: Thresholds) -> bool:
     """Whether a fit need not be finished: another one of the same rows leaves noise alone, and it is far behind."""
-    if one is best or variance_ratio(best, noise_of(bench, best)) >= limits.equation_noise:
+    if one is best or variance_ratio(best, noise_of(bench, best)) >= limits.adequate_quick:
         return False
     return one.residual.size * float(np.log(one.rss / max(best.rss, 1e-300))) > limits.equation_behind
 
 
-def is_slow(bench: Bench, one: Outcome, limits: Thresholds) -> bool:
-    """Whether block means of a residual vary by more than its noise says."""
-    noise, ratios = noise_of(bench, one), []
+def is_slow(one: Outcome, noise: Noise, limits: Thresholds) -> bool:
+    """Whether block means of a residual vary by more than its noise says, and chance brings."""
+    ratios, blocks = [], 0
     rho = noise.ar[0] if noise.ar else 0.0
     for residual in one.fitted.residuals:
         e = residual[np.isfinite(residual)]
-        width = max(10, e.size // 60)
+        width = max(10, e.size // BLOCKS)
         means = e[: e.size // width * width].reshape(-1, width).mean(axis=1)
         wanted = noise.total_sd**2 / width * (1.0 + rho) / (1.0 - rho)
         ratios.append(float(np.mean(means**2)) / max(wanted, 1e-300))
-    return bool(np.mean(ratios) > limits.equation_slow)
+        blocks += means.size
+    return float(np.mean(ratios)) > limits.white + 2.0 * math.sqrt(2.0 / blocks)
 
 
 def attempt(bench: Bench, effects: Sequence[Effect], start: Outcome, iterations: int) -> Outcome | None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import replace
 
 import numpy as np
@@ -21,7 +21,7 @@ PARALLEL = 1.0 - 1e-6
 
 
 def screened(
-    bench: Bench, base: Outcome, without: Sequence[str], progress: Progress, limits: Thresholds = IN_USE,
+    bench: Bench, base: Outcome, without: Collection[str], progress: Progress, limits: Thresholds = IN_USE,
     only: Callable[[Effect], bool] = lambda effect: True,
 ) -> list[tuple[float, Effect]]:  # fmt: skip
     """Return for every effect and place the decrease that first order predicts, with the values that bring it.
@@ -30,7 +30,7 @@ def screened(
     ----------
     bench, base : Bench, Outcome
         The model on its recordings, and the fit beside which effects are tried.
-    without : sequence of str
+    without : collection of str
         Effects that are left out.
     progress : callable
         Told what is being done and the share done.

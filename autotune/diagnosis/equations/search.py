@@ -1,40 +1,27 @@
-"""First order screens every effect at every place, fits decide, one effect after the other.
-
-The steps of one search: the file is a little longer than others.
-"""
+"""First order screens every effect at every place, fits follow, and what they leave decides, as it does for chains."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 
 import numpy as np
 
 from autotune.diagnosis.equations.bench import Bench, Outcome
-from autotune.diagnosis.equations.candidates import (
-    is_free_load,
-    is_plainer,
-    is_usual,
-    key_of,
-    plainer,
-)
+from autotune.diagnosis.equations.candidates import is_plainer, is_usual, key_of, plainer
 from autotune.diagnosis.equations.dry_friction import settled_among, swept, with_force
+from autotune.diagnosis.equations.judged import JudgedEquations, Searched, judged, odds_of
 from autotune.diagnosis.equations.scores import (
     attempt,
-    independent_rows,
     is_noise,
     is_settled,
-    is_slow,
-    is_worth,
     least,
     noise_of,
-    penalised,
+    quick_score,
     variance_ratio,
 )
 from autotune.diagnosis.equations.screening import screened
-from autotune.diagnosis.evidence.stretches import advantage
-from autotune.diagnosis.fitting.noise import Noise
+from autotune.diagnosis.selection.judged import leading, ranked, simplest
 from autotune.diagnosis.thresholds import IN_USE, Thresholds
 from autotune.errors import InputError
 from autotune.models import Effect
@@ -46,54 +33,27 @@ LOOK, FIRST, LAST, FINAL = 2, 4, 8, 30
 CARRIED = 3
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Searched:
-    """What a search found.
-
-    Attributes
-    ----------
-    nominal, retuned, chosen : Outcome
-        The model as it is, with its own numbers retuned, and with the effects that are worth it.
-    tried : tuple of Outcome
-        All hypotheses that were fitted.
-    noise : Noise
-        What differences of the chosen residual show.
-    rows : float
-        Rows that count, as many as independent noise would make.
-    limits : Thresholds
-        What decided.
-    """
-
-    nominal: Outcome
-    retuned: Outcome
-    chosen: Outcome
-    tried: tuple[Outcome, ...]
-    noise: Noise
-    rows: float
-    limits: Thresholds
-
-    def score(self, one: Outcome) -> float:
-        """Return the penalised chi-square of a hypothesis, up to a constant."""
-        return penalised(one, self.rows, self.limits)
-
-    def variance_ratio(self, one: Outcome) -> float:
-        """Return the residual's variance in units of the noise's."""
-        return variance_ratio(one, self.noise)
-
-
-def search(bench: Bench, without: Sequence[str], progress: Progress, limits: Thresholds = IN_USE) -> Searched:
+def search(
+    bench: Bench,
+    without: Collection[str],
+    progress: Progress,
+    limits: Thresholds = IN_USE,
+    begun: Outcome | None = None,
+) -> Searched:
     """Search for what is missing.
 
     Parameters
     ----------
     bench : Bench
         The model on its recordings.
-    without : sequence of str
+    without : collection of str
         Effects that are left out.
     progress : callable
         Told what is being done and the share done.
     limits : Thresholds
         What decides between two findings.
+    begun : Outcome, optional
+        What predicted best on more rows of these recordings: it is judged as well, from the numbers that it had there.
 
     Notes
     -----
@@ -104,103 +64,115 @@ def search(bench: Bench, without: Sequence[str], progress: Progress, limits: Thr
     """
     progress("retuning the model", 0.02)
     retuned = bench.retuned()
-    nominal = bench.as_it_is(retuned)
-    noise = noise_of(bench, retuned)
-    rows = independent_rows(retuned, noise)
-    tried: list[Outcome] = []
-    chosen = retuned
-    while len(chosen.effects) - len(retuned.effects) < limits.equation_effects:
-        if is_noise(bench, chosen, limits.equation_noise, limits) and not is_slow(bench, chosen, limits):
+    own = len(retuned.effects)
+
+    def of(fits: Sequence[Outcome | None]) -> list[JudgedEquations]:
+        each = (judged(bench, one, own, limits) for one in fits if one is not None)
+        return [one for one in each if one is not None]
+
+    found = of([retuned])
+    if not found:
+        raise InputError("the model runs away on left-out stretches", where="diagnose", remedy="check its numbers")
+    best = found[0]
+    while len(best.names) < limits.rig_effects and not best.leaves_noise:
+        fits = _leading(bench, best.outcome, without, progress, limits, bool(best.names))
+        larger = of(_promising(bench, fits, own, limits))
+        found += larger
+        first = ranked([best, *larger])[0]
+        if first is best or not first.is_better(best, limits.material):
             break
-        new = _leading(bench, chosen, without, progress, limits, chosen is not retuned)
-        tried += new
-        noise = noise_of(bench, min([chosen, *new], key=lambda one: one.rss))
-        rows = independent_rows(retuned, noise)
-        larger = _larger(bench, chosen, new, tried, len(retuned.effects), rows, limits)
-        if larger is None:
-            break
-        chosen = _simplified(bench, larger, retuned, tried, rows, limits)
-    chosen = _pruned(bench, chosen, len(retuned.effects), tried, rows, limits)
-    if chosen is not retuned and not is_noise(bench, chosen, limits.equation_noise, limits):
-        chosen = _finished(bench, chosen, retuned, rows)
-        tried.append(chosen)
-    return Searched(
-        nominal=nominal, retuned=retuned, chosen=chosen, tried=tuple(tried), noise=noise, rows=rows, limits=limits
-    )
+        best = first
+    found += of([_brought(bench, begun, retuned)])
+    found = _pruned(bench, found, of, limits)
+    found += of(_finished(bench, simplest(found, limits.material), retuned, limits))
+    chosen = simplest(found, limits.material)
+    return Searched(nominal=bench.as_it_is(retuned), judged=tuple(found), best=chosen, taken=chosen)
 
 
-def _simplified(
-    bench: Bench, one: Outcome, retuned: Outcome, tried: list[Outcome], rows: float, limits: Thresholds
-) -> Outcome:
-    """Return a hypothesis with the effects before its last one in their plainest form where more is not worth it.
+def _promising(bench: Bench, fits: Sequence[Outcome], own: int, limits: Thresholds) -> list[Outcome]:
+    """Return the fits to judge: of each hypothesis the best, and the effect that its last one comes down to."""
+    if not fits:
+        return []
+    noise = noise_of(bench, min(fits, key=lambda one: one.rss))
 
-    A torque of free period and phase may have stood for gravity and a bend: beside the bend gravity is enough.
+    def charged(one: Outcome) -> float:
+        odds = sum(np.log(odds_of(e)) for e in one.effects[own:])
+        return quick_score(one, noise) - 2.0 * limits.temperature * float(odds)
+
+    once = {frozenset(map(key_of, one.effects)): one for one in sorted(fits, key=charged, reverse=True)}
+    few = sorted(once.values(), key=charged)[: limits.rig_judged]
+    plain = [_plainest(bench, one, noise_ratio_of(bench, one)) for one in few[: limits.confirmed]]
+    return [one for one in few if not is_plainer(one.effects[-1])] + [one for one in plain if one is not None]
+
+
+def noise_ratio_of(bench: Bench, one: Outcome) -> float:
+    """Return the residual's variance in units of the noise that it shows itself."""
+    return variance_ratio(one, noise_of(bench, one))
+
+
+def _plainest(bench: Bench, one: Outcome, ratio: float) -> Outcome | None:
+    """Return a fit with its last effect in its plainest form; nothing where it has none."""
+    less = plainer(one.effects[-1])
+    if less is None:
+        return None
+    first = attempt(bench, (*one.effects[:-1], less), one, FIRST)
+    return first and (attempt(bench, first.effects, first, LAST) or first)
+
+
+def _brought(bench: Bench, begun: Outcome | None, retuned: Outcome) -> Outcome | None:
+    """Return what was found elsewhere fitted here; nothing where it runs away, or there is none."""
+    return None if begun is None else attempt(bench, begun.effects, retuned, FINAL)
+
+
+def _pruned(
+    bench: Bench,
+    found: Sequence[JudgedEquations],
+    of: Callable[[Sequence[Outcome | None]], list[JudgedEquations]],
+    limits: Thresholds,
+) -> list[JudgedEquations]:
+    """Return hypotheses with those that leading ones become without each of their effects, or with a plainer one.
+
+    Built one by one, an effect may have stood for another: a torque of free period for gravity and a bend.
     """
-    for i in range(len(retuned.effects), len(one.effects) - 1):
-        less = plainer(one.effects[i])
-        if less is None:
-            continue
-        effects = [*one.effects[:i], less, *one.effects[i + 1 :]]
-        fits = [attempt(bench, effects, one, LAST)]
-        if less.name == one.effects[i].name:  # what a bent torque moved away from is far from where gravity leaves it
-            fits.append(attempt(bench, effects, retuned, FINAL))
-        simple = least(fits)
-        if simple is not None:
-            tried.append(simple)
-            one = one if is_worth(simple, one, rows, limits) else simple
-    return one
+    result, done = list(found), set()
+    for _ in range(limits.rig_effects):
+        first = leading(result, limits.confirmed)
+        fresh = [one for one in (*first, simplest(result, limits.material)) if len(one.names) > 1]
+        fresh = [one for one in fresh if one.identity not in done]
+        if not fresh:
+            break
+        for one in {one.identity: one for one in fresh}.values():
+            done.add(one.identity)
+            known = {other.identity for other in result}
+            effects = one.outcome.effects
+            for i in range(one.own, len(effects)):
+                less = plainer(effects[i])
+                smaller = [(*effects[:i], *effects[i + 1 :])]
+                smaller += [] if less is None else [(*effects[:i], less, *effects[i + 1 :])]
+                new = [e for e in smaller if frozenset(map(key_of, e[one.own :])) not in known]
+                result += of([attempt(bench, e, one.outcome, LAST) for e in new])
+    return result
 
 
-def _finished(bench: Bench, chosen: Outcome, retuned: Outcome, rows: float) -> Outcome:
+def _finished(bench: Bench, one: JudgedEquations, retuned: Outcome, limits: Thresholds) -> list[Outcome]:
     """Return a fit to its end: from where it is, from the numbers without effects, and with start states found anew.
 
     Where dry friction held the plant while numbers were still wrong, start states stay behind, and hold numbers back:
     from the numbers without effects it begins at half of what was found.
     """
+    if not one.names or one.leaves_noise:
+        return []
+    chosen = one.outcome
     fits = [chosen, attempt(bench, chosen.effects, chosen, FINAL)]
     fits.append(attempt(bench, [with_force(effect, 0.5) for effect in chosen.effects], retuned, FINAL))
     with suppress(InputError):
         fits.append(bench.carried(chosen, FINAL))
     best = least(fits) or chosen
-    return settled_among(bench, swept(bench, best), rows, variance_ratio(best, noise_of(bench, best)))
-
-
-def _larger(
-    bench: Bench, parent: Outcome, new: list[Outcome], tried: list[Outcome], own: int, rows: float, limits: Thresholds
-) -> Outcome | None:
-    """Return the best hypothesis with one more effect in its plainest form; nothing where none is needed."""
-    new.sort(key=_first(bench, rows, limits))
-    best = next((one for one in new if is_worth(parent, one, rows, limits)), new[0] if new else None)
-    best = best and _plainest(bench, best, tried, rows, limits)
-    if best is not None and _is_needed(bench, parent, best, own, rows, limits):
-        return best
-    usual = (one for one in new if is_usual(one.effects[-1]))
-    return next((one for one in usual if _is_usual(bench, parent, one, rows, limits)), None)
-
-
-def _is_usual(bench: Bench, before: Outcome, after: Outcome, rows: float, limits: Thresholds) -> bool:
-    """Whether a usual effect pays for its number and predicts what was left out, if only a little.
-
-    It was expected, not the best of a hundred: where more than noise is left it need not take a large share away.
-    """
-    if is_noise(bench, before, limits.equation_astray, limits):
-        return False
-    if penalised(after, rows, limits) >= penalised(before, rows, limits):
-        return False
-    speaks = advantage(bench.left_out_squares(before), bench.left_out_squares(after)) > 0.0
-    return speaks and bench.held_out_error(after, True) < bench.held_out_error(before, True)
-
-
-def _first(bench: Bench, rows: float, limits: Thresholds) -> Callable[[Outcome], tuple[bool, float]]:
-    """Return the key by which the best hypothesis comes first.
-
-    A load of free timing explains a part of everything: others come first unless it leaves noise alone.
-    """
-    return lambda one: (_is_partial_load(bench, one, limits), penalised(one, rows, limits))
+    return [settled_among(bench, swept(bench, best), one.rows, noise_ratio_of(bench, best))]
 
 
 def _leading(
-    bench: Bench, base: Outcome, without: Sequence[str], progress: Progress, limits: Thresholds, further: bool
+    bench: Bench, base: Outcome, without: Collection[str], progress: Progress, limits: Thresholds, further: bool
 ) -> list[Outcome]:
     """Return fits with one more effect, sought on a part of the rows where there are many, fitted to all of them."""
     part = bench.part(base, limits.equation_rows)
@@ -208,8 +180,7 @@ def _leading(
         return _round(bench, base, without, progress, limits, further)
     small, there = part
     found = _round(small, there, without, progress, limits, further)
-    rows = independent_rows(there, noise_of(small, there))
-    found.sort(key=_first(small, rows, limits))
+    found.sort(key=lambda one: quick_score(one, noise_of(small, there)))
     once = {(*key_of(one.effects[-1]), len(one.effects)): one for one in reversed(found)}
     carried: list[Outcome] = []
     for one in sorted(once.values(), key=found.index)[: limits.confirmed]:
@@ -227,7 +198,7 @@ def _leading(
 
 
 def _usual_beside(
-    bench: Bench, base: Outcome, found: Sequence[Outcome], without: Sequence[str], limits: Thresholds
+    bench: Bench, base: Outcome, found: Sequence[Outcome], without: Collection[str], limits: Thresholds
 ) -> list[Outcome]:
     """Return fits to all rows with the usual effects that a part did not lead to, where more than noise is left.
 
@@ -249,7 +220,7 @@ def _elsewhere(bench: Bench, one: Outcome, limits: Thresholds) -> Outcome:
 
 
 def _round(
-    bench: Bench, base: Outcome, without: Sequence[str], progress: Progress, limits: Thresholds, further: bool
+    bench: Bench, base: Outcome, without: Collection[str], progress: Progress, limits: Thresholds, further: bool
 ) -> list[Outcome]:
     """Look at every effect at every place, and fit the best: on long windows, and from short ones where those fail."""
     share, count = (0.5, limits.equation_further) if further else (0.1, limits.equation_fitted)
@@ -278,7 +249,7 @@ def _round(
 
 
 def _grown(
-    bench: Bench, base: Outcome, without: Sequence[str], told: Progress, limits: Thresholds, count: int, usual: bool
+    bench: Bench, base: Outcome, without: Collection[str], told: Progress, limits: Thresholds, count: int, usual: bool
 ) -> list[Outcome]:
     """Return fits of a base with each of the effects that predict most, and with usual ones that predict anything.
 
@@ -287,100 +258,6 @@ def _grown(
     ranked = screened(bench, base, without, lambda what, done: told(what, 0.4 * done), limits)
     tried = [e for k, (_, e) in enumerate(ranked) if k < count or (usual and is_usual(e))]
     return _fitted(bench, base, tried, lambda what: told(what, 0.6), limits)
-
-
-def _pruned(
-    bench: Bench, chosen: Outcome, own: int, tried: list[Outcome], rows: float, limits: Thresholds
-) -> Outcome:  # fmt: skip
-    """Drop added effects that buy nothing once the others have their numbers, or predict nothing.
-
-    What is fitted so joins those tried.
-    """
-    while len(chosen.effects) - own > 1:
-        smaller = []
-        for i in range(own, len(chosen.effects)):
-            one = attempt(bench, (*chosen.effects[:i], *chosen.effects[i + 1 :]), chosen, LAST)
-            smaller += [] if one is None else [one]
-        tried += smaller
-        smaller.sort(key=lambda one: penalised(one, rows, limits))
-        whole = bench.held_out_error(chosen, True)
-        less = next((one for one in smaller if not ((_predicts(bench, one, whole, limits)
-                     and _is_needed(bench, one, chosen, own, rows, limits))
-                     or (_lacks_usual(one, chosen) and _is_usual(bench, one, chosen, rows, limits)))),
-                    None)  # fmt: skip
-        if less is None:
-            break
-        chosen = less
-    return chosen
-
-
-def _lacks_usual(smaller: Outcome, larger: Outcome) -> bool:
-    """Whether what a hypothesis has beyond another one is a usual effect."""
-    have = {key_of(e) for e in smaller.effects}
-    return any(is_usual(e) and key_of(e) not in have for e in larger.effects)
-
-
-def _is_needed(bench: Bench, before: Outcome, after: Outcome, own: int, rows: float, limits: Thresholds) -> bool:
-    """Whether the larger of two hypotheses is worth its numbers; beside other effects left-out stretches must agree.
-
-    A second effect may make up for a first one that is not quite the right one, or not quite fitted: on rows that were
-    fitted something is always gained. A load of free timing explains a part of everything: beside other effects it must
-    leave noise alone. Where the model's error and not noise is left, rows are no witnesses and stretches decide alone.
-    """
-    worth = is_worth(before, after, rows, limits)
-    if len(before.effects) <= own and (worth or is_noise(bench, after, limits.equation_astray, limits)):
-        return worth
-    had = {key_of(e) for e in before.effects}
-    loads = any(is_free_load(e) and key_of(e) not in had for e in after.effects)
-    if loads and before.effects[own:] and not is_noise(bench, after, limits.equation_noise, limits):
-        return False
-    if not worth and variance_ratio(after, noise_of(bench, after)) < limits.equation_astray:
-        return False
-    return _is_earned(bench, before, after, limits)
-
-
-def _predicts(bench: Bench, smaller: Outcome, error: float, limits: Thresholds) -> bool:
-    """Whether a held-out error of a free run is less than a smaller hypothesis's by a share that matters.
-
-    Stretches are short, and the rows about them tell their states: what bends them a little may predict nothing.
-    """
-    before = bench.held_out_error(smaller, True)
-    return not np.isfinite(before) or error < (1.0 - limits.material) * before
-
-
-def _is_partial_load(bench: Bench, one: Outcome, limits: Thresholds) -> bool:
-    """Whether the last effect is a load, and more than noise is left beside it."""
-    return is_free_load(one.effects[-1]) and not is_noise(bench, one, limits.equation_noise, limits)
-
-
-def _is_earned(bench: Bench, before: Outcome, after: Outcome, limits: Thresholds) -> bool:
-    """Whether left-out stretches speak for the larger of two hypotheses, and it takes a share of their error away."""
-    squares, fewer = bench.left_out_squares(before), bench.left_out_squares(after)
-    if not np.all(np.isfinite(squares)):
-        return bool(np.all(np.isfinite(fewer)))
-    left = float(np.sqrt(fewer.sum() / max(float(squares.sum()), 1e-300)))
-    return left < 1.0 - limits.material and advantage(squares, fewer) > 0.0
-
-
-def _plainest(bench: Bench, best: Outcome, tried: list[Outcome], rows: float, limits: Thresholds) -> Outcome:
-    """Return a hypothesis with its last effect in its plainest form, unless more numbers are worth it."""
-    last = best.effects[-1]
-    less = plainer(last)
-    if less is None:
-        return best
-    one = attempt(bench, (*best.effects[:-1], less), best, FIRST)
-    if one is not None and not is_settled(bench, one, best, limits):
-        one = attempt(bench, one.effects, one, LAST) or one
-    if one is None:
-        return best
-    tried.append(one)
-    if is_plainer(last):
-        tried[:] = [other for other in tried if not (other.effects and is_plainer(other.effects[-1]))]
-        return one
-    if variance_ratio(best, noise_of(bench, best)) < limits.equation_noise:
-        # two forms of one effect: noise alone is left, so that rows are witnesses, and it is not the best of many
-        return best if penalised(best, rows, limits) < penalised(one, rows, limits) else one
-    return best if is_worth(one, best, rows, limits) and _is_earned(bench, one, best, limits) else one
 
 
 def _fitted(
@@ -393,7 +270,9 @@ def _fitted(
     found: list[Outcome] = []
     for effect in sorted(effects, key=lambda one: plainer(one) is not None):
         less = plainer(effect)
-        if less is not None and any(_leaves_nothing(bench, one, less, limits) for one in found):
+        if less is not None and any(
+            key_of(one.effects[-1]) == key_of(less) and is_noise(bench, one, limits.adequate, limits) for one in found
+        ):
             continue
         told(f"fitting {effect.name}")
         whole = (*base.effects, effect)
@@ -409,14 +288,6 @@ def _fitted(
     return found
 
 
-def _leaves_nothing(bench: Bench, one: Outcome, effect: Effect, limits: Thresholds) -> bool:
-    """Whether an outcome's last effect is a given one and leaves less beside noise than an effect must bring."""
-    last = one.effects[-1]
-    if key_of(last) != key_of(effect):
-        return False
-    return (1.0 - limits.equation_share) * variance_ratio(one, noise_of(bench, one)) < 1.0
-
-
 def _ends_usual(one: Outcome) -> bool:
     """Whether the last effect is a usual one beside others."""
     return len(one.effects) > 1 and is_usual(one.effects[-1])
@@ -427,7 +298,7 @@ def _lengthened(bench: Bench, fits: Sequence[Outcome], limits: Thresholds) -> li
     found: list[Outcome] = []
     ranked = sorted(fits, key=lambda one: one.rss)
     for one in [*ranked[:CARRIED], *(one for one in ranked[CARRIED:] if _ends_usual(one))]:
-        if is_settled(bench, one, ranked[0], limits) and is_noise(bench, found[0], limits.equation_noise, limits):
+        if is_settled(bench, one, ranked[0], limits) and is_noise(bench, found[0], limits.adequate_quick, limits):
             continue
         try:
             found.append(bench.lengthened(one))

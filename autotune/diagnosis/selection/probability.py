@@ -3,8 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+
+from autotune.diagnosis.thresholds import Thresholds
+from autotune.effects import counted_as
+
+#: Prior odds, at least, of any effect in any rig.
+RARE = 0.01
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,3 +39,10 @@ def weighed(scores: Mapping[str, float], scale: float, unknown_odds: float) -> t
     total = sum(weights.values())
     ranked = sorted(weights.items(), key=lambda item: -item[1])
     return tuple(Candidate(name=name, probability=w / total) for name, w in ranked if w / total > 1e-4)[:12]
+
+
+def probability_of(name: str, candidates: Sequence[Candidate], most: float = Thresholds.most_probable) -> float:
+    """Return the probability that an effect is part of the truth: as such, in a larger one, or as one like it."""
+    group = counted_as(name)
+    total = sum(c.probability for c in candidates if group & set(c.name.split("+")))
+    return min(max(total, 0.0), most)

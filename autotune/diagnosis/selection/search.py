@@ -28,6 +28,7 @@ from autotune.diagnosis.selection.hypothesis import hypothesis, is_stand_in
 from autotune.diagnosis.selection.judged import leading, ranked, simplest
 from autotune.diagnosis.selection.judged_chain import Found, JudgedChain
 from autotune.diagnosis.selection.prediction import distinct, extended, predictions, signal_sizes, starting_effects
+from autotune.diagnosis.selection.probability import RARE
 from autotune.diagnosis.selection.refits import timed, without
 from autotune.diagnosis.selection.scan import searched
 from autotune.diagnosis.simulation.assembly import input_size
@@ -40,8 +41,6 @@ from autotune.models import Effect, Model
 from autotune.progress import Progress, quiet
 from autotune.recording import Recording
 
-#: Prior odds, at least, of any effect in any rig.
-RARE = 0.01
 #: Share of what its numbers must bring near the noise that the first order must predict before an effect is fitted.
 PROMISING = 0.5
 

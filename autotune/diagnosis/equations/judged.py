@@ -1,0 +1,162 @@
+"""Hypotheses of equations, judged as those of chains are, and what a search among them found."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from autotune.diagnosis.equations.bench import Bench, Outcome
+from autotune.diagnosis.equations.candidates import key_of
+from autotune.diagnosis.equations.scores import innovations_variance, is_slow, noise_of, quick_score, variance_ratio
+from autotune.diagnosis.fitting.noise import Noise
+from autotune.diagnosis.selection.judged import Judged, probabilities
+from autotune.diagnosis.selection.probability import RARE, Candidate
+from autotune.diagnosis.thresholds import Thresholds
+from autotune.effects import kind_of
+from autotune.models import Effect
+
+#: Prior odds, at most, of an effect that a rig of some kind usually lacks: of what kind equations are is not known.
+MOST = 0.3
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class JudgedEquations(Judged):
+    """Equations with effects, judged.
+
+    Attributes
+    ----------
+    outcome : Outcome
+        The fit.
+    own : int
+        Effects that the model has itself.
+    bench : Bench
+        What it was fitted on.
+    table : Thresholds
+        What decides between two findings.
+    """
+
+    outcome: Outcome
+    own: int
+    bench: Bench
+    table: Thresholds
+
+    @property
+    def limits(self) -> Thresholds:
+        """What decides between two findings."""
+        return self.table
+
+    @cached_property
+    def noise(self) -> Noise:
+        """The noise that what it leaves shows from row to row."""
+        return noise_of(self.bench, self.outcome)
+
+    @cached_property
+    def leaves_noise(self) -> bool:
+        """Whether what it leaves is noise: no more variance, no slow part, and stretches are foretold about as well."""
+        outcome, limits = self.outcome, self.table
+        chance = math.sqrt(2.0 / outcome.residual.size)
+        if self.noise.ar and self.noise.ar[0] > limits.slow_noise:
+            return False
+        if variance_ratio(outcome, self.noise) > limits.adequate_quick + chance or is_slow(outcome, self.noise, limits):
+            return False
+        error = math.sqrt(float(self.long_squares.sum()) / outcome.residual.size)
+        return error < limits.foretold * math.sqrt(outcome.rss / outcome.residual.size)
+
+    @cached_property
+    def variance(self) -> float:
+        """Variance of the innovations of what it leaves."""
+        return innovations_variance(self.outcome, self.noise)
+
+    @property
+    def rows(self) -> int:
+        """Rows that it was fitted to."""
+        return self.outcome.residual.size
+
+    @property
+    def numbers(self) -> int:
+        """Numbers that were fitted, the model's own ones with them, which all hypotheses have."""
+        return self.outcome.count
+
+    @property
+    def identity(self) -> frozenset[object]:
+        """What tells hypotheses apart: an effect may act at several places."""
+        return frozenset(key_of(e) for e in self.outcome.effects[self.own :])
+
+
+def odds_of(effect: Effect) -> float:
+    """Return the prior odds that equations lack an effect: those of the kinds of rigs that usually have it."""
+    return min(max(*kind_of(effect.name).odds.values(), RARE, RARE), MOST)
+
+
+def judged(bench: Bench, outcome: Outcome, own: int, limits: Thresholds) -> JudgedEquations | None:
+    """Return a fit with its errors on left-out stretches; nothing where an effect is no longer what its name says."""
+    if bench.is_stand_in(outcome):
+        return None
+    squares = bench.left_out_squares(outcome)
+    if not np.all(np.isfinite(squares)):
+        return None
+    added = outcome.effects[own:]
+    return JudgedEquations(
+        names=tuple(e.name for e in added), long_squares=squares, short_squares=squares,
+        log_odds=math.fsum(math.log(odds_of(e)) for e in added), outcome=outcome, own=own, bench=bench, table=limits,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Searched:
+    """What a search found.
+
+    Attributes
+    ----------
+    nominal : Outcome
+        The model as it is.
+    judged : tuple of JudgedEquations
+        All that were judged, the model with its own numbers retuned first.
+    best, taken : JudgedEquations
+        What predicts best, for what it is, and what is left of it where parts of the recordings do not agree.
+    """
+
+    nominal: Outcome
+    judged: tuple[JudgedEquations, ...]
+    best: JudgedEquations
+    taken: JudgedEquations
+
+    @property
+    def limits(self) -> Thresholds:
+        """What decided."""
+        return self.best.table
+
+    @property
+    def retuned(self) -> Outcome:
+        """The model with its own numbers retuned."""
+        return self.judged[0].outcome
+
+    @property
+    def chosen(self) -> Outcome:
+        """The model with the effects that are taken."""
+        return self.taken.outcome
+
+    @property
+    def tried(self) -> tuple[Outcome, ...]:
+        """All fits with effects, the one first that the least speaks against."""
+        return tuple(one.outcome for one in sorted(self.judged, key=lambda one: one.behind(self.best)) if one.names)
+
+    @property
+    def noise(self) -> Noise:
+        """What differences of the best residual show."""
+        return self.best.noise
+
+    def score(self, one: Outcome) -> float:
+        """Return Schwarz's criterion of a fit, up to a constant."""
+        return quick_score(one, self.noise)
+
+    def variance_ratio(self, one: Outcome) -> float:
+        """Return the residual's variance in units of the noise's."""
+        return variance_ratio(one, self.noise)
+
+    def candidates(self, unknown_odds: float) -> tuple[Candidate, ...]:
+        """Return the hypotheses with their probabilities, best first."""
+        return probabilities(self.judged, self.best, unknown_odds)

@@ -1,0 +1,172 @@
+"""Hypotheses of a chain, judged, and what a search among them found."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+from autotune.diagnosis.evidence.adequacy import is_noise
+from autotune.diagnosis.evidence.constancy import largest_variation
+from autotune.diagnosis.evidence.held_out import FitQuality
+from autotune.diagnosis.evidence.stretches import judged_rows, rms
+from autotune.diagnosis.fitting.data import Data
+from autotune.diagnosis.fitting.fit import Fit
+from autotune.diagnosis.fitting.long_windows import spread_of
+from autotune.diagnosis.fitting.retuning import reduced_chi2, under_noise
+from autotune.diagnosis.fitting.spreading import spread_out
+from autotune.diagnosis.selection.hypothesis import Hypothesis, vanished
+from autotune.diagnosis.selection.judged import Judged, probabilities
+from autotune.diagnosis.selection.probability import Candidate
+from autotune.diagnosis.selection.searched import Search
+from autotune.diagnosis.thresholds import Thresholds
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class JudgedChain(Judged):
+    """A chain with effects, judged.
+
+    Attributes
+    ----------
+    fit, short : Fit
+        Fitted to long and to short windows.
+    data, few : Data
+        What they were fitted to.
+    """
+
+    fit: Fit
+    short: Fit
+    data: Data
+    few: Data
+
+    @property
+    def limits(self) -> Thresholds:
+        """What decides between two findings."""
+        return self.data.thresholds
+
+    @property
+    def rows(self) -> int:
+        """Rows that it was fitted to."""
+        return self.fit.rows
+
+    @property
+    def numbers(self) -> int:
+        """Numbers of its effects that were fitted."""
+        return self.fit.parametrisation.effect_numbers
+
+    @property
+    def identity(self) -> frozenset[object]:
+        """What tells hypotheses apart: effects of a chain have their places."""
+        return frozenset(self.names)
+
+    @cached_property
+    def vanished(self) -> frozenset[str]:
+        """Effects that came to nothing on long windows."""
+        return frozenset(vanished(Hypothesis(names=self.names, fit=self.fit)))
+
+    @cached_property
+    def leaves_noise(self) -> bool:
+        """Whether what it leaves is noise, at both scales, and rows that were left out are foretold about as well.
+
+        Start states that are free may make noise of anything; then it does not run through what was left out.
+        """
+        both = ((self.fit, self.data, self.long_squares), (self.short, self.few, self.short_squares))
+        return all(
+            is_noise(result, data)
+            and math.sqrt(float(squares.sum()) / judged_rows(data))
+            < data.thresholds.foretold * rms(result.residuals, data.good)
+            for result, data, squares in both
+        )
+
+    @cached_property
+    def variance(self) -> float:
+        """Variance of the innovations of what it leaves, under the noise that this shows from row to row."""
+        return reduced_chi2(self.fit, self.data) * under_noise(self.fit, self.data).noise.sd ** 2
+
+    def spread_out(self) -> JudgedChain:
+        """Return it with all rows of the recordings."""
+        result, data = spread_out(self.fit, self.data)
+        return replace(self, fit=result, data=data)
+
+    @property
+    def error(self) -> float:
+        """Held-out error of the free run as a share of the spread of y."""
+        return math.sqrt(float(self.long_squares.sum()) / judged_rows(self.data)) / spread_of(self.data)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Found:
+    """What a search found.
+
+    Attributes
+    ----------
+    nominal, retuned : JudgedChain
+        The nominal structure with the operating point fitted alone, and all its numbers.
+    judged : tuple of JudgedChain
+        All that were judged, the retuned one first.
+    best : JudgedChain
+        The one that predicts best, for what it is.
+    chosen : JudgedChain
+        The one to go on with: the best one, or what is left of it where parts of the recordings do not agree.
+    """
+
+    nominal: JudgedChain
+    retuned: JudgedChain
+    judged: tuple[JudgedChain, ...]
+    best: JudgedChain
+    chosen: JudgedChain
+
+    def as_search(self) -> Search:
+        """Return the hypotheses in the form that pages and planning know."""
+        order = sorted(self.judged, key=lambda j: j.behind(self.chosen))
+        return Search(
+            data=self.chosen.data,
+            nominal=self._scaled(self.nominal),
+            retuned=Hypothesis(names=(), fit=self._scaled(self.retuned)),
+            others=tuple(Hypothesis(names=one.names, fit=self._scaled(one)) for one in order if one.names),
+            chosen=Hypothesis(names=self.chosen.names, fit=self.chosen.fit),
+        )
+
+    def _scaled(self, one: JudgedChain) -> Fit:
+        """Return a fit with its chi-square in units of the residual that the chosen hypothesis was fitted at."""
+        return replace(one.fit, chi2=one.fit.chi2 * (one.data.noise.sd / self.chosen.data.noise.sd) ** 2)
+
+    @property
+    def gained(self) -> float:
+        """Twice the log likelihood ratio of the chosen hypothesis beside the retuned model, every row a witness."""
+        left, before = (rms(j.fit.residuals, j.data.good) for j in (self.chosen, self.retuned))
+        return 2.0 * self.chosen.fit.rows * math.log(before / left)
+
+    def candidates(self, unknown_odds: float) -> tuple[Candidate, ...]:
+        """Return every hypothesis with its probability: what chose it weighs here too."""
+        return probabilities(self.judged, self.best, unknown_odds)
+
+    def quality(self, noise_floor: float) -> FitQuality:
+        """Return errors of free runs through stretches that were left out."""
+        return FitQuality(
+            nominal=self.nominal.error,
+            retuned=self.retuned.error,
+            extended=self.chosen.error,
+            noise_floor=noise_floor,
+        )
+
+    def varies_more(self, limits: Thresholds) -> bool:
+        """Whether what varies beside the chosen effects explains more than it may where they are what is missing.
+
+        What leaves noise leaves nothing that varies but for a share of what was gained, which simulations are wrong by;
+        where the model's error decides, three times as much is left beside what is true.
+        """
+        chosen, before = self.chosen, rms(self.retuned.fit.residuals, self.retuned.data.good)
+        if not chosen.names:
+            return False
+        share = before**2 / rms(chosen.fit.residuals, chosen.data.good) ** 2 - 1.0
+        gained = max(share, 0.0) * sum(int(g.sum()) for g in chosen.data.good)
+        if chosen.leaves_noise:
+            left = largest_variation(chosen.fit, under_noise(chosen.fit, chosen.data)).gain
+            return left > max(limits.inconstant, limits.inconstant_share * gained)
+        return largest_variation(chosen.fit, chosen.data).gain > limits.varies_more * gained
+
+    def keeps_nominal(self, share: float) -> bool:
+        """Whether the nominal numbers predict about as well as those retuned, so that they stand."""
+        ratio = float(self.retuned.long_squares.sum() / self.nominal.long_squares.sum())
+        return not self.chosen.names and math.sqrt(ratio) > 1.0 - share
