@@ -179,7 +179,7 @@ def keeping(evidence: Evidence, names: Collection[str]) -> Evidence:
     if found is None or set(found.chosen.names) <= set(names):
         return evidence
     best = max((j for j in found.judged if set(j.names) <= set(names)), key=lambda j: (len(j.names), -j.fit.cost))
-    found = replace(found, chosen=best.spread_out())
+    found = replace(found, chosen=best.spread_out() if best.names else found.retuned)
     return replace(evidence, search=found.as_search(), quality=found.quality(evidence.quality.noise_floor), found=found)
 
 

@@ -87,7 +87,7 @@ class Thresholds:
     numbers_decrease: float = known(25.0, "chi2", "that wrong numbers must bring to be called wrong", "chance")
     missing: float = known(1.05, "reduced chi2", "of a model without effects from which on something is missing; clean ones leave 1.02", "counted")
     offset_sigmas: float = known(6.0, "sd", "that an operating point must be off to be an offset", "chance")
-    temperature: float = known(3.0, "chi2", "that counts as one: noise is never ideal", "counted")
+    temperature: float = known(2.0, "chi2", "that counts as one: noise is never ideal", "counted")
     unknown_odds: float = known(0.03, "odds", "prior, of a cause outside the catalogue where the best explains the recordings", "counted")
     most_probable: float = known(0.99, "probability", "stated at most", "convention")
     informative: float = known(0.5, "of the residual", "held out, from which on a description tells the place", "counted")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,6 +14,7 @@ from autotune.equations.simulate import Compiled, compile_model, derivatives
 from autotune.equations.starts import rest_state
 from autotune.errors import InputError
 from autotune.models import Block, Model, Port, TransferFunction
+from autotune.recording import Recording
 
 #: Relative step of the central differences.
 _STEP = 1e-5
@@ -77,6 +79,27 @@ def linearise(model: EquationModel, inputs: FloatArray, y: float = float("nan"))
                          remedy="give inputs, and y where the plant integrates, at which it can rest")  # fmt: skip
     A, B, C, D = _differences(compiled, p, x, inputs)
     return Linear(A=A, B=B, C=C, D=D, states=x, inputs=inputs, y=float(outputs[0, 0]), delays_s=applied.delays)
+
+
+def growth_rate(model: EquationModel, recordings: Sequence[Recording]) -> float:
+    """Return the rate at which a deviation from where recordings are grows [1/s]: 0 of a stable plant.
+
+    Parameters
+    ----------
+    model : EquationModel
+        The model.
+    recordings : sequence of Recording
+        Their medians are the operating point; where nothing rests under these inputs the rate is not known, and 0.
+    """
+    inputs = np.array([float(np.median(np.concatenate([r[name] for r in recordings]))) for name in model.columns])
+    y = float(np.nanmedian(np.concatenate([r.y for r in recordings])))
+    for near in (float("nan"), y):
+        try:
+            A = linearise(model, inputs, near).A
+        except InputError:
+            continue
+        return max(float(np.max(np.linalg.eigvals(A).real, initial=0.0)), 0.0)
+    return 0.0
 
 
 def _differences(

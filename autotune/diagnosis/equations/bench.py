@@ -55,6 +55,11 @@ class Bench(Protocol):
         ...
 
     @property
+    def grows(self) -> float:
+        """How many times an error of a start state grows through a window at most; 1 where the plant is stable."""
+        ...
+
+    @property
     def is_closed(self) -> bool:
         """Whether only inputs and reading can be reached."""
         ...

@@ -47,6 +47,7 @@ class ClosedBench:
             replace(r, y=np.where(ok, r.y, np.nan)) for r, ok in zip(recordings, good, strict=True)
         )
         self._rows = [np.isfinite(r.y) for r in self._recordings]
+        self.grows = 1.0
         self._drives = []
         for r in self._recordings:
             r.require_finite(box.columns)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
@@ -25,6 +26,7 @@ from autotune.equations.effects import compile_with, where_of, with_values
 from autotune.equations.fit import LEAST_ROWS, fit, retune
 from autotune.equations.fit_data import Fitted
 from autotune.equations.left_out import left_out_squares
+from autotune.equations.linearise import growth_rate
 from autotune.equations.model import EquationModel, InputColumn
 from autotune.equations.parameter_scales import values_of as natural
 from autotune.equations.sensitivity import Windows, side_by_side
@@ -45,6 +47,8 @@ FAR, NEAR = 2.0, 1.2
 WINDOWS = 3
 #: Rows of such a window at most: in longer ones fits take more steps, and say no more.
 MOST_ROWS = 500
+#: Logarithm of how far a deviation may grow through a window of a plant that is not stable: no free run is told beyond.
+GROWTH = 3.0
 #: A search works on a part of the rows where there are this many times as many.
 PARTED = 1.5
 #: Shares of the search's length, where a fit to short windows is carried on to long ones, and iterations on each.
@@ -78,7 +82,12 @@ class EquationBench:
         self._drives = [drive_of(self._model, r) for r in self.recordings]
         span = max(float(r.t[-1] - r.t[0]) for r in recordings)
         dt = max(float(np.median(np.diff(r.t))) for r in recordings)
-        self.length_s = model.horizon_s or min(span / WINDOWS, MOST_ROWS * dt)
+        longest = min(span / WINDOWS, MOST_ROWS * dt)
+        rate = growth_rate(model, recordings) if model.horizon_s is None else 0.0
+        unstable = GROWTH / rate if rate * longest > GROWTH else None
+        self._horizon_s = model.horizon_s or unstable
+        self.grows = math.exp(GROWTH) if unstable else 1.0
+        self.length_s = self._horizon_s or longest
 
     @property
     def model(self) -> EquationModel:
@@ -136,8 +145,8 @@ class EquationBench:
                 z, windows = found.z, list(found.windows)
             p = natural(compiled, z)
             for (r, k, _), drive, w in zip(each, self._drives, windows, strict=True):
-                if self.model.horizon_s is not None:
-                    errors.append(forecast_errors(compiled, p, drive, r.y, k, self.model.horizon_s))
+                if self._horizon_s is not None:
+                    errors.append(forecast_errors(compiled, p, drive, r.y, k, self._horizon_s))
                 else:
                     errors.append(free_run_errors(compiled, p, drive, r.y, w, k))
         except InputError:

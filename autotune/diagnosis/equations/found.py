@@ -6,6 +6,7 @@ The steps from what a search found to what is said, and the records of it: the f
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -246,11 +247,19 @@ def _agreed(
         progress("once more on a part of the rows", 0.9)
         small = _bench(model, part.recordings, [np.isfinite(r.y) for r in part.recordings])
         try:
-            return _said_by(search(small, others, quiet, found.limits, found.best.outcome))
+            here = search(small, others, quiet, found.limits, found.best.outcome)
+            unfelt = [e.name for e in found.best.outcome.effects[found.best.own :] if not _is_felt(e, small, here)]
         except InputError:  # nothing runs there
             return {}
+        return _said_by(here) | dict.fromkeys(unfelt, math.nan)
 
     return agreement(whole, {}, parts_of(bench.recordings, LEAST_ROWS), said)
+
+
+def _is_felt(effect: Effect, bench: Bench, found: Searched) -> bool:
+    """Whether an effect changes what recordings read by as much as one row's noise: of others they tell nothing."""
+    change = bench.with_trial(found.retuned, effect)
+    return change is None or float(change @ change) > found.noise.total_sd**2
 
 
 def _keeping(found: Searched, names: Collection[str]) -> Searched:

@@ -63,7 +63,7 @@ class JudgedEquations(Judged):
         if variance_ratio(outcome, self.noise) > limits.adequate_quick + chance or is_slow(outcome, self.noise, limits):
             return False
         error = math.sqrt(float(self.long_squares.sum()) / outcome.residual.size)
-        return error < limits.foretold * math.sqrt(outcome.rss / outcome.residual.size)
+        return error < limits.foretold * self.bench.grows * math.sqrt(outcome.rss / outcome.residual.size)
 
     @cached_property
     def variance(self) -> float:

@@ -103,6 +103,7 @@ def search(
         bench, found = _grown(retuned, beam, bench, progress, limits)
         found = _regrown(_finished(_pruned([*found, *_begun(begun, bench)], bench), bench), bench)
         chosen = bench.with_both_scales(simplest(found, limits.material))
+        retuned = chosen if not chosen.names else ranked([one for one in found if not one.names])[0]
         nominal, retuned, chosen = (one.spread_out() for one in (nominal, retuned, chosen))
         return Found(nominal=nominal, retuned=retuned, judged=tuple(found), best=chosen, chosen=chosen)
 

@@ -12,7 +12,7 @@ from autotune.diagnosis import diagnose
 from autotune.diagnosis.agreement import NAMED
 from autotune.diagnosis.fitting.fit import fit
 from autotune.diagnosis.fitting.retuning import prepare
-from autotune.diagnosis.selection.judged import Judged
+from autotune.diagnosis.selection.judged_chain import JudgedChain
 from autotune.diagnosis.selection.prediction import extended
 from autotune.diagnosis.selection.search import search
 from autotune.diagnosis.simulation.chain import build_chain
@@ -167,7 +167,7 @@ def test_what_stands_for_something_else_once_it_is_fitted_to_the_end_is_not_judg
     p, theta, states = extended(start, Effect(name="plant.resonance", parameters=values), data)
     known = fit(p, data, theta, states)
     assert known.model.effects[0].parameters["damping"].value > 1.0
-    begun = Judged(
+    begun = JudgedChain(
         names=("plant.resonance",), fit=known, short=known, data=data, few=data, long_squares=np.ones(8),
         short_squares=np.ones(8), log_odds=0.0,
     )  # fmt: skip

@@ -9,7 +9,8 @@ from autotune.diagnosis.evidence.samples import inspect
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import Fit
 from autotune.diagnosis.fitting.retuning import prepare
-from autotune.diagnosis.selection.judged import Judged, ranked, simplest
+from autotune.diagnosis.selection.judged import ranked, simplest
+from autotune.diagnosis.selection.judged_chain import JudgedChain
 from autotune.models import Block, Model, Port, TransferFunction
 from autotune.recording import Recording
 
@@ -33,9 +34,9 @@ def fitted() -> tuple[Data, Fit]:
 def test_what_is_freed_of_the_immaterial_is_compared_once_more(fitted: tuple[Data, Fit]) -> None:
     data, fit = fitted
 
-    def one(names: tuple[str, ...], size: float, log_odds: float) -> Judged:
+    def one(names: tuple[str, ...], size: float, log_odds: float) -> JudgedChain:
         squares = np.square(size * STRETCHES)
-        return Judged(
+        return JudgedChain(
             names=names, fit=fit, short=fit, data=data, few=data, long_squares=squares, short_squares=squares,
             log_odds=log_odds,
         )  # fmt: skip
