@@ -179,8 +179,12 @@ def keeping(evidence: Evidence, names: Collection[str]) -> Evidence:
     if found is None or set(found.chosen.names) <= set(names):
         return evidence
     best = max((j for j in found.judged if set(j.names) <= set(names)), key=lambda j: (len(j.names), -j.fit.cost))
-    found = replace(found, chosen=best.spread_out() if best.names else found.retuned)
-    return replace(evidence, search=found.as_search(), quality=found.quality(evidence.quality.noise_floor), found=found)
+    left, residual = best.spread_out() if best.names else found.retuned, evidence.residual
+    if found.chosen.leaves_noise:
+        residual = residual_tests(left.fit, under_noise(left.fit, left.data), uneven=residual.uneven)
+    found = replace(found, chosen=left)
+    quality = found.quality(evidence.quality.noise_floor)
+    return replace(evidence, search=found.as_search(), residual=residual, quality=quality, found=found)
 
 
 def _late_rows(evidence: Evidence, gained: float, without: Sequence[str]) -> Evidence | None:
