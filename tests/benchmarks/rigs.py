@@ -3,7 +3,8 @@
 ``python -m tests.benchmarks rigs`` runs the scorers of the recordings beside the checkout over both sets and prints
 their last lines with what both give together; RIGS_ONLY names cases, RIGS_KERNEL a linear-algebra kernel (Haswell,
 SkylakeX). ``RIGS_STABLE=1`` prints instead how often a diagnosis says the same of a recording that is changed by what
-must not matter: its first or last tenth left out, a tenth of its noise added, its units and its clock.
+must not matter: its first or last tenth left out, a tenth of its noise added, and what cannot matter at all: units of u
+and y, of time, the sign of u together with the plant's, another hour, the recordings' order.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from autotune.diagnosis import diagnose
-from autotune.models import Model, read_model
+from autotune.models import Model, TransferFunction, read_model
 from autotune.recording import Recording, read_recording
 from tests.conftest import SHARED
 
@@ -63,7 +64,7 @@ def _scored(name: str, only: list[str]) -> list[dict[str, Any]]:
             "--only",
             ",".join(only),
             "--json",
-            out,
+            str(out),
         ]
         said = subprocess.run(call, check=True, capture_output=True, text=True, env=environment).stdout
         print("\n".join(said.splitlines()[:-2]), f"\n{name}: ", *said.splitlines()[-2:], sep="\n", flush=True)
@@ -97,6 +98,14 @@ def _told(cases: Mapping[str, Mapping[str, Any]], results: list[dict[str, Any]])
             print(f"| {low:.1f} to {high:.1f} | {len(some)} | {mean:.2f} | {right:.2f} |")
 
 
+#: What a change makes of a model and its recordings.
+Changed = tuple[Model, list[Recording]]
+
+
+def _of_rows(change: Callable[[Recording], Recording]) -> Callable[[Model, list[Recording]], Changed]:
+    return lambda model, recordings: (model, [change(r) for r in recordings])
+
+
 def _without_first(r: Recording) -> Recording:
     return r.only(np.arange(len(r) // 10, len(r)))
 
@@ -114,17 +123,59 @@ def _later(r: Recording) -> Recording:
     return replace(r, t=r.t + 1000.0)
 
 
-CHANGES: dict[str, Callable[[Recording], Recording]] = {
-    "first tenth left out": _without_first,
-    "last tenth left out": _without_last,
-    "a tenth of the noise added": _noisier,
-    "another hour": _later,
+def _times(model: Model, place: int, factor: float) -> Model:
+    """Return a model with one block's gain times a factor."""
+    blocks = list(model.blocks)
+    dynamics = blocks[place].dynamics
+    num = tuple(factor * c for c in dynamics.num)
+    blocks[place] = replace(blocks[place], dynamics=replace(dynamics, num=num))
+    return replace(model, blocks=tuple(blocks))
+
+
+def _with_u(factor: float) -> Callable[[Model, list[Recording]], Changed]:
+    def change(model: Model, recordings: list[Recording]) -> Changed:
+        model = replace(_times(model, 0, 1.0 / factor), input=replace(model.input, offset=factor * model.input.offset))
+        return model, [replace(r, u=factor * r.u) for r in recordings]
+
+    return change
+
+
+def _with_y(factor: float) -> Callable[[Model, list[Recording]], Changed]:
+    def change(model: Model, recordings: list[Recording]) -> Changed:
+        model = replace(_times(model, -1, factor), output=replace(model.output, offset=factor * model.output.offset))
+        return model, [replace(r, y=factor * r.y) for r in recordings]
+
+    return change
+
+
+def _slower(model: Model, recordings: list[Recording]) -> Changed:
+    """Return everything a thousand times as slow."""
+
+    def slowed(dynamics: TransferFunction) -> TransferFunction:
+        num, den = (tuple(c * 1e3 ** (len(p) - 1 - i) for i, c in enumerate(p)) for p in (dynamics.num, dynamics.den))
+        return TransferFunction(num=num, den=den, delay_s=1e3 * dynamics.delay_s)
+
+    blocks = tuple(replace(b, dynamics=slowed(b.dynamics)) for b in model.blocks)
+    return replace(model, blocks=blocks), [replace(r, t=1e3 * r.t) for r in recordings]
+
+
+#: What may matter a little, and what cannot.
+CHANGES: dict[str, Callable[[Model, list[Recording]], Changed]] = {
+    "first tenth left out": _of_rows(_without_first),
+    "last tenth left out": _of_rows(_without_last),
+    "a tenth of the noise added": _of_rows(_noisier),
+    "another hour": _of_rows(_later),
+    "other order": lambda model, recordings: (model, recordings[::-1]),
+    "u in thousandths": _with_u(1e3),
+    "y in thousandths": _with_y(1e3),
+    "sign of u": _with_u(-1.0),
+    "time in thousandths": _slower,
 }
 
 
 def _stability(only: set[str]) -> None:
-    """Print for each change how often names stay, and probabilities within a tenth."""
-    held = {name: [0, 0, 0] for name in CHANGES}
+    """Print for each change how often names stay, probabilities within a tenth, and how far these move at most."""
+    held: dict[str, list[float]] = {name: [0, 0, 0, 0.0] for name in CHANGES}
     for folder in SETS:
         for case in json.loads((SHARED / folder / "answers.json").read_text(encoding="utf-8"))["cases"]:
             if only and case["id"] not in only:
@@ -134,16 +185,22 @@ def _stability(only: set[str]) -> None:
             recordings = [read_recording(place / name) for name in case["fit"]]
             before = _names(model, recordings)
             for change, changed in CHANGES.items():
-                after = _names(model, [changed(r) for r in recordings])
-                same = set(before) == set(after)
-                near = same and all(abs(before[name] - after[name]) <= SAME for name in before)
-                held[change] = [a + b for a, b in zip(held[change], (1, same, near), strict=True)]
-                if not near:
-                    print(f"{case['id']}, {change}: {before} -> {after}", flush=True)
-    print("| change | cases | same names | probabilities within .1 |\n|---|---|---|---|")
-    for change, (total, same, near) in held.items():
-        print(f"| {change} | {total} | {same} | {near} |")
+                if len(recordings) == 1 and change == "other order":
+                    continue
+                after = _names(*changed(model, recordings))
+                moved = max((abs(before.get(n, 0.0) - after.get(n, 0.0)) for n in {*before, *after}), default=0.0)
+                same, (count, names, near, most) = set(before) == set(after), held[change]
+                held[change] = [count + 1, names + same, near + (same and moved <= SAME), max(most, moved)]
+                if moved > SAME:
+                    print(f"{case['id']}, {change}: {_said(before)} -> {_said(after)}", flush=True)
+    print("| change | cases | same names | probabilities within .1 | moved at most |\n|---|---|---|---|---|")
+    for change, (count, names, near, most) in held.items():
+        print(f"| {change} | {count} | {names} | {near} | {most:.2g} |")
 
 
 def _names(model: Model, recordings: list[Recording]) -> dict[str, float]:
-    return {e.name: round(e.probability, 2) for e in diagnose(model, recordings).effects}
+    return {e.name: e.probability for e in diagnose(model, recordings).effects}
+
+
+def _said(names: Mapping[str, float]) -> str:
+    return ", ".join(f"{name} {p:.2f}" for name, p in names.items()) or "nothing"
