@@ -112,7 +112,8 @@ class Bench:
             begun = list(self.pool.map(lambda theta: fit(p, both, theta, free=held, iterations=STEPS), thetas))
             start = min(begun, key=lambda each: each.cost)
             joint = fit(p, both, start.theta, start.x0, iterations=LAST_STEPS)
-            far = fit(p, self.long, joint.theta, free=held, iterations=STEPS)
+            there = fit(p, self.long, joint.theta, free=held, iterations=STEPS)
+            far = fit(p, self.long, there.theta, there.x0, rounds=0)  # with the derivatives of all numbers
         except RUNAWAY:
             return one
         return replace(one, fit=replace(far, covariance=joint.covariance))
