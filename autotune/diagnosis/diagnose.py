@@ -158,9 +158,12 @@ def _on_parts(
 
     def said(part: Part) -> Mapping[str, float]:
         progress("once more on a part of the rows", WHOLE)
-        cannot_tell = dict.fromkeys(unmoved(model, part.recordings), math.nan)
         part_shows = evidence_of(model, part.recordings, controller, others, quiet, thresholds, begun)
-        return said_by(part_shows) | cannot_tell
+        cannot_tell = set(unmoved(model, part.recordings))
+        if part_shows.found is not None:
+            fitted = search.chosen.fit
+            cannot_tell |= part_shows.found.retuned.unfelt(fitted.model.effects[fitted.parametrisation.own :])
+        return said_by(part_shows) | dict.fromkeys(cannot_tell, math.nan)
 
     return said
 

@@ -150,10 +150,11 @@ def _asymmetric_starts(s: SignalSizes) -> list[tuple[float, ...]]:
 
 
 def _limits_tried(a: Around) -> list[Tried]:
-    """Return limits above and below the middle of the command."""
+    """Return limits above and below the middle of the command, and both."""
     top, bottom = (float(np.quantile(a.u, q)) for q in (0.999, 0.001))
     shares = [share * (top - bottom) for share in (0.05, 0.2, 0.4)]
-    return [Tried(values) for d in shares for values in ({"high": top - d}, {"low": bottom + d})]
+    ends = [({"high": top - d}, {"low": bottom + d}, {"low": bottom + d, "high": top - d}) for d in shares]
+    return [Tried(values) for some in ends for values in some]
 
 
 def _usual_move(u: FloatArray) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -11,15 +12,17 @@ from autotune.diagnosis.evidence.constancy import largest_variation
 from autotune.diagnosis.evidence.held_out import FitQuality
 from autotune.diagnosis.evidence.stretches import judged_rows, rms
 from autotune.diagnosis.fitting.data import Data
-from autotune.diagnosis.fitting.fit import Fit
+from autotune.diagnosis.fitting.fit import RUNAWAY, Fit, residual_at
 from autotune.diagnosis.fitting.long_windows import spread_of
 from autotune.diagnosis.fitting.retuning import reduced_chi2, under_noise
 from autotune.diagnosis.fitting.spreading import spread_out
 from autotune.diagnosis.selection.hypothesis import Hypothesis, vanished
 from autotune.diagnosis.selection.judged import Judged, probabilities
+from autotune.diagnosis.selection.prediction import extended
 from autotune.diagnosis.selection.probability import Candidate
 from autotune.diagnosis.selection.searched import Search
 from autotune.diagnosis.thresholds import Thresholds
+from autotune.models import Effect
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -87,6 +90,19 @@ class JudgedChain(Judged):
         """Return it with all rows of the recordings."""
         result, data = spread_out(self.fit, self.data)
         return replace(self, fit=result, data=data)
+
+    def unfelt(self, effects: Sequence[Effect]) -> frozenset[str]:
+        """Return the effects that would change what is read by less than one row's residual does."""
+        names = set()
+        for effect in effects:
+            p, theta, states = extended(self.fit, effect, self.data)
+            try:
+                change = residual_at(p, self.data, theta, states) - self.fit.e
+            except RUNAWAY:
+                continue
+            if float(change @ change) < 1.0:
+                names.add(effect.name)
+        return frozenset(names)
 
     @property
     def error(self) -> float:

@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 
 from autotune.diagnosis import diagnose
+from autotune.diagnosis.equations.found import diagnose_equations
 from autotune.diagnosis.evidence.operating_point import unmoved
 from autotune.models import Block, Model, Port, TransferFunction
 from autotune.recording import Recording
+from tests.autotune.equations.models import one_state
 
 
 def test_no_effect_of_the_actuator_is_named_where_the_command_stands() -> None:
@@ -46,3 +48,26 @@ def test_a_recording_that_begins_at_rest_under_another_command_begins_with_a_ste
     assert found.effects[0].parameters["time_constant"].value == pytest.approx(20.0, rel=0.1)
     assert set(found.effects[0].places) >= {"sensor", "actuator"}
     assert "actuator.lag" in unmoved(model, [Recording(t=t, u=np.zeros(t.size), y=y)])
+
+
+@pytest.mark.parametrize("as_equations", [False, True])
+def test_a_part_in_which_an_effect_would_change_nothing_is_not_asked_of_it(as_equations: bool) -> None:
+    """A valve that saturates beyond 1 V, driven beyond it in the first minutes alone."""
+    rng, rows = np.random.default_rng(5), 2000
+    u = np.repeat(rng.uniform(-0.9, 0.9, rows // 20), 20)
+    u[: rows // 6] *= 2.2
+    y, x = np.empty(rows), 0.0
+    for k in range(rows):
+        y[k] = x
+        x += (1.0 - np.exp(-0.1)) * (min(max(u[k], -1.0), 1.0) - x)
+    r = Recording(t=0.1 * np.arange(rows), u=u, y=y + 0.02 * rng.normal(size=rows))
+    if as_equations:
+        told = diagnose_equations(one_state("(u - x)/tau", {"tau": {"value": 1.0}}), [r])
+        names, p = [e.name for e in told.effects], told.probabilities
+    else:
+        dynamics = TransferFunction(num=(1.0,), den=(1.0, 1.0))
+        valve = Block(name="valve", place="plant", dynamics=dynamics)
+        found = diagnose(Model(name="valve", input=Port(), output=Port(), blocks=(valve,)), [r])
+        names, p = [e.name for e in found.effects], tuple(e.probability for e in found.effects)
+    assert names == ["actuator.saturation"]
+    assert p[0] > 0.9
