@@ -26,6 +26,10 @@ from autotune.text_files import read_toml
 __all__ = ["Config", "json_schema", "load_config", "validated"]
 
 
+#: Samples that a sweep has at least.
+LEAST_SAMPLES = 100
+
+
 class Config(Section):
     """One complete file per rig and per use."""
 
@@ -71,6 +75,16 @@ class Config(Section):
             )
         if not limits.y_min < at.y < limits.y_max:
             raise ValueError(f"operating_point.y = {at.y:g} must lie between limits.y_min and y_max")
+        return self
+
+    @model_validator(mode="after")
+    def _has_time(self) -> Config:
+        budget_s, sample_s = self.experiment.budget_s, self.signals.sample_time_s
+        if budget_s < LEAST_SAMPLES * sample_s:
+            raise ValueError(
+                f"experiment.budget_s = {budget_s:g} is less than {LEAST_SAMPLES} samples of {sample_s:g} s: nothing"
+                f" swings in that time; give at least {LEAST_SAMPLES * sample_s:g}, and some periods of the rig"
+            )
         return self
 
     @model_validator(mode="after")

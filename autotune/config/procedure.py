@@ -51,6 +51,11 @@ class LimitSettings(Section):
             raise ValueError(f"u_safe = {self.u_safe:g} must lie within u_min..u_max")
         if not self.y_min < self.y_max:
             raise ValueError(f"y_min = {self.y_min:g} must be below y_max = {self.y_max:g}")
+        if self.swing > self.y_max - self.y_min:
+            raise ValueError(
+                f"swing = {self.swing:g} is more than y_min..y_max allow, {self.y_max - self.y_min:g}, and limits"
+                " nothing: give the largest departure from the operating point that the rig may see"
+            )
         return self
 
 

@@ -71,6 +71,12 @@ def test_margins_replace_those_of_the_named_specification(tmp_path: Path) -> Non
         ("y_min = 1.0", "y_min = 9.5", r"y_min = 9\.5 must be below y_max = 9"),
         ("u_max = 10.0", "u_max = nan", r"limits\.u_max = nan.*finite"),
         ("u_max = 10.0", 'u_max = "ten"', r"limits\.u_max = 'ten'.*valid number"),
+        ("swing = 3.0", "swing = 1e9", r"swing = 1e\+09 is more than y_min\.\.y_max allow, 8"),
+        (
+            "[operating_point]",
+            "[experiment]\nbudget_s = 1e-6\n[operating_point]",
+            r"budget_s = 1e-06 .*100 samples of 0\.01",
+        ),
         ("name = ", "name ", "not TOML"),
     ],
 )
