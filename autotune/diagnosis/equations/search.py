@@ -66,25 +66,26 @@ def search(
     retuned = bench.retuned()
     own = len(retuned.effects)
 
-    def of(fits: Sequence[Outcome | None]) -> list[JudgedEquations]:
+    def all_judged(fits: Sequence[Outcome | None]) -> list[JudgedEquations]:
         each = (judged(bench, one, own, limits) for one in fits if one is not None)
         return [one for one in each if one is not None]
 
-    found = of([retuned])
+    found = all_judged([retuned])
     if not found:
         raise InputError("the model runs away on left-out stretches", where="diagnose", remedy="check its numbers")
     best = found[0]
     while len(best.names) < limits.rig_effects and not best.leaves_noise:
         fits = _leading(bench, best.outcome, without, progress, limits, bool(best.names))
-        larger = of(_promising(bench, fits, own, limits))
+        larger = all_judged(_promising(bench, fits, own, limits))
         found += larger
         first = ranked([best, *larger])[0]
         if first is best or not first.is_better(best, limits.material):
             break
         best = first
-    found += of([_brought(bench, begun, retuned)])
-    found = _pruned(bench, found, of, limits)
-    found += of(_finished(bench, simplest(found, limits.material), retuned, limits))
+    if begun is not None:
+        found += all_judged([attempt(bench, begun.effects, retuned, FINAL)])
+    found = _pruned(bench, found, all_judged, limits)
+    found += all_judged(_finished(bench, simplest(found, limits.material), retuned, limits))
     chosen = simplest(found, limits.material)
     return Searched(nominal=bench.as_it_is(retuned), judged=tuple(found), best=chosen, taken=chosen)
 
@@ -101,16 +102,11 @@ def _promising(bench: Bench, fits: Sequence[Outcome], own: int, limits: Threshol
 
     once = {frozenset(map(key_of, one.effects)): one for one in sorted(fits, key=charged, reverse=True)}
     few = sorted(once.values(), key=charged)[: limits.rig_judged]
-    plain = [_plainest(bench, one, noise_ratio_of(bench, one)) for one in few[: limits.confirmed]]
+    plain = [_plainest(bench, one) for one in few[: limits.confirmed]]
     return [one for one in few if not is_plainer(one.effects[-1])] + [one for one in plain if one is not None]
 
 
-def noise_ratio_of(bench: Bench, one: Outcome) -> float:
-    """Return the residual's variance in units of the noise that it shows itself."""
-    return variance_ratio(one, noise_of(bench, one))
-
-
-def _plainest(bench: Bench, one: Outcome, ratio: float) -> Outcome | None:
+def _plainest(bench: Bench, one: Outcome) -> Outcome | None:
     """Return a fit with its last effect in its plainest form; nothing where it has none."""
     less = plainer(one.effects[-1])
     if less is None:
@@ -119,15 +115,10 @@ def _plainest(bench: Bench, one: Outcome, ratio: float) -> Outcome | None:
     return first and (attempt(bench, first.effects, first, LAST) or first)
 
 
-def _brought(bench: Bench, begun: Outcome | None, retuned: Outcome) -> Outcome | None:
-    """Return what was found elsewhere fitted here; nothing where it runs away, or there is none."""
-    return None if begun is None else attempt(bench, begun.effects, retuned, FINAL)
-
-
 def _pruned(
     bench: Bench,
     found: Sequence[JudgedEquations],
-    of: Callable[[Sequence[Outcome | None]], list[JudgedEquations]],
+    all_judged: Callable[[Sequence[Outcome | None]], list[JudgedEquations]],
     limits: Thresholds,
 ) -> list[JudgedEquations]:
     """Return hypotheses with those that leading ones become without each of their effects, or with a plainer one.
@@ -150,7 +141,7 @@ def _pruned(
                 smaller = [(*effects[:i], *effects[i + 1 :])]
                 smaller += [] if less is None else [(*effects[:i], less, *effects[i + 1 :])]
                 new = [e for e in smaller if frozenset(map(key_of, e[one.own :])) not in known]
-                result += of([attempt(bench, e, one.outcome, LAST) for e in new])
+                result += all_judged([attempt(bench, e, one.outcome, LAST) for e in new])
     return result
 
 
@@ -168,7 +159,7 @@ def _finished(bench: Bench, one: JudgedEquations, retuned: Outcome, limits: Thre
     with suppress(InputError):
         fits.append(bench.carried(chosen, FINAL))
     best = least(fits) or chosen
-    return [settled_among(bench, swept(bench, best), one.rows, noise_ratio_of(bench, best))]
+    return [settled_among(bench, swept(bench, best), one.rows, variance_ratio(best, noise_of(bench, best)))]
 
 
 def _leading(
