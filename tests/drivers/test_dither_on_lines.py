@@ -21,7 +21,7 @@ rig = { kind = "simulated", plant = "servo" }
 signals = { sample_time_s = 0.05, u_unit = "V", y_unit = "rad" }
 limits = { u_min = -10.0, u_max = 10.0, u_safe = -0.5, y_min = -3.0, y_max = 3.0, swing = 2.0, time_s = 20.0 }
 operating_point = { y = 0.0, u_guess = 0.0, u_uncertainty = 0.3, approach = "hold" }
-experiment = { phases_deg = [-105.0, -160.0], points = 5, budget_s = 2.0 }
+experiment = { phases_deg = [-105.0, -160.0], points = 5, budget_s = 6.0 }
 """
 
 

@@ -117,7 +117,7 @@ def test_a_rig_without_registers_or_without_a_twin_cannot_be_served(tmp_path: Pa
 
 
 def test_a_dead_man_shorter_than_a_sample_is_refused(tmp_path: Path) -> None:
-    path = config_like("ball_modbus_tcp.toml", tmp_path, sample_time_s=1.0)
+    path = config_like("ball_modbus_tcp.toml", tmp_path, sample_time_s=1.0, budget_s=120.0)
     done = CliRunner().invoke(app, ["rig", str(path)])
     assert isinstance(done.exception, InputError)
     assert "runs out between two samples" in str(done.exception)
