@@ -49,6 +49,8 @@ def misread_columns(model: Model, recordings: Sequence[Recording], quality: FitQ
     for what, changed in readings.items():
         try:
             good, _ = inspect(changed, (), thresholds)
+            if not all(ok.any() for ok in good):
+                continue  # a command that never moves is no reading
             data, retuned = prepare(model, changed, good, thresholds)
         except RUNAWAY:
             continue

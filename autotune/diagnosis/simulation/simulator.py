@@ -216,7 +216,7 @@ class Simulator:
             free motion from there.
         """
         span = max(float(np.std(u)) for u in commands)
-        spread = max(float(np.std(y)) for y in readings)
+        spread = max((float(np.std(y)) for y in readings if y.size), default=0.0)
         A, b, tap = self.chain.A, self.chain.B[:, 0], self.chain.taps[kernel.OUTPUT]
         if span == 0.0 < spread:
             fastest = max(float(np.abs(np.linalg.eigvals(A)).max()), 1e-9)

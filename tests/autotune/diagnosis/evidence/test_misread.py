@@ -62,3 +62,10 @@ def test_white_noise_for_u_and_y_is_missing_no_physics() -> None:
     u, y = 5.0 + rng.standard_normal(2000), 50.0 + rng.standard_normal(2000)
     found = diagnose(OVEN, [Recording(t=np.arange(2000.0), u=u, y=y)])
     assert "follows nothing" in first_words(found)
+
+
+def test_a_command_that_never_moves_is_not_asked_to_be_the_reading() -> None:
+    y = 50.0 + np.cumsum(np.random.default_rng(0).standard_normal(300))
+    found = diagnose(OVEN, [Recording(t=np.arange(300.0), u=np.full(300, 5.0), y=y)])
+    assert not any("exchanged" in sentence for sentence in found.sentences)
+    assert not found.effects

@@ -153,3 +153,12 @@ def test_dry_friction_alone_is_simulated_as_beside_a_load_of_nothing(
     runs = [assemble(model).run(recording, np.zeros(2))[0] for model in (alone, beside)]
     np.testing.assert_array_equal(runs[0], runs[1])
     assert np.ptp(runs[0][:, 0]) > 0.0
+
+
+def test_a_recording_of_which_no_row_counts_says_nothing_of_the_states_sizes() -> None:
+    sim = assemble(servo())
+    u, y = np.array([0.0, 1.0, 0.0]), np.array([0.0, 2.0, 1.0])
+    alone, nothing = sim.state_sizes([u], [y]), y[:0]
+    assert np.array_equal(sim.state_sizes([u, u], [nothing, y]), alone)
+    assert np.array_equal(sim.state_sizes([u, u], [y, nothing]), alone)
+    assert np.all(np.isfinite(sim.state_sizes([u], [nothing])))
