@@ -25,6 +25,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from autotune.errors import InputError
 from autotune.live.controls import Controls
 from autotune.live.page import Screen, build
+from autotune.live.requests import BoundedConnection
 from autotune.live.story import Story
 
 LOOPBACK = ("127.0.0.1", "::1", "localhost")
@@ -209,7 +210,9 @@ def serve(folder: Path, bound: socket.socket, token: str, run: Run | None = None
         shell, dark=None, tailwind=False, show_welcome_message=False, message_history_length=50, language="en-US"
     )
     guard, refusals = Guard(shell, token, loopback=bound.getsockname()[0] in LOOPBACK), Refusals()
-    settings = uvicorn.Config(guard, log_config=None, ws_per_message_deflate=False, timeout_graceful_shutdown=1)
+    settings = uvicorn.Config(
+        guard, http=BoundedConnection, log_config=None, ws_per_message_deflate=False, timeout_graceful_shutdown=1
+    )
     refusals.attach()
     server = uvicorn.Server(settings)
     looked_s = time.monotonic()
