@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import json
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ from urllib.parse import quote
 
 import pyarrow as pa
 import pyarrow.parquet
+from pydantic import BaseModel, ConfigDict, ValidationError
 
 from autotune.batch.export import to_parquet
 from autotune.batch.loop import Finding, Row, Work
@@ -25,6 +25,17 @@ from autotune.version import __version__
 RESULTS, REPORT = "results.parquet", "report.html"
 
 _ARROW = {"str": pa.string(), "float": pa.float64(), "int": pa.int64(), "bool": pa.bool_(), "Attention": pa.string()}
+
+
+class _Kept(BaseModel):
+    """The result of a loop as its file holds it, and a digest of what it answers."""
+
+    model_config = ConfigDict(strict=True, extra="forbid")
+
+    asked: str
+    row: Row
+    points: list[dict[str, Any]]
+    result: Any
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,17 +82,33 @@ class Campaign:
         except OSError as error:
             raise unwritable(error, self.out) from None
 
-    def done(self) -> dict[str, Row]:
-        """Return the rows that lie there and still answer what the campaign asks, by loop."""
+    def done(self, tell: Callable[[str], None]) -> dict[str, Row]:
+        """Return the rows that lie there and still answer what the campaign asks, by loop.
+
+        Parameters
+        ----------
+        tell : callable
+            Told in a line of each file that is damaged; its loop is not done.
+
+        Raises
+        ------
+        InputError
+            A file cannot be read, or is a folder.
+        """
         rows = {}
         for loop in self.loops:
+            path = self.file(loop.name)
             try:
-                content = json.loads(self.file(loop.name).read_text(encoding="utf-8"))
-            except (OSError, ValueError):
+                kept = _Kept.model_validate_json(path.read_bytes())
+            except FileNotFoundError:
                 continue
-            with contextlib.suppress(AttributeError, KeyError, TypeError):  # not a file of this tool
-                if content["asked"] == self._digest(loop):
-                    rows[loop.name] = Row(**content["row"])
+            except OSError as error:  # found before the work, not after it
+                raise unwritable(error, path) from None
+            except ValidationError:
+                tell(f"{path}: is damaged; the loop is done again")
+                continue
+            if kept.asked == self._digest(loop):
+                rows[loop.name] = kept.row
         return rows
 
     def works(self, done: Iterable[str], advance: Progress) -> dict[str, Work]:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
+from pydantic import ConfigDict
 from threadpoolctl import threadpool_limits
 
 from autotune.batch.pieces import Record, read_record
@@ -84,6 +85,8 @@ class Row:
     notes : str
         What was corrected, left out or uncertain.
     """
+
+    __pydantic_config__ = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)  # of a row that is read again
 
     loop: str
     attention: Attention

@@ -39,8 +39,8 @@ def batch(
     settings, loops = read_campaign(campaign)
     work = Campaign(settings=settings, loops=loops, out=out.absolute())
     work.claim()
-    rows = work.done()
     console = Console(highlight=False, soft_wrap=True)
+    rows = work.done(lambda line: console.print(line, markup=False))
     bars = Console(stderr=True)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(

@@ -51,7 +51,7 @@ def designed(tmp_path_factory):
 def analysed(path, out, client=None):
     settings, loops = read_campaign(path)
     campaign = Campaign(settings=settings, loops=loops, out=out)
-    rows = campaign.done()
+    rows = campaign.done(print)
     works = campaign.works(rows, lambda name, share: None)
     found = run_all(client, analyse_loop, works) if client else ((n, analyse_loop(w)) for n, w in works.items())
     rows |= {name: campaign.keep(works[name].loop, finding) for name, finding in found}
@@ -149,6 +149,50 @@ def test_only_what_is_missing_or_was_asked_otherwise_is_done_again(tmp_path):
     assert {row.loop: row.attention for row in again} == {row.loop: row.attention for row in rows} | {"broken": "fine"}
     path.write_text(path.read_text().replace("Ti_s = 2.0", "Ti_s = 2.5"))
     assert sorted(analysed(path, out)[1]) == ["broken", "good", "hot", "still"]
+
+
+DAMAGE = {
+    "cut off": lambda text: text[: len(text) // 2],
+    "empty": lambda text: "",
+    "not text": lambda text: "\udcff\udcfe" + text,
+    "nested without end": lambda text: "[" * 100_000,
+    "a list": lambda text: "[]",
+    "no row": lambda text: text.replace('"row"', '"wor"'),
+    "a key that no row has": lambda text: text.replace('"u_unit"', '"unit"'),
+    "a word for a number": lambda text: text.replace('"severity": 0.0', '"severity": "x"'),
+    "no severity": lambda text: text.replace('"severity": 0.0', '"severity": null'),
+    "not a number": lambda text: text.replace('"severity": 0.0', '"severity": NaN'),
+    "beyond all numbers": lambda text: text.replace('"severity": 0.0', '"severity": 1e999'),
+    "of too many digits": lambda text: text.replace('"severity": 0.0', f'"severity": {"9" * 5000}'),
+    "half a row": lambda text: text.replace('"pieces": 1', '"pieces": 1.5'),
+    "an unknown attention": lambda text: text.replace('"attention": "fine"', '"attention": "later"'),
+    "points that are none": lambda text: text.replace('"points": [', '"points": [7, '),
+}  # fmt: skip
+
+
+def test_whatever_damaged_the_file_of_a_loop_is_said_in_a_line_and_the_loop_done_again(tmp_path, capsys):
+    plant_file(tmp_path / "good.csv", 0)
+    (tmp_path / "campaign.toml").write_text('name = "one"\ntask = "identify"\nfolder = "*.csv"\n')
+    rows, _ = analysed(tmp_path / "campaign.toml", tmp_path / "out")
+    file = tmp_path / "out" / "loops" / "good.json"
+    whole = file.read_text()
+    settings, loops = read_campaign(tmp_path / "campaign.toml")
+    campaign = Campaign(settings=settings, loops=loops, out=tmp_path / "out")
+    for kind, damage in DAMAGE.items():
+        assert damage(whole) != whole, kind
+        file.write_text(damage(whole), errors="surrogateescape")
+        assert campaign.done(print) == {}, kind
+        assert capsys.readouterr().out == f"{file}: is damaged; the loop is done again\n", kind
+    assert analysed(tmp_path / "campaign.toml", tmp_path / "out") == (rows, ["good"])
+    assert file.read_text() == whole
+
+
+def test_a_folder_in_the_place_of_a_loops_file_is_refused_before_the_work(tmp_path):
+    plant_file(tmp_path / "good.csv", 0)
+    (tmp_path / "campaign.toml").write_text('name = "one"\ntask = "identify"\nfolder = "*.csv"\n')
+    (tmp_path / "out" / "loops" / "good.json").mkdir(parents=True)
+    with pytest.raises(InputError, match=r"good\.json: cannot be written \(Is a directory\)"):
+        analysed(tmp_path / "campaign.toml", tmp_path / "out")
 
 
 def test_tags_of_a_wide_export_give_what_the_recording_itself_gives(tmp_path):
