@@ -115,6 +115,8 @@ def test_nothing_is_appended_to_a_file_that_is_no_audit_log(tmp_path: Path) -> N
 
 
 OPTIONS = {
+    "--modulus-margin": ["watch", "r.csv", "--modulus-margin", "-1", "--out", "o.csv"],
+    "--phase-margin": ["watch", "r.csv", "--phase-margin", "-5", "--out", "o.csv"],
     "--follow": ["watch", "r.csv", "--follow", "nan", "--out", "o.csv"],
     "--noise-frequency": ["tune", "r.csv", "--noise-frequency", "inf", "--out", "o"],
     "noise_gain": ["tune", "r.csv", "--noise-gain", "-1", "--out", "o"],
