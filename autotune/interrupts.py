@@ -6,7 +6,7 @@ import _thread
 import signal
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from multiprocessing import resource_tracker
 from types import FrameType
@@ -61,6 +61,28 @@ def _give(number: int) -> None:
 
 
 @contextmanager
+def signals_heard(*numbers: signal.Signals, by: Callable[[signal.Signals], object]) -> Iterator[None]:
+    """Have a block hear signals in place of whoever hears them outside of it; not in another thread than the main one.
+
+    Parameters
+    ----------
+    *numbers : Signals
+        Which.
+    by : callable
+        Is called with the one that came.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = {one: signal.signal(one, lambda number, _: by(signal.Signals(number))) for one in numbers}
+    try:
+        yield
+    finally:
+        for one, handler in before.items():
+            signal.signal(one, handler)
+
+
+@contextmanager
 def interrupt_held() -> Iterator[None]:
     """Hold Ctrl-C back while the block starts processes: it is raised after the block, and they never hear one.
 
@@ -71,14 +93,13 @@ def interrupt_held() -> Iterator[None]:
         yield
         return
     came: list[int] = []
-    handler = signal.signal(signal.SIGINT, lambda number, _: came.append(number))  # another thread may hear it
-    resource_tracker.ensure_running()  # whoever starts it first has SIGINT unblocked in its thread
-    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
-        signal.signal(signal.SIGINT, handler)
+    with signals_heard(signal.SIGINT, by=came.append):  # another thread may hear it
+        resource_tracker.ensure_running()  # whoever starts it first has SIGINT unblocked in its thread
+        mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            yield
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, mask)
     if came:
         raise KeyboardInterrupt
 
@@ -89,14 +110,8 @@ def interrupt_deferred() -> Iterator[None]:
 
     It then goes to whoever hears Ctrl-C outside of the block: a control loop ends its experiment by it.
     """
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
     came: list[int] = []
-    handler = signal.signal(signal.SIGINT, lambda number, _: came.append(number))
-    try:
+    with signals_heard(signal.SIGINT, by=came.append):
         yield
-    finally:
-        signal.signal(signal.SIGINT, handler)
     if came:
         signal.raise_signal(signal.SIGINT)

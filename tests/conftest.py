@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import signal
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -52,3 +53,14 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
             if not (Path(shows).exists() if shows.startswith("/") else shutil.which(shows)):
                 say = pytest.fail if os.environ.get("REQUIRE_SYSTEM_PACKAGES") else pytest.skip
                 say(f"needs {package}: apt-get install {package}")
+
+
+@pytest.fixture(autouse=True)
+def _signals_left_alone() -> Iterator[None]:
+    """No test changes who hears a signal: a Ctrl-C that a later one sends would not be heard."""
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    yield
+    after = {number: signal.getsignal(number) for number in before}
+    for number, handler in before.items():
+        signal.signal(number, handler)
+    assert after == before

@@ -16,6 +16,7 @@ from rich.table import Table
 
 from autotune.cli import app
 from autotune.errors import LinkError
+from autotune.interrupts import signals_heard
 
 if TYPE_CHECKING:
     from autotune.config import Config
@@ -36,9 +37,8 @@ def rig(config: _CONFIG) -> None:
     content = load_config(config)
     console = Console(highlight=False)
     stop = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set())
     with ExitStack() as serving:
+        serving.enter_context(signals_heard(signal.SIGINT, signal.SIGTERM, by=lambda _: stop.set()))
         if isinstance(content.rig, SerialSettings):
             serving.enter_context(served_on_line(content, content.rig))
             said = f"a microcontroller on {content.rig.device}"

@@ -5,12 +5,11 @@ from __future__ import annotations
 import contextlib
 import math
 import signal
-import threading
 from collections import deque
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from types import FrameType, TracebackType
+from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
@@ -25,12 +24,15 @@ from autotune.experiment.rig import Exchanges, Feeds, Reading, Rig, Row
 from autotune.experiment.rows import KEPT_ROWS, RecentRows
 from autotune.experiment.timing import Tick, Timing
 from autotune.experiment.warm import warm_up
+from autotune.interrupts import signals_heard
 from autotune.recording import RecordingWriter, as_written
 
 #: longest wait without looking for a stop signal [s]
 SLICE_S = 0.1
 #: what an onlooker's Abort arrives as; Ctrl-C itself where the system has no signal to spare
-ABORT = getattr(signal, "SIGUSR1", signal.SIGINT)
+ABORT: signal.Signals = getattr(signal, "SIGUSR1", signal.SIGINT)
+#: the signals that end an experiment, as the operator knows them
+_SIGNALS = {ABORT: "Abort on the live page", signal.SIGINT: "Ctrl-C", signal.SIGTERM: "SIGTERM"}
 #: sample times that the loop may always be behind its schedule, however short limits.late_s is
 LATE_SAMPLES = 5
 #: rows over which the share of missed samples is counted
@@ -132,7 +134,8 @@ class ControlLoop:
 
     def __enter__(self) -> Self:
         warm_up()
-        self._exits.enter_context(_signals(self._on_signal))
+        # a flag the loop looks at, so that no frame on the link is torn in two
+        self._exits.enter_context(signals_heard(*_SIGNALS, by=lambda number: self._on_signal(_SIGNALS[number])))
         self._exits.enter_context(undisturbed(self.rig.clock))
         try:
             self.rig.open()
@@ -390,22 +393,3 @@ def _reason(error: BaseException | None) -> dict[str, Any]:
     if isinstance(error, AutotuneError):
         return {"reason": str(error), "verdict": type(error).__name__, "exit_status": error.exit_status}
     return {"reason": f"{type(error).__name__}: {error}", "verdict": type(error).__name__, "exit_status": 1}
-
-
-@contextlib.contextmanager
-def _signals(on_signal: Any) -> Iterator[None]:
-    """Turn Ctrl-C, SIGTERM and Abort into a flag the loop looks at, so that no frame on the link is torn in two."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    names = {ABORT: "Abort on the live page", signal.SIGINT: "Ctrl-C", signal.SIGTERM: "SIGTERM"}
-
-    def handle(number: int, _frame: FrameType | None) -> None:
-        on_signal(names[signal.Signals(number)])
-
-    before = {number: signal.signal(number, handle) for number in names}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
