@@ -8,6 +8,7 @@ In Python, ``import autotune as at``:
 ``frequency_points``   points of the frequency response, with covariance
 ``reduce``             the cautious model of points or of a plant
 ``tune``               PI or PID with margins, on points or on a model
+``rst``                RST by pole placement, to compare with
 ``margins``            margins of a loop
 ``validate``           nu-gap and stability margins b of a model beside its plant
 ``delay``              coefficients and dead time, by three methods; two delays
@@ -60,6 +61,7 @@ if TYPE_CHECKING:
     from autotune.api.models import Model
     from autotune.api.plots import plot
     from autotune.api.points import Points, frequency_points
+    from autotune.api.pole_placement import rst
     from autotune.api.python_control import from_control
     from autotune.api.recordings import read
     from autotune.api.shown import to_pandas
@@ -77,6 +79,7 @@ _HOMES = {
     "Points": "autotune.api.points",
     "reduce": "autotune.api.methods",
     "tune": "autotune.api.methods",
+    "rst": "autotune.api.pole_placement",
     "margins": "autotune.api.methods",
     "validate": "autotune.api.methods",
     "delay": "autotune.api.methods",
@@ -116,6 +119,7 @@ __all__ = [
     "read_controller",
     "read_model",
     "reduce",
+    "rst",
     "simulate",
     "to_control",
     "to_pandas",

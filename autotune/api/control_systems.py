@@ -10,6 +10,7 @@ from autotune.api.plants import as_plant
 from autotune.api.points import as_points
 from autotune.api.python_control import python_control
 from autotune.controller import DiscreteController, PIDController
+from autotune.design.rst import RST
 from autotune.identification.closed_loop.state_space import InnovationModel
 from autotune.models import TransferFunction
 
@@ -23,8 +24,8 @@ def to_control(source: Any, *, pade: int = PADE_ORDER) -> Any:
     Parameters
     ----------
     source : object
-        A plant, a model, a controller or a design becomes a ``TransferFunction``, a closed-loop model a ``StateSpace``
-        with its sample time, points an ``FRD``.
+        A plant, a model, a controller or a design becomes a ``TransferFunction`` (an RST its R/S), a closed-loop
+        model a ``StateSpace`` with its sample time, points an ``FRD``.
     pade : int
         Order of the Pade approximation of a dead time, which python-control does not have.
 
@@ -46,7 +47,7 @@ def to_control(source: Any, *, pade: int = PADE_ORDER) -> Any:
     points = as_points(source)
     if points is not None:
         return control.frd([point.response for point in points], [point.omega_rad_s for point in points])
-    part = getattr(source, "controller", source)
+    part = source.feedback() if isinstance(source, RST) else getattr(source, "controller", source)
     if isinstance(part, DiscreteController):
         size = max(len(part.num), len(part.den))  # ascending powers of q^-1 are descending ones of z, padded alike
         num, den = (np.pad(np.array(c), (0, size - len(c))) for c in (part.num, part.den))

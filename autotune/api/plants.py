@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from autotune.api.python_control import from_control
 from autotune.controller import Controller, DiscreteController, PIDController, read_controller
+from autotune.design.rst import RST
 from autotune.errors import InputError
 from autotune.models import LARGEST, SMALLEST, Model, TransferFunction, read_model
 
@@ -79,9 +80,11 @@ def as_loop_plant(source: Any) -> PlantFit | None:
 
 
 def as_controller(source: Any) -> Controller:
-    """Return the controller in a design, a file, or a python-control system."""
+    """Return the controller in a design, a file, or a python-control system; of an RST its feedback R/S."""
     if isinstance(source, PIDController | TransferFunction | DiscreteController):
         return source
+    if isinstance(source, RST):
+        return source.feedback()
     if isinstance(source, str | os.PathLike):
         return read_controller(source)
     if hasattr(source, "controller"):

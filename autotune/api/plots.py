@@ -12,6 +12,7 @@ import numpy as np
 from autotune.api.points import Points, as_points
 from autotune.arrays import FloatArray
 from autotune.design.reference import Trajectory
+from autotune.design.rst import RST
 from autotune.errors import InputError
 from autotune.identification.closed_loop.state_space import InnovationModel
 from autotune.recording import Recording
@@ -81,6 +82,8 @@ def _responds(result: Any) -> Any:
     model = getattr(getattr(result, "estimate", None), "model", result)
     if isinstance(model, InnovationModel):
         return _Sampled(model)
+    if isinstance(result, RST):
+        return result.feedback()
     if hasattr(result, "response"):
         return result
     from autotune.api.plants import as_plant

@@ -15,6 +15,7 @@ from autotune.controller import DiscreteController, PIDController
 from autotune.design.margins import Margins
 from autotune.design.nugap import Validation
 from autotune.design.reference import Trajectory
+from autotune.design.rst import RST
 from autotune.design.specification import UNCERTAIN, Design
 from autotune.errors import InputError
 from autotune.identification.closed_loop.identify import ClosedLoopIdentification
@@ -168,6 +169,12 @@ def _(result: TransferFunction | DiscreteController) -> tuple[str, Row, list[Row
 
 
 @rows_of.register
+def _(result: RST) -> tuple[str, Row, list[Row]]:
+    rows = [(name, ", ".join(map(_number, getattr(result, name)))) for name in ("R", "S", "T")]
+    return "RST controller S u = T r - R y, descending powers of s", ("", ""), [*rows]
+
+
+@rows_of.register
 def _(result: Trajectory) -> tuple[str, Row, list[Row]]:
     rows = [("duration [s]", _number(result.duration_s)), ("decided by", result.binding)]
     return f"Transition from {result.y[0]:.4g} to {result.y[-1]:.4g}", ("", ""), [*rows]
@@ -184,6 +191,7 @@ def _(result: Model) -> tuple[str, Row, list[Row]]:
 SHOWN: tuple[type, ...] = (
     Recording, Points, ReducedModel, Margins, PIDController, Design, Validation, DelayModel, TwoDelays, InnovationModel,
     ClosedLoopIdentification, TransferFunction, DiscreteController, Trajectory, Model,
+    RST,
 )  # fmt: skip
 
 

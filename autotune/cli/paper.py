@@ -9,11 +9,13 @@ import typer
 
 from autotune.cli import app
 from autotune.cli.common import OVERWRITE
+from autotune.errors import InputError
 from autotune.outputs import Output
 
 if TYPE_CHECKING:
     from autotune.identification.closed_loop.state_space import InnovationModel
     from autotune.recording import Recording
+    from autotune.report.relay_tables import Law
 
 paper = typer.Typer(help="Draw the figures and tables of the papers.", no_args_is_help=True)
 app.add_typer(paper, name="paper")
@@ -43,35 +45,68 @@ def relay(
         typer.Option(help="controller file (TOML) or result.json; the PI designed on the reduced model when absent"),
     ] = None,
     beside: Annotated[list[Path] | None, typer.Option(help="a further controller file; may be repeated")] = None,
-    noise_gain: Annotated[float, typer.Option(min=1e-9, help="N_max of the design and of (26) [u/y unit]")] = 0.1,
+    noise_gain: Annotated[
+        float | None,
+        typer.Option(
+            min=1e-9,
+            help="N_max of the design and of (26) [u/y unit]; when absent 0.1 of the paper's ball, "
+            "else ten over the plant's gain where its phase is -135 degrees",
+        ),
+    ] = None,
+    dominant: Annotated[
+        float | None, typer.Option(min=1e-9, help="with --rest an RST too: its double dominant pole [rad/s]")
+    ] = None,
+    rest: Annotated[float | None, typer.Option(min=1e-9, help="its other poles [rad/s]")] = None,
     overwrite: OVERWRITE = False,
 ) -> None:
-    """Tables I and II and figures 6 to 9 of Le & Mendes, for a run's points, a known plant, or the paper's ball."""
+    """Tables I and II and figures 6 to 9 of Le & Mendes, for a run's points, a known plant, or the paper's ball.
+
+    On the paper's ball (23) the tables have printed, recomputed and own values side by side.
+    """
     from autotune.api.examples import BALL
     from autotune.api.methods import reduce, tune, validate
     from autotune.api.plants import as_plant
     from autotune.api.points import Points
+    from autotune.api.pole_placement import rst
     from autotune.controller import read_controller
+    from autotune.design.noise import LoopFacts, default_noise_gain
+    from autotune.design.rst import comparison_rst
     from autotune.identification.parametric import fit_plant
     from autotune.points import read_points
     from autotune.report.page import write_page
     from autotune.report.relay_figures import relay_page
+    from autotune.report.relay_tables import PAPER_NOISE_GAIN
 
     place = Output(out, inputs=(points, plant, controller, *(beside or [])), overwrite=overwrite)
+    if (dominant is None) != (rest is None):
+        raise InputError("an RST takes --dominant and --rest together", where="autotune paper relay")
     measured = Points([] if points is None else read_points(points))
     known = as_plant(plant) if plant is not None else fit_plant(measured).plant if measured else BALL
+    of_paper = known == BALL
+    if noise_gain is None:
+        highest = measured[-1].omega_rad_s if measured else None
+        noise_gain = PAPER_NOISE_GAIN if of_paper else default_noise_gain(known, LoopFacts(), highest)[0]
     reduced = reduce(measured if measured else known)
-    law = tune(reduced, noise_gain=noise_gain, certificate=False).controller if controller is None else None
-    first = law if law is not None else read_controller(controller or Path())
-    others = {path.stem: read_controller(path) for path in beside or []}
+    laws: dict[str, Law] = {}
+    if controller is None:
+        laws["PI on the reduced model"] = tune(reduced, noise_gain=noise_gain, certificate=False).controller
+    else:
+        laws[controller.stem] = read_controller(controller)
+    first = next(iter(laws.values()))
+    if of_paper and controller is None:
+        laws["PI on (23)"] = tune(known, noise_gain=noise_gain, certificate=False).controller
+    laws |= {path.stem: read_controller(path) for path in beside or []}
+    if dominant is not None and rest is not None:
+        laws["RST placed here"] = rst(known, dominant_rad_s=dominant, rest_rad_s=rest)
     page = relay_page(
         measured,
         reduced,
         known,
-        {"PI" if controller is None else controller.stem: first, **others},
+        laws,
         validate(known, reduced, first),
         noise_gain,
         "the plant fitted to the points" if plant is None and measured else "the plant",
+        comparison_rst(known) if of_paper else None,
     )
     place.by(lambda part: write_page(page, part))
     typer.echo(f"{page.verdict} wrote {out}")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
@@ -12,10 +12,6 @@ from autotune.cli import app
 from autotune.cli.common import OVERWRITE
 from autotune.errors import InputError
 from autotune.outputs import Output
-
-if TYPE_CHECKING:
-    from autotune.design.rst import RST
-    from autotune.models import TransferFunction
 
 #: Rows of a reference, a file of 40 MB.
 _MOST_ROWS = 1e6
@@ -134,19 +130,23 @@ def rst_command(
     dominant: Annotated[float, typer.Option(min=1e-9, help="distance of the double dominant pole [rad/s]")],
     rest: Annotated[float, typer.Option(min=1e-9, help="distance of the poles that nothing else decides [rad/s]")],
     controller: Annotated[Path | None, typer.Option(help="also write the feedback R/S (controller file, TOML)")] = None,
+    sample_time: Annotated[
+        float | None, typer.Option(min=1e-6, help="also write the law as it runs, for this time between samples [s]")
+    ] = None,
     overwrite: OVERWRITE = False,
 ) -> None:
     """Place the poles of a loop with an RST controller, the plant's own stable poles kept."""
-    from autotune.api.plants import as_plant
+    from autotune.api.methods import margins
+    from autotune.api.pole_placement import rst
     from autotune.controller import write_controller
-    from autotune.design.margins import margins
 
     place = Output(out, inputs=(model, controller), overwrite=overwrite)
     law = None if controller is None else Output(controller, inputs=(model, out), overwrite=overwrite)
-    plant = as_plant(model)
-    placed = _placed(plant, dominant, rest)
-    m = margins(plant, placed.feedback())
+    placed = rst(model, dominant_rad_s=dominant, rest_rad_s=rest)
+    m = margins(model, placed)
     content: dict[str, Any] = {"R": list(placed.R), "S": list(placed.S), "T": list(placed.T), "margins": m.to_json()}
+    if sample_time is not None:
+        content["sampled"] = placed.law(sample_time).to_json()
     place.json(content)
     if law is not None:
         law.by(lambda part: write_controller(placed.feedback(), part))
@@ -155,13 +155,3 @@ def rst_command(
         f"{math.degrees(m.phase_rad):.1f} deg, delay margin {m.delay_s:.3g} s, noise gain "
         f"{m.noise_gain:.3g}, H2 {m.h2:.4g}; wrote {out}"
     )
-
-
-def _placed(plant: TransferFunction, dominant: float, rest: float) -> RST:
-    from autotune.design.rst import place_poles
-
-    order = len(plant.den) - 1
-    kept = sorted((pole for pole in plant.poles if pole.real < 0.0), key=lambda pole: pole.real)[: order - 1]
-    if kept and kept[-1].imag and abs(kept[-1] - kept[-1].conjugate()) and kept[-1].conjugate() not in kept[:-1]:
-        kept = kept[:-1]  # a complex pole stays with its conjugate or not at all
-    return place_poles(plant, [*kept, *([-dominant] * 2), *([-rest] * (2 * order - 1 - len(kept)))])

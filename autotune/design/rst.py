@@ -6,14 +6,22 @@ The paper gives neither the structure nor the other closed-loop poles of its fif
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from autotune.arrays import ComplexArray, FloatArray
 from autotune.errors import DesignError
 from autotune.models import TransferFunction
+
+if TYPE_CHECKING:
+    from autotune.design.rst_law import RSTLaw
+
+#: Dominant pole of the paper's RST as printed, and the distance of the other poles that gives its row of Table II.
+DOMINANT_RAD_S, REST_RAD_S = 1.8, 11.2
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,6 +45,25 @@ class RST:
     def prefilter(self) -> TransferFunction:
         """Return F = T/R of figure 1, so that u = C (F r - y)."""
         return TransferFunction(num=self.T, den=self.R)
+
+    def law(self, sample_time_s: float, *, u_min: float = -math.inf, u_max: float = math.inf) -> RSTLaw:
+        """Return the controller as it runs: difference equations between limits of the command.
+
+        Parameters
+        ----------
+        sample_time_s : float
+            Time between two samples [s].
+        u_min, u_max : float
+            Limits of the command [u unit].
+
+        Raises
+        ------
+        InputError, DesignError
+            As :class:`autotune.design.rst_law.RSTLaw`, such as an S with a root in the right half plane.
+        """
+        from autotune.design.rst_law import RSTLaw
+
+        return RSTLaw(controller=self, sample_time_s=sample_time_s, u_min=u_min, u_max=u_max)
 
 
 def place_poles(plant: TransferFunction, poles: Sequence[complex]) -> RST:
@@ -98,17 +125,43 @@ def closed_loop_poles(plant: TransferFunction, controller: RST) -> ComplexArray:
     return np.asarray(np.roots(polynomial), dtype=np.complex128)
 
 
-def comparison_rst(plant: TransferFunction, dominant_rad_s: float = 1.8, filter_rad_s: float = 11.2) -> RST:
+def place_dominant(plant: TransferFunction, dominant_rad_s: float, rest_rad_s: float) -> RST:
+    """Return the RST controller with a double dominant pole, the plant's stable poles kept, and the rest in one place.
+
+    Parameters
+    ----------
+    plant : TransferFunction
+        B/A without dead time, strictly proper, of order n.
+    dominant_rad_s : float
+        Distance of the double dominant pole from the axis [rad/s].
+    rest_rad_s : float
+        Distance of the poles that nothing else decides [rad/s].
+
+    Raises
+    ------
+    DesignError
+        As :func:`place_poles`.
+
+    Notes
+    -----
+    Of the plant's stable poles the fastest n - 1 are kept, a complex pole with its conjugate or not at all. Margins are
+    what comes out; nothing promises them.
+    """
+    order = len(plant.den) - 1
+    kept = sorted((pole for pole in plant.poles if pole.real < 0.0), key=lambda pole: pole.real)[: max(order - 1, 0)]
+    if kept and kept[-1].imag and kept[-1].conjugate() not in kept[:-1]:
+        kept = kept[:-1]
+    rest = max(2 * order - 1 - len(kept), 0)
+    return place_poles(plant, [*kept, *([-dominant_rad_s] * 2), *([-rest_rad_s] * rest)])
+
+
+def comparison_rst(plant: TransferFunction) -> RST:
     """Return the RST that Table II is compared with.
 
     Parameters
     ----------
     plant : TransferFunction
         The ball (23), or another stable plant of fourth order with one integrator.
-    dominant_rad_s : float
-        Distance of the dominant pole from the axis.
-    filter_rad_s : float
-        Distance of the four poles that nothing else decides.
 
     Notes
     -----
@@ -118,8 +171,7 @@ def comparison_rst(plant: TransferFunction, dominant_rad_s: float = 1.8, filter_
     with that row; the printed 4.25 cannot be reproduced, and would make the RST 13 times better than the PI, where
     figure 9 and the text call the two comparable.
     """
-    kept = np.sort(plant.poles.real)[:3]
-    return place_poles(plant, [*kept, *([-dominant_rad_s] * 2), *([-filter_rad_s] * 4)])
+    return place_dominant(plant, DOMINANT_RAD_S, REST_RAD_S)
 
 
 def _floats(values: FloatArray) -> tuple[float, ...]:

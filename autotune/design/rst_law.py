@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from scipy.signal import bilinear
@@ -123,6 +124,12 @@ class RSTLaw:
         v = float(T @ np.array(rs) - R @ np.array(ys) - S[1:] @ np.array(state.u) + self.observer[1:] @ limited)
         u = min(max(v, self.u_min), self.u_max)
         return u, RSTState(r=rs[:-1], y=ys[:-1], v=(v, *state.v[:-1]), u=(u, *state.u[:-1]))
+
+    def to_json(self) -> dict[str, Any]:
+        """Return R, S, T and the observer in ascending powers of q^-1, as ``autotune rst`` writes them."""
+        R, S, T = self.coefficients
+        polynomials = {"R": R.tolist(), "S": S.tolist(), "T": T.tolist(), "observer": self.observer.tolist()}
+        return {"sample_time_s": self.sample_time_s} | polynomials
 
     def discrete(self) -> DiscreteController:
         """Return the feedback R/S between its limits as C(q), without the hold."""

@@ -3,10 +3,10 @@
 ``python -m tests.benchmarks.guarantees [COUNT [SOURCE ...]]``: COUNT plants of each class (60 by default), all sources
 or some. A result fails where a figure that it prints (modulus, phase, delay, gain margin), or one that was asked for,
 is above that of the true plant by more than 1 %; a refusal is no result. ``BRUTE=1`` looks for a better controller for
-every known plant by a search of other code, contradicts refusals and tells missed optima. ``WORKERS`` in the
-environment says how many processes work, 2 by default; with ``ROWS`` the outcomes are kept in that file as they come,
-and what is in it is not done again, so that a campaign can be run in parts: ``SECONDS`` says after how many nothing
-further is begun.
+every known plant by a search of other code, contradicts refusals and tells missed optima. ``SEED`` draws other plants
+and other noise (0 by default); ``WORKERS`` says how many processes work, 2 by default; with ``ROWS`` the outcomes are
+kept in that file as they come, and what is in it is not done again, so that a campaign can be run in parts:
+``SECONDS`` says after how many nothing further is begun.
 """
 
 from __future__ import annotations
@@ -60,11 +60,12 @@ CLASSES = (
 SOURCES = ("model", "reduced from the model", "points", "exact points", "points of a slow plant")
 ASKED = Specification(modulus_margin=0.5, phase_margin_rad=math.radians(45.0), noise_gain=1e3)
 TOLERANCE = 0.01
+SEED = int(os.environ.get("SEED", "0"))
 
 
 def plants(kind: str, count: int) -> Iterator[TransferFunction]:
     """Yield random plants of a class, time in units of their slowest lag but for the scale of some of them."""
-    rng = np.random.default_rng(CLASSES.index(kind))
+    rng = np.random.default_rng(CLASSES.index(kind) + 1000 * SEED)
     for _ in range(count):
         scale, gain = 10.0 ** rng.uniform(-2.0, 3.0), 10.0 ** rng.uniform(-2.0, 2.0) * rng.choice([-1.0, 1.0])
         lags, delay, zero, extra = [1.0], 0.0, 0.0, [np.array([1.0])]
@@ -240,7 +241,7 @@ def outcome(plant: TransferFunction, make: Callable[[], Design], brute: Callable
 
 def makers(plant: TransferFunction, seed: int, kind: Kind) -> dict[str, Callable[[], Design]]:
     """Return the ways to a controller."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(seed + 1_000_000 * SEED)
 
     def tuned(points: list[FrequencyPoint]) -> Design:
         return on_measured(of_use(points), _fit(tuple(points)), asked_of(plant), kind)[1]

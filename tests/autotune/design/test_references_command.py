@@ -52,6 +52,11 @@ def test_pole_placement_gives_the_row_of_table_ii(files):
     assert margins["phase_deg"] == pytest.approx(45.5, abs=0.1)
     assert margins["delay_s"] == pytest.approx(0.388, abs=0.001)
     assert isinstance(read_controller(files / "feedback.toml"), TransferFunction)
+    run("rst", "--model", files / "ball.toml", "--dominant", 1.8, "--rest", 11.2, "--sample-time", 0.01, "--out",
+        files / "sampled.json")  # fmt: skip
+    law = json.loads((files / "sampled.json").read_text())["sampled"]
+    assert sum(law["T"]) == pytest.approx(sum(law["R"]))  # y is r at rest, whatever u
+    assert sum(law["S"]) == pytest.approx(0.0, abs=1e-9)  # integral action
     refused = CliRunner().invoke(
         app,
         ["rst", "--model", str(files / "oven.toml"), "--dominant", "1", "--rest", "2", "--out", str(files / "r.json")],

@@ -75,6 +75,12 @@ def test_limited_command_does_not_wind_up() -> None:
     assert wound_up.max() > 4.0 * 1.15
 
 
+def test_a_placed_controller_becomes_the_law_that_runs() -> None:
+    law = LAW.controller.law(0.01, u_min=4.0, u_max=6.0)
+    assert law == replace(LAW, u_min=4.0, u_max=6.0)
+    assert law.to_json()["R"] == pytest.approx(LAW.coefficients[0])
+
+
 @pytest.mark.parametrize("wrong", [{"sample_time_s": 0.0}, {"u_min": 1.0, "u_max": 0.0}])
 def test_settings_that_make_no_law_are_refused(wrong: dict[str, float]) -> None:
     with pytest.raises(InputError):
