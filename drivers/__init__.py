@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from autotune.config.rig import PlantSettings, RigSettings, SimulatedRigSettings, TwinSettings
+from autotune.config.rig import RigSettings, SimulatedRigSettings
+from autotune.config.twin import PlantSettings, TwinSettings
 from autotune.controller import PIDController
 from autotune.errors import InputError
 from autotune.experiment.rig import Rig

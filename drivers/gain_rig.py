@@ -250,6 +250,18 @@ class GainRegisterRig(RegisterRig):
         return LinkError(f"the gains were not taken ({cause.what}); {state}", where=self._link.where, remedy=remedy)
 
 
+class TypedGainRig(GainRegisterRig):
+    """A device whose protocol says in which order words and bytes travel; parameters as of :class:`RegisterRig`."""
+
+    def misread(self, controller: PIDController) -> dict[str, PIDController]:
+        """Return nothing: a value has one reading."""
+        return {}
+
+    def misread_setpoint(self, setpoint: float) -> dict[str, float]:
+        """Return nothing: a value has one reading."""
+        return {}
+
+
 def _round(value: float) -> float:
     """Return the largest 1, 2 or 5 times a power of ten that is not above the magnitude."""
     value = max(abs(value), sys.float_info.min)  # a hundredth of the smallest gain there is may be none

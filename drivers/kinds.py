@@ -27,6 +27,7 @@ from autotune.config.rig import (
     SimulatedRigSettings,
     rig_kind_of,
 )
+from autotune.config.s7 import S7Settings
 from autotune.controller import PIDController
 from autotune.errors import InputError
 from autotune.experiment.rig import Rig
@@ -139,6 +140,7 @@ KINDS = (
     Kind(ModbusTlsSettings, "drivers.modbus_rig", has_registers=True),
     Kind(ModbusRtuSettings, "drivers.modbus_rig", has_registers=True),
     Kind(OpcUaSettings, "drivers.opcua_rig"),
+    Kind(S7Settings, "drivers.s7_rig"),
     Kind(SerialSettings, "drivers.device_rig"),
 )
 

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.optimize import root
 
 from autotune.arrays import ComplexArray, FloatArray
-from autotune.config.rig import PlantSettings
+from autotune.config.twin import PlantSettings
 from autotune.equations.black_box import BlackBox
 from autotune.equations.chain import from_chain
 from autotune.equations.files import read_any_model

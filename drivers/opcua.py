@@ -25,8 +25,9 @@ from asyncua.crypto.uacrypto import CertProperties
 from asyncua.ua.uaerrors import UaStatusCodeError
 from cryptography import x509
 
-from autotune.config.opcua import SAMPLE, SOURCE_TIME
+from autotune.config.opcua import SOURCE_TIME
 from autotune.config.rig import OpcUaSettings
+from autotune.config.signal_map import SAMPLE
 from autotune.errors import InputError, LinkError
 from drivers.opcua_errors import refusal, sentence_on
 from drivers.register_link import Answer

@@ -6,10 +6,9 @@ from collections.abc import Mapping
 from urllib.parse import urlsplit
 
 from autotune.config.rig import OpcUaSettings
-from autotune.controller import PIDController
 from autotune.errors import InputError
 from autotune.experiment.rig import Rig
-from drivers.gain_rig import GainRegisterRig
+from drivers.gain_rig import TypedGainRig
 from drivers.kinds import Reach, Session
 from drivers.probe import ProbedDevice, ProbedSignal
 from drivers.register_link import RegisterLink
@@ -30,22 +29,10 @@ def _link(settings: OpcUaSettings, *, exclusive: bool = True) -> RegisterLink:
     return OpcUaLink(settings, exclusive=exclusive)
 
 
-class NodeGainRig(GainRegisterRig):
-    """A device whose own controller's gains are in nodes: their words and bytes are the protocol's matter."""
-
-    def misread(self, controller: PIDController) -> dict[str, PIDController]:
-        """Return nothing: a node has one reading."""
-        return {}
-
-    def misread_setpoint(self, setpoint: float) -> dict[str, float]:
-        """Return nothing: a node has one reading."""
-        return {}
-
-
 def open_kind(settings: OpcUaSettings, session: Session) -> Rig:
     """Return the rig, with its own controller's gains where they are mapped."""
     registers = settings.registers
-    kind = RegisterRig if registers.held_gains is None else NodeGainRig
+    kind = RegisterRig if registers.held_gains is None else TypedGainRig
     return kind(
         _link(settings),
         registers,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from autotune.config.rig import PlantSettings
+from autotune.config.twin import PlantSettings
 from sim.plant import Plant, make_plant
 
 

@@ -45,7 +45,7 @@ def unguarded(config: Config) -> str:
     registers = getattr(config.rig, "registers", None)
     if registers is None or registers.heartbeat is not None:
         return ""
-    place = "nodes" if hasattr(config.rig, "nodes") else "registers"
+    place = next((name for name in ("nodes", "signals") if hasattr(config.rig, name)), "registers")
     return (
         "no dead-man is mapped: if this computer or the line fails, the device may hold the last command for ever;"
         f" map rig.{place}.heartbeat, or stand at the rig's stop"

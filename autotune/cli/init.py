@@ -78,11 +78,15 @@ def init(
     plant: Annotated[
         Plant | None, typer.Option(help="which simulated plant; of a real rig: the plant of its twin for --dry-run")
     ] = None,
-    host: Annotated[str | None, typer.Option(help="address of a Modbus TCP or TLS device")] = None,
+    host: Annotated[str | None, typer.Option(help="address of a Modbus TCP or TLS device, or of a Siemens CPU")] = None,
     device: Annotated[str | None, typer.Option(help="serial device, see autotune ports")] = None,
     endpoint: Annotated[str | None, typer.Option(help="address of an OPC UA server, opc.tcp://HOST:4840")] = None,
     y_node: Annotated[str | None, typer.Option(metavar="NODE", help="node of y on it, e.g. ns=2;s=Ball.y")] = None,
     u_node: Annotated[str | None, typer.Option(metavar="NODE", help="node of u on it")] = None,
+    y_place: Annotated[
+        str | None, typer.Option(metavar="PLACE", help="place of y in a Siemens CPU, e.g. DB10.DBD0")
+    ] = None,
+    u_place: Annotated[str | None, typer.Option(metavar="PLACE", help="place of u in it")] = None,
     recording: Annotated[str | None, typer.Option(help="recording that is replayed as a rig")] = None,
     y_register: Annotated[
         str | None, typer.Option(metavar=REGISTER, help="Modbus register of y, e.g. input:0:int16,scale=0.01")
@@ -160,7 +164,7 @@ def init(
         content = _simulated(twin)
     else:
         given = {"host": host, "device": device, "recording": recording, "y_span": y_span, "u_span": u_span}
-        given |= {"endpoint": endpoint, "y_node": y_node, "u_node": u_node}
+        given |= {"endpoint": endpoint, "y_node": y_node, "u_node": u_node, "y_place": y_place, "u_place": u_place}
         reached = _reached(questions, chosen, given | {"y": y_register, "u": u_register})
         if registers and not chosen.has_registers:
             raise InputError(f'kind = "{chosen.name}" has no registers', where="--register", remedy="leave it out")
@@ -244,6 +248,10 @@ def _reached(questions: Questions, kind: Kind, given: Mapping[str, Any]) -> Tabl
         asked = "node of {}, its id or path of browse names, e.g. ns=2;s=Ball.{}"
         rig["nodes"] = {one: questions.ask(f"--{one}-node", given[f"{one}_node"], asked.format(one, one), str)
                         for one in ("y", "u")}  # fmt: skip
+    if "signals" in keys:
+        asked = "place of {} in the CPU, e.g. DB10.DBD{}"
+        rig["signals"] = {one: questions.ask(f"--{one}-place", given[f"{one}_place"], asked.format(one, at), str)
+                          for one, at in (("y", 0), ("u", 4))}  # fmt: skip
     if kind.has_registers:
         asked = "register of {}, TABLE:ADDRESS:TYPE, e.g. {}:0:int16"
         y = questions.ask("--y-register", given["y"], asked.format("y", "input"), register)
@@ -314,7 +322,7 @@ def _section(path: str, model: type[BaseModel], given: Mapping[str, Any] | None)
     given_here = given or {}
     written, after = [], []
     for name, field in sorted(model.model_fields.items(), key=lambda named: named[0] != "kind"):
-        inner = None if path.endswith(("registers", "nodes")) else _model(field.annotation, {})
+        inner = None if path.endswith(("registers", "nodes", "rig.signals")) else _model(field.annotation, {})
         if inner is not None and not isinstance(given_here.get(name), list | tuple):
             if name in given_here:
                 after += _section(f"{path}.{name}", inner, given_here[name])

@@ -30,9 +30,10 @@ _CONFIG = Annotated[Path, typer.Argument(metavar="CONFIG.toml", help="configurat
 @app.command()
 def rig(config: _CONFIG) -> None:
     """Serve the config's simulated plant over its real transport, until stopped by Ctrl-C."""
-    from autotune.cli.served import device_of, modbus_settings, served, served_on_line, served_opcua
+    from autotune.cli.served import device_of, modbus_settings, served, served_on_line, served_opcua, served_s7
     from autotune.config import load_config
     from autotune.config.rig import OpcUaSettings, SerialSettings
+    from autotune.config.s7 import S7Settings
 
     content = load_config(config)
     console = Console(highlight=False)
@@ -45,6 +46,9 @@ def rig(config: _CONFIG) -> None:
         elif isinstance(content.rig, OpcUaSettings):
             serving.enter_context(served_opcua(content, content.rig))
             said = f"OPC UA on {content.rig.endpoint}"
+        elif isinstance(content.rig, S7Settings):
+            serving.enter_context(served_s7(content, content.rig))
+            said = f"a Siemens CPU on {content.rig.twin.listen if content.rig.twin else ''}:{content.rig.port}"
         else:
             settings = modbus_settings(content)
             server = serving.enter_context(served(content, device_of(content)))

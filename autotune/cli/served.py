@@ -17,8 +17,9 @@ from autotune.config.rig import (
     ModbusTlsSettings,
     OpcUaSettings,
     SerialSettings,
-    TwinSettings,
 )
+from autotune.config.s7 import S7Settings
+from autotune.config.twin import TwinSettings
 from autotune.controller import PIDController
 from autotune.errors import InputError
 from drivers.gain_settings import controller_of, settings_of
@@ -33,6 +34,7 @@ from sim.served_rig import ServedRig
 
 if TYPE_CHECKING:
     from sim.opcua_rig import OpcUaRig
+    from sim.s7_rig import S7Rig, ServedPlace
 
 _Served = TypeVar("_Served", bound=ServedRig)
 
@@ -76,7 +78,7 @@ def device_of(config: Config, plant: Plant | None = None) -> RegisterDevice:
     Parameters
     ----------
     config : Config
-        With a Modbus rig that names its twin.
+        With a rig behind registers, nodes or data blocks that names its twin.
     plant : Plant, optional
         Replaces the twin's plant.
 
@@ -85,7 +87,7 @@ def device_of(config: Config, plant: Plant | None = None) -> RegisterDevice:
     InputError
         The dead-man would run out between two samples.
     """
-    settings = config.rig if isinstance(config.rig, OpcUaSettings) else modbus_settings(config)
+    settings = config.rig if isinstance(config.rig, OpcUaSettings | S7Settings) else modbus_settings(config)
     twin = _twin(settings)
     if twin.deadman_s <= config.signals.sample_time_s:
         raise InputError(
@@ -97,7 +99,7 @@ def device_of(config: Config, plant: Plant | None = None) -> RegisterDevice:
     specs = {name: spec_of(register) for name, register in registers.mapped().items()}
     if registers.unlock is not None:
         specs["unlock"] = spec_of(registers.unlock)
-    conditions = () if isinstance(settings, OpcUaSettings) else settings.permissives
+    conditions = () if isinstance(settings, OpcUaSettings | S7Settings) else settings.permissives
     permissives = {f"permissive {one.name!r}": one for one in conditions}
     specs |= {name: spec_of(register) for name, register in permissives.items()}
     device = RegisterDevice(
@@ -186,6 +188,32 @@ def served_opcua(config: Config, settings: OpcUaSettings, users: Mapping[str, st
 
 
 @contextmanager
+def served_s7(config: Config, settings: S7Settings) -> Iterator[S7Rig]:
+    """Serve the configuration's twin as a Siemens CPU at its address until the context ends.
+
+    Raises
+    ------
+    InputError
+        There is no twin, or the address is taken.
+    """
+    from sim.s7_rig import S7Rig
+
+    twin = _twin(settings)
+    with _started(S7Rig(device_of(config), s7_places(settings), twin.listen, settings.port)) as rig:
+        yield rig
+
+
+def s7_places(settings: S7Settings) -> dict[str, ServedPlace]:
+    """Return the simulated CPU's own description of where its signals are."""
+    from sim.s7_rig import ServedPlace
+
+    return {
+        name: ServedPlace(block=one.place.block, byte=one.place.byte, bit=one.place.bit, type=one.kind)
+        for name, one in settings.signals.mapped().items()
+    }
+
+
+@contextmanager
 def served_on_line(config: Config, settings: SerialSettings) -> Iterator[SerialRig]:
     """Serve the configuration's twin as a microcontroller on a serial line until the context ends.
 
@@ -210,7 +238,7 @@ def served_on_line(config: Config, settings: SerialSettings) -> Iterator[SerialR
             yield rig
 
 
-def _twin(settings: AnyModbusSettings | OpcUaSettings | SerialSettings) -> TwinSettings:
+def _twin(settings: AnyModbusSettings | OpcUaSettings | S7Settings | SerialSettings) -> TwinSettings:
     if settings.twin is None:
         raise InputError(
             "the rig has no simulated twin",

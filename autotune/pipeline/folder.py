@@ -23,8 +23,12 @@ PROGRESS, CONFIG, REPORT, CONTROLLER = "progress.jsonl", "config.toml", "report.
 #: what a new run writes, its configuration apart, which may be the one that it was given
 FILES_OF_A_RUN = (RECORDING, VERIFICATION, RESULT, JOURNAL, PROGRESS, REPORT, CONTROLLER)
 
-#: registers that no point depends on: a scale that turned out to be too coarse for the gains may be changed
-_OF_GAINS = tuple(f"rig.registers.{name}" for name in ("K", "Ti", "Td", "Tf", "gains", "unlock"))
+#: signals that no point depends on: a scale that turned out to be too coarse for the gains may be changed
+_OF_GAINS = tuple(
+    f"rig.{where}.{name}"
+    for where in ("registers", "nodes", "signals")
+    for name in ("K", "Ti", "Td", "Tf", "gains", "unlock")
+)
 #: sections of the configuration that the measured points depend on
 EXPERIMENT_SECTIONS = ("rig", "signals", "limits", "operating_point", "experiment")
 

@@ -55,6 +55,7 @@ def test_a_simulated_rig_is_described_as_the_shipped_configuration_does(tmp_path
         ("modbus_tls", ["--host", "10.0.0.2", *MODBUS]),
         ("modbus_rtu", ["--device", "/dev/ttyUSB0", *MODBUS]),
         ("opcua", ["--endpoint", "opc.tcp://h:4840", "--y-node", "ns=2;s=y", "--u-node", "2:Rig/2:u"]),
+        ("s7", ["--host", "10.0.0.2", "--y-place", "DB10.DBD0", "--u-place", "DB10.DBD4"]),
         ("serial", ["--device", "/dev/ttyACM0", "--y-span", "0", "100", "--u-span", "0", "10"]),
         ("replay", ["--recording", "rig.csv"]),
     ],
@@ -74,6 +75,7 @@ def test_every_kind_that_there_is_a_driver_for_can_be_described(tmp_path: Path) 
     answers = [*MODBUS, *REAL, "--host", "h", "--device", "/dev/ttyS9", "--recording", "r.csv"]
     answers += ["--y-span", "0", "1", "--u-span", "0", "10"]
     answers += ["--endpoint", "opc.tcp://h:4840", "--y-node", "ns=2;s=y", "--u-node", "2:Rig/2:u"]
+    answers += ["--y-place", "DB10.DBD0", "--u-place", "DB10.DBD4"]
     for kind in KINDS:
         path = tmp_path / f"{kind.name}.toml"
         command("init", path, "--kind", kind.name, *answers, *(["--plant", "ball"] if kind.name == "simulated" else []))

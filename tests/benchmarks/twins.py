@@ -106,6 +106,7 @@ REACHED = {
     "modbus_tls": ("--host", "10.0.0.2"),
     "modbus_rtu": ("--device", "/dev/ttyUSB0"),
     "opcua": ("--endpoint", "opc.tcp://10.0.0.2:4840", "--y-node", "ns=2;s=y", "--u-node", "ns=2;s=u"),
+    "s7": ("--host", "10.0.0.2", "--y-place", "DB10.DBD0", "--u-place", "DB10.DBD4"),
     "serial": ("--device", "/dev/ttyACM0", "--y-span", "-50", "50", "--u-span", "0", "10"),
 }
 REGISTERS = ("--y-register", "input:0:float32", "--u-register", "holding:0:float32")

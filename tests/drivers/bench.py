@@ -11,8 +11,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 
-from autotune.cli.served import spec_of
+from autotune.cli.served import s7_places, spec_of
 from autotune.config.registers import RegisterMap
 from autotune.config.rig import (
     AnyModbusSettings,
@@ -22,6 +23,7 @@ from autotune.config.rig import (
     OpcUaSettings,
     SerialSettings,
 )
+from autotune.config.s7 import S7Settings
 from autotune.experiment.rig import Rig
 from autotune.recording import Recording
 from drivers import open_rig
@@ -101,7 +103,7 @@ def register_device(registers: RegisterMap = REGISTERS, plant: Any = None) -> Re
     )
 
 
-def rig_of(settings: AnyModbusSettings | OpcUaSettings | SerialSettings) -> Rig:
+def rig_of(settings: AnyModbusSettings | OpcUaSettings | S7Settings | SerialSettings) -> Rig:
     return open_rig(settings, u_range=U_RANGE, u_safe=U_SAFE)
 
 
@@ -185,6 +187,42 @@ def opcua_bench(endpoint: str) -> Iterator[Bench]:
     with ExitStack() as stack:
         serving = stack.enter_context(ExitStack())
         serving.enter_context(OpcUaRig(device, shown, endpoint))
+        rig = rig_of(settings)
+        stack.callback(rig.close)
+        yield Bench(rig=rig, output=lambda: device.output, cut=serving.close, device=device)
+
+
+#: the same device in data blocks: one signal in each form that programs have
+PLACES = {
+    "y": "DB10.DBD0",
+    "u_applied": {"address": "DB10.DBD4", "type": "REAL"},
+    "heartbeat_echo": {"address": "DB10.DBW8", "type": "WORD"},
+    "in_command": "DB10.DBX10.3",
+    "u": {"address": "DB11.DBW0", "scale": 1e-3},
+    "heartbeat": {"address": "DB11.DBW2", "type": "WORD"},
+    "safe": {"address": "DB11.DBD4", "type": "DINT", "scale": 1e-3},
+    "enable": "DB11.DBX8.0",
+    "automatic": "DB11.DBX8.5",
+    "K": "DB12.DBD0",
+    "Ti": {"address": "DB12.DBD4", "type": "TIME"},
+    "setpoint": {"address": "DB12.DBX8.0", "type": "LREAL"},
+}
+
+
+def s7_settings(port: int, signals: dict[str, Any] = PLACES, **changes: Any) -> S7Settings:
+    return S7Settings.model_validate({"kind": "s7", "port": port, "signals": signals} | changes)
+
+
+@contextmanager
+def s7_bench(port: int, **changes: Any) -> Iterator[Bench]:
+    pytest.importorskip("snap7", reason="needs the extra s7")
+    from sim.s7_rig import S7Rig
+
+    settings = s7_settings(port, **changes)
+    device = register_device(settings.registers)
+    with ExitStack() as stack:
+        serving = stack.enter_context(ExitStack())
+        serving.enter_context(S7Rig(device, s7_places(settings), "127.0.0.1", port))
         rig = rig_of(settings)
         stack.callback(rig.close)
         yield Bench(rig=rig, output=lambda: device.output, cut=serving.close, device=device)

@@ -24,11 +24,23 @@ def unharmed(frame: bytes, direction: Direction) -> Sequence[tuple[float, bytes]
     return ((0.0, frame),)
 
 
-class TcpRelay:
-    """Accepts connections on ``port`` and carries whole Modbus frames to and from the device, through ``tamper``."""
+def modbus_length(head: bytes) -> int:
+    """Return the length of the Modbus frame that begins so."""
+    return 6 + int.from_bytes(head[4:6], "big")
 
-    def __init__(self, device_port: int, tamper: Tamper = unharmed) -> None:
-        self.tamper = tamper
+
+def tpkt_length(head: bytes) -> int:
+    """Return the length of the TPKT packet (RFC 1006) that begins so."""
+    return int.from_bytes(head[2:4], "big")
+
+
+class TcpRelay:
+    """Accepts connections on ``port`` and carries whole frames to and from the device, through ``tamper``."""
+
+    def __init__(
+        self, device_port: int, tamper: Tamper = unharmed, length_of: Callable[[bytes], int] = modbus_length
+    ) -> None:
+        self.tamper, self._length_of = tamper, length_of
         self._device_port = device_port
         self._listener = socket.create_server(("127.0.0.1", 0))
         self.port = int(self._listener.getsockname()[1])
@@ -111,8 +123,7 @@ class TcpRelay:
             return []
         data = self._partial[source] + data
         fates: list[tuple[float, socket.socket, bytes]] = []
-        while len(data) >= 6 and len(data) >= 6 + int.from_bytes(data[4:6], "big"):
-            length = 6 + int.from_bytes(data[4:6], "big")
+        while len(data) >= 6 and len(data) >= (length := self._length_of(data)):
             frame, data = data[:length], data[length:]
             fates += [(delay_s, target, piece) for delay_s, piece in self.tamper(frame, direction)]
         self._partial[source] = data

@@ -22,6 +22,7 @@ from tests.drivers.bench import (
     opcua_bench,
     replay_bench,
     rtu_bench,
+    s7_bench,
     serial_bench,
     simulated_bench,
     tcp_bench,
@@ -33,9 +34,9 @@ FIRMWARE = pytest.param(
     "firmware", marks=pytest.mark.system("gcc", "gcc-avr", "avr-libc", "libsimavr-dev", "libelf-dev")
 )
 ON_DEVICE = pytest.param("firmware, laws on the device", marks=FIRMWARE.marks)
-ALL = ("simulated", "replay", "tcp", "rtu", "tls", "opcua", "serial", FIRMWARE, ON_DEVICE)
-MOVING = ("simulated", "tcp", "rtu", "tls", "opcua", "serial", FIRMWARE, ON_DEVICE)
-REAL = ("tcp", "rtu", "tls", "opcua", "serial")
+ALL = ("simulated", "replay", "tcp", "rtu", "tls", "opcua", "s7", "serial", FIRMWARE, ON_DEVICE)
+MOVING = ("simulated", "tcp", "rtu", "tls", "opcua", "s7", "serial", FIRMWARE, ON_DEVICE)
+REAL = ("tcp", "rtu", "tls", "opcua", "s7", "serial")
 
 
 @pytest.fixture
@@ -51,6 +52,8 @@ def bench(request: pytest.FixtureRequest) -> Iterator[Bench]:
             context = rtu_bench()
         case "opcua":
             context = opcua_bench(f"opc.tcp://127.0.0.1:{free_port()}")
+        case "s7":
+            context = s7_bench(free_port())
         case "serial":
             context = serial_bench()
         case "firmware":
