@@ -30,6 +30,8 @@ _GAP = 0.005
 _ROUNDED = 1.01
 _MOST_EVALUATIONS = 60_000_000  # boxes times frequencies
 _INTEGRAL_SPAN = 30.0
+#: proportional part over the integral part at the crossover below which a box is not halved in K any more than in k
+_SMALL_SHARE = 0.1
 
 
 def lower_bound(
@@ -79,6 +81,8 @@ def lower_bound(
         end = min(float(audible[-1]) if len(audible) else 0.0, 1000.0 / H.delay_s)
         omega = np.union1d(omega, np.arange(60.0 / H.delay_s, end, 0.15 / H.delay_s))
     plant = on_grid(H, omega, sampled.sign)
+    L = np.abs(plant.h * controller.response(omega))
+    crossover = float(omega[int(np.argmin(np.abs(np.log(np.maximum(L, 1e-300)))))])
     k_max = _INTEGRAL_SPAN * abs(controller.K) / controller.Ti_s
     omega_n = specification.noise_frequency_rad_s
     allowed, by_bound = specification.noise_gain, specification.noise == "bound"
@@ -102,6 +106,7 @@ def lower_bound(
         h2 * h2,
         _GAP,
         _MOST_EVALUATIONS // len(plant.omega),
+        _SMALL_SHARE / crossover,
     )
     lowest = min(math.sqrt(bound), h2)
     gap = h2 / lowest - 1.0
@@ -200,8 +205,12 @@ def _branch_and_bound(
     best: float,
     gap: float,
     most: int,
+    of_integral: float,
 ) -> tuple[float, int]:
-    """Best-first search; returns the lower bound on the squared norm and the number of boxes examined."""
+    """Best-first search; returns the lower bound on the squared norm and the number of boxes examined.
+
+    ``of_integral`` is the K per k below which the proportional part does nothing [s].
+    """
     box = (domain[0], domain[1], domain[2], domain[3])
     heap = [(_bound(omega, q, weights, phase, turn, box, limits), box)]
     count = 1
@@ -212,7 +221,8 @@ def _branch_and_bound(
             return min(bound, best), count
         heapq.heappop(heap)
         K1, K2, k1, k2 = box
-        if (K2 - K1) * k2 > (k2 - k1) * K2:
+        # relative widths; of a K beside whose integral part it does nothing at the crossover none is worth halving
+        if (K2 - K1) * k2 > (k2 - k1) * max(K2, k2 * of_integral):
             K = 0.5 * (K1 + K2)
             halves = ((K1, K, k1, k2), (K, K2, k1, k2))
         else:

@@ -11,6 +11,7 @@ from scipy.optimize import minimize
 
 from autotune.arrays import BoolArray, FloatArray
 from autotune.controller import PIDController
+from autotune.design.corners import out_of_corner
 from autotune.design.figures import Figures, columns
 from autotune.design.kernels import SampledPlant, evaluate, evaluate_grid
 from autotune.design.loop import open_loop
@@ -28,6 +29,7 @@ _TOLERANCE = 1e-6
 _CORRECTIONS = 6
 _TIGHTER = (1e-4, 1e-3, 0.01, 0.03)
 _ENOUGH = 0.01  # slack with which a controller counts as well inside
+_PI_GAINS = 2
 _MOST_SLACK = 10.0  # what is not asked for has infinite slack, which has no derivative
 
 
@@ -128,6 +130,8 @@ def polished(problem: Problem, starts: FloatArray) -> PIDController:
         Not even a starting value keeps the constraints between the frequencies of the grid.
     """
     best = _corrected(problem, starts)
+    if best is not None and np.sum(best > 0.0) == _PI_GAINS:
+        best = out_of_corner(problem, best)
     shape = (len(problem.plants), 4)
     for more in _TIGHTER if best is None else ():
         norm, parameters = _best_of(problem, starts, np.full(shape, more))

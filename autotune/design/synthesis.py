@@ -1,7 +1,7 @@
 """Fixed-structure synthesis (17)-(18): the PI or PID that minimises the H2 norm (11) under the constraints.
 
-A coarse grid finds every basin, sequential quadratic programming goes to its bottom, and the constraints are corrected
-until they hold for margins refined between the grid's frequencies.
+A coarse grid looks for basins, sequential quadratic programming goes to the bottom of the best ones, and the
+constraints are corrected until they hold for margins refined between the grid's frequencies.
 """
 
 from __future__ import annotations
@@ -171,12 +171,16 @@ def gain_range(sampled: SampledPlant, specification: Specification) -> tuple[flo
     """Return the largest gain worth looking at, and the frequency [rad/s] and phase limit that it comes from.
 
     The crossover lies where arg H >= -pi + phi with phi the larger of the phase margin and the angle that the modulus
-    margin implies, as arg C < 0; a factor of 20 covers plants whose gain is not monotone.
+    margin implies, as arg C < 0; a factor of 20 covers plants whose gain is not monotone. The phase of an unstable
+    plant begins at -pi and rises: the frequency is where it falls below that limit again, or is largest.
     """
     phi = max(specification.phase_margin_rad, 2.0 * math.asin(0.5 * specification.modulus_margin))
     most = specification.largest_gain
     gain = np.abs(sampled.h)
-    beyond = np.flatnonzero(sampled.phase <= -math.pi + phi)
+    phase = sampled.phase
+    within = np.flatnonzero(phase > -math.pi + phi)
+    start = int(within[0]) if len(within) else int(np.argmax(phase))
+    beyond = start + np.flatnonzero(phase[start:] <= -math.pi + phi)
     audible = np.flatnonzero(gain * most >= 1.0)
     last = audible[-1] if len(audible) else len(gain) - 1
     at = min(int(beyond[0]) if len(beyond) else last, last) if len(audible) else int(beyond[0]) if len(beyond) else last

@@ -83,7 +83,7 @@ def _judge(
         if i > 0 and (size - 1.0) * (size_before - 1.0) < 0.0:
             angle = math.atan2(-L.imag, -L.real)
             phase = angle if abs(angle) < abs(phase) else phase
-            crossed = w
+            crossed = omega[i - 1]  # the noise gain is looked for from before the crossover on
         f_before, w_before, size_before = f, w, size
     if crossed > 0.0:
         for i in range(len(omega)):

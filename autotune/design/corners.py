@@ -1,0 +1,68 @@
+"""The best PI in a corner of its constraints, where a search that follows gradients stops."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from autotune.arrays import FloatArray
+
+if TYPE_CHECKING:
+    from autotune.design.search import Problem
+
+#: the grid about the best PI: nodes each way, first and last half-width in log gains, most grids
+_ZOOM_NODES, _ZOOM_SPAN, _ZOOM_END, _ZOOMS = 9, 0.3, 1e-5, 60
+#: relative decrease of the squared norm that is worth another controller
+_WORTHWHILE = 1e-4
+#: slacks that are asked for on the grid of frequencies so that the margins are kept between them
+_SLIGHTLY_TIGHTER = (1e-5, 1e-4, 1e-3)
+
+
+def out_of_corner(problem: Problem, start: FloatArray) -> FloatArray:
+    """Return the best PI near one that keeps the constraints exactly, at least as good as it.
+
+    Parameters
+    ----------
+    problem : Problem
+        Plants and specification.
+    start : (4,) array
+        K, T_I, 0, 0, which keep the constraints.
+
+    Notes
+    -----
+    The modulus margin is the least of several dips of abs(1 + L): where two of them are as deep, sequential quadratic
+    programming sees the gradient of one at a time and stops. A grid that follows the best controller and shrinks about
+    it needs no gradient. What it keeps it keeps on the grid of frequencies, with as much more as the exact margins ask.
+    """
+    enough = float(problem.norms_and_slacks(start[None, :])[0][0]) * (1.0 - _WORTHWHILE)
+    for more in (0.0, *_SLIGHTLY_TIGHTER):
+        squared, found = _followed(problem, start, more)
+        if squared > enough:
+            break
+        if problem.kept(found):
+            return found
+    return start
+
+
+def _followed(problem: Problem, start: FloatArray, more: float) -> tuple[float, FloatArray]:
+    """Return squared norm and gains of the best PI that shrinking grids find whose slacks are at least ``more``."""
+    free = start > 0.0
+    steps = np.linspace(-1.0, 1.0, _ZOOM_NODES)
+    # in log K and log K/T_I, by which the norm goes
+    mesh = np.array([(K, K - k) for K in steps for k in steps])
+    best, span, least = start, _ZOOM_SPAN, math.inf
+    for _ in range(_ZOOMS):
+        nodes = np.tile(best, (len(mesh), 1))
+        nodes[:, free] = best[free] * np.exp(span * mesh)
+        squared, slacks = problem.norms_and_slacks(nodes)
+        squared[np.min(slacks, axis=(1, 2)) < more] = math.inf
+        at = int(np.argmin(squared))
+        if squared[at] < least * (1.0 - 1e-9):
+            best, least = nodes[at], float(squared[at])
+        else:
+            span *= 0.3
+        if span < _ZOOM_END:
+            break
+    return least, best
