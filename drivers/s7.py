@@ -12,14 +12,14 @@ import logging
 import struct
 import time
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 from snap7.connection import ISOTCPConnection
 from snap7.datatypes import S7Area, S7WordLen
 from snap7.error import S7Error, S7TimeoutError
 from snap7.s7protocol import S7Protocol
 
-from autotune.config.s7 import SIZES, Place, S7Settings
+from autotune.config.s7 import SIZES, S7Settings
 from autotune.errors import LinkError
 from drivers.register_link import Answer
 from drivers.registers import Block, codecs
@@ -34,6 +34,7 @@ from drivers.s7_errors import (
     item_refusal,
     request_refusal,
 )
+from drivers.s7_requests import Part, adjacent, together
 from drivers.session_lock import SessionLock
 
 # the library logs what is raised here anyway; without a handler Python would print it
@@ -43,8 +44,8 @@ _T = TypeVar("_T")
 _DONE = 0xFF
 #: as a programming device: the resource that every CPU has
 _CONNECTION_TYPE = 1
-#: length of a message that is asked for, and what of it the smallest that a CPU grants leaves for data [bytes]
-_PDU, _MOST = 480, 200
+#: length of a message that is asked for [bytes]
+_PDU = 480
 #: part of the system status list with the operating state, and where in it the state is
 _STATE, _STATE_AT = 0x0424, 11
 #: time between two looks at the operating state where the program echoes no heartbeat [s]
@@ -53,15 +54,6 @@ _LOOK_S = 1.0
 
 class S7Refused(LinkError):  # noqa: N818 - a verdict, as its base
     """The CPU answered, and refuses."""
-
-
-class _Part(NamedTuple):
-    """A signal in a request."""
-
-    name: str
-    place: Place
-    size: int
-    is_bit: bool
 
 
 class S7Link:
@@ -85,7 +77,7 @@ class S7Link:
         self._is_looked_at = not exclusive
         self._looked_s = time.monotonic()
         self._parts = {
-            name: _Part(name, signal.place, SIZES[signal.kind], signal.kind == "BOOL")
+            name: Part(name, signal.place, SIZES[signal.kind], signal.kind == "BOOL")
             for name, signal in settings.signals.mapped().items()
         }
         mapped = settings.registers.mapped()
@@ -95,7 +87,7 @@ class S7Link:
         }
         # a program that echoes the heartbeat says by that whether it runs
         self._looks = exclusive and "heartbeat_echo" not in self._parts
-        self._requests: dict[tuple[str, ...], list[list[_Part]]] = {}
+        self._requests: dict[tuple[str, ...], list[list[Part]]] = {}
 
     @property
     def where(self) -> str:
@@ -163,7 +155,7 @@ class S7Link:
             self._exchange(self._require_run)
         names = tuple(codec.name for codec, _ in block.parts)
         if names not in self._requests:
-            self._requests[names] = _together([self._parts[name] for name in names])
+            self._requests[names] = together([self._parts[name] for name in names])
 
         def ask() -> tuple[dict[str, bytes], float]:
             held: dict[str, bytes] = {}
@@ -193,7 +185,7 @@ class S7Link:
             address, left = address + size, left[size:]
 
         def ask() -> None:
-            for parts, data in _adjacent(given):
+            for parts, data in adjacent(given):
                 self._write(parts, data)
 
         return self._exchange(ask)[1] > 1
@@ -227,7 +219,7 @@ class S7Link:
         self._connection, self._protocol = line, S7Protocol()
         self._ask(self._protocol.build_setup_communication_request(pdu_length=_PDU))
 
-    def _read(self, parts: Sequence[_Part]) -> dict[str, bytes]:
+    def _read(self, parts: Sequence[Part]) -> dict[str, bytes]:
         """Return the bytes of signals that lie in one block, read in one request."""
         block, start = parts[0].place.block, parts[0].place.byte
         count = max(part.place.byte + part.size for part in parts) - start
@@ -239,7 +231,7 @@ class S7Link:
         held = bytes(data["data"])
         return {part.name: held[part.place.byte - start :][: part.size] for part in parts}
 
-    def _write(self, parts: Sequence[_Part], data: bytes) -> None:
+    def _write(self, parts: Sequence[Part], data: bytes) -> None:
         place = parts[0].place
         start, kind = place.byte, S7WordLen.BYTE
         if parts[0].is_bit:
@@ -247,11 +239,11 @@ class S7Link:
         answer = self._ask(self._protocol.build_write_request(S7Area.DB, place.block, start, kind, data), parts)
         self._require_done(bytes(answer.get("raw_data") or b"\0")[0], parts)
 
-    def _require_done(self, code: int, parts: Sequence[_Part]) -> None:
+    def _require_done(self, code: int, parts: Sequence[Part]) -> None:
         if code != _DONE:
             raise self._refused(item_refusal(code), parts)
 
-    def _ask(self, request: bytes, parts: Sequence[_Part] = ()) -> dict[str, Any]:
+    def _ask(self, request: bytes, parts: Sequence[Part] = ()) -> dict[str, Any]:
         """Send a request and return its answer; whatever the library raises on the way is a LinkError."""
         assert self._connection is not None
         try:
@@ -292,38 +284,9 @@ class S7Link:
         words = getattr(cause, "strerror", None) or (str(cause) if cause is not None else "")
         return LinkError(said[0] + (f" ({words})" if words else ""), where=self.where, remedy=said[1])
 
-    def _refused(self, said: tuple[str, str], parts: Sequence[_Part]) -> LinkError:
+    def _refused(self, said: tuple[str, str], parts: Sequence[Part]) -> LinkError:
         """Return the refusal of a request, with the first of its places."""
         if not parts:
             return S7Refused(f"a request {said[0]}", where=self.where, remedy=said[1])
         place = self._settings.signals.mapped()[parts[0].name].address
         return S7Refused(f"{parts[0].name} {said[0]}", where=f"{self.where}, {place}", remedy=said[1])
-
-
-def _together(parts: Sequence[_Part]) -> list[list[_Part]]:
-    """Group signals into requests for reading, that of the first signal first; what lies between is read along."""
-    found: list[list[_Part]] = []
-    for part in sorted(parts, key=lambda part: part.place):
-        last = found[-1] if found else None
-        first = last[0].place if last else None
-        if last and first and first.block == part.place.block and part.place.byte + part.size - first.byte <= _MOST:
-            last.append(part)
-        else:
-            found.append([part])
-    return sorted(found, key=lambda group: parts[0] not in group)
-
-
-def _adjacent(given: Sequence[tuple[_Part, bytes]]) -> list[tuple[list[_Part], bytes]]:
-    """Group signals into requests for writing, in their order: numbers of which one ends where the next begins."""
-    found: list[tuple[list[_Part], bytes]] = []
-    for part, data in given:
-        last = found[-1][0][-1] if found else None
-        if last is not None and not last.is_bit and not part.is_bit and _end(last) == part.place:
-            found[-1] = ([*found[-1][0], part], found[-1][1] + data)
-        else:
-            found.append(([part], data))
-    return found
-
-
-def _end(part: _Part) -> Place:
-    return Place(part.place.block, part.place.byte + part.size, 0)

@@ -1,10 +1,12 @@
-"""Short cycles on loopback: a relay every 10, 5 and 2 ms on Modbus TCP against the slave in C, and on OPC UA.
+"""Short cycles on loopback: a relay every 10, 5 and 2 ms on Modbus TCP against the slave in C, on S7 and on OPC UA.
 
-OPC UA is served by asyncua in a process of its own, without security and signed and encrypted, every 50 and 20 ms.
+S7 is served by python-snap7 in a process of its own, every 20 and 10 ms; OPC UA by asyncua, likewise, without security
+and signed and encrypted, every 50 and 20 ms.
 
-*missed* are sample times without a row; *decision* is the time from a sample's stamp to its command in the device,
-acknowledged: the row is on its way to the disk before the command is sent. Figures are of the machine as it is: its
-load is printed beside them. ``FAST_S=60`` runs each for so long; 20 s where nothing is said.
+*missed* are sample times without a row; *reading* is the time of a sample on the link; *decision* is the time from a
+sample's stamp to its command in the device, acknowledged: the row is on its way to the disk before the command is sent.
+Figures are of the machine as it is: its load is printed beside them. ``FAST_S=60`` runs each for so long; 20 s where
+nothing is said.
 """
 
 from __future__ import annotations
@@ -30,8 +32,9 @@ from autotune.recording import RecordingWriter
 from drivers import open_rig
 from tests.benchmarks.modbus_cycle import SLAVE, slave
 from tests.drivers.test_opcua import ball, certificates_of_the_page
+from tests.drivers.test_s7 import ball as ball_behind_s7
 
-CYCLES_S, OPC_CYCLES_S = (0.01, 0.005, 0.002), (0.05, 0.02)
+CYCLES_S, S7_CYCLES_S, OPC_CYCLES_S = (0.01, 0.005, 0.002), (0.02, 0.01), (0.05, 0.02)
 #: rows of a half period of the relay
 HALF = 10
 
@@ -62,12 +65,26 @@ def opc_ua(folder: Path, *, secured: bool) -> Iterator[Rig]:
     """Yield a rig on the ball behind a server in a process of its own."""
     certificates_of_the_page(folder)
     config = ball(folder, secured=secured)
-    with subprocess.Popen(
-        [sys.executable, "-m", "autotune.cli", "rig", str(folder / "ball.toml")], stdout=subprocess.PIPE, text=True
-    ) as server:
+    with served(folder):
+        yield open_rig(config.rig, u_range=(0.0, 10.0), u_safe=0.0)
+
+
+@contextmanager
+def s7(folder: Path) -> Iterator[Rig]:
+    """Yield a rig on the ball behind a Siemens CPU in a process of its own."""
+    config = ball_behind_s7(folder)
+    with served(folder):
+        yield open_rig(config.rig, u_range=(0.0, 10.0), u_safe=0.0)
+
+
+@contextmanager
+def served(folder: Path) -> Iterator[None]:
+    """Serve the twin of the folder's configuration in a process of its own."""
+    command = [sys.executable, "-m", "autotune.cli", "rig", str(folder / "ball.toml")]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server:
         assert server.stdout is not None
         server.stdout.readline()  # it serves
-        yield open_rig(config.rig, u_range=(0.0, 10.0), u_safe=0.0)
+        yield
         server.terminate()
 
 
@@ -75,15 +92,20 @@ def main() -> None:
     """Print a line for each link and cycle time."""
     seconds = float(os.environ.get("FAST_S", "20"))
     links = [("Modbus TCP", modbus, cycle_s) for cycle_s in CYCLES_S]
+    links += [("S7", s7, cycle_s) for cycle_s in S7_CYCLES_S]
     for secured in (False, True):
         name = f"OPC UA, {'Basic256Sha256, encrypted' if secured else 'no security'}"
         links += [(name, partial(opc_ua, secured=secured), cycle_s) for cycle_s in OPC_CYCLES_S]
+    first = float("nan")
     for name, link, sample_time_s in links:
         with tempfile.TemporaryDirectory() as folder, link(Path(folder)) as rig:
             timing = run_cycles(rig, sample_time_s, seconds, Path(folder))
         decision, late = 1e3 * np.array(timing.decision_s), 1e3 * np.array(timing.lateness_s)
+        reading = 1e3 * timing.latency_s[0]
+        first = reading if name == links[0][0] and sample_time_s == links[0][2] else first
         print(
             f"{name}, {1e3 * sample_time_s:g} ms: {timing.missed} of {timing.rows + timing.missed} missed;"
+            f" reading {reading:.2f} ms median, {reading / first:.1f} times that of Modbus TCP;"
             f" decision {decision[0]:.2f} ms median, {decision[1]:.2f} ms in 99 %, {decision[2]:.2f} ms at worst;"
             f" woken late by {late[0]:.3f} ms, {late[1]:.2f} ms in 99 %; load average {os.getloadavg()[0]:.1f}",
             flush=True,
