@@ -2,8 +2,8 @@
 
 Each structure is
 
-    H(s) = b exp(-s L) N(s)/D(s),   D = [s | 1 + s T | 1 - s T] [1 | 1 + s T_2 | 1 + 2 zeta s/omega_0 + s^2/omega_0^2],
-    N = [1 | 1 + s a, a of either sign | 1 + 2 zeta_z s/omega_z + s^2/omega_z^2],
+    H(s) = b exp(-s L) N(s)/D(s),   D = [1 | s | 1 + s T | 1 - s T | pair] [1 | 1 + s T_2 | pair],
+    N = [1 | 1 + s a, a of either sign | pair],   pair = 1 + 2 zeta s/omega_0 + s^2/omega_0^2,
 
 strictly proper, with the zero in the left half plane where a pole is unstable. What the points leave possible is the
 joint region of their errors: every plant whose weighted squared distance from all of them is below the quantile. It is
@@ -11,7 +11,9 @@ sampled, not linearised, because five points seldom determine seven parameters. 
 parameters: those with at most two more than the smallest that has a member.
 
 A pole and a zero that nearly cancel can be put between any points, and a resonance beyond the last of them: neither is
-a member. Light damping is taken to lie between half of the lowest and 1.3 times the highest frequency.
+a member. Light damping is taken to lie between half of the lowest and 1.3 times the highest frequency. A second pair of
+poles stands for two modes in series of which the points show one: it has a damping of a tenth at least and lies at up
+to three times the highest frequency.
 """
 
 from __future__ import annotations
@@ -30,7 +32,7 @@ from autotune.arrays import BoolArray, ComplexArray, FloatArray
 from autotune.models import TransferFunction
 from autotune.points import FrequencyPoint
 
-First: TypeAlias = Literal["none", "integrator", "lag", "unstable"]
+First: TypeAlias = Literal["none", "integrator", "lag", "unstable", "pair"]
 Second: TypeAlias = Literal["none", "lag", "pair"]
 Zero: TypeAlias = Literal["none", "real", "pair"]
 
@@ -42,6 +44,8 @@ _MORE = 2
 _AUDIBLE = 0.4
 #: where a lightly damped pair may lie, times the lowest and the highest frequency
 _BELOW, _ABOVE = 0.5, 1.3
+#: how far a second pair may lie, times the highest frequency, and its least damping
+_FURTHER, _DAMPED = 3.0, 0.1
 _WALKERS, _STEPS, _KEPT = 48, 400, 64
 _STARTS, _ROUNDS = 12, 60
 
@@ -52,8 +56,8 @@ class Structure:
 
     Attributes
     ----------
-    first : {"none", "integrator", "lag", "unstable"}
-        Pole at 0, in the left or in the right half plane.
+    first : {"none", "integrator", "lag", "unstable", "pair"}
+        Pole at 0, in the left or in the right half plane; or a pair beside the one of ``second``.
     second : {"none", "lag", "pair"}
         Further poles.
     zero : {"none", "real", "pair"}
@@ -68,13 +72,15 @@ class Structure:
     def names(self) -> tuple[str, ...]:
         """Names of the parameters in their order; all but L and a are logarithms."""
         found = ["b", "L"]
-        found += ["T"] if self.first in ("lag", "unstable") else []
+        found += {"lag": ["T"], "unstable": ["T"], "pair": ["w1", "z1"]}.get(self.first, [])
         found += {"none": [], "lag": ["T2"], "pair": ["w0", "z0"]}[self.second]
         return tuple(found + {"none": [], "real": ["a"], "pair": ["wz", "zz"]}[self.zero])
 
     @property
     def is_member(self) -> bool:
         """Whether the structure is strictly proper, and none that another one is already."""
+        if self.first == "pair":
+            return self.second == "pair"
         poles = (self.first != "none") + {"none": 0, "lag": 1, "pair": 2}[self.second]
         zeros = {"none": 0, "real": 1, "pair": 2}[self.zero]
         return poles > zeros and not (self.first == "none" and self.second == "lag")
@@ -85,7 +91,7 @@ STRUCTURES = tuple(
         (
             structure
             for first, second, zero in product(
-                ("none", "integrator", "lag", "unstable"), ("none", "lag", "pair"), ("none", "real", "pair")
+                ("none", "integrator", "lag", "unstable", "pair"), ("none", "lag", "pair"), ("none", "real", "pair")
             )
             if (structure := Structure(first=first, second=second, zero=zero)).is_member  # type: ignore[arg-type]
         ),
@@ -156,6 +162,9 @@ def _responses(structure: Structure, x: FloatArray, omega: FloatArray) -> Comple
         H = H / (1.0 + s * np.exp(p["T"]))
     elif structure.first == "unstable":
         H = H / (s * np.exp(p["T"]) - 1.0)
+    elif structure.first == "pair":
+        w = s / np.exp(p["w1"])
+        H = H / (1.0 + 2.0 * np.exp(p["z1"]) * w + w * w)
     if structure.second == "lag":
         H = H / (1.0 + s * np.exp(p["T2"]))
     elif structure.second == "pair":
@@ -179,6 +188,8 @@ def _bounds(structure: Structure, evidence: Evidence) -> tuple[FloatArray, Float
         "T2": (math.log(0.03 / last), math.log(30.0 / first)),
         "w0": (math.log(0.1 * first), math.log(10.0 * last)),
         "z0": (math.log(2e-3), math.log(3.0)),
+        "w1": (math.log(0.1 * first), math.log(_FURTHER * last)),
+        "z1": (math.log(_DAMPED), math.log(3.0)),
         "a": (0.0 if structure.first == "unstable" else -math.asinh(10.0 / first), math.asinh(10.0 / first)),
         "wz": (math.log(0.1 * first), math.log(10.0 * last)),
         "zz": (math.log(2e-3), math.log(3.0)),
@@ -198,7 +209,10 @@ def _admitted(structure: Structure, x: FloatArray, evidence: Evidence) -> BoolAr
             w = np.exp(p[frequency])
             inside &= ((w >= _BELOW * first) & (w <= _ABOVE * last)) | (p[damping] >= math.log(_AUDIBLE))
             phase = phase + turn * np.arctan2(2.0 * np.exp(p[damping]) * first / w, 1.0 - (first / w) ** 2)
-    if structure.first == "integrator":
+    if structure.first == "pair":
+        w = np.exp(p["w1"])
+        phase = phase - np.arctan2(2.0 * np.exp(p["z1"]) * first / w, 1.0 - (first / w) ** 2)
+    elif structure.first == "integrator":
         phase = phase - 0.5 * np.pi
     elif structure.first != "none":
         phase = phase - np.arctan(first * np.exp(p["T"])) * (1.0 if structure.first == "lag" else -1.0)
@@ -215,9 +229,11 @@ def _starts(structure: Structure, evidence: Evidence, rng: np.random.Generator) 
     lower, upper = _bounds(structure, evidence)
     x = lower + (upper - lower) * rng.uniform(0.25, 0.75, (_STARTS, len(lower)))
     for i, name in enumerate(structure.names):
-        if name in ("w0", "wz"):
+        if name == "w1":
+            x[:, i] = np.log(evidence.omega[-1] * rng.uniform(0.8, _FURTHER, _STARTS))
+        elif name in ("w0", "wz"):
             x[:, i] = np.log(rng.choice(evidence.omega, _STARTS))
-        elif name in ("z0", "zz"):
+        elif name in ("z0", "z1", "zz"):
             x[:, i] = np.log(10.0 ** rng.uniform(-1.7, 0.0, _STARTS))
         elif name == "L":
             x[:, i] = rng.choice([0.01, 0.1, 0.5], _STARTS) / evidence.omega[-1]
@@ -298,6 +314,8 @@ def _built(structure: Structure, x: FloatArray, evidence: Evidence) -> TransferF
         den = np.array([math.exp(p["T"]) / omega_0, 1.0])
     elif structure.first == "unstable":
         den = np.array([math.exp(p["T"]) / omega_0, -1.0])
+    elif structure.first == "pair":
+        den = np.polymul(den, _pair(p["w1"], p["z1"], omega_0))
     if structure.second == "lag":
         den = np.polymul(den, [math.exp(p["T2"]) / omega_0, 1.0])
     elif structure.second == "pair":

@@ -36,6 +36,19 @@ def test_a_controller_designed_on_points_keeps_its_margins_on_the_plant_they_com
     assert row["what"] in ("kept", "refused"), row["reason"]
 
 
+@pytest.mark.parametrize("kind", ["pi", "pid"])
+@pytest.mark.parametrize(("above", "damping"), [(3.04, 0.103), (2.15, 0.2), (2.55, 0.25)])
+def test_points_of_one_resonance_guard_against_a_second_one_beyond_them(
+    kind: Kind, above: float, damping: float
+) -> None:
+    """Five points end at 1.6 to 1.8 times the first resonance; a PID that knows no other missed its margins by 38 %."""
+    first, second = (1.0, 0.75, 1.0), (above**-2, 2.0 * damping / above, 1.0)
+    plant = TransferFunction(num=(1.0,), den=tuple(np.polymul(first, second)))
+    for source in ("exact points", "points"):
+        row = outcome(plant, makers(plant, 5, kind)[source], lambda: None)
+        assert row["what"] in ("kept", "refused"), (source, row["shortfall"], row["reason"])
+
+
 def test_a_structure_that_the_points_contradict_is_no_evidence_against_a_design_on_them() -> None:
     """Nine lags, of which the fit has two and a dead time: the design was refused for missing the fit's margins."""
     plant = next(iter(plants("high order", 1)))
