@@ -22,7 +22,7 @@ from scipy.optimize import minimize_scalar
 from autotune.arrays import FloatArray
 from autotune.errors import InputError
 from autotune.outputs import append_whole, write_whole
-from autotune.text_files import printable, read_toml
+from autotune.text_files import checked_path, printable, read_toml
 
 #: Largest size of a value that is computed with: far beyond every unit, far from where squares overflow.
 LARGEST = 1e15
@@ -260,7 +260,7 @@ def read_recording(path: str | os.PathLike[str]) -> Recording:
     InputError
         No such file, no ``t,u,y`` header, or a cell that is not a number; names the line.
     """
-    path = Path(path)
+    path = checked_path(path)
     try:
         text = path.read_text(encoding="utf-8-sig", errors="replace")
     except OSError as error:

@@ -11,6 +11,7 @@ import os
 import tomllib
 import unicodedata
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, NoReturn
 
 from autotune.errors import InputError
@@ -41,7 +42,7 @@ def read_text(path: str | os.PathLike[str]) -> str:
     InputError
         No such file, longer than 64 MiB, or in another encoding; names the first line that shows it.
     """
-    where = str(path)
+    where = str(checked_path(path))
     try:
         with open(path, "rb") as file:
             content = file.read(LONGEST_TEXT_BYTES + 1)
@@ -62,6 +63,23 @@ def read_text(path: str | os.PathLike[str]) -> str:
             remedy="save the file as UTF-8",
         ) from None
     return text.replace("\r\n", "\n").replace("\r", "\n")
+
+
+def checked_path(path: Any) -> Path:
+    """Return a path that a file can have.
+
+    Raises
+    ------
+    InputError
+        No text or path, or a name with a NUL or half of a character in it.
+    """
+    try:
+        name = os.fsencode(path)
+    except (TypeError, UnicodeError):
+        raise InputError("cannot be read (no path)", where=f"{path!r}"[:200], remedy="give a file's path") from None
+    if b"\0" in name:
+        raise InputError("cannot be read (a NUL in its name)", where=f"{path!r}"[:200], remedy="check the path")
+    return Path(os.fsdecode(name))
 
 
 def reason(error: Exception) -> str:

@@ -69,7 +69,12 @@ def as_reduced(source: Any) -> ReducedModel | None:
 
 
 def as_loop_plant(source: Any) -> PlantFit | None:
-    """Return the plant of a loop's identification with its region; None for everything else."""
+    """Return the plant of a loop's identification, or of its file, with its region; None for everything else."""
+    if isinstance(source, str | os.PathLike):
+        from autotune.identification.closed_loop.loop_plant import read_loop_region
+
+        region = read_loop_region(source) if os.path.splitext(source)[1].lower() == ".json" else None
+        return None if region is None else region.plant_fit()
     from autotune.identification.closed_loop.identify import ClosedLoopIdentification
 
     if not isinstance(source, ClosedLoopIdentification):

@@ -172,12 +172,14 @@ def closed_loop_json(result: ClosedLoopIdentification) -> dict[str, Any]:
     """Return the content of ``closed_loop.json``.
 
     ``response`` is that of the polynomials; ``points`` is the plant's own, without the command's hold, at as many
-    frequencies as are independent, so that the file can be given to ``autotune design --points`` and to
-    ``autotune tune --points`` as it is.
+    frequencies as are independent, so that the file can be given to ``autotune tune --points`` as it is.
+    ``plant_region`` has the coefficients with their joint covariance, on which ``autotune design --points`` designs.
     """
+    from autotune.identification.closed_loop.loop_plant import loop_region
     from autotune.points import points_to_json
 
     model = result.estimate.model
+    region = loop_region(result.estimate)
     num, den = model.polynomials()
     verdict = result.excitation
     content: dict[str, Any] = {
@@ -191,6 +193,7 @@ def closed_loop_json(result: ClosedLoopIdentification) -> dict[str, Any]:
         "noise_variance": float(model.innovation_covariance[0, 0]),
         "response": points_to_json(result.response),
         "points": points_to_json(result.design_points),
+        "plant_region": None if region is None else region.to_json(),
         "excitation": {
             "enough": verdict.enough,
             "band_rad_s": list(verdict.band_rad_s),

@@ -16,6 +16,8 @@ from autotune.errors import InputError
 from autotune.outputs import Output
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from autotune.design.specification import Design, Specification
     from autotune.models import TransferFunction
 
@@ -38,7 +40,12 @@ class Noise(StrEnum):
 def design_command(
     out: Annotated[Path, typer.Option(help="file to write the design to (JSON)")],
     model: Annotated[Path | None, typer.Option(help="model file (TOML) to design on")] = None,
-    points: Annotated[Path | None, typer.Option(help="points file (JSON) to design on, with its regions")] = None,
+    points: Annotated[
+        Path | None,
+        typer.Option(
+            help="points file (JSON) to design on, with its regions; or closed_loop.json, on its joint region"
+        ),
+    ] = None,
     modulus_margin: Annotated[float, typer.Option(help="smallest distance of L from -1, between 0 and 1")] = 0.5,
     phase_margin: Annotated[float, typer.Option(help="smallest phase margin [deg]")] = 45.0,
     noise_gain: Annotated[
@@ -107,27 +114,40 @@ def design_command(
             seen = "; ".join(check.sentence for check in looked) or designed.certificate
             typer.echo(f"designed on the reduced model; checked: {seen}")
     else:
-        from autotune.design.specification import UNCERTAIN
-        from autotune.identification.frequency.thinning import said, thinned
-        from autotune.identification.parametric import fit_plant
-        from autotune.pipeline.analysis import of_use, on_measured
-        from autotune.points import read_points
-
         assert points is not None
-        given = of_use(read_points(points))
-        measured = list(thinned(given))
-        for note in said(len(given), len(measured)):
-            typer.echo(f"note: {note}")
-        fit = fit_plant(measured)
-        source, designed, looked = on_measured(measured, fit, asked(fit.plant, measured[-1].omega_rad_s), kind.value)
-        typer.echo(f"designed on the {source}; checked: " + "; ".join(check.sentence for check in looked))
-        if UNCERTAIN in designed.certificate:
-            typer.echo(f"warning: {designed.certificate}")
+        designed = _on_points(points, asked, kind.value)
     place.json(designed.to_json())
     if law is not None:
         law.by(lambda part: write_controller(designed.controller, part))
     typer.echo(_sentence(designed))
     typer.echo(f"wrote {out}" + (f" and {controller}" if controller is not None else ""))
+
+
+def _on_points(points: Path, asked: Callable[..., Specification], kind: Literal["pi", "pid"]) -> Design:
+    """Return the design on a file of points, or on the joint region of an identified loop's file, and say on what."""
+    from autotune.design.on_fit import design_on_fit
+    from autotune.design.specification import UNCERTAIN
+    from autotune.identification.closed_loop.loop_plant import read_loop_region
+    from autotune.identification.frequency.thinning import said, thinned
+    from autotune.identification.parametric import fit_plant
+    from autotune.pipeline.analysis import of_use, on_measured
+    from autotune.points import read_points
+
+    region = read_loop_region(points)
+    of_loop = None if region is None else region.plant_fit()
+    if of_loop is not None:
+        typer.echo("designed on the joint region of the identified loop's coefficients")
+        return design_on_fit(of_loop, asked(of_loop.plant), kind)
+    given = of_use(read_points(points))
+    measured = list(thinned(given))
+    for note in said(len(given), len(measured)):
+        typer.echo(f"note: {note}")
+    fit = fit_plant(measured)
+    source, designed, looked = on_measured(measured, fit, asked(fit.plant, measured[-1].omega_rad_s), kind)
+    typer.echo(f"designed on the {source}; checked: " + "; ".join(check.sentence for check in looked))
+    if UNCERTAIN in designed.certificate:
+        typer.echo(f"warning: {designed.certificate}")
+    return designed
 
 
 def _sentence(designed: Design) -> str:

@@ -20,6 +20,7 @@ from autotune.files.stretches import on_change, on_grid, stamped, stretch, stret
 from autotune.files.table import FileForm, Table, listed
 from autotune.files.workbook import open_table
 from autotune.recording import Recording, is_own_form, read_recording, read_sidecar
+from autotune.text_files import checked_path
 
 #: What asks somebody for a column: what for, the file's columns, the best guess.
 Ask: TypeAlias = Callable[[str, Sequence[str], str], str]
@@ -98,7 +99,7 @@ def read_recordings(
     InputError
         The file cannot be read, or a column is not sure and nobody is there to ask.
     """
-    path, given, form = Path(path), names or SignalNames(), form or FileForm()
+    path, given, form = checked_path(path), names or SignalNames(), form or FileForm()
     if given == SignalNames() and form == FileForm() and is_own_form(path):
         return Reading(recordings=(read_recording(path),), names=SignalNames(t="t", u="u", y="y"))
     table = open_table(path, form)

@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
+import json
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 import pytest
 from scipy.signal import cont2discrete, lfilter
 from scipy.stats import chi2
+from typer.testing import CliRunner
 
 import autotune as at
+from autotune.cli import app
+from autotune.cli.closed_loop import closed_loop_json
+from autotune.errors import InputError
 from autotune.identification.closed_loop.identify import ClosedLoopIdentification
-from autotune.identification.closed_loop.loop_plant import loop_plant
+from autotune.identification.closed_loop.loop_plant import loop_plant, read_loop_region
 
 TS = 0.2
 PLANTS = {
@@ -51,6 +59,57 @@ def test_the_region_holds_the_true_coefficients() -> None:
         off = fit.parameters - true
         inside += bool(off @ np.linalg.solve(fit.covariance, off) < chi2.ppf(0.95, true.size))
     assert inside >= 34
+
+
+def test_the_file_of_a_loop_keeps_the_region_and_a_design_uses_it(tmp_path: Path) -> None:
+    found = identified("resonant", 1)
+    path = tmp_path / "closed_loop.json"
+    path.write_text(json.dumps(closed_loop_json(found)), encoding="utf-8")
+    fit, read = loop_plant(found.estimate), read_loop_region(path)
+    assert fit is not None
+    assert read is not None
+    again = read.plant_fit()
+    assert again is not None
+    np.testing.assert_allclose(again.covariance, fit.covariance)
+    omega = np.geomspace(0.05, 5.0, 20)
+    np.testing.assert_allclose(again.plant.response(omega), fit.plant.response(omega), rtol=1e-9)
+    from_file, direct = at.tune(str(path), noise_gain=5.0), at.tune(found, noise_gain=5.0)
+    assert abs(from_file.controller.K / direct.controller.K - 1.0) < 1e-3
+    ran = CliRunner().invoke(
+        app, ["design", "--points", str(path), "--noise-gain", "5", "--out", str(tmp_path / "design.json")]
+    )
+    assert ran.exit_code == 0, ran.output
+    assert "joint region" in ran.output
+    assert json.loads((tmp_path / "design.json").read_text())["K"] == pytest.approx(direct.controller.K, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ({"covariance": [[1.0]]}, "covariance must be a"),
+        ({"free": [4, 1, 2, 3]}, "free must be ascending"),
+        ({"den": [2.0, 0.0, 0.0]}, "den begin with 1"),
+        ({"covariance": (-np.eye(4)).tolist()}, "diagonal of covariance must be positive"),
+        ({"covariance": (np.eye(4) + 3.0 * np.eye(4)[::-1]).tolist()}, "positive semi-definite"),
+        ({"nonsense": 1.0}, "nonsense"),
+    ],
+)
+def test_a_region_that_is_none_is_refused_by_its_key(tmp_path: Path, wrong: dict[str, Any], said: str) -> None:
+    region = {
+        "num": [0.0, 0.1, 0.1],
+        "den": [1.0, -1.5, 0.7],
+        "input_delay": 0,
+        "sample_time_s": 0.1,
+        "free": [1, 2, 3, 4],
+        "covariance": (1e-4 * np.eye(4)).tolist(),
+        "degrees_of_freedom": 100,
+    }
+    path = tmp_path / "closed_loop.json"
+    path.write_text(json.dumps({"plant_region": region}), encoding="utf-8")
+    assert read_loop_region(path) is not None
+    path.write_text(json.dumps({"plant_region": region | wrong}), encoding="utf-8")
+    with pytest.raises(InputError, match=said):
+        read_loop_region(path)
 
 
 @pytest.mark.parametrize("name", PLANTS)
