@@ -25,8 +25,8 @@ _SCAN_S, _SCANS_LATE = 0.02, 5
 _TAKE_S = 0.25
 #: how long the safe output is written again where the device does not take it, and the first wait between [s]
 _SAFE_S, _SAFE_WAIT_S = 2.0, 0.05
-#: time between two looks whether the command is still ours [s]
-_LOOK_S = 0.2
+#: part of the time that looks whether the command is still ours may take
+_LOOK_SHARE = 0.125
 #: longest time of a reading on a line that has the time for such looks [s]
 _QUICK_S = 0.005
 #: so many foreign commands within this time end the session [s]
@@ -111,7 +111,7 @@ class RegisterRig:
         self._is_commanding = False
         self._opened_s = 0.0
         self._trial_setpoint = math.nan  # of the device's own controller, as a trial began
-        self._looks_s = math.inf  # when it was last looked whether the command is still ours; never where it cannot be
+        self._looks_s = math.inf  # when it is looked next whether the command is still ours; never where it cannot be
         self._foreign: deque[tuple[float, float]] = deque(maxlen=_FOREIGN)  # when it was not, and what was there
         self._released_s = math.nan  # when this session gave the actuator to the device's own controller
 
@@ -359,12 +359,12 @@ class RegisterRig:
             It was another's several times within a short while.
         """
         now_s = self._clock.now()
-        if not self._is_commanding or now_s - self._looks_s < _LOOK_S:
+        if not self._is_commanding or now_s < self._looks_s:
             return reading
         if reading.suspect or reading.latency_s > _QUICK_S:
             return reading
-        self._looks_s = now_s
         held, own = self._shown_command(), self._command_held
+        self._looks_s = now_s + (self._clock.now() - now_s) / _LOOK_SHARE
         if held == own or math.isnan(held):
             return reading
         self._foreign.append((now_s, held))
@@ -374,7 +374,7 @@ class RegisterRig:
             f"another master writes the command: its register held {told} of this session, {own:g} was written last",
             "end the other session; only one master may command",
         )
-        return replace(reading, suspect=True)
+        return replace(reading, suspect=True, foreign_u=held)
 
     def _check_permissives(self, values: Mapping[str, float]) -> None:
         for name, condition in self._permissives.items():

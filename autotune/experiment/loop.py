@@ -16,6 +16,7 @@ import numpy as np
 
 from autotune.arrays import FloatArray
 from autotune.errors import AutotuneError, ExperimentStopped, LinkError, OperatorStop
+from autotune.experiment.foreign import describe_foreign
 from autotune.experiment.leaving import leave, say, verdict_on
 from autotune.experiment.limits import Envelope, Watch
 from autotune.experiment.monitor import ReadingMonitor
@@ -140,6 +141,7 @@ class ControlLoop:
         try:
             self.rig.open()
             self._start_s = self._deadline_s = self.rig.clock.now()
+            self.monitor.commands.start_s = self._start_s
             limits = self.envelope.settings
             self._reading = self.rig.read()
             held = self._reading.u_applied if math.isfinite(self._reading.u_applied) else limits.u_safe
@@ -238,6 +240,11 @@ class ControlLoop:
         self._deadline_s = self.rig.clock.now()
         self.tick = self._judged(row.reading, u=row.reading.u_applied)
         return self.tick
+
+    @property
+    def foreign(self) -> tuple[str, ...]:
+        """What is to be said of commands that were not the loop's own, one sentence each."""
+        return describe_foreign(self.monitor.commands.found)
 
     def history(self, start: int = 0) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return t, u, y of the rows from number ``start`` on, (N,) each; y is NaN where a sample was unusable."""
@@ -372,6 +379,8 @@ class ControlLoop:
         if farewell.note:
             self.metadata["ended"]["note"] = farewell.note
         self.metadata["timing"] = self.timing.to_table()
+        if self.foreign:
+            self.metadata["foreign_commands"] = list(self.foreign)
         with contextlib.suppress(OSError):  # a full disk must not hide why the loop ended
             self._writer.finish(self.metadata)
         self._exits.close()

@@ -7,6 +7,7 @@ from collections import deque
 from statistics import median
 
 from autotune.errors import ExperimentStopped, LinkError
+from autotune.experiment.foreign import CommandWatch
 from autotune.experiment.limits import Patience
 from autotune.experiment.rig import Reading
 
@@ -38,6 +39,8 @@ class ReadingMonitor:
         Difference between commanded and applied output that is the device's rounding [u unit].
     recent : tuple of float
         The last usable readings, the newest last.
+    commands : CommandWatch
+        Tells commands that are not the session's own.
     """
 
     def __init__(self, patience: Patience) -> None:
@@ -46,6 +49,7 @@ class ReadingMonitor:
         self.same_s = math.inf
         self.u_tolerance = math.inf
         self.recent: tuple[float, ...] = ()
+        self.commands = CommandWatch()
         self._patience = patience
         self._bad_run = self._repeats = self._not_followed = 0
         # when a reading was last usable, y last changed, and the actuator first did not follow
@@ -68,6 +72,7 @@ class ReadingMonitor:
         ExperimentStopped, LinkError
             The verdict on a sensor, link or actuator that has failed.
         """
+        self.commands.look(reading, u, self.u_tolerance)
         reason = self._unusable(reading)
         self._usable.append(not reason)
         if math.isnan(self._usable_s):

@@ -29,6 +29,9 @@ class Reading:
         Time the read took on the link [s]; NaN where the device sent it by itself.
     suspect : bool
         Whether the link had to retry or the answer did not identify itself: not to be used in an estimate.
+    foreign_u : float
+        Command that another master had put in place of the session's own before this sample [u unit]; NaN where there
+        was none, or nobody looked.
     """
 
     t_s: float
@@ -37,6 +40,7 @@ class Reading:
     device_time_s: float = math.nan
     latency_s: float = 0.0
     suspect: bool = False
+    foreign_u: float = math.nan
 
 
 class Clock(Protocol):

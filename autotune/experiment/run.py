@@ -104,7 +104,7 @@ def run_experiment(
     # all cycles together, which takes many samples' time: the rig has been handed back
     final = refined(swept.segments, rows, config.signals.sample_time_s)
     result = _result(final, config.experiment, (*earlier.parts, swept.part), loop.timing, swept.known)
-    return replace(result, output=loop.metadata["ended"]["output"])
+    return replace(result, output=loop.metadata["ended"]["output"], warnings=(*result.warnings, *loop.foreign))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -237,8 +237,12 @@ def _measure(
     start, start_row, lead = loop.tick.slot if settled else -1, oscillation.start_row, 0
     turning = round(choice.turning_s / step_s)
     skip = 0  # edges before the cycle that is measured
+    foreign = loop.monitor.commands.found
+    disturbed = len(foreign)
     while True:
         tick, switched = oscillation.step()
+        if len(foreign) > disturbed:  # its command was not this cycle's: anew, when it has died away for a period
+            disturbed, skip, start = len(foreign), len(oscillation.edges) + 1, -1
         edges = oscillation.slots[skip:]
         if switched and len(edges) > 2 and _rebalanced(oscillation):
             skip, start = len(oscillation.edges) - 1, -1

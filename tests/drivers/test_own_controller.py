@@ -16,7 +16,7 @@ import tomli_w
 from autotune.config import Config, load_config
 from autotune.config.registers import RegisterMap
 from autotune.controller import PIDController
-from autotune.errors import AutotuneError, ExperimentStopped, LinkError
+from autotune.errors import AutotuneError, ExperimentStopped
 from autotune.experiment.judgement import Verification
 from autotune.experiment.run import run_experiment
 from autotune.experiment.verify import run_verification
@@ -188,37 +188,6 @@ def test_after_a_trial_of_the_hosts_law_the_controller_takes_over_at_its_set_poi
     recording = read_recording(tmp_path / "trial.csv")
     assert recording.extra["r"][-2] == 5.0
     assert np.mean(recording.y[-6:-1]) == pytest.approx(5.0, abs=0.25)
-
-
-def commanding(foreign_s: tuple[float, ...]) -> tuple[Any, list[bool]]:
-    """Command for ten seconds while another master writes the command now and then; return its error, if any."""
-    rig, device = virtual_rig(make_plant("ball", seed=1), registers=REGISTERS)
-    left, suspect = list(foreign_s), []
-    rig.open()
-    start_s, at = rig.clock.now(), device.registers["u"]
-    try:
-        while rig.clock.now() - start_s < 10.0:
-            rig.write(4.0)
-            rig.clock.sleep_until(rig.clock.now() + 0.01)
-            if left and rig.clock.now() - start_s > left[0]:
-                left.pop(0)
-                device.write("holding", at.address, [0x3F80, 0], rig.clock.now())  # 1.0
-            suspect.append(rig.read().suspect)
-    except LinkError as error:
-        return error, suspect
-    return None, suspect
-
-
-def test_a_second_master_that_writes_now_and_then_is_found_and_told_with_its_times() -> None:
-    error, _ = commanding(tuple(0.2 * k for k in range(50)))
-    assert error is not None
-    assert re.search(r"another master writes the command: its register held 1 at [\d.]+ s, 1 at [\d.]+ s", str(error))
-
-
-def test_alone_nothing_is_said_of_another_master() -> None:
-    error, suspect = commanding(())
-    assert error is None
-    assert not any(suspect)
 
 
 # a controller in C that is nobody's own code here: positional form, its plant and its clock its own
