@@ -6,10 +6,12 @@ from collections.abc import Mapping
 from urllib.parse import urlsplit
 
 from autotune.config.rig import OpcUaSettings
+from autotune.config.signal_map import SAMPLE
 from autotune.errors import InputError
 from autotune.experiment.rig import Rig
 from drivers.gain_rig import TypedGainRig
 from drivers.kinds import Reach, Session
+from drivers.pace import tell_pace
 from drivers.probe import ProbedDevice, ProbedSignal
 from drivers.register_link import RegisterLink
 from drivers.register_rig import RegisterRig
@@ -58,9 +60,10 @@ def probe_kind(settings: OpcUaSettings, expected: Mapping[str, tuple[float, floa
     """Return every mapped node, read once; types and rights are looked at on the way."""
     link = _link(settings, exclusive=False)
     link.connect()
-    found = []
+    found, mapped = [], codecs(settings.registers.mapped())
     try:
-        for codec in codecs(settings.registers.mapped()).values():
+        pace = tell_pace(link, (codec for name, codec in mapped.items() if name in SAMPLE))
+        for codec in mapped.values():
             value = codec.decode(link.read(blocks([codec])[0]).words) if codec.name != "device_time" else None
             if value is None:
                 continue
@@ -70,4 +73,4 @@ def probe_kind(settings: OpcUaSettings, expected: Mapping[str, tuple[float, floa
             found.append(ProbedSignal(name=codec.name, raw=node.node, value=value, warnings=said))
     finally:
         link.disconnect()
-    return ProbedDevice(description=f"OPC UA server {settings.endpoint}", signals=tuple(found))
+    return ProbedDevice(description=f"OPC UA server {settings.endpoint}; {pace}", signals=tuple(found))

@@ -7,10 +7,12 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 from autotune.config.s7 import SIZES, S7Settings, S7Signal, S7Type
+from autotune.config.signal_map import SAMPLE
 from autotune.errors import InputError, LinkError
 from autotune.experiment.rig import Rig
 from drivers.gain_rig import TypedGainRig
 from drivers.kinds import Reach, Session
+from drivers.pace import tell_pace
 from drivers.probe import ProbedDevice, ProbedSignal
 from drivers.register_rig import RegisterRig
 from drivers.registers import Codec, blocks, codecs
@@ -64,10 +66,13 @@ def probe_kind(settings: S7Settings, expected: Mapping[str, tuple[float, float]]
     try:
         state = link.state()
         found = [_probed(link, codec, signals[name], expected.get(name)) for name, codec in registers.items()]
+        refused = {one.name for one in found if math.isnan(one.value)}
+        readable = [codec for name, codec in registers.items() if name in SAMPLE and name not in refused]
+        pace = f"; {tell_pace(link, readable)}" if readable else ""
     finally:
         link.disconnect()
     said = "it does not say whether it runs" if state is None else f"in {'RUN' if state == RUN else 'STOP'}"
-    return ProbedDevice(description=f"{link.where}, {said}", signals=tuple(found))
+    return ProbedDevice(description=f"{link.where}, {said}{pace}", signals=tuple(found))
 
 
 def _probed(link: S7Link, codec: Codec, signal: S7Signal, expected: tuple[float, float] | None) -> ProbedSignal:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -217,6 +218,7 @@ def test_probe_reads_every_node_once_and_writes_nothing(certificates: Path) -> N
         found = probe_kind(config.rig, {"y": (5.0, 9.0)})
         assert {one.name for one in found.signals} == set(config.rig.nodes.mapped())
         assert [one.name for one in found.signals if one.warnings] == ["y"]
+        assert re.search(r"; a sample takes .* sample times from [125]0* ms on$", found.description)
         assert not server.device.by_host
         assert server.device.value["heartbeat"] == 0.0
     reach = kind_of(config.rig).reached_by(config.rig)

@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from autotune.config.registers import RegisterMap, RegisterSettings
+from drivers.pace import shortest_sample_s
 from drivers.ports import answers_on
 from drivers.probe import implausible, probe, probe_line
 from drivers.registers import Codec
@@ -169,3 +170,10 @@ def test_a_rig_that_does_not_listen_in_time_says_so_instead_of_serving_nothing(m
             pytest.fail(f"serves port {rig.port}")
     finally:
         released.set()
+
+
+@given(st.floats(1e-5, 10.0))
+def test_a_reading_and_a_command_take_half_of_the_shortest_sample_time_at_most(slowest_s: float) -> None:
+    shortest_s = shortest_sample_s(slowest_s)
+    assert shortest_s >= max(4.0 * slowest_s, 1e-3) * (1.0 - 1e-6)
+    assert shortest_s <= max(10.0 * slowest_s, 1e-3) * (1.0 + 1e-6)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import socket
 import struct
 import threading
@@ -266,7 +267,8 @@ def test_probe_reads_every_place_once_and_says_what_looks_wrong(tmp_path: Path) 
         found = probe_kind(config.rig, {"y": (5.0, 9.0)})
         assert {one.name for one in found.signals} == set(config.rig.signals.mapped())
         assert [one.name for one in found.signals if one.warnings] == ["y"]
-        assert found.description.endswith("rack 0 slot 1, in RUN")
+        assert "rack 0 slot 1, in RUN; a sample takes" in found.description
+        assert re.search(r"cyclic reads keep up with sample times from [125]0* ms on$", found.description)
         wrong = with_signals(config, y={"address": "DB10.DBD28", "type": "DINT"}, setpoint="DB9.DBD0")
         assert isinstance(wrong.rig, S7Settings)
         server.device.show("setpoint", 7.0)
