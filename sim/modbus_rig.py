@@ -7,6 +7,7 @@ import ssl
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, TypeAlias
 
 from pymodbus import FramerType
@@ -15,6 +16,7 @@ from pymodbus.exceptions import NoSuchIdException
 from pymodbus.server import ModbusSerialServer, ModbusTcpServer, ModbusTlsServer
 from pymodbus.simulator import DataType, SimData, SimDevice
 
+from sim.bounded_connection import BoundedConnection
 from sim.register_device import IllegalAddress, IllegalValue, RegisterDevice
 from sim.registers import RegisterSpec, Table
 from sim.served_rig import ServedRig
@@ -116,6 +118,8 @@ class ModbusRig(ServedRig):
     def _server(self) -> ModbusTcpServer | ModbusSerialServer:
         server = self._library_server(sim_device(self.device.registers, self._unit_id, self._serve_request))
         server.context = _OneUnit(server.context)  # type: ignore[assignment]  # the two methods it is asked
+        if isinstance(self._transport, TcpTransport):
+            server.callback_new_connection = partial(BoundedConnection, server)  # type: ignore[method-assign]
         return server
 
     def _library_server(self, context: SimDevice) -> ModbusTcpServer | ModbusSerialServer:

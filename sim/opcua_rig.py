@@ -26,6 +26,8 @@ from sim.served_rig import ServedRig
 logging.getLogger("asyncua").addHandler(logging.NullHandler())
 
 _CYCLE_S = 0.002
+#: Time within which a connection must have a session [s], and connections at once.
+PATIENCE_S, MOST_CONNECTIONS = 10.0, 200
 _VARIANTS = {
     "float64": ua.VariantType.Double, "float32": ua.VariantType.Float, "boolean": ua.VariantType.Boolean,
     "int16": ua.VariantType.Int16, "uint16": ua.VariantType.UInt16, "int32": ua.VariantType.Int32,
@@ -110,6 +112,8 @@ class OpcUaRig(ServedRig):
         wants = self._security
         server = Server(user_manager=_Users(wants.users) if wants.users is not None else None)
         await server.init()
+        server.iserver.max_pending_activation_seconds = PATIENCE_S
+        server.iserver.max_connections = MOST_CONNECTIONS
         server.set_endpoint(self._endpoint)
         if wants.cert_file is None or wants.key_file is None:
             server.set_security_policy([ua.SecurityPolicyType.NoSecurity])
