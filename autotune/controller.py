@@ -16,12 +16,12 @@ import numpy as np
 import tomli_w
 from pydantic import Field, field_validator, model_validator
 
-from autotune.arrays import ComplexArray, FloatArray
+from autotune.arrays import ComplexArray, FloatArray, is_real
 from autotune.errors import InputError
 from autotune.models import TransferFunction
 from autotune.outputs import write_whole
 from autotune.schema import LONGEST_S, SHORTEST_S, Number, Section, Time, shortened, validated
-from autotune.text_files import read_json, read_toml
+from autotune.text_files import checked_path, read_json, read_toml
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,6 +52,9 @@ class PIDController:
     setpoint_weight: float = 1.0
 
     def __post_init__(self) -> None:
+        for name in ("K", "Ti_s", "Td_s", "Tf_s", "setpoint_weight"):
+            if not is_real(getattr(self, name)):
+                raise InputError(f"{name} = {getattr(self, name)!r}"[:200], where="controller", remedy="give a number")
         if not math.isfinite(self.K):
             raise InputError(f"K = {self.K:g}", where="controller", remedy="it must be a finite number")
         if not self.Ti_s > 0.0 and self.K != 0.0:  # a device as delivered may hold zeros: there is no law in it
@@ -203,7 +206,7 @@ def read_controller(path: str | os.PathLike[str]) -> Controller:
     InputError
         No such file, neither TOML nor JSON, or keys that make no controller; names the key.
     """
-    where = str(path)
+    where = str(checked_path(path))
     if os.path.isdir(path):
         return read_controller(os.path.join(path, "result.json"))
     if os.path.splitext(path)[1].lower() == ".json":

@@ -18,7 +18,7 @@ from typing import Any, Literal, TypeAlias, get_args
 import numpy as np
 import tomli_w
 
-from autotune.arrays import ComplexArray, FloatArray
+from autotune.arrays import ComplexArray, FloatArray, is_real
 from autotune.errors import InputError
 from autotune.outputs import write_whole
 from autotune.text_files import read_toml
@@ -66,7 +66,8 @@ class TransferFunction:
     delay_s: float = 0.0
 
     def __post_init__(self) -> None:
-        if not self.num or not self.den or not all(map(math.isfinite, (*self.num, *self.den, self.delay_s))):
+        lists = all(isinstance(one, tuple | list | np.ndarray) and len(one) for one in (self.num, self.den))
+        if not lists or not all(is_real(v) and math.isfinite(v) for v in (*self.num, *self.den, self.delay_s)):
             raise InputError("num, den and delay must be finite numbers", where="transfer function")
         object.__setattr__(self, "num", _trimmed(self.num))
         object.__setattr__(self, "den", _trimmed(self.den))

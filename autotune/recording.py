@@ -66,6 +66,18 @@ class Recording:
     name: str = "recording"
 
     def __post_init__(self) -> None:
+        for column, values in {"t": self.t, "u": self.u, "y": self.y}.items():
+            if not isinstance(values, np.ndarray) or values.ndim != 1 or values.dtype.kind not in "fiu":
+                raise InputError(
+                    f"column {column!r} is no row of numbers",
+                    where=str(self.name),
+                    remedy="give an array; autotune.read takes lists and tables",
+                )
+        if not isinstance(self.extra, Mapping) or not isinstance(self.metadata, Mapping):
+            raise InputError("extra and metadata must be mappings", where=str(self.name), remedy="leave them out")
+        for column, values in self.extra.items():
+            if not isinstance(column, str) or not isinstance(values, np.ndarray):
+                raise InputError(f"extra column {column!r} is no array"[:99], where=str(self.name), remedy="convert it")
         odd = next((column for column in self.extra if not column.isprintable() or len(column) > 200), None)
         if odd is not None:
             raise InputError(

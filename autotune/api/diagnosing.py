@@ -8,6 +8,7 @@ from typing import Any
 
 from autotune.arrays import FloatArray
 from autotune.controller import Controller
+from autotune.errors import InputError
 from autotune.models import Model
 from autotune.recording import Recording
 
@@ -35,6 +36,16 @@ def simulated(model: Any, recording: Recording, horizon_s: float | None) -> Floa
 
 
 def _model(model: Any) -> Any:
+    from autotune.equations.black_box import BlackBox
+    from autotune.equations.model import EquationModel
     from autotune.model_file import read_any as read_any_model
 
-    return read_any_model(model) if isinstance(model, str | os.PathLike) else model
+    if isinstance(model, str | os.PathLike):
+        return read_any_model(model)
+    if not isinstance(model, Model | EquationModel | BlackBox):
+        raise InputError(
+            f"a {type(model).__name__} is no model",
+            where="model",
+            remedy="give a model file or what autotune.Model makes, such as Model.from_text",
+        )
+    return model

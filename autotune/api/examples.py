@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from autotune.api.arguments import number
 from autotune.errors import InputError
 from autotune.models import TransferFunction
 from autotune.recording import Recording
@@ -43,10 +44,13 @@ def example(name: str, *, noise: float | None = None, seed: int = 0) -> Any:
     'oven'
     """
     makers = {"oven": _oven, "loop": _loop, "delay": _delay, "two delays": _two_delays}
-    if name == "ball":
+    if isinstance(name, str) and name == "ball":
         return BALL
-    if name not in makers:
-        raise InputError(f"no example {name!r}", where="example", remedy=f"one of ball, {', '.join(makers)}")
+    if not isinstance(name, str) or name not in makers:
+        raise InputError(f"no example {name!r}"[:200], where="example", remedy=f"one of ball, {', '.join(makers)}")
+    if noise is not None and number(noise, name="noise", where="example") < 0.0:
+        raise InputError(f"noise = {noise!r}", where="example", remedy="a standard deviation is not negative")
+    seed = int(number(seed, name="seed", where="example", above=-1, whole=True))
     return makers[name](noise, np.random.default_rng(seed))
 
 

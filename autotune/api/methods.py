@@ -12,6 +12,7 @@ from autotune.api.arguments import number, one_of, settings_of
 from autotune.api.plants import as_controller, as_loop_plant, as_plant, as_reduced
 from autotune.api.points import as_points
 from autotune.api.recordings import Source, as_recordings, read
+from autotune.arrays import is_real
 from autotune.controller import Controller, PIDController
 from autotune.errors import InputError
 
@@ -282,10 +283,13 @@ def transition(
     """
     from autotune.design.reference import flat_transition
 
-    return flat_transition(
-        as_plant(plant), y_start=y_start, y_end=y_end, u_rest=u_rest, u_min=u_min, u_max=u_max, u_rate=u_rate,
-        y_speed=y_speed,
-    )  # fmt: skip
+    levels = {"y_start": y_start, "y_end": y_end, "u_rest": u_rest}
+    limits = {"u_min": u_min, "u_max": u_max, "u_rate": u_rate, "y_speed": y_speed}
+    for name, value in limits.items():
+        if not is_real(value) or math.isnan(value):
+            raise InputError(f"{name} = {value!r}"[:200], where="transition", remedy="a number; infinite for no limit")
+    exact = {name: number(value, name=name, where="transition") for name, value in levels.items()}
+    return flat_transition(as_plant(plant), **exact, **{name: float(value) for name, value in limits.items()})
 
 
 def delay(
@@ -325,7 +329,7 @@ def delay(
     order = int(number(order, name="order", where="delay", above=0, whole=True))
     if interval_s is not None:
         interval_s = number(interval_s, name="interval_s", where="delay", above=0.0)
-    if delays not in (1, 2) or isinstance(delays, bool):
+    if not isinstance(delays, int) or isinstance(delays, bool) or delays not in (1, 2):
         raise InputError(f"delays = {delays!r}", where="delay", remedy="1, or 2 for x'' + a x(t - h_1) = b u(t - h_2)")
     record = read(recording)
     if delays == 2:
@@ -389,6 +393,10 @@ def closed_loop(
     way = one_of(method, METHODS, name="method", where="closed_loop")
     if order is not None:
         order = int(number(order, name="order", where="closed_loop", above=0, whole=True))
+    if not isinstance(more, tuple | list) or len(more) != 3 or not all(map(_are_names, more)):
+        raise InputError(
+            f"more = {more!r}"[:200], where="closed_loop", remedy="three lists of columns: inputs, outputs, r"
+        )
     record = read(recording)
     law = None if controller is None else as_controller(controller)
     if way == "prediction-error" and not any(more):
@@ -403,6 +411,10 @@ def closed_loop(
             f"no setting {next(iter(settings))!r}", where=f"closed_loop, {way}", remedy="it has order, controller, more"
         )
     return model_of_recording(record, method=way, order=order, controller=law, more=more)
+
+
+def _are_names(value: Any) -> bool:
+    return isinstance(value, tuple | list) and all(isinstance(name, str) for name in value)
 
 
 def simulate(model: Any, recording: Source, *, horizon_s: float | None = None) -> Any:

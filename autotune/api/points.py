@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any
 
+from autotune.api.arguments import number
 from autotune.api.recordings import Source, recordings
+from autotune.errors import InputError
 from autotune.points import FrequencyPoint, read_points
 
 
@@ -22,6 +24,9 @@ class Points(tuple[FrequencyPoint, ...]):
 
     def __new__(cls, points: Iterable[FrequencyPoint], notes: Iterable[str] = ()) -> Points:
         """Return the points sorted by frequency."""
+        points = list(points) if isinstance(points, Iterable) else [points]
+        if not all(isinstance(point, FrequencyPoint) for point in points) or not isinstance(notes, Iterable):
+            raise InputError("not all of these are points", where="Points", remedy="give FrequencyPoint objects")
         made = super().__new__(cls, sorted(points, key=lambda point: point.omega_rad_s))
         made.notes = tuple(notes)
         return made
@@ -64,6 +69,7 @@ def frequency_points(source: Source, *, largest_relative_sd: float = 0.5, **name
     from autotune.identification.frequency.recorded import combine
     from autotune.identification.frequency.recorded import frequency_points as estimate
 
+    largest_relative_sd = number(largest_relative_sd, name="largest_relative_sd", where="frequency_points", above=0.0)
     if isinstance(source, str) and source.endswith(".json"):
         return Points(read_points(source))
     estimates = [estimate(one, largest_relative_sd=largest_relative_sd) for one in recordings(source, **names)]

@@ -48,6 +48,12 @@ def from_control(
     if isinstance(system, control.FrequencyResponseData):
         response = np.asarray(system.frdata)[0, 0]
         return Points(_known(float(w), complex(g)) for w, g in zip(np.asarray(system.omega), response, strict=True))
+    if not hasattr(system, "dt"):
+        raise InputError(
+            f"a {type(system).__name__} is no system of python-control",
+            where="from_control",
+            remedy="give a TransferFunction, a StateSpace or an FRD of it",
+        )
     discrete = bool(system.dt)
     if discrete and isinstance(system, control.StateSpace):
         n_y = system.C.shape[0]

@@ -51,6 +51,9 @@ def read(source: Source, *, t: str = "", u: str = "", y: str = "", r: str = "", 
     >>> len(recording), round(recording.sample_time_s, 6)
     (100, 0.1)
     """
+    for role, column in {"t": t, "u": u, "y": y, "r": r, "name": name}.items():
+        if not isinstance(column, str):
+            raise InputError(f"{role} = {column!r}"[:200], where="read", remedy="give a name")
     if isinstance(source, Recording):
         return source
     if isinstance(source, str | os.PathLike):
@@ -106,6 +109,8 @@ def _numbers(values: Any, column: str) -> FloatArray:
 def recordings(source: Source, **names: str) -> list[Recording]:
     """Return one or several recordings; a list or tuple is several."""
     several = source if isinstance(source, list | tuple) else [source]
+    if not several:
+        raise InputError("no recording", where="read", remedy="give at least one")
     return [read(one, **names) for one in several]
 
 

@@ -111,6 +111,10 @@ def place_poles(plant: TransferFunction, poles: Sequence[complex]) -> RST:
     for k in range(n + 1):
         matrix[k : k + n + 1, n + k] = B
     known = np.concatenate((A, np.zeros(n + 1)))  # A s^(n+1)
+    if not np.all(np.isfinite(matrix)) or not np.all(np.isfinite(P)):
+        raise DesignError(
+            "the poles leave the range of numbers", where="RST", remedy="place them nearer to the plant's"
+        )
     if np.linalg.cond(matrix) > 1e14:
         raise DesignError("the plant has a common factor or a zero at s = 0", where="RST", remedy="cancel it first")
     x = np.linalg.solve(matrix, (P - known)[1:])
@@ -152,7 +156,13 @@ def place_dominant(plant: TransferFunction, dominant_rad_s: float, rest_rad_s: f
     if kept and kept[-1].imag and kept[-1].conjugate() not in kept[:-1]:
         kept = kept[:-1]
     rest = max(2 * order - 1 - len(kept), 0)
-    return place_poles(plant, [*kept, *([-dominant_rad_s] * 2), *([-rest_rad_s] * rest)])
+    with np.errstate(all="ignore"):
+        found = place_poles(plant, [*kept, *([-dominant_rad_s] * 2), *([-rest_rad_s] * rest)])
+    if not np.all(np.isfinite((*found.R, *found.S, *found.T))):
+        raise DesignError(
+            "the poles leave the range of numbers", where="RST", remedy="place them nearer to the plant's"
+        )
+    return found
 
 
 def comparison_rst(plant: TransferFunction) -> RST:

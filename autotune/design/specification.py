@@ -21,6 +21,10 @@ _EQUAL = {"h2": 1e-4, "iae": 3e-3}
 UNCERTAIN = "not certain:"
 
 
+#: a margin as small as this asks for nothing, and its reciprocal is no gain
+_LEAST = 1e-9
+
+
 @dataclass(frozen=True, kw_only=True)
 class Specification:
     """Constraints (18) on the loop.
@@ -65,9 +69,9 @@ class Specification:
         def refuse(name: str, value: float, allowed: str) -> None:
             raise DesignError(f"{name} = {value:g}", where="specification", remedy=f"it must be {allowed}")
 
-        if not 0.0 < self.modulus_margin < 1.0:
+        if not _LEAST < self.modulus_margin < 1.0:
             refuse("modulus margin", self.modulus_margin, "between 0 and 1")
-        if not 0.0 < self.phase_margin_rad < math.pi / 2.0:
+        if not _LEAST < self.phase_margin_rad < math.pi / 2.0:
             refuse("phase margin", math.degrees(self.phase_margin_rad), "between 0 and 90 degrees")
         if not 0.0 < self.noise_gain < math.inf:
             refuse("noise gain", self.noise_gain, "a positive number")

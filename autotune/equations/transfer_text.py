@@ -50,6 +50,8 @@ def parse_transfer_function(text: str) -> TransferFunction:
     >>> parse_transfer_function("-65.5/(s(0.36s+1)) e^-0.1s")
     TransferFunction(num=(-65.5,), den=(0.36, 1.0, 0.0), delay_s=0.1)
     """
+    if not isinstance(text, str):
+        raise _refused(f"{text!r}"[:40], "a transfer function is written as text")
     if len(text) > _LONGEST:
         raise _refused(text[:40], f"{len(text)} characters")
     plain = text.strip().replace("−", "-").replace("·", "*").replace("**", "^")

@@ -13,17 +13,20 @@ evaluated at t - h exactly, from its stored past, and needs no factor.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
-from autotune.arrays import FloatArray
+from autotune.arrays import FloatArray, is_real
 from autotune.errors import IdentificationError, InputError
 from autotune.identification.delay import online_chain as chain
 from autotune.recording import Recording
 
 #: Rows of u's past that are made room for at once.
 _ROOM = 4096
+#: Highest order: the chain of kernels t^j exp(-t) loses its digits beyond.
+_MOST_ORDER = 20
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -139,6 +142,16 @@ class OnlineEstimator:
         linear: bool = True,
         offset: bool = False,
     ) -> None:
+        for name, value in {"order": order, "forgetting": forgetting, "memory_s": memory_s, "gain": gain}.items():
+            absent = value is None and name in ("memory_s", "gain")
+            if not absent and not (is_real(value) and math.isfinite(value or 0.0)):
+                raise InputError(f"{name} = {value!r}"[:200], where="follow", remedy="give a positive number")
+        if not isinstance(linear, bool) or not isinstance(offset, bool):
+            raise InputError(f"linear = {linear!r}, offset = {offset!r}"[:200], where="follow", remedy="True or False")
+        if order != int(order) or order > _MOST_ORDER:
+            raise InputError(f"order = {order!r}", where="follow", remedy=f"a whole number, at most {_MOST_ORDER}")
+        if not isinstance(delay, DelayTracking | None):
+            raise InputError(f"delay = {delay!r}"[:200], where="follow", remedy="give DelayTracking(start_s=...)")
         memory_s = (4.0 * order + 8.0) / forgetting if memory_s is None and forgetting > 0.0 else memory_s
         if not (forgetting > 0 and (gain is None or gain > 0) and (memory_s or 0.0) > 0 and order >= 1):
             raise InputError("forgetting, memory, gain and order must be positive", where="follow")
@@ -146,6 +159,7 @@ class OnlineEstimator:
             raise InputError("a scalar gain has no offset", where="follow", remedy="give memory_s instead")
         self._n, self._delay, self._linear, self._offset = order, delay, linear, offset
         self._forgetting, self._memory_s, self._gain = float(forgetting), float(memory_s or 0.0), float(gain or 0.0)
+        order = int(order)
         kernels, unknowns = 2 * order + 2, order + (2 if delay else 1) + int(offset)
         self._chains = np.zeros(kernels), np.zeros(kernels)
         self._averages = np.zeros(unknowns), np.zeros((unknowns,) * 2), np.zeros(unknowns), np.zeros((unknowns,) * 2)
