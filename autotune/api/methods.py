@@ -121,6 +121,8 @@ def tune(
     True
     """
     structure = one_of(kind, KINDS, name="kind", where="tune")
+    if not isinstance(certificate, bool):
+        raise InputError(f"certificate = {certificate!r}"[:200], where="tune", remedy="True or False")
     records = as_recordings(plant)
     if records is not None:
         margins_asked = {"modulus_margin": modulus_margin, "phase_margin_deg": phase_margin_deg}

@@ -1,7 +1,8 @@
 """How often 95 % intervals and regions hold the truth: every identifier, white noise and autoregressive noise.
 
-``RECORDS=400 python -m tests.benchmarks coverage``: so many records for each row (400 by default); ``ROWS=delay,loop``
-takes the rows whose names begin so. The share is printed with Wilson's 95 % interval, and what was refused beside it.
+``RECORDS=400 python -m tests.benchmarks coverage``: so many records for each row (400 by default);
+``ROWS=algebraic,loop`` takes the rows whose names begin so. The share is printed with Wilson's 95 % interval, and what
+was refused beside it.
 """
 
 from __future__ import annotations
@@ -105,12 +106,12 @@ def by_loop(seed: int, pole: float) -> BoolArray:
 
 
 ROWS: dict[str, tuple[Callable[[int, float], BoolArray], tuple[str, ...], tuple[str, ...]]] = {
-    "delay, output error": (by_delay("output-error"), ("a0", "a1", "b", "h"), ("white", "AR(.9)")),
-    "delay, algebraic": (by_delay("algebraic"), ("a0", "a1", "b", "h"), ("white", "AR(.9)")),
-    "delays, two": (by_two_delays, ("a", "b", "h1", "h2"), ("white", "AR(.9)")),
-    "points of a recording": (by_points, ("regions",), ("white", "AR(.9)")),
-    "loop, order 5": (by_loop, ("poles", "response", "joint region"), ("white",)),
-    "delay, online": (by_delay("online"), ("a0", "a1", "b", "h"), ("white", "AR(.9)")),
+    "output error": (by_delay("output-error"), ("a0", "a1", "b", "h"), ("white", "AR(.9)")),
+    "algebraic": (by_delay("algebraic"), ("a0", "a1", "b", "h"), ("white", "AR(.9)")),
+    "two delays": (by_two_delays, ("a", "b", "h1", "h2"), ("white", "AR(.9)")),
+    "points": (by_points, ("regions",), ("white", "AR(.9)")),
+    "loop": (by_loop, ("poles", "response", "joint region"), ("white",)),
+    "online": (by_delay("online"), ("a0", "a1", "b", "h"), ("white", "AR(.9)")),
 }
 
 
