@@ -25,6 +25,11 @@ NAMED = 0.5
 LEAST = 0.01
 
 
+def likely(said: Mapping[str, float]) -> frozenset[str]:
+    """Return the effects that are likelier than not."""
+    return frozenset(name for name, probability in said.items() if probability >= NAMED)
+
+
 #: When effects begin: recording and time [s].
 Begins: TypeAlias = Mapping[str, Sequence[tuple[int, float]]]
 

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from autotune.controller import Controller
-from autotune.diagnosis.agreement import Part, agreement, parts_of
+from autotune.diagnosis.agreement import Part, agreement, likely, parts_of
 from autotune.diagnosis.evidence.description import describe
 from autotune.diagnosis.evidence.misread import misread_columns
 from autotune.diagnosis.evidence.operating_point import unmoved
@@ -82,6 +82,7 @@ def diagnose(
     evidence = evidence_of(model, recordings, controller, without, told, thresholds)
     if columns := misread_columns(model, recordings, evidence.quality, thresholds):
         return _of_columns(model, keeping(evidence, ()), columns)
+    evidence = keeping(evidence, likely(said_by(evidence)))
     begins = {e.name: _begins(e, recordings) for e in found_effects(evidence, judged(evidence))}
     parts = parts_of(recordings, LEAST_ROWS) if begins else ()
     said = _on_parts(evidence, model, controller, without, progress, thresholds)

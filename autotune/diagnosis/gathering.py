@@ -22,6 +22,7 @@ from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import RUNAWAY, Fit
 from autotune.diagnosis.fitting.retuning import at_nominal, prepare, under_noise
 from autotune.diagnosis.selection.hypothesis import Hypothesis
+from autotune.diagnosis.selection.judged import of_likely
 from autotune.diagnosis.selection.judged_chain import Found, JudgedChain
 from autotune.diagnosis.selection.search import search
 from autotune.diagnosis.selection.searched import Search
@@ -172,13 +173,13 @@ def _with_found(evidence: Evidence, found: Found, without: Sequence[str]) -> Evi
 
 
 def keeping(evidence: Evidence, names: Collection[str]) -> Evidence:
-    """Return the evidence with no other effects than those named: the largest hypothesis of them that was fitted."""
+    """Return the evidence with no other effects than those named: the hypothesis of them that was fitted."""
     samples = tuple(s for s in evidence.samples if s.name in names)
     evidence = replace(evidence, samples=samples, offset=evidence.offset if OFFSET in names else None)
     found = evidence.found
     if found is None or set(found.chosen.names) <= set(names):
         return evidence
-    best = max((j for j in found.judged if set(j.names) <= set(names)), key=lambda j: (len(j.names), -j.fit.cost))
+    best = of_likely(found.judged, names)
     left, residual = best.spread_out() if best.names else found.retuned, evidence.residual
     if found.chosen.leaves_noise:
         residual = residual_tests(left.fit, under_noise(left.fit, left.data), uneven=residual.uneven)

@@ -213,6 +213,7 @@ ACTUATOR = (
         search=_bands,
         lasting=True,
         rough=True,
+        includes=("actuator.backlash",),  # with a slip of 0 it is play
         odds={"valve": 0.4, "process": 0.15},
         in_equations=InEquations(
             acts="held",

@@ -26,7 +26,7 @@ from autotune.diagnosis.evidence.law import law_effect
 from autotune.diagnosis.evidence.readings import converter_step, struck
 from autotune.diagnosis.evidence.samples import SampleEffect, inspect, outliers_in, spared, together
 from autotune.diagnosis.result import NextExperiment, Verdict
-from autotune.diagnosis.selection.judged import worst
+from autotune.diagnosis.selection.judged import of_likely
 from autotune.diagnosis.selection.probability import Candidate, probability_of
 from autotune.diagnosis.thresholds import IN_USE, Thresholds
 from autotune.effects import KINDS, kind_of
@@ -158,8 +158,9 @@ def _places(name: str) -> tuple[str, ...]:
 def _sits(effect: Effect, found: Searched) -> tuple[str, ...]:
     """Return where an effect may sit, and where one does that is the same as it on these recordings."""
     places, same = dict.fromkeys(_places(effect.name)), kind_of(effect.name).same
+    rivalling = 2.0 * math.log(found.limits.decided / (1.0 - found.limits.decided))
     for one in found.judged:
-        if one.names and one.names[-1] in same and one.behind(found.taken) < found.limits.most_evidence:
+        if one.names and one.names[-1] in same and one.behind(found.taken) < rivalling:
             places |= dict.fromkeys(_places(one.names[-1]))
     return tuple(places)
 
@@ -263,11 +264,10 @@ def _is_felt(effect: Effect, bench: Bench, found: Searched) -> bool:
 
 
 def _keeping(found: Searched, names: Collection[str]) -> Searched:
-    """Return a search with no other effects taken than those named: the largest hypothesis of them that was fitted."""
+    """Return a search with no other effects taken than those named: the hypothesis of them that was fitted."""
     if set(found.best.names) <= set(names):
         return found
-    able = [one for one in found.judged if set(one.names) <= set(names)]
-    return replace(found, taken=min(able, key=lambda one: (-len(one.names), worst(one, able))))
+    return replace(found, taken=of_likely(found.judged, names))
 
 
 def _searched(

@@ -21,7 +21,7 @@ from autotune.diagnosis.equations.scores import (
     variance_ratio,
 )
 from autotune.diagnosis.equations.screening import screened
-from autotune.diagnosis.selection.judged import leading, ranked, simplest
+from autotune.diagnosis.selection.judged import leading, ranked
 from autotune.diagnosis.thresholds import IN_USE, Thresholds
 from autotune.errors import InputError
 from autotune.models import Effect
@@ -85,8 +85,8 @@ def search(
     if begun is not None:
         found += all_judged([attempt(bench, begun.effects, retuned, FINAL)])
     found = _pruned(bench, found, all_judged, limits)
-    found += all_judged(_finished(bench, simplest(found, limits.material), retuned, limits))
-    chosen = simplest(found, limits.material)
+    found += all_judged(_finished(bench, ranked(found)[0], retuned, limits))
+    chosen = ranked(found)[0]
     return Searched(nominal=bench.as_it_is(retuned), judged=tuple(found), best=chosen, taken=chosen)
 
 
@@ -127,8 +127,7 @@ def _pruned(
     """
     result, done = list(found), set()
     for _ in range(limits.rig_effects):
-        first = leading(result, limits.confirmed)
-        fresh = [one for one in (*first, simplest(result, limits.material)) if len(one.names) > 1]
+        fresh = [one for one in leading(result, limits.confirmed) if len(one.names) > 1]
         fresh = [one for one in fresh if one.identity not in done]
         if not fresh:
             break

@@ -26,11 +26,7 @@ HEAD, LARGE_HEAD, LEAST_HEAD = 0.12, 0.35, 8
 STEPS = 3
 #: Ratio of errors on one stretch that counts at most: where one runs away, how far does not matter.
 FAR_OFF = 10.0
-#: Scatter of the differences, as a share of the mean error, that is assumed at least: stretches are never that alike.
-LEAST_SCATTER = 0.05
 TINY = 1e-300
-#: Product of two agreeing evidences that rounding alone makes of differences whose mean is 0.
-ROUNDING = 1e-20
 
 
 def stretches_of(data: Data) -> list[IntArray]:
@@ -134,34 +130,6 @@ def _without(
     return at
 
 
-def advantage(squares: FloatArray, other: FloatArray) -> float:
-    """Return twice the logarithm of how much more stretches speak for the other model than for the first one.
-
-    Parameters
-    ----------
-    squares, other : (K,) array
-        Squared errors of both on the same stretches.
-
-    Returns
-    -------
-    float
-        K ln(1 + t^2/(K - 1)) for Student's t of the mean difference of their errors, with its sign: the likelihood
-        ratio of a mean that is free to one that is 0, with unknown scatter. The differences of the errors, in which the
-        stretch with the largest ones counts most, and of their logarithms, in which all count alike, must agree on the
-        sign: 0 where they do not, else the larger of both.
-
-    References
-    ----------
-    Diebold and Mariano, J. Business and Economic Statistics 13, 1995: comparing predictive accuracy.
-    """
-    errors = np.sqrt(np.maximum((squares, other), 0.0))
-    errors = np.minimum(errors, FAR_OFF * np.min(errors, axis=0) + TINY)
-    differences = (errors[0] - errors[1]) / float(np.mean(errors) + TINY)
-    logarithms = np.log(errors[0] + TINY) - np.log(errors[1] + TINY)
-    first, second = (_speaks(d) for d in (differences, logarithms))
-    return max((first, second), key=abs) if first * second > ROUNDING else 0.0
-
-
 def reduction(squares: FloatArray, other: FloatArray) -> float:
     """Return the logarithm of how many times smaller the other model's mean squared error is.
 
@@ -180,13 +148,6 @@ def reduction(squares: FloatArray, other: FloatArray) -> float:
     together = math.log(float(np.sum(squares) + TINY) / float(np.sum(other) + TINY))
     each = float(np.mean(np.log(first / second)))
     return min((together, each), key=abs) if together * each > 0.0 else 0.0
-
-
-def _speaks(differences: FloatArray) -> float:
-    """Return twice the log likelihood ratio of a mean that is free to one that is 0, with the mean's sign."""
-    count, scatter = differences.size, max(float(differences.std(ddof=1)), LEAST_SCATTER)
-    t = float(differences.mean()) / (scatter / math.sqrt(count))
-    return math.copysign(count * math.log1p(t * t / (count - 1)), t)
 
 
 def correlation_rows(result: Fit, data: Data) -> float:

@@ -59,21 +59,6 @@ def merged(found: Sequence[Hypothesis]) -> list[Hypothesis]:
     return sorted(best.values(), key=penalised)
 
 
-def vanished(h: Hypothesis) -> frozenset[str]:
-    """Return its effects that came to nothing: none of their amplitudes is as large as its standard deviation."""
-    p, theta = h.fit.parametrisation, h.fit.theta
-    sd = np.sqrt(np.maximum(np.diag(h.fit.covariance), 0.0))
-    felt: dict[str, bool] = {}
-    for i, free in enumerate(p.free):
-        if free.kind != "effect" or free.index[0] < p.own:
-            continue
-        name = p.model.effects[free.index[0]].name
-        if kind_of(name).parameters[free.index[1]].role == "amplitude":
-            # a number that is searched as a logarithm has its standard deviation relative to itself
-            felt[name] = felt.get(name, False) or bool((1.0 if free.positive else abs(theta[i])) >= sd[i])
-    return frozenset(name for name, one in felt.items() if not one)
-
-
 def is_stand_in(h: Hypothesis, data: Data) -> bool:
     """Whether one of its effects came to where it is a simpler one by another name."""
     added = h.fit.model.effects[h.fit.parametrisation.own :]

@@ -1,25 +1,22 @@
 """Hypotheses judged by what they leave: compared in pairs, ranked, weighed. Chains and equations are judged alike.
 
-Where one of two leaves noise alone, rows are independent witnesses and the likelihood of the rows decides. Where both
-err by more, the model's own error decides and rows are none: then stretches that were left out are what counts.
+Where both leave noise alone, rows are independent witnesses and the likelihood of the rows decides. Where both err by
+more, the model's own error decides and rows are none: stretches that were left out are, by the same formula.
 """
 
 from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from statistics import fmean
 from typing import TypeVar
 
 from autotune.arrays import FloatArray
-from autotune.diagnosis.evidence.stretches import advantage, reduction
+from autotune.diagnosis.evidence.stretches import STRETCHES, reduction
 from autotune.diagnosis.selection.probability import Candidate, weighed
 from autotune.diagnosis.thresholds import Thresholds
-from autotune.effects import kind_of
-
-#: Leading hypotheses that are compared as what is material in them.
-LEADING = 4
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -71,11 +68,6 @@ class Judged(ABC):
     def identity(self) -> frozenset[object]:
         """What tells hypotheses apart that are fitted."""
 
-    @property
-    def vanished(self) -> frozenset[str]:
-        """Effects that came to nothing on long windows."""
-        return frozenset()
-
     def behind(self, other: Judged) -> float:
         """Return twice the logarithm of the odds that another hypothesis is the better one, priors counted.
 
@@ -102,39 +94,24 @@ class Judged(ABC):
         return said / self.limits.temperature
 
     def _by_stretches(self, other: Judged) -> float:
-        """Return what stretches that were left out say for another hypothesis.
+        """Return what stretches that were left out say for another hypothesis, cooled as rows are.
 
-        The scale, long or short, at which they differ more decides, unless the other one contradicts it. Stretches have
-        the rig and its excitation in common: together they speak for no more than ``most_evidence``, however well they
-        agree, unless the error is far smaller at both scales: so much that ``error_witnesses`` errors, independent and
-        of unknown size, would say more.
+        A stretch is one witness of the model's own error, as a row is of noise: errors that are normal, independent
+        from stretch to stretch and of a size that is not known give K ln(S1/S2) for the squared errors S of K
+        stretches. Long windows and short ones are two measurements of the same, and count as their mean.
         """
         scales = ((self.long_squares, other.long_squares), (self.short_squares, other.short_squares))
-        limits = self.limits
-        agree = [advantage(*pair) for pair in scales]
-        capped = min(max(max(agree) if sum(agree) > 0.0 else min(agree), -limits.most_evidence), limits.most_evidence)
-        smaller = [limits.error_witnesses * reduction(*pair) for pair in scales]
-        least = min(smaller, key=abs) if smaller[0] * smaller[1] > 0.0 else 0.0
-        return least if least * capped > 0.0 and abs(least) > abs(capped) else capped
+        return STRETCHES * fmean(reduction(*pair) for pair in scales) / self.limits.temperature
 
     def is_better(self, other: Judged, share: float) -> bool:
         """Whether it takes a share of another one's held-out error away, at one of the scales.
 
-        What it has beyond the other one may have come to nothing on long windows: then short ones do not speak for it.
-        What happens at a time of its own explains a part of everything: it must take away more, and since it lasts,
-        at both scales. Near the noise whatever rows speak for is better.
+        Near the noise whatever rows speak for is better.
         """
         if self.leaves_noise or other.leaves_noise:
             return other.behind(self) > 0.0
-        extra = set(self.names) - set(other.names)
-        at_nothing = bool(extra) and extra <= self.vanished
-        long, short = (
-            math.sqrt(float(mine.sum() / its.sum()))
-            for mine, its in ((self.long_squares, other.long_squares), (self.short_squares, other.short_squares))
-        )
-        if any(kind_of(name).is_event for name in extra):
-            return max(long, short) < 1.0 - max(share, self.limits.material_event)
-        return (long if at_nothing else min(long, short)) < 1.0 - share
+        scales = ((self.long_squares, other.long_squares), (self.short_squares, other.short_squares))
+        return min(math.sqrt(float(mine.sum() / its.sum())) for mine, its in scales) < 1.0 - share
 
 
 _J = TypeVar("_J", bound=Judged)
@@ -158,23 +135,24 @@ def leading(found: Sequence[_J], count: int) -> list[_J]:
     return list(best.values())[:count]
 
 
-def simplest(found: Sequence[_J], material: float) -> _J:
-    """Return the hypothesis that stretches speak for most, priors counted, without what is not material in any.
+def of_likely(found: Sequence[_J], likely: Collection[str]) -> _J:
+    """Return the hypothesis of the effects that are likely: the first of a ranking of those with most of them alone.
 
-    Each of the leading ones is first freed of what is not material in it, and they are compared as what they then are.
+    Parameters
+    ----------
+    found : sequence of Judged
+        All hypotheses, one without effects among them.
+    likely : collection of str
+        Effects whose probability, over all hypotheses that have them, is at least a half.
+
+    References
+    ----------
+    Barbieri and Berger, Annals of Statistics 32, 2004: the median probability model predicts best where one model must
+    be taken for all.
     """
-    order = ranked(found)
-    return min((_freed(one, order, material) for one in leading(found, LEADING)), key=lambda one: worst(one, found))
-
-
-def _freed(best: _J, order: Sequence[_J], material: float) -> _J:
-    """Return a hypothesis without what is not material in it: one of those that were judged."""
-    while best.names:
-        lesser = [j for j in order if j.identity < best.identity and not best.is_better(j, material)]
-        if not lesser:
-            break
-        best = lesser[0]
-    return best
+    able = [one for one in found if set(one.names) <= set(likely)]
+    most = max(len(one.names) for one in able)
+    return ranked([one for one in able if len(one.names) == most])[0]
 
 
 def probabilities(found: Sequence[_J], best: _J, unknown_odds: float) -> tuple[Candidate, ...]:
@@ -185,7 +163,7 @@ def probabilities(found: Sequence[_J], best: _J, unknown_odds: float) -> tuple[C
     found : sequence of Judged
         All hypotheses.
     best : Judged
-        The one that was chosen: what was more, and not material, speaks for it too.
+        The one that was chosen.
     unknown_odds : float
         Prior odds of a cause that is none of them.
     """

@@ -16,7 +16,7 @@ from autotune.diagnosis.fitting.fit import RUNAWAY, Fit, residual_at
 from autotune.diagnosis.fitting.long_windows import spread_of
 from autotune.diagnosis.fitting.retuning import reduced_chi2, under_noise
 from autotune.diagnosis.fitting.spreading import spread_out
-from autotune.diagnosis.selection.hypothesis import Hypothesis, vanished
+from autotune.diagnosis.selection.hypothesis import Hypothesis
 from autotune.diagnosis.selection.judged import Judged, probabilities
 from autotune.diagnosis.selection.prediction import extended
 from autotune.diagnosis.selection.probability import Candidate
@@ -61,11 +61,6 @@ class JudgedChain(Judged):
     def identity(self) -> frozenset[object]:
         """What tells hypotheses apart: effects of a chain have their places."""
         return frozenset(self.names)
-
-    @cached_property
-    def vanished(self) -> frozenset[str]:
-        """Effects that came to nothing on long windows."""
-        return frozenset(vanished(Hypothesis(names=self.names, fit=self.fit)))
 
     @cached_property
     def leaves_noise(self) -> bool:

@@ -25,7 +25,7 @@ from autotune.diagnosis.fitting.parameters import parametrise
 from autotune.diagnosis.fitting.restarts import realigned
 from autotune.diagnosis.selection.bench import LAST_STEPS, STEPS, Bench, at_once, residual_sd
 from autotune.diagnosis.selection.hypothesis import hypothesis, is_stand_in
-from autotune.diagnosis.selection.judged import leading, ranked, simplest
+from autotune.diagnosis.selection.judged import leading, ranked
 from autotune.diagnosis.selection.judged_chain import Found, JudgedChain
 from autotune.diagnosis.selection.prediction import distinct, extended, predictions, signal_sizes, starting_effects
 from autotune.diagnosis.selection.probability import RARE
@@ -102,7 +102,7 @@ def search(
         bench = replace(bench, lasting=tuple(_lasting(retuned, bench)))
         bench, found = _grown(retuned, beam, bench, progress, limits)
         found = _regrown(_finished(_pruned([*found, *_begun(begun, bench)], bench), bench), bench)
-        chosen = bench.with_both_scales(simplest(found, limits.material))
+        chosen = bench.with_both_scales(ranked(found)[0])
         retuned = chosen if not chosen.names else ranked([one for one in found if not one.names])[0]
         nominal, retuned, chosen = (one.spread_out() for one in (nominal, retuned, chosen))
         return Found(nominal=nominal, retuned=retuned, judged=tuple(found), best=chosen, chosen=chosen)
@@ -294,20 +294,17 @@ def _pruned(found: Sequence[JudgedChain], bench: Bench) -> list[JudgedChain]:
     """
     result, done = list(found), set()
     for _ in range(bench.limits.rig_effects):
-        first = leading(result, bench.limits.rig_pruned)
-        fresh = [j for j in (*first, simplest(result, bench.limits.material)) if id(j) not in done]
+        fresh = [j for j in leading(result, bench.limits.rig_pruned) if id(j) not in done]
         if not fresh:
             break
-        once = list({id(j): j for j in fresh}.values())
-        done |= {id(j) for j in once}
-        result += [j for group in at_once(lambda j: _smaller(j, bench), once) for j in group]
+        done |= {id(j) for j in fresh}
+        result += [j for group in at_once(lambda j: _smaller(j, bench), fresh) for j in group]
     return result
 
 
 def _finished(found: Sequence[JudgedChain], bench: Bench) -> list[JudgedChain]:
     """Return hypotheses and, beside them, the leading ones fitted to the end: the search leaves them before."""
     first = leading(found, bench.limits.rig_pruned)
-    first += [j for j in [simplest(found, bench.limits.material)] if j not in first]
     return [*found, *(j for j in bench.pool.map(bench.finished, first) if j is not None)]
 
 
@@ -316,7 +313,7 @@ def _regrown(found: Sequence[JudgedChain], bench: Bench) -> list[JudgedChain]:
 
     Fits under dry friction end in local minima: what is larger is compared with what is smaller from the same place.
     """
-    best = simplest(found, bench.limits.material)
+    best = ranked(found)[0]
     larger = [j for j in ranked(found) if set(j.names) > set(best.names) and len(j.names) == len(best.names) + 1]
     once = {frozenset(j.names): j for j in reversed(larger)}
     chosen = sorted(once.values(), key=larger.index)[: bench.limits.rig_pruned]

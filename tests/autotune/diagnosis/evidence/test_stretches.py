@@ -7,7 +7,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from autotune.diagnosis.evidence.stretches import advantage, correlation_rows, held_out_squares, stretches_of
+from autotune.diagnosis.evidence.stretches import correlation_rows, held_out_squares, reduction, stretches_of
 from autotune.diagnosis.fitting.fit import fit
 from autotune.diagnosis.fitting.long_windows import cut
 from autotune.diagnosis.fitting.parameters import parametrise
@@ -20,27 +20,30 @@ SQUARES = st.lists(st.floats(0.01, 100.0), min_size=8, max_size=8).map(np.array)
 
 @given(SQUARES, SQUARES)
 def test_what_speaks_for_one_model_speaks_as_much_against_the_other(a, b):
-    assert advantage(a, b) == pytest.approx(-advantage(b, a))
+    assert reduction(a, b) == pytest.approx(-reduction(b, a))
 
 
 @given(SQUARES, st.floats(1e-3, 1e3))
 @example(np.array([18.0, 36.0, 36.0, 72.0, 0.5, 0.25, 0.25, 0.125]), 61.0)  # logarithms whose mean is 0
 def test_the_unit_of_the_reading_does_not_matter(a, unit):
     b = a[::-1] * 0.7
-    assert advantage(a * unit, b * unit) == pytest.approx(advantage(a, b), rel=1e-9, abs=1e-9)
+    assert reduction(a * unit, b * unit) == pytest.approx(reduction(a, b), rel=1e-9, abs=1e-9)
 
 
-def test_a_model_that_is_better_on_every_stretch_is_surer_than_one_that_is_better_on_one():
-    base = np.ones(8)
-    everywhere, once = 0.7 * base, np.array([0.01, *np.ones(7)])
-    assert advantage(base, everywhere) > 4.0 * advantage(base, once) > 0.0
+def test_an_error_that_is_smaller_everywhere_is_told_by_its_size():
+    assert reduction(np.ones(8), np.full(8, 0.49)) == pytest.approx(-np.log(0.49))
+
+
+def test_a_model_that_is_better_on_one_stretch_alone_gains_what_that_is_of_all():
+    once = np.array([0.01, *np.ones(7)])
+    assert 0.0 < reduction(np.ones(8), once) < 0.15
 
 
 def test_a_run_away_on_one_stretch_counts_no_more_than_far_off():
     base = np.ones(8)
     far, farther = base.copy(), base.copy()
     far[3], farther[3] = 1e6, np.inf
-    assert advantage(far, base) == pytest.approx(advantage(farther, base))
+    assert reduction(far, base) == pytest.approx(reduction(farther, base))
 
 
 def test_slow_errors_count_as_few_rows_and_white_ones_as_many():

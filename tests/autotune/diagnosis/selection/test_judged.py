@@ -1,0 +1,77 @@
+"""How hypotheses are compared that stretches have judged, and which one is taken for all that is likely."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from autotune.diagnosis.evidence.stretches import STRETCHES
+from autotune.diagnosis.selection.judged import Judged, of_likely, probabilities, ranked
+from autotune.diagnosis.selection.probability import probability_of
+from autotune.diagnosis.thresholds import IN_USE, Thresholds
+
+GRAVITY, DRY, CURVED, DROPPING = (
+    "plant.sine_torque", "plant.coulomb_friction", "actuator.nonlinear_gain", "plant.stribeck_friction",
+)  # fmt: skip
+#: Errors on eight stretches, about 1.
+ERRORS = np.array([0.9, 1.1, 1.0, 0.95, 1.05, 1.02, 0.98, 1.0])
+SIZES = st.floats(0.4, 3.5)
+
+
+class Astray(Judged):
+    """A hypothesis of a rig whose model errs by more than noise: stretches judge it."""
+
+    leaves_noise = False
+    limits: Thresholds = IN_USE
+    variance, rows, numbers = math.nan, 0, 0
+
+    @property
+    def identity(self) -> frozenset[object]:
+        """What tells hypotheses apart."""
+        return frozenset(self.names)
+
+
+def hypothesis_of(names: tuple[str, ...], size: float, log_odds: float = 0.0, short: float | None = None) -> Astray:
+    near = size if short is None else short
+    return Astray(
+        names=names, long_squares=np.square(size * ERRORS), short_squares=np.square(near * ERRORS), log_odds=log_odds
+    )
+
+
+@given(SIZES, SIZES, SIZES, SIZES)
+def test_stretches_count_as_rows_do(a: float, b: float, c: float, d: float) -> None:
+    """K stretches say K ln(S1/S2), cooled; two scales count as their mean, and both ways alike."""
+    one, other = hypothesis_of((), a, short=c), hypothesis_of((DRY,), b, short=d)
+    expected = STRETCHES * (math.log(a / b) + math.log(c / d)) / IN_USE.temperature
+    assert one.behind(other) == pytest.approx(expected, abs=1e-9)
+    assert other.behind(one) == pytest.approx(-expected, abs=1e-9)
+
+
+@given(st.lists(st.tuples(SIZES, st.floats(-5.0, 5.0)), min_size=3, max_size=3))
+def test_what_beats_one_that_beats_another_beats_that(three: list[tuple[float, float]]) -> None:
+    first, second, third = (hypothesis_of((), size, log_odds) for size, log_odds in three)
+    assert first.behind(second) + second.behind(third) == pytest.approx(first.behind(third), abs=1e-9)
+
+
+def test_what_is_rare_needs_more_evidence_than_what_is_usual() -> None:
+    rare = hypothesis_of((CURVED,), 0.66, math.log(0.01))
+    usual = hypothesis_of((DRY,), 0.7, math.log(0.5))
+    assert ranked([hypothesis_of((), 1.0), rare, usual])[0] is usual
+
+
+def test_what_is_likely_is_taken_together_where_that_was_fitted() -> None:
+    """Friction is in every good hypothesis, what bends beside it is another thing in each: friction alone is taken."""
+    plain, alone = hypothesis_of((), 3.0), hypothesis_of((DRY,), 1.0)
+    others = [hypothesis_of((DRY, name), 0.97) for name in (CURVED, GRAVITY)]
+    found = [plain, alone, *others]
+    assert ranked(found)[0] in others
+    candidates = probabilities(found, ranked(found)[0], 0.03)
+    said = {name: probability_of(name, candidates) for name in (DRY, CURVED, GRAVITY)}
+    assert said[DRY] > 0.9 > 0.5 > max(said[CURVED], said[GRAVITY])
+    assert of_likely(found, {DRY}) is alone
+    assert of_likely(found, {DRY, GRAVITY}) is others[1]
+    assert of_likely(found, {DROPPING}) is plain
