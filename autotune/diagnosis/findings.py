@@ -181,7 +181,7 @@ def sentences_of(
         case "effect":
             names = " and ".join(f"{e.name} (probability {e.probability:.2f})" for e in effects)
             clean = residual.is_noise or q.comes_down_to_noise
-            rest = "" if clean else " What is left is not noise: something smaller is missing as well."
+            rest = "" if clean else " What is left is not noise: something else is missing as well."
             first = f"Physics was left out: {names}.{beside(effects, evidence)}{rest}"
         case _ if not evidence.follows:
             first = (

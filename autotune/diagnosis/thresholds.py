@@ -99,7 +99,6 @@ class Thresholds:
     ringing: float = known(0.05, "damping", "below which long windows are some periods", "convention")
     ringing_periods: float = known(8.0, "periods", "length of long windows of a plant that rings", "convention")
     swinging: float = known(0.5, "damping", "below which a fit goes from short to long windows", "convention")
-    varies_more: float = known(3.0, "of the gained", "of a rig's effects, from which on what varies beside them is what is missing; real rigs leave up to 1.3", "real rigs")
     rig_rows: int = known(9000, "rows", "fitted at most", "cost")
     foretold: float = known(2.0, "times the fitted rows'", "error of rows that were left out, up to which what leaves noise is taken for true: start states cost up to half as much again", "counted")
     material: float = known(0.1, "of the held-out error", "that one more effect takes away where the search goes on", "cost")

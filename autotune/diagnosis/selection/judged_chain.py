@@ -162,20 +162,18 @@ class Found:
         )
 
     def varies_more(self, limits: Thresholds) -> bool:
-        """Whether what varies beside the chosen effects explains more than it may where they are what is missing.
+        """Whether what varies beside chosen effects that leave noise explains more than it may where they are true.
 
-        What leaves noise leaves nothing that varies but for a share of what was gained, which simulations are wrong by;
-        where the model's error decides, three times as much is left beside what is true.
+        It may be a share of what was gained, which simulations are wrong by. Where the model's error decides, much
+        varies beside what is true as well, and says nothing.
         """
         chosen, before = self.chosen, rms(self.retuned.fit.residuals, self.retuned.data.good)
-        if not chosen.names:
+        if not chosen.names or not chosen.leaves_noise:
             return False
         share = before**2 / rms(chosen.fit.residuals, chosen.data.good) ** 2 - 1.0
         gained = max(share, 0.0) * sum(int(g.sum()) for g in chosen.data.good)
-        if chosen.leaves_noise:
-            left = largest_variation(chosen.fit, under_noise(chosen.fit, chosen.data)).gain
-            return left > max(limits.inconstant, limits.inconstant_share * gained)
-        return largest_variation(chosen.fit, chosen.data).gain > limits.varies_more * gained
+        left = largest_variation(chosen.fit, under_noise(chosen.fit, chosen.data)).gain
+        return left > max(limits.inconstant, limits.inconstant_share * gained)
 
     def keeps_nominal(self, share: float) -> bool:
         """Whether the nominal numbers predict about as well as those retuned, so that they stand."""

@@ -40,4 +40,4 @@ def test_a_table_passed_in_decides_and_the_one_in_use_stays() -> None:
     closed = replace(IN_USE, inconstant=-1.0, inconstant_share=-1.0)
     assert diagnose(servo_model(), recordings, without=rest, thresholds=closed).verdict == "unexplained"
     with pytest.raises(FrozenInstanceError):
-        IN_USE.varies_more = 1.0  # type: ignore[misc]
+        IN_USE.material = 1.0  # type: ignore[misc]
