@@ -153,12 +153,20 @@ class Found:
         return probabilities(self.judged, self.best, unknown_odds)
 
     def quality(self, noise_floor: float) -> FitQuality:
-        """Return errors of free runs through stretches that were left out."""
+        """Return errors of free runs through stretches that were left out, beside the noise.
+
+        Parameters
+        ----------
+        noise_floor : float
+            What the retuned model's residual shows from row to row, as a share of the spread of y: a missing sign looks
+            like noise there. What the chosen hypothesis leaves counts where it is less.
+        """
+        shown = under_noise(self.chosen.fit, self.chosen.data).noise.total_sd / spread_of(self.chosen.data)
         return FitQuality(
             nominal=self.nominal.error,
             retuned=self.retuned.error,
             extended=self.chosen.error,
-            noise_floor=noise_floor,
+            noise_floor=min(noise_floor, shown),
         )
 
     def varies_more(self, limits: Thresholds) -> bool:

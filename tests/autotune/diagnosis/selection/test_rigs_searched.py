@@ -184,3 +184,19 @@ def test_what_predicted_best_on_more_rows_is_judged_on_fewer_though_their_own_se
     found = search(model, [part], good(part), left_out=whole.names, begun=whole)
     assert found.chosen.names == whole.names
     assert found.chosen.log_odds == whole.log_odds
+
+
+def test_a_sign_that_is_missing_is_no_noise():
+    """A retuned model without it misses by whole swings from row to row; noise is what is left with it."""
+    rng, t, sd = np.random.default_rng(3), 0.02 * np.arange(1500), 0.02
+    u = np.repeat(rng.normal(size=150), 10)
+    y, state = np.empty(t.size), 0.0
+    for k in range(t.size):
+        y[k] = abs(state)
+        state = u[k] + (state - u[k]) * math.exp(-0.02 / 0.08)
+    recording = Recording(t=t, u=u, y=y + sd * rng.normal(size=t.size))
+    block = Block(name="drive", place="plant", dynamics=TransferFunction(num=(1.0,), den=(0.08, 1.0)), output="speed")
+    model = Model(name="drive", input=Port(), output=Port(), blocks=(block,))
+    told = diagnose(model, [recording], without=[k.name for k in ALL if k.name != "sensor.absolute_value"])
+    assert [e.name for e in told.effects] == ["sensor.absolute_value"]
+    assert told.fit.noise_floor == pytest.approx(sd / np.std(recording.y), rel=0.1)
