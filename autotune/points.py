@@ -19,6 +19,8 @@ MOST_POINTS = 200_000
 #: Range of frequencies [rad/s] and gains, far beyond every unit and far from where arithmetic overflows.
 SMALLEST, LARGEST = 1e-30, 1e30
 LARGEST_PHASE_DEG = 1e6
+#: Relative precision of arithmetic, and relative distance within which two frequencies are one.
+_PRECISION, _SAME = 1e-15, 1e-3
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -130,6 +132,40 @@ def points_from_json(entries: Sequence[Any], where: str) -> tuple[FrequencyPoint
         An entry without frequency, gain, phase or covariance; names the entry.
     """
     return tuple(_point(entry, f"{where} points[{i}]") for i, entry in enumerate(entries))
+
+
+def require_regions(points: Sequence[FrequencyPoint], where: str) -> None:
+    """Refuse points that no design can rest on: without uncertainty, or at one frequency.
+
+    Parameters
+    ----------
+    points : sequence of FrequencyPoint
+        What a design is asked on.
+    where : str
+        Their file, for messages.
+
+    Raises
+    ------
+    InputError
+        A covariance that is zero to the precision of its numbers, or fewer than three frequencies.
+    """
+    for i, point in enumerate(points):
+        if point.covariance[0][0] + point.covariance[1][1] <= (_PRECISION * point.gain) ** 2:
+            raise InputError(
+                f"cov is zero (omega_rad_s = {point.omega_rad_s:g}): margins are kept on a region",
+                where=f"{where} points[{i}]",
+                remedy="give the covariance of (re, im), or design on a model of the known plant",
+            )
+    frequencies = np.sort([point.omega_rad_s for point in points])
+    different = 1 + int(np.sum(np.diff(frequencies) > _SAME * frequencies[:-1])) if frequencies.size else 0
+    if different < 3:
+        raise InputError(
+            f"{len(points)} points at {different} frequencies"
+            if different != 1
+            else f"{len(points)} points at 1 frequency",
+            where=where,
+            remedy="measure at least three frequencies, around the phase of -135 degrees",
+        )
 
 
 def _point(entry: Any, where: str) -> FrequencyPoint:

@@ -31,6 +31,8 @@ LARGEST = 1e15
 _MOST_NEW_ROWS = 100_000
 #: Times its rows that a recording's time may hold where it is simulated from end to end.
 _MOST_GAPS = 100
+#: Sample times after each other that a slow link may turn into one step, as a rule.
+_LATEST = 5.0
 _REQUIRED = ("t", "u", "y")
 
 
@@ -270,7 +272,8 @@ def read_recording(path: str | os.PathLike[str]) -> Recording:
     Raises
     ------
     InputError
-        No such file, no ``t,u,y`` header, or a cell that is not a number; names the line.
+        No such file, no ``t,u,y`` header, a cell that is not a number (names the line), or a sidecar that is none or
+        states a sample time that the rows contradict.
     """
     path = checked_path(path)
     try:
@@ -294,7 +297,24 @@ def read_recording(path: str | os.PathLike[str]) -> Recording:
     values = _parse(lines, header_at, len(header), path)
     columns = {name: np.ascontiguousarray(values[:, i]) for i, name in enumerate(header)}
     t, u, y = (columns.pop(name) for name in _REQUIRED)
-    return Recording(t=t, u=u, y=y, extra=MappingProxyType(columns), metadata=read_sidecar(path), name=str(path))
+    metadata = read_sidecar(path)
+    recording = Recording(t=t, u=u, y=y, extra=MappingProxyType(columns), metadata=metadata, name=str(path))
+    _require_own_steps(recording, path)
+    return recording
+
+
+def _require_own_steps(recording: Recording, path: Path) -> None:
+    """Refuse a sidecar whose sample time the rows contradict: rows may be late, and never come early."""
+    stated = recording.metadata.get("sample_time_s", recording.sample_time_s)
+    where = str(path.with_suffix(".toml"))
+    if isinstance(stated, bool) or not isinstance(stated, int | float):
+        raise InputError(f"sample_time_s = {stated!r}", where=where, remedy="write a number of seconds")
+    if not 0.9 * stated <= recording.sample_time_s <= _LATEST * stated:
+        raise InputError(
+            f"sample_time_s = {stated:g}, and the rows of {path.name} are {recording.sample_time_s:g} s apart",
+            where=where,
+            remedy="correct or delete the line",
+        )
 
 
 def _parse(lines: Sequence[str], header_at: int, width: int, path: Path) -> FloatArray:
@@ -368,6 +388,11 @@ def read_sidecar(path: Path) -> Mapping[str, Any]:
     if content.get("hold", "zero") not in ("zero", "linear"):
         raise InputError(
             f"hold = {content['hold']!r}", where=str(sidecar), remedy='write hold = "zero" or hold = "linear"'
+        )
+    units = content.get("units", {})
+    if not isinstance(units, dict) or not all(isinstance(unit, str) for unit in units.values()):
+        raise InputError(
+            "[units] holds what is no text", where=str(sidecar), remedy='write the unit of each column, as in u = "V"'
         )
     return MappingProxyType(content)
 

@@ -17,8 +17,11 @@ def diagnosed(model: Any, recordings: Sequence[Recording], controller: Controlle
     """Return the diagnosis of recordings."""
     from autotune.diagnosis import diagnose
     from autotune.diagnosis.equations import diagnose_equations
+    from autotune.equations.recorded_units import require_units_of_each_other, require_units_of_model
 
     given = _model(model)
+    require_units_of_model(given, recordings)
+    require_units_of_each_other(recordings)
     if isinstance(given, Model):
         return diagnose(given, recordings, controller, **settings)
     return diagnose_equations(given, recordings, controller=controller, **settings)
@@ -28,8 +31,10 @@ def simulated(model: Any, recording: Recording, horizon_s: float | None) -> Floa
     """Return y simulated with a recording's u, of a chain, of equations or of an FMU."""
     from autotune.diagnosis import forecast
     from autotune.equations.files import forecast_any
+    from autotune.equations.recorded_units import require_units_of_model
 
     given = _model(model)
+    require_units_of_model(given, [recording])
     if isinstance(given, Model):
         return forecast(given, recording, horizon_s)
     return forecast_any(given, recording, horizon_s)

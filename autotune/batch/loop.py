@@ -21,6 +21,7 @@ from autotune.design.margins import Margins, margins
 from autotune.design.noise import LoopFacts
 from autotune.diagnosis.diagnose import diagnose
 from autotune.diagnosis.result import Diagnosis
+from autotune.equations.recorded_units import require_units_of_model
 from autotune.errors import AutotuneError, IdentificationError
 from autotune.experiment_design.next_experiment import with_next_experiment
 from autotune.identification.closed_loop.identify import identify_closed_loop
@@ -228,7 +229,11 @@ def _finding(work: Work, row: Row) -> Finding:
         notes="; ".join(record.notes),
     )
     if settings.task == "diagnose":
-        found = with_next_experiment(diagnose(read_model(loop.model), record.pieces, present))
+        model = read_model(loop.model)
+        require_units_of_model(
+            model, [replace(piece, metadata={"units": _units(loop, piece)}) for piece in record.pieces]
+        )
+        found = with_next_experiment(diagnose(model, record.pieces, present))
         return Finding(row=_diagnosed(row, found), result=found.as_json())
     if settings.task == "design" and settings.method == "frequency":
         measured = measured_of(record.pieces)
@@ -246,6 +251,13 @@ def _finding(work: Work, row: Row) -> Finding:
     return Finding(
         row=_designed(row, analysis, present, settings), points=points_to_json(points), result=analysis_json(analysis)
     )
+
+
+def _units(loop: LoopSettings, piece: Recording) -> dict[str, str]:
+    """Return the units that a loop states; those of its file where it states none and scales nothing."""
+    of_file = piece.metadata.get("units", {})
+    stated = {"u": (loop.u_unit, loop.u_scale), "y": (loop.y_unit, loop.y_scale)}
+    return {name: unit or (of_file.get(name, "") if scale == 1.0 else "") for name, (unit, scale) in stated.items()}
 
 
 def _present(loop: LoopSettings) -> Controller | None:

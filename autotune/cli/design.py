@@ -131,14 +131,16 @@ def _on_points(points: Path, asked: Callable[..., Specification], kind: Literal[
     from autotune.identification.frequency.thinning import said, thinned
     from autotune.identification.parametric import fit_plant
     from autotune.pipeline.analysis import of_use, on_measured
-    from autotune.points import read_points
+    from autotune.points import read_points, require_regions
 
     region = read_loop_region(points)
     of_loop = None if region is None else region.plant_fit()
     if of_loop is not None:
         typer.echo("designed on the joint region of the identified loop's coefficients")
         return design_on_fit(of_loop, asked(of_loop.plant), kind)
-    given = of_use(read_points(points))
+    from_file = read_points(points)
+    require_regions(from_file, str(points))
+    given = of_use(from_file)
     measured = list(thinned(given))
     for note in said(len(given), len(measured)):
         typer.echo(f"note: {note}")

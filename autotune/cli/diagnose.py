@@ -45,12 +45,14 @@ def simulate(
 
     from autotune.diagnosis.simulation.forecast import forecast
     from autotune.equations.files import forecast_any as of_any
+    from autotune.equations.recorded_units import require_units_of_model
     from autotune.model_file import read_any as read_any_model
     from autotune.models import Model
 
     place = Output(out, inputs=(recording, model), overwrite=overwrite)
     data = read_one(recording, signal_names(t, u, y, r), moving=False)
     nominal = read_any_model(model)
+    require_units_of_model(nominal, [data])
     y_sim = forecast(nominal, data, horizon) if isinstance(nominal, Model) else of_any(nominal, data, horizon)
     if not np.all(np.isfinite(y_sim)):
         at = float(data.t[int(np.argmax(~np.isfinite(y_sim)))])
@@ -132,6 +134,7 @@ def diagnose(
     from autotune.controller import read_controller
     from autotune.diagnosis.diagnose import diagnose as find
     from autotune.effects import kind_of
+    from autotune.equations.recorded_units import require_units_of_model
     from autotune.experiment_design.next_experiment import with_next_experiment
     from autotune.model_file import read_any as read_any_model
     from autotune.models import Model, write_model
@@ -141,6 +144,7 @@ def diagnose(
     place = OutputFolder(out, files, inputs=(model, controller, *recordings), overwrite=overwrite)
     nominal = read_any_model(model)
     data = read_all(recordings, signal_names(t, u, y, r))
+    require_units_of_model(nominal, data)
     if not isinstance(nominal, Model):
         _diagnose_equations(nominal, data, controller, without or (), place, out, model)
         return

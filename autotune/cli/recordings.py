@@ -32,9 +32,12 @@ def signal_names(t: str | None, u: str | None, y: str | None, r: str | None) -> 
 
 def read_all(paths: Iterable[Path], names: SignalNames) -> list[Recording]:
     """Return the recordings of all files, each uninterrupted stretch one, and say how the files were read."""
+    from autotune.equations.recorded_units import require_units_of_each_other
     from autotune.recording import usable
 
-    return [usable(recording) for path in paths for recording in _read(path, names).recordings]
+    recordings = [usable(recording) for path in paths for recording in _read(path, names).recordings]
+    require_units_of_each_other(recordings)
+    return recordings
 
 
 def read_one(path: Path, names: SignalNames, *, moving: bool = True) -> Recording:

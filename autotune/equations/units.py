@@ -75,6 +75,11 @@ def _registry() -> Any:
     return pint.UnitRegistry()
 
 
+def understood(text: str) -> Unit | None:
+    """Return what a unit's text means; None where it is not known."""
+    return _parsed(text.strip())
+
+
 def check_units(model: EquationModel) -> None:
     """Refuse a model whose units contradict each other.
 

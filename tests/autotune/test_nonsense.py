@@ -10,10 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import autotune as at
 from autotune.batch.campaign import REPORT, RESULTS, Campaign
 from autotune.batch.settings import CampaignSettings
 from autotune.config import load_config
 from autotune.diagnosis import diagnose
+from autotune.equations.recorded_units import require_units_of_model
 from autotune.errors import InputError
 from autotune.files.workbook import open_table
 from autotune.models import Block, Model, Port, TransferFunction
@@ -52,13 +54,71 @@ def test_a_recording_that_is_nearly_all_gap_is_not_simulated_through_it() -> Non
 
 
 @pytest.mark.parametrize(
-    ("sidecar", "said"), [('hold = "first"', "hold = 'first'"), ('[[block]]\nname = "a"', "is a model")]
+    ("sidecar", "said"),
+    [
+        ('hold = "first"', "hold = 'first'"),
+        ('[[block]]\nname = "a"', "is a model"),
+        ("sample_time_s = 0.1", r"r\.toml: sample_time_s = 0\.1, and the rows of r\.csv are 1 s apart; correct"),
+        ("sample_time_s = 1.5", "rows of r.csv are 1 s apart"),
+        ("sample_time_s = true", "sample_time_s = True"),
+        ("[units]\nu = 5", "no text"),
+    ],
 )
 def test_a_sidecar_that_is_none_is_refused(tmp_path: Path, sidecar: str, said: str) -> None:
     (tmp_path / "r.csv").write_text("t,u,y\n0,1,2\n1,2,3\n")
     (tmp_path / "r.toml").write_text(sidecar)
     with pytest.raises(InputError, match=said):
         read_recording(tmp_path / "r.csv")
+
+
+def test_a_sample_time_that_rows_of_a_slow_link_do_not_keep_is_believed(tmp_path: Path) -> None:
+    (tmp_path / "r.csv").write_text("t,u,y\n0,1,2\n1.5,2,3\n3,2,3\n")
+    (tmp_path / "r.toml").write_text("sample_time_s = 1")
+    assert read_recording(tmp_path / "r.csv").sample_time_s == 1.5
+
+
+CHAIN = Model(
+    name="lag", input=Port(unit="V"), output=Port(unit="Pa"),
+    blocks=(Block(name="lag", place="plant", dynamics=TransferFunction(num=(1.0,), den=(9.0, 1.0))),),
+)  # fmt: skip
+
+
+def recorded_in(**units: str) -> Recording:
+    t = np.arange(5.0)
+    return Recording(t=t, u=t, y=t, metadata={"units": units}, name="r.csv")
+
+
+@pytest.mark.parametrize(
+    ("units", "said"),
+    [
+        ({"u": "mV"}, r"r\.csv: u is in mV, and in V in the model 'lag': a factor of 0\.001; convert"),
+        ({"u": "V", "y": "kPa"}, "y is in kPa, and in Pa in the model 'lag': a factor of 1000"),
+        ({"y": "degC"}, "y is in degC, and in Pa in the model 'lag': which do not convert"),
+    ],
+)
+def test_units_of_a_recording_and_of_a_model_are_compared(units: dict[str, str], said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        at.simulate(CHAIN, recorded_in(**units))
+    with pytest.raises(InputError, match=said):
+        at.diagnose(CHAIN, recorded_in(**units))
+
+
+def test_units_that_say_the_same_or_nothing_are_no_contradiction() -> None:
+    alike: list[dict[str, str]] = [{}, {"u": "", "y": "Pa"}, {"u": "volt", "y": "N/m^2"}, {"u": "scoops"}, {"x": "A"}]
+    require_units_of_model(CHAIN, [recorded_in(**units) for units in alike])
+
+
+def test_units_of_recordings_taken_together_are_compared(tmp_path: Path) -> None:
+    for name, unit in (("a", "V"), ("b", "mV")):
+        rows = "".join(f"{t},{t % 3},{t % 5}\n" for t in range(200))
+        (tmp_path / f"{name}.csv").write_text(f"t,u,y\n{rows}")
+        (tmp_path / f"{name}.toml").write_text(f'[units]\ny = "{unit}"\n')
+    line = ["identify", "frequency", "a.csv", "b.csv", "--out", "p.json"]
+    done = subprocess.run(
+        [sys.executable, "-m", "autotune", *line], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 2
+    assert "b.csv: y is in mV, and in V in a.csv: a factor of 0.001" in done.stderr
 
 
 @pytest.mark.parametrize("cell", ["XFD1048576", "A99999999999999999999"])

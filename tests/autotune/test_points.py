@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from autotune.errors import InputError
-from autotune.points import FrequencyPoint, points_to_json, read_points, responses
+from autotune.points import FrequencyPoint, points_to_json, read_points, require_regions, responses
 
 
 def test_points_read_back_in_their_fixed_form(tmp_path: Path) -> None:
@@ -53,3 +53,31 @@ def test_a_wrong_points_file_is_refused(tmp_path: Path, content: str, says: str)
     path.write_text(content)
     with pytest.raises(InputError, match=says):
         read_points(path)
+
+
+def at_frequencies(*omega: float, variance: float = 1e-4) -> list[FrequencyPoint]:
+    return [
+        FrequencyPoint(omega_rad_s=w, response=2.0 / (1.0 + 1j * w), covariance=((variance, 0.0), (0.0, variance)))
+        for w in omega
+    ]
+
+
+@pytest.mark.parametrize(
+    ("points", "says"),
+    [
+        (at_frequencies(1.0, 2.0, 4.0, variance=0.0), r"p\.json points\[0\]: cov is zero .* margins are kept"),
+        (at_frequencies(1.0, 2.0, 4.0, variance=1e-40), "cov is zero"),
+        ([*at_frequencies(1.0, 2.0, 4.0), *at_frequencies(8.0, variance=0.0)], r"points\[3\]: cov is zero"),
+        (at_frequencies(2.0, 2.0, 2.0, 2.0), r"p\.json: 4 points at 1 frequency"),
+        (at_frequencies(2.0, 2.0000001, 4.0), "3 points at 2 frequencies"),
+    ],
+)
+def test_no_design_rests_on_points_without_uncertainty_or_at_one_frequency(
+    points: list[FrequencyPoint], says: str
+) -> None:
+    with pytest.raises(InputError, match=says):
+        require_regions(points, "p.json")
+
+
+def test_points_at_three_frequencies_with_regions_are_designed_on() -> None:
+    require_regions(at_frequencies(1.0, 2.0, 2.0, 4.0), "p.json")
