@@ -16,7 +16,7 @@ from autotune.diagnosis.evidence.operating_point import unmoved
 from autotune.diagnosis.extended import extended_model
 from autotune.diagnosis.findings import OFFSET, found_effects, places_of, said_by, sentences_of
 from autotune.diagnosis.gathering import evidence_of, keeping
-from autotune.diagnosis.result import Diagnosis, FoundEffect, Verdict
+from autotune.diagnosis.result import Diagnosis, FoundEffect
 from autotune.diagnosis.safe_extension import safe_extension
 from autotune.diagnosis.simulation.chain import build_chain
 from autotune.diagnosis.simulation.forecast import forecast
@@ -30,6 +30,12 @@ from autotune.recording import Recording
 
 #: Rows that a diagnosis needs.
 LEAST_ROWS = 100
+#: What is said where the extended model is handed out without what was found: with retuned numbers, or as it was.
+WITHHELD = tuple(
+    f"extended_model.toml {has}: run freely through the whole recordings, what was found is farther off than the "
+    "nominal model, or it runs away on commands twice as large."
+    for has in ("has retuned numbers alone", "is the model as it was")
+)
 #: Share of the work that the whole recordings take; parts of them are searched among fewer effects.
 WHOLE = 0.6
 
@@ -94,7 +100,10 @@ def diagnose(
     plain = replace(found.data, thresholds=thresholds)
     description = describe(found.retuned.fit, plain) if verdict == "unexplained" else None
     places = places_of(evidence, effects, description)
-    sentences = sentences_of(verdict, effects, evidence, places)
+    wanted = extended_model(evidence, verdict, model)
+    handed_out = _handed_out(wanted, evidence, model)
+    withheld = "" if handed_out is wanted or verdict == "unexplained" else WITHHELD[handed_out is model]
+    first, *rest = sentences_of(verdict, effects, evidence, places)
     return Diagnosis(
         verdict=verdict,
         effects=effects,
@@ -102,8 +111,9 @@ def diagnose(
         places=places,
         fit=evidence.quality,
         next_experiment=None,
-        extended_model=_handed_out(evidence, verdict, model),
-        sentences=sentences,
+        extended_model=handed_out,
+        sentences=(first, withheld, *rest) if withheld else (first, *rest),
+        withheld=withheld,
         residual=evidence.residual,
         description=description,
         search=found,
@@ -132,9 +142,9 @@ def _begins(effect: FoundEffect, recordings: Sequence[Recording]) -> list[tuple[
     return [(i, start) for i, start, _ in effect.windows if start > float(recordings[i].t[0])]
 
 
-def _handed_out(evidence: Evidence, verdict: Verdict, nominal: Model) -> Model:
+def _handed_out(extended: Model, evidence: Evidence, nominal: Model) -> Model:
     """Return the model to go on with: what was found, where that is no danger; else retuned numbers, or the nominal."""
-    extended, fitted = extended_model(evidence, verdict, nominal), evidence.search.retuned.fit.model
+    fitted = evidence.search.retuned.fit.model
     if extended is nominal:
         return nominal
     # a model without what happened at a time of these recordings cannot follow them to their end

@@ -87,6 +87,8 @@ class Diagnosis:
         cause.
     search : Search
         All hypotheses, for the report.
+    withheld : str
+        Why the extended model is without what was found, where it is.
     """
 
     verdict: Verdict
@@ -100,6 +102,7 @@ class Diagnosis:
     residual: ResidualTests
     description: Description | None
     search: Search
+    withheld: str = ""
 
     def as_json(self) -> dict[str, Any]:
         """Return the content of diagnosis.json."""

@@ -102,7 +102,7 @@ def _to_do(found: Diagnosis) -> str:
     following = found.next_experiment
     if found.verdict == "unexplained" and not found.places:
         return "Put the columns, or the sign, right and diagnose again."
-    first = {
+    first = found.withheld or {
         "none": "Go on with the model as it is.",
         "parameters": "Go on with extended_model.toml, which has the new numbers.",
         "effect": "Go on with extended_model.toml, within the range below.",

@@ -73,6 +73,7 @@ def test_a_drag_left_out_is_named_with_its_coefficient() -> None:
     coefficient = found.effects[0].parameters["coefficient"]
     assert abs(coefficient.value - 0.15) < 4.0 * coefficient.sd + 0.005
     assert found.fit.extended < 1.1 * found.fit.noise_floor < found.fit.retuned
+    assert not found.withheld
 
 
 def test_intervals_of_the_retuned_gain_cover_the_truth_in_closed_loop() -> None:

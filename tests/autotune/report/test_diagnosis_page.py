@@ -12,7 +12,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from autotune.diagnosis.diagnose import diagnose
+from autotune.diagnosis.diagnose import WITHHELD, diagnose
 from autotune.diagnosis.findings import sentences_of
 from autotune.diagnosis.result import Diagnosis
 from autotune.diagnosis.verdict import Evidence
@@ -109,6 +109,15 @@ def test_an_effect_in_the_extended_model_that_is_not_named_is_said_to_be_there(t
     page = page_of(within, tmp_path)
     assert "Nothing was added" not in page
     assert "The extended model has, beyond what is named: the plant loses what it has stored (plant.leak)" in page
+
+
+def test_an_extended_model_without_what_was_found_is_not_said_to_have_it(tmp_path: Path) -> None:
+    found = servo_diagnosis(tuple(CATALOGUE))
+    assert not found.withheld
+    withheld = replace(found, extended_model=servo_model(), withheld=WITHHELD[True])
+    page = page_of(withheld, tmp_path)
+    assert "extended_model.toml is the model as it was" in page
+    assert "Go on with extended_model.toml" not in page
 
 
 def test_a_structure_is_called_right_only_where_nothing_larger_than_noise_is_left() -> None:
