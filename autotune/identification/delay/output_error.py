@@ -14,7 +14,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_toeplitz
-from scipy.signal import lfilter
 
 from autotune.arrays import BoolArray, FloatArray
 from autotune.errors import IdentificationError
@@ -25,12 +24,6 @@ from autotune.identification.delay.response import linear_part, normal_matrix, o
 
 _WHITE = np.empty(0)
 _MAX_AR = 12
-#: largest share of a residual that is taken for noise lost in the fit; a model that errs leaves slow errors of its own
-_MOST_TAKEN = 0.15
-#: times that the noise's colour is found anew
-_COLOURINGS = 6
-#: condition of the whitened sensitivities beyond which the data do not tell the parameters apart
-_WORST_CONDITION = 1e10
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -250,40 +243,7 @@ def residuals(data: DelayData, point: Point) -> FloatArray:
     )
 
 
-def _taken_by_fit(data: DelayData, structure: Structure, point: Point, whitening: FloatArray) -> FloatArray:
-    """Return the autocovariances that a fit takes out of coloured noise, lags 0 to the highest of a filter.
-
-    With the noise's covariance S and the sensitivities J the residual of the weighted fit has that of
-    S - J (J' S^-1 J)^-1 J': slow noise looks like the plant's own response and goes into it. Without what is missing
-    the noise would be taken for less slow than it is, and the intervals for narrower.
-    """
-    n, before = structure.order, 0.0 if data.before is None else data.before
-    centre = np.concatenate([point.theta, point.a, [point.h]])  # the order of structure.free
-    steps = np.where(np.arange(centre.size) < n + 2, 1.0, 1e-5 * np.maximum(np.abs(centre), 1e-3))
-
-    def simulated(values: FloatArray) -> FloatArray:
-        a, h = tuple(values[n + 2 : 2 * n + 2].tolist()), float(values[-1])
-        x = output(data.tu, data.u, before, data.linear, data.ty, a, h, values[: n + 2])
-        return np.asarray(x, dtype=np.float64)
-
-    columns = []
-    for i in np.flatnonzero(structure.free):
-        move = steps[i] * np.eye(centre.size)[i]
-        columns.append((simulated(centre + move) - simulated(centre - move)) / (2.0 * steps[i]))
-    J = np.column_stack(columns)
-    size = np.linalg.norm(J, axis=0)
-    if not np.all(np.isfinite(J)) or not np.all(size > 0.0):
-        return np.zeros(_MAX_AR + 1)
-    J /= size
-    white = lfilter(np.concatenate([[1.0], whitening]), [1.0], J, axis=0)[whitening.size :]
-    R = np.linalg.qr(white)[1]
-    if np.linalg.cond(R) > _WORST_CONDITION:
-        return np.zeros(_MAX_AR + 1)
-    M = np.linalg.solve(R.T, J.T) * np.sqrt(point.cost / (point.rows - structure.parameters))
-    return np.asarray(sum(autocovariances(row, _MAX_AR) for row in M))
-
-
-def whitening_filter(residual: FloatArray, max_order: int = _MAX_AR, taken: FloatArray | None = None) -> FloatArray:
+def whitening_filter(residual: FloatArray, max_order: int = _MAX_AR) -> FloatArray:
     """Return the autoregressive filter that makes the residual white, its order by the Bayes information criterion.
 
     Parameters
@@ -292,8 +252,6 @@ def whitening_filter(residual: FloatArray, max_order: int = _MAX_AR, taken: Floa
         Residual, row by row.
     max_order : int
         Largest order tried.
-    taken : (max_order + 1,) array, optional
-        Autocovariances that a fit took out of the noise before it became this residual.
 
     Returns
     -------
@@ -307,8 +265,6 @@ def whitening_filter(residual: FloatArray, max_order: int = _MAX_AR, taken: Floa
     N = residual.size
     max_order = min(max_order, N // 20)
     r = autocovariances(residual, max_order)
-    if taken is not None:
-        r = r + taken[: max_order + 1] * min(1.0, _MOST_TAKEN * r[0] / max(float(taken[0]), 1e-300))
     best, filter_best = N * np.log(r[0]), _WHITE
     for order in range(1, max_order + 1):
         c = -solve_toeplitz(r[:order], r[1 : order + 1])
@@ -354,10 +310,9 @@ def polish(
         data, structure, solve_linear(data, structure, start.a, start.h), max_delay_s=max_delay_s, iterations=50
     )
     whitening = _WHITE
-    for _ in range(_COLOURINGS if coloured else 0):
+    for _ in range(3 if coloured else 0):
         before = whitening
-        taken = _taken_by_fit(data, structure, point, whitening) if whitening.size else None
-        whitening = whitening_filter(residuals(data, point), taken=taken)
+        whitening = whitening_filter(residuals(data, point))
         if whitening.size == 0 and before.size == 0:
             break
         settled = whitening.size == before.size and np.max(np.abs(whitening - before)) < 1e-3

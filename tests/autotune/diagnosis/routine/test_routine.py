@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
@@ -142,6 +142,7 @@ def test_readings_that_are_missing_do_not_change_the_verdict():
 
 @settings(deadline=None, max_examples=15)
 @given(seed=st.integers(0, 2**32 - 1), period=st.floats(12.0, 40.0))
+@example(seed=118, period=32.0)  # the largest swings 11 % off the band's middle
 def test_a_sine_keeps_its_phase_and_ringing_noise_loses_it(seed, period):
     random = np.random.default_rng(seed)
     n = 2000
@@ -156,7 +157,8 @@ def test_a_sine_keeps_its_phase_and_ringing_noise_loses_it(seed, period):
         record = Recording(t=np.arange(n, dtype=float), u=np.roll(y, 3), y=y)
         share, periods = phase_kept(operation_of([record], LIMITS))
         assert (share > LIMITS.least_phase) == lasts
-        assert periods == pytest.approx(n / period, rel=0.1)
+        # noise that rings has a band of frequencies, and its largest swings may lie anywhere in it
+        assert periods == pytest.approx(n / period, rel=0.02 if lasts else 0.3)
 
 
 def test_a_sine_is_regular_and_white_noise_is_not():
