@@ -85,6 +85,43 @@ def is_fed_back(recording: Recording) -> bool:
     return abs(dependence(recording.u, recording.y).same_row) > _SAME_ROW
 
 
+def require_order(recordings: Sequence[Recording]) -> None:
+    """Refuse recordings whose u answers y, within no row as a controller does, while y does not answer u.
+
+    Parameters
+    ----------
+    recordings : sequence of Recording
+        Of one loop, at least one.
+
+    Raises
+    ------
+    IdentificationError
+        u and y seem swapped.
+
+    Notes
+    -----
+    Weaker than :func:`require_answer`: a loop that nothing but its own noise drives passes.
+    """
+    moving = [recording for recording in recordings if not _is_constant(_bridged(recording.u))]
+    found = [recorded_dependence(recording) for recording in moving]
+    answers = any(one.answers for one in found) or any(map(_answers_a_test, moving, found))
+    if found and not answers and _seem_swapped(found):
+        raise _swapped(recordings)
+
+
+def _seem_swapped(found: Sequence[Dependence]) -> bool:
+    in_row = max(abs(one.same_row) for one in found) > _SAME_ROW
+    return min(one.backward for one in found) * len(found) < CHANCE and not in_row
+
+
+def _swapped(recordings: Sequence[Recording]) -> IdentificationError:
+    return IdentificationError(
+        "u and y seem swapped: u answers y, and y does not answer u",
+        where=", ".join(recording.name for recording in recordings),
+        remedy="name the columns the other way round with --u and --y",
+    )
+
+
 def require_answer(recordings: Sequence[Recording]) -> None:
     """Refuse recordings in which y has nothing to do with u, and those whose columns say something else.
 
@@ -113,12 +150,8 @@ def require_answer(recordings: Sequence[Recording]) -> None:
         return
     where = ", ".join(recording.name for recording in recordings)
     in_row = max(abs(one.same_row) for one in found) > _SAME_ROW
-    if min(one.backward for one in found) * len(found) < CHANCE and not in_row:
-        raise IdentificationError(
-            "u and y seem swapped: u answers y, and y does not answer u",
-            where=where,
-            remedy="name the columns the other way round with --u and --y",
-        )
+    if _seem_swapped(found):
+        raise _swapped(recordings)
     if in_row:
         raise IdentificationError(
             "u does nothing but follow y, as a controller does that nobody disturbs: this says nothing of the plant, "

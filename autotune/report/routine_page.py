@@ -114,7 +114,7 @@ def _comparison(found: RoutineDiagnosis) -> Section:
     facts = [
         ("ln of squared error, by the command over by the best faulty valve", f"{valves.decrease:+.2f}"),
         ("chance of as much in the same loop with a linear valve", f"{valves.chance:.2g}"),
-        ("reversals of the command", f"{valves.reversals}"),
+        ("reversals of the best faulty valve", f"{valves.reversals}"),
         ("band S over u's range", f"{valves.valve.S / valves.span:.2f}"),
         ("slip jump J over S", f"{valves.valve.J / max(valves.valve.S, 1e-300):.2f}"),
         ("period of the dominant oscillation [s]", f"{seen.period_s:.4g}"),

@@ -22,6 +22,7 @@ from autotune.diagnosis.routine.oscillation import (
 from autotune.diagnosis.routine.result import Oscillation, RoutineDiagnosis, Verdict
 from autotune.diagnosis.routine.thresholds import RoutineThresholds
 from autotune.diagnosis.routine.valves import ValveComparison, compare_valves
+from autotune.identification.dependence import require_order
 from autotune.recording import Recording
 
 
@@ -52,6 +53,8 @@ def diagnose_routine(
     ------
     InputError
         Too few rows, a command that does not move or has gaps, recordings of different sample times.
+    IdentificationError
+        u and y seem swapped.
 
     Notes
     -----
@@ -59,6 +62,7 @@ def diagnose_routine(
     """
     limits = thresholds or RoutineThresholds()
     operation = operation_of(recordings, limits)
+    require_order(recordings)
     valves = compare_valves(operation, limits, lambda share: progress("valves", 0.8 * share))
     progress("oscillation", 0.8)
     answer, seen = setpoint_answer(operation, limits.badly_damped), _oscillation(operation)

@@ -59,7 +59,7 @@ def _compared(found: RoutineDiagnosis) -> str:
     less = "less" if valves.decrease >= 0.0 else "more"
     return (
         f"The position of the best faulty valve predicts y with {change:.0%} {less} squared"
-        f" error than the command does, over {valves.reversals} reversals of the command; by chance it gains as much"
+        f" error than the command does, over {valves.reversals} reversals of that valve; by chance it gains as much"
         f" with a probability of {valves.chance:.2g}."
     )
 
@@ -83,7 +83,7 @@ def _reasons(found: RoutineDiagnosis, limits: RoutineThresholds) -> tuple[str, .
         else:
             reasons.append("its phase does not last")
         if valves.reversals < limits.least_reversals:
-            reasons.append(f"{valves.reversals} reversals of the command are too few to see a valve by")
+            reasons.append(f"{valves.reversals} reversals of the best faulty valve are too few to see it by")
         elif valves.decrease > 0.0:
             reasons.append("a faulty valve is better than a linear one, but not clearly, or its band may be narrow")
         return (f"Why not: {'; '.join(reasons)}.",)

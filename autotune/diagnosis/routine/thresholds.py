@@ -30,7 +30,7 @@ class RoutineThresholds:
     chance: float = known(0.005, "probability", "that the best faulty valve gains as much in the same loop with a linear one", "chance")
     least_decrease: float = known(0.2, "ln of squared error", "that predictions by the valve's position must bring: 18 % less", "counted")
     kinds_apart: float = known(0.05, "of the resamplings", "up to which the other kind of fault may win before sticking and play are told apart", "convention")
-    least_reversals: int = known(6, "reversals", "of the command by more than the least band, before a valve's fault is named", "convention")
+    least_reversals: int = known(6, "reversals", "of the best faulty valve, before its fault is named: what has not turned has shown nothing of its band", "convention")
     least_band: float = known(0.1, "of u's range", "the narrowest band of a valve that is looked for; narrower ones act as dead time", "counted")
     unlikely: float = known(0.05, "probability", "of chance from which on a faulty valve is no better than a linear one, before an oscillation is said to come from outside", "convention")
     resamplings: int = known(399, "resamplings", "of the linear loop's errors, for the chance, and of the half cycles, for the band's interval", "cost")

@@ -68,7 +68,7 @@ class ValveComparison:
     chance : float
         Probability that the best of all valves gains as much in the same loop with a linear one.
     reversals : int
-        Turns of the command by more than the least band.
+        Turns of the best valve's position: what has not turned has shown nothing of its band.
     valve : Valve
         The best one.
     band, jump : Interval
@@ -179,13 +179,20 @@ def compare_valves(
     by_chance = _log_ratio(total - by_command, total - gained, total)
     half_cycle = half_cycles(_means(operation, past.every, operation.u), limits.least_band * span)
     drawn = _resampled(squared, half_cycle[past.rows], valves, limits.resamplings, random)
+    position = position_of(operation, valves[best])
     return ValveComparison(
         decrease=decrease, chance=float((1 + np.sum(by_chance >= decrease)) / (1 + by_chance.size)),
-        reversals=int(half_cycle[-1]), valve=valves[best], band=_interval(valves[best].S, drawn[:, 0], span),
+        reversals=_turns(position, operation), valve=valves[best], band=_interval(valves[best].S, drawn[:, 0], span),
         jump=_interval(valves[best].J, drawn[:, 1], span), sticks=float(np.mean(drawn[:, 1] > 0.0)), span=span,
         t=(past.rows * past.every).astype(np.float64) * operation.dt_s, linear=linear, faulty=errors[best],
-        position=position_of(operation, valves[best]),
+        position=position,
     )  # fmt: skip
+
+
+def _turns(position: FloatArray, operation: Operation) -> int:
+    """Return how often a position changes its direction, rest between two moves aside."""
+    moves = (np.diff(position[operation.rows_of(i)]) for i in range(operation.starts.size))
+    return sum(int(np.sum(np.diff(np.sign(one[one != 0.0])) != 0.0)) for one in moves)
 
 
 def position_of(operation: Operation, valve: Valve) -> FloatArray:

@@ -20,7 +20,7 @@ from autotune.diagnosis.routine.operation import operation_of
 from autotune.diagnosis.routine.oscillation import phase_kept, regularity, setpoint_answer
 from autotune.diagnosis.routine.thresholds import RoutineThresholds, table
 from autotune.diagnosis.routine.valves import compare_valves
-from autotune.errors import InputError
+from autotune.errors import IdentificationError, InputError
 from autotune.recording import Recording, read_recording, write_recording
 from sim.valve_cases import CaseKind, valve_case
 from sim.valve_loop import Surroundings, ValveLoop, simulate_loop
@@ -322,3 +322,19 @@ def test_nothing_is_claimed_of_a_valve_that_follows(kind: CaseKind):
     case = valve_case(kind, 11, 900)
     record = Recording(t=case.dt_s * np.arange(900.0), u=case.u, y=case.y, extra={"r": case.r})
     assert diagnose_routine([record]).verdict in ("none", "abstain", "outside_oscillation")
+
+
+@pytest.mark.parametrize("seed", [6, 57, 66, 122, 182])
+def test_a_valve_that_hardly_turned_is_not_blamed(seed: int) -> None:
+    """Two random walks without a relation: the valve that explains most spans nearly all of u, and rests."""
+    found = diagnose_routine([surrogate("random walk", seed)])
+    assert found.valves.reversals < 6
+    assert not found.faulty
+
+
+@pytest.mark.parametrize("seed", [39, 66, 120, 142])
+def test_exchanged_columns_are_said_first(seed: int) -> None:
+    exchanged = surrogate("swapped", seed)
+    diagnose_routine([replace(exchanged, u=exchanged.y, y=exchanged.u)])
+    with pytest.raises(IdentificationError, match="u and y seem swapped"):
+        diagnose_routine([exchanged])
