@@ -57,6 +57,22 @@ def transfer_function_of(plant: Plant) -> TransferFunction:
     return plant.transfer_function() if isinstance(plant, Model) else plant
 
 
+#: Ratio of a coefficient to the largest below which roots, or products of responses, leave the range of numbers.
+_LEAST = 1e-60
+
+
+def _require_range(*systems: TransferFunction) -> None:
+    """Refuse polynomials whose roots leave the range of numbers."""
+    for polynomial in (p for system in systems for p in (system.num, system.den)):
+        sizes = np.abs([c for c in polynomial if c != 0.0])
+        if sizes.size and np.max(sizes) * _LEAST > np.min(sizes):
+            raise InputError(
+                f"coefficients from {np.min(sizes):.3g} to {np.max(sizes):.3g} leave the range of numbers",
+                where="closed loop",
+                remedy="check the units of gains and times",
+            )
+
+
 def characteristic_frequencies(*systems: TransferFunction) -> FloatArray:
     """Return magnitudes of nonzero poles, zeros, asymptote crossings of gain 1 and reciprocal delays [rad/s]."""
     found: list[float] = []
@@ -128,6 +144,7 @@ class ContinuousLoop:
     def grid(self) -> FloatArray:
         """Logarithmic grid over all features, dense around resonances and as fine as the dead time asks."""
         L = self.transfer_function
+        _require_range(self.plant, self.controller, L)
         corners = characteristic_frequencies(self.plant, self.controller, L)
         low, high = float(corners[0]) * 1e-3, float(corners[-1]) * 1e3
         if low == 0.0 or math.isinf(high / low):
@@ -190,6 +207,12 @@ class ContinuousLoop:
             middle = 0.5 * (omega[coarse] + omega[coarse + 1])
             omega = np.insert(omega, coarse + 1, middle)
             values = np.insert(values, coarse + 1, normalised(middle))
+        if not np.all(np.isfinite(values)):
+            raise InputError(
+                "the loop's response leaves the range of numbers",
+                where="closed loop",
+                remedy="check the units of gains and times",
+            )
         if np.min(np.abs(values)) < 1e-12 * np.max(np.abs(values)):
             return math.inf  # a pole on the axis to within rounding
         turned = float(np.sum(np.angle(values[1:] / values[:-1])))

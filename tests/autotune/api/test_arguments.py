@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis import HealthCheck, Phase, example, given, settings
 from hypothesis import strategies as st
 
 import autotune as at
@@ -84,6 +84,8 @@ def _tried(call: Any) -> Any:
 
 @settings(max_examples=25, phases=PHASES, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(num=COEFFICIENTS, den=COEFFICIENTS, delay_s=NUMBERS, K=NUMBERS, Ti_s=NUMBERS)
+@example(num=[0.0044, 4e5], den=[0.0044, 4e5], delay_s=3e16, K=1e-320, Ti_s=1e-320)
+@example(num=[-7e5, -9e5], den=[4e5, -1.0, 8.0], delay_s=1e6, K=0.5, Ti_s=1.4e-120)
 def test_margins_of_any_plant_and_controller(num: Any, den: Any, delay_s: Any, K: Any, Ti_s: Any) -> None:
     found = _tried(
         lambda: at.margins(at.TransferFunction(num=tuple(num), den=tuple(den), delay_s=delay_s), at.PI(K=K, Ti_s=Ti_s))
