@@ -15,7 +15,8 @@ import pyarrow.parquet
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from autotune.batch.export import to_parquet
-from autotune.batch.loop import Finding, Row, Work
+from autotune.batch.loop import Finding, Work
+from autotune.batch.row import Row
 from autotune.batch.settings import CampaignSettings, LoopSettings, matches
 from autotune.errors import InputError
 from autotune.outputs import Output, unwritable, write_whole

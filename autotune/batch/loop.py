@@ -7,14 +7,15 @@ import traceback
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal, TypeAlias
+from typing import Any
 
 import numpy as np
-from pydantic import ConfigDict
 from threadpoolctl import threadpool_limits
 
+from autotune.batch.operation import look_in_operation, row_of
 from autotune.batch.pieces import Record, read_record
 from autotune.batch.plant_figures import plant_figures
+from autotune.batch.row import Attention, Row
 from autotune.batch.settings import CampaignSettings, LoopSettings
 from autotune.controller import Controller, PIDController, read_controller
 from autotune.design.margins import Margins, margins
@@ -34,111 +35,10 @@ from autotune.points import FrequencyPoint, points_to_json
 from autotune.recording import Recording
 from autotune.run_log import jsonable
 
-Attention: TypeAlias = Literal["act", "failed", "look", "fine"]
-
-#: What comes first in the table.
-ATTENTION: tuple[Attention, ...] = ("act", "failed", "look", "fine")
 #: A controller whose disturbance rejection (11) could be this many times better is worth a look.
 _SLUGGISH = 1.5
 #: Margins that are missed by less than this share are kept, within what a recording tells.
 _TOLERANCE = 0.1
-
-
-@dataclass(frozen=True, kw_only=True)
-class Row:
-    """A loop's row in the table of results; what was not reached or not asked is None.
-
-    Attributes
-    ----------
-    loop : str
-        Name.
-    attention : {"act", "failed", "look", "fine"}
-        What the reader should do.
-    severity : float
-        0 to 1. Within ``act``: 1 for an unstable loop, else the share by which a margin is missed, or the part of the
-        simulation error that is not noise; within ``look``: the part of (11) that another controller would spare.
-    reason : str
-        Why, in a sentence.
-    file, u_unit, y_unit : str
-        Where the record lies, and its units.
-    rows, bad_rows, pieces : int
-        Rows of the record, those without a good u and y, uninterrupted stretches used.
-    duration_s, sample_time_s : float
-        Of the stretches together, and their usual step [s].
-    points : int
-        Frequency points.
-    omega_low_rad_s, omega_high_rad_s : float
-        Their range [rad/s].
-    G_r, omega_0r_rad_s, omega_d_rad_s : float
-        Reduced model (8), or (24) without omega_0r.
-    gain, integrators, lags_s, dead_time_s, step, step_s
-        The fitted plant, see :class:`PlantFigures`.
-    K, Ti_s, Td_s, Tf_s, h2, modulus, phase_deg, delay_margin_s : float
-        The designed controller, and its norm (11) and margins on the fitted plant.
-    K_now, Ti_now_s, h2_now, modulus_now, phase_now_deg : float
-        The controller the loop runs with, likewise.
-    stable_now : bool
-        Whether that loop is stable on the fitted plant.
-    verdict, effects : str
-        Of the diagnosis; the effects with their probabilities.
-    nominal, retuned, extended, noise_floor : float
-        Simulation error on held-out rows over the spread of y.
-    notes : str
-        What was corrected, left out or uncertain.
-    """
-
-    __pydantic_config__ = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)  # of a row that is read again
-
-    loop: str
-    attention: Attention
-    severity: float = 0.0
-    reason: str = ""
-    file: str = ""
-    u_unit: str = ""
-    y_unit: str = ""
-    rows: int | None = None
-    bad_rows: int | None = None
-    pieces: int | None = None
-    duration_s: float | None = None
-    sample_time_s: float | None = None
-    points: int | None = None
-    omega_low_rad_s: float | None = None
-    omega_high_rad_s: float | None = None
-    G_r: float | None = None
-    omega_0r_rad_s: float | None = None
-    omega_d_rad_s: float | None = None
-    gain: float | None = None
-    integrators: int | None = None
-    lags_s: str | None = None
-    dead_time_s: float | None = None
-    step: str | None = None
-    step_s: float | None = None
-    K: float | None = None
-    Ti_s: float | None = None
-    Td_s: float | None = None
-    Tf_s: float | None = None
-    h2: float | None = None
-    modulus: float | None = None
-    phase_deg: float | None = None
-    delay_margin_s: float | None = None
-    K_now: float | None = None
-    Ti_now_s: float | None = None
-    h2_now: float | None = None
-    modulus_now: float | None = None
-    phase_now_deg: float | None = None
-    stable_now: bool | None = None
-    verdict: str | None = None
-    effects: str | None = None
-    nominal: float | None = None
-    retuned: float | None = None
-    extended: float | None = None
-    noise_floor: float | None = None
-    notes: str = ""
-
-    @property
-    def order(self) -> tuple[int, float, str]:
-        """Key that sorts rows by what needs attention first."""
-        return ATTENTION.index(self.attention), -self.severity, self.loop
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -228,12 +128,15 @@ def _finding(work: Work, row: Row) -> Finding:
         sample_time_s=float(np.median(np.concatenate([np.diff(piece.t) for piece in record.pieces]))),
         notes="; ".join(record.notes),
     )
+    pieces = [replace(piece, metadata={**piece.metadata, "units": _units(loop, piece)}) for piece in record.pieces]
+    if settings.task == "routine":
+        in_operation, notes = look_in_operation(pieces, settings.routine)
+        row = replace(_with_notes(row, notes), **row_of(in_operation))
+        return Finding(row=row, result=in_operation.as_json())
     if settings.task == "diagnose":
         model = read_model(loop.model)
-        require_units_of_model(
-            model, [replace(piece, metadata={"units": _units(loop, piece)}) for piece in record.pieces]
-        )
-        found = with_next_experiment(diagnose(model, record.pieces, present))
+        require_units_of_model(model, pieces)
+        found = with_next_experiment(diagnose(model, pieces, present))
         return Finding(row=_diagnosed(row, found), result=found.as_json())
     if settings.task == "design" and settings.method == "frequency":
         measured = measured_of(record.pieces)

@@ -98,13 +98,27 @@ class ExportSettings(Section):
         )  # fmt: skip
 
 
+class RoutineSettings(Section):
+    """What is asked of a finding before a valve is blamed, where loops are looked at in operation."""
+
+    chance: Annotated[
+        float, Field(ge=0.0025, le=0.05, description="largest probability that a linear valve looks as faulty")
+    ] = 0.005
+    least_reversals: Annotated[
+        int, Field(ge=6, le=10_000, description="reversals of the command, fewer of which name no valve's fault")
+    ] = 6
+
+
 class CampaignSettings(Section):
     """What is asked of every loop, and how their files are read."""
 
     name: Annotated[Text, Field(description="title of the campaign")]
     task: Annotated[
-        Literal["identify", "design", "diagnose"],
-        Field(description="identify: points; design: points, reduced model, controller; diagnose: missing physics"),
+        Literal["identify", "design", "diagnose", "routine"],
+        Field(
+            description="identify: points; design: points, reduced model, controller; diagnose: missing physics;"
+            " routine: why loops in operation oscillate"
+        ),
     ] = "design"
     method: Annotated[
         Literal["frequency", "closed-loop"],
@@ -116,6 +130,7 @@ class CampaignSettings(Section):
     ] = None
     export: ExportSettings | None = None
     design: DesignSettings = DesignSettings()
+    routine: RoutineSettings | None = None
 
 
 class _CampaignFile(CampaignSettings):
@@ -130,6 +145,12 @@ class _CampaignFile(CampaignSettings):
     def _one_source(self) -> _CampaignFile:
         if sum(map(bool, (self.folder, self.loops, self.loop))) != 1:
             raise ValueError("give the loops once: folder, loops or [[loop]]")
+        return self
+
+    @model_validator(mode="after")
+    def _routine_alone(self) -> _CampaignFile:
+        if self.routine is not None and self.task != "routine":
+            raise ValueError(f'[routine] goes with task = "routine", and task is "{self.task}"')
         return self
 
 

@@ -1,4 +1,4 @@
-"""Command: identify, design or diagnose many loops at once."""
+"""Command: identify, design or diagnose many loops at once, or look at them in operation."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def batch(
         str | None, typer.Option(metavar="ADDRESS", help="existing Dask scheduler, tcp://host:8786, with its workers")
     ] = None,
 ) -> None:
-    """Identify, design or diagnose every loop of a plant; results as a Parquet table and one page."""
+    """Identify, design or diagnose every loop of a plant, or look at it in operation; a Parquet table and one page."""
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
     from autotune.errors import InputError, OperatorStop, require_extra
@@ -31,7 +31,8 @@ def batch(
     require_extra("batch", "distributed", "pyarrow")
     from autotune.batch.campaign import REPORT, RESULTS, Campaign, failed, write_results
     from autotune.batch.engine import cluster, run_all
-    from autotune.batch.loop import ATTENTION, analyse_loop
+    from autotune.batch.loop import analyse_loop
+    from autotune.batch.row import ATTENTION
     from autotune.batch.settings import read_campaign
     from autotune.report.campaign_page import campaign_page
     from autotune.report.page import write_page

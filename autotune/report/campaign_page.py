@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from autotune.batch.loop import ATTENTION, Attention, Row
+from autotune.batch.row import ATTENTION, Attention, Row
 from autotune.batch.settings import CampaignSettings
 from autotune.report.page import GREEN, GREY, ORANGE, RED, Figure, Page, Picture, Section, Table, Tone, lines_figure
 
@@ -25,6 +25,18 @@ _WORDS: dict[Attention, tuple[str, str]] = {
     "fine": ("is fine", "are fine"),
 }
 _COLOURS: dict[Attention, str] = {"act": RED, "failed": GREY, "look": ORANGE, "fine": GREEN}
+
+_SURE_IN_OPERATION = (
+    "A valve is blamed where the past of its position predicts y better than the command does, and better than it"
+    " would in the same loop with a linear valve. Each row says how much better, over how many reversals and by which"
+    " chance."
+)
+_TODO_IN_OPERATION: dict[Attention, str] = {
+    "act": "See to the valves and gains under 'Needs action' first, from the top; each with the test that tells.",
+    "failed": "Read why the loops under 'Not analysed' failed; each names its remedy.",
+    "look": "Loops that oscillate, not by their valve as far as is seen: look upstream, or make the test that tells.",
+    "fine": "Nothing to do; look again when a loop oscillates.",
+}
 
 _Columns = dict[str, Callable[[Row], str | Picture]]
 
@@ -53,26 +65,33 @@ def campaign_page(settings: CampaignSettings, rows: Sequence[Row]) -> Page:
             f"Designed for a modulus margin of {asked_modulus:.2g} and a phase margin of {np.degrees(asked_phase):.0f} "
             "deg. A loop's own page: autotune tune --points loops/NAME.json --out DIR."
         )
+    if settings.task == "routine":
+        summary.append(
+            "The worst come first: valves by what they explain that the command does not, then oscillations by their"
+            " share of y. A loop's own page: autotune diagnose --routine FILE --out DIR."
+        )
     sections = [_section(settings, attention, rows) for attention in ATTENTION if counts[attention]]
     return Page(
         title=settings.name,
         verdict=f"Of {len(rows)} loops, {said}.",
         tone=tone,
-        answers=_answers(counts),
+        answers=_answers(counts, settings),
         summary=tuple(summary),
         sections=(*sections, *_present_margins(settings, rows), *_notes(rows)),
     )
 
 
-def _answers(counts: Counter[Attention]) -> tuple[tuple[str, str], ...]:
+def _answers(counts: Counter[Attention], settings: CampaignSettings) -> tuple[tuple[str, str], ...]:
     """Return what to do, the most pressing first."""
+    first: Attention = next((attention for attention in ATTENTION if counts[attention]), "fine")
+    if settings.task == "routine":
+        return ("How sure", _SURE_IN_OPERATION), ("What to do", _TODO_IN_OPERATION[first])
     todo = {
         "act": "Retune what needs action first: its margins are missed or physics is missing.",
         "failed": "Read why the loops under 'Not analysed' failed; each names its remedy.",
         "look": "Look at the loops that could do better when there is time.",
         "fine": "Nothing to do.",
     }
-    first = next((attention for attention in ATTENTION if counts[attention]), "fine")
     sure = "Every figure rests on the loop's own record; what was left out of it is said under Notes."
     return ("How sure", sure), ("What to do", todo[first])
 
@@ -171,7 +190,21 @@ _COLUMNS: dict[str, _Columns] = {
         "error → after (noise)": _error,
         "record": _record,
     },
+    "routine": {
+        "how sure": lambda row: row.sure or "",
+        "band of u": lambda row: _band(row),
+        "period": lambda row: "" if row.period_s is None else _time(row.period_s),
+        "next": lambda row: row.what_next or "" if row.attention != "fine" else "",
+        "record": _record,
+    },
 }
+
+
+def _band(row: Row) -> str:
+    if row.band is None or row.band_of_range is None:
+        return ""
+    unit = f"\N{NO-BREAK SPACE}{row.u_unit}" if row.u_unit else ""
+    return f"{row.band:.3g}{unit} ({row.band_of_range:.0%})"
 
 
 def _present_margins(settings: CampaignSettings, rows: Sequence[Row]) -> tuple[Section, ...]:

@@ -20,7 +20,8 @@ from scipy.signal import cont2discrete, lfilter
 
 from autotune.batch.campaign import Campaign, write_results
 from autotune.batch.engine import cluster, run_all
-from autotune.batch.loop import Finding, Row, analyse_loop
+from autotune.batch.loop import Finding, analyse_loop
+from autotune.batch.row import Row
 from autotune.batch.settings import read_campaign
 
 ROWS, SAMPLE_S = 6000, 0.1

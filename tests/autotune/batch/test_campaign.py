@@ -14,7 +14,8 @@ from typer.testing import CliRunner
 
 from autotune.batch.campaign import RESULTS, Campaign, write_results
 from autotune.batch.engine import run_all
-from autotune.batch.loop import Row, Work, analyse_loop
+from autotune.batch.loop import Work, analyse_loop
+from autotune.batch.row import Row
 from autotune.batch.settings import CampaignSettings, LoopSettings, read_campaign
 from autotune.cli import app
 from autotune.errors import InputError

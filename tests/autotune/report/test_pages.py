@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from autotune.batch.loop import Row
 from autotune.batch.plant_figures import plant_figures
+from autotune.batch.row import Row
 from autotune.batch.settings import CampaignSettings
 from autotune.config.procedure import DesignSettings, SignalSettings
 from autotune.controller import PIDController
