@@ -7,12 +7,13 @@ import math
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, Protocol
 
 from autotune.config.registers import GainSettings, RegisterMap, UnlockSettings
 from autotune.controller import PIDController
 from autotune.errors import InputError, LinkError
 from drivers.gain_settings import controller_of, settings_of
+from drivers.kinds import Session
 from drivers.register_link import RegisterLink
 from drivers.register_rig import RegisterRig
 from drivers.registers import Codec, blocks
@@ -260,6 +261,48 @@ class TypedGainRig(GainRegisterRig):
     def misread_setpoint(self, setpoint: float) -> dict[str, float]:
         """Return nothing: a value has one reading."""
         return {}
+
+
+class RegisterSection(Protocol):
+    """What the settings of every rig behind registers, nodes or data blocks have."""
+
+    feed_s: float
+    scan_time_s: float | None
+
+    @property
+    def registers(self) -> RegisterMap:
+        """The map."""
+        ...
+
+
+def open_registers(
+    link: RegisterLink, settings: RegisterSection, session: Session, with_gains: type[GainRegisterRig], **more: Any
+) -> RegisterRig:
+    """Return the rig behind a link, with its own controller's gains where they are mapped.
+
+    Parameters
+    ----------
+    link : RegisterLink
+        To the device, not yet connected.
+    settings : RegisterSection
+        Of the rig.
+    session : Session
+        Limits and safe output.
+    with_gains : type
+        What the rig is where gains are mapped.
+    **more
+        Further settings of the rig, as ``permissives``.
+    """
+    kind = RegisterRig if settings.registers.held_gains is None else with_gains
+    return kind(
+        link,
+        settings.registers,
+        u_range=session.u_range,
+        u_safe=session.u_safe,
+        feed_s=settings.feed_s,
+        scan_time_s=settings.scan_time_s,
+        **more,
+    )
 
 
 def _round(value: float) -> float:

@@ -214,6 +214,12 @@ require_complete(KINDS)
 _BY_SETTINGS = {kind.settings: kind for kind in KINDS}
 
 
+def not_installed(error: ModuleNotFoundError, extra: str) -> InputError:
+    """Return what is said where a kind's library is absent: the extra of its name brings it."""
+    remedy = f'pip install "relay-autotune[{extra}]"'
+    return InputError(f"{error.name} is not installed", where=f'kind = "{extra}"', remedy=remedy)
+
+
 def kind_of(settings: Section) -> Kind:
     """Return the line of the table for the settings of a rig."""
     return _BY_SETTINGS[type(settings)]

@@ -7,25 +7,15 @@ from typing import assert_never
 
 from autotune.config.rig import AnyModbusSettings, ModbusRtuSettings, ModbusTcpSettings, ModbusTlsSettings
 from autotune.experiment.rig import Rig
-from drivers.gain_rig import GainRegisterRig
+from drivers.gain_rig import GainRegisterRig, open_registers
 from drivers.kinds import Reach, Session
 from drivers.modbus import ModbusLink
 from drivers.probe import ProbedRegister, probe
-from drivers.register_rig import RegisterRig
 
 
 def open_kind(settings: AnyModbusSettings, session: Session) -> Rig:
     """Return the rig, with its own controller's gains where they are mapped."""
-    kind = RegisterRig if settings.registers.held_gains is None else GainRegisterRig
-    return kind(
-        ModbusLink(settings),
-        settings.registers,
-        u_range=session.u_range,
-        u_safe=session.u_safe,
-        feed_s=settings.feed_s,
-        scan_time_s=settings.scan_time_s,
-        permissives=settings.permissives,
-    )
+    return open_registers(ModbusLink(settings), settings, session, GainRegisterRig, permissives=settings.permissives)
 
 
 def reached_by(settings: AnyModbusSettings) -> Reach:

@@ -7,14 +7,12 @@ from urllib.parse import urlsplit
 
 from autotune.config.rig import OpcUaSettings
 from autotune.config.signal_map import SAMPLE
-from autotune.errors import InputError
 from autotune.experiment.rig import Rig
-from drivers.gain_rig import TypedGainRig
-from drivers.kinds import Reach, Session
+from drivers.gain_rig import TypedGainRig, open_registers
+from drivers.kinds import Reach, Session, not_installed
 from drivers.pace import tell_pace
 from drivers.probe import ProbedDevice, ProbedSignal
 from drivers.register_link import RegisterLink
-from drivers.register_rig import RegisterRig
 from drivers.registers import blocks, codecs
 
 #: port where an endpoint names none
@@ -25,24 +23,13 @@ def _link(settings: OpcUaSettings, *, exclusive: bool = True) -> RegisterLink:
     try:
         from drivers.opcua import OpcUaLink
     except ModuleNotFoundError as error:
-        raise InputError(
-            f"{error.name} is not installed", where='kind = "opcua"', remedy='pip install "relay-autotune[opcua]"'
-        ) from None
+        raise not_installed(error, "opcua") from None
     return OpcUaLink(settings, exclusive=exclusive)
 
 
 def open_kind(settings: OpcUaSettings, session: Session) -> Rig:
     """Return the rig, with its own controller's gains where they are mapped."""
-    registers = settings.registers
-    kind = RegisterRig if registers.held_gains is None else TypedGainRig
-    return kind(
-        _link(settings),
-        registers,
-        u_range=session.u_range,
-        u_safe=session.u_safe,
-        feed_s=settings.feed_s,
-        scan_time_s=settings.scan_time_s,
-    )
+    return open_registers(_link(settings), settings, session, TypedGainRig)
 
 
 def reached_by(settings: OpcUaSettings) -> Reach:

@@ -8,13 +8,12 @@ from typing import TYPE_CHECKING
 
 from autotune.config.s7 import SIZES, S7Settings, S7Signal, S7Type
 from autotune.config.signal_map import SAMPLE
-from autotune.errors import InputError, LinkError
+from autotune.errors import LinkError
 from autotune.experiment.rig import Rig
-from drivers.gain_rig import TypedGainRig
-from drivers.kinds import Reach, Session
+from drivers.gain_rig import TypedGainRig, open_registers
+from drivers.kinds import Reach, Session, not_installed
 from drivers.pace import tell_pace
 from drivers.probe import ProbedDevice, ProbedSignal
-from drivers.register_rig import RegisterRig
 from drivers.registers import Codec, blocks, codecs
 from drivers.s7_errors import RUN
 
@@ -33,24 +32,13 @@ def _link(settings: S7Settings, *, exclusive: bool = True) -> S7Link:
     try:
         from drivers.s7 import S7Link
     except ModuleNotFoundError as error:
-        raise InputError(
-            f"{error.name} is not installed", where='kind = "s7"', remedy='pip install "relay-autotune[s7]"'
-        ) from None
+        raise not_installed(error, "s7") from None
     return S7Link(settings, exclusive=exclusive)
 
 
 def open_kind(settings: S7Settings, session: Session) -> Rig:
     """Return the rig, with its own controller's gains where they are mapped."""
-    registers = settings.registers
-    kind = RegisterRig if registers.held_gains is None else TypedGainRig
-    return kind(
-        _link(settings),
-        registers,
-        u_range=session.u_range,
-        u_safe=session.u_safe,
-        feed_s=settings.feed_s,
-        scan_time_s=settings.scan_time_s,
-    )
+    return open_registers(_link(settings), settings, session, TypedGainRig)
 
 
 def reached_by(settings: S7Settings) -> Reach:

@@ -6,8 +6,8 @@ from typing import Annotated, ClassVar
 
 from pydantic import Field
 
-from autotune.config.registers import RegisterMap
-from autotune.config.signal_map import COUNTED, LOGICAL, Held, SignalMap, SignalType, side_by_side
+from autotune.config.registers import LOGICAL, RegisterMap
+from autotune.config.signal_map import COUNTED, Held, SignalMap, SignalType, side_by_side
 from autotune.schema import Number, Section
 
 #: the server's time stamp of y

@@ -17,7 +17,7 @@ RegisterType = Literal["int16", "uint16", "int32", "uint32", "int64", "uint64", 
 _BIT_TABLES = ("coil", "discrete")
 _WIDTH = {"int32": 2, "uint32": 2, "float32": 2, "int64": 4, "uint64": 4, "float64": 4}
 #: signals that are true or false
-_LOGICAL = ("enable", "in_command", "automatic")
+LOGICAL = ("enable", "in_command", "automatic")
 
 
 class RegisterSettings(Section):
@@ -251,12 +251,12 @@ class RegisterMap(Section):
     @model_validator(mode="after")
     def _consistent(self) -> RegisterMap:
         mapped = self.mapped()
-        written = ("u", "heartbeat", "safe", "setpoint", "load", *_LOGICAL, *_PLAIN)
+        written = ("u", "heartbeat", "safe", "setpoint", "load", *LOGICAL, *_PLAIN)
         for name, register in mapped.items():
             if (name in written or name.startswith("gains.")) and name != "in_command" and not register.writable:
                 raise ValueError(f"{name} is written by the host, so it cannot lie in table {register.table!r}")
-            if register.is_coded and name not in (*_LOGICAL, "gains.reverse_acting"):
-                raise ValueError(f"{name} is a number: bit, on and off are for {', '.join(_LOGICAL)}")
+            if register.is_coded and name not in (*LOGICAL, "gains.reverse_acting"):
+                raise ValueError(f"{name} is a number: bit, on and off are for {', '.join(LOGICAL)}")
         if (self.K is None) != (self.Ti is None):
             raise ValueError("K and Ti must be mapped together")
         if self.K is None and (self.Td is not None or self.Tf is not None):

@@ -7,6 +7,7 @@ from typing import Annotated, Literal, TypeAlias, get_args
 
 from pydantic import Field, model_validator
 
+from autotune.config.link import Feed, Retries, Timeout
 from autotune.config.opcua import NodeMap
 from autotune.config.registers import RegisterMap, RegisterSettings
 from autotune.config.s7 import S7Settings
@@ -58,16 +59,12 @@ class ModbusSettings(Section):
     """What the Modbus transports have in common."""
 
     unit_id: Annotated[int, Field(ge=0, le=247, description="unit (slave) id of the device, 0..247")] = 1
-    timeout_s: Annotated[float, Field(gt=0, le=60, description="longest wait for one answer [s], up to 60")] = 0.2
-    retries: Annotated[
-        int, Field(ge=0, le=10, description="further attempts of one request, 0..10; such a sample is marked suspect")
-    ] = 1
+    timeout_s: Timeout = 0.2
+    retries: Retries = 1
     late_reply_s: Annotated[
         float, Field(gt=0, le=60, description="longest time after which a late answer may still come [s], up to 60")
     ] = 1.0
-    feed_s: Annotated[
-        float, Field(gt=0, le=60, description="longest time between two heartbeats while the host commands [s]")
-    ] = 0.1
+    feed_s: Feed = 0.1
     scan_time_s: Annotated[
         float | None,
         Field(
@@ -125,10 +122,8 @@ class SerialSettings(Section):
     kind: Literal["serial"]
     device: Annotated[str, Field(description="serial device, e.g. /dev/ttyACM0")]
     baud: Annotated[int, Field(ge=300, le=4_000_000, description="line speed [bit/s], 300..4000000")] = 115200
-    timeout_s: Annotated[float, Field(gt=0, le=60, description="longest wait for one answer [s], up to 60")] = 0.1
-    retries: Annotated[
-        int, Field(ge=0, le=10, description="further attempts of one request, 0..10; such a sample is marked suspect")
-    ] = 1
+    timeout_s: Timeout = 0.1
+    retries: Retries = 1
     start_s: Annotated[
         float, Field(gt=0, le=60, description="time the device may take to start after the line was opened [s]")
     ] = 3.0
@@ -163,13 +158,9 @@ class OpcUaSettings(Section):
     ] = None
     user: Annotated[str | None, Field(description="user; absent: anonymous")] = None
     password_file: Annotated[str | None, Field(description="file whose first line is the user's password")] = None
-    timeout_s: Annotated[float, Field(gt=0, le=60, description="longest wait for one answer [s], up to 60")] = 1.0
-    retries: Annotated[
-        int, Field(ge=0, le=10, description="further attempts of one request, 0..10; such a sample is marked suspect")
-    ] = 1
-    feed_s: Annotated[
-        float, Field(gt=0, le=60, description="longest time between two heartbeats while the host commands [s]")
-    ] = 0.1
+    timeout_s: Timeout = 1.0
+    retries: Retries = 1
+    feed_s: Feed = 0.1
     scan_time_s: Annotated[
         float | None, Field(gt=0, le=60, description="cycle of the device's program [s]; absent: not known, 0.02")
     ] = None

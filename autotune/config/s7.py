@@ -9,8 +9,9 @@ from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 from pydantic import Field, model_validator
 
-from autotune.config.registers import RegisterMap
-from autotune.config.signal_map import LOGICAL, Held, SignalMap, SignalType, side_by_side
+from autotune.config.link import Feed, Retries, Timeout
+from autotune.config.registers import LOGICAL, RegisterMap
+from autotune.config.signal_map import Held, SignalMap, SignalType, side_by_side
 from autotune.config.twin import TwinSettings
 from autotune.schema import Number, Section
 
@@ -180,13 +181,9 @@ class S7Settings(Section):
     slot: Annotated[
         int, Field(ge=0, le=31, description="slot of the CPU, 0..31: 1 of S7-1200 and S7-1500, 2 of S7-300")
     ] = 1
-    timeout_s: Annotated[float, Field(gt=0, le=60, description="longest wait for one answer [s], up to 60")] = 0.5
-    retries: Annotated[
-        int, Field(ge=0, le=10, description="further attempts of one request, 0..10; such a sample is marked suspect")
-    ] = 1
-    feed_s: Annotated[
-        float, Field(gt=0, le=60, description="longest time between two heartbeats while the host commands [s]")
-    ] = 0.1
+    timeout_s: Timeout = 0.5
+    retries: Retries = 1
+    feed_s: Feed = 0.1
     scan_time_s: Annotated[
         float | None, Field(gt=0, le=60, description="cycle of the CPU's program [s]; absent: not known, 0.02")
     ] = None

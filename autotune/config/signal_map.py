@@ -14,8 +14,8 @@ from autotune.schema import Section
 SignalType = Literal["float64", "float32", "int16", "uint16", "int32", "uint32", "int64", "uint64", "boolean"]
 #: words of a number as registers carry it
 WORDS = {"float64": 4, "float32": 2, "int16": 1, "uint16": 1, "int32": 2, "uint32": 2, "int64": 4, "uint64": 4}
-#: signals that are true or false, and those that count
-LOGICAL, COUNTED = ("enable", "in_command", "automatic"), ("heartbeat", "heartbeat_echo")
+#: signals that count
+COUNTED = ("heartbeat", "heartbeat_echo")
 #: signals that a sample is made of, which are read; the others are written
 SAMPLE = ("y", "u_applied", "heartbeat_echo", "in_command", "device_time")
 

@@ -61,16 +61,17 @@ def transfer_function_of(plant: Plant) -> TransferFunction:
 _LEAST = 1e-60
 
 
+def _beyond_numbers(what: str) -> InputError:
+    remedy = "check the units of gains and times"
+    return InputError(f"{what} the range of numbers", where="closed loop", remedy=remedy)
+
+
 def _require_range(*systems: TransferFunction) -> None:
     """Refuse polynomials whose roots leave the range of numbers."""
     for polynomial in (p for system in systems for p in (system.num, system.den)):
         sizes = np.abs([c for c in polynomial if c != 0.0])
         if sizes.size and np.max(sizes) * _LEAST > np.min(sizes):
-            raise InputError(
-                f"coefficients from {np.min(sizes):.3g} to {np.max(sizes):.3g} leave the range of numbers",
-                where="closed loop",
-                remedy="check the units of gains and times",
-            )
+            raise _beyond_numbers(f"coefficients from {np.min(sizes):.3g} to {np.max(sizes):.3g} leave")
 
 
 def characteristic_frequencies(*systems: TransferFunction) -> FloatArray:
@@ -148,11 +149,7 @@ class ContinuousLoop:
         corners = characteristic_frequencies(self.plant, self.controller, L)
         low, high = float(corners[0]) * 1e-3, float(corners[-1]) * 1e3
         if low == 0.0 or math.isinf(high / low):
-            raise InputError(
-                f"the loop's corners, {corners[0]:.3g} to {corners[-1]:.3g} rad/s, leave the range of numbers",
-                where="closed loop",
-                remedy="check the units of gains and times",
-            )
+            raise _beyond_numbers(f"the loop's corners, {corners[0]:.3g} to {corners[-1]:.3g} rad/s, leave")
         count = int(_POINTS_PER_DECADE * math.log10(high / low)) + 1
         parts = [np.geomspace(low, high, count)]
         closed = np.roots(np.polyadd(L.num, L.den)) if L.delay_s == 0.0 else np.zeros(0)
@@ -208,11 +205,7 @@ class ContinuousLoop:
             omega = np.insert(omega, coarse + 1, middle)
             values = np.insert(values, coarse + 1, normalised(middle))
         if not np.all(np.isfinite(values)):
-            raise InputError(
-                "the loop's response leaves the range of numbers",
-                where="closed loop",
-                remedy="check the units of gains and times",
-            )
+            raise _beyond_numbers("the loop's response leaves")
         if np.min(np.abs(values)) < 1e-12 * np.max(np.abs(values)):
             return math.inf  # a pole on the axis to within rounding
         turned = float(np.sum(np.angle(values[1:] / values[:-1])))
