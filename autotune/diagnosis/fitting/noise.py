@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -35,7 +36,7 @@ class Noise:
     sd: float
     ar: tuple[float, ...] = ()
 
-    @property
+    @cached_property
     def total_sd(self) -> float:
         """Standard deviation of the noise itself."""
         if not self.ar:
