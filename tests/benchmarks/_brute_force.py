@@ -95,6 +95,35 @@ def _judge(
     return norm / math.pi, least if stable else -least, phase, noise
 
 
+def figures(plant: TransferFunction, controller: TransferFunction) -> tuple[bool, float, float, float, float]:
+    """Return whether the loop is stable, and its modulus, phase [rad], delay [s] and gain margin, on a plain grid.
+
+    Stability is counted by the argument of the characteristic polynomial, which turns by 90 degrees times its order.
+    """
+    top, bottom = np.polymul(plant.num, controller.num), np.polymul(plant.den, controller.den)
+    omega = frequencies(TransferFunction(num=tuple(top), den=tuple(bottom), delay_s=plant.delay_s))
+    s = 1j * omega
+    open_, closed = np.polyval(top, s) * np.exp(-s * plant.delay_s), np.polyval(bottom, s)
+    D = open_ + closed
+    begin = math.atan2(D[0].imag, D[0].real)
+    begin -= math.pi * round(begin / math.pi)
+    turn = begin + float(np.sum(np.angle(D[1:] / D[:-1])))
+    stable = round((0.5 * math.pi * (len(bottom) - 1) - turn) / math.pi) == 0
+    L = open_ / closed
+    size, angle = np.log(np.abs(L)), np.angle(-L)
+    phase, delay, gain = math.pi, math.inf, math.inf
+    for k in np.flatnonzero(size[1:] * size[:-1] < 0.0):
+        share = size[k] / (size[k] - size[k + 1])
+        at = float(np.angle(-L[k] * np.exp(1j * share * np.angle(L[k + 1] / L[k]))))
+        phase = min(phase, abs(at), key=abs)
+        delay = min(delay, (at % (2.0 * math.pi)) / float(omega[k] + share * (omega[k + 1] - omega[k])))
+    for k in np.flatnonzero((angle[1:] * angle[:-1] < 0.0) & (np.abs(angle[1:] - angle[:-1]) < math.pi)):
+        share = angle[k] / (angle[k] - angle[k + 1])
+        at = math.exp(-float(size[k] + share * (size[k + 1] - size[k])))
+        gain = min(gain, at if at > 1.0 else math.inf)
+    return stable, float(np.min(np.abs(1.0 + L))), phase, delay, gain
+
+
 def search(
     plant: TransferFunction, kind: str, modulus: float, phase_rad: float, noise_gain: float, seed: int = 0
 ) -> Found | None:

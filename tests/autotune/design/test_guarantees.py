@@ -24,7 +24,8 @@ from autotune.identification.reduction import reduce_points
 from autotune.models import TransferFunction
 from autotune.pipeline import analyse
 from tests.autotune.design.plants import DELAY_DOMINATED, FOPDT, LAG_DOMINATED, REDUCED, measured
-from tests.benchmarks.guarantees import CLASSES, judged, makers, outcome, plants, relay_points
+from tests.benchmarks.guarantees import judged, makers, outcome
+from tests.benchmarks.random_plants import CLASSES, plants, relay_points
 
 ROOMY = spec1(10.0)
 

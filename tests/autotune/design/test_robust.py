@@ -21,7 +21,8 @@ from autotune.errors import DesignError
 from autotune.models import TransferFunction
 from autotune.points import FrequencyPoint
 from tests.autotune.design.plants import BALL, EIGHT_LAGS, REDUCED, measured
-from tests.benchmarks.guarantees import asked_of, falling, plants, relay_points, slow_points
+from tests.benchmarks.guarantees import asked_of
+from tests.benchmarks.random_plants import falling, plants, relay_points, slow_points
 
 
 def _lags(constants: list[float], delay_s: float, integrator: bool) -> TransferFunction:
