@@ -1,8 +1,9 @@
-"""The best PI in a corner of its constraints, where a search that follows gradients stops."""
+"""Where searches in log gains do not arrive: a PI in a corner of its constraints, and a PID that is a PI."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,6 +19,8 @@ _ZOOM_NODES, _ZOOM_SPAN, _ZOOM_END, _ZOOMS = 9, 0.3, 1e-5, 60
 _WORTHWHILE = 1e-4
 #: slacks that are asked for on the grid of frequencies so that the margins are kept between them
 _SLIGHTLY_TIGHTER = (1e-5, 1e-4, 1e-3)
+#: share of the norm that a derivative buys at least
+_NO_DERIVATIVE = 1e-4
 
 
 def out_of_corner(problem: Problem, start: FloatArray) -> FloatArray:
@@ -66,3 +69,18 @@ def _followed(problem: Problem, start: FloatArray, more: float) -> tuple[float, 
         if span < _ZOOM_END:
             break
     return least, best
+
+
+def plainest(
+    found: Sequence[FloatArray], log_norm: Callable[[FloatArray], float], kept: Callable[[FloatArray], bool]
+) -> FloatArray:
+    """Return the (4,) controller of least norm, without a derivative where that buys less than a ten-thousandth.
+
+    A search in logarithms of the gains comes as near to a PI as it has steps: its T_d of 1e-30 s says nothing, and no
+    device holds it.
+    """
+    cut = [p * np.array([1.0, 1.0, 0.0, 0.0]) for p in found]
+    plain = [p for p in cut if kept(p)]
+    best = min(found, key=log_norm)
+    without = min(plain, key=log_norm, default=best)
+    return without if log_norm(without) <= log_norm(best) + _NO_DERIVATIVE else best

@@ -12,8 +12,8 @@ import numpy as np
 from numba import njit
 
 from autotune.arrays import ComplexArray, FloatArray
+from autotune.design.axis import characteristic_frequencies
 from autotune.design.figures import Figures
-from autotune.design.loop import characteristic_frequencies
 from autotune.errors import DesignError
 from autotune.models import TransferFunction
 

@@ -17,7 +17,8 @@ from scipy.linalg import expm
 
 from autotune.arrays import ComplexArray, FloatArray
 from autotune.controller import Controller, DiscreteController, PIDController
-from autotune.errors import DesignError, InputError
+from autotune.design.axis import beyond_numbers, characteristic_frequencies, require_range, turn_along_axis
+from autotune.errors import DesignError
 from autotune.models import Model, TransferFunction
 
 Plant: TypeAlias = TransferFunction | Model
@@ -55,52 +56,6 @@ class OpenLoop(Protocol):
 def transfer_function_of(plant: Plant) -> TransferFunction:
     """Return the small-signal transfer function of a plant."""
     return plant.transfer_function() if isinstance(plant, Model) else plant
-
-
-#: Ratio of a coefficient to the largest below which roots, or products of responses, leave the range of numbers.
-_LEAST = 1e-60
-
-
-def _beyond_numbers(what: str) -> InputError:
-    remedy = "check the units of gains and times"
-    return InputError(f"{what} the range of numbers", where="closed loop", remedy=remedy)
-
-
-def _require_range(*systems: TransferFunction) -> None:
-    """Refuse polynomials whose roots leave the range of numbers."""
-    for polynomial in (p for system in systems for p in (system.num, system.den)):
-        sizes = np.abs([c for c in polynomial if c != 0.0])
-        if sizes.size and np.max(sizes) * _LEAST > np.min(sizes):
-            raise _beyond_numbers(f"coefficients from {np.min(sizes):.3g} to {np.max(sizes):.3g} leave")
-
-
-def characteristic_frequencies(*systems: TransferFunction) -> FloatArray:
-    """Return magnitudes of nonzero poles, zeros, asymptote crossings of gain 1 and reciprocal delays [rad/s]."""
-    found: list[float] = []
-    for system in systems:
-        num, den = np.array(system.num), np.array(system.den)
-        for polynomial in (num, den, np.polyadd(num, den)):
-            # coefficients that are 0 up to rounding would add roots many decades away from the loop
-            found.extend(np.abs(np.roots(polynomial)) if np.any(polynomial) else [])
-        if np.any(num):
-            found.extend(_unit_gain_asymptotes(num, den))
-        if system.delay_s > 0.0:  # a dead time a million times shorter than all else is no feature
-            found.append(min(1.0 / system.delay_s, 1e6 * max(found, default=math.inf)))
-    values = np.array([value for value in found if value > 0.0 and math.isfinite(value)])
-    return np.unique(values) if len(values) else np.array([1.0])
-
-
-def _unit_gain_asymptotes(num: FloatArray, den: FloatArray) -> list[float]:
-    high = len(den) - len(num)
-    low = np.flatnonzero(den[::-1])[0] - np.flatnonzero(num[::-1])[0]
-    found = []
-    if high != 0:
-        found.append(abs(num[0] / den[0]) ** (1.0 / high))
-    if low != 0:
-        found.append(
-            abs(num[::-1][np.flatnonzero(num[::-1])[0]] / den[::-1][np.flatnonzero(den[::-1])[0]]) ** (1 / low)
-        )
-    return [float(value) for value in found]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -145,11 +100,11 @@ class ContinuousLoop:
     def grid(self) -> FloatArray:
         """Logarithmic grid over all features, dense around resonances and as fine as the dead time asks."""
         L = self.transfer_function
-        _require_range(self.plant, self.controller, L)
+        require_range(self.plant, self.controller, L)
         corners = characteristic_frequencies(self.plant, self.controller, L)
         low, high = float(corners[0]) * 1e-3, float(corners[-1]) * 1e3
         if low == 0.0 or math.isinf(high / low):
-            raise _beyond_numbers(f"the loop's corners, {corners[0]:.3g} to {corners[-1]:.3g} rad/s, leave")
+            raise beyond_numbers(f"the loop's corners, {corners[0]:.3g} to {corners[-1]:.3g} rad/s, leave")
         count = int(_POINTS_PER_DECADE * math.log10(high / low)) + 1
         parts = [np.geomspace(low, high, count)]
         closed = np.roots(np.polyadd(L.num, L.den)) if L.delay_s == 0.0 else np.zeros(0)
@@ -189,26 +144,14 @@ class ContinuousLoop:
         a = float(np.exp(np.mean(np.log(characteristic_frequencies(L)))))
         order = len(L.den) - 1
 
-        def normalised(omega: FloatArray) -> ComplexArray:
+        def parts(omega: FloatArray) -> ComplexArray:
             s = 1j * omega
-            D = np.polyval(L.den, s) + np.polyval(L.num, s) * np.exp(-s * L.delay_s)
-            return np.asarray(D / (s + a) ** order, dtype=np.complex128)
+            found = np.array([np.polyval(L.den, s), np.polyval(L.num, s) * np.exp(-s * L.delay_s)])
+            return np.asarray(found / (s + a) ** order, dtype=np.complex128)
 
-        omega = np.concatenate(([0.0], self.grid))
-        values = normalised(omega)
-        for _ in range(12):  # halve every step in which the argument turns by more than a quarter circle's half
-            turns = np.abs(np.angle(values[1:] / values[:-1]))
-            coarse = np.flatnonzero(turns > np.pi / 4.0)
-            if not len(coarse):
-                break
-            middle = 0.5 * (omega[coarse] + omega[coarse + 1])
-            omega = np.insert(omega, coarse + 1, middle)
-            values = np.insert(values, coarse + 1, normalised(middle))
-        if not np.all(np.isfinite(values)):
-            raise _beyond_numbers("the loop's response leaves")
-        if np.min(np.abs(values)) < 1e-12 * np.max(np.abs(values)):
-            return math.inf  # a pole on the axis to within rounding
-        turned = float(np.sum(np.angle(values[1:] / values[:-1])))
+        turned = turn_along_axis(parts, np.concatenate(([0.0], self.grid)))
+        if turned is None:
+            return math.inf
         # D/(s + a)^n tends to den[0] (1 + L(inf)), whose argument is within asin|L(inf)| of den[0]'s: rounding
         # absorbs the rest
         return max(0.0, round(-turned / np.pi))
@@ -316,24 +259,15 @@ class SampledLoop:
         den_C = np.array(self.controller.den)
         T_s = self.controller.sample_time_s
 
-        def normalised(omega: FloatArray) -> ComplexArray:
+        def parts(omega: FloatArray) -> ComplexArray:
             z = np.exp(1j * omega * T_s)
             states = np.linalg.det(np.eye(len(Phi)) - Phi / z[:, None, None]) if len(Phi) else np.ones(len(z))
             controller = np.polyval(den_C[::-1], 1.0 / z)
             numerator = np.polyval(np.array(self.controller.num)[::-1], 1.0 / z)
-            return np.asarray(states * (controller + self._pulse(z) * numerator), dtype=np.complex128)
+            return np.array([states * controller, states * self._pulse(z) * numerator], dtype=np.complex128)
 
-        omega = np.concatenate(([self.grid[0] * 1e-3], self.grid))
-        values = normalised(omega)
-        for _ in range(12):
-            coarse = np.flatnonzero(np.abs(np.angle(values[1:] / values[:-1])) > np.pi / 4.0)
-            if not len(coarse):
-                break
-            middle = 0.5 * (omega[coarse] + omega[coarse + 1])
-            omega, values = np.insert(omega, coarse + 1, middle), np.insert(values, coarse + 1, normalised(middle))
-        if np.min(np.abs(values)) < 1e-14 * np.max(np.abs(values)):
-            return False
-        return round(float(np.sum(np.angle(values[1:] / values[:-1]))) / np.pi) == 0
+        turned = turn_along_axis(parts, np.concatenate(([self.grid[0] * 1e-3], self.grid)))
+        return turned is not None and round(turned / np.pi) == 0
 
 
 def open_loop(plant: Plant, controller: Controller) -> ContinuousLoop | SampledLoop:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from autotune.arrays import FloatArray
-from autotune.design.loop import characteristic_frequencies
+from autotune.design.axis import characteristic_frequencies
 from autotune.models import TransferFunction
 
 #: noise on the command [standard deviation] as a share of the command's range, from u_min to u_max

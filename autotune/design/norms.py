@@ -12,7 +12,8 @@ from collections.abc import Callable
 import numpy as np
 
 from autotune.arrays import FloatArray
-from autotune.design.loop import ContinuousLoop, OpenLoop, SampledLoop, characteristic_frequencies
+from autotune.design.axis import characteristic_frequencies
+from autotune.design.loop import ContinuousLoop, OpenLoop, SampledLoop
 from autotune.errors import DesignError
 from autotune.models import TransferFunction
 

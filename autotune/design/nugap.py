@@ -14,14 +14,8 @@ from scipy.linalg import eigvalsh, solve_continuous_are
 
 from autotune.arrays import ComplexArray, FloatArray
 from autotune.controller import Controller
-from autotune.design.loop import (
-    ContinuousLoop,
-    Plant,
-    SampledLoop,
-    characteristic_frequencies,
-    open_loop,
-    transfer_function_of,
-)
+from autotune.design.axis import characteristic_frequencies, turn_along_axis
+from autotune.design.loop import ContinuousLoop, Plant, SampledLoop, open_loop, transfer_function_of
 from autotune.design.margins import refined_minimum
 from autotune.errors import DesignError
 from autotune.models import TransferFunction
@@ -237,22 +231,15 @@ def _winding_condition(H1: TransferFunction, H2: TransferFunction) -> bool:
     omega = np.concatenate((-omega[::-1], [0.0], omega))
     a = float(np.exp(np.mean(np.log(characteristic_frequencies(H1, H2)))))
 
-    def f(x: FloatArray) -> ComplexArray:
+    def parts(x: FloatArray) -> ComplexArray:
         s = 1j * x
-        D = np.polyval(N1, s) * np.polyval(N2, s) * np.exp(-s * lag) + np.polyval(M1, s) * np.polyval(M2, s)
+        crossed = np.polyval(N1, s) * np.polyval(N2, s) * np.exp(-s * lag)
         # M_1~ has n1 zeros to the right, M_2 counts n2 to the left: what is left must not wind
-        return np.asarray(D / ((a - s) ** n1 * (a + s) ** n2), dtype=np.complex128)
+        found = np.array([crossed, np.polyval(M1, s) * np.polyval(M2, s)]) / ((a - s) ** n1 * (a + s) ** n2)
+        return np.asarray(found, dtype=np.complex128)
 
-    values = f(omega)
-    for _ in range(14):
-        if np.min(np.abs(values)) <= 1e-13 * np.max(np.abs(values)):
-            return False  # a zero on the axis: the chordal distance is 1 there
-        coarse = np.flatnonzero(np.abs(np.angle(values[1:] / values[:-1])) > np.pi / 4.0)
-        if not len(coarse):
-            break
-        middle = 0.5 * (omega[coarse] + omega[coarse + 1])
-        omega, values = np.insert(omega, coarse + 1, middle), np.insert(values, coarse + 1, f(middle))
-    return round(float(np.sum(np.angle(values[1:] / values[:-1]))) / (2.0 * np.pi)) == 0
+    turned = turn_along_axis(parts, omega)  # none where a zero lies on the axis: the chordal distance is 1 there
+    return turned is not None and round(turned / (2.0 * np.pi)) == 0
 
 
 def _mirrored(coefficients: tuple[float, ...]) -> FloatArray:

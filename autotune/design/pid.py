@@ -11,6 +11,7 @@ import numpy as np
 
 from autotune.arrays import FloatArray
 from autotune.controller import PIDController
+from autotune.design.corners import plainest
 from autotune.design.search import Problem, admissible, polished, separate
 from autotune.errors import DesignError
 
@@ -49,11 +50,9 @@ def best_pid(problem: Problem, pi: PIDController | None, largest: float, omega_r
         best = polished(problem, nodes)
     except DesignError:  # no PID was found between the frequencies of the grid: the PI is one with T_d = 0
         return pi
-    if pi is None:
-        return best
-    both = np.array([(abs(c.K), c.Ti_s, c.Td_s, c.Tf_s) for c in (pi, best)])
-    norms, _ = problem.norms_and_slacks(both)
-    return pi if norms[0] <= norms[1] else best
+    both = [np.array((abs(c.K), c.Ti_s, c.Td_s, c.Tf_s)) for c in (pi, best) if c is not None]
+    found = plainest(both, lambda p: 0.5 * float(np.log(problem.norms_and_slacks(p[None, :])[0][0])), problem.kept)
+    return problem.controller(found)
 
 
 def _everywhere(largest: float, omega_ref: float) -> FloatArray:

@@ -16,6 +16,7 @@ from scipy.optimize import minimize
 
 from autotune.arrays import BoolArray, ComplexArray, FloatArray
 from autotune.controller import PIDController
+from autotune.design.corners import plainest
 from autotune.design.figures import columns
 from autotune.design.kernels import evaluate, evaluate_grid
 from autotune.design.load_error import least_error, load_step
@@ -141,7 +142,9 @@ def _search(plant: UncertainPlant, specification: Specification, kind: Kind) -> 
     if not found:
         assert refused is not None
         raise refused
-    return min(found, key=lambda p: _norm(plant, p))
+    return plainest(
+        found, lambda p: _norm(plant, p), lambda p: float(np.min(_slacks(plant, specification, p))) >= -1e-6
+    )
 
 
 def _search_structure(plant: UncertainPlant, specification: Specification, kind: Kind) -> FloatArray:

@@ -118,6 +118,28 @@ def test_counting_by_argument_agrees_with_the_roots(den: list[float], num: list[
     assert loop.unstable_poles == np.sum(closed.real > 0)
 
 
+@given(decades=st.floats(3.0, 28.0))
+@settings(max_examples=20)
+def test_a_filter_far_faster_than_the_loop_changes_nothing(decades: float) -> None:
+    """The characteristic polynomial then ranges over more decades than a number has digits."""
+    plant = TransferFunction(num=(1.0,), den=(7.7, 15.4, 8.5, 1.0), delay_s=5.0)
+    without = margins(plant, PIDController(K=0.15, Ti_s=5.0))
+    filtered = margins(plant, PIDController(K=0.15, Ti_s=5.0, Td_s=1e-30, Tf_s=5.0 * 10.0**-decades))
+    assert (filtered.stable, without.stable) == (True, True)
+    assert filtered.modulus == pytest.approx(without.modulus, rel=3.0 * 10.0**-decades + 1e-6)
+
+
+@given(lags=st.integers(1, 5), ratio=st.floats(3.0, 4.5))
+@settings(max_examples=20, deadline=None)
+def test_lags_sampled_far_faster_than_they_are_keep_the_margins(lags: int, ratio: float) -> None:
+    """Four lags of 1 s were called unstable at 1 ms: near z = 1 the determinant of the states is (T_s/T)^4."""
+    plant = TransferFunction(num=(1.0,), den=tuple(np.poly([-1.0] * lags)))
+    controller = PIDController(K=0.5, Ti_s=3.0)
+    sampled = margins(plant, PILaw(controller=controller, sample_time_s=10.0**-ratio).discrete())
+    assert sampled.stable
+    assert sampled.modulus == pytest.approx(margins(plant, controller).modulus, rel=3.0 * 10.0**-ratio)
+
+
 def test_delay_with_gain_above_one_at_infinity_is_unstable() -> None:
     plant = TransferFunction(num=(1.0, 2.0), den=(1.0, 1.0), delay_s=0.1)
     assert not margins(plant, PIDController(K=1.1, Ti_s=1.0)).stable

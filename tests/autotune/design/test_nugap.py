@@ -133,6 +133,16 @@ def test_margin_is_the_inverse_norm_of_the_gang_of_four(P: TransferFunction, K: 
     assert b == pytest.approx(1.0 / norm, rel=5e-3)
 
 
+@given(decades=st.floats(0.0, 10.0))
+@settings(max_examples=15)
+def test_lags_far_apart_are_no_distance(decades: float) -> None:
+    """A gain 5 % higher has a nu-gap of .05/2.05 where both crossovers lie on the flat part; 1 was printed."""
+    slow, fast = (10.0**decades, 1.0), (10.0**-decades / 1e3, 1.0)
+    den = tuple(np.polymul(np.polymul(slow, slow), np.polymul(fast, fast)))
+    louder = TransferFunction(num=(1.05,), den=den)
+    assert nu_gap(TransferFunction(num=(1.0,), den=den), louder) == pytest.approx(0.05 / 2.05, rel=1e-3)
+
+
 def test_optimal_margin_of_an_integrator_and_of_a_double_integrator() -> None:
     # X = Y = 1 gives 1/sqrt(2); X = [[sqrt 2, 1], [1, sqrt 2]] and its mirror image give rho(XY) = 3 + 2 sqrt 2
     assert optimal_stability_margin(TransferFunction(num=(1.0,), den=(1.0, 0.0))) == pytest.approx(1.0 / math.sqrt(2.0))

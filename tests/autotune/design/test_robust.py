@@ -98,6 +98,13 @@ def test_pid_on_points_keeps_the_margins_and_is_better_than_the_pi() -> None:
     assert pid.h2 < design_on_points(points, spec1(0.1)).h2
 
 
+def test_a_pid_whose_derivative_buys_nothing_is_a_pi() -> None:
+    """Td_s = 3.3e-30 and Tf_s = 1.3e-24 were handed out, which no device holds."""
+    plant = TransferFunction(num=(-9.024, 1.0), den=(7.6949, 15.3877, 8.5281, 1.0), delay_s=4.9538)
+    found = design_on_points(relay_points(plant, None), asked_of(plant), "pid").controller
+    assert (found.Td_s, found.Tf_s) == (0.0, 0.0)
+
+
 def test_points_that_contradict_each_other_are_refused_by_name() -> None:
     points = list(measured(BALL, 0))
     points[2] = replace(points[2], response=points[2].response * 1.3)
