@@ -25,7 +25,7 @@ def to_control(source: Any, *, pade: int = PADE_ORDER) -> Any:
     ----------
     source : object
         A plant, a model, a controller or a design becomes a ``TransferFunction`` (an RST its R/S), a closed-loop
-        model a ``StateSpace`` with its sample time, points an ``FRD``.
+        model a ``StateSpace`` with its sample time, points an ``FRD`` that remembers their covariance.
     pade : int
         Order of the Pade approximation of a dead time, which python-control does not have.
 
@@ -46,7 +46,9 @@ def to_control(source: Any, *, pade: int = PADE_ORDER) -> Any:
         return control.ss(whole.A, whole.B, whole.C, whole.D, whole.sample_time_s)
     points = as_points(source)
     if points is not None:
-        return control.frd([point.response for point in points], [point.omega_rad_s for point in points])
+        response = control.frd([point.response for point in points], [point.omega_rad_s for point in points])
+        response.measured_points = points  # an FRD knows no covariance: from_control finds it here again
+        return response
     part = source.feedback() if isinstance(source, RST) else getattr(source, "controller", source)
     if isinstance(part, DiscreteController):
         size = max(len(part.num), len(part.den))  # ascending powers of q^-1 are descending ones of z, padded alike

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from autotune.api.points import Points
+from autotune.arrays import ComplexArray, FloatArray
 from autotune.controller import DiscreteController
 from autotune.errors import InputError
 from autotune.identification.closed_loop.state_space import InnovationModel
@@ -35,7 +36,8 @@ def from_control(
     InnovationModel
         Of a discrete ``StateSpace``, without a noise model.
     Points
-        Of an ``FRD``, with a standard deviation of a thousandth of each gain.
+        Of an ``FRD``: those that :func:`autotune.to_control` made it of, else with a standard deviation of a thousandth
+        of each gain, which is in their ``notes``.
 
     Examples
     --------
@@ -46,8 +48,7 @@ def from_control(
     """
     control = python_control()
     if isinstance(system, control.FrequencyResponseData):
-        response = np.asarray(system.frdata)[0, 0]
-        return Points(_known(float(w), complex(g)) for w, g in zip(np.asarray(system.omega), response, strict=True))
+        return _points(np.asarray(system.omega), np.asarray(system.frdata)[0, 0], system)
     if not hasattr(system, "dt"):
         raise InputError(
             f"a {type(system).__name__} is no system of python-control",
@@ -75,6 +76,17 @@ def from_control(
     late = np.concatenate([np.zeros(len(den) - len(num)), num])
     return DiscreteController(
         num=tuple(map(float, late / den[0])), den=tuple(map(float, den / den[0])), sample_time_s=float(system.dt)
+    )
+
+
+def _points(omega: FloatArray, response: ComplexArray, system: Any) -> Points:
+    measured = getattr(system, "measured_points", ())
+    same = [(point.omega_rad_s, point.response) for point in measured] == list(zip(omega, response, strict=True))
+    if measured and same:
+        return Points(measured, measured.notes)
+    return Points(
+        (_known(float(w), complex(g)) for w, g in zip(omega, response, strict=True)),
+        ["an FRD has no covariance: a thousandth of each gain is taken for its standard deviation"],
     )
 
 

@@ -162,7 +162,7 @@ def _(result: ClosedLoopIdentification) -> tuple[str, Row, list[Row]]:
 def _(result: TransferFunction | DiscreteController) -> tuple[str, Row, list[Row]]:
     s = "s" if isinstance(result, TransferFunction) else "q^-1"
     order = "descending" if s == "s" else "ascending"
-    rows = [("num", ", ".join(map(_number, result.num))), ("den", ", ".join(map(_number, result.den)))]
+    rows = [("num", _numbers(result.num)), ("den", _numbers(result.den))]
     if isinstance(result, TransferFunction) and result.delay_s:
         rows.append(("dead time [s]", _number(result.delay_s)))
     return f"Transfer function, {order} powers of {s}", ("", ""), [*rows]
@@ -170,7 +170,7 @@ def _(result: TransferFunction | DiscreteController) -> tuple[str, Row, list[Row
 
 @rows_of.register
 def _(result: RST) -> tuple[str, Row, list[Row]]:
-    rows = [(name, ", ".join(map(_number, getattr(result, name)))) for name in ("R", "S", "T")]
+    rows = [(name, _numbers(getattr(result, name))) for name in ("R", "S", "T")]
     return "RST controller S u = T r - R y, descending powers of s", ("", ""), [*rows]
 
 
@@ -225,14 +225,14 @@ class Cell(str):
 
     Attributes
     ----------
-    value : float or complex
+    value : float, complex or tuple of float
         All of its digits.
     """
 
-    value: float | complex
+    value: float | complex | tuple[float, ...]
 
-    def __new__(cls, text: str, value: float | complex) -> Cell:
-        """Return the text with the number that it stands for."""
+    def __new__(cls, text: str, value: float | complex | tuple[float, ...]) -> Cell:
+        """Return the text with the number or coefficients that it stands for."""
         made = super().__new__(cls, text)
         made.value = value
         return made
@@ -244,6 +244,10 @@ def _pole(pole: complex) -> Cell:
 
 def _number(value: Any) -> Cell:
     return Cell(f"{float(value):.5g}", float(value))
+
+
+def _numbers(values: Sequence[float]) -> Cell:
+    return Cell(", ".join(map(_number, values)), tuple(map(float, values)))
 
 
 def _share(value: float) -> Cell:
@@ -258,8 +262,9 @@ def to_pandas(result: Any) -> Any:
     ----------
     result : object
         A recording has its time [s] as index and a column each; points have their gain, phase and standard deviations;
-        a transition its time, y and u; another result the rows of its table, numbers with all of their digits and
-        relative standard deviations as shares. Remarks on all of a table are in ``attrs["remarks"]``.
+        a transition its time, y and u; another result the rows of its table, numbers with all of their digits,
+        coefficients as tuples of them, and relative standard deviations as shares. Remarks on all of a table are in
+        ``attrs["remarks"]``.
 
     Returns
     -------

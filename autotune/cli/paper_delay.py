@@ -31,6 +31,8 @@ def _noisy(clean: Recording, sd: float, seed: int) -> Recording:
 def one_delay_estimates(sets: Iterable[int]) -> dict[float, tuple[FloatArray, FloatArray, FloatArray | None]]:
     """Return a_1, a_0, b, h of Example 2 at each noise: the paper's way, weighted, and output error where starred.
 
+    Those by output error have their standard deviations beside them, which are the Cramer-Rao bound's.
+
     Parameters
     ----------
     sets : iterable of int
@@ -38,10 +40,10 @@ def one_delay_estimates(sets: Iterable[int]) -> dict[float, tuple[FloatArray, Fl
 
     Returns
     -------
-    dict of float to three (sets, 4) arrays, the last one None for noises that the paper does not improve
+    dict of float to two (sets, 4) arrays and one of (sets, 2, 4), None for noises that the paper does not improve
     """
     clean = example("delay", noise=0.0)
-    rows: dict[float, tuple[list[list[float]], list[list[float]], list[list[float]]]] = {
+    rows: dict[float, tuple[list[list[float]], list[list[float]], list[list[FloatArray]]]] = {
         sd: ([], [], []) for sd in TABLE_1
     }
     for seed in sets:
@@ -53,7 +55,8 @@ def one_delay_estimates(sets: Iterable[int]) -> dict[float, tuple[FloatArray, Fl
             ours.append([weighted.a[1], weighted.a[0], weighted.b, weighted.delay_s])
             if sd in _STARRED:
                 model = identify_delay(record, 2, max_delay_s=12.0)
-                best.append([model.a[1], model.a[0], model.b, model.delay_s])
+                given = [1, 0, 2, 3]
+                best.append([model.values[given], model.standard_deviations[given]])
     return {sd: (np.array(p), np.array(w), np.array(b) if b else None) for sd, (p, w, b) in rows.items()}
 
 

@@ -104,8 +104,10 @@ def _responses(plant: TransferFunction, controllers: Mapping[str, Law]) -> Figur
     slowest = min(margins(plant, feedback(c)).crossover_rad_s for c in controllers.values())
     half_s = _SETTLING / slowest
     figure = make_subplots(rows=2, cols=1, shared_xaxes=True, vertical_spacing=0.06, row_heights=[0.6, 0.4])
+    load = 0.0  # the first controller's own, and the same for all others
     for i, (name, controller) in enumerate(controllers.items()):
-        t, y, u = step_responses(plant, controller, half_s)
+        t, y, u = step_responses(plant, controller, half_s, load)
+        load = load or half_of_largest(u[: u.size // 2])
         for row, values in ((1, y), (2, u)):
             add_line(figure, t, values, name, _COLOURS[i % len(_COLOURS)], row=row, col=1, showlegend=row == 1)
     figure.update_yaxes(title="y", row=1, col=1)
@@ -113,14 +115,14 @@ def _responses(plant: TransferFunction, controllers: Mapping[str, Law]) -> Figur
     figure.update_xaxes(title="time [s]", row=2, col=1)
     return Figure(
         figure=figure,
-        caption="A unit step of the set-point at 0, a step of load at the plant's input half way; the linear loop, "
-        "without limits or noise.",
+        caption="A unit step of the set-point at 0, the same step of load at the plant's input for all half way; "
+        "the linear loop, without limits or noise.",
         height_px=520,
     )
 
 
 def step_responses(
-    plant: TransferFunction, controller: Law, half_s: float
+    plant: TransferFunction, controller: Law, half_s: float, load: float = 0.0
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return t, y and u of a loop after a unit set-point step at 0 and a load step at ``half_s``.
 
@@ -132,11 +134,13 @@ def step_responses(
         Acts on the error; of an RST the set-point passes T.
     half_s : float
         Time of the load step, half of what is simulated [s].
+    load : float
+        Size of the load [u unit]; where it is 0, half of the largest command that the set-point step took.
 
     Returns
     -------
     t, y, u : (1001,) arrays
-        The load is half of the largest command that the set-point step took, with the sign that command had.
+        The linear loop's.
     """
     law = _rational(controller)
     fine = 2.0 * half_s / _STEPS / _SUBSTEPS
@@ -146,15 +150,20 @@ def step_responses(
     wanted = np.cumsum(_sampled(of_setpoint, fine, "bilinear")[0])  # T of a set-point that is 1 from the first row on
     b = np.concatenate([np.zeros(round(plant.delay_s / fine)), b])
     y, u, count = np.zeros(_STEPS * _SUBSTEPS + 1), np.zeros(_STEPS * _SUBSTEPS + 1), _STEPS * _SUBSTEPS + 1
-    at_plant, load = np.zeros(count), 0.0
+    at_plant, at_input = np.zeros(count), 0.0
     for k in range(count):
         y[k] = _next(b, at_plant, k) - _next(np.concatenate([[0.0], a[1:]]), y, k)
         u[k] = wanted[min(k, wanted.size - 1)] - _next(d, y, k) - _next(np.concatenate([[0.0], c[1:]]), u, k)
         if k == count // 2:
-            load = 0.5 * u[int(np.argmax(np.abs(u[: k + 1])))]
-        at_plant[k] = u[k] + load
+            at_input = load or half_of_largest(u[:k])
+        at_plant[k] = u[k] + at_input
     thin = slice(None, None, _SUBSTEPS)
     return fine * np.arange(count, dtype=np.float64)[thin], y[thin], u[thin]
+
+
+def half_of_largest(u: FloatArray) -> float:
+    """Return half of the largest of some commands, with its sign."""
+    return float(0.5 * u[int(np.argmax(np.abs(u)))])
 
 
 def _sampled(

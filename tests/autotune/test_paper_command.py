@@ -125,6 +125,13 @@ def test_the_responses_are_those_of_python_control():
     assert np.ptp(y[~first]) > 0.1
 
 
+def test_controllers_are_compared_under_the_same_load():
+    """Each had half of its own largest command as load, so that the RST looked four times better than it is."""
+    pi, other = PIDController(K=-0.023, Ti_s=3.0), PIDController(K=-0.0367, Ti_s=4.05)
+    levels = [step_responses(BALL, law, 40.0, -0.0115)[2][-1] for law in (pi, other)]
+    np.testing.assert_allclose(levels, 0.0115, rtol=0.02)  # with integral action u takes the load away
+
+
 def test_the_set_point_of_an_rst_passes_its_prefilter():
     control = pytest.importorskip("control")
     rst = at.rst(BALL, dominant_rad_s=1.8, rest_rad_s=11.2)

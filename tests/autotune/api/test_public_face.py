@@ -91,7 +91,24 @@ def test_systems_come_back_from_python_control_as_they_went(oven):
                                model.response(omega)[:, 0, 0])  # fmt: skip
     points = at.frequency_points(oven)
     again = at.from_control(at.to_control(points))
-    np.testing.assert_allclose([p.response for p in again], [p.response for p in points])
+    assert again == points  # with their covariance, of which an FRD knows nothing
+    louder = at.from_control(2.0 * at.to_control(points))
+    np.testing.assert_allclose([p.response for p in louder], [2.0 * p.response for p in points])
+    assert "no covariance" in louder.notes[0]
+
+
+def test_points_that_went_through_python_control_give_the_same_design(oven):
+    """Of a thousandth of each gain, which was taken for their covariance, they contradicted each other."""
+    points = at.frequency_points(oven, largest_relative_sd=0.05)
+    assert at.tune(at.to_control(points)) == at.tune(points)
+
+
+def test_a_table_of_coefficients_has_all_of_their_digits():
+    plant = at.TransferFunction(num=(2.0 / 3.0,), den=(math.pi, 5.0, 1.0))
+    rows = dict(at.to_pandas(plant).to_numpy().tolist())
+    assert (rows["num"], rows["den"]) == (plant.num, plant.den)
+    placed = at.rst(plant, dominant_rad_s=1.0, rest_rad_s=3.0)
+    assert dict(at.to_pandas(placed).to_numpy().tolist()) == {"R": placed.R, "S": placed.S, "T": placed.T}
 
 
 @pytest.mark.parametrize(
