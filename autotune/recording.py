@@ -19,6 +19,7 @@ import numpy as np
 import tomli_w
 from scipy.optimize import minimize_scalar
 
+from autotune.arguments import checked
 from autotune.arrays import FloatArray
 from autotune.errors import InputError
 from autotune.outputs import append_whole, write_whole
@@ -148,15 +149,22 @@ class Recording:
         what = f"{said}: the longest gap has {longest:g} s"
         return InputError(what, where=self.name, remedy=f"cut the recording at the gap{further}")
 
+    @checked
     def between(self, start_s: float, end_s: float) -> Recording:
         """Return the rows with ``start_s <= t < end_s``, time stamps unchanged."""
         return self.only((self.t >= start_s) & (self.t < end_s))
 
     def only(self, keep: Any) -> Recording:
         """Return some of the rows, by number or by mask."""
+        try:
+            self.t[keep]
+        except (IndexError, TypeError, ValueError) as error:
+            remedy = "give numbers of rows, a slice or a mask"
+            raise InputError(f"keep: {error}", where=self.name, remedy=remedy) from None
         extra = {name: values[keep] for name, values in self.extra.items()}
         return replace(self, t=self.t[keep], u=self.u[keep], y=self.y[keep], extra=MappingProxyType(extra))
 
+    @checked
     def resampled(self, dt_s: float) -> Recording:
         """Return the recording on a uniform grid: commands held, other columns linearly interpolated.
 
@@ -170,6 +178,8 @@ class Recording:
         Interpolation filters the noise of ``y`` and attenuates content near the Nyquist frequency; use the
         recorded stamps wherever a method can.
         """
+        if not dt_s > 0.0:
+            raise InputError(f"dt_s = {dt_s:g}", where=self.name, remedy="the step of the new grid must be positive")
         rows = (float(self.t[-1]) - float(self.t[0])) / dt_s + 1.0
         if rows > _MOST_NEW_ROWS + 10.0 * len(self):
             raise self._mostly_gap(f"an even grid of {dt_s:g} s needs {rows:.3g} rows for {len(self)}")
@@ -206,6 +216,7 @@ class Recording:
         b = 1.0 if lateness(1.0) <= found.fun else float(found.x)  # even ones stay as they are
         return replace(self, t=earliest(b) + b * mean * number)
 
+    @checked
     def require_finite(self, columns: Iterable[str] = ("u", "y")) -> Recording:
         """Return self if the columns hold no NaN or infinity.
 

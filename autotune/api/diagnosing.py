@@ -6,6 +6,7 @@ import os
 from collections.abc import Sequence
 from typing import Any
 
+from autotune.arguments import settings_of
 from autotune.arrays import FloatArray
 from autotune.controller import Controller
 from autotune.errors import InputError
@@ -20,11 +21,12 @@ def diagnosed(model: Any, recordings: Sequence[Recording], controller: Controlle
     from autotune.equations.recorded_units import require_units_of_each_other, require_units_of_model
 
     given = _model(model)
+    asked = settings_of(diagnose, settings, where="diagnose", of=("without", "progress", "thresholds"))
     require_units_of_model(given, recordings)
     require_units_of_each_other(recordings)
     if isinstance(given, Model):
-        return diagnose(given, recordings, controller, **settings)
-    return diagnose_equations(given, recordings, controller=controller, **settings)
+        return diagnose(given, recordings, controller, **asked)
+    return diagnose_equations(given, recordings, controller=controller, **asked)
 
 
 def simulated(model: Any, recording: Recording, horizon_s: float | None) -> FloatArray:

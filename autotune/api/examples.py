@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from autotune.api.arguments import number
+from autotune.arguments import number
 from autotune.errors import InputError
 from autotune.models import TransferFunction
 from autotune.recording import Recording

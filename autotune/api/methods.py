@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, get_args
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from autotune.api.arguments import number, one_of, settings_of
 from autotune.api.plants import as_controller, as_loop_plant, as_plant, as_reduced
 from autotune.api.points import as_points
 from autotune.api.recordings import Source, as_recordings, read
+from autotune.arguments import number, one_of, settings_of
 from autotune.arrays import is_real
 from autotune.controller import Controller, PIDController
 from autotune.errors import InputError
@@ -55,19 +55,14 @@ def reduce(source: Any, **settings: Any) -> ReducedModel:
     >>> round(model.G_r, 1), model.integrating
     (-65.5, True)
     """
-    from autotune.identification.reduction import Conditions, Kind, reduce_points, reduce_transfer_function
+    from autotune.identification.reduction import reduce_points, reduce_transfer_function
 
     points = as_points(source)
     if points is None:
         if settings:
             settings_of(reduce_transfer_function, settings, where="reduce, of a known plant")
         return reduce_transfer_function(as_plant(source))
-    asked = settings_of(reduce_points, settings, where="reduce")
-    if asked.get("kind") is not None:
-        asked["kind"] = one_of(asked["kind"], get_args(Kind), name="kind", where="reduce")
-    if "conditions" in asked:
-        asked["conditions"] = one_of(asked["conditions"], get_args(Conditions), name="conditions", where="reduce")
-    return reduce_points(points, **asked)
+    return reduce_points(points, **settings_of(reduce_points, settings, where="reduce"))
 
 
 def tune(
@@ -175,13 +170,6 @@ def _specification(
     from autotune.design.specification import Specification
 
     asked = settings_of(Specification, settings, where="tune")
-    for name in ("delay_margin_s", "setpoint_command", "noise_frequency_rad_s"):
-        value = asked.get(name)
-        if value is not None and not (name == "setpoint_command" and value == math.inf):
-            asked[name] = number(value, name=name, where="tune")
-    for name, words in (("criterion", ("h2", "iae")), ("noise", ("true", "bound"))):
-        if name in asked:
-            asked[name] = one_of(asked[name], words, name=name, where="tune")
     return Specification(
         modulus_margin=number(modulus_margin, name="modulus_margin", where="tune"),
         phase_margin_rad=math.radians(number(phase_margin_deg, name="phase_margin_deg", where="tune")),
@@ -459,7 +447,7 @@ def diagnose(model: Any, recordings: Source, controller: Any = None, **settings:
     controller : PI, controller file, optional
         The law that u was computed by.
     **settings
-        Handed on to the diagnosis.
+        Of :func:`autotune.diagnosis.diagnose`: ``without``, effects that are not looked for, and ``thresholds``.
 
     Returns
     -------

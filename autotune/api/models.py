@@ -6,6 +6,7 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+from autotune.arguments import checked
 from autotune.arrays import FloatArray
 from autotune.equations.black_box import BlackBox
 from autotune.equations.model import EquationModel
@@ -16,6 +17,7 @@ class Model:
     """Makers of models for ``simulate`` and ``diagnose``; none of what they return is an object of this class."""
 
     @staticmethod
+    @checked
     def read(path: str | os.PathLike[str]) -> Chain | EquationModel | BlackBox:
         """Return what a model file holds: a chain of blocks, equations, or an FMU with its inputs and parameters."""
         from autotune.model_file import read_any as read_any_model
@@ -23,6 +25,7 @@ class Model:
         return read_any_model(path)
 
     @staticmethod
+    @checked
     def from_equations(content: Mapping[str, Any], name: str = "model") -> EquationModel:
         """Return equations from a mapping with the keys of a model file: ``input``, ``output``, ``state``, .."""
         from autotune.equations.read import equations_of
@@ -30,6 +33,7 @@ class Model:
         return equations_of({"name": name, **content}, str(content.get("name", name)))
 
     @staticmethod
+    @checked
     def from_control(system: Any, name: str = "") -> Chain | EquationModel:
         """Return a continuous system of python-control: a chain, or equations where it has several inputs."""
         from autotune.equations.imports import from_control
@@ -37,6 +41,7 @@ class Model:
         return from_control(system, name)
 
     @staticmethod
+    @checked
     def from_text(text: str, name: str = "plant") -> Chain:
         """Return a transfer function as people write it: ``-65.5/(s(0.36s+1)) e^-0.1s``, zpk, gain and lags."""
         from autotune.equations.imports import from_coefficients
@@ -46,6 +51,7 @@ class Model:
         return from_coefficients(tf.num, tf.den, tf.delay_s, name)
 
     @staticmethod
+    @checked
     def from_function(
         step: Callable[[Any, FloatArray, Mapping[str, float], float], tuple[Any, float]],
         state: Any,

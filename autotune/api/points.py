@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any
 
-from autotune.api.arguments import number
-from autotune.api.recordings import Source, recordings
+from autotune.api.recordings import Source, read, recordings
+from autotune.arguments import number, settings_of
 from autotune.errors import InputError
 from autotune.points import FrequencyPoint, read_points
 
@@ -72,6 +72,7 @@ def frequency_points(source: Source, *, largest_relative_sd: float = 0.5, **name
     largest_relative_sd = number(largest_relative_sd, name="largest_relative_sd", where="frequency_points", above=0.0)
     if isinstance(source, str) and source.endswith(".json"):
         return Points(read_points(source))
+    names = settings_of(read, names, where="frequency_points")
     estimates = [estimate(one, largest_relative_sd=largest_relative_sd) for one in recordings(source, **names)]
     combined = combine(estimates)
     return Points(combined.points, combined.notes)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from autotune.api.arguments import number
 from autotune.api.plants import as_plant
+from autotune.arguments import number
 
 if TYPE_CHECKING:
     from autotune.design.rst import RST

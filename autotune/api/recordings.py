@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any, TypeAlias
 
 import numpy as np
 
+from autotune.arguments import checked
 from autotune.arrays import FloatArray
 from autotune.errors import InputError
 from autotune.recording import Recording, usable
@@ -18,6 +20,7 @@ Source: TypeAlias = Any
 _OTHER_FILES = ("", ".toml", ".json", ".fmu")
 
 
+@checked
 def read(source: Source, *, t: str = "", u: str = "", y: str = "", r: str = "", name: str = "") -> Recording:
     """Return a recording of the command u and the measurement y over the time t.
 
@@ -51,11 +54,12 @@ def read(source: Source, *, t: str = "", u: str = "", y: str = "", r: str = "", 
     >>> len(recording), round(recording.sample_time_s, 6)
     (100, 0.1)
     """
-    for role, column in {"t": t, "u": u, "y": y, "r": r, "name": name}.items():
-        if not isinstance(column, str):
-            raise InputError(f"{role} = {column!r}"[:200], where="read", remedy="give a name")
     if isinstance(source, Recording):
-        return source
+        if t or u or y or r:
+            raise InputError(
+                "a recording's columns have their names", where="read", remedy="name those of a file or a table"
+            )
+        return replace(source, name=name) if name else source
     if isinstance(source, str | os.PathLike):
         from autotune.files import SignalNames, read_recordings
 

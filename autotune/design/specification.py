@@ -13,6 +13,7 @@ from autotune.controller import PIDController
 from autotune.design.figures import CONSTRAINTS, Figures
 from autotune.design.margins import Margins
 from autotune.errors import DesignError
+from autotune.models import LARGEST, SMALLEST
 
 Kind: TypeAlias = Literal["pi", "pid"]
 #: relative slack below which a constraint counts as binding
@@ -36,7 +37,8 @@ class Specification:
     phase_margin_rad : float
         phi_d of (13) [rad], between 0 and pi/2.
     noise_gain : float
-        N_max: largest amplification of measurement noise to command, input unit per output unit.
+        N_max: largest amplification of measurement noise to command, input unit per output unit, so that no default
+        would mean the same on two rigs.
     noise : {"true", "bound"}
         ``true`` keeps (15) itself, abs(C/(1 + L)) <= N_max for omega >= omega_n; ``bound`` keeps (16), abs(C) <=
         M_m N_max there, which implies (15) wherever the modulus margin is kept and so never asks for less.
@@ -58,7 +60,7 @@ class Specification:
 
     modulus_margin: float = 0.5
     phase_margin_rad: float = math.pi / 4.0
-    noise_gain: float = 0.1
+    noise_gain: float
     noise: Literal["bound", "true"] = "true"
     noise_frequency_rad_s: float | None = None
     delay_margin_s: float = 0.0
@@ -75,12 +77,12 @@ class Specification:
             refuse("phase margin", math.degrees(self.phase_margin_rad), "between 0 and 90 degrees")
         if not 0.0 < self.noise_gain < math.inf:
             refuse("noise gain", self.noise_gain, "a positive number")
-        if not 0.0 <= self.delay_margin_s < math.inf:
+        if self.delay_margin_s != 0.0 and not SMALLEST <= self.delay_margin_s <= LARGEST:
             refuse("delay margin", self.delay_margin_s, "a time in s, not negative")
         if not self.setpoint_command > 0.0:
             refuse("set-point command", self.setpoint_command, "positive")
 
-        if self.noise_frequency_rad_s is not None and not 0.0 < self.noise_frequency_rad_s < math.inf:
+        if self.noise_frequency_rad_s is not None and not SMALLEST <= self.noise_frequency_rad_s <= LARGEST:
             refuse("noise frequency", self.noise_frequency_rad_s, "a positive frequency in rad/s")
 
     @property

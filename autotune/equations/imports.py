@@ -76,7 +76,7 @@ def from_control(system: Any, name: str = "") -> Model | EquationModel:
     """
     name = name or str(getattr(system, "name", "") or "plant")
     kind = type(system).__name__
-    if kind not in ("TransferFunction", "StateSpace"):
+    if kind not in ("TransferFunction", "StateSpace") or not hasattr(system, "dt"):
         raise InputError(
             f"a {kind} is no linear system", where=name,
             remedy="give a TransferFunction or a StateSpace, or write the equations as a model file",
