@@ -164,11 +164,11 @@ def _of_one(value: Any, hints: list[Any], *, name: str, where: str, endless: boo
 
 def _array(value: Any, *, name: str, where: str) -> FloatArray:
     try:
-        found = np.asarray(value, dtype=np.float64)
+        found = np.atleast_1d(np.asarray(value, dtype=np.float64))
     except (TypeError, ValueError, OverflowError):
         found = np.empty(0)
-    if found.size == 0 or not np.all(np.isfinite(found)):
-        raise InputError(f"{name} = {value!r}"[:200], where=where, remedy="it must be finite numbers")
+    if found.size == 0 or found.ndim > 1 or not np.all(np.isfinite(found)):
+        raise InputError(f"{name} = {value!r}"[:200], where=where, remedy="it must be finite numbers in a row")
     return found
 
 

@@ -20,7 +20,7 @@ import tomli_w
 from scipy.optimize import minimize_scalar
 
 from autotune.arguments import checked
-from autotune.arrays import FloatArray
+from autotune.arrays import FloatArray, is_real
 from autotune.errors import InputError
 from autotune.outputs import append_whole, write_whole
 from autotune.text_files import checked_path, printable, read_toml
@@ -149,9 +149,11 @@ class Recording:
         what = f"{said}: the longest gap has {longest:g} s"
         return InputError(what, where=self.name, remedy=f"cut the recording at the gap{further}")
 
-    @checked
     def between(self, start_s: float, end_s: float) -> Recording:
         """Return the rows with ``start_s <= t < end_s``, time stamps unchanged."""
+        if not (is_real(start_s) and is_real(end_s)):
+            said = f"from {start_s!r} to {end_s!r}"[:200]
+            raise InputError(said, where=self.name, remedy="give two times in s, infinite where there is no end")
         return self.only((self.t >= start_s) & (self.t < end_s))
 
     def only(self, keep: Any) -> Recording:

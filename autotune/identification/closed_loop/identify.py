@@ -160,7 +160,7 @@ def identify_closed_loop(
         estimate, evidence = _fitted(u_1, y_1, starts, order, delay, max_order, progress)
         white = whiteness(estimate, residuals(estimate, u_1, y_1, starts))
         estimate = in_units(estimate, scale_u, scale_y, dt_s)
-        omega = _grid(dt_s, len(y)) if omega_rad_s is None else np.asarray(omega_rad_s, dtype=np.float64)
+        omega = _grid(dt_s, len(y)) if omega_rad_s is None else _below_nyquist(omega_rad_s, dt_s)
         result = _report(estimate, omega, law, motion, white)
         if not result.excitation.enough:
             result = replace(result, proposal=_proposal(result, limits or recorded_limits(u, y)))
@@ -264,6 +264,16 @@ def in_units(
         offset_y=estimate.offset_y * scale_y,
         log_det=estimate.log_det + 2.0 * math.log(scale_y) * model.C.shape[0],
     )
+
+
+def _below_nyquist(omega_rad_s: FloatArray, dt_s: float) -> FloatArray:
+    omega = np.asarray(omega_rad_s, dtype=np.float64)
+    if omega.size < 2 or np.any(np.diff(omega) <= 0.0) or not (omega[0] > 0.0 and omega[-1] <= 1.001 * np.pi / dt_s):
+        raise IdentificationError(
+            f"{omega.size} frequencies from {omega[0]:.3g} to {omega[-1]:.3g} rad/s",
+            remedy=f"give at least two, ascending, above 0 and up to {np.pi / dt_s:.4g} rad/s (a row every {dt_s:g} s)",
+        )
+    return omega
 
 
 def _grid(sample_time_s: float, rows: int) -> FloatArray:

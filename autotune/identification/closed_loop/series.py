@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from autotune.arrays import BoolArray, FloatArray
+from autotune.errors import IdentificationError
 from autotune.identification.closed_loop.predictor_directions import Predictor
 from autotune.identification.closed_loop.predictor_sweep import innovations, normal_equations, scatter
 
@@ -62,7 +63,11 @@ class Series:
         """Return the series with a dead time taken out, in each stretch: rows u(t - delay), y(t)."""
         if delay == 0:
             return self
-        kept = [(u[: len(u) - delay], y[delay:]) for u, y in self.stretches if len(u) > delay]
+        kept = [(u[: len(u) - delay], y[delay:]) for u, y in self.stretches if len(u) > delay >= 0]
+        if not kept:
+            raise IdentificationError(
+                f"a dead time of {delay:g} rows in {len(self.y)}", remedy="give it in rows, fewer than were recorded"
+            )
         starts = np.cumsum([0, *(len(y) for _, y in kept)])[:-1]
         u, y = (np.ascontiguousarray(np.concatenate(column)) for column in zip(*kept, strict=True))
         return Series(u=u, y=y, starts=tuple(int(start) for start in starts))

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from autotune.arguments import checked
 from autotune.arrays import FloatArray, is_real
 from autotune.errors import IdentificationError, InputError
 from autotune.identification.delay import online_chain as chain
@@ -188,8 +189,9 @@ class OnlineEstimator:
         IdentificationError
             The delay ran out of the record: lock was lost.
         """
-        if not (np.isfinite(t) and np.isfinite(u) and np.isfinite(y)):
-            raise InputError(f"t = {t}, u = {u}, y = {y}", where="step", remedy="leave out rows that are not numbers")
+        if not all(is_real(value) and math.isfinite(value) for value in (t, u, y)):
+            said = f"t = {t!r}, u = {u!r}, y = {y!r}"[:200]
+            raise InputError(said, where="step", remedy="leave out rows that are not numbers")
         if self._rows and not t > self._scalars[chain.LAST_T]:
             raise InputError(f"t = {t:g} s is not later than the last row", where="step", remedy="call it once a row")
         self._make_room()
@@ -207,6 +209,7 @@ class OnlineEstimator:
             raise _lost(t)
         return self._filled_sample(t, state, covariance)
 
+    @checked
     def run(self, t: FloatArray, u: FloatArray, y: FloatArray) -> OnlineSample:
         """Take all rows of a record at once, as the first ones, and return the estimates after the last.
 
@@ -214,7 +217,15 @@ class OnlineEstimator:
         ----------
         t, u, y : (N,) arrays
             As of :meth:`step`, in order.
+
+        Raises
+        ------
+        InputError, IdentificationError
+            As of :meth:`step`, or columns that are not of one length.
         """
+        if not (t.shape == u.shape == y.shape and t.size > 1 and np.all(np.diff(t) > 0.0)):
+            what = f"t, u and y of shapes {t.shape}, {u.shape} and {y.shape}"
+            raise InputError(what, where="run", remedy="give one of each for every row, two at least, in order")
         self._t, self._u, self._past = t, u, np.zeros((t.size, self._past.shape[1]))
         self._rows = self._taken = t.size
         self._begin(t[0], u[0], y[0])

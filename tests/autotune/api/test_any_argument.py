@@ -109,6 +109,10 @@ FURTHER: dict[str, tuple[Callable[..., Any], tuple[str, ...]]] = {
         lambda **more: at.rst(PLANT, dominant_rad_s=1.0, rest_rad_s=2.0).law(**{"sample_time_s": 0.01, **more}),
         ("sample_time_s", "u_min", "u_max"),
     ),
+    "OnlineEstimator.step": (
+        lambda **more: at.OnlineEstimator(1, forgetting=1.0).step(**{"t": 0.0, "u": 0.0, "y": 0.0, **more}),
+        ("t", "u", "y"),
+    ),
     "OnlineEstimator.run": (
         lambda **more: at.OnlineEstimator(1, forgetting=1.0).run(**{"t": [0.0], "u": [0.0], "y": [0.0], **more}),
         ("t", "u", "y"),
