@@ -369,7 +369,9 @@ def closed_loop(
     more : three sequences of str
         Columns of further inputs, outputs and excitations.
     **settings
-        Of :func:`autotune.identification.closed_loop.identify.identify_closed_loop`, such as ``max_order``.
+        Of :func:`autotune.identification.closed_loop.identify.identify_closed_loop`, such as ``max_order``; of the
+        other methods ``f``, ``p``, ``n_cl`` and ``Psi``, see
+        :class:`autotune.identification.closed_loop.methods.Windows`.
 
     Examples
     --------
@@ -378,7 +380,7 @@ def closed_loop(
     >>> len(found.poles)
     5
     """
-    from autotune.identification.closed_loop.methods import METHODS
+    from autotune.identification.closed_loop.methods import METHODS, Windows
 
     way = one_of(method, METHODS, name="method", where="closed_loop")
     if order is not None:
@@ -396,11 +398,8 @@ def closed_loop(
         return identify_closed_loop(record, order=order, controller=law, **asked)
     from autotune.identification.closed_loop.signals import model_of_recording
 
-    if settings:
-        raise InputError(
-            f"no setting {next(iter(settings))!r}", where=f"closed_loop, {way}", remedy="it has order, controller, more"
-        )
-    return model_of_recording(record, method=way, order=order, controller=law, more=more)
+    windows = Windows(**settings_of(Windows, settings, where=f"closed_loop, {way}"))
+    return model_of_recording(record, method=way, order=order, controller=law, more=more, windows=windows)
 
 
 def _are_names(value: Any) -> bool:

@@ -14,14 +14,14 @@ from rich.console import Console
 from autotune.cli import app, identify
 from autotune.cli.common import OVERWRITE
 from autotune.cli.recordings import R, T, U, Y, read_one, signal_names
+from autotune.errors import InputError
 from autotune.outputs import Output, claim
 
 if TYPE_CHECKING:
-    from autotune.controller import Controller
     from autotune.identification.closed_loop.dither_proposal import DitherLimits
     from autotune.identification.closed_loop.identify import ClosedLoopIdentification
+    from autotune.identification.closed_loop.methods import Windows
     from autotune.identification.closed_loop.state_space import InnovationModel
-    from autotune.recording import Recording
 
 
 class ClosedLoopMethod(StrEnum):
@@ -67,6 +67,10 @@ def closed_loop(
     more_r: Annotated[
         list[str] | None, typer.Option(metavar="COLUMN", help="what was added to that further input; may be repeated")
     ] = None,
+    f: Annotated[int | None, typer.Option("--f", min=1, help="rows of the future, of a subspace method")] = None,
+    p: Annotated[int | None, typer.Option("--p", min=1, help="rows of the past, likewise")] = None,
+    n_cl: Annotated[int | None, typer.Option("--n-cl", min=1, help="order of the loop, of the indirect method")] = None,
+    psi: Annotated[str | None, typer.Option("--psi", help="its instrument: r, or 'r and y' (when absent)")] = None,
     t: T = None,
     u: U = None,
     y: Y = None,
@@ -76,6 +80,7 @@ def closed_loop(
     """Identify the plant from r, u and y recorded while its loop is closed."""
     from autotune.controller import read_controller
     from autotune.identification.closed_loop.identify import identify_closed_loop
+    from autotune.identification.closed_loop.signals import model_of_recording
     from autotune.identification.dependence import require_answer
 
     console = Console(stderr=True, highlight=False)
@@ -84,12 +89,19 @@ def closed_loop(
     require_answer([data])
     law = None if controller is None else read_controller(controller)
     if method is not ClosedLoopMethod.prediction_error or more_u or more_y:
-        model = _by_method(data, method.value, order, law, (more_u or [], more_y or [], more_r or []))
+        if delay is not None or config is not None:
+            raise InputError("--delay and --config are of prediction-error", where=method.value)
+        more = more_u or [], more_y or [], more_r or []
+        model = model_of_recording(
+            data, method=method.value, order=order, controller=law, more=more, windows=_windows(f, p, n_cl, psi)
+        )
         place.json(model_json(model, method.value))
         poles = ", ".join(f"{pole:.4g}" for pole in model.poles)
         typer.echo(f"order {model.order} by {method.value}, poles {poles}")
         typer.echo(f"wrote {out}")
         return
+    if any(value is not None for value in (f, p, n_cl, psi)):
+        raise InputError("--f, --p, --n-cl and --psi are of the other methods", where="prediction-error")
     with console.status("reading the loop") as status:
         result = identify_closed_loop(
             data,
@@ -107,17 +119,11 @@ def closed_loop(
     typer.echo(f"wrote {out}")
 
 
-def _by_method(
-    data: Recording,
-    method: Any,
-    order: int | None,
-    law: Controller | None,
-    more: tuple[list[str], list[str], list[str]],
-) -> InnovationModel:
-    """Return the model of a method that gives nothing but a model, of as many signals as are named."""
-    from autotune.identification.closed_loop.signals import model_of_recording
+def _windows(f: int | None, p: int | None, n_cl: int | None, psi: str | None) -> Windows:
+    from autotune.arguments import settings_of
+    from autotune.identification.closed_loop.methods import Windows
 
-    return model_of_recording(data, method=method, order=order, controller=law, more=more)
+    return Windows(**settings_of(Windows, {"f": f, "p": p, "n_cl": n_cl, "Psi": psi}, where="identify closed-loop"))
 
 
 def model_json(model: InnovationModel, method: str) -> dict[str, Any]:

@@ -177,7 +177,7 @@ def _estimate(data: Recording, models: dict[str, list[InnovationModel]]) -> None
     from autotune.api.examples import LOOP_CONTROLLER
     from autotune.controller import DiscreteController
     from autotune.errors import IdentificationError
-    from autotune.identification.closed_loop.methods import closed_loop_model, markov_of
+    from autotune.identification.closed_loop.methods import NEED_R, Windows, closed_loop_model, markov_of
 
     law = DiscreteController(num=LOOP_CONTROLLER[0], den=LOOP_CONTROLLER[1], sample_time_s=1.0)
     for title, (method, window) in _DRAWN.items():
@@ -190,6 +190,6 @@ def _estimate(data: Recording, models: dict[str, list[InnovationModel]]) -> None
                     order=5,
                     r=data.extra["r"][:, None],
                     controller_markov=markov_of(law, 40),
-                    window=window or None,
+                    windows=Windows(f=window) if method in NEED_R else Windows(p=window or None),
                 )
             )

@@ -78,8 +78,12 @@ def reference_command(
     if (model is None) == (controller is None):
         raise InputError("give one of --model and --controller", where="autotune reference")
     if controller is not None:
-        _prefilter(controller, place)
-        typer.echo(f"wrote {out}: filter the set-point by it, and set the controller's set-point weight to 1")
+        weight = _prefilter(controller, place)
+        passes = "; F is 1: the whole set-point passes; write setpoint_weight = 0 into the file for the full prefilter"
+        typer.echo(
+            f"wrote {out}, the prefilter F of set-point weight {weight:g}{passes if weight == 1.0 else ''}; "
+            "filter the set-point by it, and set the controller's set-point weight to 1"
+        )
         return
     import numpy as np
 
@@ -113,7 +117,8 @@ def reference_command(
     typer.echo(f"{found.duration_s:.4g} s from {begin:g} to {end:g}, decided by {found.binding}; wrote {out}")
 
 
-def _prefilter(controller: Path, place: Output) -> None:
+def _prefilter(controller: Path, place: Output) -> float:
+    """Write the prefilter of a controller file and return its set-point weight."""
     from autotune.controller import PIDController, read_controller, write_controller
     from autotune.design.reference import prefilter
 
@@ -121,6 +126,7 @@ def _prefilter(controller: Path, place: Output) -> None:
     if not isinstance(law, PIDController):
         raise InputError("has num and den", where=str(controller), remedy="a prefilter belongs to a PI or PID")
     place.by(lambda part: write_controller(prefilter(law), part))
+    return law.setpoint_weight
 
 
 @app.command("rst")

@@ -11,7 +11,7 @@ from autotune.arrays import FloatArray
 from autotune.controller import Controller, DiscreteController
 from autotune.errors import InputError
 from autotune.identification.closed_loop.control_law import check_law
-from autotune.identification.closed_loop.methods import NEED_R, Method, closed_loop_model, markov_of
+from autotune.identification.closed_loop.methods import CHOSEN, NEED_R, Method, Windows, closed_loop_model, markov_of
 from autotune.identification.closed_loop.state_space import InnovationModel
 from autotune.recording import Recording
 
@@ -26,6 +26,7 @@ def model_of_recording(
     order: int | None = None,
     controller: Controller | None = None,
     more: tuple[Sequence[str], Sequence[str], Sequence[str]] = ((), (), ()),
+    windows: Windows = CHOSEN,
 ) -> InnovationModel:
     """Return the plant's model by one of the closed-loop methods from a recording of the loop.
 
@@ -42,6 +43,8 @@ def model_of_recording(
         With one input and one output; several controllers' laws are found from the data.
     more : three sequences of str
         Columns of further inputs, outputs and excitations.
+    windows : Windows
+        f, p, n_cl and Psi of the subspace methods.
 
     Returns
     -------
@@ -73,7 +76,14 @@ def model_of_recording(
                 remedy="name what was added to each further input by --more-r",
             )
     return closed_loop_model(
-        u, y, method=method, order=order, r=r, controller_markov=markov, sample_time_s=recording.sample_time_s
+        u,
+        y,
+        method=method,
+        order=order,
+        r=r,
+        controller_markov=markov,
+        windows=windows,
+        sample_time_s=recording.sample_time_s,
     )
 
 

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+import autotune as at
 from autotune.cli import app
 from autotune.controller import DiscreteController, write_controller
+from autotune.errors import InputError
 from autotune.identification.closed_loop.methods import METHODS
 from autotune.recording import Recording, write_recording
 from tests.autotune.identification.delay_examples import A, B, example_2
@@ -103,3 +106,36 @@ def test_an_indirect_method_without_r_is_refused_with_what_would_do(loop, tmp_pa
         ["identify", "closed-loop", str(tmp_path / "no_r.csv"), "--method", "indirect", "--out", str(tmp_path / "c")],
     )
     assert "record what moved the loop" in str(result.exception)
+
+
+@pytest.mark.parametrize(
+    ("method", "windows"),
+    [
+        ("indirect", {"f": 15, "p": 15, "n_cl": 8, "Psi": "r"}),
+        ("van-overschee", {"f": 10, "p": 10}),
+        ("oku-tanaka", {"f": 20}),
+        ("ssarx", {"f": 12, "p": 20}),
+    ],
+)
+def test_the_papers_windows_are_reached_and_change_the_model(method: str, windows: dict[str, Any]) -> None:
+    record = at.example("loop")
+    chosen = at.closed_loop(record, 5, method=method)
+    asked = at.closed_loop(record, 5, method=method, **windows)
+    assert len(asked.poles) == 5
+    assert np.max(np.abs(asked.poles - chosen.poles)) > 1e-9
+
+
+@pytest.mark.parametrize(
+    ("method", "windows", "named"),
+    [
+        ("oku-tanaka", {"n_cl": 8}, "n_cl is none of its settings"),
+        ("ssarx", {"Psi": "r"}, "Psi is none of its settings"),
+        ("indirect", {"psi": "r"}, "'Psi'"),
+        ("indirect", {"Psi": "u"}, "known are r, r and y"),
+        ("indirect", {"f": 0}, "at least 1"),
+        ("prediction-error", {"f": 10}, "no setting 'f'"),
+    ],
+)
+def test_a_window_that_a_method_does_not_take_is_refused(method: str, windows: dict[str, Any], named: str) -> None:
+    with pytest.raises(InputError, match=named):
+        at.closed_loop(at.example("loop"), 5, method=method, **windows)
