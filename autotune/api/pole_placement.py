@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from autotune.api.plants import as_plant
+from autotune.api.plants import as_plant, as_reduced
 from autotune.arguments import number
+from autotune.errors import DesignError
 
 if TYPE_CHECKING:
     from autotune.design.rst import RST
@@ -16,7 +17,7 @@ def rst(plant: Any, *, dominant_rad_s: float, rest_rad_s: float) -> RST:
 
     Parameters
     ----------
-    plant : TransferFunction, model or its file, reduced model, python-control system
+    plant : TransferFunction, model or its file, python-control system
         Strictly proper, of order n, without dead time.
     dominant_rad_s : float
         Distance of the double dominant pole from the imaginary axis [rad/s].
@@ -33,7 +34,8 @@ def rst(plant: Any, *, dominant_rad_s: float, rest_rad_s: float) -> RST:
     Raises
     ------
     DesignError
-        Dead time, a plant that is not strictly proper, or one with a common factor or a zero at s = 0.
+        Dead time, a plant that is not strictly proper, one with a common factor or a zero at s = 0, or a reduced model:
+        a loop that is stable with it need not be with the plant.
 
     Notes
     -----
@@ -53,6 +55,12 @@ def rst(plant: Any, *, dominant_rad_s: float, rest_rad_s: float) -> RST:
     """
     from autotune.design.rst import place_dominant
 
+    if as_reduced(plant) is not None:
+        raise DesignError(
+            "an RST is not of class (2), so that margins on the reduced model are no guarantee",
+            where="rst",
+            remedy="place its poles on the plant, or on a model fitted to it",
+        )
     wanted = [
         number(value, name=name, where="rst", above=0.0)
         for name, value in (("dominant_rad_s", dominant_rad_s), ("rest_rad_s", rest_rad_s))

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import autotune as at
 from autotune.config.procedure import DesignSettings
 from autotune.controller import PIDController
 from autotune.design.checks import on_plants, on_points
@@ -24,7 +25,7 @@ from autotune.identification.reduction import reduce_points
 from autotune.models import TransferFunction
 from autotune.pipeline import analyse
 from tests.autotune.design.plants import DELAY_DOMINATED, FOPDT, LAG_DOMINATED, REDUCED, measured
-from tests.benchmarks.guarantees import judged, makers, outcome
+from tests.benchmarks.guarantees import judged, makers, outcome, shortfall, true_margins
 from tests.benchmarks.random_plants import CLASSES, plants, relay_points
 
 ROOMY = spec1(10.0)
@@ -48,6 +49,36 @@ def test_points_of_one_resonance_guard_against_a_second_one_beyond_them(
     for source in ("exact points", "points"):
         row = outcome(plant, makers(plant, 5, kind)[source], lambda: None)
         assert row["what"] in ("kept", "refused"), (source, row["shortfall"], row["reason"])
+
+
+def test_no_rst_is_placed_on_a_reduced_model() -> None:
+    """Of 126 that were, two were stable on the reduced model and not on the plant it stands for."""
+    plant = TransferFunction(num=(-0.5, 1.0), den=(0.5, 1.5, 1.0), delay_s=0.3)
+    with pytest.raises(DesignError, match="no guarantee"):
+        at.rst(at.reduce(plant), dominant_rad_s=0.5, rest_rad_s=1.5)
+
+
+@given(
+    lags=st.lists(st.floats(0.05, 1.0), min_size=1, max_size=6),
+    zero=st.sampled_from([-2.0, -0.5, 0.0, 0.3, 0.9]),
+    dominant=st.floats(0.2, 3.0),
+    ratio=st.floats(1.0, 10.0),
+)
+@settings(max_examples=20, deadline=None)
+def test_the_figures_of_an_rst_are_those_of_a_loop_of_other_code(
+    lags: list[float], zero: float, dominant: float, ratio: float
+) -> None:
+    den = np.array([1.0, 1.0])
+    for lag in lags:
+        den = np.polymul(den, [lag, 1.0])
+    plant = TransferFunction(num=(-zero, 1.0) if zero else (1.0,), den=tuple(den))
+    try:
+        found = at.rst(plant, dominant_rad_s=dominant, rest_rad_s=dominant * ratio)
+    except DesignError:  # a zero that a lag takes away
+        return
+    printed = at.margins(plant, found)
+    assert printed.stable
+    assert shortfall(true_margins(plant, found.feedback()), printed, None) > -0.01
 
 
 def test_a_structure_that_the_points_contradict_is_no_evidence_against_a_design_on_them() -> None:
