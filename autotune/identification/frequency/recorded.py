@@ -27,7 +27,7 @@ _PER_DECADE = (10, 5, 3, 2)
 _ENOUGH_POINTS = 4
 _LEAST_LINES = 13
 _HIGHEST_PART = 0.1  # of the sampling frequency: the images of the hold and the noise of the stamps stay below
-_ROUNDS = 2
+_ROUNDS = 6
 _RELAY_PART = 0.5  # of the recording that relay oscillations must fill
 
 
@@ -194,7 +194,7 @@ def _corrected(
     repeat: int | None,
     per_decade: int,
 ) -> tuple[list[LocalEstimate], ReferenceModel | None]:
-    """Estimate on y, then twice on what a rough model leaves of it, if one describes the estimates at all."""
+    """Estimate on y, then again on what a rough model leaves of it, if one describes the estimates at all."""
     centred = u - u.mean()
     reference: ReferenceModel | None = None
     spectra = record_spectra(t, u, y, r, highest_rad_s=highest)
