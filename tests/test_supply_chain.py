@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import tomllib
+from importlib import metadata
 from pathlib import Path
 
 import pytest
@@ -36,6 +37,11 @@ def test_the_lock_holds_every_package_that_is_asked_for_in_a_version_that_is(nam
         assert canonicalize_name(asked.name) in versions, f"{text}: make lock"
         for version in versions[canonicalize_name(asked.name)]:
             assert asked.specifier.contains(version), f"{text}, locked {version}: make lock"
+
+
+@pytest.mark.parametrize("name", ["pip", "setuptools"])
+def test_what_installs_is_locked_too_and_not_what_the_interpreter_brought(name: str) -> None:
+    assert metadata.version(name) in locked("test")[name]
 
 
 @pytest.mark.parametrize("name", [*ASKED, "tools"])

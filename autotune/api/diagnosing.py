@@ -37,6 +37,7 @@ def simulated(model: Any, recording: Recording, horizon_s: float | None) -> Floa
 
     given = _model(model)
     require_units_of_model(given, [recording])
+    recording.require_dense()
     if isinstance(given, Model):
         return forecast(given, recording, horizon_s)
     return forecast_any(given, recording, horizon_s)

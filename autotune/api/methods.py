@@ -56,12 +56,14 @@ def reduce(source: Any, **settings: Any) -> ReducedModel:
     (-65.5, True)
     """
     from autotune.identification.reduction import reduce_points, reduce_transfer_function
+    from autotune.points import require_regions
 
     points = as_points(source)
     if points is None:
         if settings:
             settings_of(reduce_transfer_function, settings, where="reduce, of a known plant")
         return reduce_transfer_function(as_plant(source))
+    require_regions(points, "reduce")
     return reduce_points(points, **settings_of(reduce_points, settings, where="reduce"))
 
 
@@ -138,7 +140,9 @@ def tune(
     if points is not None:
         from autotune.identification.parametric import fit_plant
         from autotune.pipeline.analysis import of_use, on_measured
+        from autotune.points import require_regions
 
+        require_regions(points, "tune")
         measured = of_use(points)
         fit = fit_plant(measured)
         return on_measured(measured, fit, wanted(fit.plant, measured[-1].omega_rad_s), structure)[1]

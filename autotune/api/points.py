@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable
 from typing import Any
 
@@ -70,7 +71,7 @@ def frequency_points(source: Source, *, largest_relative_sd: float = 0.5, **name
     from autotune.identification.frequency.recorded import frequency_points as estimate
 
     largest_relative_sd = number(largest_relative_sd, name="largest_relative_sd", where="frequency_points", above=0.0)
-    if isinstance(source, str) and source.endswith(".json"):
+    if isinstance(source, str | os.PathLike) and os.fspath(source).endswith(".json"):
         return Points(read_points(source))
     names = settings_of(read, names, where="frequency_points")
     estimates = [estimate(one, largest_relative_sd=largest_relative_sd) for one in recordings(source, **names)]

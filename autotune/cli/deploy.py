@@ -66,24 +66,22 @@ def deploy(
 ) -> None:
     """Write gains into the rig's own controller, read them back, verify the loop; else restore the old gains."""
     from autotune.config import load_config
-    from autotune.experiment.judgement import require_predictable
     from autotune.pipeline.approval import approval_of
     from autotune.pipeline.audit import audit_log
     from autotune.pipeline.deployment import deploy as hand_over
     from autotune.pipeline.folder import JOURNAL, next_free
     from autotune.pipeline.held_gains import held_by
     from autotune.pipeline.result import verification_json, write_json
+    from autotune.pipeline.sensible_gains import require_sensible
     from autotune.report.page import write_page
     from autotune.report.run_page import deployment_page
 
     content = load_config(config)
     approval = approval_of(content, approved_by, reason)
     new = _gains(controller, design, run)
-    measured, fit = _plant(run, points) if verify else (None, None)
+    measured, fit = _plant(run, points) if verify or run is not None or points is not None else (None, None)
     rig = _with_gains(rig_of(content))
     new = held_by(rig, new, content.design, fit=fit)
-    if fit is not None:
-        require_predictable(fit, new)
     if not yes and not sys.stdin.isatty():
         raise InputError(
             "nobody can be asked here", where="autotune deploy", remedy="look at the gains, then give --yes"
@@ -94,6 +92,7 @@ def deploy(
     _restore_interrupted(rig, folder / JOURNAL, console, yes, audit)
 
     def agree(old: PIDController, to_be: PIDController) -> None:
+        require_sensible(content, old, to_be, fit)
         console.print(_comparison(content, old, to_be, form, (u_span, y_span), fit))
         if not yes and not typer.confirm("Write the new gains?"):
             raise InputError("refused: nothing was written", where="autotune deploy")

@@ -53,6 +53,7 @@ def simulate(
     data = read_one(recording, signal_names(t, u, y, r), moving=False)
     nominal = read_any_model(model)
     require_units_of_model(nominal, [data])
+    data.require_dense()
     y_sim = forecast(nominal, data, horizon) if isinstance(nominal, Model) else of_any(nominal, data, horizon)
     if not np.all(np.isfinite(y_sim)):
         at = float(data.t[int(np.argmax(~np.isfinite(y_sim)))])

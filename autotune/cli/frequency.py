@@ -90,7 +90,7 @@ def reduce(
     from autotune.identification.frequency.thinning import said, thinned
     from autotune.identification.reduced_file import write_reduced
     from autotune.identification.reduction import reduce_points, reduce_transfer_function
-    from autotune.points import LARGEST, SMALLEST, read_points
+    from autotune.points import LARGEST, SMALLEST, read_points, require_regions
 
     place = Output(out, inputs=(points, model), overwrite=overwrite)
     if (points is None) == (model is None):
@@ -114,6 +114,7 @@ def reduce(
             )  # fmt: skip
         known = (static_gain, static_gain_sd if static_gain_sd is not None else 0.01 * abs(static_gain))
     given = read_points(points)
+    require_regions(given, str(points))
     few = thinned(given)
     for note in said(len(given), len(few)):
         typer.echo(f"note: {note}")

@@ -216,7 +216,7 @@ def tune(
     from autotune.config.procedure import DesignSettings, SignalSettings
     from autotune.controller import write_controller
     from autotune.pipeline import CONTROLLER, RESULT, analyse, analysis_json, measured_of
-    from autotune.points import read_points
+    from autotune.points import read_points, require_regions
     from autotune.report.page import write_page
     from autotune.report.run_page import analysis_page
     from autotune.schema import validated
@@ -240,6 +240,8 @@ def tune(
     )
     read = read_all(recordings, signal_names(t, u, y, r))
     given = [point for path in files for point in read_points(path)]
+    if given and not read:
+        require_regions(given, ", ".join(map(str, files)))
     with ProgressBar() as bar:
         found = measured_of(read, given, bar.work)
         analysis = analyse(found.points, asked, fit=found.fit, facts=found.facts, progress=bar.work)

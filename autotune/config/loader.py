@@ -8,6 +8,7 @@ from typing import Annotated, Any
 
 from pydantic import Field, model_validator
 
+from autotune.config.gains import beyond_ranges
 from autotune.config.procedure import (
     ApprovalSettings,
     ControllerSettings,
@@ -85,6 +86,13 @@ class Config(Section):
                 f"experiment.budget_s = {budget_s:g} is less than {LEAST_SAMPLES} samples of {sample_s:g} s: nothing"
                 f" swings in that time; give at least {LEAST_SAMPLES * sample_s:g}, and some periods of the rig"
             )
+        return self
+
+    @model_validator(mode="after")
+    def _has_gains_of_its_ranges(self) -> Config:
+        now = self.controller
+        if now is not None and (odd := beyond_ranges(now.K, now.Ti_s, self.limits, self.signals.sample_time_s)):
+            raise ValueError(f"controller: {odd}; check the units of the gains")
         return self
 
     @model_validator(mode="after")

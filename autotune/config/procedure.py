@@ -69,7 +69,9 @@ class OperatingPointSettings(Section):
         Literal["ramp", "hold"],
         Field(description="ramp the command until y moves, or start where the rig is"),
     ] = "ramp"
-    plant_sign: Annotated[Literal[-1, 0, 1], Field(description="sign of the plant's gain; 0 to have it measured")] = 0
+    plant_sign: Annotated[
+        int, Field(ge=-1, le=1, description="sign of the plant's gain, -1 or 1; 0 to have it measured")
+    ] = 0
     ramp_rate: Annotated[
         float | None,
         Field(

@@ -113,7 +113,7 @@ class ModbusRtuSettings(ModbusSettings):
     device: Annotated[str, Field(description="serial device, e.g. /dev/ttyUSB0")]
     baud: Annotated[int, Field(ge=300, le=4_000_000, description="line speed [bit/s], 300..4000000")] = 19200
     parity: Annotated[Literal["N", "E", "O"], Field(description="none, even or odd parity")] = "E"
-    stop_bits: Annotated[Literal[1, 2], Field(description="stop bits, 1 or 2")] = 1
+    stop_bits: Annotated[int, Field(ge=1, le=2, description="stop bits, 1 or 2")] = 1
 
 
 class SerialSettings(Section):

@@ -12,6 +12,7 @@ Grammar (highest binding last)::
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -168,7 +169,10 @@ class _Parser:
     def _product(self) -> Expression:
         tree = self._signed()
         while (sign := self._take("*", "/")) is not None:
-            tree = Call(sign, (tree, self._signed()))
+            divisor_at, right = self._at, self._signed()
+            if sign == "/" and right == Number(0.0):
+                raise self._refused("division by zero", self._tokens[divisor_at][2])
+            tree = Call(sign, (tree, right))
         return tree
 
     def _signed(self) -> Expression:
@@ -197,6 +201,8 @@ class _Parser:
         kind, text, at = self._tokens[self._at]
         self._at += 1
         if kind == "number":
+            if not math.isfinite(float(text)):
+                raise self._refused("no number holds this", at)
             return Number(float(text))
         if kind == "name":
             return self._called(text, at) if self._take("(") is not None else self._named(text, at)

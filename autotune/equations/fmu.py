@@ -14,6 +14,7 @@ The model file names the FMU, its inputs by the recording's columns, the output,
 
 from __future__ import annotations
 
+import math
 import shutil
 import tempfile
 import weakref
@@ -98,7 +99,8 @@ def fmu_of(content: Mapping[str, Any], where: str) -> BlackBox:
     for name, table in content.get("parameters", {}).items():
         _require(known, name, "parameter", f"{where} [parameters.{name}]")
         given = dict(table) if isinstance(table, dict) else {"value": table}
-        given.setdefault("value", float(known[name].start or 0.0))
+        if "value" not in given:
+            given["value"] = _start(known[name], path) if known[name].start else 0.0
         parameters.append(parameter_of(name, given, where))
     return BlackBox(
         name=str(content.get("name", Path(where).stem)),
@@ -139,11 +141,24 @@ def template(path: Path) -> dict[str, Any]:
     for table in inputs:
         if table["column"] == table["variable"]:
             del table["variable"]
-    parameters = {v.name: {"value": float(v.start)} for v in by["parameter"] if _is_real(v) and v.start is not None}
+    parameters = {v.name: {"value": _start(v, path)} for v in by["parameter"] if _is_real(v) and v.start is not None}
     return {
         "name": str(description.modelName), "fmu": path.name, "input": inputs,
         "output": {"value": by["output"][0].name}, "parameters": parameters,
     }  # fmt: skip
+
+
+def _start(variable: Any, path: Path) -> float:
+    try:
+        value = float(variable.start)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise InputError(
+            f"start = {str(variable.start)[:40]!r} of {variable.name!r} is no number", where=str(path),
+            remedy="declare it in the tool that made it",
+        )  # fmt: skip
+    return value
 
 
 def _is_real(variable: Any) -> bool:

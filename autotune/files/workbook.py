@@ -5,6 +5,7 @@ from __future__ import annotations
 import datetime
 import re
 import zipfile
+import zlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -82,6 +83,15 @@ def _require_bounded(path: Path) -> None:
     """
     if not zipfile.is_zipfile(path):
         return
+    try:
+        _require_bounded_archive(path)
+    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError) as error:  # or encrypted
+        raise InputError(
+            f"cannot be read as a workbook ({error})", where=str(path), remedy="save it as CSV, without a password"
+        ) from None
+
+
+def _require_bounded_archive(path: Path) -> None:
     with zipfile.ZipFile(path) as archive:
         if sum(part.file_size for part in archive.infolist()) > _MOST_BYTES:
             raise InputError("is larger than 1 GB unpacked", where=str(path), remedy="save the sheet as CSV")

@@ -33,6 +33,8 @@ _FEEDBACK, _LEAST_OWN = 0.7, 3e-4
 _LEAST_RIDGE = 1e-10
 #: Of the cause's energy, so much has to be left at a lag.
 _LEAST_ENERGY = 0.05
+#: By so much later than it does y may seem to answer: whitening smears.
+_SMEARED = 2.0
 #: One column is a copy of the other, in another unit, where less than this part of its spread is left.
 _COPY = 1e-6
 
@@ -53,6 +55,8 @@ class Dependence:
         Rows by which u came first where the relation forward is closest.
     sign : {1, -1}
         Sign of that relation.
+    within : int
+        Rows within which y answers by that relation: the lag, and the rows that were summed.
     """
 
     forward: float
@@ -60,6 +64,7 @@ class Dependence:
     same_row: float
     lag: int
     sign: int
+    within: int
 
     @property
     def answers(self) -> bool:
@@ -74,7 +79,7 @@ def recorded_dependence(recording: Recording) -> Dependence:
     if found.answers or r is None or np.ptp(_bridged(r)) == 0.0:
         return found
     by_setpoint = dependence(r, recording.y, fed_back=False)
-    return replace(found, forward=by_setpoint.forward, lag=by_setpoint.lag, sign=found.sign)
+    return replace(by_setpoint, backward=found.backward, same_row=found.same_row, sign=found.sign)
 
 
 def is_fed_back(recording: Recording) -> bool:
@@ -83,6 +88,21 @@ def is_fed_back(recording: Recording) -> bool:
     if r is not None and np.ptp(_bridged(r)) > 0.0:
         return True
     return abs(dependence(recording.u, recording.y).same_row) > _SAME_ROW
+
+
+def latest_answer_s(recording: Recording) -> float | None:
+    """Return the time within which y answers a command that a controller makes of it [s], None where that is not seen.
+
+    A dead time that is longer contradicts the record. In a loop that hardly anything but its own noise moves, a plant
+    of the other sign, dead for several periods of the loop, fits about as well as the true one: it is 1/C, delayed.
+    """
+    r = recording.extra.get("r")
+    if r is not None and np.ptp(_bridged(r)) > 0.0:
+        return None
+    found = dependence(recording.u, recording.y)
+    if abs(found.same_row) <= _SAME_ROW or not found.answers:
+        return None
+    return _SMEARED * found.within * recording.sample_time_s
 
 
 def require_order(recordings: Sequence[Recording]) -> None:
@@ -217,15 +237,17 @@ def dependence(u: FloatArray, y: FloatArray, *, first_lag: int = 1, fed_back: bo
     ----------
     Haugh, Checking the independence of two covariance-stationary time series, JASA 71, 1976.
     """
-    u, y, first = _thinned(_bridged(u), _bridged(y), first_lag)
+    u, y, first, every = _thinned(_bridged(u), _bridged(y), first_lag)
     if min(u.size, y.size) < _LEAST_ROWS or np.ptp(u) == 0.0 or np.ptp(y) == 0.0:
-        return Dependence(forward=1.0, backward=1.0, same_row=0.0, lag=0, sign=1)
+        return Dependence(forward=1.0, backward=1.0, same_row=0.0, lag=0, sign=1, within=0)
     e_u, e_y = _innovations(u, _COMMAND), _innovations(y, _ROUNDING)
-    forward, lag, sign = _closest(_own_moves(u, y, e_u) if first and fed_back else e_u, e_y, first)
-    backward, _, _ = _closest(_innovations(y, _COMMAND), _innovations(u, _ROUNDING), 1)
+    forward, lag, sign, within = _closest(_own_moves(u, y, e_u) if first and fed_back else e_u, e_y, first)
+    backward, *_ = _closest(_innovations(y, _COMMAND), _innovations(u, _ROUNDING), 1)
     size = float(np.linalg.norm(e_u) * np.linalg.norm(e_y))
     same = float(e_u @ e_y) / size * math.sqrt(e_u.size) if size > 0.0 else 0.0
-    return Dependence(forward=forward, backward=backward, same_row=same, lag=lag, sign=sign)
+    return Dependence(
+        forward=forward, backward=backward, same_row=same, lag=lag * every, sign=sign, within=within * every
+    )
 
 
 def _bridged(values: FloatArray) -> FloatArray:
@@ -257,13 +279,13 @@ def _past(x: FloatArray, order: int) -> FloatArray:
     return np.column_stack([x[order - k : x.size - k] for k in range(1, order + 1)])
 
 
-def _thinned(u: FloatArray, y: FloatArray, first_lag: int) -> tuple[FloatArray, FloatArray, int]:
-    """Return at most so many rows: means of both, so that a row of u is before the next of y."""
+def _thinned(u: FloatArray, y: FloatArray, first_lag: int) -> tuple[FloatArray, FloatArray, int, int]:
+    """Return at most so many rows, the first lag, and how many each is the mean of: a row of u is before y's next."""
     every = -(-u.size // (_MOST_ROWS if first_lag else _MOST_SMOOTH_ROWS))
     if every <= 1:
-        return u, y, first_lag
+        return u, y, first_lag, 1
     rows = u.size // every * every
-    return u[:rows].reshape(-1, every).mean(axis=1), y[:rows].reshape(-1, every).mean(axis=1), first_lag
+    return u[:rows].reshape(-1, every).mean(axis=1), y[:rows].reshape(-1, every).mean(axis=1), first_lag, every
 
 
 def _innovations(x: FloatArray, floor: float) -> FloatArray:
@@ -288,8 +310,8 @@ def _innovations(x: FloatArray, floor: float) -> FloatArray:
     return np.concatenate([np.zeros(order), innovations])
 
 
-def _closest(cause: FloatArray, effect: FloatArray, first: int) -> tuple[float, int, int]:
-    """Return the probability of the closest relation of an effect to sums of an earlier cause, its lag and sign.
+def _closest(cause: FloatArray, effect: FloatArray, first: int) -> tuple[float, int, int, int]:
+    """Return the probability of an effect's closest relation to sums of an earlier cause, lag, sign, and lag and sum.
 
     Every octave of lags and every length of the sums is looked at for the same part of the error probability.
     """
@@ -298,12 +320,12 @@ def _closest(cause: FloatArray, effect: FloatArray, first: int) -> tuple[float, 
     n = effect.size
     sd = float(np.sqrt(np.mean(effect[np.flatnonzero(effect)] ** 2))) if effect.any() else 0.0
     if sd == 0.0 or not cause.any():
-        return 1.0, 0, 1
+        return 1.0, 0, 1, 0
     spectrum, total = np.fft.rfft(effect, 2 * n), np.concatenate([[0.0], np.cumsum(cause)])
     lags = np.arange(first, n // 4 + 1)
     widths = [width for width in 2 ** np.arange(9) if width <= n // 8]
     each = 2.0 * len(widths) * math.log2(2.0 * lags[-1])
-    best, lag, sign = 1.0, 0, 1
+    best, lag, sign, within = 1.0, 0, 1, 0
     for width in widths:
         sums = np.concatenate([np.zeros(width - 1), total[width:] - total[:-width]])
         products = np.fft.irfft(np.fft.rfft(sums, 2 * n).conj() * spectrum, 2 * n)[lags]
@@ -318,4 +340,5 @@ def _closest(cause: FloatArray, effect: FloatArray, first: int) -> tuple[float, 
         found = float(min(1.0, 2.0 * norm.sf(size) * looks[at]))
         if found < best:
             best, lag, sign = found, int(lags[at]), 1 if products[at] > 0.0 else -1
-    return best, lag, sign
+            within = lag + int(width)
+    return best, lag, sign, within

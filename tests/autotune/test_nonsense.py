@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 import zipfile
@@ -9,15 +10,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 import autotune as at
 from autotune.batch.campaign import REPORT, RESULTS, Campaign
 from autotune.batch.settings import CampaignSettings
 from autotune.config import load_config
 from autotune.diagnosis import diagnose
+from autotune.equations.expressions import parse
 from autotune.equations.recorded_units import require_units_of_model
 from autotune.errors import InputError
 from autotune.files.workbook import open_table
+from autotune.identification.delay.tracking import track
 from autotune.models import Block, Model, Port, TransferFunction
 from autotune.pipeline.audit import audit_log
 from autotune.recording import Recording, read_recording
@@ -31,6 +35,27 @@ def test_a_number_of_another_type_is_none(tmp_path: Path, value: str) -> None:
     lines = [f"sample_time_s = {value}" if line.startswith("sample_time_s") else line for line in BALL.splitlines()]
     (tmp_path / "c.toml").write_text("\n".join(lines))
     with pytest.raises(InputError, match=r"signals\.sample_time_s.*valid number"):
+        load_config(tmp_path / "c.toml")
+
+
+@pytest.mark.parametrize(
+    ("written", "said"),
+    [
+        (
+            {"[operating_point]": "[operating_point]\nplant_sign = true"},
+            r"operating_point\.plant_sign = True: ",
+        ),
+        ({"K = -0.01": "K = 1e15"}, r"controller: K = 1e\+15 moves the command through its whole range, .* of 1e-14"),
+        ({"K = -0.01": "K = -0.05", "Ti_s = 6.0": "Ti_s = 1e-6"}, r"controller: K / T_I = .* within one sample for"),
+    ],
+)
+def test_what_a_rig_has_is_what_its_ranges_can_mean(tmp_path: Path, written: dict[str, str], said: str) -> None:
+    text = BALL
+    for before, after in written.items():
+        assert before in text
+        text = text.replace(before, after)
+    (tmp_path / "c.toml").write_text(text)
+    with pytest.raises(InputError, match=said):
         load_config(tmp_path / "c.toml")
 
 
@@ -228,6 +253,57 @@ def test_a_command_computed_for_an_unstable_plant_is_said_to_need_a_controller(
     )
     assert done.returncode == 0, done.stderr
     assert ("the plant is unstable" in done.stderr) == warned
+
+
+@pytest.mark.parametrize(("expression", "said"), [("1/0", "division by zero"), ("x/1e999", "no number holds this")])
+def test_an_expression_that_has_no_value_is_refused_where_it_is_read(expression: str, said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        parse(expression)
+
+
+def points_of(frequencies: list[float], sd: float) -> str:
+    response = [2.0 / (1j * w + 1.0) for w in frequencies]
+    entries = [
+        {"omega_rad_s": w, "gain": abs(g), "phase_deg": float(np.degrees(np.angle(g))), "cov": [[sd**2, 0], [0, sd**2]]}
+        for w, g in zip(frequencies, response, strict=True)
+    ]
+    return json.dumps({"points": entries})
+
+
+@pytest.mark.parametrize(
+    ("points", "said"),
+    [
+        (points_of([0.5, 1.0, 2.0, 4.0], 0.0), "cov is zero"),
+        (points_of([1.0] * 5, 0.01), "5 points at 1 frequency"),
+    ],
+)
+@pytest.mark.parametrize("command", ["design", "tune", "reduce"])
+def test_points_on_which_no_design_can_rest_are_refused(tmp_path: Path, command: str, points: str, said: str) -> None:
+    (tmp_path / "p.json").write_text(points)
+    done = subprocess.run(
+        [sys.executable, "-m", "autotune", command, "--points", "p.json", "--out", "o"],
+        cwd=tmp_path, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 2
+    assert said in done.stderr
+    assert [file.name for file in tmp_path.iterdir()] == ["p.json"]
+    given = at.frequency_points(tmp_path / "p.json")
+    with pytest.raises(InputError, match=said):
+        (at.reduce if command == "reduce" else at.tune)(given)
+
+
+def test_windows_that_lie_in_a_gap_are_told_and_do_not_end_the_watch() -> None:
+    rng = np.random.default_rng(0)
+    t = np.arange(600.0)
+    u = np.repeat(rng.choice([-1.0, 1.0], 30), 20)
+    y = lfilter([0.1], [1.0, -0.9], np.roll(u, 2)) + 0.01 * rng.standard_normal(t.size)
+    recording = Recording(t=np.where(t < 300, t, t + 2000.0), u=u, y=y, name="r.csv")
+    windows = list(track(recording, 1, window_s=200.0, every_s=100.0, max_delay_s=10.0))
+    assert [one.reason for one in windows if 600.0 < one.end_s < 2200.0] == ["no rows in it: a gap"] * 15
+    assert windows[0].model is not None
+    assert windows[-1].model is not None
+    with pytest.raises(InputError, match=r"a window every 1e-06 s on 2599 s makes 2\.6e\+09 of them"):
+        next(track(recording, 1, window_s=200.0, every_s=1e-6))
 
 
 def test_a_name_neither_breaks_the_page_nor_turns_its_text(tmp_path: Path) -> None:

@@ -17,6 +17,7 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 import pytest
 import tomli_w
 from typer.testing import CliRunner
@@ -25,12 +26,13 @@ from autotune.cli import app
 from autotune.config import Config, load_config
 from autotune.config.registers import RegisterMap
 from autotune.controller import PIDController
-from autotune.errors import ExperimentStopped, InputError, LinkError, OperatorStop
+from autotune.errors import DesignError, ExperimentStopped, InputError, LinkError, OperatorStop
 from autotune.experiment.judgement import Verification
 from autotune.experiment.loop import ControlLoop
 from autotune.experiment.run import envelope_of
 from autotune.pipeline.audit import AuditLog, audit_log, user
 from autotune.pipeline.deployment import Journal, Step, deploy, hand_over, restore
+from autotune.points import FrequencyPoint, points_to_json
 from autotune.recording import RecordingWriter
 from drivers.simulated import SimulatedRig
 from sim.modbus_rig import ModbusRig, TcpTransport
@@ -359,6 +361,43 @@ def test_old_and_new_gains_are_shown_and_an_answer_of_no_writes_nothing(line: Li
     row = next(text for text in said.splitlines() if "Ki_per_s" in text)
     assert [float(cell) for cell in row.split("│")[2:4]] == [0.75, 0.1875]  # K / Ti, old and new
     assert not (tmp_path / "rig-gains" / "journal.jsonl").exists()
+
+
+@pytest.mark.parametrize(
+    ("gains", "said"),
+    [
+        ("K = 1e15\nTi_s = 4.0", "moves the command through its whole range"),
+        ("K = -0.75\nTi_s = 4.0", "have the other sign than the K = 1.5 that the rig holds"),
+    ],
+)
+def test_gains_that_no_such_rig_runs_with_are_not_written_even_unverified(
+    line: Line, tmp_path: Path, gains: str, said: str
+) -> None:
+    config = config_file(line, tmp_path)
+    (tmp_path / "new.toml").write_text(f'kind = "pi"\n{gains}\n')
+    call = ["deploy", str(config), "--controller", str(tmp_path / "new.toml"), "--no-verify", "--yes"]
+    error = CliRunner().invoke(app, call).exception
+    assert isinstance(error, InputError)
+    assert said in str(error)
+    assert line.gains == OLD
+
+
+def test_gains_are_compared_with_the_measured_plant_even_unverified(line: Line, tmp_path: Path) -> None:
+    """Thirty times the gain: within the rig's ranges, and unstable on its points."""
+    config = config_file(line, tmp_path)
+    w = np.array([1.0, 2.0, 4.0, 8.0])
+    plant = 2.0 * np.exp(-0.2j * w) / (1j * w + 1.0)
+    points = [
+        FrequencyPoint(omega_rad_s=a, response=b, covariance=((1e-6, 0.0), (0.0, 1e-6)))
+        for a, b in zip(w, plant, strict=True)
+    ]
+    (tmp_path / "p.json").write_text(json.dumps({"points": points_to_json(points)}))
+    (tmp_path / "new.toml").write_text('kind = "pi"\nK = 22.0\nTi_s = 4.0\n')
+    call = ["deploy", str(config), "--controller", str(tmp_path / "new.toml"), "--no-verify", "--yes"]
+    error = CliRunner().invoke(app, [*call, "--points", str(tmp_path / "p.json")]).exception
+    assert isinstance(error, DesignError)
+    assert "make no stable loop" in str(error)
+    assert line.gains == OLD
 
 
 def test_without_a_person_and_without_yes_nothing_is_done(line: Line, tmp_path: Path) -> None:

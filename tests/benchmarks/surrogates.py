@@ -1,5 +1,8 @@
 """What is found where nothing is to be found: noise, swapped columns, a constant command, a loop driven by noise.
 
+A loop whose command is at its limit for a while is none of a linear controller, and its plant can be told from routine
+operation (Ljung 1999, section 13.4): there a plant is a false finding where it is not the true one.
+
 ``SURROGATES=N,COMMAND+COMMAND`` in the environment sets inputs per family and the commands; 200 and all when absent.
 """
 
@@ -8,13 +11,16 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 from scipy.signal import lfilter
 
 from autotune.arrays import FloatArray
+from autotune.design.margins import margins
 from autotune.errors import AutotuneError
 from autotune.models import Block, Model, Port, TransferFunction
+from autotune.points import FrequencyPoint
 from autotune.recording import Recording
 
 COUNT = 200
@@ -22,6 +28,8 @@ COUNT = 200
 _ROWS = (300, 800, 2000)
 #: A finding counts from this probability on, where a command states one.
 _PROBABLE = 0.5
+#: Chi-square of a point's two values, beyond which the truth is by chance once in a thousand.
+_SURE = 13.8
 
 
 def _commands(rng: np.random.Generator, rows: int) -> FloatArray:
@@ -65,10 +73,30 @@ def _constant(rng: np.random.Generator, rows: int) -> tuple[FloatArray, FloatArr
     return np.full(rows, 5.0), 50.0 + np.cumsum(rng.standard_normal(rows))
 
 
+class _Drawn(NamedTuple):
+    """A loop: gain and integral time of its PI, rows of delay, colour of the noise, time constant; times in rows."""
+
+    gain: float
+    reset: float
+    delay: int
+    colour: float
+    lag: float
+
+    @property
+    def plant(self) -> TransferFunction:
+        """The plant, its command held from row to row."""
+        return TransferFunction(num=(1.0,), den=(self.lag, 1.0), delay_s=self.delay - 1.0)
+
+
+def _drawn(rng: np.random.Generator) -> _Drawn:
+    gain, reset, delay = rng.uniform(0.2, 2.0), rng.uniform(5.0, 50.0), int(rng.integers(1, 8))
+    return _Drawn(gain, reset, delay, rng.uniform(0.0, 0.98), rng.uniform(5.0, 50.0))
+
+
 def _loop(rng: np.random.Generator, rows: int, limit: float = np.inf) -> tuple[FloatArray, FloatArray]:
     """Return u and y of a PI loop that only its own coloured noise drives, the command limited or not."""
-    gain, reset, delay = rng.uniform(0.2, 2.0), rng.uniform(5.0, 50.0), int(rng.integers(1, 8))
-    colour, lag = rng.uniform(0.0, 0.98), float(np.exp(-1.0 / rng.uniform(5.0, 50.0)))
+    gain, reset, delay, colour, time = _drawn(rng)
+    lag = float(np.exp(-1.0 / time))
     u, y = np.zeros(rows + 200), np.zeros(rows + 200)
     x = noise = total = 0.0
     for k in range(y.size):
@@ -93,6 +121,11 @@ FAMILIES: dict[str, Callable[[np.random.Generator, int], tuple[FloatArray, Float
 }  # fmt: skip
 
 
+def true_plant(family: str, seed: int) -> TransferFunction | None:
+    """Return the plant that an input can tell of, None where it can tell of none."""
+    return _drawn(np.random.default_rng(seed)).plant if family == "linear loop, limited" else None
+
+
 def surrogate(family: str, seed: int) -> Recording:
     """Return one input of a family."""
     rows = _ROWS[seed % len(_ROWS)]
@@ -100,16 +133,19 @@ def surrogate(family: str, seed: int) -> Recording:
     return Recording(t=np.arange(rows, dtype=np.float64), u=u, y=y, name=f"{family} {seed}")
 
 
-def _tune(recording: Recording) -> bool:
+def _tune(recording: Recording, true: TransferFunction | None) -> bool:
     from autotune.config.procedure import DesignSettings
     from autotune.pipeline import analyse, measured_of
 
-    found = measured_of([recording])
-    analyse(found.points, DesignSettings(criterion="iae"), fit=found.fit, facts=found.facts, compare=False)
-    return True
+    found, asked = measured_of([recording]), DesignSettings(criterion="iae")
+    design = analyse(found.points, asked, fit=found.fit, facts=found.facts, compare=False).design
+    if true is None:
+        return True
+    kept, (modulus, phase_rad) = margins(true, design.controller), asked.margins
+    return not kept.stable or kept.modulus < modulus or kept.phase_rad < phase_rad
 
 
-def _delay(recording: Recording) -> bool:
+def _delay(recording: Recording, true: TransferFunction | None) -> bool:
     from autotune.identification.delay.identify import identify_delay
     from autotune.identification.dependence import require_answer
 
@@ -118,16 +154,23 @@ def _delay(recording: Recording) -> bool:
     return True
 
 
-def _closed_loop(recording: Recording) -> bool:
+def _closed_loop(recording: Recording, true: TransferFunction | None) -> bool:
     from autotune.identification.closed_loop.identify import identify_closed_loop
     from autotune.identification.dependence import require_answer
 
     require_answer([recording])
-    identify_closed_loop(recording)
-    return True
+    points = identify_closed_loop(recording).points
+    return true is None or max(_apart(point, true) for point in points) > _SURE
 
 
-def _watch(recording: Recording) -> bool:
+def _apart(point: FrequencyPoint, true: TransferFunction) -> float:
+    """Return how far a plant's response is from a point, in units of its covariance: chi-square of two values."""
+    away = complex(true.response(np.array([point.omega_rad_s]))[0]) - point.response
+    both = np.array([away.real, away.imag])
+    return float(both @ np.linalg.solve(np.array(point.covariance), both))
+
+
+def _watch(recording: Recording, true: TransferFunction | None) -> bool:
     from autotune.identification.delay.tracking import track
 
     length = recording.duration_s
@@ -135,13 +178,13 @@ def _watch(recording: Recording) -> bool:
     return any(window.model is not None for window in windows)
 
 
-def _routine(recording: Recording) -> bool:
+def _routine(recording: Recording, true: TransferFunction | None) -> bool:
     from autotune.diagnosis.routine import diagnose_routine
 
     return diagnose_routine([recording]).verdict in ("stiction", "backlash")
 
 
-def _diagnose(recording: Recording) -> bool:
+def _diagnose(recording: Recording, true: TransferFunction | None) -> bool:
     from autotune.diagnosis.diagnose import diagnose
 
     lag = Block(name="plant", place="plant", dynamics=TransferFunction(num=(2.0,), den=(9.5, 1.0), delay_s=3.0))
@@ -149,7 +192,7 @@ def _diagnose(recording: Recording) -> bool:
     return any(effect.probability >= _PROBABLE for effect in diagnose(nominal, [recording]).effects)
 
 
-COMMANDS: dict[str, Callable[[Recording], bool]] = {
+COMMANDS: dict[str, Callable[[Recording, TransferFunction | None], bool]] = {
     "tune": _tune, "identify delay": _delay, "identify closed-loop": _closed_loop, "watch": _watch,
     "diagnose --routine": _routine, "diagnose": _diagnose,
 }  # fmt: skip
@@ -157,10 +200,10 @@ COMMANDS: dict[str, Callable[[Recording], bool]] = {
 _RIGHT = {("wrong sign", name) for name in COMMANDS if name != "diagnose"}
 
 
-def is_finding(command: str, recording: Recording) -> bool:
-    """Return whether a command finds something in a recording; a refusal finds nothing."""
+def is_false(command: str, family: str, seed: int) -> bool:
+    """Return whether a command finds something false in an input; a refusal finds nothing."""
     try:
-        return COMMANDS[command](recording)
+        return COMMANDS[command](surrogate(family, seed), true_plant(family, seed))
     except AutotuneError:
         return False
 
@@ -176,7 +219,7 @@ def main() -> None:
             if (family, command) in _RIGHT:
                 cells.append("")
                 continue
-            found = [seed for seed in range(int(count)) if is_finding(command, surrogate(family, seed))]
+            found = [seed for seed in range(int(count)) if is_false(command, family, seed)]
             cells.append(str(len(found)))
             if found:
                 print(f"{command} on {family}: seeds {found}", file=sys.stderr, flush=True)

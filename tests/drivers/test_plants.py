@@ -384,3 +384,28 @@ def test_a_lock_leaves_no_file_and_lets_one_session_in() -> None:
     assert path.exists()
     second.give_back()
     assert not path.exists()
+
+
+def test_a_lock_lies_where_no_other_user_can_put_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    monkeypatch.setattr("tempfile.tempdir", None)
+    tmp_path.chmod(0o700)
+    lock = SessionLock("a rig of this test")
+    assert lock.take()
+    assert lock._path.parent == tmp_path
+    lock.give_back()
+    tmp_path.chmod(0o777)  # the system's folder is open to others: one of its own is made
+    assert lock.take()
+    own = lock._path.parent
+    assert own.parent == tmp_path
+    assert own.stat().st_mode & 0o777 == 0o700
+    lock.give_back()
+    own.chmod(0o777)
+    with pytest.raises(LinkError, match="others can write to it"):
+        lock.take()
+    own.rmdir()
+    (tmp_path / "elsewhere").mkdir(mode=0o700)
+    own.symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(LinkError, match="belongs to somebody else"):
+        lock.take()

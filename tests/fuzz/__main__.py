@@ -34,14 +34,24 @@ def _say(answer: Answer) -> None:
 
 
 def _print(tallies: dict[str, Tally], took_s: float, seed: int) -> None:
-    columns = ("inputs", "tracebacks", "hangs", "wrong exits", "not one line", "slowest [s]", "peak [MB]", "0 / 2 / 3")
+    columns = (
+        "inputs",
+        "tracebacks",
+        "hangs",
+        "over 1 GB",
+        "wrong exits",
+        "not one line",
+        "slowest [s]",
+        "peak [MB]",
+        "0 / 2 / 3",
+    )
     print(f"| {'family':12s} | {' | '.join(columns)} |")
     print(f"|---|{'---|' * len(columns)}")
     total = Tally()
     for name in [family.name for family in FAMILIES if family.name in tallies]:
         tally = tallies[name]
         _row(name, tally)
-        for key in ("inputs", "tracebacks", "hangs", "wrong_exits", "not_one_line"):
+        for key in ("inputs", "tracebacks", "hangs", "growths", "wrong_exits", "not_one_line"):
             setattr(total, key, getattr(total, key) + getattr(tally, key))
         total.exits += tally.exits
         total.slowest_s, total.peak_mb = max(total.slowest_s, tally.slowest_s), max(total.peak_mb, tally.peak_mb)
@@ -55,6 +65,7 @@ def _row(name: str, t: Tally) -> None:
         t.inputs,
         t.tracebacks,
         t.hangs,
+        t.growths,
         t.wrong_exits,
         t.not_one_line,
         f"{t.slowest_s:.1f}",

@@ -25,12 +25,13 @@ from typing import Any
 
 import typer
 
-from tests.fuzz.families import FAMILIES, Call, Family
+from tests.fuzz.families import FAMILIES, Family
+from tests.fuzz.sound import Call
 
 #: an input that has not been answered after this time of a processor, or after ten times as long, hangs [s]
-HANG_S = 60.0
-#: most memory that a worker may map [byte]: what a small machine has
-MEMORY_BYTES = 6 << 30
+HANG_S = 20.0
+#: most memory that a worker may map [byte]: what a small machine has; most by which an input lets it grow [MB]
+MEMORY_BYTES, GROWTH_MB = 6 << 30, 1024.0
 WELL = (0, 2, 3)
 
 
@@ -41,6 +42,7 @@ class Tally:
     inputs: int = 0
     tracebacks: int = 0
     hangs: int = 0
+    growths: int = 0
     wrong_exits: int = 0
     not_one_line: int = 0
     slowest_s: float = 0.0
@@ -50,7 +52,7 @@ class Tally:
     @property
     def faults(self) -> int:
         """Inputs that were not answered well."""
-        return self.tracebacks + self.hangs + self.wrong_exits + self.not_one_line
+        return self.tracebacks + self.hangs + self.growths + self.wrong_exits + self.not_one_line
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,7 +82,7 @@ def try_one(family: Family, number: int, seed: int, folder: Path) -> Answer:
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     call = family.make(rng, folder)
-    began_s = time.monotonic()
+    began_s, before_mb = time.monotonic(), _peak_mb()
     out, err = io.StringIO(), io.StringIO()
     signal.signal(signal.SIGPROF, _ring)
     signal.setitimer(signal.ITIMER_PROF, HANG_S)
@@ -95,11 +97,17 @@ def try_one(family: Family, number: int, seed: int, folder: Path) -> Answer:
     finally:
         signal.setitimer(signal.ITIMER_PROF, 0.0)
     said = f"{call if isinstance(call, list) else family.name}\n{err.getvalue()[-2000:]}"
-    peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    peak_mb = _peak_mb()
+    if not fault and peak_mb > before_mb + GROWTH_MB:
+        fault = f"growth: {peak_mb - before_mb:.0f} MB"
     return Answer(
         family=family.name, number=number, fault=fault, status=status, said=said,
         duration_s=time.monotonic() - began_s, peak_mb=peak_mb,
     )  # fmt: skip
+
+
+def _peak_mb() -> float:
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
 def _at(error: BaseException) -> str:
@@ -293,6 +301,7 @@ def _count(tally: Tally, answer: Answer) -> None:
     tally.exits[answer.status] += 1
     tally.tracebacks += answer.fault.startswith("traceback")
     tally.hangs += answer.fault.startswith("hang")
+    tally.growths += answer.fault.startswith("growth")
     tally.wrong_exits += answer.fault.startswith("wrong exit")
     tally.not_one_line += answer.fault.startswith("not one line")
     tally.slowest_s = max(tally.slowest_s, answer.duration_s)

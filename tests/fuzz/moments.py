@@ -26,7 +26,7 @@ from pathlib import Path
 import numpy as np
 
 from autotune.recording import read_recording
-from tests.fuzz.families import MODEL, POINTS
+from tests.fuzz.sound import MODEL, POINTS
 
 CONFIG = Path(__file__).parents[2] / "configs" / "ball_sim.toml"
 COMMAND = (sys.executable, "-m", "autotune")

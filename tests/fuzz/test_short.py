@@ -13,10 +13,14 @@ from tests.fuzz.families import FAMILIES
 #: inputs that ended in a traceback, a hang or a wrong exit when they were first tried: family and number, by seed
 ONCE = {
     0: [("recordings", 60)],
+    1: [("workbooks", 4), ("workbooks", 30), ("workbooks", 34)],
+    2: [("fmus", 77)],
     7: [("models", 76), ("models", 147), ("controllers", 66)],
     11: [("models", 568), ("options", 57)],
     1801: [("options", 31)],
     2002: [("models", 2395), ("points", 3849), ("points", 5169), ("live story", 3778)],
+    29103: [("structure", 137)],
+    29104: [("structure", 32), ("structure", 45)],
 }
 
 

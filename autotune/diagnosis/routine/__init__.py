@@ -1,8 +1,7 @@
 """Why a loop in operation oscillates, without a test and without a model: its valve, its tuning, something outside.
 
 A recording becomes an :class:`~autotune.diagnosis.routine.operation.Operation` (one even grid, windows, stretches);
-:mod:`~autotune.diagnosis.routine.candidates` sums every combination of valve and plant over the stretches,
-:mod:`~autotune.diagnosis.routine.fitting` picks the best on some and judges it on the others,
+:mod:`~autotune.diagnosis.routine.valves` compares predictions by a valve's position with linear ones,
 :mod:`~autotune.diagnosis.routine.oscillation` looks at phase and set-point, and
 :mod:`~autotune.diagnosis.routine.judgement` says the verdict.
 """

@@ -149,7 +149,7 @@ def compare_valves(
     Raises
     ------
     InputError
-        Hardly a row of y that has a past to predict it by.
+        Hardly a row of y that has a past to predict it by, or of u that is not at rest.
 
     Notes
     -----
@@ -160,6 +160,11 @@ def compare_valves(
     past, random = _past(operation, limits), np.random.default_rng(0)
     low, high = np.quantile(operation.u, (0.002, 0.998))
     span = float(high - low)
+    if not span > 0.0:
+        raise InputError(
+            "u rests in all but its rarest rows: a valve that is not moved shows nothing",
+            where=", ".join(operation.names), remedy="give a record of the loop in automatic mode",
+        )  # fmt: skip
     valves = list(_valves(span, limits.least_band))
     space = past.beside(operation.u)
     linear = past.left - space @ (space.T @ past.left)

@@ -25,6 +25,7 @@ from autotune.identification.delay.output_error import (
 )
 from autotune.identification.delay.profile import profile
 from autotune.identification.delay.search import binned, scan, search
+from autotune.identification.dependence import latest_answer_s
 from autotune.models import Hold
 from autotune.progress import Progress, quiet
 from autotune.recording import Recording
@@ -71,7 +72,8 @@ def identify_delay(
         Order n, 1 to 4.
     max_delay_s : float, optional
         Largest delay considered [s]. Where not given, half the record, or half the period where u is periodic: a
-        relay's limit cycle looks the same with half a period more of delay and b reversed.
+        relay's limit cycle looks the same with half a period more of delay and b reversed. Where a controller makes u
+        of y, no more than the time within which y is seen to answer u.
     hold : {"zero", "linear"}, optional
         How u runs between rows; the sidecar's ``hold`` where not given, else zero-order hold.
     past_input : {"unknown", "held", "zero"}
@@ -123,6 +125,8 @@ def identify_delay(
         recording, hold=hold, past_input=past_input, start_s=start_s, offset=offset, skip_missing=skip_missing
     )
     largest = _largest_delay(data, max_delay_s)
+    if max_delay_s is None and (answered_s := latest_answer_s(recording)) is not None:
+        largest = min(largest, answered_s)
     if data.ty.size < 3 * structure.parameters:
         raise _too_short(data, structure)
     if start is not None:

@@ -18,6 +18,9 @@ from autotune.identification.dependence import require_answer
 from autotune.models import Hold
 from autotune.recording import Recording
 
+#: More windows take memory before the first is fitted, and time without end.
+_MOST_WINDOWS = 1e7
+
 
 @dataclass(frozen=True, kw_only=True)
 class Quantity:
@@ -105,8 +108,16 @@ def track(
         )
     largest = 0.5 * window_s if max_delay_s is None else max_delay_s
     last: DelayModel | None = None
+    if (end - begin) / every_s > _MOST_WINDOWS:
+        raise InputError(
+            f"a window every {every_s:g} s on {end - begin:.4g} s makes {(end - begin) / every_s:.2g} of them",
+            where=recording.name, remedy="give a longer time between them, or cut the recording at its gap",
+        )  # fmt: skip
     ends = begin + window_s + every_s * np.arange(int((end - begin - window_s) / every_s + 1e-9) + 1)
     for at in ends[ends > after_s + 1e-6 * every_s]:
+        if np.sum((recording.t > at - window_s) & (recording.t <= at)) < 2:
+            yield Window(end_s=float(at), model=None, reason="no rows in it: a gap")
+            continue
         part = recording.between(at - window_s - largest, at + 1e-9 * window_s)
 
         def fit(start: DelayModel | None, part: Recording = part, at: float = float(at)) -> DelayModel:
