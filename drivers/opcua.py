@@ -29,7 +29,7 @@ from autotune.config.opcua import SOURCE_TIME
 from autotune.config.rig import OpcUaSettings
 from autotune.config.signal_map import SAMPLE
 from autotune.errors import InputError, LinkError
-from drivers.opcua_errors import refusal, sentence_on
+from drivers.opcua_errors import ChannelRefusedError, refusal, sentence_on
 from drivers.register_link import Answer
 from drivers.registers import Block, Codec, codecs
 from drivers.session_lock import SessionLock
@@ -175,7 +175,10 @@ class OpcUaLink:
                 server_certificate=_file(settings.server_cert_file),
                 mode=getattr(ua.MessageSecurityMode, settings.security_mode),
             )
-        await client.connect()
+        try:
+            await client.connect()
+        except AssertionError:  # the library's, of an answer that refuses the channel
+            raise ChannelRefusedError from None
         for name, given in settings.nodes.mapped().items():
             try:
                 node = await self._node(client, given.node)
