@@ -29,6 +29,7 @@ from autotune.config.opcua import SOURCE_TIME
 from autotune.config.rig import OpcUaSettings
 from autotune.config.signal_map import SAMPLE
 from autotune.errors import InputError, LinkError
+from autotune.experiment.priority import before_others
 from drivers.opcua_errors import ChannelRefusedError, refusal, sentence_on
 from drivers.register_link import Answer
 from drivers.registers import Block, Codec, codecs
@@ -254,7 +255,8 @@ class OpcUaLink:
         loop = asyncio.new_event_loop()
 
         def run() -> None:
-            loop.run_forever()
+            with before_others():  # the control loop waits for its answers
+                loop.run_forever()
             loop.close()
 
         self._loop, self._thread = loop, threading.Thread(target=run, name="opc ua", daemon=True)
