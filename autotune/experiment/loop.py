@@ -96,7 +96,7 @@ class ControlLoop:
         self.rig = rig
         self.envelope = envelope
         self.watch = Watch()
-        self.monitor = ReadingMonitor(envelope.patience)
+        self.monitor = ReadingMonitor(envelope.patience, envelope.sample_time_s)
         self.metadata: dict[str, Any] = {}
         self._writer = writer
         self._extra = tuple(extra)

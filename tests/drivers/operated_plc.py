@@ -18,7 +18,7 @@ from tests.drivers.iec_compiler import Blocks, CompiledInstance
 from tests.drivers.scanned_plc import STRUCTURED_TEXT, Lags
 
 FILES = ("relay.st", "pi.st", "rig.st", "operated.st")
-U_RANGE, U_SAFE, Y_RANGE, DEADMAN_S = (0.0, 10.0), 1.0, (0.2, 9.8), 0.4
+U_RANGE, U_SAFE, Y_RANGE, DEADMAN_S = (0.0, 10.0), 1.0, (0.2, 9.8), 1.0
 #: how often the server lets its program run the cycles that are due [s]
 _LOOK_S = 0.001
 #: node by signal: its type, the block's variable, and whether the host writes it
@@ -85,7 +85,7 @@ class OperatedPlc(ServedRig):
         Where it is served.
     """
 
-    start_s = 20.0
+    start_s = 60.0
 
     def __init__(self, program: Program, endpoint: str) -> None:
         super().__init__(program, endpoint, "operated plc")  # type: ignore[arg-type]  # what a device does here
