@@ -229,7 +229,7 @@ class ControlLoop:
         if self._time_of(reading) > self.tick.t_s:
             if not self._is_written:
                 self._write_row(self.tick.u, {})
-            self._reading = reading
+            self._reading, self._slots = reading, 1
             self.tick = self._judged(reading, u=reading.u_applied)
 
     def follow(self, row: Row, *, extra: Mapping[str, float] | None = None) -> Tick:
@@ -243,7 +243,7 @@ class ControlLoop:
             t_s = before.t_s + self.sample_time_s
             self.tick = replace(before, k=before.k + 1, t_s=t_s, usable=False, slot=before.slot + 1)
             self._write_row(row.u_mean, extra or {})
-        self._reading = row.reading
+        self._reading, self._slots = row.reading, 1  # what the host missed before is none of the device's
         self._deadline_s = self.rig.clock.now()
         self.tick = self._judged(row.reading, u=row.reading.u_applied)
         return self.tick
