@@ -29,7 +29,8 @@ from autotune.config.opcua import SOURCE_TIME
 from autotune.config.rig import OpcUaSettings
 from autotune.config.signal_map import SAMPLE
 from autotune.errors import InputError, LinkError
-from drivers.opcua_errors import refusal, sentence_on
+from autotune.experiment.priority import before_others
+from drivers.opcua_errors import ChannelRefusedError, refusal, sentence_on
 from drivers.register_link import Answer
 from drivers.registers import Block, Codec, codecs
 from drivers.session_lock import SessionLock
@@ -165,6 +166,55 @@ class OpcUaLink:
                 raise self._refused(name, code.name)
         return attempts > 1
 
+    def read_numbers(self, place: str) -> list[float]:
+        """Return the numbers of an array, by its node or browse names.
+
+        Raises
+        ------
+        LinkError
+            No answer in all attempts, or no such array.
+        """
+        value, _, _ = self._exchange(lambda: self._read_array(place))
+        if value.StatusCode is not None and value.StatusCode.is_bad():
+            raise self._refused_at("the array", place, value.StatusCode.name)
+        if value.Value is None or value.Value.VariantType is not ua.VariantType.Double:
+            raise self._refused_at("the array", place, "BadTypeMismatch")
+        held = value.Value.Value
+        return [float(number) for number in (held if isinstance(held, list) else [held])]
+
+    def may_write(self, place: str) -> bool:
+        """Return whether the server lets this user write a node."""
+        access, _, _ = self._exchange(lambda: self._access(place))
+        return ua.AccessLevel.CurrentWrite in access
+
+    def write_numbers(self, place: str, numbers: Sequence[float]) -> None:
+        """Write the numbers of an array, all in one request.
+
+        Raises
+        ------
+        LinkError
+            No answer in all attempts, or the server does not let it be written.
+        """
+        (code,), _, _ = self._exchange(lambda: self._write_array(place, list(numbers)))
+        if code.is_bad():
+            raise self._refused_at("the array", place, code.name)
+
+    async def _read_array(self, place: str) -> ua.DataValue:
+        assert self._client is not None
+        node = await self._node(self._client, place)
+        (value,) = await self._client.read_attributes([node])
+        return value
+
+    async def _access(self, place: str) -> set[ua.AccessLevel]:
+        assert self._client is not None
+        return await (await self._node(self._client, place)).get_user_access_level()
+
+    async def _write_array(self, place: str, numbers: list[float]) -> list[ua.StatusCode]:
+        assert self._client is not None
+        node = await self._node(self._client, place)
+        value = ua.DataValue(ua.Variant(numbers, ua.VariantType.Double))
+        return await self._client.uaclient.write_attributes([node.nodeid], [value])
+
     async def _open(self, client: Client) -> None:
         settings = self._settings
         if settings.security_policy != "None":
@@ -175,7 +225,10 @@ class OpcUaLink:
                 server_certificate=_file(settings.server_cert_file),
                 mode=getattr(ua.MessageSecurityMode, settings.security_mode),
             )
-        await client.connect()
+        try:
+            await client.connect()
+        except AssertionError:  # the library's, of an answer that refuses the channel
+            raise ChannelRefusedError from None
         for name, given in settings.nodes.mapped().items():
             try:
                 node = await self._node(client, given.node)
@@ -251,7 +304,8 @@ class OpcUaLink:
         loop = asyncio.new_event_loop()
 
         def run() -> None:
-            loop.run_forever()
+            with before_others():  # the control loop waits for its answers
+                loop.run_forever()
             loop.close()
 
         self._loop, self._thread = loop, threading.Thread(target=run, name="opc ua", daemon=True)
@@ -291,9 +345,11 @@ class OpcUaLink:
         return at_s - self._began_s
 
     def _refused(self, name: str, code: str) -> LinkError:
+        return self._refused_at(f"the node of {name}", getattr(self._settings.nodes, name).node, code)
+
+    def _refused_at(self, which: str, place: str, code: str) -> LinkError:
         what, remedy = refusal(code)
-        place = getattr(self._settings.nodes, name).node
-        return LinkError(f"the node of {name} {what}", where=f"{self.where}, {place}", remedy=remedy)
+        return LinkError(f"{which} {what}", where=f"{self.where}, {place}", remedy=remedy)
 
     def _named(self, error: BaseException) -> LinkError:
         what, remedy = sentence_on(error)

@@ -5,16 +5,23 @@ from __future__ import annotations
 import asyncio
 import concurrent.futures
 
+
+class ChannelRefusedError(Exception):
+    """A server answered the request for a secure channel by a refusal, without a reason that can be read."""
+
+
+_UNTRUSTED = (
+    "the server refuses this host's certificate or security",
+    "put rig.cert_file among the certificates that the server trusts; its log says why it refused",
+)
 #: of a session, by the name of the status code
 _SESSION = {
+    "ChannelRefusedError": _UNTRUSTED,
     "BadCertificateUntrusted": (
         "the server does not trust this host's certificate",
         "put rig.cert_file among the certificates that the server trusts",
     ),
-    "BadSecurityChecksFailed": (
-        "the server refuses this host's certificate or security",
-        "put rig.cert_file among the certificates that the server trusts; its log says why it refused",
-    ),
+    "BadSecurityChecksFailed": _UNTRUSTED,
     "BadCertificateUriInvalid": (
         "the certificate's application URI is not this host's",
         "make the certificate anew as docs/opcua.md says",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
 from autotune.config.rig import OpcUaSettings
@@ -10,16 +11,19 @@ from autotune.config.signal_map import SAMPLE
 from autotune.experiment.rig import Rig
 from drivers.gain_rig import TypedGainRig, open_registers
 from drivers.kinds import Reach, Session, not_installed
+from drivers.operated_relay import OperatedRelayRig, tell_relay
 from drivers.pace import tell_pace
 from drivers.probe import ProbedDevice, ProbedSignal
-from drivers.register_link import RegisterLink
 from drivers.registers import blocks, codecs
+
+if TYPE_CHECKING:
+    from drivers.opcua import OpcUaLink
 
 #: port where an endpoint names none
 _PORT = 4840
 
 
-def _link(settings: OpcUaSettings, *, exclusive: bool = True) -> RegisterLink:
+def _link(settings: OpcUaSettings, *, exclusive: bool = True) -> OpcUaLink:
     try:
         from drivers.opcua import OpcUaLink
     except ModuleNotFoundError as error:
@@ -28,8 +32,11 @@ def _link(settings: OpcUaSettings, *, exclusive: bool = True) -> RegisterLink:
 
 
 def open_kind(settings: OpcUaSettings, session: Session) -> Rig:
-    """Return the rig, with its own controller's gains where they are mapped."""
-    return open_registers(_link(settings), settings, session, TypedGainRig)
+    """Return the rig, with its own controller's gains where they are mapped, and its own relay where it has one."""
+    link = _link(settings)
+    if settings.relay is None:
+        return open_registers(link, settings, session, TypedGainRig)
+    return open_registers(link, settings, session, OperatedRelayRig, arrays=link, relay=settings.relay)
 
 
 def reached_by(settings: OpcUaSettings) -> Reach:
@@ -50,6 +57,8 @@ def probe_kind(settings: OpcUaSettings, expected: Mapping[str, tuple[float, floa
     found, mapped = [], codecs(settings.registers.mapped())
     try:
         pace = tell_pace(link, (codec for name, codec in mapped.items() if name in SAMPLE))
+        if settings.relay is not None:
+            pace += f"; {tell_relay(link, settings.relay)}"
         for codec in mapped.values():
             value = codec.decode(link.read(blocks([codec])[0]).words) if codec.name != "device_time" else None
             if value is None:

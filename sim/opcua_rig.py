@@ -89,7 +89,7 @@ class OpcUaRig(ServedRig):
         What it wants of a client.
     """
 
-    start_s = 20.0
+    start_s = 60.0
 
     def __init__(
         self, device: RegisterDevice, nodes: Mapping[str, ServedNode], endpoint: str, security: Security | None = None

@@ -173,6 +173,10 @@ def served_opcua(config: Config, settings: OpcUaSettings, users: Mapping[str, st
     from sim.opcua_rig import OpcUaRig, Security, ServedNode
 
     twin, written = _twin(settings), settings.nodes.registers().mapped()
+    if settings.relay is not None:
+        raise InputError(
+            "the served twin runs no relay of its own", where="rig.relay", remedy="leave it out for the twin"
+        )
     if settings.security_policy != "None" and not (twin.cert_file and twin.key_file):
         raise InputError("the served twin has no certificate", where="rig.twin", remedy="give cert_file and key_file")
     nodes = {

@@ -139,6 +139,13 @@ class SerialSettings(Section):
     twin: TwinSettings | None = None
 
 
+class RelayNodes(Section):
+    """Arrays of a device that runs the relay by itself: the block OPERATED_RIG, see docs/plc.md."""
+
+    law: Annotated[str, Field(min_length=1, description="node of its input LAW, 14 numbers that the host writes")]
+    rows: Annotated[str, Field(min_length=1, description="node of its output ROWS, 260 numbers that the host reads")]
+
+
 class OpcUaSettings(Section):
     """A device behind an OPC UA server."""
 
@@ -165,6 +172,9 @@ class OpcUaSettings(Section):
         float | None, Field(gt=0, le=60, description="cycle of the device's program [s]; absent: not known, 0.02")
     ] = None
     nodes: NodeMap
+    relay: Annotated[
+        RelayNodes | None, Field(description="where the device runs the relay by itself; absent: the host does")
+    ] = None
     twin: TwinSettings | None = None
 
     @property
@@ -180,6 +190,17 @@ class OpcUaSettings(Section):
             raise ValueError(f"security_policy = {self.security_policy!r} needs {', '.join(missing)}")
         if (self.user is None) != (self.password_file is None):
             raise ValueError("user and password_file belong together")
+        return self
+
+    @model_validator(mode="after")
+    def _relay_can_end(self) -> OpcUaSettings:
+        if self.relay is None:
+            return self
+        lacking = [name for name in ("heartbeat", "enable", "in_command", "K", "Ti") if name not in self.nodes.mapped()]
+        if lacking:
+            raise ValueError(f"a relay in the device needs the nodes of {', '.join(lacking)}")
+        if self.scan_time_s is None:
+            raise ValueError("a relay in the device needs scan_time_s, the cycle that it runs in")
         return self
 
 

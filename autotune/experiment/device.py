@@ -14,7 +14,7 @@ from autotune.errors import ExperimentStopped
 from autotune.experiment.loop import ControlLoop, Tick
 from autotune.experiment.oscillation import Oscillation
 from autotune.experiment.relay import RelaySettings
-from autotune.experiment.rig import RunsLaws
+from autotune.experiment.rig import RunsLaws, RunsRelay
 
 
 def device_range(loop: ControlLoop) -> tuple[float, float]:
@@ -34,7 +34,7 @@ class DeviceOscillation(Oscillation):
 
     Parameters
     ----------
-    rig : RunsLaws
+    rig : RunsRelay
         The loop's rig.
     before : Oscillation
         The host's relay that it takes over from.
@@ -45,7 +45,7 @@ class DeviceOscillation(Oscillation):
     less is added to the inserted delay; what the shorter average hides less is added to the hysteresis.
     """
 
-    def __init__(self, rig: RunsLaws, before: Oscillation) -> None:
+    def __init__(self, rig: RunsRelay, before: Oscillation) -> None:
         super().__init__(before.loop, before.settings, patience_s=math.inf)
         self._rig = rig
         self._running: RelaySettings | None = None

@@ -21,7 +21,7 @@ from autotune.experiment.leaving import leave, say, verdict_on
 from autotune.experiment.limits import Envelope, Watch
 from autotune.experiment.monitor import ReadingMonitor
 from autotune.experiment.priority import GoesOn, undisturbed
-from autotune.experiment.rig import Exchanges, Feeds, Reading, Rig, Row
+from autotune.experiment.rig import Exchanges, Feeds, Reading, Rig, Row, RunsRelay
 from autotune.experiment.rows import KEPT_ROWS, RecentRows
 from autotune.experiment.timing import Tick, Timing
 from autotune.experiment.warm import warm_up
@@ -96,7 +96,7 @@ class ControlLoop:
         self.rig = rig
         self.envelope = envelope
         self.watch = Watch()
-        self.monitor = ReadingMonitor(envelope.patience)
+        self.monitor = ReadingMonitor(envelope.patience, envelope.sample_time_s)
         self.metadata: dict[str, Any] = {}
         self._writer = writer
         self._extra = tuple(extra)
@@ -125,8 +125,13 @@ class ControlLoop:
 
     @property
     def is_exact(self) -> bool:
-        """Whether rows carry the device's own stamps, in which the link has no part."""
-        return self._exchange is not None
+        """Whether the rows of a sweep carry the device's own stamps, in which the link has no part."""
+        return self._exchange is not None or isinstance(self.rig, RunsRelay)
+
+    @property
+    def patience_s(self) -> float:
+        """How far the loop may be behind its schedule [s]."""
+        return max(self.envelope.settings.late_s, LATE_SAMPLES * self.sample_time_s)
 
     @property
     def recording(self) -> Path:
@@ -222,7 +227,9 @@ class ControlLoop:
     def begin(self, reading: Reading) -> None:
         """Take the sample after which a law on the device begins; its row is written with the one that follows."""
         if self._time_of(reading) > self.tick.t_s:
-            self._reading = reading
+            if not self._is_written:
+                self._write_row(self.tick.u, {})
+            self._reading, self._slots = reading, 1
             self.tick = self._judged(reading, u=reading.u_applied)
 
     def follow(self, row: Row, *, extra: Mapping[str, float] | None = None) -> Tick:
@@ -236,7 +243,7 @@ class ControlLoop:
             t_s = before.t_s + self.sample_time_s
             self.tick = replace(before, k=before.k + 1, t_s=t_s, usable=False, slot=before.slot + 1)
             self._write_row(row.u_mean, extra or {})
-        self._reading = row.reading
+        self._reading, self._slots = row.reading, 1  # what the host missed before is none of the device's
         self._deadline_s = self.rig.clock.now()
         self.tick = self._judged(row.reading, u=row.reading.u_applied)
         return self.tick
@@ -312,7 +319,7 @@ class ControlLoop:
         self._deadline_s += step
         self._slots = 1
         behind_s = clock.now() - self._deadline_s
-        if behind_s > max(self.envelope.settings.late_s, LATE_SAMPLES * step):
+        if behind_s > self.patience_s:
             raise LinkError(
                 f"link too slow: {behind_s:.3g} s behind the schedule of a sample every {step:g} s",
                 remedy="raise signals.sample_time_s, or unload the computer or the link; autotune doctor measures it",

@@ -13,8 +13,9 @@ from autotune.experiment.rig import Reading
 
 #: readings whose median stands for y where limits are judged
 RECENT = 5
-#: share of unusable readings among the last hundred at which the signal is called garbled
-GARBLED_SHARE = 0.25
+#: share of unusable readings at which the signal is called garbled, among so many: more where a run that is ridden
+#: through would be as much
+GARBLED_SHARE, GARBLED_OF = 0.25, 100
 #: fewest equal readings that a frozen sensor is told from a link that has nothing new by
 FEWEST_REPEATS = 10
 
@@ -26,6 +27,8 @@ class ReadingMonitor:
     ----------
     patience : Patience
         Without a usable reading; an actuator may be late for twice as long.
+    sample_time_s : float
+        Control period [s].
 
     Attributes
     ----------
@@ -43,7 +46,7 @@ class ReadingMonitor:
         Tells commands that are not the session's own.
     """
 
-    def __init__(self, patience: Patience) -> None:
+    def __init__(self, patience: Patience, sample_time_s: float) -> None:
         self.noise = 0.0
         self.jump = math.inf
         self.same_s = math.inf
@@ -55,7 +58,8 @@ class ReadingMonitor:
         # when a reading was last usable, y last changed, and the actuator first did not follow
         self._usable_s = self._changed_s = self._astray_s = math.nan
         self._last_device_time_s = math.nan
-        self._usable: deque[bool] = deque(maxlen=100)
+        longest_run = min(patience.samples, patience.seconds / sample_time_s)
+        self._usable: deque[bool] = deque(maxlen=max(GARBLED_OF, math.ceil(longest_run / GARBLED_SHARE)))
 
     def judge(self, reading: Reading, u: float) -> tuple[float, bool]:
         """Return the measurement to use, and whether it is this reading's own.
@@ -87,10 +91,10 @@ class ReadingMonitor:
                     raise LinkError(said, where="link", remedy=remedy)
                 remedy = "check the sensor, its wiring and its scaling in the configuration"
                 raise ExperimentStopped(said, where="sensor", remedy=remedy)
-            if len(self._usable) == 100 and self._usable.count(False) > 100 * GARBLED_SHARE:
+            wrong, looked_at = self._usable.count(False), len(self._usable)
+            if looked_at == self._usable.maxlen and wrong > looked_at * GARBLED_SHARE:
                 raise ExperimentStopped(
-                    f"garbled sensor: {self._usable.count(False)} of the last 100 readings were unusable"
-                    f" (last: {reason})",
+                    f"garbled sensor: {wrong} of the last {looked_at} readings were unusable (last: {reason})",
                     where="sensor",
                     remedy="check the sensor's wiring and shielding",
                 )

@@ -36,12 +36,13 @@ def undisturbed(clock: object) -> Iterator[None]:
     if not isinstance(clock, GoesOn) or not clock.goes_on:
         yield
         return
-    with threadpool_limits(limits=1), _real_time():
+    with threadpool_limits(limits=1), before_others():
         yield
 
 
 @contextlib.contextmanager
-def _real_time() -> Iterator[None]:
+def before_others() -> Iterator[None]:
+    """Let this thread run before others, where the system grants it: the loop's, and one that it waits for."""
     if not hasattr(os, "sched_setscheduler"):
         yield
         return

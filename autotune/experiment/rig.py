@@ -168,10 +168,10 @@ class Row:
 
 
 @runtime_checkable
-class RunsLaws(Exchanges, Protocol):
-    """A rig whose device runs relay and PI by itself, in ticks shorter than the host's samples, and streams rows.
+class RunsRelay(Rig, Protocol):
+    """A rig whose device runs the relay by itself, in ticks shorter than the host's samples, and tells of its rows.
 
-    The host's next exchange ends what runs, without a bump. The device ends it at the safe output where y leaves its
+    The host's next command ends what runs, without a bump. The device ends it at the safe output where y leaves its
     range, the time is over, or the host falls silent.
     """
 
@@ -191,6 +191,15 @@ class RunsLaws(Exchanges, Protocol):
         """Run the relay, its delay in ticks, or change the setting of one that runs; return the last sample before."""
         ...
 
+    def row(self) -> Row:
+        """Wait for the next row."""
+        ...
+
+
+@runtime_checkable
+class RunsLaws(RunsRelay, Exchanges, Protocol):
+    """A rig whose device runs its PI on trial as it runs the relay."""
+
     def start_trial(
         self,
         controller: PIDController,
@@ -202,10 +211,6 @@ class RunsLaws(Exchanges, Protocol):
         y_range: tuple[float, float],
     ) -> Reading:
         """Run the PI on gains that are not kept, or change what is asked of it; return the last sample before."""
-        ...
-
-    def row(self) -> Row:
-        """Wait for the next row."""
         ...
 
 

@@ -21,7 +21,7 @@ from autotune.experiment.loop import ControlLoop, Timing
 from autotune.experiment.relay import RelaySettings
 from autotune.experiment.result import ExperimentResult, Part, Segment, State, Status
 from autotune.experiment.return_to_setpoint import return_by_relay, setpoint_before
-from autotune.experiment.rig import Rig, RunsLaws, ShowsOutput
+from autotune.experiment.rig import Rig, RunsRelay, ShowsOutput
 from autotune.experiment.sweep import missing_phases, sweep, sweep_warnings
 from autotune.identification.frequency.windows import Rows
 from autotune.recording import RecordingWriter
@@ -148,7 +148,7 @@ def experiment_on(
         known = approach(loop, point, known, journal.tell, u_rest=earlier.u_rest)
         journal.enter(State.MIDPOINT)
         known, oscillation = find_midpoint(loop, point, wanted.relay_amplitude, known, journal.tell)
-        if isinstance(loop.rig, RunsLaws):
+        if isinstance(loop.rig, RunsRelay):
             oscillation = DeviceOscillation(loop.rig, oscillation)
         journal.enter(State.SWEEP)
         segments, known = sweep(loop, point, wanted, known, oscillation, journal.show, earlier)

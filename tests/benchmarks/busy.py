@@ -2,7 +2,8 @@
 
 The served rig stands for a device with a processor of its own: it has real-time priority where the system grants that.
 
-``RUNS=3 python -m tests.benchmarks busy``: so many of each; ten where nothing is said.
+``RUNS=3 python -m tests.benchmarks busy``: so many of each; ten where nothing is said. ``BUSY=4``: with four busy
+processes only. What else the computer does is told by its load beside each run.
 """
 
 from __future__ import annotations
@@ -26,9 +27,9 @@ BUSY = 4
 def main() -> None:
     """Print a line for each run, and how many were accepted."""
     runs = int(os.environ.get("RUNS", "10"))
-    for busy in (0, BUSY):
+    for busy in map(int, os.environ["BUSY"].split(",")) if "BUSY" in os.environ else (0, BUSY):
         accepted = sum(_run(busy) for _ in range(runs))
-        print(f"{busy} busy processes: {accepted} of {runs} accepted")
+        print(f"{busy} busy processes: {accepted} of {runs} accepted", flush=True)
 
 
 def _first() -> None:
@@ -57,7 +58,8 @@ def _run(busy: int) -> bool:
             timing = json.loads((out / "result.json").read_text())["experiment"].get("timing", {})
         said = (done.stdout if done.returncode == 0 else done.stderr).strip().splitlines()
         line = next((text for text in said if text.startswith("Accepted")), said[-1] if said else "")
-        print(f"  {busy} busy, {time.monotonic() - began_s:.0f} s, missed {timing.get('missed')}: {line[:160]}")
+        took = f"{time.monotonic() - began_s:.0f} s, load {os.getloadavg()[0]:.0f}"
+        print(f"  {busy} busy, {took}, missed {timing.get('missed')}: {line[:160]}", flush=True)
         return done.returncode == 0
 
 

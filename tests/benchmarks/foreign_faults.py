@@ -2,8 +2,10 @@
 
 The device (``tests/drivers/libmodbus_controller.c``: its own plant, clock and positional PI, on libmodbus) understands
 the gains otherwise, or the line to it fails, while a hand-over tries them. A line says whether they were kept, which K
-the device holds afterwards, what it puts out when the host has gone, and what was said.
-``FAULTS=minutes`` runs those whose name has the pattern in it.
+the device holds afterwards, what it puts out when the host has gone, and what was said. Then the fault campaign's
+faults of a TCP line, a second master, and a device that is busy and has no dead-man, each in a short relay session: a
+line says how long after its last command the device was at its safe output, by its own log.
+``FAULTS=minutes`` runs those whose name has the pattern in it, ``MOMENTS=20`` strikes at so many moments of a session.
 """
 
 from __future__ import annotations
@@ -29,7 +31,9 @@ from autotune.experiment.verify import run_verification
 from autotune.pipeline.deployment import deploy
 from drivers import open_rig
 from tests.autotune.experiment.test_verify import fitted
-from tests.drivers.tcp_relay import Direction, Tamper, TcpRelay, unharmed
+from tests.drivers import campaign
+from tests.drivers.foreign_line import faults_on_controller
+from tests.drivers.tcp_relay import Direction, Tamper, TcpRelay, refuses, unharmed
 from tests.drivers.test_own_controller import GAINS, LAGS, compiled_controller, controller, peer_config
 
 #: moment of a fault on the line [s], in the middle of the trial
@@ -95,17 +99,6 @@ def _late(frame: bytes, direction: Direction) -> Sequence[tuple[float, bytes]]:
     return ((1.3, frame),) if direction == "to host" else ((0.0, frame),)
 
 
-def _refusal(code: int) -> Tamper:
-    """Return a device that answers everything with an exception."""
-
-    def tamper(frame: bytes, direction: Direction) -> Sequence[tuple[float, bytes]]:
-        if direction == "to device":
-            return ((0.0, frame),)
-        return ((0.0, frame[:4] + bytes((0, 3, frame[6], frame[7] | 0x80, code))),)
-
-    return tamper
-
-
 FAULTS = (
     Fault("none", "ideal", "behaves as predicted", kept=True),
     Fault("wrong word order", "swapped", "wrong word_order of rig.registers.K"),
@@ -113,12 +106,13 @@ FAULTS = (
     Fault("percent", "percent", "percent for engineering units"),
     Fault("parallel form", "parallel", "parallel form"),
     Fault("wrong sign", "reversed", "the wrong sign"),
+    Fault("set-point ten times", "tenfold", "wrong scale of the set-point: the device holds y at 10 times"),
     Fault("connection reset", "ideal", "behaves as predicted", kept=True, strike=_reset),
-    Fault("busy for .35 s", "ideal", "behaves as predicted", kept=True, strike=_for_a_while(_refusal(6), 0.35)),
+    Fault("busy for .35 s", "ideal", "behaves as predicted", kept=True, strike=_for_a_while(refuses(6), 0.35)),
     Fault("silent for .1 s", "ideal", "behaves as predicted", kept=True, strike=_for_a_while(_silent, 0.1)),
     Fault("answers too late for good", "ideal", "no answer|link too slow", strike=_for_a_while(_late, math.inf)),
     Fault("silent for good", "ideal", "no answer", strike=_for_a_while(_silent, math.inf)),
-    Fault("fails for good", "ideal", "failed to do it", strike=_for_a_while(_refusal(4), math.inf)),
+    Fault("fails for good", "ideal", "failed to do it", strike=_for_a_while(refuses(4), math.inf)),
 )
 
 
@@ -162,24 +156,50 @@ def _float(port: int, table: str, address: int) -> float:
     return float(struct.unpack(">f", struct.pack(">2H", *words))[0])
 
 
+def trials(program: Path, place: Path) -> list[bool]:
+    """Print a line for each fault of a trial; return which were as they should be."""
+    right = []
+    for fault in FAULTS:
+        if not re.search(os.environ.get("FAULTS", ""), fault.name):
+            continue
+        folder = place / fault.name.replace(" ", "_")
+        folder.mkdir()
+        outcome = run_fault(fault, program, folder)
+        right.append(fault.is_right(outcome))
+        print(
+            f"{'right' if right[-1] else 'WRONG'}  {fault.name}: {'kept' if outcome.kept else 'not kept'},"
+            f" K = {outcome.K:.3g}, output {outcome.output:.3g}: {outcome.said[:220]}",
+            flush=True,
+        )
+    return right
+
+
+def sessions(program: Path, place: Path) -> list[bool]:
+    """Print a line for each fault of a session, of its worst moment; return which were as they should be."""
+    right = []
+    for fault in faults_on_controller(program, place):
+        if not re.search(os.environ.get("FAULTS", ""), fault.name):
+            continue
+        outcomes = [campaign.run_fault(fault, seed) for seed in range(int(os.environ.get("MOMENTS", "4")))]
+        wrong = [one for one in outcomes if not (one.is_good and any(re.search(end, one.ended) for end in fault.ends))]
+        right.append(not wrong)
+        said = (wrong or outcomes)[-1].ended[:120]
+        print(
+            f"{'WRONG' if wrong else 'right'}  {fault.name}: {len(outcomes) - len(wrong)} of {len(outcomes)} moments,"
+            f" safe {max(one.safe_after_s for one in outcomes):.3f} s after the last command at most,"
+            f" {sum(one.beyond_limits for one in outcomes)} commands beyond limits,"
+            f" {sum(one.bad_samples for one in outcomes)} samples nobody measured: {said}",
+            flush=True,
+        )
+    return right
+
+
 def main() -> None:
     """Print a line for each fault, and how many were as they should be."""
-    faults = [fault for fault in FAULTS if re.search(os.environ.get("FAULTS", ""), fault.name)]
-    right = 0
     with tempfile.TemporaryDirectory() as place:
         program = compiled_controller(Path(place))
-        for fault in faults:
-            folder = Path(place) / fault.name.replace(" ", "_")
-            folder.mkdir()
-            outcome = run_fault(fault, program, folder)
-            is_right = fault.is_right(outcome)
-            right += is_right
-            print(
-                f"{'right' if is_right else 'WRONG'}  {fault.name}: {'kept' if outcome.kept else 'not kept'},"
-                f" K = {outcome.K:.3g}, output {outcome.output:.3g}: {outcome.said[:220]}",
-                flush=True,
-            )
-    print(f"safe, named and not called verified: {right} of {len(faults)}")
+        right = trials(program, Path(place)) + sessions(program, Path(place))
+    print(f"safe, named and not called verified: {sum(right)} of {len(right)}")
 
 
 if __name__ == "__main__":

@@ -31,7 +31,7 @@ CONFIGS = ROOT / "configs"
 #: words for blocks of which make only says what it would do, and its folder
 DRY = {"dry": ROOT, "board": ROOT / "drivers" / "firmware"}
 #: languages whose blocks a reader only reads
-READ_ONLY = {"text", "{toctree}"}
+READ_ONLY = {"text", "{toctree}", "st"}
 STATUS = re.compile(r"\s+# exit status (\d+)$")
 
 

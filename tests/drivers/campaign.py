@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import random
 import tempfile
-import threading
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -19,13 +18,24 @@ from typing import Any
 
 import numpy as np
 
+from autotune.config.procedure import LimitSettings
 from autotune.errors import AutotuneError
 from autotune.experiment.limits import Envelope
 from autotune.experiment.loop import ControlLoop
 from autotune.recording import RecordingWriter, read_recording
-from sim.register_device import RegisterDevice
-from tests.drivers.bench import DEADMAN_S, U_SAFE
-from tests.drivers.lines import LIMITS, TIMEOUT_S, Fate, Harm, Line, LoggedServo, rtu_line, serial_line, tcp_line
+from tests.drivers.bench import DEADMAN_S
+from tests.drivers.lines import (
+    LIMITS,
+    TIMEOUT_S,
+    Device,
+    Fate,
+    Harm,
+    Line,
+    Measured,
+    rtu_line,
+    serial_line,
+    tcp_line,
+)
 
 SAMPLE_S = 0.01
 SESSION_S = 1.2
@@ -49,6 +59,8 @@ class Outcome:
         Outputs outside the limits; recorded samples that nobody measured, or not then.
     rows : int
         Rows of the recording as it can be read.
+    within_s : float
+        How long that may take [s].
     """
 
     ended: str
@@ -57,71 +69,73 @@ class Outcome:
     beyond_limits: int
     bad_samples: int
     rows: int
+    within_s: float = DEADMAN_S
 
     @property
     def is_good(self) -> bool:
         """Whether the rig and the data came through."""
-        return self.safe_after_s <= DEADMAN_S + 1e-6 and not self.beyond_limits and not self.bad_samples
+        return self.safe_after_s <= self.within_s + 1e-6 and not self.beyond_limits and not self.bad_samples
 
 
 class NeverBegunError(AssertionError):
     """A session ended before the fault: this computer was too busy to hold the time-outs."""
 
 
-def run_session(line: Line, strike: Callable[[Line], None], moment_s: float) -> Outcome:
+def run_session(line: Line, fault: Fault, moment_s: float) -> Outcome:
     """Run one session and strike once at the moment [s]; return what came of it."""
-    released = threading.Event()
-    line.device.on_change = lambda change: released.set() if change.cause in ("dead-man", "given back") else None
     struck_s = float("inf")
     error: AutotuneError | None = None
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "session.csv"
         writer = RecordingWriter(path, ("t", "u", "y", "u_applied"), {})
-        envelope = Envelope(settings=LIMITS, sample_time_s=SAMPLE_S)
+        level, above, below = line.relay
+        envelope = Envelope(settings=line.limits, sample_time_s=SAMPLE_S)
         try:
             with ControlLoop(rig=line.rig, envelope=envelope, writer=writer, extra=("u_applied",)) as loop:
                 tick = loop.tick
-                while tick.t_s < SESSION_S:
+                while tick.t_s < fault.session_s:
                     if tick.t_s >= moment_s and struck_s == float("inf"):
                         struck_s = line.device.history[-1].t_s
-                        strike(line)
-                    tick = loop.step(loop.nearest(-0.4 if tick.y > 0.0 else 0.4))
+                        fault.strike(line)
+                    tick = loop.step(loop.nearest(above if tick.y > level else below))
         except AutotuneError as caught:
             error = caught
-        released.wait(10.0)
+        line.settle()
         if struck_s == float("inf") and error is not None:
             raise NeverBegunError from error
         recording = read_recording(path)
     return Outcome(
         ended="completed" if error is None else str(error),
         exit_status=0 if error is None else error.exit_status,
-        safe_after_s=_safe_after(line.device, 0.0 if struck_s == float("inf") else struck_s),
-        beyond_limits=beyond_limits(line.device),
+        safe_after_s=_safe_after(line.device, line.limits.u_safe, 0.0 if struck_s == float("inf") else struck_s),
+        beyond_limits=beyond_limits(line.device, line.limits),
         bad_samples=bad_samples(line.plant, recording.t, recording.y),
         rows=len(recording),
+        within_s=fault.within_s,
     )
 
 
-def _safe_after(device: RegisterDevice, struck_s: float) -> float:
+def _safe_after(device: Device, u_safe: float, struck_s: float) -> float:
     """Return the time from the last command that was taken to the safe output [s]; infinite if it is not there."""
     history = list(device.history)
-    if abs(device.output - U_SAFE) > 1e-9:
+    if abs(device.output - u_safe) > 1e-9:
         return float("inf")
-    reached = next(i for i in range(len(history)) if all(abs(c.output - U_SAFE) < 1e-9 for c in history[i:]))
+    reached = next(i for i in range(len(history)) if all(abs(c.output - u_safe) < 1e-9 for c in history[i:]))
     last_other = history[reached - 1].t_s if reached else history[reached].t_s
     return history[reached].t_s - max(last_other, struck_s)
 
 
-def beyond_limits(device: RegisterDevice) -> int:
+def beyond_limits(device: Device, limits: LimitSettings = LIMITS) -> int:
     """Count outputs outside the limits, on the rig's side."""
-    return sum(not LIMITS.u_min <= change.output <= LIMITS.u_max for change in device.history)
+    return sum(not limits.u_min <= change.output <= limits.u_max for change in device.history)
 
 
-def bad_samples(plant: LoggedServo, t: Any, y: Any) -> int:
+def bad_samples(plant: Measured, t: Any, y: Any) -> int:
     """Count samples that were not measured, or were measured longer ago than an answer may take."""
     # the line carries fewer digits than the file, and a few measurements look alike
+    measured = plant.measured
     delays = [
-        [float(t_k) - at for at in plant.measured.get(plant.shown(float(y_k)), [])]
+        [float(t_k) - at for at in measured.get(plant.shown(float(y_k)), [])]
         for t_k, y_k in zip(t, y, strict=True)
         if np.isfinite(y_k)
     ]
@@ -151,13 +165,7 @@ def _flip(frame: bytes, draw: random.Random) -> Fate:
 
 
 def _refuse(code: int, times: int) -> Callable[[Line], None]:
-    return lambda line: line.refusing.update(code=code, left=times)
-
-
-def _restart(line: Line) -> None:
-    """What a device's reset does: registers cleared, the actuator safe, nobody in command."""
-    line.device._values |= {"heartbeat": 0.0, "u": 0.0, "enable": 0.0}
-    line.device._release("given back")
+    return lambda line: line.refuse(code, times)
 
 
 def _stale_first() -> Callable[[random.Random], Harm]:
@@ -183,6 +191,8 @@ class Fault:
     line: Callable[[int], Any]
     strike: Callable[[Line], None]
     ends: tuple[str, ...]
+    session_s: float = SESSION_S
+    within_s: float = DEADMAN_S
 
 
 _LOST = (
@@ -266,7 +276,12 @@ FAULTS = (
     Fault(name="Modbus exception 4", line=tcp_line, ends=("failed to do it",), strike=_refuse(4, 10**9)),
     Fault(name="device busy once", line=tcp_line, ends=_RIDDEN, strike=_refuse(6, 1)),
     Fault(name="device busy for good", line=tcp_line, ends=("is busy",), strike=_refuse(6, 10**9)),
-    Fault(name="device restarts", line=tcp_line, ends=("took the actuator back", "echoes heartbeat"), strike=_restart),
+    Fault(
+        name="device restarts",
+        line=tcp_line,
+        ends=("took the actuator back", "echoes heartbeat"),
+        strike=lambda line: line.restart(),
+    ),
     Fault(name="wall clock jumps an hour", line=tcp_line, ends=("completed",), strike=_set_wall_clock),
     Fault(name="RTU late beyond time-out", line=rtu_line, ends=_RIDDEN, strike=_sometimes(_late)),
     Fault(name="RTU lost answers", line=rtu_line, ends=_RIDDEN, strike=_sometimes(_lost)),
@@ -291,7 +306,7 @@ def run_fault(fault: Fault, seed: int) -> Outcome:
         with ExitStack() as stack:
             line = stack.enter_context(fault.line(seed))
             try:
-                return run_session(line, fault.strike, moment_s)
+                return run_session(line, fault, moment_s)
             except NeverBegunError:
                 continue
     raise NeverBegunError

@@ -80,6 +80,7 @@ class Blocks:
             name: {v: kind for kind, v in re.findall(r"__DECLARE_VAR\((\w+),(\w+)\)", body) if kind in _NUMBERS}
             for body, name in blocks
         }
+        self.arrays = {name: re.findall(r"__DECLARE_VAR\(__ARRAY_OF_LREAL_\d+,(\w+)\)", body) for body, name in blocks}
         shim = folder / "shim.c"
         shim.write_text(_GLOBALS + "".join(self._shim(name) for name in self.types))
         self._library = library([shim], headers, folder / "blocks.so")
@@ -92,6 +93,9 @@ class Blocks:
         for name in self.types[block]:
             lines.append(f"void {block}_set_{name}({block} *d, double v) {{ d->{name}.value = v; }}")
             lines.append(f"double {block}_get_{name}({block} *d) {{ return d->{name}.value; }}")
+        for name in self.arrays[block]:
+            lines.append(f"void {block}_put_{name}({block} *d, int i, double v) {{ d->{name}.value.table[i] = v; }}")
+            lines.append(f"double {block}_at_{name}({block} *d, int i) {{ return d->{name}.value.table[i]; }}")
         return "\n".join(lines) + "\n"
 
     def call(self, block: str, what: str, *arguments: Any, returns: Any = None) -> Any:
@@ -115,6 +119,16 @@ class CompiledInstance:
             self.value[name] = value
         self._blocks.call(self._name, "cycle", self._it)
         return self
+
+    def put(self, name: str, numbers: Iterable[float]) -> None:
+        """Set an array."""
+        for i, number in enumerate(numbers):
+            self._blocks.call(self._name, f"put_{name}", self._it, i, ctypes.c_double(number))
+
+    def numbers(self, name: str, count: int) -> list[float]:
+        """Return an array's first numbers."""
+        call, it = self._blocks.call, self._it
+        return [call(self._name, f"at_{name}", it, i, returns=ctypes.c_double) for i in range(count)]
 
 
 class _Values:

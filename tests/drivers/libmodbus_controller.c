@@ -1,13 +1,16 @@
 /* A controller with a plant behind it on libmodbus, for the tests: a PI of its own in positional form, cycle 10 ms.
  *
- *   controller LAW    listens on a free loopback port, prints "ready PORT"
+ *   controller LAW [PORT [DEADMAN [LOG]]]    listens on the loopback, on a free port for 0, prints "ready PORT"
  *
  * LAW says how it understands its gains: ideal, swapped (words of K the other way round), minutes (T_I), percent (K of
- * an output of 0..10 over a measurement of 0..5), parallel, reversed. The plant: 1/((0.3 s + 1)(0.1 s + 1)).
+ * an output of 0..10 over a measurement of 0..5), parallel, reversed, tenfold (set-point).
+ * The plant: 1/((0.3 s + 1)(0.1 s + 1)). LOG takes a line of every cycle: time, y, output,
+ * who moves it (0 nobody, 1 host, 2 own), heartbeat.
  *
  * Input registers: 0-1 y, 2-3 output, 4 last heartbeat, 5 whether the host commands. Holding registers: 0-1 u, 2
  * heartbeat, 3-4 safe output, 10-11 K, 12-13 T_I in s, 14-15 set-point, 16-17 load. Coils: 0 host commands, 1 automatic.
- * Floats have their high word first. Without a new heartbeat for half a second the host loses the output.
+ * Floats have their high word first. Without a new heartbeat for DEADMAN seconds, half a one if not
+ * given, the host loses the output.
  */
 #include <errno.h>
 #include <arpa/inet.h>
@@ -15,6 +18,7 @@
 #include <modbus/modbus.h>
 #include <netinet/in.h>
 #include <stdio.h>
+#include <stdlib.h>
 #include <string.h>
 #include <sys/select.h>
 #include <sys/socket.h>
@@ -22,7 +26,10 @@
 #include <unistd.h>
 
 #define SCAN 0.01
+#define PEERS 4
 enum { IDLE, HOST, OWN };
+static double deadman = 0.5;
+static FILE *record;
 
 static double now(void)
 {
@@ -59,7 +66,7 @@ static void scan(modbus_mapping_t *memory, const char *law, double t)
     static int mode = IDLE, beat = -1;
     uint16_t *held = memory->tab_registers;
     double y = x2, K = get(held + 10, strcmp(law, "swapped") == 0), Ti = get(held + 12, 0);
-    double e = get(held + 14, 0) - y, load = get(held + 16, 0);
+    double e = (strcmp(law, "tenfold") == 0 ? 10.0 : 1.0) * get(held + 14, 0) - y, load = get(held + 16, 0);
     double slope = Ti > 0.0 ? K / Ti : 0.0;
     if (strcmp(law, "minutes") == 0)
         slope /= 60.0;
@@ -72,7 +79,7 @@ static void scan(modbus_mapping_t *memory, const char *law, double t)
 
     if (held[2] != beat || !memory->tab_bits[0])
         beat = held[2], fed = t;
-    if (memory->tab_bits[0] && t - fed > 0.5)
+    if (memory->tab_bits[0] && t - fed > deadman)
         memory->tab_bits[0] = 0;
     int next = memory->tab_bits[0] ? HOST : memory->tab_bits[1] ? OWN : IDLE;
     if (next == OWN && mode != OWN)
@@ -94,18 +101,38 @@ static void scan(modbus_mapping_t *memory, const char *law, double t)
     put(memory->tab_input_registers + 2, output);
     memory->tab_input_registers[4] = held[2];
     memory->tab_input_registers[5] = mode == HOST;
+    if (record)
+        fprintf(record, "%.6f %.9g %.9g %d %d\n", now(), (float)x2, output, mode, held[2]);
+}
+
+/* Answer one request; close the connection where the peer has. */
+static void serve(modbus_t *link, modbus_mapping_t *memory, int *peer)
+{
+    uint8_t request[MODBUS_TCP_MAX_ADU_LENGTH];
+    modbus_set_socket(link, *peer);
+    int length = modbus_receive(link, request);
+    if (length > 0)
+        modbus_reply(link, request, length, memory);
+    else if (length == -1)
+        close(*peer), *peer = -1;
 }
 
 int main(int count, char **words)
 {
     const char *law = count > 1 ? words[1] : "ideal";
     modbus_mapping_t *memory = modbus_mapping_new(8, 8, 32, 16);
-    modbus_t *link = modbus_new_tcp("127.0.0.1", 0);
-    int listener = modbus_tcp_listen(link, 4), peer = -1;
+    modbus_t *link = modbus_new_tcp("127.0.0.1", count > 2 ? atoi(words[2]) : 0);
+    int listener = modbus_tcp_listen(link, PEERS), peers[PEERS], oldest = 0;
     struct sockaddr_in address;
     socklen_t size = sizeof address;
     if (listener == -1 || getsockname(listener, (struct sockaddr *)&address, &size) == -1)
         return 1;
+    if (count > 3)
+        deadman = atof(words[3]);
+    if (count > 4 && (record = fopen(words[4], "a")))
+        setvbuf(record, NULL, _IOLBF, 0);
+    for (int i = 0; i < PEERS; i++)
+        peers[i] = -1;
     put(memory->tab_registers + 10, 0.1);
     put(memory->tab_registers + 12, 1.0);
     printf("ready %d\n", ntohs(address.sin_port));
@@ -120,22 +147,23 @@ int main(int count, char **words)
         fd_set ready;
         FD_ZERO(&ready);
         FD_SET(listener, &ready);
-        if (peer >= 0)
-            FD_SET(peer, &ready);
+        int highest = listener;
+        for (int i = 0; i < PEERS; i++)
+            if (peers[i] >= 0) {
+                FD_SET(peers[i], &ready);
+                highest = peers[i] > highest ? peers[i] : highest;
+            }
         struct timeval limit = {0, (suseconds_t)(1e6 * wait)};
-        if (select((peer > listener ? peer : listener) + 1, &ready, NULL, NULL, &limit) <= 0)
+        if (select(highest + 1, &ready, NULL, NULL, &limit) <= 0)
             continue;
+        for (int i = 0; i < PEERS; i++)
+            if (peers[i] >= 0 && FD_ISSET(peers[i], &ready))
+                serve(link, memory, peers + i);
         if (FD_ISSET(listener, &ready)) {
-            if (peer >= 0)
-                close(peer);
-            peer = modbus_tcp_accept(link, &listener);
-        } else if (peer >= 0) {
-            uint8_t request[MODBUS_TCP_MAX_ADU_LENGTH];
-            int length = modbus_receive(link, request);
-            if (length > 0)
-                modbus_reply(link, request, length, memory);
-            else if (length == -1)
-                close(peer), peer = -1;
+            if (peers[oldest] >= 0)
+                close(peers[oldest]);
+            peers[oldest] = modbus_tcp_accept(link, &listener);
+            oldest = (oldest + 1) % PEERS;
         }
     }
 }

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import random
-from collections.abc import Callable, Iterator, Sequence
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -14,7 +15,7 @@ from autotune.config.procedure import LimitSettings
 from autotune.experiment.rig import Rig
 from drivers import open_rig
 from sim.modbus_rig import ModbusRig, RtuTransport, TcpTransport
-from sim.register_device import RegisterDevice
+from sim.register_device import OutputChange, RegisterDevice
 from sim.serial_line import SerialLine
 from sim.serial_rig import SerialRig, device_on_line
 from sim.servo import Servo, ServoSettings
@@ -62,17 +63,45 @@ class LoggedServo(Servo):
         return y
 
 
+class Device(Protocol):
+    """What the rig's own side says of the actuator: what moved it, and what moves it now."""
+
+    @property
+    def history(self) -> Sequence[OutputChange]: ...
+
+    @property
+    def output(self) -> float: ...
+
+
+class Measured(Protocol):
+    """What the rig's own side measured, as its line shows it, and when."""
+
+    @property
+    def shown(self) -> Callable[[float], float]: ...
+
+    @property
+    def measured(self) -> Mapping[float, Sequence[float]]: ...
+
+
 @dataclass(kw_only=True)
 class Line:
-    """A rig on a line, the device behind it, and the means to harm both."""
+    """A rig on a line, the device behind it, and the means to harm both.
+
+    ``settle`` waits until nobody moves the actuator any more; ``relay`` is the level of y at which a session switches,
+    and its commands above and below that.
+    """
 
     rig: Rig
-    device: RegisterDevice
-    plant: LoggedServo
+    device: Device
+    plant: Measured
     random: random.Random
+    settle: Callable[[], object]
+    limits: LimitSettings = LIMITS
+    relay: tuple[float, float, float] = (0.0, -0.4, 0.4)
+    restart: Callable[[], None] = lambda: None
     set_harm: Callable[[Harm], None] = lambda harm: None
     reset: Callable[[], None] = lambda: None
-    refusing: dict[str, Any] = field(default_factory=dict)
+    refuse: Callable[[int, int], None] = lambda code, times: None
     unplug: Callable[[], None] = lambda: None
     jump: Callable[[float], None] = lambda seconds: None
     undo: ExitStack = field(default_factory=ExitStack)
@@ -80,6 +109,19 @@ class Line:
 
 def _whole(frame: bytes, direction: str) -> Fate:
     return ((0.0, frame),)
+
+
+def _released(device: RegisterDevice) -> Callable[[], object]:
+    """Return what waits until the device has been given back, or its dead-man has acted."""
+    released = threading.Event()
+    device.on_change = lambda change: released.set() if change.cause in ("dead-man", "given back") else None
+    return lambda: released.wait(10.0)
+
+
+def _reset_registers(device: RegisterDevice) -> None:
+    """What a device's reset does: registers cleared, the actuator safe, nobody in command."""
+    device._values |= {"heartbeat": 0.0, "u": 0.0, "enable": 0.0}
+    device._release("given back")
 
 
 @contextmanager
@@ -111,9 +153,11 @@ def tcp_line(seed: int) -> Iterator[Line]:
             device=device,
             plant=plant,
             random=random.Random(seed),
+            settle=_released(device),
             set_harm=harm,
             reset=relay.reset,
-            refusing=refusing,
+            restart=lambda: _reset_registers(device),
+            refuse=lambda code, times: refusing.update(code=code, left=times),
             undo=undo,
         )
         rig.close()
@@ -131,7 +175,14 @@ def rtu_line(seed: int) -> Iterator[Line]:
         def harm(how: Harm) -> None:
             line.tamper = how
 
-        yield Line(rig=rig, device=device, plant=plant, random=random.Random(seed), set_harm=harm)
+        yield Line(
+            rig=rig,
+            device=device,
+            plant=plant,
+            random=random.Random(seed),
+            settle=_released(device),
+            set_harm=harm,
+        )
         rig.close()
 
 
@@ -157,6 +208,7 @@ def serial_line(seed: int) -> Iterator[Line]:
             device=device,
             plant=plant,
             random=random.Random(seed),
+            settle=_released(device),
             set_harm=harm,
             reset=served.restart,
             unplug=line.close,

@@ -1,6 +1,7 @@
 /* A controller behind node-opcua's server, for the tests: nobody's own code here but its program and its plant.
  *
- *   node node_opcua_server.js PORT FOLDER     prints "ready" when it serves; FOLDER takes its certificates
+ *   node node_opcua_server.js PORT FOLDER     prints "ready" when it serves; FOLDER takes its certificates, and has
+ *                                             certificates/host.pem, the only one that it trusts
  *
  * Program, every 10 ms: while enable is true and the heartbeat moves, u is the output; after half a second without a
  * new heartbeat, or with enable false, the safe output, or the PI where automatic is true. The plant has two lags of
@@ -8,6 +9,9 @@
  */
 const { OPCUAServer, Variant, DataType, StatusCodes, SecurityPolicy, MessageSecurityMode, OPCUACertificateManager } =
   require("node-opcua");
+
+const { readFileSync } = require("fs");
+const { X509Certificate } = require("crypto");
 
 const [port, folder] = [Number(process.argv[2]), process.argv[3]];
 const held = { u: 0, heartbeat: 0, safe: 0, enable: false, automatic: false, setpoint: 0, load: 0, K: 0.1, Ti: 1 };
@@ -28,10 +32,13 @@ function scan(dt, t) {
 }
 
 (async () => {
-  const certificates = (name) => new OPCUACertificateManager({ automaticallyAcceptUnknownCertificate: true, rootFolder: folder + "/" + name });
+  const certificates = (name) => new OPCUACertificateManager({ automaticallyAcceptUnknownCertificate: false, rootFolder: folder + "/" + name });
+  const peers = certificates("pki");
+  await peers.initialize();
+  await peers.trustCertificate(new X509Certificate(readFileSync(folder + "/certificates/host.pem")).raw);
   const server = new OPCUAServer({
     port, resourcePath: "/rig", allowAnonymous: false,
-    serverCertificateManager: certificates("pki"), userCertificateManager: certificates("users"),
+    serverCertificateManager: peers, userCertificateManager: certificates("users"),
     securityPolicies: [SecurityPolicy.Basic256Sha256], securityModes: [MessageSecurityMode.SignAndEncrypt],
     userManager: { isValidUser: (user, password) => user === "operator" && password === "right" },
   });

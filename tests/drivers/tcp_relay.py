@@ -24,6 +24,22 @@ def unharmed(frame: bytes, direction: Direction) -> Sequence[tuple[float, bytes]
     return ((0.0, frame),)
 
 
+def refuses(code: int, while_: Callable[[], bool] = lambda: True) -> Tamper:
+    """Return a Modbus device that takes no request and answers each with an exception, while that holds."""
+    refused: dict[bytes, int] = {}
+
+    def tamper(frame: bytes, direction: Direction) -> Sequence[tuple[float, bytes]]:
+        if direction == "to device":
+            if not while_():
+                return ((0.0, frame),)
+            refused[frame[:2]] = frame[7]
+            return ((0.0, frame[:4] + bytes((0, 6, frame[6], 3, 0, 0, 0, 1))),)  # a reading changes nothing
+        function = refused.pop(frame[:2], None)
+        return ((0.0, frame if function is None else frame[:4] + bytes((0, 3, frame[6], function | 0x80, code))),)
+
+    return tamper
+
+
 def modbus_length(head: bytes) -> int:
     """Return the length of the Modbus frame that begins so."""
     return 6 + int.from_bytes(head[4:6], "big")

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import re
 import signal
+from pathlib import Path
 
 import pytest
 
 from tests.drivers.campaign import FAULTS, Fault, run_fault
 from tests.drivers.ctrl_c import STATES, stop_in
+from tests.drivers.foreign_line import faults_on_controller
 from tests.drivers.plant_campaign import PLANT_FAULTS, PlantFault, run_plant_fault
 from tests.drivers.signals import SIGNALS, strike_process
+from tests.drivers.test_own_controller import compiled_controller
 
 
 @pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.name)
@@ -34,6 +37,20 @@ def test_what_plants_do_leaves_the_rig_safe_and_is_said_in_one_line(fault: Plant
     assert any(re.search(end, outcome.ended) for end in fault.ends), outcome.ended
     assert outcome.exit_status == (0 if outcome.ended == "completed" else 3)
     assert "\n" not in outcome.ended
+
+
+@pytest.fixture(scope="session")
+def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return compiled_controller(tmp_path_factory.mktemp("controller"))
+
+
+@pytest.mark.system("libmodbus-dev", "gcc")
+@pytest.mark.parametrize("name", ["half-open", "second master, once", "second master, 5 a second", "no dead-man"])
+def test_a_controller_in_c_is_safe_and_the_cause_is_named(program: Path, tmp_path: Path, name: str) -> None:
+    (fault,) = (one for one in faults_on_controller(program, tmp_path) if name in one.name)
+    outcome = run_fault(fault, seed=5)
+    assert outcome.is_good, outcome
+    assert any(re.search(end, outcome.ended) for end in fault.ends), outcome.ended
 
 
 @pytest.mark.parametrize(("number", "status", "line"), SIGNALS, ids=lambda value: getattr(value, "name", None))

@@ -80,6 +80,19 @@ def test_a_limit_cycle_on_the_device_is_the_plants_response_to_the_last_tick(uno
     assert bench.uno.duty == 0
 
 
+def test_a_sample_that_the_host_missed_before_shifts_no_row_of_the_device(uno_elf: Path, tmp_path: Path) -> None:
+    bench = Bench(uno_elf, tmp_path)
+    with bench.loop as loop:
+        loop.step(loop.nearest(bench.ball.ball.u_rest))
+        bench.rig.clock.sleep_until(bench.rig.clock.now() + 2.5 * loop.sample_time_s)
+        loop.step(loop.nearest(bench.ball.ball.u_rest))
+        missed, oscillation = loop.tick.slot - loop.tick.k, bench.oscillation()
+        assert missed > 0
+        for _ in range(50):
+            oscillation.step()
+        assert loop.tick.slot - loop.tick.k == missed
+
+
 def test_gains_are_tried_on_the_device_and_not_kept(uno_elf: Path, tmp_path: Path) -> None:
     bench = Bench(uno_elf, tmp_path)
     with bench.loop as loop:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 import subprocess
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -21,20 +22,35 @@ from tests.drivers.test_rig_commands import free_port
 SERVER = Path(__file__).with_name("node_opcua_server.js")
 
 
-@pytest.fixture(scope="module")
-def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, int]]:
-    """Serve the controller; return the folder of certificates and the port."""
+@contextmanager
+def serving(folder: Path, port: int) -> Iterator[None]:
+    """Serve the controller until the context ends, which is a power failure to it."""
     node = shutil.which("node")
-    if node is None or subprocess.run([node, "-e", 'require("node-opcua")'], capture_output=True).returncode:
-        pytest.skip("needs node with node-opcua: npm install node-opcua, and NODE_PATH to its node_modules")
-    folder, port = certificates_of_the_page(tmp_path_factory.mktemp("node")), free_port()
+    assert node is not None
     with subprocess.Popen([node, SERVER, str(port), str(folder)], stdout=subprocess.PIPE, text=True) as server:
         try:
             assert server.stdout is not None
             assert any(line.startswith("ready") for line in server.stdout)
-            yield folder, port
+            yield
         finally:
             server.kill()
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with certificates, where there is a node-opcua to use them."""
+    node = shutil.which("node")
+    if node is None or subprocess.run([node, "-e", 'require("node-opcua")'], capture_output=True).returncode:
+        pytest.skip("needs node with node-opcua: npm install node-opcua, and NODE_PATH to its node_modules")
+    return certificates_of_the_page(tmp_path_factory.mktemp("node"))
+
+
+@pytest.fixture(scope="module")
+def served(made: Path) -> Iterator[tuple[Path, int]]:
+    """Serve the controller; return the folder of certificates and the port."""
+    port = free_port()
+    with serving(made, port):
+        yield made, port
 
 
 def described(served: tuple[Path, int], folder: Path, password: str = "right", **nodes: Any) -> Config:
@@ -97,6 +113,42 @@ def test_what_is_wrong_is_named(served: tuple[Path, int], tmp_path: Path, given:
     rig.close()
     assert isinstance(error.value, LinkError)
     assert named in str(error.value)
+
+
+def test_a_certificate_that_the_server_does_not_trust_is_named(served: tuple[Path, int], tmp_path: Path) -> None:
+    made, port = served
+    stranger = certificates_of_the_page(tmp_path) / "certificates"
+    config = described((made, port), tmp_path)
+    files = {"cert_file": str(stranger / "host.pem"), "key_file": str(stranger / "host.key")}
+    rig = rig_of(config.model_copy(update={"rig": config.rig.model_copy(update=files)}))
+    with pytest.raises(LinkError, match=r"the server (does not trust|refuses) this host's certificate") as error:
+        rig.open()
+    rig.close()
+    assert "among the certificates that the server trusts" in str(error.value)
+
+
+def test_a_type_that_the_server_refuses_in_a_write_is_named(served: tuple[Path, int], tmp_path: Path) -> None:
+    rig = rig_of(described(served, tmp_path, Ti={"node": "ns=1;s=Ti", "type": "float32"}))
+    with pytest.raises(LinkError, match="node of Ti holds Double, not float32") as error:
+        rig.read_gains()
+    rig.close()
+    assert 'its type = "float64"' in str(error.value)
+
+
+def test_after_a_restart_of_the_server_the_rig_is_not_commanded_any_more(made: Path, tmp_path: Path) -> None:
+    port = free_port()
+    with serving(made, port):
+        config = described((made, port), tmp_path)
+        rig = rig_of(config.model_copy(update={"rig": config.rig.model_copy(update={"retries": 3})}))
+        rig.open()
+        rig.write(6.0)
+    with serving(made, port):
+        with pytest.raises(LinkError, match=r"took the actuator back|echoes heartbeat") as error:
+            rig.read()
+        assert "\n" not in str(error.value)
+        rig.make_safe()
+        assert rig._ask()[0].u_applied == 4.5
+        rig.close()
 
 
 @pytest.mark.slow

@@ -25,7 +25,7 @@ from tests.drivers.structured_text import Instance, function_blocks
 FOLDER = Path(__file__).parents[2] / "drivers" / "firmware" / "structured_text"
 
 
-FILES = ("relay.st", "pi.st", "rig.st")
+FILES = ("relay.st", "pi.st", "rig.st", "operated.st")
 NAN = float("nan")
 
 #: Makes an instance of a block by its name.
@@ -64,7 +64,7 @@ def relay_inputs(settings: RelaySettings) -> dict[str, Any]:
 
 def test_every_file_parses_and_is_named_in_the_readme(blocks: dict[str, Any]) -> None:
     readme = (FOLDER / "README.md").read_text()
-    assert set(blocks) == {"RELAY_DELAY", "PI_LAW", "RIG"}
+    assert set(blocks) == {"RELAY_DELAY", "PI_LAW", "RIG", "OPERATED_RIG"}
     for name in (*blocks, *(path.name for path in FOLDER.glob("*.st"))):
         assert f"`{name}`" in readme
     source, configuration = (FOLDER / "program.st").read_text().split("CONFIGURATION", 1)
@@ -225,6 +225,9 @@ def test_the_whole_program_and_the_law_that_is_written_for_a_plc_compile(tmp_pat
     program = "".join((FOLDER / name).read_text() for name in (*FILES, "program.st"))
     generated_c(program, tmp_path / "program")
     assert "TUNED_RIG_body__" in (tmp_path / "program" / "POUS.c").read_text()
+    page = (Path(__file__).parents[2] / "docs" / "plc.md").read_text().split("```st\n")[1].split("```")[0]
+    generated_c("".join((FOLDER / name).read_text() for name in FILES) + page, tmp_path / "page")
+    assert "OPERATED_body__" in (tmp_path / "page" / "POUS.c").read_text()
     for law in LAWS:
         generated_c(structured_text(law), tmp_path / "law")
 

@@ -22,7 +22,7 @@ PACES = st.lists(st.integers(1, 4), min_size=500, max_size=500)
 def monitor(**limits: float) -> ReadingMonitor:
     given = {"u_min": 0.0, "u_max": 10.0, "u_safe": 0.0, "y_min": 1.0, "y_max": 9.0, "swing": 3.0}
     settings = LimitSettings.model_validate(given | limits)
-    return ReadingMonitor(Envelope(settings=settings, sample_time_s=T_S).patience)
+    return ReadingMonitor(Envelope(settings=settings, sample_time_s=T_S).patience, T_S)
 
 
 def stopped_after(one: ReadingMonitor, readings: list[Reading]) -> tuple[float, int]:
