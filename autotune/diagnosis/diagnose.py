@@ -13,7 +13,6 @@ from autotune.diagnosis.agreement import Part, agreement, likely, parts_of
 from autotune.diagnosis.evidence.description import describe
 from autotune.diagnosis.evidence.misread import misread_columns
 from autotune.diagnosis.evidence.operating_point import unmoved
-from autotune.diagnosis.evidence.stretches import rms
 from autotune.diagnosis.extended import extended_model
 from autotune.diagnosis.findings import OFFSET, found_effects, places_of, said_by, sentences_of
 from autotune.diagnosis.gathering import evidence_of, keeping
@@ -174,8 +173,7 @@ def _on_parts(
         cannot_tell = set(unmoved(model, part.recordings))
         if part_shows.found is not None:
             fitted = search.chosen.fit
-            left = rms(fitted.residuals, search.data.good)
-            cannot_tell |= part_shows.found.cannot_tell(fitted.model.effects[fitted.parametrisation.own :], left)
+            cannot_tell |= part_shows.found.retuned.unfelt(fitted.model.effects[fitted.parametrisation.own :])
         return said_by(part_shows) | dict.fromkeys(cannot_tell, math.nan)
 
     return said

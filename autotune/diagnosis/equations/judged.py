@@ -63,7 +63,7 @@ class JudgedEquations(Judged):
         if variance_ratio(outcome, self.noise) > limits.adequate_quick + chance or is_slow(outcome, self.noise, limits):
             return False
         error = math.sqrt(float(self.long_squares.sum()) / outcome.residual.size)
-        return error < self.most_foretold * math.sqrt(outcome.rss / outcome.residual.size)
+        return error < limits.foretold * self.bench.grows * math.sqrt(outcome.rss / outcome.residual.size)
 
     @cached_property
     def variance(self) -> float:
@@ -74,16 +74,6 @@ class JudgedEquations(Judged):
     def rows(self) -> int:
         """Rows that it was fitted to."""
         return self.outcome.residual.size
-
-    @property
-    def judged_rows(self) -> tuple[int, int]:
-        """Rows that are judged on left-out stretches; equations are judged at one scale."""
-        return self.rows, self.rows
-
-    @property
-    def most_foretold(self) -> float:
-        """Error of rows that were left out over the noise, up to which it may be that of start states alone."""
-        return self.limits.foretold * self.bench.grows
 
     @property
     def numbers(self) -> int:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
@@ -36,7 +35,7 @@ class Noise:
     sd: float
     ar: tuple[float, ...] = ()
 
-    @cached_property
+    @property
     def total_sd(self) -> float:
         """Standard deviation of the noise itself."""
         if not self.ar:

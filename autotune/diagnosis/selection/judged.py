@@ -1,8 +1,7 @@
 """Hypotheses judged by what they leave: compared in pairs, ranked, weighed. Chains and equations are judged alike.
 
-A hypothesis leaves noise and a discrepancy, what it lacks. Noise is new in every row; a discrepancy goes on and on, so
-that a stretch of the recordings says no more of it than one independent number would. One formula has both: see
-:meth:`Judged.behind`.
+Where both leave noise alone, rows are independent witnesses and the likelihood of the rows decides. Where both err by
+more, the model's own error decides and rows are none: stretches that were left out are, by the same formula.
 """
 
 from __future__ import annotations
@@ -14,14 +13,10 @@ from dataclasses import dataclass
 from statistics import fmean
 from typing import TypeVar
 
-import numpy as np
-
 from autotune.arrays import FloatArray
 from autotune.diagnosis.evidence.stretches import STRETCHES, reduction
-from autotune.diagnosis.fitting.noise import Noise
 from autotune.diagnosis.selection.probability import Candidate, weighed
 from autotune.diagnosis.thresholds import Thresholds
-from autotune.effects import called
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -55,11 +50,6 @@ class Judged(ABC):
 
     @property
     @abstractmethod
-    def noise(self) -> Noise:
-        """The noise that what it leaves shows from row to row."""
-
-    @property
-    @abstractmethod
     def variance(self) -> float:
         """Variance of the innovations of what it leaves."""
 
@@ -70,18 +60,8 @@ class Judged(ABC):
 
     @property
     @abstractmethod
-    def judged_rows(self) -> tuple[int, int]:
-        """Rows that are judged on left-out stretches of long windows, and of short ones."""
-
-    @property
-    @abstractmethod
     def numbers(self) -> int:
         """Numbers of its effects that were fitted."""
-
-    @property
-    def most_foretold(self) -> float:
-        """Error of rows that were left out over the noise, up to which it may be that of start states alone."""
-        return self.limits.foretold
 
     @property
     @abstractmethod
@@ -96,31 +76,37 @@ class Judged(ABC):
     def behind(self, other: Judged) -> float:
         """Return twice the logarithm of the odds that another hypothesis is the better one, priors counted.
 
-        Notes
-        -----
-        Of N rows with noise of variance s^2 and a discrepancy of mean square d^2 that has K independent values, one
-        in each stretch, K directions of the residual have the variance s^2 + N d^2/K and all others s^2. With d of a
-        size that is not known, two hypotheses differ in twice their log likelihood by
-
-            K ln((1 + N d1^2/(K s^2)) / (1 + N d2^2/(K s^2))).
-
-        Near the noise that is the difference of their chi-squares, every row a witness; far from it K ln(d1^2/d2^2),
-        every stretch one. What is left inside the fitted rows pays ln N for each number (Schwarz 1978), what is left
-        of stretches that were not fitted pays nothing, and the larger of both is the discrepancy (Kennedy & O'Hagan,
-        J. R. Statist. Soc. B 63, 2001). The noise is that of the quieter one: what moves fast may be missing physics.
+        Where both leave noise that is what rows say. Where neither does, the model's error decides, and it is what
+        stretches say that were left out. Where one does, rows may speak for it, but not against it: what leaves more
+        than noise, or foretells nothing, is no better for what it makes of the rows that it was fitted to.
         """
-        noise = min((self.noise, other.noise), key=lambda each: each.total_sd)
-        scales = zip(self._spread_over_stretches(noise), other._spread_over_stretches(noise), strict=True)
-        said = STRETCHES * fmean(reduction(mine, its) for mine, its in scales) / self.limits.temperature
-        return said - 2.0 * (self.log_odds - other.log_odds)
+        prior = 2.0 * (self.log_odds - other.log_odds)
+        if self.leaves_noise and other.leaves_noise:
+            return self._by_rows(other) - prior
+        if other.leaves_noise:
+            return max(self._by_rows(other), self._by_stretches(other)) - prior
+        if self.leaves_noise:
+            return min(self._by_rows(other), self._by_stretches(other)) - prior
+        return self._by_stretches(other) - prior
 
-    def _spread_over_stretches(self, noise: Noise) -> tuple[FloatArray, FloatArray]:
-        """Return 1 + N d^2/(K s^2) by every stretch, of long windows and of short ones."""
-        inside = self.variance / noise.sd**2 - 1.0 + self.numbers * math.log(self.rows) / self.rows
-        scales = zip((self.long_squares, self.short_squares), self.judged_rows, strict=True)
-        outside = (STRETCHES * squares / (rows * noise.total_sd**2) - self.most_foretold**2 for squares, rows in scales)
-        long, short = (1.0 + self.rows / STRETCHES * np.maximum(each, max(inside, 0.0)) for each in outside)
-        return long, short
+    def _by_rows(self, other: Judged) -> float:
+        """Return what the innovations of all rows say for another hypothesis: Schwarz's criterion, cooled.
+
+        Noise is never ideal: ``temperature`` units of chi-square count as one.
+        """
+        said = self.rows * math.log(self.variance / other.variance)
+        said += (self.numbers - other.numbers) * math.log(self.rows)
+        return said / self.limits.temperature
+
+    def _by_stretches(self, other: Judged) -> float:
+        """Return what stretches that were left out say for another hypothesis, cooled as rows are.
+
+        A stretch is one witness of the model's own error, as a row is of noise: errors that are normal, independent
+        from stretch to stretch and of a size that is not known give K ln(S1/S2) for the squared errors S of K
+        stretches. Long windows and short ones are two measurements of the same, and count as their mean.
+        """
+        scales = ((self.long_squares, other.long_squares), (self.short_squares, other.short_squares))
+        return STRETCHES * fmean(reduction(*pair) for pair in scales) / self.limits.temperature
 
     def is_better(self, other: Judged, share: float) -> bool:
         """Whether it takes a share of another one's held-out error away, at one of the scales.
@@ -162,8 +148,7 @@ def of_likely(found: Sequence[_J], likely: Collection[str]) -> _J:
     found : sequence of Judged
         All hypotheses, one without effects among them.
     likely : collection of str
-        Effects whose probability, over all hypotheses that have them, is at least a half. Of those that command and
-        reading cannot tell from one another one is enough.
+        Effects whose probability, over all hypotheses that have them, is at least a half.
 
     References
     ----------
@@ -171,8 +156,8 @@ def of_likely(found: Sequence[_J], likely: Collection[str]) -> _J:
     be taken for all.
     """
     able = [one for one in found if set(one.names) <= set(likely)]
-    most = max(len({called(name) for name in one.names}) for one in able)
-    return ranked([one for one in able if len({called(name) for name in one.names}) == most])[0]
+    most = max(len(one.names) for one in able)
+    return ranked([one for one in able if len(one.names) == most])[0]
 
 
 def probabilities(found: Sequence[_J], best: _J, unknown_odds: float) -> tuple[Candidate, ...]:

@@ -3,23 +3,22 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 from autotune.diagnosis.evidence.adequacy import is_noise
 from autotune.diagnosis.evidence.constancy import largest_variation
 from autotune.diagnosis.evidence.held_out import FitQuality
-from autotune.diagnosis.evidence.stretches import STRETCHES, judged_rows, rms
+from autotune.diagnosis.evidence.stretches import judged_rows, rms
 from autotune.diagnosis.fitting.data import Data
-from autotune.diagnosis.fitting.fit import RUNAWAY, Fit
+from autotune.diagnosis.fitting.fit import RUNAWAY, Fit, residual_at
 from autotune.diagnosis.fitting.long_windows import spread_of
-from autotune.diagnosis.fitting.noise import Noise
 from autotune.diagnosis.fitting.retuning import reduced_chi2, under_noise
 from autotune.diagnosis.fitting.spreading import spread_out
 from autotune.diagnosis.selection.hypothesis import Hypothesis
 from autotune.diagnosis.selection.judged import Judged, probabilities
-from autotune.diagnosis.selection.prediction import direction
+from autotune.diagnosis.selection.prediction import extended
 from autotune.diagnosis.selection.probability import Candidate
 from autotune.diagnosis.selection.searched import Search
 from autotune.diagnosis.thresholds import Thresholds
@@ -78,45 +77,27 @@ class JudgedChain(Judged):
         )
 
     @cached_property
-    def noise(self) -> Noise:
-        """The noise that what it leaves shows from row to row."""
-        return under_noise(self.fit, self.data).noise
-
-    @cached_property
-    def judged_rows(self) -> tuple[int, int]:
-        """Rows that are judged on left-out stretches of long windows, and of short ones."""
-        return judged_rows(self.data), judged_rows(self.few)
-
-    @cached_property
     def variance(self) -> float:
         """Variance of the innovations of what it leaves, under the noise that this shows from row to row."""
-        return reduced_chi2(self.fit, self.data) * self.noise.sd**2
+        return reduced_chi2(self.fit, self.data) * under_noise(self.fit, self.data).noise.sd ** 2
 
     def spread_out(self) -> JudgedChain:
         """Return it with all rows of the recordings."""
         result, data = spread_out(self.fit, self.data)
         return replace(self, fit=result, data=data)
 
-    def expected(self, effect: Effect, left: float) -> float:
-        """Return what these rows would say for an effect, were it there as it is given: 2 ln odds.
-
-        Parameters
-        ----------
-        effect : Effect
-            With its values.
-        left : float
-            Root mean square that would be left beside it, in the reading's unit.
-        """
-        try:
-            d = direction(self.fit, effect, self.data)
-        except RUNAWAY:
-            return math.inf
-        moved = max(float(d @ self.fit.without_numbers(d)), 0.0) * self.data.noise.sd**2 / self.rows
-
-        def spread(square: float) -> float:
-            return 1.0 + self.rows / STRETCHES * max(square / self.noise.total_sd**2 - 1.0, 0.0)
-
-        return STRETCHES * math.log(spread(left**2 + moved) / spread(left**2)) / self.limits.temperature
+    def unfelt(self, effects: Sequence[Effect]) -> frozenset[str]:
+        """Return the effects that would change what is read by less than one row's residual does."""
+        names = set()
+        for effect in effects:
+            p, theta, states = extended(self.fit, effect, self.data)
+            try:
+                change = residual_at(p, self.data, theta, states) - self.fit.e
+            except RUNAWAY:
+                continue
+            if float(change @ change) < 1.0:
+                names.add(effect.name)
+        return frozenset(names)
 
     @property
     def error(self) -> float:
@@ -138,8 +119,6 @@ class Found:
         The one that predicts best, for what it is.
     chosen : JudgedChain
         The one to go on with: the best one, or what is left of it where parts of the recordings do not agree.
-    log_odds : mapping of str to float
-        Logarithms of the prior odds of all effects that were looked for.
     """
 
     nominal: JudgedChain
@@ -147,20 +126,6 @@ class Found:
     judged: tuple[JudgedChain, ...]
     best: JudgedChain
     chosen: JudgedChain
-    log_odds: Mapping[str, float]
-
-    def cannot_tell(self, effects: Sequence[Effect], left: float) -> frozenset[str]:
-        """Return the effects that these rows could not make likelier than not, were they there as they are given.
-
-        Parameters
-        ----------
-        effects : sequence of Effect
-            With their values on more rows.
-        left : float
-            Root mean square that is left beside them there, in the reading's unit.
-        """
-        sought = ((e, 2.0 * self.log_odds.get(e.name, -math.inf)) for e in effects)
-        return frozenset(e.name for e, prior in sought if self.retuned.expected(e, left) + prior < 0.0)
 
     def as_search(self) -> Search:
         """Return the hypotheses in the form that pages and planning know."""

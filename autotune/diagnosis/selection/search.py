@@ -105,10 +105,7 @@ def search(
         chosen = bench.with_both_scales(ranked(found)[0])
         retuned = chosen if not chosen.names else ranked([one for one in found if not one.names])[0]
         nominal, retuned, chosen = (one.spread_out() for one in (nominal, retuned, chosen))
-        odds = {kind.name: math.log(odds) for kind, odds in bench.odds}
-        return Found(
-            nominal=nominal, retuned=retuned, judged=tuple(found), best=chosen, chosen=chosen, log_odds=odds
-        )  # fmt: skip
+        return Found(nominal=nominal, retuned=retuned, judged=tuple(found), best=chosen, chosen=chosen)
 
 
 def _odds(
@@ -146,11 +143,11 @@ def _grown(
 
 
 def _built_on(larger: Sequence[JudgedChain]) -> list[JudgedChain]:
-    """Return what is built on: the likeliest two, and what predicts best for all that its effects are rare.
+    """Return what is built on: what is likeliest, and what predicts best for all that its effects are rare.
 
     What is usual in a rig may show only beside what is not: a root outflow beside the tank that runs over.
     """
-    return list({id(j): j for j in (*larger[:2], min(larger, key=lambda j: j.log_squares))}.values())
+    return list({id(j): j for j in (larger[0], min(larger, key=lambda j: j.log_squares))}.values())
 
 
 def _roots(model: Model, bench: Bench) -> tuple[Bench, list[JudgedChain]]:
