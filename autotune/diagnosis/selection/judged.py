@@ -68,11 +68,6 @@ class Judged(ABC):
     def identity(self) -> frozenset[object]:
         """What tells hypotheses apart that are fitted."""
 
-    @property
-    def log_squares(self) -> float:
-        """Logarithm of its squared errors on left-out stretches, the mean of both scales."""
-        return 0.5 * math.log(float(self.long_squares.sum()) * float(self.short_squares.sum()))
-
     def behind(self, other: Judged) -> float:
         """Return twice the logarithm of the odds that another hypothesis is the better one, priors counted.
 

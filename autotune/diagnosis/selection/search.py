@@ -132,7 +132,7 @@ def _grown(
         larger = ranked((best, *larger))
         leads = larger[0] is not best
         larger.remove(best)
-        beam = _built_on(larger)
+        beam = larger[: limits.rig_beam]
         if leads and larger[0].is_better(best, limits.material):
             best = larger[0]
             bench = bench.with_sd(residual_sd(best.fit, best.data), residual_sd(best.short, best.few))
@@ -140,14 +140,6 @@ def _grown(
         elif size > 0:
             break
     return bench, found
-
-
-def _built_on(larger: Sequence[JudgedChain]) -> list[JudgedChain]:
-    """Return what is built on: what is likeliest, and what predicts best for all that its effects are rare.
-
-    What is usual in a rig may show only beside what is not: a root outflow beside the tank that runs over.
-    """
-    return list({id(j): j for j in (larger[0], min(larger, key=lambda j: j.log_squares))}.values())
 
 
 def _roots(model: Model, bench: Bench) -> tuple[Bench, list[JudgedChain]]:
@@ -221,7 +213,7 @@ def _starts(base: JudgedChain, bench: Bench) -> list[_Start]:
     Where the free run through long windows is out of phase, no derivative there leads anywhere: short ones do.
     """
     scales = [(base.fit, bench.long)]
-    if bench.few is not bench.long and base.error > bench.limits.out_of_phase:
+    if len(bench.cuts) > 1 and base.error > bench.limits.out_of_phase:
         scales.append((bench.shortened(base.fit), bench.few))
     taken = taken_by(base.names)
     tried = [
