@@ -8,7 +8,7 @@ from collections import abc
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from difflib import get_close_matches
-from functools import wraps
+from functools import cache, wraps
 from itertools import repeat
 from types import NoneType, SimpleNamespace, UnionType
 from typing import Any, Literal, ParamSpec, TypeVar, Union, get_args, get_origin, get_type_hints
@@ -88,6 +88,7 @@ def checked(function: Callable[P, T]) -> Callable[P, T]:
     return call
 
 
+@cache
 def _hints(function: Callable[..., Any]) -> dict[str, Any]:
     """Return the types of the arguments; what a function returns may be known to type checkers only."""
     if isinstance(function, type):

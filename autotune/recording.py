@@ -159,12 +159,12 @@ class Recording:
     def only(self, keep: Any) -> Recording:
         """Return some of the rows, by number or by mask."""
         try:
-            self.t[keep]
+            t = self.t[keep]
         except (IndexError, TypeError, ValueError) as error:
             remedy = "give numbers of rows, a slice or a mask"
             raise InputError(f"keep: {error}", where=self.name, remedy=remedy) from None
         extra = {name: values[keep] for name, values in self.extra.items()}
-        return replace(self, t=self.t[keep], u=self.u[keep], y=self.y[keep], extra=MappingProxyType(extra))
+        return replace(self, t=t, u=self.u[keep], y=self.y[keep], extra=MappingProxyType(extra))
 
     @checked
     def resampled(self, dt_s: float) -> Recording:

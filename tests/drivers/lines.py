@@ -7,6 +7,7 @@ import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, Protocol
 
 import numpy as np
@@ -145,16 +146,13 @@ def tcp_line(seed: int) -> Iterator[Line]:
         settings = tcp_settings(relay.port, timeout_s=TIMEOUT_S)
         rig = open_rig(settings, u_range=(LIMITS.u_min, LIMITS.u_max), u_safe=U_SAFE)
 
-        def harm(how: Harm) -> None:
-            relay.tamper = how
-
         yield Line(
             rig=rig,
             device=device,
             plant=plant,
             random=random.Random(seed),
             settle=_released(device),
-            set_harm=harm,
+            set_harm=partial(setattr, relay, "tamper"),
             reset=relay.reset,
             restart=lambda: _reset_registers(device),
             refuse=lambda code, times: refusing.update(code=code, left=times),
@@ -172,16 +170,13 @@ def rtu_line(seed: int) -> Iterator[Line]:
         settings = rtu_settings(line.host_device, timeout_s=TIMEOUT_S, late_reply_s=0.2)
         rig = open_rig(settings, u_range=(LIMITS.u_min, LIMITS.u_max), u_safe=U_SAFE)
 
-        def harm(how: Harm) -> None:
-            line.tamper = how
-
         yield Line(
             rig=rig,
             device=device,
             plant=plant,
             random=random.Random(seed),
             settle=_released(device),
-            set_harm=harm,
+            set_harm=partial(setattr, line, "tamper"),
         )
         rig.close()
 
@@ -200,16 +195,13 @@ def serial_line(seed: int) -> Iterator[Line]:
         settings = serial_settings(line.host_device, timeout_s=TIMEOUT_S, start_s=0.2, **spans)
         rig = open_rig(settings, u_range=(LIMITS.u_min, LIMITS.u_max), u_safe=U_SAFE)
 
-        def harm(how: Harm) -> None:
-            line.tamper = how
-
         yield Line(
             rig=rig,
             device=device,
             plant=plant,
             random=random.Random(seed),
             settle=_released(device),
-            set_harm=harm,
+            set_harm=partial(setattr, line, "tamper"),
             reset=served.restart,
             unplug=line.close,
             jump=served.jump,

@@ -47,14 +47,19 @@ def _parameters(name: str) -> list[str]:
     return [p.name for p in inspect.signature(value).parameters.values() if p.kind in kinds]
 
 
+def examples(count: int) -> settings:
+    """Return how many arguments of a function are tried: so many, or what the environment asks for."""
+    return settings(
+        max_examples=int(os.environ.get("ANY_EXAMPLES", count)),
+        phases=PHASES,
+        deadline=None,
+        suppress_health_check=[HealthCheck.too_slow],
+        derandomize=True,
+    )
+
+
 @pytest.mark.parametrize("name", sorted(set(at.__all__) - {"Model", "diagnose"}))
-@settings(
-    max_examples=int(os.environ.get("ANY_EXAMPLES", "40")),
-    phases=PHASES,
-    deadline=None,
-    suppress_health_check=[HealthCheck.too_slow],
-    derandomize=True,
-)
+@examples(40)
 @given(data=st.data())
 def test_a_public_function_answers_or_refuses(name: str, data: st.DataObject) -> None:
     names = _parameters(name)
@@ -123,13 +128,7 @@ NEEDED = {"Model.from_equations": "content", "Model.from_control": "system", "Mo
 
 
 @pytest.mark.parametrize("name", sorted(FURTHER))
-@settings(
-    max_examples=int(os.environ.get("ANY_EXAMPLES", "25")),
-    phases=PHASES,
-    deadline=None,
-    suppress_health_check=[HealthCheck.too_slow],
-    derandomize=True,
-)
+@examples(25)
 @given(data=st.data())
 def test_a_setting_or_a_method_answers_or_refuses(name: str, data: st.DataObject) -> None:
     call, names = FURTHER[name]
