@@ -204,9 +204,11 @@ class OperatedRelayRig(TypedGainRig):
         self._await_command(1.0)
 
     def make_safe(self) -> None:
-        """Command the safe output and give the actuator back, which ends a relay; see the base class."""
-        self._law = 0.0
+        """Command the safe output, give the actuator back and see the relay end; see the base class."""
+        runs, self._law = self._law != 0.0, 0.0
         super().make_safe()
+        if runs:  # the echo of the heartbeat may be of a cycle before the one that gives the actuator back
+            self._await_end()
 
     def hand_back(self) -> None:
         """Give the actuator back to the device's own controller; see the base class."""
@@ -235,6 +237,18 @@ class OperatedRelayRig(TypedGainRig):
                 "look whether rig.relay.law is the input LAW of OPERATED_RIG, and what tripped it",
             )
             self.feed()
+            self._clock.sleep_until(self._clock.now() + 0.25 * self._scan_s)
+
+    def _await_end(self) -> None:
+        """Wait until the device's relay has let go of the output."""
+        start_s = self._clock.now()
+        while self._arrays.read_numbers(self._relay.rows)[1] == _RELAY:
+            waited_s = self._clock.now() - start_s
+            self._require(
+                waited_s < max(0.25, self._late_s),
+                f"the device's relay goes on {waited_s:.2g} s after it was to end",
+                "stop the device by hand, and look whether its program runs",
+            )
             self._clock.sleep_until(self._clock.now() + 0.25 * self._scan_s)
 
     def _take_rows(self, numbers: Sequence[float]) -> None:
