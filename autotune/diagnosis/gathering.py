@@ -23,7 +23,7 @@ from autotune.diagnosis.fitting.fit import RUNAWAY, Fit
 from autotune.diagnosis.fitting.retuning import at_nominal, prepare, under_noise
 from autotune.diagnosis.selection.hypothesis import Hypothesis
 from autotune.diagnosis.selection.judged import of_likely
-from autotune.diagnosis.selection.judged_chain import Found, JudgedChain
+from autotune.diagnosis.selection.judged_chain import Found, JudgedChain, at_both_scales
 from autotune.diagnosis.selection.search import search
 from autotune.diagnosis.selection.searched import Search
 from autotune.diagnosis.thresholds import Thresholds
@@ -162,7 +162,7 @@ def _with_found(evidence: Evidence, found: Found, without: Sequence[str]) -> Evi
         return replace(evidence, search=found.as_search(), found=found)
     if not chosen.names and (own := own_noise(near.retuned.fit, near.data)) is not None:
         # such a disturbance has a mean of its own in every recording: it is no offset
-        return replace(evidence, residual=own.residual, offset=None, own=own)
+        return replace(evidence, residual=own.residual, offset=None, own=own, found=found)
     limits, residual = evidence.limits, evidence.residual
     offset = None
     if chosen.names and chosen.leaves_noise:
@@ -177,11 +177,13 @@ def keeping(evidence: Evidence, names: Collection[str]) -> Evidence:
     samples = tuple(s for s in evidence.samples if s.name in names)
     evidence = replace(evidence, samples=samples, offset=evidence.offset if OFFSET in names else None)
     found = evidence.found
-    if found is None or set(found.chosen.names) <= set(names):
+    if found is None or evidence.own is not None:
         return evidence
     best = of_likely(found.judged, names)
-    left, residual = best.spread_out() if best.names else found.retuned, evidence.residual
-    if found.chosen.leaves_noise:
+    if best.names == found.chosen.names:
+        return evidence
+    left, residual = at_both_scales(best, found.judged).spread_out() if best.names else found.retuned, evidence.residual
+    if found.chosen.leaves_noise or left.leaves_noise:
         residual = residual_tests(left.fit, under_noise(left.fit, left.data), uneven=residual.uneven)
     found = replace(found, chosen=left)
     quality = found.quality(evidence.quality.noise_floor)

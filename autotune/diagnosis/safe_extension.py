@@ -16,9 +16,8 @@ M = TypeVar("M")
 
 #: Commands, as a multiple of those recorded about their mean, on which a model must stay bounded.
 TIMES = 2.0
-#: How far it may go there, as a multiple of what the nominal model does and the readings did: an arm that is pushed
-#: twice as hard may go round and round, which is no error of its model; what runs away goes farther in no time.
-FARTHER = 1000.0
+#: How far it may go there, as a multiple of what the nominal model does and the readings did.
+FARTHER = 10.0
 
 
 def safe_extension(
@@ -47,7 +46,7 @@ def safe_extension(
     Notes
     -----
     A model must leave no larger squared error than the nominal one on the recordings as a whole, run as a person will
-    run it, and stay within a thousand times the range of the nominal model and the readings on commands that reach
+    run it, and stay within ten times the range of the nominal model and the readings on commands that reach
     twice as far from their mean. What it does on inputs that look otherwise is not known.
     """
     stressed = [_stressed(r) for r in recordings]

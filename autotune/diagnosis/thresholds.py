@@ -107,7 +107,7 @@ class Thresholds:
     most_scatter: float = known(0.5, "of the residual's", "variance from row to row that readings may have where a limit of the sensor holds them: a rig's noise is mostly the sensor's, in front of it", "convention")
     rig_effects: int = known(4, "effects", "in one hypothesis at most", "cost")
     rig_beam: int = known(2, "hypotheses", "that are built on", "cost")
-    rig_judged: int = known(8, "hypotheses", "of each size whose left-out stretches are judged", "cost")
+    rig_judged: int = known(8, "hypotheses", "with one effect more than another one whose left-out stretches are judged", "cost")
     rig_starts: int = known(2, "starting points", "of an effect that are fitted", "cost")
     rig_pruned: int = known(4, "hypotheses", "leading, of which each effect is left out once more", "cost")
     rig_tried: int = known(8, "effects", "beside one hypothesis that are fitted", "cost")

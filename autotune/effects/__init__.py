@@ -50,6 +50,11 @@ def counted_as(name: str) -> frozenset[str]:
     return frozenset((name, *KINDS[name].same, *larger))
 
 
+def called(name: str) -> str:
+    """Return the one name of all effects that command and reading cannot tell from one another."""
+    return min((name, *KINDS[name].same))
+
+
 def taken_by(names: Iterable[str]) -> set[str]:
     """Return the effects that are not added beside others: these, what they include, and what includes them."""
     given = set(names)

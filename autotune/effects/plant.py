@@ -82,14 +82,22 @@ def weighed(w: float, x: float, slope: float, low: float, high: float) -> float:
 
 
 def cogging(
-    x: float, y_offset: float, gain: float, amplitude: float, period: float, phase: float, gravity: float
+    x: float,
+    y_offset: float,
+    gain: float,
+    amplitude: float,
+    period: float,
+    phase: float,
+    gravity: float,
+    low: float,
+    high: float,
 ) -> float:
     """Return a force that is periodic in position; as gravity it takes the place of the spring that stood for it."""
-    angle = 2.0 * math.pi * (x + y_offset) / period + phase
     if gravity > 0.0:
-        per_turn = period / (2.0 * math.pi)
-        return (x - per_turn * (math.sin(angle) - math.sin(angle - x / per_turn))) / gain
-    return -(amplitude * math.sin(angle))
+        c, per_turn = min(max(x, low), high), period / (2.0 * math.pi)
+        angle = (c + y_offset) / per_turn + phase
+        return (c - per_turn * (math.sin(angle) - math.sin(angle - c / per_turn))) / gain
+    return -(amplitude * math.sin(2.0 * math.pi * (x + y_offset) / period + phase))
 
 
 def rising(x: float, gain: float, coefficient: float) -> float:
@@ -573,8 +581,10 @@ PLANT = (
             Quantity(name="period", unit="{y}", role="shape", nonzero=True, held=_is_gravity),
             Quantity(name="phase", unit="rad", role="shape", sign="real", neutral=0.0),
             Quantity(name="gravity", unit="", role="mark", neutral=0.0),
+            *ends("{y}"),  # of gravity: unwound, an arm would turn on and on where nobody has seen it
         ),
         lines=(Line(stage="force", does=cogging),),
+        goes_on=lambda values, x: True,
         needs=TRAVEL,
         suits=TRAVEL,
         starts=_sine_starts,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from autotune.diagnosis.result import Diagnosis
 from autotune.diagnosis.selection.hypothesis import Hypothesis
-from autotune.effects import kind_of
+from autotune.effects import called
 
 
 def open_hypotheses(found: Diagnosis) -> dict[str, tuple[Hypothesis, float]]:
@@ -50,4 +50,4 @@ def _gains(h: Hypothesis, chosen: Hypothesis) -> bool:
 
 
 def _class(names: frozenset[str]) -> frozenset[str]:
-    return frozenset(min((name, *kind_of(name).same)) for name in names)
+    return frozenset(map(called, names))

@@ -34,6 +34,8 @@ from autotune.diagnosis.simulation.simulator import Simulator
 from autotune.errors import AutotuneError, IdentificationError
 from autotune.models import Model
 
+#: Gauss-Newton steps of a fit in a search, and of the leading ones at its end.
+STEPS, LAST_STEPS = 12, 40
 #: What a fit raises where the simulation runs away: that start is no hypothesis.
 RUNAWAY = (AutotuneError, OverflowError, np.linalg.LinAlgError)
 

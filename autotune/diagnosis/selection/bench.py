@@ -13,7 +13,7 @@ import numpy as np
 from autotune.arrays import FloatArray
 from autotune.diagnosis.evidence.stretches import correlation_rows, held_out_squares, rms
 from autotune.diagnosis.fitting.data import Data, as_white
-from autotune.diagnosis.fitting.fit import RUNAWAY, Fit, fit, start_states
+from autotune.diagnosis.fitting.fit import LAST_STEPS, RUNAWAY, STEPS, Fit, fit, start_states
 from autotune.diagnosis.fitting.long_windows import spread_of
 from autotune.diagnosis.fitting.parameters import Parametrisation
 from autotune.diagnosis.selection.hypothesis import hypothesis, is_stand_in
@@ -23,8 +23,6 @@ from autotune.diagnosis.thresholds import Thresholds
 from autotune.effects.base import EffectKind
 from autotune.models import Effect
 
-#: Gauss-Newton steps of a fit in the search, and of the leading ones at its end.
-STEPS, LAST_STEPS = 12, 40
 #: Share of the bench's residual below which a fit is made again at its own.
 CLOSER = 0.7
 #: Tasks side by side at most.
@@ -70,7 +68,12 @@ class Bench:
     @property
     def two_scales(self) -> bool:
         """Whether hypotheses are judged on short windows too: what swings tells of itself on long ones alone."""
-        return len(self.cuts) == 1 and self.few.starts[0].size > self.long.starts[0].size
+        return len(self.cuts) == 1 and self.has_shorter
+
+    @property
+    def has_shorter(self) -> bool:
+        """Whether short windows are shorter than the long ones."""
+        return self.few.starts[0].size > self.long.starts[0].size
 
     @property
     def near(self) -> Data:
@@ -95,28 +98,6 @@ class Bench:
         p, held = result.parametrisation, np.zeros(result.theta.size, dtype=bool)
         begun = fit(p, self.few, result.theta, free=held, iterations=STEPS)
         return fit(p, self.few, begun.theta, begun.x0, iterations=STEPS)
-
-    def with_both_scales(self, one: JudgedChain) -> JudgedChain:
-        """Return a hypothesis with the numbers that suit long and short windows together.
-
-        What a plant that integrates lacks piles up in a long run and bends its numbers along a valley that the long run
-        hardly sees; short windows see it, and are bent otherwise. So both are fitted at once, each in units of its own
-        residual, from those numbers of either that suit both better.
-        """
-        if not self.two_scales or not one.fit.model.transfer_function().integrators:
-            return one
-        p, held = one.fit.parametrisation, np.zeros(one.fit.theta.size, dtype=bool)
-        both = self.long.beside(self.few)
-        try:
-            thetas = one.fit.theta, one.short.theta
-            begun = list(self.pool.map(lambda theta: fit(p, both, theta, free=held, iterations=STEPS), thetas))
-            start = min(begun, key=lambda each: each.cost)
-            joint = fit(p, both, start.theta, start.x0, iterations=LAST_STEPS)
-            there = fit(p, self.long, joint.theta, free=held, iterations=STEPS)
-            far = fit(p, self.long, there.theta, there.x0, rounds=0)  # with the derivatives of all numbers
-        except RUNAWAY:
-            return one
-        return replace(one, fit=replace(far, covariance=joint.covariance))
 
     def finished(self, one: JudgedChain) -> JudgedChain | None:
         """Return a hypothesis fitted to the end, at the residual that it leaves; nothing if not better so."""

@@ -17,6 +17,7 @@ from autotune.arrays import FloatArray
 from autotune.diagnosis.evidence.stretches import STRETCHES, reduction
 from autotune.diagnosis.selection.probability import Candidate, weighed
 from autotune.diagnosis.thresholds import Thresholds
+from autotune.effects import called
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -67,6 +68,11 @@ class Judged(ABC):
     @abstractmethod
     def identity(self) -> frozenset[object]:
         """What tells hypotheses apart that are fitted."""
+
+    @property
+    def log_squares(self) -> float:
+        """Logarithm of its squared errors on left-out stretches, the mean of both scales."""
+        return 0.5 * math.log(float(self.long_squares.sum()) * float(self.short_squares.sum()))
 
     def behind(self, other: Judged) -> float:
         """Return twice the logarithm of the odds that another hypothesis is the better one, priors counted.
@@ -135,6 +141,15 @@ def leading(found: Sequence[_J], count: int) -> list[_J]:
     return list(best.values())[:count]
 
 
+def built_on(found: Sequence[_J], count: int) -> list[_J]:
+    """Return what a search builds on, of a ranking: its first ones, and what predicts best for all that it is rare.
+
+    What is usual in a rig may show only beside what is not: a root outflow beside the tank that runs over.
+    """
+    best = min(found, key=lambda j: j.log_squares, default=None)
+    return [*found[:count], *([] if best is None or any(best is j for j in found[:count]) else [best])]
+
+
 def of_likely(found: Sequence[_J], likely: Collection[str]) -> _J:
     """Return the hypothesis of the effects that are likely: the first of a ranking of those with most of them alone.
 
@@ -143,7 +158,8 @@ def of_likely(found: Sequence[_J], likely: Collection[str]) -> _J:
     found : sequence of Judged
         All hypotheses, one without effects among them.
     likely : collection of str
-        Effects whose probability, over all hypotheses that have them, is at least a half.
+        Effects whose probability, over all hypotheses that have them, is at least a half. Of those that command and
+        reading cannot tell from one another one is enough.
 
     References
     ----------
@@ -151,8 +167,8 @@ def of_likely(found: Sequence[_J], likely: Collection[str]) -> _J:
     be taken for all.
     """
     able = [one for one in found if set(one.names) <= set(likely)]
-    most = max(len(one.names) for one in able)
-    return ranked([one for one in able if len(one.names) == most])[0]
+    most = max(len({called(name) for name in one.names}) for one in able)
+    return ranked([one for one in able if len({called(name) for name in one.names}) == most])[0]
 
 
 def probabilities(found: Sequence[_J], best: _J, unknown_odds: float) -> tuple[Candidate, ...]:
@@ -170,10 +186,10 @@ def probabilities(found: Sequence[_J], best: _J, unknown_odds: float) -> tuple[C
     scores: dict[str, float] = {}
     for one in found:
         rivals = [other for other in found if other.identity != one.identity]
-        scores[_called(one)] = min(scores.get(_called(one), math.inf), max(worst(one, rivals), 0.0))
-    scores[_called(best)] = min(scores.values())
+        scores[_title(one)] = min(scores.get(_title(one), math.inf), max(worst(one, rivals), 0.0))
+    scores[_title(best)] = min(scores.values())
     return weighed(scores, 1.0, unknown_odds)
 
 
-def _called(one: Judged) -> str:
+def _title(one: Judged) -> str:
     return "+".join(one.names) if one.names else "none"

@@ -7,12 +7,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
+import numpy as np
+
 from autotune.diagnosis.evidence.adequacy import is_noise
 from autotune.diagnosis.evidence.constancy import largest_variation
 from autotune.diagnosis.evidence.held_out import FitQuality
 from autotune.diagnosis.evidence.stretches import judged_rows, rms
 from autotune.diagnosis.fitting.data import Data
-from autotune.diagnosis.fitting.fit import RUNAWAY, Fit, residual_at
+from autotune.diagnosis.fitting.fit import LAST_STEPS, RUNAWAY, STEPS, Fit, fit, residual_at
 from autotune.diagnosis.fitting.long_windows import spread_of
 from autotune.diagnosis.fitting.retuning import reduced_chi2, under_noise
 from autotune.diagnosis.fitting.spreading import spread_out
@@ -103,6 +105,29 @@ class JudgedChain(Judged):
     def error(self) -> float:
         """Held-out error of the free run as a share of the spread of y."""
         return math.sqrt(float(self.long_squares.sum()) / judged_rows(self.data)) / spread_of(self.data)
+
+
+def at_both_scales(one: JudgedChain, found: Sequence[JudgedChain]) -> JudgedChain:
+    """Return a hypothesis with the numbers that suit long and short windows together.
+
+    What a plant that integrates lacks piles up in a long run and bends its numbers along a valley that the long run
+    hardly sees; short windows see it, and are bent otherwise. So both are fitted at once, each in units of its own
+    residual, from those numbers of the same hypothesis, wherever they were found, that suit both best: fits under dry
+    friction end in local minima.
+    """
+    if one.few is one.data or not one.fit.model.transfer_function().integrators:
+        return one
+    p, held = one.fit.parametrisation, np.zeros(one.fit.theta.size, dtype=bool)
+    both = one.data.beside(one.few)
+    thetas = (theta for j in found if j.names == one.names for theta in (j.fit.theta, j.short.theta))
+    try:
+        start = min((fit(p, both, theta, free=held, iterations=STEPS) for theta in thetas), key=lambda f: f.cost)
+        joint = fit(p, both, start.theta, start.x0, iterations=LAST_STEPS)
+        there = fit(p, one.data, joint.theta, free=held, iterations=STEPS)
+        far = fit(p, one.data, there.theta, there.x0, rounds=0)  # with the derivatives of all numbers
+    except RUNAWAY:
+        return one
+    return replace(one, fit=replace(far, covariance=joint.covariance))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -19,14 +19,14 @@ from threadpoolctl import threadpool_limits
 from autotune.arrays import BoolArray
 from autotune.diagnosis.evidence.operating_point import unmoved
 from autotune.diagnosis.fitting.data import Data
-from autotune.diagnosis.fitting.fit import RUNAWAY, Fit, fit
+from autotune.diagnosis.fitting.fit import LAST_STEPS, RUNAWAY, STEPS, Fit, fit
 from autotune.diagnosis.fitting.long_windows import cut, lengths_of
 from autotune.diagnosis.fitting.parameters import parametrise
 from autotune.diagnosis.fitting.restarts import realigned
-from autotune.diagnosis.selection.bench import LAST_STEPS, STEPS, Bench, at_once, residual_sd
+from autotune.diagnosis.selection.bench import Bench, at_once, residual_sd
 from autotune.diagnosis.selection.hypothesis import hypothesis, is_stand_in
-from autotune.diagnosis.selection.judged import leading, ranked
-from autotune.diagnosis.selection.judged_chain import Found, JudgedChain
+from autotune.diagnosis.selection.judged import built_on, leading, ranked
+from autotune.diagnosis.selection.judged_chain import Found, JudgedChain, at_both_scales
 from autotune.diagnosis.selection.prediction import distinct, extended, predictions, signal_sizes, starting_effects
 from autotune.diagnosis.selection.probability import RARE
 from autotune.diagnosis.selection.refits import timed, without
@@ -102,7 +102,7 @@ def search(
         bench = replace(bench, lasting=tuple(_lasting(retuned, bench)))
         bench, found = _grown(retuned, beam, bench, progress, limits)
         found = _regrown(_finished(_pruned([*found, *_begun(begun, bench)], bench), bench), bench)
-        chosen = bench.with_both_scales(ranked(found)[0])
+        chosen = at_both_scales(ranked(found)[0], found)
         retuned = chosen if not chosen.names else ranked([one for one in found if not one.names])[0]
         nominal, retuned, chosen = (one.spread_out() for one in (nominal, retuned, chosen))
         return Found(nominal=nominal, retuned=retuned, judged=tuple(found), best=chosen, chosen=chosen)
@@ -132,7 +132,7 @@ def _grown(
         larger = ranked((best, *larger))
         leads = larger[0] is not best
         larger.remove(best)
-        beam = larger[: limits.rig_beam]
+        beam = built_on(larger, limits.rig_beam)
         if leads and larger[0].is_better(best, limits.material):
             best = larger[0]
             bench = bench.with_sd(residual_sd(best.fit, best.data), residual_sd(best.short, best.few))
@@ -189,15 +189,16 @@ def _larger(beam: Sequence[JudgedChain], bench: Bench) -> list[JudgedChain]:
         found.sort(key=lambda s: -s.decrease - 2.0 * math.log(s.odds))
         starts += [s for rank, s in enumerate(found) if rank < bench.limits.rig_tried or s.odds >= bench.limits.usual]
     fits = bench.pool.map(lambda s: _added(s, bench), starts)
-    best: dict[frozenset[str], tuple[Fit, float]] = {}
+    best: dict[frozenset[str], tuple[Fit, float, JudgedChain]] = {}
     for s, result in zip(starts, fits, strict=True):
         if result is None or result.cost > s.base.fit.cost - 0.3:
             continue
         key, log_odds = frozenset((*s.base.names, s.kind.name)), s.base.log_odds + math.log(s.odds)
         if key not in best or result.cost < best[key][0].cost:
-            best[key] = result, log_odds
-    ranked = sorted(best.values(), key=lambda pair: pair[0].cost - 2.0 * pair[1])[: bench.limits.rig_judged]
-    done = bench.pool.map(lambda pair: bench.judged(*pair), ranked)
+            best[key] = result, log_odds, s.base
+    ranked = sorted(best.values(), key=lambda one: one[0].cost - 2.0 * one[1])
+    able = [[one for one in ranked if one[2] is base][: bench.limits.rig_judged] for base in beam]
+    done = bench.pool.map(lambda one: bench.judged(one[0], one[1]), [one for group in able for one in group])
     return [j for j in done if j is not None and np.all(np.isfinite(j.long_squares + j.short_squares))]
 
 
@@ -213,7 +214,7 @@ def _starts(base: JudgedChain, bench: Bench) -> list[_Start]:
     Where the free run through long windows is out of phase, no derivative there leads anywhere: short ones do.
     """
     scales = [(base.fit, bench.long)]
-    if len(bench.cuts) > 1 and base.error > bench.limits.out_of_phase:
+    if bench.has_shorter and base.error > bench.limits.out_of_phase:
         scales.append((bench.shortened(base.fit), bench.few))
     taken = taken_by(base.names)
     tried = [

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from autotune.diagnosis.gathering import evidence_of, keeping
 from autotune.diagnosis.thresholds import IN_USE
 from autotune.diagnosis.verdict import judged
@@ -23,3 +25,15 @@ def test_an_effect_that_is_not_kept_is_missing_from_search_and_verdict() -> None
     assert without.search.chosen.names == ()
     assert without.quality.extended == without.quality.retuned > evidence.quality.extended
     assert judged(without) == "unexplained"
+
+
+def test_a_likely_effect_is_kept_though_the_leading_hypothesis_has_none() -> None:
+    """What is in many hypotheses may be likelier than not where no one of them leads."""
+    recordings = [servo_recording(seed, lambda x, v: -0.03 * v * abs(v)) for seed in (1, 2)]
+    rest = [name for name in CATALOGUE if name not in (DRAG, "actuator.rate_limit")]
+    evidence = evidence_of(servo_model(), recordings, None, rest, quiet, IN_USE)
+    assert evidence.found is not None
+    found = replace(evidence.found, chosen=evidence.found.retuned)
+    leads = replace(evidence, found=found, search=found.as_search())
+    assert keeping(leads, {DRAG}).search.chosen.names == (DRAG,)
+    assert keeping(leads, set()).search.chosen.names == ()

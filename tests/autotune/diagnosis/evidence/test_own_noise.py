@@ -8,7 +8,13 @@ from scipy.signal import lfilter
 
 from autotune.diagnosis import diagnose
 from autotune.diagnosis.evidence.own_noise import coloured_noise
+from autotune.diagnosis.findings import said_by
+from autotune.diagnosis.gathering import evidence_of, keeping
+from autotune.diagnosis.thresholds import IN_USE
+from autotune.diagnosis.verdict import judged
+from autotune.effects import CATALOGUE
 from autotune.models import Block, Model, Port, TransferFunction
+from autotune.progress import quiet
 from autotune.recording import Recording
 
 STEP_S, TAU_S = 0.5, 20.0
@@ -36,6 +42,16 @@ def test_a_disturbance_that_goes_with_no_signal_of_the_rig_is_nothing_missing(me
     assert (found.verdict, found.effects) == ("none", ())
     assert found.residual.reduced_chi2 > 2.0
     assert "goes with no signal of the rig" in " ".join(found.sentences)
+
+
+def test_a_disturbance_of_its_own_rules_no_effect_out() -> None:
+    """What it leaves open has the probability of the search: a part of the rows that says so contradicts nothing."""
+    rest = [name for name in CATALOGUE if name not in ("actuator.backlash", "actuator.stiction")]
+    evidence = evidence_of(lag(2.0, TAU_S), [stirred(1, 8.0)], None, rest, quiet, IN_USE)
+    assert evidence.own is not None
+    assert judged(evidence) == "none"
+    assert 0.0 < said_by(evidence)["actuator.backlash"] < 0.5
+    assert keeping(evidence, {"actuator.backlash"}).search.chosen.names == ()
 
 
 def test_wrong_numbers_are_told_beside_a_disturbance() -> None:

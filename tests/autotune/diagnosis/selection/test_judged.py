@@ -10,10 +10,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from autotune.diagnosis.evidence.stretches import STRETCHES
-from autotune.diagnosis.selection.judged import Judged, of_likely, probabilities, ranked
+from autotune.diagnosis.selection.judged import Judged, built_on, of_likely, probabilities, ranked
 from autotune.diagnosis.selection.probability import probability_of
 from autotune.diagnosis.thresholds import IN_USE, Thresholds
 
+LAG, READING_LAG = "actuator.lag", "sensor.lag"
 GRAVITY, DRY, CURVED, DROPPING = (
     "plant.sine_torque", "plant.coulomb_friction", "actuator.nonlinear_gain", "plant.stribeck_friction",
 )  # fmt: skip
@@ -75,3 +76,21 @@ def test_what_is_likely_is_taken_together_where_that_was_fitted() -> None:
     assert of_likely(found, {DRY}) is alone
     assert of_likely(found, {DRY, GRAVITY}) is others[1]
     assert of_likely(found, {DROPPING}) is plain
+
+
+def test_of_two_that_command_and_reading_cannot_tell_apart_one_is_taken() -> None:
+    """A lag before the plant and one behind it: both are likely, and both at once are no better than one."""
+    plain, before, behind = hypothesis_of((), 3.0), hypothesis_of((LAG,), 1.0), hypothesis_of((READING_LAG,), 1.01)
+    both = hypothesis_of((LAG, READING_LAG), 1.0, math.log(0.05))
+    assert of_likely([plain, before, behind, both], {LAG, READING_LAG}) is before
+
+
+def test_what_predicts_best_is_built_on_though_it_is_too_rare_to_lead() -> None:
+    usual = [hypothesis_of((name,), size) for name, size in ((DRY, 0.8), (CURVED, 0.85), (LAG, 0.9))]
+    rare = hypothesis_of((GRAVITY,), 0.7, math.log(1e-4))
+    order = ranked([*usual, rare])
+    assert order[0] is usual[0]
+    assert order.index(rare) > 1
+    assert built_on(order, 2) == [*order[:2], rare]
+    assert built_on([rare, *usual], 2) == [rare, usual[0]]
+    assert built_on([], 2) == []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from autotune.diagnosis import diagnose
 from autotune.diagnosis.agreement import NAMED
 from autotune.diagnosis.fitting.fit import fit
 from autotune.diagnosis.fitting.retuning import prepare
-from autotune.diagnosis.selection.judged_chain import JudgedChain
+from autotune.diagnosis.selection.judged_chain import JudgedChain, at_both_scales
 from autotune.diagnosis.selection.prediction import extended
 from autotune.diagnosis.selection.search import search
 from autotune.diagnosis.simulation.chain import build_chain
@@ -200,3 +201,44 @@ def test_a_sign_that_is_missing_is_no_noise():
     told = diagnose(model, [recording], without=[k.name for k in ALL if k.name != "sensor.absolute_value"])
     assert [e.name for e in told.effects] == ["sensor.absolute_value"]
     assert told.fit.noise_floor == pytest.approx(sd / np.std(recording.y), rel=0.1)
+
+
+def carriage(level: float, cogging: float) -> Recording:
+    """tau dv/dt = -v + .159 (3.3 u - level sign(v) - cogging sin(27 x)), sticking at rest; u turns at two places."""
+    rng, rows, dt, h = np.random.default_rng(2), 2000, 0.007, 0.007 / 8
+    u, y, (x, v), sign = np.empty(rows), np.empty(rows), (0.4, 0.0), 1.0
+    for k in range(rows):
+        sign = -1.0 if x > 0.55 else 1.0 if x < 0.4 else sign
+        u[k], y[k] = 4.0 * sign, x
+        for _ in range(8):
+            drive = 3.3 * u[k] - cogging * math.sin(27.0 * x) - v / 0.159
+            held = v == 0.0 and abs(drive) <= level
+            w = 0.0 if held else v + h * 0.159 * (drive - level * math.copysign(1.0, v or drive))
+            v = 0.0 if v * w < 0.0 else w
+            x += h * v
+    return Recording(t=dt * np.arange(rows), u=u, y=y + 2e-4 * rng.normal(size=rows))
+
+
+def test_numbers_of_what_integrates_do_not_hang_on_which_of_its_fits_is_taken():
+    """A carriage on an uneven rail: a fit with six times the level and one that is near end at the same numbers."""
+    blocks = (
+        Block(name="motor", place="actuator", dynamics=TransferFunction(num=(3.3,), den=(1.0,)), output="force"),
+        Block(name="cart", place="plant", dynamics=TransferFunction(num=(0.159,), den=(1.0, 1.0, 0.0)), output="x"),
+    )
+    model = Model(name="carriage", input=Port(unit="A"), output=Port(unit="m"), blocks=blocks)
+    recording = carriage(1.2, 1.3)
+    friction = "plant.coulomb_friction"
+    found = search(model, [recording], good(recording), left_out=[k.name for k in ALL if k.name != friction])
+    best = next(j for j in found.judged if j.names == (friction,))
+    far = best.fit.theta + np.array([f.kind == "effect" for f in best.fit.parametrisation.free]) * math.log(6.0)
+    held = np.zeros(far.size, dtype=bool)
+    long, short = (fit(best.fit.parametrisation, d, far, free=held) for d in (best.data, best.few))
+    stuck = replace(best, fit=long, short=short)
+
+    def level(one: JudgedChain) -> float:
+        return one.fit.model.effects[0].parameters["level"].value
+
+    assert level(stuck) > 4.0
+    assert level(at_both_scales(stuck, [stuck])) != level(at_both_scales(best, [best]))
+    assert level(at_both_scales(stuck, [stuck, best])) == level(at_both_scales(best, [stuck, best]))
+    assert level(at_both_scales(best, [stuck, best])) == pytest.approx(1.2, rel=0.3)
