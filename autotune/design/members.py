@@ -92,3 +92,11 @@ def _gain_margins(plant: SampledPlant, controller: PIDController) -> tuple[float
     factors = -1.0 / real[real < 0.0]
     up, down = factors[factors > 1.0], factors[factors <= 1.0]
     return float(np.min(up, initial=np.inf)), float(np.max(down, initial=0.0))
+
+
+def crossovers(plant: SampledPlant, controller: PIDController) -> FloatArray:
+    """Return the frequencies [rad/s] at which abs(L) passes 1, between those of the plant's grid in log-log."""
+    gain = np.log(np.maximum(np.abs(plant.h * controller.response(plant.omega)), 1e-300))
+    passed = np.flatnonzero(np.sign(gain[:-1]) * np.sign(gain[1:]) < 0.0)
+    a, b, x = gain[passed], gain[passed + 1], np.log(plant.omega)
+    return np.asarray(np.exp(x[passed] - a * (x[passed + 1] - x[passed]) / (b - a)))

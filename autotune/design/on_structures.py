@@ -7,12 +7,15 @@ Where these plants do not agree on a controller, the answer is the frequency at 
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
 
 from autotune.arrays import FloatArray
-from autotune.design.members import members_of
+from autotune.controller import PIDController
+from autotune.design.margins import Margins
+from autotune.design.members import Members, crossovers, members_of
 from autotune.design.on_fit import TOLERANCE, design_on_plants
 from autotune.design.specification import Design, Kind, Specification
 from autotune.errors import DesignError
@@ -46,7 +49,8 @@ def design_on_structures(structures: ConsistentStructures, specification: Specif
 
     Notes
     -----
-    The guarantee is that of the structures, sampled: see :mod:`autotune.identification.consistent_structures`.
+    The guarantee is that of the structures, sampled: see :mod:`autotune.identification.consistent_structures`. Of phase
+    and delay margin at a crossover below the points no more is said than the modulus margin leaves of them.
     """
     assert structures.nominal is not None
     try:
@@ -59,13 +63,14 @@ def design_on_structures(structures: ConsistentStructures, specification: Specif
         ) from None
     members = members_of(structures.plants, specification)
     require_kept(members.slacks(found.controller, specification), structures, specification)
+    least, remark = _as_measured(members.least(found.margins, found.controller), members, found.controller, structures)
     return replace(
         found,
-        margins=members.least(found.margins, found.controller),
+        margins=least,
         certificate=(
             "margins hold for every sampled plant of low order (lags, a resonance, a lead or a zero in the right half "
             "plane, one unstable pole, dead time) through the joint region of the points, none of which is an "
-            "aperiodic process; no lower bound on the norm"
+            f"aperiodic process; no lower bound on the norm{remark}"
         ),
     )
 
@@ -86,6 +91,27 @@ def require_kept(slack: FloatArray, structures: ConsistentStructures, specificat
         where="points",
         remedy=f"relax the margins, or {where_to_measure(structures)}",
     )
+
+
+def _as_measured(
+    margins: Margins, members: Members, controller: PIDController, structures: ConsistentStructures
+) -> tuple[Margins, str]:
+    """Return margins with phase and delay as far as points tell of them, and what is to be said of them.
+
+    Where a plant crosses over below the lowest point its phase there is extrapolated. No loop of modulus margin M_m
+    has a phase margin below 2 asin(M_m/2) (Åström and Hägglund, Advanced PID Control, sec. 4.6): that is left.
+    """
+    lowest = float(structures.omega_points[0])
+    below = [float(w) for s in members.sampled for w in crossovers(s, controller) if w < lowest]
+    if not below:
+        return margins, ""
+    phase = 2.0 * math.asin(min(margins.modulus / 2.0, 1.0))
+    remark = (
+        f"; the loop crosses over at {max(below):.3g} rad/s, below the lowest point: phase and delay margin are what "
+        "the modulus margin leaves of them, a point measured there shows more"
+    )
+    delay = min(margins.delay_s, phase / max(below))
+    return replace(margins, phase_rad=min(margins.phase_rad, phase), delay_s=delay), remark
 
 
 def where_to_measure(structures: ConsistentStructures) -> str:

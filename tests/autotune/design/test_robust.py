@@ -139,6 +139,22 @@ def test_printed_margins_hold_on_a_resonant_plant(damping: float, seed: int | No
     assert true.gain >= found.margins.gain * 0.999
 
 
+def test_of_a_crossover_below_the_points_no_more_is_said_than_the_modulus_margin_leaves() -> None:
+    """Three lags, a lead and a delay under a slow PI: .303 s of delay margin were printed of .290 s."""
+    plant = TransferFunction(
+        num=(-0.13331, -0.06116934672), den=(0.001067170875, 0.02729007462, 0.2424625152, 0.8695226964, 1.0),
+        delay_s=0.0649191653,
+    )  # fmt: skip
+    points = relay_points(plant, None)
+    found = design_on_points(points, asked_of(plant))
+    true = margins(plant, found.controller)
+    assert true.crossover_rad_s < points[0].omega_rad_s
+    assert "below the lowest point" in found.certificate
+    assert found.margins.phase_rad == pytest.approx(2.0 * math.asin(found.margins.modulus / 2.0))
+    assert true.phase_rad >= found.margins.phase_rad
+    assert true.delay_s >= found.margins.delay_s
+
+
 def test_the_margins_of_an_unstable_plant_are_not_those_of_an_aperiodic_one_through_its_points() -> None:
     plant = TransferFunction(num=(1.0,), den=(1.0, -1.0), delay_s=0.1)
     points = relative_points(plant, falling(plant, -165.0), 0.004, 1)
