@@ -4,6 +4,10 @@ On the lines around omega: E(k) = G(omega_k) X(k) + T(omega_k) + V(k), G and T i
 Least squares removes the leakage T (transient, drift, ends of the record) and gives the noise level from what is left.
 1/omega in place of the usual omega^2 is as good in a narrow window, and exact for integrators and ramps in a wide one.
 
+A wide window, as one at the lowest lines is, holds more of G than three terms follow; what they miss goes with X and is
+no noise, so that the residual shows too little of it. How far omega^2 as a fourth term moves the gain estimates that
+bias; its square, less what noise alone would make of it, is added to the variance.
+
 References
 ----------
 Pintelon, Schoukens, Vandersteen, Barbe, Estimation of nonparametric noise and FRF models for multivariable systems,
@@ -12,7 +16,7 @@ Mechanical Systems and Signal Processing 24, 2010.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -34,7 +38,7 @@ class LocalEstimate:
     gain : (q,) complex array
         Complex gains from the regressor to each output.
     covariance : (q, q) complex array
-        Covariance E{g g^H} of the errors, for circular noise.
+        Covariance E{g g^H} of the errors, squared bias included, for circular noise.
     degrees_of_freedom : int
         Complex ones of the noise estimate.
     """
@@ -86,21 +90,37 @@ def local_estimate(
     Notes
     -----
     Bias: what of G the three terms cannot follow within the window; taking a rough model's response off first leaves
-    little of it. A command that is itself smooth over the lines (one step) cannot be told from leakage: the covariance
-    says so.
+    little of it, and the covariance holds the square of what a fourth term shows of it. A command that is itself smooth
+    over the lines (one step) cannot be told from leakage: the covariance says so.
     """
     n = omega_rad_s.size
     lines = n if excited is None else int(excited.sum())
     if lines < 1 or n < 9:
         return None
-    # the terms other than 1 are zero at the centre: the first coefficient is the gain there
-    terms = (np.ones(n), omega_rad_s / centre_rad_s - 1.0, centre_rad_s / omega_rad_s - 1.0)
     regressor = X if excited is None else np.where(excited, X, 0.0)
-    size = float(np.sqrt(np.mean(np.abs(regressor) ** 2)))
-    if size == 0.0:
+    if not np.any(regressor):
         return None
+    found = _fitted(omega_rad_s, regressor, Z, centre_rad_s, min(lines, 3))
+    finer = _fitted(omega_rad_s, regressor, Z, centre_rad_s, 4) if lines >= 4 else None
+    if found is None or finer is None:
+        return found
+    moved = found.gain - finer.gain
+    noise = np.maximum(np.diag(finer.covariance - found.covariance).real, 0.0)
+    bias = moved * np.sqrt(np.maximum(1.0 - noise / np.maximum(np.abs(moved) ** 2, 1e-300), 0.0))
+    return replace(found, covariance=found.covariance + np.outer(bias, bias.conj()))
+
+
+def _fitted(
+    omega_rad_s: FloatArray, regressor: ComplexArray, Z: ComplexArray, centre_rad_s: float, terms_of_gain: int
+) -> LocalEstimate | None:
+    """Return the estimate with so many terms of G and three of T, its variance that of the residual."""
+    n = omega_rad_s.size
+    x = omega_rad_s / centre_rad_s - 1.0
+    # the terms other than 1 are zero at the centre: the first coefficient is the gain there
+    terms = (np.ones(n), x, centre_rad_s / omega_rad_s - 1.0, x**2)
+    size = float(np.sqrt(np.mean(np.abs(regressor) ** 2)))
     design = np.column_stack(
-        [regressor / size * term for term in terms[: min(lines, 3)]] + [term + 0j for term in terms]
+        [regressor / size * term for term in terms[:terms_of_gain]] + [term + 0j for term in terms[:3]]
     )
     scale = np.linalg.norm(design, axis=0)
     design = design / scale
