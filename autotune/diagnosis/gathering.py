@@ -1,36 +1,35 @@
-"""All that recordings show: what samples show, what a search finds, and what is beside the chain."""
+"""All that recordings show of a chain: samples, what a search finds, and what is beside it."""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 
 from autotune.controller import Controller
+from autotune.diagnosis.chain_evidence import ChainEvidence
 from autotune.diagnosis.evidence.adequacy import residual_tests
 from autotune.diagnosis.evidence.beside_chain import beside_chain
 from autotune.diagnosis.evidence.held_out import held_out
 from autotune.diagnosis.evidence.late_rows import JITTER, late_rows
 from autotune.diagnosis.evidence.operating_point import offset_of, unmoved
 from autotune.diagnosis.evidence.own_noise import own_noise
-from autotune.diagnosis.evidence.sample_gain import is_material, supported
+from autotune.diagnosis.evidence.sample_gain import is_material, rows_of, supported
 from autotune.diagnosis.evidence.samples import SampleEffect, inspect, outliers_in, spared
 from autotune.diagnosis.evidence.stamps import evened
-from autotune.diagnosis.findings import OFFSET
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import RUNAWAY, Fit
 from autotune.diagnosis.fitting.retuning import at_nominal, prepare, under_noise
 from autotune.diagnosis.selection.hypothesis import Hypothesis
-from autotune.diagnosis.selection.judged import of_likely
-from autotune.diagnosis.selection.judged_chain import Found, JudgedChain, at_both_scales
+from autotune.diagnosis.selection.judged_chain import Found, JudgedChain
 from autotune.diagnosis.selection.search import search
 from autotune.diagnosis.selection.searched import Search
 from autotune.diagnosis.thresholds import Thresholds
-from autotune.diagnosis.verdict import Evidence
-from autotune.effects import kind_of
+from autotune.effects import KINDS, kind_of
 from autotune.models import Model
-from autotune.progress import Progress
+from autotune.progress import Progress, quiet
 from autotune.recording import Recording
 
 
@@ -42,7 +41,7 @@ def evidence_of(
     progress: Progress,
     thresholds: Thresholds,
     begun: JudgedChain | None = None,
-) -> Evidence:
+) -> ChainEvidence:
     """Return all that the verdict rests on: samples, search, what is beside the chain, the residual, held-out rows.
 
     Parameters
@@ -62,7 +61,12 @@ def evidence_of(
     begun : JudgedChain, optional
         What predicted best on more rows: it is judged as well, with its odds, from the numbers that it had there.
     """
-    without = [*without, *unmoved(model, recordings)]
+    given, without = without, [*without, *unmoved(model, recordings)]
+
+    def again(part: Sequence[Recording], known: Collection[str], begun: JudgedChain | None) -> ChainEvidence:
+        others = [*given, *(name for name in KINDS if name not in known)]
+        return evidence_of(model, part, controller, others, quiet, thresholds, begun)
+
     progress("looking at the samples", 0.0)
     if any(kind_of(effect.name).late_stamps for effect in model.effects):
         recordings, late = [r.at_even_times() for r in recordings], None
@@ -79,12 +83,14 @@ def evidence_of(
         return others if late is None else [late, *(s for s in others if s.name != late.name)]
 
     retuned, data = near.retuned.fit, near.data
-    samples = (*supported(seen, retuned, data), *beside(retuned, data))
-    evidence = Evidence(
+    samples = (*supported(seen, rows_of(retuned, data)), *beside(retuned, data))
+    evidence = ChainEvidence(
+        model=model,
+        again=again,
         search=near,
         samples=samples,
         residual=residual_tests(retuned, data, uneven=any(kind_of(s.name).uneven for s in samples)),
-        quality=held_out(retuned, data),
+        quality_of=cache(lambda: held_out(retuned, data)),
         offset=None if unmoved(model, recordings) else offset_of(retuned, thresholds.offset_sigmas),
         evened=late is not None,
     )
@@ -92,8 +98,9 @@ def evidence_of(
         return evidence  # noise of some rows explains all: it disturbs commands too, and beside it nothing is named
     if found.chosen.names:
         chosen = found.chosen.fit, found.chosen.data
-        samples = (*supported(seen, *chosen), *beside(chosen[0], under_noise(*chosen)))
-        evidence = replace(evidence, samples=tuple(s for s in samples if is_material(s, *chosen)))
+        rows = rows_of(*chosen)
+        samples = (*supported(seen, rows), *beside(chosen[0], under_noise(*chosen)))
+        evidence = replace(evidence, samples=tuple(s for s in samples if is_material(s, rows)))
     return _with_found(evidence, found, without)
 
 
@@ -111,7 +118,7 @@ def _seen(
         data, retuned = prepare(model, recordings, good, limits)
     except RUNAWAY:
         return seen
-    return [s for s in supported(seen, retuned, data) if s.speaks > limits.samples_clear]
+    return [s for s in supported(seen, rows_of(retuned, data)) if s.speaks > limits.samples_clear]
 
 
 def _searched(
@@ -146,14 +153,14 @@ def _searched(
     left = [r.y - signals[:, 0] for r, signals in zip(data.recordings, chosen.signals, strict=True)]
     good = [g & np.isfinite(e) for g, e in zip(data.good, left, strict=True)]
     outliers = outliers_in(left, recordings, good, limits)
-    confirmed = [] if outliers is None else supported([outliers], chosen, data)
+    confirmed = [] if outliers is None else supported([outliers], rows_of(chosen, data))
     if not confirmed:
         return near, found, seen
     seen = [*seen, *confirmed]
     return *searched(), seen
 
 
-def _with_found(evidence: Evidence, found: Found, without: Sequence[str]) -> Evidence:
+def _with_found(evidence: ChainEvidence, found: Found, without: Sequence[str]) -> ChainEvidence:
     """Return the evidence with what a search found; as it was where what is left needs no effect."""
     chosen, near = found.chosen, evidence.search
     if not chosen.leaves_noise and (late := _late_rows(evidence, found.gained, without)) is not None:
@@ -168,29 +175,14 @@ def _with_found(evidence: Evidence, found: Found, without: Sequence[str]) -> Evi
     if chosen.names and chosen.leaves_noise:
         residual = residual_tests(chosen.fit, under_noise(chosen.fit, chosen.data), uneven=residual.uneven)
         offset = offset_of(chosen.fit, limits.offset_sigmas)
-    quality = found.quality(evidence.quality.noise_floor)
-    return replace(evidence, search=found.as_search(), residual=residual, quality=quality, offset=offset, found=found)
+    floor = evidence.quality.noise_floor
+    return replace(
+        evidence, search=found.as_search(), residual=residual, quality_of=lambda: found.quality(floor), offset=offset,
+        found=found,
+    )  # fmt: skip
 
 
-def keeping(evidence: Evidence, names: Collection[str]) -> Evidence:
-    """Return the evidence with no other effects than those named: the hypothesis of them that was fitted."""
-    samples = tuple(s for s in evidence.samples if s.name in names)
-    evidence = replace(evidence, samples=samples, offset=evidence.offset if OFFSET in names else None)
-    found = evidence.found
-    if found is None or evidence.own is not None:
-        return evidence
-    best = of_likely(found.judged, names)
-    if best.names == found.chosen.names:
-        return evidence
-    left, residual = at_both_scales(best, found.judged).spread_out() if best.names else found.retuned, evidence.residual
-    if found.chosen.leaves_noise or left.leaves_noise:
-        residual = residual_tests(left.fit, under_noise(left.fit, left.data), uneven=residual.uneven)
-    found = replace(found, chosen=left)
-    quality = found.quality(evidence.quality.noise_floor)
-    return replace(evidence, search=found.as_search(), residual=residual, quality=quality, found=found)
-
-
-def _late_rows(evidence: Evidence, gained: float, without: Sequence[str]) -> Evidence | None:
+def _late_rows(evidence: ChainEvidence, gained: float, without: Sequence[str]) -> ChainEvidence | None:
     """Return the evidence where rows that are late, and their commands with them, explain more than effects gained."""
     excluded = {name for s in evidence.samples for name in kind_of(s.name).excludes}
     if evidence.evened or evidence.residual.is_noise or JITTER in (*without, *excluded):

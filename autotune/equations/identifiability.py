@@ -7,11 +7,12 @@ states projected out, has singular values s: along its right singular vector a r
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from autotune.arrays import FloatArray
+from autotune.arrays import BoolArray, FloatArray
 from autotune.equations.fit_data import Fitted
 
 #: A parameter belongs to a combination where its share of the direction's length is at least this.
@@ -51,19 +52,33 @@ class Combination:
 def combinations(fitted: Fitted) -> list[Combination]:
     """Return all directions of the parameters that were retuned, the least determined first."""
     which = np.flatnonzero(np.any(fitted.jacobian != 0.0, axis=0) | _retuned(fitted))
-    if which.size == 0:
-        return []
-    J = fitted.jacobian[:, which]
-    values, vectors = np.linalg.eigh(J.T @ J)
     parameters = [fitted.compiled.parameters[i] for i in which]
-    spread = np.array([p.spread for p in parameters])
+    J = fitted.jacobian[:, which]
+    return directions(J.T @ J, np.array([p.spread for p in parameters]), [p.name for p in parameters])
+
+
+def directions(information: FloatArray, spread: FloatArray, names: Sequence[str]) -> list[Combination]:
+    """Return the directions of parameters by how well data determine them, the least determined first.
+
+    Parameters
+    ----------
+    information : (p, p) array
+        Of the data on the parameters, in units of their prior standard deviations.
+    spread : (p,) array
+        Those standard deviations, relative.
+    names : sequence of str
+        Of the parameters.
+    """
+    if not names:
+        return []
+    values, vectors = np.linalg.eigh(information)
     found = []
     for value, vector in zip(values, vectors.T, strict=True):
         order = [i for i in np.argsort(-np.abs(vector)) if abs(vector[i]) >= _SHARE]
         changes = (vector * spread)[order]
         found.append(
             Combination(
-                parameters=tuple(parameters[i].name for i in order),
+                parameters=tuple(names[i] for i in order),
                 changes=tuple(float(c) for c in changes / changes[0]),
                 narrowed=float(1.0 / np.sqrt(1.0 + max(value, 0.0))),
             )
@@ -71,10 +86,10 @@ def combinations(fitted: Fitted) -> list[Combination]:
     return found
 
 
-def undetermined(fitted: Fitted, narrowed: float = 0.5) -> list[Combination]:
+def undetermined(found: Sequence[Combination], narrowed: float = 0.5) -> list[Combination]:
     """Return the combinations along which the recordings narrow the belief to no less than a share of it."""
-    return [one for one in combinations(fitted) if one.narrowed >= narrowed]
+    return [one for one in found if one.narrowed >= narrowed]
 
 
-def _retuned(fitted: Fitted) -> FloatArray:
+def _retuned(fitted: Fitted) -> BoolArray:
     return np.array([p.spread > 0.0 for p in fitted.compiled.parameters])

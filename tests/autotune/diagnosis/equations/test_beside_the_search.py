@@ -9,11 +9,11 @@ import numpy as np
 from typer.testing import CliRunner
 
 from autotune.cli import app
-from autotune.diagnosis.equations import diagnose_equations
+from autotune.diagnosis import diagnose
 from autotune.equations import write_equations
 from autotune.errors import InputError
 from autotune.experiment.excitation import KINDS
-from autotune.experiment_design.in_equations import with_next_experiment_in_equations
+from autotune.experiment_design import with_next_experiment
 from autotune.recording import Recording, write_recording
 from tests.autotune.equations.models import model, one_state
 
@@ -63,7 +63,7 @@ def test_where_several_explanations_are_left_an_experiment_within_the_commands_i
         # a loss that comes and goes by itself, which no effect of the catalogue is
         kept = np.exp(-A * (1.0 + 0.6 * np.sign(np.sin(0.9 * k * DT))) * DT)
         x = kept * x + (1.0 - kept) * B / A * u[k]
-    found = with_next_experiment_in_equations(diagnose_equations(LAG, [Recording(t=DT * np.arange(800), u=u, y=y)]))
+    found = with_next_experiment(diagnose(LAG, [Recording(t=DT * np.arange(800), u=u, y=y)]))
     assert found.verdict == "unexplained"
     planned = found.as_json()["next_experiment"]
     assert planned["kind"] in KINDS
@@ -72,7 +72,7 @@ def test_where_several_explanations_are_left_an_experiment_within_the_commands_i
 
 
 def test_nothing_is_planned_where_nothing_is_left_out() -> None:
-    found = with_next_experiment_in_equations(diagnose_equations(LAG, [closed(2, 1.5)]))
+    found = with_next_experiment(diagnose(LAG, [closed(2, 1.5)]))
     assert found.verdict == "parameters"
     assert found.as_json()["next_experiment"] is None
 
@@ -99,9 +99,9 @@ def test_spikes_smaller_than_the_reading_moves_are_found_in_what_a_simulation_le
         x = kept * x + (1.0 - kept) * u[k]
     struck = np.array([80, 200, 201, 333, 460, 461, 590, 742, 811])
     y[struck] += 0.09 * rng.choice([-1.0, 1.0], struck.size)
-    found = diagnose_equations(quick, [Recording(t=t, u=u, y=y)])
+    found = diagnose(quick, [Recording(t=t, u=u, y=y)])
     assert found.verdict == "effect"
-    (outliers,) = found.samples
+    (outliers,) = found.effects
     assert outliers.name == "sensor.outliers"
-    assert set(np.flatnonzero(outliers.rows[0])) == set(struck)
-    assert found.effects == ()
+    spared = np.isnan(found.search.bench.recordings[0].y)
+    assert set(np.flatnonzero(spared)) == set(struck)

@@ -1,0 +1,360 @@
+"""What recordings show of equations or of a closed model, and how effects are read, kept, run and handed out."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass, replace
+from functools import cache, cached_property
+from types import MappingProxyType
+
+import numpy as np
+
+from autotune.arrays import BoolArray
+from autotune.controller import Controller
+from autotune.diagnosis.equations.bench import Bench, Outcome
+from autotune.diagnosis.equations.closed import ClosedBench
+from autotune.diagnosis.equations.equation_bench import EquationBench
+from autotune.diagnosis.equations.judged import Searched
+from autotune.diagnosis.equations.scores import slow_power
+from autotune.diagnosis.equations.search import search
+from autotune.diagnosis.equations.shown import EquationSearch
+from autotune.diagnosis.equations.sizes import command_of, spans_at, with_units
+from autotune.diagnosis.evidence.adequacy import ResidualTests
+from autotune.diagnosis.evidence.held_out import FitQuality
+from autotune.diagnosis.evidence.law import law_effect
+from autotune.diagnosis.evidence.misread import misread_columns
+from autotune.diagnosis.evidence.readings import struck
+from autotune.diagnosis.evidence.sample_gain import SimulatedRows, is_material, supported
+from autotune.diagnosis.evidence.samples import SampleEffect, inspect, outliers_in, spared, together
+from autotune.diagnosis.readable import in_commands, readable
+from autotune.diagnosis.result import FoundEffect, Verdict
+from autotune.diagnosis.safe_extension import safe_extension
+from autotune.diagnosis.selection.judged import of_likely
+from autotune.diagnosis.selection.probability import Candidate, probability_of
+from autotune.diagnosis.thresholds import Thresholds
+from autotune.diagnosis.verdict import Evidence
+from autotune.effects import KINDS, kind_of
+from autotune.equations.black_box import BlackBox
+from autotune.equations.effects import equation_of
+from autotune.equations.files import forecast_any
+from autotune.equations.linearise import settles
+from autotune.equations.model import EquationModel
+from autotune.errors import IdentificationError, InputError
+from autotune.models import Effect
+from autotune.progress import Progress, quiet
+from autotune.recording import Recording
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class EquationEvidence(Evidence):
+    """What recordings show of equations.
+
+    Attributes
+    ----------
+    model : EquationModel or BlackBox
+        The nominal model.
+    given : tuple of Recording
+        What was measured, rows that samples spoil among them.
+    bench : Bench
+        The model on the rows that count.
+    found : Searched
+        What the search found.
+    error_of : callable
+        Held-out error of a fit; kept, for it takes fits.
+    again : callable
+        Returns what other recordings show among some effects, beginning with a hypothesis of these ones.
+    """
+
+    model: EquationModel | BlackBox
+    given: tuple[Recording, ...]
+    bench: Bench
+    found: Searched
+    error_of: Callable[[Outcome], float]
+    again: Callable[[Sequence[Recording], Collection[str], Outcome], EquationEvidence]
+
+    @cached_property
+    def result(self) -> EquationSearch:
+        """What the search found."""
+        return EquationSearch(model=self.model, recordings=self.given, bench=self.bench, found=self.found)
+
+    @property
+    def limits(self) -> Thresholds:
+        """What decides between two findings."""
+        return self.found.limits
+
+    @property
+    def recordings(self) -> tuple[Recording, ...]:
+        """What was measured."""
+        return self.given
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Effects of the hypothesis to go on with."""
+        return self.found.taken.names
+
+    @cached_property
+    def candidates(self) -> tuple[Candidate, ...]:
+        """Every hypothesis with its probability, best first."""
+        return self.found.candidates(self.unknown_odds if self.residual.is_noise else self.limits.unknown_odds)
+
+    @property
+    def leading(self) -> tuple[tuple[str, ...], ...]:
+        """Effects of the leading hypotheses, the best first."""
+        own = len(self.model.effects)
+        return tuple(tuple(e.name for e in one.effects[own:]) for one in self.found.tried)
+
+    @property
+    def more_than_noise(self) -> bool:
+        """Whether something was found, or the retuned model leaves more than noise."""
+        return bool(self.names) or not (self.found.judged[0].leaves_noise or self.residual.accounted)
+
+    @property
+    def leaves_noise(self) -> bool:
+        """Whether what the chosen model leaves is noise."""
+        return self.found.taken.leaves_noise or self.residual.accounted
+
+    @property
+    def numbers(self) -> float:
+        """Decrease of chi-square that retuning brings beside the nominal numbers."""
+        return self.found.score(self.found.nominal) - self.found.score(self.found.retuned)
+
+    def keeping(self, names: Collection[str]) -> EquationEvidence:
+        """Return the evidence with no other effects than those named: the hypothesis of them that was fitted."""
+        samples, found = tuple(s for s in self.samples if s.name in names), self.found
+        if not set(found.taken.names) <= set(names):
+            found = replace(found, taken=of_likely(found.judged, names))
+        return replace(
+            self, samples=samples, found=found, quality_of=lambda: _quality(found, self.error_of, self.given),
+            residual=_left(found, samples),
+        )  # fmt: skip
+
+    def on(self, part: Sequence[Recording]) -> tuple[EquationEvidence | None, Collection[str]]:
+        """Return what a part of the recordings shows, and effects that it cannot tell."""
+        known = {name for one in self.found.judged for name in one.names} | {s.name for s in self.samples}
+        best = self.found.best
+        try:
+            there = self.again(part, known, best.outcome)
+            unfelt = {e.name for e in best.outcome.effects[best.own :] if not there.feels(e)}
+        except InputError:  # nothing runs there
+            return None, ()
+        return there, unfelt
+
+    def feels(self, effect: Effect) -> bool:
+        """Whether an effect changes what is read by as much as one row's noise: of others these rows tell nothing."""
+        change = self.bench.with_trial(self.found.retuned, effect)
+        return change is None or float(change @ change) > self.found.noise.total_sd**2
+
+    def described(self) -> list[tuple[float, FoundEffect]]:
+        """Return the chosen effects as people read them."""
+        found, own = self.found, len(self.model.effects)
+        base = found.score(found.chosen)
+        scores = {frozenset(one.names): found.score(one.outcome) for one in found.judged}
+        described = []
+        for effect in found.chosen.effects[own:]:
+            rest = frozenset(self.names) - {effect.name}
+            described.append((scores.get(rest, found.score(found.retuned)) - base, self._described(effect)))
+        return described
+
+    def _described(self, effect: Effect) -> FoundEffect:
+        named = with_units(self.bench.model, effect, self.model.output_unit)
+        fitted = {k: q for k, q in named.parameters.items() if math.isfinite(q.sd) and q.sd != 0.0}
+        shown = readable(replace(named, parameters=MappingProxyType(fitted or dict(named.parameters))))
+        command, unit = command_of(self.bench.model, self.found.chosen, effect, self.given), self.bench.model.inputs[0]
+        return FoundEffect(
+            name=effect.name,
+            probability=probability_of(effect.name, self.candidates, self.limits.most_probable),
+            places=self.places(effect.name),
+            parameters=MappingProxyType(shown),
+            equation=equation_of(self.bench.model, effect),
+            windows=self.acting(effect.name, {k: q.value for k, q in effect.parameters.items()}),
+            operating_range=spans_at(self.bench, self.found.chosen, effect),
+            as_command=MappingProxyType(in_commands(effect.name, shown, command, unit.unit) if command else {}),
+            **{key: getattr(effect, key) for key in ("state", "port", "input", "column")},
+        )
+
+    def misread_columns(self) -> str:
+        """Say what is wrong with the columns, where the model then explains the recordings."""
+        if self.model.columns[0] != "u":
+            return ""
+
+        def error_of(changed: Sequence[Recording]) -> float:
+            good, _ = inspect(changed, (), self.limits)
+            if not all(ok.any() for ok in good):
+                raise IdentificationError("no reading counts")  # a command that never moves is no reading
+            bench = bench_of(self.model, changed, good)
+            return bench.held_out_error(bench.retuned(), True) / _spread(changed)
+
+        return misread_columns(self.given, self.model.inputs[0].offset, self.quality, self.limits, error_of)
+
+    def handed_out(self, verdict: Verdict) -> tuple[EquationModel | BlackBox, EquationModel | BlackBox]:
+        """Return the model to go on with, and the one that was wanted."""
+        nominal, wanted = self.model, self._wanted(verdict)
+        if wanted is nominal:
+            return nominal, nominal
+        lasting = not any(kind_of(name).at_a_time for name in self.names)
+        comparable = lasting and (isinstance(nominal, BlackBox) or settles(nominal, self.given))
+        able = (wanted, _with_numbers(nominal, self.found.retuned))
+        return safe_extension(able, nominal, self.given, forecast_any, comparable=comparable), wanted
+
+    def _wanted(self, verdict: Verdict) -> EquationModel | BlackBox:
+        """Return the nominal model where nothing is missing, else what explains more."""
+        found, quality = self.found, self.quality
+        if verdict == "none":
+            return self.model
+        if self.names and quality.is_better and verdict in ("effect", "unexplained"):
+            return _with_numbers(self.model, found.chosen)
+        stands = not self.names and self.more_than_noise
+        stands = stands and quality.retuned > (1.0 - self.limits.material_numbers) * quality.nominal
+        return self.model if stands else _with_numbers(self.model, found.retuned)
+
+
+def bench_of(model: EquationModel | BlackBox, recordings: Sequence[Recording], good: Sequence[BoolArray]) -> Bench:
+    """Return a model on its recordings, of whose rows some count."""
+    kind = ClosedBench if isinstance(model, BlackBox) else EquationBench
+    bench: Bench = kind(model, recordings, good)  # type: ignore[arg-type]  # each kind has its bench
+    return bench
+
+
+def evidence_of_equations(
+    model: EquationModel | BlackBox,
+    recordings: Sequence[Recording],
+    controller: Controller | None,
+    without: Sequence[str],
+    progress: Progress,
+    limits: Thresholds,
+    begun: Outcome | None = None,
+) -> EquationEvidence:
+    """Return all that the verdict rests on: samples, search, the residual, held-out rows.
+
+    Parameters
+    ----------
+    model : EquationModel or BlackBox
+        The nominal model.
+    recordings : sequence of Recording
+        What was measured.
+    controller : Controller, optional
+        The law that u was computed by; the sidecars' by default.
+    without : sequence of str
+        Effects that are not looked for.
+    progress : callable
+        Told what is being done and the share done, 0 to 1.
+    limits : Thresholds
+        What decides between two findings.
+    begun : Outcome, optional
+        What predicted best on more rows: it is judged as well, from the numbers that it had there.
+
+    Raises
+    ------
+    InputError
+        A model that runs away.
+    """
+    own = {effect.name for effect in model.effects}
+    seen = _seen(model, recordings, [name for name in without if name not in own], limits)
+    bench, found, seen = _searched(model, recordings, seen, without, progress, limits, begun)
+    run = _rows_of(found.chosen, recordings, bench, limits)
+    samples = [s for s in supported(seen, run) if s.name not in own]
+    samples = [s for s in samples if not found.taken.names or is_material(s, run)]
+    law = law_effect(recordings, controller, limits)
+    samples += [] if law is None or law.name in without else [law]
+    error_of = cache(lambda one: bench.held_out_error(one, one is not found.nominal) / _spread(recordings))
+
+    def again(part: Sequence[Recording], known: Collection[str], begun: Outcome) -> EquationEvidence:
+        others = [*without, *(name for name in KINDS if name not in known)]
+        return evidence_of_equations(model, part, controller, others, quiet, limits, begun)
+
+    return EquationEvidence(
+        model=model, given=tuple(recordings), bench=bench, found=found, samples=tuple(samples),
+        residual=_left(found, samples), quality_of=cache(lambda: _quality(found, error_of, recordings)),
+        error_of=error_of, again=again,
+    )  # fmt: skip
+
+
+def _spread(recordings: Sequence[Recording]) -> float:
+    return float(np.nanstd(np.concatenate([r.y for r in recordings]))) or 1.0
+
+
+def _quality(found: Searched, error_of: Callable[[Outcome], float], recordings: Sequence[Recording]) -> FitQuality:
+    """Return errors on the last third of every recording, the numbers fitted to the rest."""
+    nominal, retuned, extended = (error_of(one) for one in (found.nominal, found.retuned, found.chosen))
+    noise = found.noise.total_sd / _spread(recordings)
+    return FitQuality(nominal=nominal, retuned=retuned, extended=extended, noise_floor=noise)
+
+
+def _left(found: Searched, samples: Sequence[SampleEffect]) -> ResidualTests:
+    """Return what the chosen model leaves; noise of some rows may account for a little more than all rows' has."""
+    ratio, chosen = found.variance_ratio(found.chosen), found.chosen
+    slow, chance = slow_power(chosen, found.taken.noise)
+    return ResidualTests(
+        reduced_chi2=ratio, reduced_chi2_chance=math.sqrt(2.0 / chosen.residual.size), slow=slow, slow_chance=chance,
+        uneven=any(kind_of(s.name).uneven for s in samples),
+        accounted=bool(samples) and ratio < found.limits.equation_astray, limits=found.limits,
+    )  # fmt: skip
+
+
+def _rows_of(
+    outcome: Outcome, recordings: Sequence[Recording], bench: Bench, limits: Thresholds
+) -> SimulatedRows:  # fmt: skip
+    """Return the rows that a fit simulates."""
+    whole = [(np.zeros(1, dtype=np.int64), np.array([len(r)])) for r in recordings]
+    windows = [(w.starts, w.stops) for w in outcome.fitted.windows] or whole
+    return SimulatedRows(
+        recordings=tuple(recordings), good=tuple(np.isfinite(r.y) for r in bench.recordings),
+        starts=tuple(a for a, _ in windows), stops=tuple(b for _, b in windows),
+        simulated=outcome.fitted.simulated, limits=limits,
+    )  # fmt: skip
+
+
+def _seen(
+    model: EquationModel | BlackBox, recordings: Sequence[Recording], without: Sequence[str], limits: Thresholds
+) -> list[SampleEffect]:
+    """Return what the samples show where the retuned model speaks for it clearly, as for chains."""
+    good, seen = inspect(recordings, without, limits)
+    if not any(s.rows for s in seen):
+        return seen
+    bench = bench_of(model, recordings, good)
+    run = _rows_of(bench.retuned(), recordings, bench, limits)
+    return [s for s in supported(seen, run) if s.speaks > limits.samples_clear]
+
+
+def _searched(
+    model: EquationModel | BlackBox, recordings: Sequence[Recording], seen: list[SampleEffect],
+    without: Sequence[str], progress: Progress, limits: Thresholds, begun: Outcome | None,
+) -> tuple[Bench, Searched, list[SampleEffect]]:  # fmt: skip
+    """Return the search, and what the samples show; searched again without spikes that its residual alone shows.
+
+    Where the reading moves from row to row by as much as its spikes, it shows only the largest of them, or none.
+    """
+
+    def searched() -> tuple[Bench, Searched]:
+        good, names = spared(recordings, seen), [*without, *(s.name for s in seen)]
+        bench = bench_of(model, recordings, good)
+        return bench, search(bench, names, progress, limits, begun)
+
+    bench, found = searched()
+    run, name = _rows_of(found.chosen, recordings, bench, limits), "sensor.outliers"
+    known = [ok & np.isfinite(e) for ok, e in zip(run.good, run.residuals, strict=True)]
+    outliers = None if name in without else outliers_in(run.residuals, recordings, known, limits)
+    if outliers is None:
+        return bench, found, seen
+    beside = [struck(e, ok, limits.spike) for e, ok in zip(run.residuals, known, strict=True)]
+    outliers = replace(outliers, rows=tuple(a | b for a, b in zip(outliers.rows, beside, strict=True)))
+    before = [one for one in seen if one.name == name]
+    confirmed = supported([together([*before, outliers])], run)
+    if not confirmed:
+        return bench, found, seen
+    seen = [*(one for one in seen if one.name != name), *confirmed]
+    return (*searched(), seen)
+
+
+def _with_numbers(model: EquationModel | BlackBox, outcome: Outcome) -> EquationModel | BlackBox:
+    """Return a model with the numbers and effects of a fit."""
+    own = len(model.parameters)
+    values = outcome.fitted.parameters[:own]
+    if isinstance(model, BlackBox):
+        numbers = tuple(replace(p, value=float(v)) for p, v in zip(model.parameters, values, strict=True))
+        return replace(model, parameters=numbers, effects=outcome.effects)
+    inputs = [one for one in outcome.fitted.compiled.model.inputs if one.column not in model.columns]
+    used = tuple(one for one in inputs if any(one.column == e.column for e in outcome.effects))
+    effects = tuple(with_units(outcome.fitted.compiled.model, e, model.output_unit) for e in outcome.effects)
+    return replace(model.with_parameters(values), inputs=(*model.inputs, *used), effects=effects)
