@@ -115,7 +115,7 @@ def _diagnosis(
     return Diagnosis(
         verdict=verdict,
         effects=effects,
-        candidates=() if columns else consistent(evidence.candidates, said),
+        candidates=() if columns else consistent(evidence.candidates, said, evidence.names),
         places=places,
         fit=evidence.quality,
         extended_model=handed_out,

@@ -16,6 +16,8 @@ from autotune.equations.identifiability import undetermined
 
 #: Rounds in which probabilities of hypotheses are brought to those of the effects, and how near that ends.
 ROUNDS, NEAR = 200, 1e-6
+#: Probability of a hypothesis that all rows give next to none, and below which one is not listed.
+TINY, LEAST = 1e-6, 1e-4
 
 
 def found_effects(evidence: Evidence, verdict: Verdict) -> tuple[FoundEffect, ...]:
@@ -54,7 +56,9 @@ def _of_samples(s: SampleEffect, evidence: Evidence) -> FoundEffect:
     )
 
 
-def consistent(candidates: Sequence[Candidate], effects: Mapping[str, float]) -> tuple[Candidate, ...]:
+def consistent(
+    candidates: Sequence[Candidate], effects: Mapping[str, float], chosen: Sequence[str]
+) -> tuple[Candidate, ...]:
     """Return hypotheses with probabilities that add up to those of the effects: one probability for one thing.
 
     Parameters
@@ -63,13 +67,15 @@ def consistent(candidates: Sequence[Candidate], effects: Mapping[str, float]) ->
         Hypotheses by what all rows say; together 1.
     effects : mapping of str to float
         Probabilities of effects, each over all hypotheses that have it.
+    chosen : sequence of str
+        Effects of the hypothesis to go on with, which may be none of the likeliest ones by all rows.
 
     Notes
     -----
     Of all distributions with those sums it is the one nearest to the given one (minimum discrimination information,
     Csiszar 1975), found by fitting one sum after the other.
     """
-    weights = {c.name: max(c.probability, 1e-12) for c in candidates}
+    weights = dict.fromkeys(("+".join(chosen) or "none", "none"), TINY) | {c.name: c.probability for c in candidates}
     having = {name: {n for n in weights if counted_as(name) & set(n.split("+"))} for name in effects}
     for _ in range(ROUNDS):
         most = 0.0
@@ -83,8 +89,9 @@ def consistent(candidates: Sequence[Candidate], effects: Mapping[str, float]) ->
                 weights[n] *= p / inside if n in having[name] else (1.0 - p) / outside
         if most < NEAR:
             break
+    total = sum(weights.values())
     ranked = sorted(weights.items(), key=lambda item: -item[1])
-    return tuple(Candidate(name=name, probability=w) for name, w in ranked)
+    return tuple(Candidate(name=name, probability=w / total) for name, w in ranked if w > LEAST * total)
 
 
 def places_of(evidence: Evidence, effects: Sequence[FoundEffect], description: Description | None) -> tuple[str, ...]:

@@ -101,6 +101,24 @@ def settles(model: EquationModel, recordings: Sequence[Recording]) -> bool:
     return linear is not None and bool(np.all(np.linalg.eigvals(linear.A).real < 0.0))
 
 
+def linearise_at(model: EquationModel, states: FloatArray, inputs: FloatArray) -> Linear:
+    """Linearise a model about any point, whether it rests there or not.
+
+    Parameters
+    ----------
+    model : EquationModel
+        The model; of its effects those without a memory act.
+    states, inputs : (n,), (m,) arrays
+        Where.
+    """
+    applied = apply(model)
+    compiled = compile_model(model, applied.extensions)
+    p = compiled.parameter_vector
+    A, B, C, D = _differences(compiled, p, states, inputs)
+    y = float(derivatives(compiled, p, states[None, :], inputs[None, :])[1][0, 0])
+    return Linear(A=A, B=B, C=C, D=D, states=states, inputs=inputs, y=y, delays_s=applied.delays)
+
+
 def at_recordings(model: EquationModel, recordings: Sequence[Recording]) -> Linear | None:
     """Return a model linearised at the medians of recordings; nothing where nothing rests there."""
     inputs = np.array([float(np.median(np.concatenate([r[name] for r in recordings]))) for name in model.columns])

@@ -16,7 +16,7 @@ from autotune.diagnosis.equations.candidates import Signals, Trial, form_of, val
 from autotune.diagnosis.equations.first_order import explained, start_bases, without_starts
 from autotune.diagnosis.equations.followed import followed, positions_of, sizes_of
 from autotune.diagnosis.equations.further import further_columns
-from autotune.diagnosis.equations.held_out import HELD_OUT, forecast_errors, free_run_errors, until
+from autotune.diagnosis.equations.held_out import HELD_OUT, bounded_errors, forecasts, free_run, until
 from autotune.diagnosis.equations.parts import standing_out, telling_windows
 from autotune.diagnosis.equations.sought import changed, outer, sought
 from autotune.diagnosis.evidence.stretches import stretches_in
@@ -130,13 +130,22 @@ class EquationBench:
 
     def held_out_error(self, outcome: Outcome, refits: bool) -> float:
         """Return the rms error on the last third of every recording, the numbers fitted to the rest."""
+        runs = self.held_out_runs(outcome, refits)
+        each = zip(self.recordings, runs, strict=False)
+        e = np.concatenate([np.zeros(0), *(bounded_errors(r.y, run, first) for r, (run, first) in each)])
+        return float(np.sqrt(np.nanmean(e**2))) if e.size else float("inf")
+
+    def held_out_runs(self, outcome: Outcome, refits: bool) -> list[tuple[FloatArray, int]]:
+        """Return readings of the last third of every recording, (N,), NaN before, and the row that judging begins at.
+
+        The numbers are fitted to the rest; nothing is returned where that runs away.
+        """
         compiled = self._compiled(outcome.effects)
         cuts = [int((1.0 - HELD_OUT) * len(r)) for r in self.recordings]
         z = np.zeros(len(compiled.parameters))
         own = len(self.model.parameters)
         z[:own] = outcome.fitted.z[:own]
-        each = list(zip(self.recordings, cuts, outcome.fitted.windows, strict=True))
-        errors = []
+        each, runs = list(zip(self.recordings, cuts, outcome.fitted.windows, strict=True)), []
         try:
             windows = [until(w, k) for _, k, w in each]
             if refits:
@@ -146,13 +155,12 @@ class EquationBench:
             p = natural(compiled, z)
             for (r, k, _), drive, w in zip(each, self._drives, windows, strict=True):
                 if self._horizon_s is not None:
-                    errors.append(forecast_errors(compiled, p, drive, r.y, k, self._horizon_s))
+                    runs.append(forecasts(compiled, p, drive, r.y, k, self._horizon_s))
                 else:
-                    errors.append(free_run_errors(compiled, p, drive, r.y, w, k))
+                    runs.append(free_run(compiled, p, drive, r.y, w, k))
         except InputError:
-            return float("inf")
-        e = np.concatenate(errors)
-        return float(np.sqrt(np.nanmean(e**2)))
+            return []
+        return runs
 
     def left_out_squares(self, outcome: Outcome) -> FloatArray:
         """Return squared errors on stretches, the numbers fitted to the other ones."""

@@ -160,7 +160,7 @@ class EquationEvidence(Evidence):
         named = with_units(self.bench.model, effect, self.model.output_unit)
         fitted = {k: q for k, q in named.parameters.items() if math.isfinite(q.sd) and q.sd != 0.0}
         shown = readable(replace(named, parameters=MappingProxyType(fitted or dict(named.parameters))))
-        command, unit = command_of(self.bench.model, self.found.chosen, effect, self.given), self.bench.model.inputs[0]
+        command, unit = command_of(self.bench, self.found.chosen, effect), self.bench.model.inputs[0]
         return FoundEffect(
             name=effect.name,
             probability=probability_of(effect.name, self.candidates, self.limits.most_probable),

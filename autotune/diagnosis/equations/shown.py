@@ -5,9 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+import numpy as np
+
 from autotune.arrays import FloatArray
 from autotune.diagnosis.equations.bench import Bench
+from autotune.diagnosis.equations.equation_bench import EquationBench
+from autotune.diagnosis.equations.held_out import HELD_OUT, bounded_errors
 from autotune.diagnosis.equations.judged import Searched
+from autotune.diagnosis.equations.laws import law_in_equations
 from autotune.diagnosis.evidence.missing_law import MissingLaw
 from autotune.diagnosis.evidence.unseen_run import UnseenRun
 from autotune.diagnosis.selection.retuned_numbers import RetunedNumber
@@ -103,8 +108,32 @@ class EquationSearch:
 
     def laws(self) -> tuple[MissingLaw, ...]:
         """Return the laws of the chosen effects over their signals, with the data in bins."""
-        return ()
+        if not isinstance(self.bench, EquationBench):
+            return ()
+        chosen, own = self.found.chosen, len(self.model.effects)
+        found = (law_in_equations(self.bench, chosen, i) for i in range(own, len(chosen.effects)))
+        return tuple(law for law in found if law is not None)
 
     def unseen_run(self) -> UnseenRun | None:
-        """Return free runs through a stretch that no number was fitted to."""
-        return None
+        """Return runs through the last third of the longest recording, the numbers fitted to the rest of all."""
+        if not isinstance(self.bench, EquationBench):
+            return None
+        number = int(np.argmax([len(r) for r in self.recordings]))
+        fits = {"nominal": self.found.nominal, "retuned": self.found.retuned}
+        fits |= {"extended": self.found.chosen} if self.has_effects else {}
+        found = {name: self.bench.held_out_runs(one, name != "nominal") for name, one in fits.items()}
+        runs = {name: one[number] for name, one in found.items() if one}
+        r = self.recordings[number]
+        row = int((1.0 - HELD_OUT) * len(r))
+        first = min((first for _, first in runs.values()), default=len(r))
+        if first >= len(r):
+            return None
+        y = self.bench.recordings[number].y
+        spread = float(np.nanstd(y[first:])) or 1.0
+        errors = {name: bounded_errors(y, run, first) for name, (run, first) in runs.items()}
+        return UnseenRun(
+            number=number, name=r.name, unit=self.units[1], t=r.t[row:], y=y[row:], starts_s=(float(r.t[row]),),
+            heads_s=(float(r.t[first]),),
+            runs={name: run[row:] for name, (run, _) in runs.items() if np.all(np.isfinite(run[first:]))},
+            errors={name: float(np.sqrt(np.nanmean(e**2))) / spread for name, e in errors.items()},
+        )  # fmt: skip

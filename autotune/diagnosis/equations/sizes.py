@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from types import MappingProxyType
 
@@ -15,11 +14,10 @@ from autotune.diagnosis.result import OperatingRange
 from autotune.effects import KINDS
 from autotune.equations.effects import where_of
 from autotune.equations.expressions import Number
-from autotune.equations.linearise import Linear, at_recordings
+from autotune.equations.linearise import Linear, linearise_at
 from autotune.equations.model import EquationModel, Extension
 from autotune.equations.simulate import compile_model, derivatives
 from autotune.models import Effect
-from autotune.recording import Recording
 
 #: Share of the fastest rate at which a steady command and a steady force are compared: an integrator has no rest.
 STEADY = 1e-6
@@ -33,11 +31,16 @@ def units_at(model: EquationModel, effect: Effect, output_unit: str) -> dict[str
     if effect.state in states:
         state = states[effect.state]
         at = states[state.of] if state.of else state
-        units |= {"f": f"{state.unit}/s" if state.unit else "", "v": state.unit, "y": at.unit}
+        units |= {"f": _per_second(state.unit), "v": state.unit, "y": at.unit}
     elif effect.port in ports:
         name = positions_of(model)[effect.port]
         units |= {"f": ports[effect.port].unit, "y": states[name].unit if name in states else ""}
     return units
+
+
+def _per_second(unit: str) -> str:
+    """Return the unit of a change per second of what has a unit; nothing where that is not stated."""
+    return f"{unit}^2" if unit.endswith("/s") else f"{unit}/s" if unit else ""
 
 
 def with_units(model: EquationModel, effect: Effect, output_unit: str) -> Effect:
@@ -51,20 +54,21 @@ def with_units(model: EquationModel, effect: Effect, output_unit: str) -> Effect
     return replace(effect, parameters=MappingProxyType(parameters))
 
 
-def command_of(model: EquationModel, outcome: Outcome, effect: Effect, recordings: Sequence[Recording]) -> float:
+def command_of(bench: Bench, outcome: Outcome, effect: Effect) -> float:
     """Return the steady command that does what a unit of force at an effect's place does; 0 where none does.
 
     Notes
     -----
-    Both go through the linearised equations to the reading; where the plant integrates their ratio is taken as its
-    limit at low frequencies.
+    Both go through the equations, linearised where they usually are, to the reading; where the plant integrates their
+    ratio is taken as its limit at low frequencies.
     """
     if not (effect.state or effect.port):
         return 0.0
+    model, signals = bench.model, bench.signals(outcome)
     bare = replace(model, effects=()).with_parameters(outcome.fitted.parameters[: len(model.parameters)])
-    linear = at_recordings(bare, recordings)
-    if linear is None:
-        return 0.0
+    states = np.array([float(np.median(signals.values[name])) for name in model.state_names])
+    columns = [np.concatenate([r[name] for r in bench.recordings]) for name in model.columns]
+    linear = linearise_at(bare, states, np.array([float(np.median(column)) for column in columns]))
     force, A = _unit_force(bare, linear, effect), linear.A
     fastest = float(np.max(np.abs(np.linalg.eigvals(A)), initial=0.0)) or 1.0
     reach = np.linalg.solve((STEADY * fastest * np.eye(A.shape[0]) - A).T, linear.C[0])
