@@ -75,23 +75,28 @@ def consistent(
     Of all distributions with those sums it is the one nearest to the given one (minimum discrimination information,
     Csiszar 1975), found by fitting one sum after the other.
     """
-    weights = dict.fromkeys(("+".join(chosen) or "none", "none"), TINY) | {c.name: c.probability for c in candidates}
-    having = {name: {n for n in weights if counted_as(name) & set(n.split("+"))} for name in effects}
+    # effects in another order are the same hypothesis
+    names = {frozenset(c.name.split("+")): c.name for c in reversed(candidates)}
+    names = {frozenset({"none"}): "none", frozenset(chosen or ("none",)): "+".join(chosen) or "none"} | names
+    weights = dict.fromkeys(names, TINY)
+    for c in candidates:
+        weights[frozenset(c.name.split("+"))] += c.probability
+    having = {name: {h for h in weights if counted_as(name) & h} for name in effects}
     for _ in range(ROUNDS):
         most = 0.0
         for name, p in effects.items():
-            inside = sum(weights[n] for n in having[name])
+            inside = sum(weights[h] for h in having[name])
             outside = sum(weights.values()) - inside
             if inside <= 0.0 or outside <= 0.0:
                 continue
             most = max(most, abs(inside - p))
-            for n in weights:
-                weights[n] *= p / inside if n in having[name] else (1.0 - p) / outside
+            for h in weights:
+                weights[h] *= p / inside if h in having[name] else (1.0 - p) / outside
         if most < NEAR:
             break
     total = sum(weights.values())
     ranked = sorted(weights.items(), key=lambda item: -item[1])
-    return tuple(Candidate(name=name, probability=w / total) for name, w in ranked if w > LEAST * total)
+    return tuple(Candidate(name=names[h], probability=w / total) for h, w in ranked if w > LEAST * total)
 
 
 def places_of(evidence: Evidence, effects: Sequence[FoundEffect], description: Description | None) -> tuple[str, ...]:

@@ -86,6 +86,20 @@ def directions(information: FloatArray, spread: FloatArray, names: Sequence[str]
     return found
 
 
+def determined(believed: FloatArray, spread: FloatArray, names: Sequence[str]) -> list[Combination]:
+    """Return the directions of parameters by how well data determine them, whatever else was fitted beside.
+
+    Parameters
+    ----------
+    believed : (p, p) array
+        Covariance of the parameters after the fit, in units of their prior standard deviations.
+    spread, names
+        As in :func:`directions`.
+    """
+    information = np.asarray(np.linalg.pinv(believed, hermitian=True), dtype=np.float64) - np.eye(len(names))
+    return directions(information, spread, names)
+
+
 def undetermined(found: Sequence[Combination], narrowed: float = 0.5) -> list[Combination]:
     """Return the combinations along which the recordings narrow the belief to no less than a share of it."""
     return [one for one in found if one.narrowed >= narrowed]

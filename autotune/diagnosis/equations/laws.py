@@ -127,9 +127,10 @@ def _line_of(bench: EquationBench, outcome: Outcome, number: int) -> _Line | Non
     """Return an effect with its signal at every row; nothing where it is no law over one signal."""
     effect, model = outcome.effects[number], bench.model
     form = form_of(effect, model)
+    if form.acts not in ("force", "input") or form.remembers(effect.parameters):
+        return None
     asks = names_in(parse(text_of(form, effect))) & {"V", "X", "value", "t", "column"}
-    acts = form.acts in ("force", "input") and not form.remembers(effect.parameters)
-    if not acts or asks not in ({"V"}, {"X"}, {"value"}):
+    if asks not in ({"V"}, {"X"}, {"value"}):
         return None
     over = asks.pop()
     tree = Name(where_of(effect) or model.columns[0]) if over == "value" else local_names(model, effect)[over]

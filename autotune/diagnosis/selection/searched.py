@@ -15,7 +15,7 @@ from autotune.diagnosis.fitting.fit import Fit
 from autotune.diagnosis.selection.hypothesis import Hypothesis, merged, penalised
 from autotune.diagnosis.selection.retuned_numbers import RetunedNumber, retuned_numbers
 from autotune.diagnosis.thresholds import Thresholds
-from autotune.equations.identifiability import Combination, directions
+from autotune.equations.identifiability import Combination, determined
 from autotune.models import Model
 from autotune.recording import Recording
 
@@ -94,15 +94,19 @@ class Search:
 
     def combinations(self) -> list[Combination]:
         """Return the directions of the numbers by how well the recordings determine them, the least first."""
-        result = self.retuned.fit
+        result = self.chosen.fit
+        called = dict(zip(self._own(self.retuned.fit), self.numbers(), strict=True))
         free = result.parametrisation.free
-        own = [i for i, f in enumerate(free) if f.kind != "effect" and np.isfinite(f.spread) and f.spread > 0.0]
-        spread = np.array([free[i].spread for i in own])
-        believed = result.covariance[np.ix_(own, own)] / np.outer(spread, spread)
-        information = np.linalg.pinv(believed, hermitian=True) - np.eye(len(own))
-        called = [f"{n.block} {n.name}" for n in self.numbers()]
-        names = dict(zip([i for i, f in enumerate(free) if f.kind != "effect"], called, strict=True))
-        return directions(information, spread, [names[i] for i in own])
+        told = [i for i, f in enumerate(free) if f.name in called and np.isfinite(f.spread) and f.spread > 0.0]
+        spread = np.array([free[i].spread for i in told])
+        believed = result.covariance[np.ix_(told, told)] / np.outer(spread, spread)
+        names = [f"{called[free[i].name].block} {called[free[i].name].name}" for i in told]
+        return determined(believed, spread, names)
+
+    @staticmethod
+    def _own(result: Fit) -> list[str]:
+        """Return the free numbers of a fit that are the chain's own."""
+        return [f.name for f in result.parametrisation.free if f.kind != "effect"]
 
     def hypotheses(self) -> list[tuple[str, float]]:
         """Return combinations of effects with the decrease of chi-square, numbers paid for, the best first."""

@@ -69,7 +69,7 @@ def test_gravity_that_a_spring_stands_for_is_one_number() -> None:
     states = [PENDULUM["state"][0], {**PENDULUM["state"][1], "derivative": "(u - c*omega - k*theta)/J"}]
     numbers = {"J": {"value": 0.05}, "c": {"value": 0.02}, "k": {"value": 1.3}}
     found = diagnose(model(state=states, parameters=numbers), [swung(1), swung(2)])
-    (gravity,) = found.effects
+    (gravity,) = found.extended_model.effects
     assert (gravity.name, gravity.state) == ("plant.sine_torque", "omega")
     assert set(gravity.parameters) == {"amplitude", "period"}
     # in units of the derivative: m g l / J
