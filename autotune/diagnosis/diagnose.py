@@ -11,7 +11,7 @@ import numpy as np
 
 from autotune.controller import Controller
 from autotune.diagnosis.agreement import Part, agreement, likely, parts_of
-from autotune.diagnosis.equations.evidence import evidence_of_equations
+from autotune.diagnosis.equations.gathering_equations import evidence_of_equations
 from autotune.diagnosis.findings import consistent, found_effects, places_of, said_by, sentences_of
 from autotune.diagnosis.gathering import evidence_of
 from autotune.diagnosis.result import Diagnosis, FoundEffect

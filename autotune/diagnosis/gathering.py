@@ -6,8 +6,7 @@ from collections.abc import Collection, Sequence
 from dataclasses import replace
 from functools import cache
 
-import numpy as np
-
+from autotune.arrays import BoolArray
 from autotune.controller import Controller
 from autotune.diagnosis.chain_evidence import ChainEvidence
 from autotune.diagnosis.evidence.adequacy import residual_tests
@@ -16,8 +15,9 @@ from autotune.diagnosis.evidence.held_out import held_out
 from autotune.diagnosis.evidence.late_rows import JITTER, late_rows
 from autotune.diagnosis.evidence.operating_point import offset_of, unmoved
 from autotune.diagnosis.evidence.own_noise import own_noise
-from autotune.diagnosis.evidence.sample_gain import is_material, rows_of, supported
-from autotune.diagnosis.evidence.samples import SampleEffect, inspect, outliers_in, spared
+from autotune.diagnosis.evidence.sample_gain import SimulatedRows, is_material, rows_of, supported
+from autotune.diagnosis.evidence.samples import SampleEffect, spared
+from autotune.diagnosis.evidence.spoiled_rows import clear_samples, searched_beside
 from autotune.diagnosis.evidence.stamps import evened
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import RUNAWAY, Fit
@@ -73,8 +73,19 @@ def evidence_of(
     else:
         recordings, late = evened(model, recordings, thresholds)
     own = {effect.name for effect in model.effects}
-    seen = _seen(model, recordings, [name for name in without if name not in own], thresholds)
-    near, found, seen = _searched(model, recordings, seen, without, progress, thresholds, begun)
+
+    def retuned_rows(good: Sequence[BoolArray]) -> SimulatedRows | None:
+        try:
+            data, retuned = prepare(model, recordings, good, thresholds)
+        except RUNAWAY:
+            return None
+        return rows_of(retuned, data)
+
+    def searched(seen: list[SampleEffect]) -> tuple[tuple[Search, Found | None], SimulatedRows]:
+        return _searched(model, recordings, seen, without, progress, thresholds, begun)
+
+    seen = clear_samples(recordings, [name for name in without if name not in own], thresholds, retuned_rows)
+    (near, found), seen = searched_beside(searched, seen, without)
     seen = [s for s in seen if s.name not in own]
     progress("checking on held-out rows", 0.9)
 
@@ -104,23 +115,6 @@ def evidence_of(
     return _with_found(evidence, found, without)
 
 
-def _seen(
-    model: Model, recordings: Sequence[Recording], without: Sequence[str], limits: Thresholds
-) -> list[SampleEffect]:
-    """Return what the samples show where the retuned model speaks for it clearly.
-
-    Rows at rest and turning points at one level are readings like any other: what spoils none leaves them to the fits.
-    """
-    good, seen = inspect(recordings, without, limits)
-    if not any(s.rows for s in seen):
-        return seen
-    try:
-        data, retuned = prepare(model, recordings, good, limits)
-    except RUNAWAY:
-        return seen
-    return [s for s in supported(seen, rows_of(retuned, data)) if s.speaks > limits.samples_clear]
-
-
 def _searched(
     model: Model,
     recordings: Sequence[Recording],
@@ -129,35 +123,21 @@ def _searched(
     progress: Progress,
     limits: Thresholds,
     begun: JudgedChain | None,
-) -> tuple[Search, Found | None, list[SampleEffect]]:
-    """Return the retuned model near the noise, what was found beside it, and what the samples show.
+) -> tuple[tuple[Search, Found | None], SimulatedRows]:
+    """Return the retuned model near the noise, what was found beside it, and the rows that the best one simulates.
 
-    Searched again without spikes that the residual alone shows. Nothing is found where every simulation runs away.
+    Nothing is found where every simulation runs away.
     """
-
-    def searched() -> tuple[Search, Found | None]:
-        good, names = spared(recordings, seen), [*without, *(effect.name for effect in seen)]
-        progress("retuning", 0.0)
-        data, retuned = prepare(model, recordings, good, limits)
-        alone = Hypothesis(names=(), fit=retuned)
-        near = Search(data=data, nominal=at_nominal(retuned, data), retuned=alone, chosen=alone)
-        try:
-            return near, search(model, recordings, good, names, progress, limits, begun)
-        except RUNAWAY:
-            return near, None
-
-    near, found = searched()
-    if "sensor.outliers" in without or any(s.name == "sensor.outliers" for s in seen):
-        return near, found, seen
-    data, chosen = (near.data, near.retuned.fit) if found is None else (found.chosen.data, found.chosen.fit)
-    left = [r.y - signals[:, 0] for r, signals in zip(data.recordings, chosen.signals, strict=True)]
-    good = [g & np.isfinite(e) for g, e in zip(data.good, left, strict=True)]
-    outliers = outliers_in(left, recordings, good, limits)
-    confirmed = [] if outliers is None else supported([outliers], rows_of(chosen, data))
-    if not confirmed:
-        return near, found, seen
-    seen = [*seen, *confirmed]
-    return *searched(), seen
+    good, names = spared(recordings, seen), [*without, *(effect.name for effect in seen)]
+    progress("retuning", 0.0)
+    data, retuned = prepare(model, recordings, good, limits)
+    alone = Hypothesis(names=(), fit=retuned)
+    near = Search(data=data, nominal=at_nominal(retuned, data), retuned=alone, chosen=alone)
+    try:
+        found = search(model, recordings, good, names, progress, limits, begun)
+    except RUNAWAY:
+        return (near, None), rows_of(retuned, data)
+    return (near, found), rows_of(found.chosen.fit, found.chosen.data)
 
 
 def _with_found(evidence: ChainEvidence, found: Found, without: Sequence[str]) -> ChainEvidence:

@@ -113,7 +113,9 @@ def apply(model: EquationModel, effects: Sequence[Effect] | None = None) -> Appl
     return Applied(extensions=tuple(extensions), delays=delays, before=on_drive, after=on_reading)
 
 
-def compile_with(model: EquationModel, effects: Sequence[Effect], signals: Sequence[str] = ()) -> Compiled:
+def compile_with(
+    model: EquationModel, effects: Sequence[Effect], signals: Sequence[str] = (), further: Sequence[Extension] = ()
+) -> Compiled:
     """Translate a model with effects, every number of theirs among its parameters; takes about a millisecond.
 
     Parameters
@@ -124,6 +126,8 @@ def compile_with(model: EquationModel, effects: Sequence[Effect], signals: Seque
         What acts, in the order in which a signal meets it; a converter of the reading is left to :func:`apply`.
     signals : sequence of str
         Expressions that are wanted at the rows beside y.
+    further : sequence of Extension
+        What is added beside the effects.
 
     Returns
     -------
@@ -147,7 +151,7 @@ def compile_with(model: EquationModel, effects: Sequence[Effect], signals: Seque
         )
         column = int(np.argmax(_acts_on(model, effect)))
         held.append(Held(column=column, parameter=parameter, transform=OPERATIONS.get(form.samples)))
-    return compile_model(model, apply(model, effects).extensions, signals, held)
+    return compile_model(model, (*apply(model, effects).extensions, *further), signals, held)
 
 
 def extension_of(model: EquationModel, effect: Effect, number: int = 0) -> Extension:

@@ -5,28 +5,23 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, cached_property
+from functools import cached_property
 from types import MappingProxyType
 
 import numpy as np
 
 from autotune.arrays import BoolArray
-from autotune.controller import Controller
 from autotune.diagnosis.equations.bench import Bench, Outcome
 from autotune.diagnosis.equations.closed import ClosedBench
 from autotune.diagnosis.equations.equation_bench import EquationBench
 from autotune.diagnosis.equations.judged import Searched
 from autotune.diagnosis.equations.scores import slow_power
-from autotune.diagnosis.equations.search import search
 from autotune.diagnosis.equations.shown import EquationSearch
 from autotune.diagnosis.equations.sizes import command_of, spans_at, with_units
 from autotune.diagnosis.evidence.adequacy import ResidualTests
 from autotune.diagnosis.evidence.held_out import FitQuality
-from autotune.diagnosis.evidence.law import law_effect
 from autotune.diagnosis.evidence.misread import misread_columns
-from autotune.diagnosis.evidence.readings import struck
-from autotune.diagnosis.evidence.sample_gain import SimulatedRows, is_material, supported
-from autotune.diagnosis.evidence.samples import SampleEffect, inspect, outliers_in, spared, together
+from autotune.diagnosis.evidence.samples import SampleEffect, inspect
 from autotune.diagnosis.readable import in_commands, readable
 from autotune.diagnosis.result import FoundEffect, Verdict
 from autotune.diagnosis.safe_extension import safe_extension
@@ -34,7 +29,7 @@ from autotune.diagnosis.selection.judged import of_likely
 from autotune.diagnosis.selection.probability import Candidate, probability_of
 from autotune.diagnosis.thresholds import Thresholds
 from autotune.diagnosis.verdict import Evidence
-from autotune.effects import KINDS, kind_of
+from autotune.effects import kind_of
 from autotune.equations.black_box import BlackBox
 from autotune.equations.effects import equation_of
 from autotune.equations.files import forecast_any
@@ -42,7 +37,6 @@ from autotune.equations.linearise import settles
 from autotune.equations.model import EquationModel
 from autotune.errors import IdentificationError, InputError
 from autotune.models import Effect
-from autotune.progress import Progress, quiet
 from autotune.recording import Recording
 
 
@@ -125,8 +119,8 @@ class EquationEvidence(Evidence):
         if not set(found.taken.names) <= set(names):
             found = replace(found, taken=of_likely(found.judged, names))
         return replace(
-            self, samples=samples, found=found, quality_of=lambda: _quality(found, self.error_of, self.given),
-            residual=_left(found, samples),
+            self, samples=samples, found=found, quality_of=lambda: held_out_quality(found, self.error_of, self.given),
+            residual=residual_left(found, samples),
         )  # fmt: skip
 
     def on(self, part: Sequence[Recording]) -> tuple[EquationEvidence | None, Collection[str]]:
@@ -183,7 +177,7 @@ class EquationEvidence(Evidence):
             if not all(ok.any() for ok in good):
                 raise IdentificationError("no reading counts")  # a command that never moves is no reading
             bench = bench_of(self.model, changed, good)
-            return bench.held_out_error(bench.retuned(), True) / _spread(changed)
+            return bench.held_out_error(bench.retuned(), True) / spread_of(changed)
 
         return misread_columns(self.given, self.model.inputs[0].offset, self.quality, self.limits, error_of)
 
@@ -216,72 +210,21 @@ def bench_of(model: EquationModel | BlackBox, recordings: Sequence[Recording], g
     return bench
 
 
-def evidence_of_equations(
-    model: EquationModel | BlackBox,
-    recordings: Sequence[Recording],
-    controller: Controller | None,
-    without: Sequence[str],
-    progress: Progress,
-    limits: Thresholds,
-    begun: Outcome | None = None,
-) -> EquationEvidence:
-    """Return all that the verdict rests on: samples, search, the residual, held-out rows.
-
-    Parameters
-    ----------
-    model : EquationModel or BlackBox
-        The nominal model.
-    recordings : sequence of Recording
-        What was measured.
-    controller : Controller, optional
-        The law that u was computed by; the sidecars' by default.
-    without : sequence of str
-        Effects that are not looked for.
-    progress : callable
-        Told what is being done and the share done, 0 to 1.
-    limits : Thresholds
-        What decides between two findings.
-    begun : Outcome, optional
-        What predicted best on more rows: it is judged as well, from the numbers that it had there.
-
-    Raises
-    ------
-    InputError
-        A model that runs away.
-    """
-    own = {effect.name for effect in model.effects}
-    seen = _seen(model, recordings, [name for name in without if name not in own], limits)
-    bench, found, seen = _searched(model, recordings, seen, without, progress, limits, begun)
-    run = _rows_of(found.chosen, recordings, bench, limits)
-    samples = [s for s in supported(seen, run) if s.name not in own]
-    samples = [s for s in samples if not found.taken.names or is_material(s, run)]
-    law = law_effect(recordings, controller, limits)
-    samples += [] if law is None or law.name in without else [law]
-    error_of = cache(lambda one: bench.held_out_error(one, one is not found.nominal) / _spread(recordings))
-
-    def again(part: Sequence[Recording], known: Collection[str], begun: Outcome) -> EquationEvidence:
-        others = [*without, *(name for name in KINDS if name not in known)]
-        return evidence_of_equations(model, part, controller, others, quiet, limits, begun)
-
-    return EquationEvidence(
-        model=model, given=tuple(recordings), bench=bench, found=found, samples=tuple(samples),
-        residual=_left(found, samples), quality_of=cache(lambda: _quality(found, error_of, recordings)),
-        error_of=error_of, again=again,
-    )  # fmt: skip
-
-
-def _spread(recordings: Sequence[Recording]) -> float:
+def spread_of(recordings: Sequence[Recording]) -> float:
+    """Return the spread of y, which errors are shares of."""
     return float(np.nanstd(np.concatenate([r.y for r in recordings]))) or 1.0
 
 
-def _quality(found: Searched, error_of: Callable[[Outcome], float], recordings: Sequence[Recording]) -> FitQuality:
+def held_out_quality(
+    found: Searched, error_of: Callable[[Outcome], float], recordings: Sequence[Recording]
+) -> FitQuality:
     """Return errors on the last third of every recording, the numbers fitted to the rest."""
     nominal, retuned, extended = (error_of(one) for one in (found.nominal, found.retuned, found.chosen))
-    noise = found.noise.total_sd / _spread(recordings)
+    noise = found.noise.total_sd / spread_of(recordings)
     return FitQuality(nominal=nominal, retuned=retuned, extended=extended, noise_floor=noise)
 
 
-def _left(found: Searched, samples: Sequence[SampleEffect]) -> ResidualTests:
+def residual_left(found: Searched, samples: Sequence[SampleEffect]) -> ResidualTests:
     """Return what the chosen model leaves; noise of some rows may account for a little more than all rows' has."""
     ratio, chosen = found.variance_ratio(found.chosen), found.chosen
     slow, chance = slow_power(chosen, found.taken.noise)
@@ -290,61 +233,6 @@ def _left(found: Searched, samples: Sequence[SampleEffect]) -> ResidualTests:
         uneven=any(kind_of(s.name).uneven for s in samples),
         accounted=bool(samples) and ratio < found.limits.equation_astray, limits=found.limits,
     )  # fmt: skip
-
-
-def _rows_of(
-    outcome: Outcome, recordings: Sequence[Recording], bench: Bench, limits: Thresholds
-) -> SimulatedRows:  # fmt: skip
-    """Return the rows that a fit simulates."""
-    whole = [(np.zeros(1, dtype=np.int64), np.array([len(r)])) for r in recordings]
-    windows = [(w.starts, w.stops) for w in outcome.fitted.windows] or whole
-    return SimulatedRows(
-        recordings=tuple(recordings), good=tuple(np.isfinite(r.y) for r in bench.recordings),
-        starts=tuple(a for a, _ in windows), stops=tuple(b for _, b in windows),
-        simulated=outcome.fitted.simulated, limits=limits,
-    )  # fmt: skip
-
-
-def _seen(
-    model: EquationModel | BlackBox, recordings: Sequence[Recording], without: Sequence[str], limits: Thresholds
-) -> list[SampleEffect]:
-    """Return what the samples show where the retuned model speaks for it clearly, as for chains."""
-    good, seen = inspect(recordings, without, limits)
-    if not any(s.rows for s in seen):
-        return seen
-    bench = bench_of(model, recordings, good)
-    run = _rows_of(bench.retuned(), recordings, bench, limits)
-    return [s for s in supported(seen, run) if s.speaks > limits.samples_clear]
-
-
-def _searched(
-    model: EquationModel | BlackBox, recordings: Sequence[Recording], seen: list[SampleEffect],
-    without: Sequence[str], progress: Progress, limits: Thresholds, begun: Outcome | None,
-) -> tuple[Bench, Searched, list[SampleEffect]]:  # fmt: skip
-    """Return the search, and what the samples show; searched again without spikes that its residual alone shows.
-
-    Where the reading moves from row to row by as much as its spikes, it shows only the largest of them, or none.
-    """
-
-    def searched() -> tuple[Bench, Searched]:
-        good, names = spared(recordings, seen), [*without, *(s.name for s in seen)]
-        bench = bench_of(model, recordings, good)
-        return bench, search(bench, names, progress, limits, begun)
-
-    bench, found = searched()
-    run, name = _rows_of(found.chosen, recordings, bench, limits), "sensor.outliers"
-    known = [ok & np.isfinite(e) for ok, e in zip(run.good, run.residuals, strict=True)]
-    outliers = None if name in without else outliers_in(run.residuals, recordings, known, limits)
-    if outliers is None:
-        return bench, found, seen
-    beside = [struck(e, ok, limits.spike) for e, ok in zip(run.residuals, known, strict=True)]
-    outliers = replace(outliers, rows=tuple(a | b for a, b in zip(outliers.rows, beside, strict=True)))
-    before = [one for one in seen if one.name == name]
-    confirmed = supported([together([*before, outliers])], run)
-    if not confirmed:
-        return bench, found, seen
-    seen = [*(one for one in seen if one.name != name), *confirmed]
-    return (*searched(), seen)
 
 
 def _with_numbers(model: EquationModel | BlackBox, outcome: Outcome) -> EquationModel | BlackBox:

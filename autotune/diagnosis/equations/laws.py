@@ -28,11 +28,11 @@ from autotune.equations.effects import (
     where_of,
     with_values,
 )
-from autotune.equations.expressions import Expression, Name, Number, names_in, parse, substituted, to_text
-from autotune.equations.model import EquationModel, InputColumn, State
+from autotune.equations.expressions import Call, Expression, Name, Number, names_in, parse, substituted, to_text
+from autotune.equations.model import EquationModel, Extension, InputColumn, State
 from autotune.equations.parameter_scales import slopes_of
 from autotune.equations.simulate import compile_model, derivatives, drive_of, simulate
-from autotune.models import Effect, Parameter
+from autotune.models import Effect
 
 #: Name of the column that marks a bin's rows, and its size in sizes of the law: small, for the first order is asked.
 MARK, SMALL = "rows_of_a_bin", 0.05
@@ -247,14 +247,10 @@ def _traced_back(
 
 def _simulated(line: _Line, rows: list[BoolArray], size: float) -> FloatArray | None:
     """Return how readings at the rows that count change where a size is added at some rows of the effect's place."""
-    model, outcome, effect = line.bench.model, line.outcome, line.effect
+    model, outcome = line.bench.model, line.outcome
     marked = replace(model, inputs=(*model.inputs, InputColumn(column=MARK)))
-    place = {"input": where_of(effect) or model.columns[0]} if line.is_whole else {}
-    added = Effect(
-        name="environment.measured_input", parameters={"gain": Parameter(value=size)}, column=MARK,
-        state=effect.state, port=effect.port, **place,
-    )  # fmt: skip
-    compiled = compile_with(marked, (*outcome.effects, added))
+    added = _added(line, Call("*", (Number(size), Name(MARK))))
+    compiled = compile_with(marked, outcome.effects, further=[added])
     p = compiled.parameter_vector
     known = dict(zip([q.name for q in outcome.fitted.compiled.parameters], outcome.fitted.parameters, strict=True))
     p = np.array([known.get(q.name, value) for q, value in zip(compiled.parameters, p, strict=True)])
@@ -266,3 +262,13 @@ def _simulated(line: _Line, rows: list[BoolArray], size: float) -> FloatArray | 
         found.append((y - before)[np.isfinite(r.y)])
     change = np.concatenate(found)
     return change if np.all(np.isfinite(change)) else None
+
+
+def _added(line: _Line, tree: Expression) -> Extension:
+    """Return an expression added where an effect acts."""
+    effect, column = line.effect, where_of(line.effect) or line.bench.model.columns[0]
+    if line.is_whole:
+        return Extension(name=MARK, input={column: Call("+", (Name("value"), tree))})
+    if effect.port:
+        return Extension(name=MARK, port={effect.port: tree})
+    return Extension(name=MARK, derivative={effect.state: tree})

@@ -12,7 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from autotune.diagnosis import diagnose
-from autotune.diagnosis.equations.evidence import EquationEvidence, evidence_of_equations
+from autotune.diagnosis.equations.evidence import EquationEvidence
+from autotune.diagnosis.equations.gathering_equations import evidence_of_equations
 from autotune.diagnosis.findings import LEAST, consistent, found_effects
 from autotune.diagnosis.result import Diagnosis
 from autotune.diagnosis.selection.probability import Candidate
