@@ -29,7 +29,6 @@ from autotune.diagnosis.selection.probability import Candidate, probability_of, 
 from autotune.diagnosis.selection.searched import Search
 from autotune.diagnosis.simulation.chain import build_chain
 from autotune.diagnosis.simulation.forecast import forecast
-from autotune.diagnosis.thresholds import Thresholds
 from autotune.diagnosis.verdict import Evidence
 from autotune.effects import STRUCTURES, kind_of
 from autotune.errors import IdentificationError
@@ -68,16 +67,6 @@ class ChainEvidence(Evidence):
     def result(self) -> Search:
         """What the search found."""
         return self.search
-
-    @property
-    def limits(self) -> Thresholds:
-        """What decides between two findings."""
-        return self.search.data.thresholds
-
-    @property
-    def recordings(self) -> tuple[Recording, ...]:
-        """What was measured, as it was simulated."""
-        return self.search.data.recordings
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -46,18 +46,8 @@ def evidence_of(
 
     Parameters
     ----------
-    model : Model
-        The nominal chain.
-    recordings : sequence of Recording
-        What was measured.
-    controller : Controller, optional
-        The law that u was computed by; the sidecars' by default.
-    without : sequence of str
-        Effects that are not looked for.
-    progress : callable
-        Told what is being done and the share done, 0 to 1.
-    thresholds : Thresholds
-        What decides between two findings.
+    model, recordings, controller, without, progress, thresholds
+        As in :func:`autotune.diagnosis.diagnose.diagnose`.
     begun : JudgedChain, optional
         What predicted best on more rows: it is judged as well, with its odds, from the numbers that it had there.
     """

@@ -63,14 +63,14 @@ class Evidence(ABC):
         """What the search found, for pages and planning."""
 
     @property
-    @abstractmethod
     def limits(self) -> Thresholds:
         """What decides between two findings."""
+        return self.result.limits
 
     @property
-    @abstractmethod
     def recordings(self) -> tuple[Recording, ...]:
         """What was measured, as it was simulated."""
+        return self.result.recordings
 
     @property
     @abstractmethod

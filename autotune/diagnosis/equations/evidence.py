@@ -27,7 +27,6 @@ from autotune.diagnosis.result import FoundEffect, Verdict
 from autotune.diagnosis.safe_extension import safe_extension
 from autotune.diagnosis.selection.judged import of_likely
 from autotune.diagnosis.selection.probability import Candidate, probability_of
-from autotune.diagnosis.thresholds import Thresholds
 from autotune.diagnosis.verdict import Evidence
 from autotune.effects import kind_of
 from autotune.equations.black_box import BlackBox
@@ -50,8 +49,6 @@ class EquationEvidence(Evidence):
         The nominal model.
     given : tuple of Recording
         What was measured, rows that samples spoil among them.
-    bench : Bench
-        The model on the rows that count.
     found : Searched
         What the search found.
     error_of : callable
@@ -62,7 +59,6 @@ class EquationEvidence(Evidence):
 
     model: EquationModel | BlackBox
     given: tuple[Recording, ...]
-    bench: Bench
     found: Searched
     error_of: Callable[[Outcome], float]
     again: Callable[[Sequence[Recording], Collection[str], Outcome], EquationEvidence]
@@ -70,17 +66,7 @@ class EquationEvidence(Evidence):
     @cached_property
     def result(self) -> EquationSearch:
         """What the search found."""
-        return EquationSearch(model=self.model, recordings=self.given, bench=self.bench, found=self.found)
-
-    @property
-    def limits(self) -> Thresholds:
-        """What decides between two findings."""
-        return self.found.limits
-
-    @property
-    def recordings(self) -> tuple[Recording, ...]:
-        """What was measured."""
-        return self.given
+        return EquationSearch(model=self.model, recordings=self.given, found=self.found)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -136,7 +122,7 @@ class EquationEvidence(Evidence):
 
     def feels(self, effect: Effect) -> bool:
         """Whether an effect changes what is read by as much as one row's noise: of others these rows tell nothing."""
-        change = self.bench.with_trial(self.found.retuned, effect)
+        change = self.found.bench.with_trial(self.found.retuned, effect)
         return change is None or float(change @ change) > self.found.noise.total_sd**2
 
     def described(self) -> list[tuple[float, FoundEffect]]:
@@ -151,18 +137,18 @@ class EquationEvidence(Evidence):
         return described
 
     def _described(self, effect: Effect) -> FoundEffect:
-        named = with_units(self.bench.model, effect, self.model.output_unit)
+        named = with_units(self.found.bench.model, effect, self.model.output_unit)
         fitted = {k: q for k, q in named.parameters.items() if math.isfinite(q.sd) and q.sd != 0.0}
         shown = readable(replace(named, parameters=MappingProxyType(fitted or dict(named.parameters))))
-        command, unit = command_of(self.bench, self.found.chosen, effect), self.bench.model.inputs[0]
+        command, unit = command_of(self.found.bench, self.found.chosen, effect), self.found.bench.model.inputs[0]
         return FoundEffect(
             name=effect.name,
             probability=probability_of(effect.name, self.candidates, self.limits.most_probable),
             places=self.places(effect.name),
             parameters=MappingProxyType(shown),
-            equation=equation_of(self.bench.model, effect),
+            equation=equation_of(self.found.bench.model, effect),
             windows=self.acting(effect.name, {k: q.value for k, q in effect.parameters.items()}),
-            operating_range=spans_at(self.bench, self.found.chosen, effect),
+            operating_range=spans_at(self.found.bench, self.found.chosen, effect),
             as_command=MappingProxyType(in_commands(effect.name, shown, command, unit.unit) if command else {}),
             **{key: getattr(effect, key) for key in ("state", "port", "input", "column")},
         )

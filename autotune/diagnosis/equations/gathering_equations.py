@@ -44,18 +44,8 @@ def evidence_of_equations(
 
     Parameters
     ----------
-    model : EquationModel or BlackBox
-        The nominal model.
-    recordings : sequence of Recording
-        What was measured.
-    controller : Controller, optional
-        The law that u was computed by; the sidecars' by default.
-    without : sequence of str
-        Effects that are not looked for.
-    progress : callable
-        Told what is being done and the share done, 0 to 1.
-    limits : Thresholds
-        What decides between two findings.
+    model, recordings, controller, without, progress, limits
+        As in :func:`autotune.diagnosis.diagnose.diagnose`.
     begun : Outcome, optional
         What predicted best on more rows: it is judged as well, from the numbers that it had there.
 
@@ -70,26 +60,26 @@ def evidence_of_equations(
         bench = bench_of(model, recordings, good)
         return _rows_of(bench.retuned(), recordings, bench, limits)
 
-    def searched(seen: list[SampleEffect]) -> tuple[tuple[Bench, Searched], SimulatedRows]:
+    def searched(seen: list[SampleEffect]) -> tuple[Searched, SimulatedRows]:
         bench = bench_of(model, recordings, spared(recordings, seen))
         found = search(bench, [*without, *(s.name for s in seen)], progress, limits, begun)
-        return (bench, found), _rows_of(found.chosen, recordings, bench, limits)
+        return found, _rows_of(found.chosen, recordings, bench, limits)
 
     seen = clear_samples(recordings, [name for name in without if name not in own], limits, retuned_rows)
-    (bench, found), seen = searched_beside(searched, seen, without)
-    run = _rows_of(found.chosen, recordings, bench, limits)
+    found, seen = searched_beside(searched, seen, without)
+    run = _rows_of(found.chosen, recordings, found.bench, limits)
     samples = [s for s in supported(seen, run) if s.name not in own]
     samples = [s for s in samples if not found.taken.names or is_material(s, run)]
     law = law_effect(recordings, controller, limits)
     samples += [] if law is None or law.name in without else [law]
-    error_of = cache(lambda one: bench.held_out_error(one, one is not found.nominal) / spread_of(recordings))
+    error_of = cache(lambda one: found.bench.held_out_error(one, one is not found.nominal) / spread_of(recordings))
 
     def again(part: Sequence[Recording], known: Collection[str], begun: Outcome) -> EquationEvidence:
         others = [*without, *(name for name in KINDS if name not in known)]
         return evidence_of_equations(model, part, controller, others, quiet, limits, begun)
 
     return EquationEvidence(
-        model=model, given=tuple(recordings), bench=bench, found=found, samples=tuple(samples),
+        model=model, given=tuple(recordings), found=found, samples=tuple(samples),
         residual=residual_left(found, samples), quality_of=cache(lambda: held_out_quality(found, error_of, recordings)),
         error_of=error_of, again=again,
     )  # fmt: skip

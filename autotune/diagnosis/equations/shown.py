@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from autotune.arrays import FloatArray
-from autotune.diagnosis.equations.bench import Bench
 from autotune.diagnosis.equations.equation_bench import EquationBench
 from autotune.diagnosis.equations.held_out import HELD_OUT, bounded_errors
 from autotune.diagnosis.equations.judged import Searched
@@ -35,15 +34,12 @@ class EquationSearch:
         The nominal model.
     recordings : tuple of Recording
         What was measured.
-    bench : Bench
-        The model on them.
     found : Searched
         All hypotheses.
     """
 
     model: EquationModel | BlackBox
     recordings: tuple[Recording, ...]
-    bench: Bench
     found: Searched
 
     @property
@@ -112,27 +108,27 @@ class EquationSearch:
 
     def laws(self) -> tuple[MissingLaw, ...]:
         """Return the laws of the chosen effects over their signals, with the data in bins."""
-        if not isinstance(self.bench, EquationBench):
+        if not isinstance(self.found.bench, EquationBench):
             return ()
         chosen, own = self.found.chosen, len(self.model.effects)
-        found = (law_in_equations(self.bench, chosen, i) for i in range(own, len(chosen.effects)))
+        found = (law_in_equations(self.found.bench, chosen, i) for i in range(own, len(chosen.effects)))
         return tuple(law for law in found if law is not None)
 
     def unseen_run(self) -> UnseenRun | None:
         """Return runs through the last third of the longest recording, the numbers fitted to the rest of all."""
-        if not isinstance(self.bench, EquationBench):
+        if not isinstance(self.found.bench, EquationBench):
             return None
         number = int(np.argmax([len(r) for r in self.recordings]))
         fits = {"nominal": self.found.nominal, "retuned": self.found.retuned}
         fits |= {"extended": self.found.chosen} if self.has_effects else {}
-        found = {name: self.bench.held_out_runs(one, name != "nominal") for name, one in fits.items()}
+        found = {name: self.found.bench.held_out_runs(one, name != "nominal") for name, one in fits.items()}
         runs = {name: one[number] for name, one in found.items() if one}
         r = self.recordings[number]
         row = int((1.0 - HELD_OUT) * len(r))
         first = min((first for _, first in runs.values()), default=len(r))
         if first >= len(r):
             return None
-        y = self.bench.recordings[number].y
+        y = self.found.bench.recordings[number].y
         spread = float(np.nanstd(y[first:])) or 1.0
         errors = {name: bounded_errors(y, run, first) for name, (run, first) in runs.items()}
         return UnseenRun(
