@@ -10,13 +10,13 @@ from types import MappingProxyType
 
 import numpy as np
 
+from autotune.arrays import BoolArray
 from autotune.diagnosis.evidence.adequacy import residual_tests
 from autotune.diagnosis.evidence.description import Description, describe
 from autotune.diagnosis.evidence.held_out import held_out
 from autotune.diagnosis.evidence.misread import misread_columns
 from autotune.diagnosis.evidence.operating_point import unmoved
 from autotune.diagnosis.evidence.own_noise import OwnNoise
-from autotune.diagnosis.evidence.samples import inspect
 from autotune.diagnosis.extended import extended_model, with_uncertainty
 from autotune.diagnosis.fitting.retuning import prepare, under_noise
 from autotune.diagnosis.readable import in_commands, readable
@@ -31,7 +31,6 @@ from autotune.diagnosis.simulation.chain import build_chain
 from autotune.diagnosis.simulation.forecast import forecast
 from autotune.diagnosis.verdict import Evidence
 from autotune.effects import STRUCTURES, kind_of
-from autotune.errors import IdentificationError
 from autotune.models import Effect, Model, Parameter
 from autotune.recording import Recording
 
@@ -207,16 +206,12 @@ class ChainEvidence(Evidence):
 
     def misread_columns(self) -> str:
         """Say what is wrong with the columns, where the model then explains the recordings."""
-        limits = self.limits
 
-        def error_of(changed: Sequence[Recording]) -> float:
-            good, _ = inspect(changed, (), limits)
-            if not all(ok.any() for ok in good):
-                raise IdentificationError("no reading counts")  # a command that never moves is no reading
-            data, retuned = prepare(self.model, changed, good, limits)
+        def error_of(changed: Sequence[Recording], good: Sequence[BoolArray]) -> float:
+            data, retuned = prepare(self.model, changed, good, self.limits)
             return held_out(retuned, data).retuned
 
-        return misread_columns(self.measured, self.model.input.offset, self.quality, limits, error_of)
+        return misread_columns(self.measured, self.model.input.offset, self.quality, self.limits, error_of)
 
     @property
     def measured(self) -> tuple[Recording, ...]:

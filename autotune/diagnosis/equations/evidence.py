@@ -21,7 +21,7 @@ from autotune.diagnosis.equations.sizes import command_of, spans_at, with_units
 from autotune.diagnosis.evidence.adequacy import ResidualTests
 from autotune.diagnosis.evidence.held_out import FitQuality
 from autotune.diagnosis.evidence.misread import misread_columns
-from autotune.diagnosis.evidence.samples import SampleEffect, inspect
+from autotune.diagnosis.evidence.samples import SampleEffect
 from autotune.diagnosis.readable import in_commands, readable
 from autotune.diagnosis.result import FoundEffect, Verdict
 from autotune.diagnosis.safe_extension import safe_extension
@@ -34,7 +34,7 @@ from autotune.equations.effects import equation_of
 from autotune.equations.files import forecast_any
 from autotune.equations.linearise import settles
 from autotune.equations.model import EquationModel
-from autotune.errors import IdentificationError, InputError
+from autotune.errors import InputError
 from autotune.models import Effect
 from autotune.recording import Recording
 
@@ -158,10 +158,7 @@ class EquationEvidence(Evidence):
         if self.model.columns[0] != "u":
             return ""
 
-        def error_of(changed: Sequence[Recording]) -> float:
-            good, _ = inspect(changed, (), self.limits)
-            if not all(ok.any() for ok in good):
-                raise IdentificationError("no reading counts")  # a command that never moves is no reading
+        def error_of(changed: Sequence[Recording], good: Sequence[BoolArray]) -> float:
             bench = bench_of(self.model, changed, good)
             return bench.held_out_error(bench.retuned(), True) / spread_of(changed)
 

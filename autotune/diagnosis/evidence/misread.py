@@ -7,7 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from autotune.arrays import BoolArray
 from autotune.diagnosis.evidence.held_out import FitQuality
+from autotune.diagnosis.evidence.samples import inspect
 from autotune.diagnosis.thresholds import Thresholds
 from autotune.errors import AutotuneError
 from autotune.recording import Recording
@@ -18,7 +20,7 @@ def misread_columns(
     centre: float,
     quality: FitQuality,
     limits: Thresholds,
-    error_of: Callable[[Sequence[Recording]], float],
+    error_of: Callable[[Sequence[Recording], Sequence[BoolArray]], float],
 ) -> str:
     """Say what is wrong with the columns, where a model without further physics then explains the recordings.
 
@@ -33,7 +35,8 @@ def misread_columns(
     limits : Thresholds
         What decides.
     error_of : callable
-        Returns the held-out error of the model, retuned to other recordings, as a share of the spread of y.
+        Returns the held-out error of the model, retuned to other recordings of whose rows some count, as a share of the
+        spread of y.
 
     Returns
     -------
@@ -54,7 +57,10 @@ def misread_columns(
     }
     for what, changed in readings.items():
         try:
-            error = error_of(changed)
+            good, _ = inspect(changed, (), limits)
+            if not all(ok.any() for ok in good):  # a command that never moves is no reading
+                continue
+            error = error_of(changed, good)
         except (AutotuneError, OverflowError, np.linalg.LinAlgError):
             continue
         if 2.0 * error**2 < min(1.0, quality.retuned**2) and error < (1.0 + limits.material) * quality.extended:
