@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 
 from autotune.arrays import BoolArray
 from autotune.controller import Controller
@@ -64,16 +64,8 @@ def evidence_of(
         recordings, late = evened(model, recordings, thresholds)
     own = {effect.name for effect in model.effects}
 
-    def retuned_rows(good: Sequence[BoolArray]) -> SimulatedRows | None:
-        try:
-            data, retuned = prepare(model, recordings, good, thresholds)
-        except RUNAWAY:
-            return None
-        return rows_of(retuned, data)
-
-    def searched(seen: list[SampleEffect]) -> tuple[tuple[Search, Found | None], SimulatedRows]:
-        return _searched(model, recordings, seen, without, progress, thresholds, begun)
-
+    retuned_rows = partial(_retuned_rows, model, recordings, thresholds)
+    searched = partial(_searched, model, recordings, without, progress, thresholds, begun)
     seen = clear_samples(recordings, [name for name in without if name not in own], thresholds, retuned_rows)
     (near, found), seen = searched_beside(searched, seen, without)
     seen = [s for s in seen if s.name not in own]
@@ -105,14 +97,25 @@ def evidence_of(
     return _with_found(evidence, found, without)
 
 
+def _retuned_rows(
+    model: Model, recordings: Sequence[Recording], limits: Thresholds, good: Sequence[BoolArray]
+) -> SimulatedRows | None:
+    """Return the rows that the retuned model simulates; nothing where it runs away."""
+    try:
+        data, retuned = prepare(model, recordings, good, limits)
+    except RUNAWAY:
+        return None
+    return rows_of(retuned, data)
+
+
 def _searched(
     model: Model,
     recordings: Sequence[Recording],
-    seen: list[SampleEffect],
     without: Sequence[str],
     progress: Progress,
     limits: Thresholds,
     begun: JudgedChain | None,
+    seen: list[SampleEffect],
 ) -> tuple[tuple[Search, Found | None], SimulatedRows]:
     """Return the retuned model near the noise, what was found beside it, and the rows that the best one simulates.
 

@@ -184,8 +184,8 @@ def _missing(known: _Evidence) -> tuple[Section, ...]:
             tables=(table,) if rows else (),
             details=(
                 "The dots are not computed from the curve: what the extended model leaves of the readings is traced"
-                " back through the linear chain to where the effect acts, bin by bin of its signal, and added to the"
-                " curve (component plus residual); the other numbers are held.",
+                " back through the model, to first order, to where the effect acts, bin by bin of its signal, and added"
+                " to the curve (component plus residual); the other numbers are held.",
             )
             if figures
             else (),
