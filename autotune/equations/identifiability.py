@@ -12,11 +12,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from autotune.arrays import BoolArray, FloatArray
+from autotune.arrays import FloatArray
 from autotune.equations.fit_data import Fitted
 
 #: A parameter belongs to a combination where its share of the direction's length is at least this.
 _SHARE = 0.2
+#: Width of the belief that recordings leave, over that before, from which on a combination is not determined.
+LEFT = 0.5
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,21 +51,29 @@ class Combination:
         return f"the recordings do not determine {names} apart: {moves} leaves the simulation as it is"
 
 
-def combinations(fitted: Fitted) -> list[Combination]:
-    """Return all directions of the parameters that were retuned, the least determined first."""
-    which = np.flatnonzero(np.any(fitted.jacobian != 0.0, axis=0) | _retuned(fitted))
-    parameters = [fitted.compiled.parameters[i] for i in which]
-    J = fitted.jacobian[:, which]
-    return directions(J.T @ J, np.array([p.spread for p in parameters]), [p.name for p in parameters])
+def combinations(fitted: Fitted, own: int | None = None) -> list[Combination]:
+    """Return all directions of the parameters that were retuned, the least determined first.
+
+    Parameters
+    ----------
+    fitted : Fitted
+        The fit.
+    own : int, optional
+        How many of its parameters are the model's own ones, whatever else was fitted beside; all by default.
+    """
+    parameters, J = fitted.compiled.parameters[:own], fitted.jacobian
+    moved = [i for i, p in enumerate(parameters) if p.spread > 0.0]
+    believed = np.asarray(np.linalg.inv(J.T @ J + np.eye(J.shape[1])), dtype=np.float64)[np.ix_(moved, moved)]
+    return determined(believed, np.array([parameters[i].spread for i in moved]), [parameters[i].name for i in moved])
 
 
-def directions(information: FloatArray, spread: FloatArray, names: Sequence[str]) -> list[Combination]:
+def determined(believed: FloatArray, spread: FloatArray, names: Sequence[str]) -> list[Combination]:
     """Return the directions of parameters by how well data determine them, the least determined first.
 
     Parameters
     ----------
-    information : (p, p) array
-        Of the data on the parameters, in units of their prior standard deviations.
+    believed : (p, p) array
+        Covariance of the parameters after the fit, in units of their prior standard deviations.
     spread : (p,) array
         Those standard deviations, relative.
     names : sequence of str
@@ -71,6 +81,7 @@ def directions(information: FloatArray, spread: FloatArray, names: Sequence[str]
     """
     if not names:
         return []
+    information = np.linalg.pinv(believed, hermitian=True) - np.eye(len(names))
     values, vectors = np.linalg.eigh(information)
     found = []
     for value, vector in zip(values, vectors.T, strict=True):
@@ -86,24 +97,6 @@ def directions(information: FloatArray, spread: FloatArray, names: Sequence[str]
     return found
 
 
-def determined(believed: FloatArray, spread: FloatArray, names: Sequence[str]) -> list[Combination]:
-    """Return the directions of parameters by how well data determine them, whatever else was fitted beside.
-
-    Parameters
-    ----------
-    believed : (p, p) array
-        Covariance of the parameters after the fit, in units of their prior standard deviations.
-    spread, names
-        As in :func:`directions`.
-    """
-    information = np.asarray(np.linalg.pinv(believed, hermitian=True), dtype=np.float64) - np.eye(len(names))
-    return directions(information, spread, names)
-
-
-def undetermined(found: Sequence[Combination], narrowed: float = 0.5) -> list[Combination]:
-    """Return the combinations along which the recordings narrow the belief to no less than a share of it."""
-    return [one for one in found if one.narrowed >= narrowed]
-
-
-def _retuned(fitted: Fitted) -> BoolArray:
-    return np.array([p.spread > 0.0 for p in fitted.compiled.parameters])
+def undetermined(found: Sequence[Combination]) -> list[Combination]:
+    """Return the combinations along which the recordings hardly narrow the belief."""
+    return [one for one in found if one.narrowed >= LEFT]

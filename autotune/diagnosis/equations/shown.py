@@ -18,7 +18,7 @@ from autotune.diagnosis.selection.retuned_numbers import RetunedNumber
 from autotune.diagnosis.thresholds import Thresholds
 from autotune.equations.black_box import BlackBox
 from autotune.equations.effects import where_told
-from autotune.equations.identifiability import Combination, determined
+from autotune.equations.identifiability import Combination, combinations
 from autotune.equations.model import EquationModel
 from autotune.models import Block, Model, Port, TransferFunction
 from autotune.recording import Recording
@@ -93,11 +93,7 @@ class EquationSearch:
 
     def combinations(self) -> list[Combination]:
         """Return the directions of the numbers by how well the recordings determine them, the least first."""
-        J = self.found.chosen.fitted.jacobian
-        moved = [i for i, p in enumerate(self.model.parameters) if p.spread > 0.0]
-        believed = np.asarray(np.linalg.inv(J.T @ J + np.eye(J.shape[1])), dtype=np.float64)[np.ix_(moved, moved)]
-        parameters = [self.model.parameters[i] for i in moved]
-        return determined(believed, np.array([p.spread for p in parameters]), [p.name for p in parameters])
+        return combinations(self.found.chosen.fitted, len(self.model.parameters))
 
     def hypotheses(self) -> list[tuple[str, float]]:
         """Return what was fitted to all rows with the decrease of chi-square, numbers paid for, the best first."""
