@@ -17,16 +17,13 @@ from autotune.recording import Recording
 def diagnosed(model: Any, recordings: Sequence[Recording], controller: Controller | None, **settings: Any) -> Any:
     """Return the diagnosis of recordings."""
     from autotune.diagnosis import diagnose
-    from autotune.diagnosis.equations import diagnose_equations
     from autotune.equations.recorded_units import require_units_of_each_other, require_units_of_model
 
     given = _model(model)
     asked = settings_of(diagnose, settings, where="diagnose", of=("without", "progress", "thresholds"))
     require_units_of_model(given, recordings)
     require_units_of_each_other(recordings)
-    if isinstance(given, Model):
-        return diagnose(given, recordings, controller, **asked)
-    return diagnose_equations(given, recordings, controller=controller, **asked)
+    return diagnose(given, recordings, controller, **asked)
 
 
 def simulated(model: Any, recording: Recording, horizon_s: float | None) -> FloatArray:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -19,8 +18,6 @@ OUTSIDE = 0.05
 
 if TYPE_CHECKING:
     from autotune.arrays import FloatArray
-    from autotune.equations import EquationModel
-    from autotune.equations.black_box import BlackBox
     from autotune.models import Model
     from autotune.recording import Recording
 
@@ -134,11 +131,10 @@ def diagnose(
 
     from autotune.controller import read_controller
     from autotune.diagnosis.diagnose import diagnose as find
-    from autotune.effects import kind_of
+    from autotune.equations.files import write_any
     from autotune.equations.recorded_units import require_units_of_model
     from autotune.experiment_design.next_experiment import with_next_experiment
     from autotune.model_file import read_any as read_any_model
-    from autotune.models import Model, write_model
     from autotune.report.diagnosis_page import write_diagnosis_page
 
     files = ("diagnosis.json", "extended_model.toml", "report.html")
@@ -146,9 +142,6 @@ def diagnose(
     nominal = read_any_model(model)
     data = read_all(recordings, signal_names(t, u, y, r))
     require_units_of_model(nominal, data)
-    if not isinstance(nominal, Model):
-        _diagnose_equations(nominal, data, controller, without or (), place, out, model)
-        return
     law = None if controller is None else read_controller(controller)
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
     # many short products: waiting for each other costs linear algebra's threads more than they save
@@ -163,58 +156,12 @@ def diagnose(
                 lambda what, share: progress.update(task, description=what, completed=share),
             )
         )
-    equations = {effect.name: kind_of(effect.name).equation for effect in found.extended_model.effects}
     with place.filled() as folder:
         found.write(folder / "diagnosis.json")
-        write_model(found.extended_model, folder / "extended_model.toml", equations)
+        write_any(found.extended_model, folder / "extended_model.toml", base=model.parent)
         write_diagnosis_page(found, folder / "report.html", law)
     for sentence in found.sentences:
         typer.echo(sentence)
     if found.description is not None:
         typer.echo(found.description.sentence)
-    typer.echo(f"diagnosis.json, extended_model.toml and report.html are in {out}")
-
-
-def _diagnose_equations(
-    nominal: EquationModel | BlackBox,
-    data: Sequence[Recording],
-    controller: Path | None,
-    without: Sequence[str],
-    place: OutputFolder,
-    out: Path,
-    model: Path,
-) -> None:
-    """Diagnose a model of equations and write its files."""
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
-    from threadpoolctl import threadpool_limits
-
-    from autotune.controller import read_controller
-    from autotune.diagnosis.equations import diagnose_equations
-    from autotune.equations.effects import equation_of
-    from autotune.equations.files import write_any
-    from autotune.experiment_design.in_equations import with_next_experiment_in_equations
-    from autotune.report.equations_page import write_equations_page
-
-    law = None if controller is None else read_controller(controller)
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
-    with threadpool_limits(1), Progress(*columns, console=Console(stderr=True), transient=True) as progress:
-        task = progress.add_task("diagnosing", total=1.0)
-        found = with_next_experiment_in_equations(
-            diagnose_equations(
-                nominal,
-                data,
-                without,
-                lambda what, share: progress.update(task, description=what, completed=share),
-                law,
-            )
-        )
-    with place.filled() as folder:
-        found.write(folder / "diagnosis.json")
-        extended = found.extended_model
-        written = {e.name: equation_of(found.equations, e) for e in extended.effects}
-        write_any(extended, folder / "extended_model.toml", written, model.parent)
-        write_equations_page(found, folder / "report.html")
-    for sentence in found.sentences:
-        typer.echo(sentence)
     typer.echo(f"diagnosis.json, extended_model.toml and report.html are in {out}")

@@ -83,8 +83,7 @@ def investigate(
 
 def _keep(known: Investigation, out: Path) -> None:
     """Write what is known so far; a later stop leaves it there."""
-    from autotune.effects import kind_of
-    from autotune.models import write_model
+    from autotune.equations.files import write_any
     from autotune.report.investigation_page import write_investigation_page
 
     write_whole(out / ROUNDS, json.dumps(known.as_json(), indent=2) + "\n")
@@ -92,6 +91,5 @@ def _keep(known: Investigation, out: Path) -> None:
     if found is None:
         return
     found.write(out / "diagnosis.json")
-    equations = {effect.name: kind_of(effect.name).equation for effect in found.extended_model.effects}
-    write_model(found.extended_model, out / "extended_model.toml", equations)
+    write_any(found.extended_model, out / "extended_model.toml")
     write_investigation_page(known, found, out / "report.html")

@@ -138,8 +138,7 @@ def _configuration(config: Path | None, out: Path | None, resume: Path | None, d
 
 def _diagnosed(config: Config, tuning: Tuning, folder: Path, console: Console) -> Diagnosis | None:
     """Return what the fitted plant leaves out, its files written; None where the recordings do not allow it."""
-    from autotune.effects import kind_of
-    from autotune.models import write_model
+    from autotune.equations.files import write_any
     from autotune.pipeline.folder import RESULT, VERIFICATION, recordings
     from autotune.pipeline.mismatch import diagnose_run
     from autotune.pipeline.result import append_diagnosis
@@ -156,8 +155,7 @@ def _diagnosed(config: Config, tuning: Tuning, folder: Path, console: Console) -
     place = folder / "diagnosis"
     place.mkdir(exist_ok=True)
     found.write(place / "diagnosis.json")
-    equations = {effect.name: kind_of(effect.name).equation for effect in found.extended_model.effects}
-    write_model(found.extended_model, place / "extended_model.toml", equations)
+    write_any(found.extended_model, place / "extended_model.toml")
     write_diagnosis_page(found, place / "report.html")
     append_diagnosis(folder / RESULT, found)
     return found

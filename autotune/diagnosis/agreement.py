@@ -65,7 +65,11 @@ def parts_of(recordings: Sequence[Recording], least_rows: int) -> tuple[Part, ..
 
 
 def agreement(
-    whole: Mapping[str, float], begins: Begins, parts: Sequence[Part], said: Callable[[Part], Mapping[str, float]]
+    whole: Mapping[str, float],
+    begins: Begins,
+    parts: Sequence[Part],
+    said: Callable[[Part], Mapping[str, float]],
+    least: float = NAMED,
 ) -> Mapping[str, float]:
     """Return the effects that are likelier than not, with their probabilities.
 
@@ -79,11 +83,13 @@ def agreement(
         What is diagnosed again.
     said : callable
         Returns the probabilities by a part, NaN of an effect that it cannot tell.
+    least : float
+        Mean from which on an effect is returned.
 
     Returns
     -------
     mapping of str to float
-        The geometric mean over all rows and the parts that tell of an effect, where it is at least a half: what a part
+        The geometric mean over all rows and the parts that tell of an effect, where it is at least so much: what a part
         contradicts is not named, however sure the others are.
 
     References
@@ -97,6 +103,6 @@ def agreement(
         all_said = [whole, *(one for part, one in heard if part.tells(begins.get(name, ())))]
         told = [max(p, LEAST) for p in (one.get(name, 0.0) for one in all_said) if not math.isnan(p)]
         mean = float(np.exp(np.mean(np.log(told))))
-        if mean >= NAMED:
+        if mean >= least:
             agreed[name] = mean
     return agreed

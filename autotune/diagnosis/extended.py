@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 from types import MappingProxyType
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,9 +16,11 @@ from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import Fit
 from autotune.diagnosis.result import Verdict
 from autotune.diagnosis.selection.hypothesis import Hypothesis
-from autotune.diagnosis.verdict import Evidence
 from autotune.effects import kind_of
 from autotune.models import Effect, Model, Parameter
+
+if TYPE_CHECKING:
+    from autotune.diagnosis.chain_evidence import ChainEvidence
 
 #: Places beyond a recorded range at which a law is looked at.
 _LOOKED = 51
@@ -52,9 +55,9 @@ def with_uncertainty(h: Hypothesis, effects: tuple[Effect, ...]) -> tuple[Effect
     return tuple(result)
 
 
-def extended_model(evidence: Evidence, verdict: Verdict, nominal: Model) -> Model:
-    """Return the model to go on with: the nominal one where nothing is missing, else what explains more."""
-    found = evidence.search
+def extended_model(evidence: ChainEvidence, verdict: Verdict) -> Model:
+    """Return the chain to go on with: the nominal one where nothing is missing, else what explains more."""
+    found, nominal = evidence.search, evidence.model
     named = evidence.quality.is_better and verdict in ("effect", "unexplained")
     use = found.chosen if named else found.retuned
     searched = evidence.found
@@ -72,10 +75,11 @@ def extended_model(evidence: Evidence, verdict: Verdict, nominal: Model) -> Mode
             if e.name in own or not kind_of(e.name).at_a_time or (holds and not kind_of(e.name).is_event)
         )
         extended = replace(extended, effects=lasting)
+    simulated = [signals[:, 0] for signals in use.fit.signals]
     ends = [
         Effect(name=s.name, parameters=s.parameters)
         for s in evidence.samples
-        if kind_of(s.name).late_stamps or is_nearer(s, use.fit, evidence.limits.rounding)
+        if kind_of(s.name).late_stamps or is_nearer(s, simulated, use.fit.residuals, evidence.limits.rounding)
     ]
     if extended is nominal and not ends:
         return nominal

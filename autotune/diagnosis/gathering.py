@@ -1,36 +1,35 @@
-"""All that recordings show: what samples show, what a search finds, and what is beside the chain."""
+"""All that recordings show of a chain: samples, what a search finds, and what is beside it."""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import replace
+from functools import cache, partial
 
-import numpy as np
-
+from autotune.arrays import BoolArray
 from autotune.controller import Controller
+from autotune.diagnosis.chain_evidence import ChainEvidence
 from autotune.diagnosis.evidence.adequacy import residual_tests
 from autotune.diagnosis.evidence.beside_chain import beside_chain
 from autotune.diagnosis.evidence.held_out import held_out
 from autotune.diagnosis.evidence.late_rows import JITTER, late_rows
 from autotune.diagnosis.evidence.operating_point import offset_of, unmoved
 from autotune.diagnosis.evidence.own_noise import own_noise
-from autotune.diagnosis.evidence.sample_gain import is_material, supported
-from autotune.diagnosis.evidence.samples import SampleEffect, inspect, outliers_in, spared
+from autotune.diagnosis.evidence.sample_gain import SimulatedRows, is_material, rows_of, supported
+from autotune.diagnosis.evidence.samples import SampleEffect, spared
+from autotune.diagnosis.evidence.spoiled_rows import clear_samples, searched_beside
 from autotune.diagnosis.evidence.stamps import evened
-from autotune.diagnosis.findings import OFFSET
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import RUNAWAY, Fit
 from autotune.diagnosis.fitting.retuning import at_nominal, prepare, under_noise
 from autotune.diagnosis.selection.hypothesis import Hypothesis
-from autotune.diagnosis.selection.judged import of_likely
-from autotune.diagnosis.selection.judged_chain import Found, JudgedChain, at_both_scales
+from autotune.diagnosis.selection.judged_chain import Found, JudgedChain
 from autotune.diagnosis.selection.search import search
 from autotune.diagnosis.selection.searched import Search
 from autotune.diagnosis.thresholds import Thresholds
-from autotune.diagnosis.verdict import Evidence
-from autotune.effects import kind_of
+from autotune.effects import KINDS, kind_of
 from autotune.models import Model
-from autotune.progress import Progress
+from autotune.progress import Progress, quiet
 from autotune.recording import Recording
 
 
@@ -42,35 +41,33 @@ def evidence_of(
     progress: Progress,
     thresholds: Thresholds,
     begun: JudgedChain | None = None,
-) -> Evidence:
+) -> ChainEvidence:
     """Return all that the verdict rests on: samples, search, what is beside the chain, the residual, held-out rows.
 
     Parameters
     ----------
-    model : Model
-        The nominal chain.
-    recordings : sequence of Recording
-        What was measured.
-    controller : Controller, optional
-        The law that u was computed by; the sidecars' by default.
-    without : sequence of str
-        Effects that are not looked for.
-    progress : callable
-        Told what is being done and the share done, 0 to 1.
-    thresholds : Thresholds
-        What decides between two findings.
+    model, recordings, controller, without, progress, thresholds
+        As in :func:`autotune.diagnosis.diagnose.diagnose`.
     begun : JudgedChain, optional
         What predicted best on more rows: it is judged as well, with its odds, from the numbers that it had there.
     """
-    without = [*without, *unmoved(model, recordings)]
+    given, without = without, [*without, *unmoved(model, recordings)]
+
+    def again(part: Sequence[Recording], known: Collection[str], begun: JudgedChain | None) -> ChainEvidence:
+        others = [*given, *(name for name in KINDS if name not in known)]
+        return evidence_of(model, part, controller, others, quiet, thresholds, begun)
+
     progress("looking at the samples", 0.0)
     if any(kind_of(effect.name).late_stamps for effect in model.effects):
         recordings, late = [r.at_even_times() for r in recordings], None
     else:
         recordings, late = evened(model, recordings, thresholds)
     own = {effect.name for effect in model.effects}
-    seen = _seen(model, recordings, [name for name in without if name not in own], thresholds)
-    near, found, seen = _searched(model, recordings, seen, without, progress, thresholds, begun)
+
+    retuned_rows = partial(_retuned_rows, model, recordings, thresholds)
+    searched = partial(_searched, model, recordings, without, progress, thresholds, begun)
+    seen = clear_samples(recordings, [name for name in without if name not in own], thresholds, retuned_rows)
+    (near, found), seen = searched_beside(searched, seen, without)
     seen = [s for s in seen if s.name not in own]
     progress("checking on held-out rows", 0.9)
 
@@ -79,12 +76,14 @@ def evidence_of(
         return others if late is None else [late, *(s for s in others if s.name != late.name)]
 
     retuned, data = near.retuned.fit, near.data
-    samples = (*supported(seen, retuned, data), *beside(retuned, data))
-    evidence = Evidence(
+    samples = (*supported(seen, rows_of(retuned, data)), *beside(retuned, data))
+    evidence = ChainEvidence(
+        model=model,
+        again=again,
         search=near,
         samples=samples,
         residual=residual_tests(retuned, data, uneven=any(kind_of(s.name).uneven for s in samples)),
-        quality=held_out(retuned, data),
+        quality_of=cache(lambda: held_out(retuned, data)),
         offset=None if unmoved(model, recordings) else offset_of(retuned, thresholds.offset_sigmas),
         evened=late is not None,
     )
@@ -92,68 +91,49 @@ def evidence_of(
         return evidence  # noise of some rows explains all: it disturbs commands too, and beside it nothing is named
     if found.chosen.names:
         chosen = found.chosen.fit, found.chosen.data
-        samples = (*supported(seen, *chosen), *beside(chosen[0], under_noise(*chosen)))
-        evidence = replace(evidence, samples=tuple(s for s in samples if is_material(s, *chosen)))
+        rows = rows_of(*chosen)
+        samples = (*supported(seen, rows), *beside(chosen[0], under_noise(*chosen)))
+        evidence = replace(evidence, samples=tuple(s for s in samples if is_material(s, rows)))
     return _with_found(evidence, found, without)
 
 
-def _seen(
-    model: Model, recordings: Sequence[Recording], without: Sequence[str], limits: Thresholds
-) -> list[SampleEffect]:
-    """Return what the samples show where the retuned model speaks for it clearly.
-
-    Rows at rest and turning points at one level are readings like any other: what spoils none leaves them to the fits.
-    """
-    good, seen = inspect(recordings, without, limits)
-    if not any(s.rows for s in seen):
-        return seen
+def _retuned_rows(
+    model: Model, recordings: Sequence[Recording], limits: Thresholds, good: Sequence[BoolArray]
+) -> SimulatedRows | None:
+    """Return the rows that the retuned model simulates; nothing where it runs away."""
     try:
         data, retuned = prepare(model, recordings, good, limits)
     except RUNAWAY:
-        return seen
-    return [s for s in supported(seen, retuned, data) if s.speaks > limits.samples_clear]
+        return None
+    return rows_of(retuned, data)
 
 
 def _searched(
     model: Model,
     recordings: Sequence[Recording],
-    seen: list[SampleEffect],
     without: Sequence[str],
     progress: Progress,
     limits: Thresholds,
     begun: JudgedChain | None,
-) -> tuple[Search, Found | None, list[SampleEffect]]:
-    """Return the retuned model near the noise, what was found beside it, and what the samples show.
+    seen: list[SampleEffect],
+) -> tuple[tuple[Search, Found | None], SimulatedRows]:
+    """Return the retuned model near the noise, what was found beside it, and the rows that the best one simulates.
 
-    Searched again without spikes that the residual alone shows. Nothing is found where every simulation runs away.
+    Nothing is found where every simulation runs away.
     """
-
-    def searched() -> tuple[Search, Found | None]:
-        good, names = spared(recordings, seen), [*without, *(effect.name for effect in seen)]
-        progress("retuning", 0.0)
-        data, retuned = prepare(model, recordings, good, limits)
-        alone = Hypothesis(names=(), fit=retuned)
-        near = Search(data=data, nominal=at_nominal(retuned, data), retuned=alone, chosen=alone)
-        try:
-            return near, search(model, recordings, good, names, progress, limits, begun)
-        except RUNAWAY:
-            return near, None
-
-    near, found = searched()
-    if "sensor.outliers" in without or any(s.name == "sensor.outliers" for s in seen):
-        return near, found, seen
-    data, chosen = (near.data, near.retuned.fit) if found is None else (found.chosen.data, found.chosen.fit)
-    left = [r.y - signals[:, 0] for r, signals in zip(data.recordings, chosen.signals, strict=True)]
-    good = [g & np.isfinite(e) for g, e in zip(data.good, left, strict=True)]
-    outliers = outliers_in(left, recordings, good, limits)
-    confirmed = [] if outliers is None else supported([outliers], chosen, data)
-    if not confirmed:
-        return near, found, seen
-    seen = [*seen, *confirmed]
-    return *searched(), seen
+    good, names = spared(recordings, seen), [*without, *(effect.name for effect in seen)]
+    progress("retuning", 0.0)
+    data, retuned = prepare(model, recordings, good, limits)
+    alone = Hypothesis(names=(), fit=retuned)
+    near = Search(data=data, nominal=at_nominal(retuned, data), retuned=alone, chosen=alone)
+    try:
+        found = search(model, recordings, good, names, progress, limits, begun)
+    except RUNAWAY:
+        return (near, None), rows_of(retuned, data)
+    return (near, found), rows_of(found.chosen.fit, found.chosen.data)
 
 
-def _with_found(evidence: Evidence, found: Found, without: Sequence[str]) -> Evidence:
+def _with_found(evidence: ChainEvidence, found: Found, without: Sequence[str]) -> ChainEvidence:
     """Return the evidence with what a search found; as it was where what is left needs no effect."""
     chosen, near = found.chosen, evidence.search
     if not chosen.leaves_noise and (late := _late_rows(evidence, found.gained, without)) is not None:
@@ -168,29 +148,14 @@ def _with_found(evidence: Evidence, found: Found, without: Sequence[str]) -> Evi
     if chosen.names and chosen.leaves_noise:
         residual = residual_tests(chosen.fit, under_noise(chosen.fit, chosen.data), uneven=residual.uneven)
         offset = offset_of(chosen.fit, limits.offset_sigmas)
-    quality = found.quality(evidence.quality.noise_floor)
-    return replace(evidence, search=found.as_search(), residual=residual, quality=quality, offset=offset, found=found)
+    floor = evidence.quality.noise_floor
+    return replace(
+        evidence, search=found.as_search(), residual=residual, quality_of=lambda: found.quality(floor), offset=offset,
+        found=found,
+    )  # fmt: skip
 
 
-def keeping(evidence: Evidence, names: Collection[str]) -> Evidence:
-    """Return the evidence with no other effects than those named: the hypothesis of them that was fitted."""
-    samples = tuple(s for s in evidence.samples if s.name in names)
-    evidence = replace(evidence, samples=samples, offset=evidence.offset if OFFSET in names else None)
-    found = evidence.found
-    if found is None or evidence.own is not None:
-        return evidence
-    best = of_likely(found.judged, names)
-    if best.names == found.chosen.names:
-        return evidence
-    left, residual = at_both_scales(best, found.judged).spread_out() if best.names else found.retuned, evidence.residual
-    if found.chosen.leaves_noise or left.leaves_noise:
-        residual = residual_tests(left.fit, under_noise(left.fit, left.data), uneven=residual.uneven)
-    found = replace(found, chosen=left)
-    quality = found.quality(evidence.quality.noise_floor)
-    return replace(evidence, search=found.as_search(), residual=residual, quality=quality, found=found)
-
-
-def _late_rows(evidence: Evidence, gained: float, without: Sequence[str]) -> Evidence | None:
+def _late_rows(evidence: ChainEvidence, gained: float, without: Sequence[str]) -> ChainEvidence | None:
     """Return the evidence where rows that are late, and their commands with them, explain more than effects gained."""
     excluded = {name for s in evidence.samples for name in kind_of(s.name).excludes}
     if evidence.evened or evidence.residual.is_noise or JITTER in (*without, *excluded):

@@ -1,21 +1,28 @@
-"""What a diagnosis says: the fields of diagnosis.json as frozen data."""
+"""What a diagnosis says: the fields of diagnosis.json as frozen data, of chains, equations and closed models alike."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Literal, TypeAlias
+from typing import Any, Literal, Protocol, TypeAlias
 
 import numpy as np
 
+from autotune.arrays import FloatArray
 from autotune.diagnosis.evidence.adequacy import ResidualTests
 from autotune.diagnosis.evidence.description import Description
 from autotune.diagnosis.evidence.held_out import FitQuality
+from autotune.diagnosis.evidence.missing_law import MissingLaw
+from autotune.diagnosis.evidence.unseen_run import UnseenRun
 from autotune.diagnosis.selection.probability import Candidate
-from autotune.diagnosis.selection.searched import Search
+from autotune.diagnosis.selection.retuned_numbers import RetunedNumber
+from autotune.diagnosis.thresholds import Thresholds
+from autotune.equations.files import AnyModel
+from autotune.equations.identifiability import Combination, undetermined
 from autotune.models import Model, Parameter
+from autotune.recording import Recording
 
 Verdict: TypeAlias = Literal["none", "parameters", "effect", "unexplained"]
 
@@ -27,11 +34,32 @@ class OperatingRange:
     signal: str
     low: float
     high: float
+    unit: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)
 class FoundEffect:
-    """An effect that was added to the model."""
+    """An effect that was added to the model.
+
+    Attributes
+    ----------
+    name, equation : str
+        Name in the catalogue, and what it does.
+    probability : float
+        That it is part of the truth, by all rows and by the parts that tell of it.
+    places : tuple of str
+        Where it may sit.
+    parameters : mapping of str to Parameter
+        Its numbers with units.
+    windows : tuple of (recording, t0, t1)
+        When it acts.
+    operating_range : OperatingRange, optional
+        Between which values of its signal it was seen.
+    state, port, input, column : str
+        Where it acts in equations, and the recorded column that it is of.
+    as_command : mapping of str to Parameter
+        Its sizes as the steady command that does the same: one unit for a chain and for equations.
+    """
 
     name: str
     probability: float
@@ -40,6 +68,17 @@ class FoundEffect:
     equation: str
     windows: tuple[tuple[int, float, float], ...]
     operating_range: OperatingRange | None = None
+    state: str = ""
+    port: str = ""
+    input: str = ""
+    column: str = ""
+    as_command: Mapping[str, Parameter] = field(default_factory=dict)
+
+    @property
+    def at(self) -> str:
+        """Where it acts in equations, for a reader; nothing in a chain, whose places its name says."""
+        where = self.state or self.port or self.input
+        return f"{where or 'the reading'} from column {self.column}" if self.column else where
 
 
 def told_apart(hypotheses: Sequence[str]) -> str:
@@ -58,6 +97,55 @@ class NextExperiment:
     expected: str
 
 
+class SearchResult(Protocol):
+    """What a search found, as pages and planning ask for it: of a chain and of equations alike."""
+
+    @property
+    def recordings(self) -> tuple[Recording, ...]:
+        """What was measured, as it was simulated."""
+
+    @property
+    def limits(self) -> Thresholds:
+        """What decided between two findings."""
+
+    @property
+    def units(self) -> tuple[str, str]:
+        """Units of the command and of the reading."""
+
+    @property
+    def drawn(self) -> Model:
+        """The chain of boxes that the model is drawn as."""
+
+    @property
+    def several_levels(self) -> bool:
+        """Whether every box of a place is concerned by what is missing there."""
+
+    @property
+    def has_effects(self) -> bool:
+        """Whether the hypothesis to go on with has effects that the model lacks."""
+
+    def simulated(self) -> Mapping[str, tuple[FloatArray, ...]]:
+        """Return the readings (N,) of every recording as ``retuned`` and, where effects were added, ``extended``."""
+
+    def runs(self) -> tuple[int, ...]:
+        """Return in how many runs each recording was simulated, a start state fitted for each."""
+
+    def numbers(self) -> tuple[RetunedNumber, ...]:
+        """Return the model's numbers before and after."""
+
+    def combinations(self) -> list[Combination]:
+        """Return the directions of the numbers by how well the recordings determine them, the least first."""
+
+    def hypotheses(self) -> list[tuple[str, float]]:
+        """Return what was fitted to all rows with the decrease of chi-square, numbers paid for, the best first."""
+
+    def laws(self) -> tuple[MissingLaw, ...]:
+        """Return the laws of added effects over their signals, with the data in bins."""
+
+    def unseen_run(self) -> UnseenRun | None:
+        """Return free runs through a stretch that no number was fitted to."""
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Diagnosis:
     """Outcome of a diagnosis.
@@ -67,26 +155,28 @@ class Diagnosis:
     verdict : str
         ``none``, ``parameters``, ``effect`` or ``unexplained``.
     effects : tuple of FoundEffect
-        What was added to the model, the most important first.
+        What was added to the model, and what samples show, the most important first.
     candidates : tuple of Candidate
-        Hypotheses with their probabilities.
+        Hypotheses with their probabilities; those of an effect add up to the probability that is stated for it.
     places : tuple of str
         Where the mismatch sits.
     fit : FitQuality
         Errors on rows that were not fitted.
-    next_experiment : NextExperiment, optional
-        What would decide between what is left.
-    extended_model : Model
-        The model to go on with.
+    extended_model : Model, EquationModel or BlackBox
+        The model to go on with, of the kind that was given.
     sentences : tuple of str
         The finding in words.
+    is_clean : bool
+        Whether nothing larger than noise is left.
     residual : ResidualTests
         What the chosen model leaves, and whether that is noise.
+    search : SearchResult
+        All hypotheses, for the report.
     description : Description, optional
         What is left of the residual as a function of the signals, where no effect of the catalogue explains it; not a
         cause.
-    search : Search
-        All hypotheses, for the report.
+    next_experiment : NextExperiment, optional
+        What would decide between what is left.
     withheld : str
         Why the extended model is without what was found, where it is.
     """
@@ -96,40 +186,37 @@ class Diagnosis:
     candidates: tuple[Candidate, ...]
     places: tuple[str, ...]
     fit: FitQuality
-    next_experiment: NextExperiment | None
-    extended_model: Model
+    extended_model: AnyModel
     sentences: tuple[str, ...]
+    is_clean: bool
     residual: ResidualTests
-    description: Description | None
-    search: Search
+    search: Any  # a SearchResult; planning asks chains and equations for more
+    description: Description | None = None
+    next_experiment: NextExperiment | None = None
     withheld: str = ""
 
     def as_json(self) -> dict[str, Any]:
         """Return the content of diagnosis.json."""
-        following = self.next_experiment
+        following, search = self.next_experiment, self.search
         return {
             "schema": 1,
             "verdict": self.verdict,
             "effects": [_effect(effect) for effect in self.effects],
             "candidates": [{"name": c.name, "probability": round(c.probability, 4)} for c in self.candidates],
             "places": list(self.places),
-            "fit": {
-                "metric": "nrmse",
-                "held_out": True,
-                "nominal": self.fit.nominal,
-                "retuned": self.fit.retuned,
-                "extended": self.fit.extended,
-                "noise_floor": self.fit.noise_floor,
-            },
+            "fit": {"metric": "nrmse", "held_out": True} | asdict(self.fit),
             "residual": self.residual.as_json(),
-            "next_experiment": None
-            if following is None
-            else {
-                "purpose": following.purpose,
-                "kind": following.kind,
-                "settings": dict(following.settings),
-                "expected": following.expected,
+            "parameters": {
+                f"{n.block} {n.name}".strip(): {
+                    "value": n.value[0],
+                    "sd": n.value[1],
+                    "nominal": n.nominal,
+                    "unit": n.unit,
+                }
+                for n in search.numbers()
             },
+            "undetermined": [one.sentence for one in undetermined(search.combinations())],
+            "next_experiment": None if following is None else asdict(following),
         } | ({} if self.description is None else {"description": self.description.as_json()})
 
     def write(self, path: Path) -> None:
@@ -142,14 +229,20 @@ def _effect(effect: FoundEffect) -> dict[str, Any]:
         "name": effect.name,
         "probability": round(effect.probability, 4),
         "places": list(effect.places),
-        "parameters": {
-            name: {"value": p.value, "sd": p.sd if np.isfinite(p.sd) else None, "unit": p.unit}
-            for name, p in effect.parameters.items()
-        },
+        "parameters": _numbers(effect.parameters),
+        **{key: getattr(effect, key) or None for key in ("state", "input", "port", "column")},
         "equation": effect.equation,
         "windows": [list(w) for w in effect.windows],
     }
+    if effect.as_command:
+        table["as_command"] = _numbers(effect.as_command)
     if effect.operating_range is not None:
-        r = effect.operating_range
-        table["operating_range"] = {"signal": r.signal, "low": r.low, "high": r.high}
+        table["operating_range"] = asdict(effect.operating_range)
     return table
+
+
+def _numbers(parameters: Mapping[str, Parameter]) -> dict[str, Any]:
+    return {
+        name: {"value": p.value, "sd": p.sd if np.isfinite(p.sd) else None, "unit": p.unit}
+        for name, p in parameters.items()
+    }

@@ -47,12 +47,12 @@ def safe_extension(
     -----
     A model must leave no larger squared error than the nominal one on the recordings as a whole, run as a person will
     run it, and stay within ten times the range of the nominal model and the readings on commands that reach
-    twice as far from their mean. What it does on inputs that look otherwise is not known.
+    twice as far from their mean. Where the nominal model leaves ten times the range of the readings itself, as one of
+    an unstable plant does, it sets no bound: how far such runs go depends on every digit of their numbers. What a model
+    does on inputs that look otherwise is not known.
     """
     stressed = [_stressed(r) for r in recordings]
-    allowed = [
-        FARTHER * max(_reach(nominal, s, forecast), _range(r)) for s, r in zip(stressed, recordings, strict=True)
-    ]
+    allowed = [_allowed(_reach(nominal, s, forecast), _range(r)) for s, r in zip(stressed, recordings, strict=True)]
     before = sum(_squares(nominal, r, forecast) for r in recordings) if comparable else np.inf
     for model in models:
         if all(_reach(model, s, forecast) <= most for s, most in zip(stressed, allowed, strict=True)) and (
@@ -60,6 +60,11 @@ def safe_extension(
         ):
             return model
     return nominal
+
+
+def _allowed(reach: float, span: float) -> float:
+    """Return how far a model may go where the nominal one reaches so far, and readings move through a span."""
+    return FARTHER * max(reach, span) if reach <= FARTHER * span else np.inf
 
 
 def _stressed(r: Recording) -> Recording:

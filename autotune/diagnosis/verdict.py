@@ -1,64 +1,167 @@
-"""From evidence to a verdict: one table, read from its first row to its last."""
+"""From evidence to a verdict: one table, read from its first row to its last, for models of every kind.
+
+What recordings show of a model is :class:`Evidence`. Chains and equations differ in how hypotheses are fitted, run and
+handed out; each says so in a class of its own, and all that follows asks no further what the model is.
+"""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 from autotune.diagnosis.evidence.adequacy import ResidualTests
 from autotune.diagnosis.evidence.held_out import FitQuality
 from autotune.diagnosis.evidence.operating_point import Offset
-from autotune.diagnosis.evidence.own_noise import OwnNoise
 from autotune.diagnosis.evidence.samples import SampleEffect
-from autotune.diagnosis.result import Verdict
-from autotune.diagnosis.selection.hypothesis import contradicted
-from autotune.diagnosis.selection.judged_chain import Found
-from autotune.diagnosis.selection.probability import Candidate, weighed
-from autotune.diagnosis.selection.searched import Search
+from autotune.diagnosis.result import FoundEffect, SearchResult, Verdict
+from autotune.diagnosis.selection.probability import Candidate
 from autotune.diagnosis.thresholds import Thresholds
 from autotune.effects import STRUCTURES, kind_of
+from autotune.equations.files import AnyModel
+from autotune.recording import Recording
+
+if TYPE_CHECKING:
+    from autotune.diagnosis.evidence.description import Description
 
 #: Held-out error, as a share of the spread of y, from which on a simulation follows nothing: 1 is y's mean.
 ASTRAY = 0.9
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Evidence:
+class Evidence(ABC):
     """All that a verdict rests on.
 
     Attributes
     ----------
-    search : Search
-        Hypotheses with their fits.
+    model : Model, EquationModel or BlackBox
+        The nominal model.
     samples : tuple of SampleEffect
         What single samples, the residual's size over the slope, and the recomputed law show.
     residual : ResidualTests
         What the chosen model leaves.
-    quality : FitQuality
-        Errors on rows that were not fitted.
+    quality_of : callable
+        Returns errors on rows that were not fitted; it may take fits, and is asked where a verdict is.
     offset : Offset, optional
         Shift of the operating point that is far outside its uncertainty.
-    found : Found, optional
-        What a search found, where simulations do not run away and what is left is not noise of some rows.
     evened : bool
         Whether stamps were late, so that everything runs at even times.
-    own : OwnNoise, optional
-        What is left, where it is noise of its own colour.
     """
 
-    search: Search
+    model: AnyModel
     samples: tuple[SampleEffect, ...]
     residual: ResidualTests
-    quality: FitQuality
-    offset: Offset | None
-    found: Found | None = None
+    quality_of: Callable[[], FitQuality]
+    offset: Offset | None = None
     evened: bool = False
-    own: OwnNoise | None = None
+
+    @property
+    @abstractmethod
+    def result(self) -> SearchResult:
+        """What the search found, for pages and planning."""
 
     @property
     def limits(self) -> Thresholds:
         """What decides between two findings."""
-        return self.search.data.thresholds
+        return self.result.limits
+
+    @property
+    def recordings(self) -> tuple[Recording, ...]:
+        """What was measured, as it was simulated."""
+        return self.result.recordings
+
+    @property
+    @abstractmethod
+    def names(self) -> tuple[str, ...]:
+        """Effects of the hypothesis to go on with."""
+
+    @property
+    @abstractmethod
+    def candidates(self) -> tuple[Candidate, ...]:
+        """Every hypothesis with its probability by all rows, best first."""
+
+    @property
+    @abstractmethod
+    def more_than_noise(self) -> bool:
+        """Whether something was found, or the retuned model leaves more than noise."""
+
+    @property
+    @abstractmethod
+    def numbers(self) -> float:
+        """Decrease of chi-square that retuning brings beside the nominal numbers."""
+
+    @property
+    @abstractmethod
+    def leading(self) -> tuple[tuple[str, ...], ...]:
+        """Effects of the leading hypotheses that have any, the best first."""
+
+    @abstractmethod
+    def keeping(self, names: Collection[str]) -> Evidence:
+        """Return the evidence with no other effects than those named: the hypothesis of them that was fitted."""
+
+    @abstractmethod
+    def on(self, part: Sequence[Recording]) -> tuple[Evidence | None, Collection[str]]:
+        """Return what a part of the recordings shows, searched among what all of them made a candidate.
+
+        Beside it stand effects that the part cannot tell; nothing where no simulation runs there.
+        """
+
+    @abstractmethod
+    def described(self) -> list[tuple[float, FoundEffect]]:
+        """Return the effects to go on with as people read them, each with what is lost without it."""
+
+    @abstractmethod
+    def misread_columns(self) -> str:
+        """Say what is wrong with the columns, where the model then explains the recordings; else nothing."""
+
+    @abstractmethod
+    def handed_out(self, verdict: Verdict) -> tuple[AnyModel, AnyModel]:
+        """Return the model to go on with, which is no danger beside the nominal one, and the one that was wanted."""
+
+    def description(self) -> Description | None:
+        """Return what is left as a function of the signals, where no effect explains it and that can be told."""
+        return None
+
+    @cached_property
+    def quality(self) -> FitQuality:
+        """Errors on rows that were not fitted."""
+        return self.quality_of()
+
+    @property
+    def everywhere(self) -> tuple[tuple[int, float, float], ...]:
+        """All recordings from their first row to their last."""
+        return tuple((i, float(r.t[0]), float(r.t[-1])) for i, r in enumerate(self.recordings))
+
+    def acting(self, name: str, values: Mapping[str, float]) -> tuple[tuple[int, float, float], ...]:
+        """Return when an effect with some values acts: everywhere, or in a recording from a time on."""
+        kind = kind_of(name)
+        if kind.acts_in is None:
+            return self.everywhere
+        number, after = kind.acts_in({"recording": -1.0, **values})
+        pairs = [(i, r) for i, r in enumerate(self.recordings) if number in (-1, i)]
+        return tuple((i, float(r.t[0] + after), float(r.t[-1])) for i, r in pairs)
+
+    def places(self, name: str) -> tuple[str, ...]:
+        """Return where an effect may sit, and where one does that is the same as it and that these rows leave open."""
+        kind, odds = kind_of(name), (1.0 - self.limits.decided) / self.limits.decided
+        own = max((c.probability for c in self.candidates if name in c.name.split("+")), default=1.0)
+        open_ = {n for c in self.candidates if c.probability > odds * own for n in c.name.split("+")}
+        places = dict.fromkeys(kind.may_sit)
+        for other in kind.same:
+            places |= dict.fromkeys(kind_of(other).may_sit) if other in open_ else {}
+        return tuple(places)
+
+    @property
+    def leaves_noise(self) -> bool:
+        """Whether what the chosen model leaves is noise."""
+        return self.residual.is_noise
+
+    @property
+    def is_clean(self) -> bool:
+        """Whether nothing larger than noise is left, where it was fitted or where it was not."""
+        return self.leaves_noise or self.quality.comes_down_to_noise
 
     @property
     def follows(self) -> bool:
@@ -70,58 +173,47 @@ class Evidence:
         """Whether the chosen effects leave held-out rows no farther off than the model without them was."""
         return self.quality.extended <= max(self.quality.nominal, self.quality.retuned)
 
-    @cached_property
+    @property
     def unknown_odds(self) -> float:
         """Prior odds of a cause outside the catalogue, beside 1 of all hypotheses together."""
         return odds_of_unknown(self.residual, self.limits)
 
-    @cached_property
-    def candidates(self) -> tuple[Candidate, ...]:
-        """Every hypothesis with its probability, best first."""
-        if self.found is not None:
-            unknown = self.unknown_odds if self.residual.is_noise else self.limits.unknown_odds
-            return self.found.candidates(unknown)
-        return weighed({"none": 0.0}, 1.0, self.unknown_odds)
+    @property
+    def varies_more(self) -> bool:
+        """Whether what varies beside chosen effects that leave noise explains more than it may where they are true."""
+        return False
 
     @property
-    def more_than_noise(self) -> bool:
-        """Whether something was found, or the retuned model leaves more than noise."""
-        return self.found is not None and (bool(self.found.chosen.names) or not self.residual.is_noise)
+    def jitter_explains_more(self) -> bool:
+        """Whether a clock that jitters explains more than what varies."""
+        return False
 
-    @cached_property
+    @property
     def contradicted(self) -> frozenset[str]:
-        """Chosen effects by whose name readings do not behave; asked where the model's error and not noise decides."""
-        if self.found is None or self.found.chosen.leaves_noise:
-            return frozenset()
-        return contradicted(self.search.chosen, self.search.data)
+        """Chosen effects by whose name readings do not behave."""
+        return frozenset()
 
     @property
-    def numbers(self) -> float:
-        """Decrease of chi-square that retuning brings beside the nominal numbers."""
-        if self.own is not None:
-            return self.own.numbers
-        retuned = self.search.retuned.fit
-        return self.search.nominal.chi2 - retuned.chi2 - retuned.penalty
+    def own_noise(self) -> str:
+        """What is said of a residual that is noise of its own colour."""
+        return ""
 
     @cached_property
     def facts(self) -> frozenset[str]:
         """What holds, in the words of the table."""
-        limits, names = self.limits, set(self.search.chosen.names) - STRUCTURES.keys()
-        # a clock that jitters disturbs commands too, which leaves something slow: what varies is weighed against it
-        jitter = sum(s.evidence for s in self.samples if kind_of(s.name).sought == "residual")
         holds = {
             "follows": self.follows,
-            "effects": self.predicts and bool(names - self.contradicted),
+            "effects": self.predicts and bool(set(self.names) - STRUCTURES.keys() - self.contradicted),
             "more than noise": self.more_than_noise,
-            "varies more": self.found is not None and self.found.varies_more(limits),
+            "varies more": self.varies_more,
             "late stamps": self.evened,
             "samples": bool(self.samples),
-            "adequate": self.residual.is_noise,
+            "adequate": self.leaves_noise,
             "constant": self.residual.is_constant,
             "offset": self.offset is not None,
             "missing": self.residual.is_missing,
-            "jitter explains more": self.residual.varies.gain < limits.lesser_share * jitter,
-            "wrong numbers": self.numbers > limits.numbers_decrease,
+            "jitter explains more": self.jitter_explains_more,
+            "wrong numbers": self.numbers > self.limits.numbers_decrease,
         }
         return frozenset(name for name, one in holds.items() if one)
 
@@ -160,6 +252,7 @@ def judged(evidence: Evidence) -> Verdict:
     return verdict_of(evidence.facts)
 
 
-def verdict_of(facts: frozenset[str]) -> Verdict:
+def verdict_of(facts: Collection[str]) -> Verdict:
     """Return the verdict of the first row of the table that fits."""
-    return next(verdict for holds, lacks, verdict in TABLE if holds <= facts and not lacks & facts)
+    known = set(facts)
+    return next(verdict for holds, lacks, verdict in TABLE if holds <= known and not lacks & known)

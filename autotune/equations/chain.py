@@ -32,7 +32,7 @@ def from_chain(model: Model, column: str = "u") -> EquationModel:
     made = _Chain([column])
     signal: Expression = Name(column)
     for block in model.blocks:
-        signal = made.block(block.name, block.dynamics, signal, kind_of(block))
+        signal = made.block(block.name, block.dynamics, signal, kind_of(block), block.unit)
     command = InputColumn(
         column=column, unit=model.input.unit, hold=model.input.hold, offset=model.input.offset,
         delay_s=sum(block.dynamics.delay_s for block in model.blocks),
@@ -83,7 +83,7 @@ def chain_with_inputs(content: Mapping[str, Any], where: str) -> EquationModel:
     for block in chain.blocks:
         if block.place == "plant" and not entered:
             entered, signal = True, _sum([signal, *at_plant])
-        signal = made.block(block.name, block.dynamics, signal, kind_of(block))
+        signal = made.block(block.name, block.dynamics, signal, kind_of(block), block.unit)
     output = _sum([signal, *at_output, *([Number(chain.output.offset)] if chain.output.offset else [])])
     return EquationModel(
         name=chain.name, inputs=tuple(columns), output=output, output_unit=chain.output.unit,
@@ -149,8 +149,13 @@ class _Chain:
         self.parameters: list[ModelParameter] = []
         self._names = {"t", "pi", *columns}
 
-    def block(self, name: str, dynamics: TransferFunction, signal: Expression, kind: StateKind = "other") -> Expression:
-        """Add a block that is driven by a signal, in controllable form, and return its output."""
+    def block(
+        self, name: str, dynamics: TransferFunction, signal: Expression, kind: StateKind = "other", unit: str = ""
+    ) -> Expression:
+        """Add a block that is driven by a signal, in controllable form, and return its output.
+
+        Where a state is the output itself it has the output's unit.
+        """
         label = self._label(name)
         lead = dynamics.den[0]
         den = [value / lead for value in dynamics.den[1:]]
@@ -158,30 +163,35 @@ class _Chain:
         order = len(den)
         num = [0.0] * (order + 1 - len(num)) + num
         if order == 1 and num[0] == 0.0 and den[0] != 0.0:
-            return self._lag(label, num[1] / den[0], 1.0 / den[0], signal, kind)
-        a = [self._number(f"{label}_a{order - 1 - i}", value) for i, value in enumerate(den)]
+            return self._lag(
+                label, num[1] / den[0], 1.0 / den[0], signal, State(name=label, derivative=signal, kind=kind, unit=unit)
+            )
+        a = [self._number(f"{label}_a{order - 1 - i}", value, keep=(0.0,)) for i, value in enumerate(den)]
         b = [self._number(f"{label}_b{order - i}", value) for i, value in enumerate(num)]
         x = [f"{label}_{i + 1}" if order > 1 else label for i in range(order)]
+        unit = unit if order == 1 and num == [0.0, 1.0] else ""
         feed = signal
         for i, coefficient in enumerate(a):  # highest derivative = signal - a_(n-1) x_n - ... - a_0 x_1
             feed = _minus(feed, _times(coefficient, Name(x[order - 1 - i])))
         for i in range(order):
-            self.states.append(State(name=x[i], derivative=Name(x[i + 1]) if i + 1 < order else feed, kind=kind))
+            self.states.append(
+                State(name=x[i], derivative=Name(x[i + 1]) if i + 1 < order else feed, kind=kind, unit=unit)
+            )
         parts = [_times(b[order - i], Name(x[i])) for i in range(order)]
         if num[0] != 0.0:  # direct: the highest derivative itself
             parts.append(_times(b[0], feed))
         used = [part for part in parts if part != Number(0.0)]
         return _sum(used) if used else Number(0.0)
 
-    def _lag(self, label: str, gain: float, time_constant: float, signal: Expression, kind: StateKind) -> Expression:
-        K, T = self._number(f"{label}_K", gain), self._number(f"{label}_T", time_constant)
+    def _lag(self, label: str, gain: float, time_constant: float, signal: Expression, state: State) -> Expression:
+        K, T = self._number(f"{label}_K", gain), self._number(f"{label}_T", time_constant, keep=())
         slope = Call("/", (Call("-", (_times(K, signal), Name(label))), T))
-        self.states.append(State(name=label, derivative=slope, kind=kind))
+        self.states.append(replace(state, derivative=slope))
         return Name(label)
 
-    def _number(self, name: str, value: float) -> Expression:
-        """Return a parameter, or 0 or 1 as they are."""
-        if value in (0.0, 1.0):
+    def _number(self, name: str, value: float, keep: Sequence[float] = (0.0, 1.0)) -> Expression:
+        """Return a parameter; 0 and a gain of 1 are structure, a time constant of 1 s is a number like any other."""
+        if value in keep:
             return Number(value)
         self.parameters.append(ModelParameter(name=name, value=value))
         return Name(name)

@@ -113,7 +113,9 @@ def apply(model: EquationModel, effects: Sequence[Effect] | None = None) -> Appl
     return Applied(extensions=tuple(extensions), delays=delays, before=on_drive, after=on_reading)
 
 
-def compile_with(model: EquationModel, effects: Sequence[Effect], signals: Sequence[str] = ()) -> Compiled:
+def compile_with(
+    model: EquationModel, effects: Sequence[Effect], signals: Sequence[str] = (), further: Sequence[Extension] = ()
+) -> Compiled:
     """Translate a model with effects, every number of theirs among its parameters; takes about a millisecond.
 
     Parameters
@@ -124,6 +126,8 @@ def compile_with(model: EquationModel, effects: Sequence[Effect], signals: Seque
         What acts, in the order in which a signal meets it; a converter of the reading is left to :func:`apply`.
     signals : sequence of str
         Expressions that are wanted at the rows beside y.
+    further : sequence of Extension
+        What is added beside the effects.
 
     Returns
     -------
@@ -147,7 +151,7 @@ def compile_with(model: EquationModel, effects: Sequence[Effect], signals: Seque
         )
         column = int(np.argmax(_acts_on(model, effect)))
         held.append(Held(column=column, parameter=parameter, transform=OPERATIONS.get(form.samples)))
-    return compile_model(model, apply(model, effects).extensions, signals, held)
+    return compile_model(model, (*apply(model, effects).extensions, *further), signals, held)
 
 
 def extension_of(model: EquationModel, effect: Effect, number: int = 0) -> Extension:
@@ -159,8 +163,8 @@ def extension_of(model: EquationModel, effect: Effect, number: int = 0) -> Exten
         Nowhere to act, or a parameter that is missing.
     """
     form, prefix = form_of(effect, model), prefix_of(effect, number)
-    text = _text_of(form, effect)
-    local = _local(model, effect)
+    text = text_of(form, effect)
+    local = local_names(model, effect)
     parameters: dict[str, ModelParameter] = {}
 
     def bound(text: str) -> Expression:
@@ -243,11 +247,12 @@ def _key(effect: Effect) -> str:
     return KINDS[effect.name].parameters[0].name
 
 
-def _text_of(form: InEquations, effect: Effect) -> str:
+def text_of(form: InEquations, effect: Effect) -> str:
+    """Return what an effect adds, or puts in the place of ``value``, with the numbers that it has."""
     return form.text if not form.at_once or form.remembers(effect.parameters) else form.at_once
 
 
-def _local(model: EquationModel, effect: Effect) -> dict[str, Expression | None]:
+def local_names(model: EquationModel, effect: Effect) -> dict[str, Expression | None]:
     """Return what names in an effect's text stand for that are no parameters of it; nothing for what is not there."""
     V, X = _speed_and_position(model, effect)
     return {"V": V, "X": X, "column": Name(effect.column) if effect.column in model.columns else None}
@@ -331,7 +336,7 @@ def equation_of(model: EquationModel, effect: Effect) -> str:
         return f"{column}(t - {_key(effect)})"
     if not form.text:
         return ""
-    tree = substituted(parse(_text_of(form, effect)), _local(model, effect).get)
+    tree = substituted(parse(text_of(form, effect)), local_names(model, effect).get)
     if form.acts == "anywhere" and not (effect.state or effect.port):
         return f"{effect.input or 'y'} -> {effect.input or 'y'} + {to_text(tree)}"
     if form.acts in ("input", "reading"):

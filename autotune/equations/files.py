@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TypeAlias
@@ -11,14 +10,16 @@ from typing import TypeAlias
 import tomli_w
 
 from autotune.arrays import FloatArray
+from autotune.effects import kind_of
 from autotune.equations.black_box import BlackBox, run_closed
 from autotune.equations.chain import chain_with_inputs
+from autotune.equations.effects import equation_of
 from autotune.equations.fmu import fmu_of
 from autotune.equations.forecast import forecast
 from autotune.equations.model import EquationModel
 from autotune.equations.read import content_of, equations_of, write_equations
 from autotune.errors import InputError
-from autotune.models import Model, read_model
+from autotune.models import Model, read_model, write_model
 from autotune.recording import Recording
 from autotune.text_files import read_toml
 
@@ -43,19 +44,15 @@ def read_any_model(path: str | os.PathLike[str]) -> AnyModel:
     return equations_of(content, str(path))
 
 
-def write_any(
-    model: EquationModel | BlackBox, path: Path, equations: Mapping[str, str] | None = None, base: Path | None = None
-) -> None:
-    """Write a model file that :func:`read_any_model` reads back.
+def write_any(model: AnyModel, path: Path, base: Path | None = None) -> None:
+    """Write a model file that :func:`read_any_model` reads back, each effect with its equation.
 
     Parameters
     ----------
-    model : EquationModel or BlackBox
+    model : Model, EquationModel or BlackBox
         What to write.
     path : path
         Where to.
-    equations : mapping of effect name to equation, optional
-        For the reader.
     base : path, optional
         Folder that an FMU's path counted from so far.
 
@@ -64,12 +61,17 @@ def write_any(
     InputError
         A Python function, which no file holds.
     """
+    if isinstance(model, Model):
+        write_model(model, path, {effect.name: kind_of(effect.name).equation for effect in model.effects})
+        return
+    inside = model if isinstance(model, EquationModel) else model.shell()
+    equations = {effect.name: equation_of(inside, effect) for effect in model.effects}
     if isinstance(model, EquationModel):
         write_equations(model, path, equations)
         return
-    if "fmu" not in model.source:
+    if "fmu" not in (model.source or {}):
         raise InputError("a Python function is no file", where=model.name, remedy="write its equations, or an FMU")
-    shell = content_of(replace(model.shell(), parameters=model.parameters), equations)
+    shell = content_of(replace(inside, parameters=model.parameters), equations)
     for table, variable in zip(shell["input"], model.source["variables"], strict=True):
         table["variable"] = variable
     fmu = ((base or Path()) / model.source["fmu"]).resolve()

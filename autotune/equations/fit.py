@@ -17,7 +17,6 @@ from autotune.equations.parameter_scales import values_of
 from autotune.equations.sensitivity import Windows
 from autotune.equations.simulate import Compiled
 from autotune.errors import InputError
-from autotune.progress import Progress, quiet
 from autotune.recording import Recording
 
 #: Windows that a recording is cut into, one fit after the other, each with this many rows at least.
@@ -38,7 +37,6 @@ def fit(
     z: FloatArray | None = None,
     free: BoolArray | None = None,
     iterations: int = 30,
-    progress: Progress = quiet,
 ) -> Fitted:
     """Fit a model's parameters on given windows.
 
@@ -60,8 +58,6 @@ def fit(
         Which parameters are retuned; by default all with a spread.
     iterations : int
         Gauss-Newton steps at most.
-    progress : callable
-        Told what is being done and the share done.
 
     Returns
     -------
@@ -84,13 +80,11 @@ def fit(
     state = Descent(compiled, data, which, z)
     converged = False
     for k in range(iterations):
-        progress("fitting", k / iterations)
         converged = state.step()
         if (converged or k % 2) and k + 1 < iterations and state.restarted():
             converged = False
         if converged:
             break
-    progress("fitting", 1.0)
     return state.fitted(converged)
 
 
@@ -99,14 +93,12 @@ def retune(
     recordings: Sequence[Recording],
     *,
     longest_s: float = np.inf,
-    free: BoolArray | None = None,
-    progress: Progress = quiet,
 ) -> Fitted:
     """Retune a model on short windows first, then on longer ones up to the whole free run.
 
     Parameters
     ----------
-    compiled, recordings, free, progress
+    compiled, recordings
         As for :func:`fit`.
     longest_s : float
         Length of the longest windows [s], where that is not to be the whole recording.
@@ -135,9 +127,8 @@ def retune(
         last = length >= whole
         try:
             new = fit(
-                compiled, recordings, z=z, free=free, horizon_s=None if last else length,
+                compiled, recordings, z=z, horizon_s=None if last else length,
                 iterations=30 if k == len(lengths) - 1 else 12,
-                progress=lambda what, share, k=k: progress(what, (k + share) / len(lengths)),
             )  # fmt: skip
         except InputError:
             if found is None:
@@ -147,5 +138,5 @@ def retune(
             break
         found = new
     if found is None:
-        return fit(compiled, recordings, free=free)
+        return fit(compiled, recordings)
     return found

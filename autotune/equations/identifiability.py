@@ -7,6 +7,7 @@ states projected out, has singular values s: along its right singular vector a r
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,6 +17,8 @@ from autotune.equations.fit_data import Fitted
 
 #: A parameter belongs to a combination where its share of the direction's length is at least this.
 _SHARE = 0.2
+#: Width of the belief that recordings leave, over that before, from which on a combination is not determined.
+LEFT = 0.5
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,22 +51,45 @@ class Combination:
         return f"the recordings do not determine {names} apart: {moves} leaves the simulation as it is"
 
 
-def combinations(fitted: Fitted) -> list[Combination]:
-    """Return all directions of the parameters that were retuned, the least determined first."""
-    which = np.flatnonzero(np.any(fitted.jacobian != 0.0, axis=0) | _retuned(fitted))
-    if which.size == 0:
+def combinations(fitted: Fitted, own: int | None = None) -> list[Combination]:
+    """Return all directions of the parameters that were retuned, the least determined first.
+
+    Parameters
+    ----------
+    fitted : Fitted
+        The fit.
+    own : int, optional
+        How many of its parameters are the model's own ones, whatever else was fitted beside; all by default.
+    """
+    parameters, J = fitted.compiled.parameters[:own], fitted.jacobian
+    moved = [i for i, p in enumerate(parameters) if p.spread > 0.0]
+    believed = np.asarray(np.linalg.inv(J.T @ J + np.eye(J.shape[1])), dtype=np.float64)[np.ix_(moved, moved)]
+    return determined(believed, np.array([parameters[i].spread for i in moved]), [parameters[i].name for i in moved])
+
+
+def determined(believed: FloatArray, spread: FloatArray, names: Sequence[str]) -> list[Combination]:
+    """Return the directions of parameters by how well data determine them, the least determined first.
+
+    Parameters
+    ----------
+    believed : (p, p) array
+        Covariance of the parameters after the fit, in units of their prior standard deviations.
+    spread : (p,) array
+        Those standard deviations, relative.
+    names : sequence of str
+        Of the parameters.
+    """
+    if not names:
         return []
-    J = fitted.jacobian[:, which]
-    values, vectors = np.linalg.eigh(J.T @ J)
-    parameters = [fitted.compiled.parameters[i] for i in which]
-    spread = np.array([p.spread for p in parameters])
+    information = np.linalg.pinv(believed, hermitian=True) - np.eye(len(names))
+    values, vectors = np.linalg.eigh(information)
     found = []
     for value, vector in zip(values, vectors.T, strict=True):
         order = [i for i in np.argsort(-np.abs(vector)) if abs(vector[i]) >= _SHARE]
         changes = (vector * spread)[order]
         found.append(
             Combination(
-                parameters=tuple(parameters[i].name for i in order),
+                parameters=tuple(names[i] for i in order),
                 changes=tuple(float(c) for c in changes / changes[0]),
                 narrowed=float(1.0 / np.sqrt(1.0 + max(value, 0.0))),
             )
@@ -71,10 +97,6 @@ def combinations(fitted: Fitted) -> list[Combination]:
     return found
 
 
-def undetermined(fitted: Fitted, narrowed: float = 0.5) -> list[Combination]:
-    """Return the combinations along which the recordings narrow the belief to no less than a share of it."""
-    return [one for one in combinations(fitted) if one.narrowed >= narrowed]
-
-
-def _retuned(fitted: Fitted) -> FloatArray:
-    return np.array([p.spread > 0.0 for p in fitted.compiled.parameters])
+def undetermined(found: Sequence[Combination]) -> list[Combination]:
+    """Return the combinations along which the recordings hardly narrow the belief."""
+    return [one for one in found if one.narrowed >= LEFT]

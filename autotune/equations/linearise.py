@@ -91,15 +91,44 @@ def growth_rate(model: EquationModel, recordings: Sequence[Recording]) -> float:
     recordings : sequence of Recording
         Their medians are the operating point; where nothing rests under these inputs the rate is not known, and 0.
     """
+    linear = at_recordings(model, recordings)
+    return 0.0 if linear is None else max(float(np.max(np.linalg.eigvals(linear.A).real, initial=0.0)), 0.0)
+
+
+def settles(model: EquationModel, recordings: Sequence[Recording]) -> bool:
+    """Whether a deviation from where recordings are dies out, as far as a rest is known there."""
+    linear = at_recordings(model, recordings)
+    return linear is not None and bool(np.all(np.linalg.eigvals(linear.A).real < 0.0))
+
+
+def linearise_at(model: EquationModel, states: FloatArray, inputs: FloatArray) -> Linear:
+    """Linearise a model about any point, whether it rests there or not.
+
+    Parameters
+    ----------
+    model : EquationModel
+        The model; of its effects those without a memory act.
+    states, inputs : (n,), (m,) arrays
+        Where.
+    """
+    applied = apply(model)
+    compiled = compile_model(model, applied.extensions)
+    p = compiled.parameter_vector
+    A, B, C, D = _differences(compiled, p, states, inputs)
+    y = float(derivatives(compiled, p, states[None, :], inputs[None, :])[1][0, 0])
+    return Linear(A=A, B=B, C=C, D=D, states=states, inputs=inputs, y=y, delays_s=applied.delays)
+
+
+def at_recordings(model: EquationModel, recordings: Sequence[Recording]) -> Linear | None:
+    """Return a model linearised at the medians of recordings; nothing where nothing rests there."""
     inputs = np.array([float(np.median(np.concatenate([r[name] for r in recordings]))) for name in model.columns])
     y = float(np.nanmedian(np.concatenate([r.y for r in recordings])))
     for near in (float("nan"), y):
         try:
-            A = linearise(model, inputs, near).A
+            return linearise(model, inputs, near)
         except InputError:
             continue
-        return max(float(np.max(np.linalg.eigvals(A).real, initial=0.0)), 0.0)
-    return 0.0
+    return None
 
 
 def _differences(

@@ -33,9 +33,9 @@ def stiction(t: FloatArray, u: FloatArray, band: float) -> FloatArray:
     return w
 
 
-def quantised(values: FloatArray, step: float, origin: float = 0.0) -> FloatArray:
+def quantised(values: FloatArray, step: float) -> FloatArray:
     """Return values on a converter's steps; a step of 0 leaves them."""
-    return origin + step * np.floor((values - origin) / step + 0.5) if step > 0.0 else values
+    return step * np.floor(values / step + 0.5) if step > 0.0 else values
 
 
 def _converter(t: FloatArray, u: FloatArray, step: float) -> FloatArray:

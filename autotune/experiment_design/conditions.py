@@ -52,12 +52,12 @@ def conditions_of(config: Config) -> Conditions:
 
 def is_driven(found: Diagnosis) -> bool:
     """Whether a command moved in the recordings, so that one may be planned; free decays have none."""
-    return any(float(np.ptp(r.u)) > 0.0 for r in found.search.data.recordings)
+    return any(float(np.ptp(r.u)) > 0.0 for r in found.search.recordings)
 
 
 def as_recorded(found: Diagnosis) -> Conditions:
     """Return limits, operating point and law as the recordings show them: a plan goes no further than they went."""
-    recordings = found.search.data.recordings
+    recordings = found.search.recordings
     u, y = (np.concatenate([getattr(r, key) for r in recordings]) for key in ("u", "y"))
     y = y[np.isfinite(y)]
     centre = float(np.median(y))

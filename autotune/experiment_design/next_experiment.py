@@ -11,10 +11,12 @@ from dataclasses import replace
 
 import numpy as np
 
+from autotune.diagnosis.equations.shown import EquationSearch
 from autotune.diagnosis.result import Diagnosis, FoundEffect, NextExperiment, told_apart
 from autotune.effects import kind_of
 from autotune.errors import InputError
 from autotune.experiment_design.conditions import as_recorded, is_driven
+from autotune.experiment_design.in_equations import planned_in_equations
 from autotune.experiment_design.open_hypotheses import decided, open_hypotheses
 from autotune.experiment_design.plan import plan_in
 
@@ -35,29 +37,35 @@ def next_experiment(found: Diagnosis) -> NextExperiment | None:
     found : Diagnosis
         Its verdict, effects, candidates and search.
     """
+    of_equations = isinstance(found.search, EquationSearch)
     if found.verdict in ("none", "parameters"):
-        return None if decided(found) else _planned(found)
+        return None if of_equations or decided(found) else _planned(found)
     if not found.places:
         return None
     for effect in found.effects:
         if len(effect.places) > 1:
             return _extra_signal(effect)
-    if found.verdict == "effect" and len(open_hypotheses(found)) < 2:
+    if found.verdict == "effect" and not of_equations and len(open_hypotheses(found)) < 2:
         return None
-    return _planned(found) or (_larger_swing(found) if found.verdict == "unexplained" and is_driven(found) else None)
+    planned = _planned(found)
+    if planned is None and found.verdict == "unexplained" and is_driven(found) and not of_equations:
+        return _larger_swing(found)
+    return planned
 
 
 def _planned(found: Diagnosis) -> NextExperiment | None:
     """Return the experiment that separates the hypotheses alive best; nothing where none does."""
+    if isinstance(found.search, EquationSearch):
+        return planned_in_equations(found) if is_driven(found) else None
     if len(open_hypotheses(found)) < 2 or not is_driven(found):
         return None
     recorded = as_recorded(found)
-    rows = min(PLANNED_ROWS, *(len(r) for r in found.search.data.recordings))
+    rows = min(PLANNED_ROWS, *(len(r) for r in found.search.recordings))
     try:
         plan = plan_in(found, recorded, rows * recorded.sample_time_s)
     except InputError:  # an integrating plant without a stated law
         return None
-    if plan is None or plan.discrimination < found.search.data.thresholds.least_discrimination:
+    if plan is None or plan.discrimination < found.search.limits.least_discrimination:
         return None
     return NextExperiment(
         purpose=told_apart(plan.between),
@@ -87,7 +95,7 @@ def _extra_signal(effect: FoundEffect) -> NextExperiment:
 
 def _larger_swing(found: Diagnosis) -> NextExperiment:
     """Return a staircase as wide as the recordings: of the command, of the set-point where the plant integrates."""
-    chain, recordings = found.search.chosen.fit.sim.chain, found.search.data.recordings
+    chain, recordings = found.search.chosen.fit.sim.chain, found.search.recordings
     on, name = ("y", "set-point") if chain.is_integrating else ("u", "command")
     values = np.concatenate([getattr(r, on)[np.isfinite(getattr(r, on))] for r in recordings])
     middle, span = float(np.median(values)), float(np.ptp(values))

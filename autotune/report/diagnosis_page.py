@@ -9,15 +9,17 @@ import numpy as np
 
 from autotune.controller import Controller
 from autotune.diagnosis.evidence.description import Curve, Description
-from autotune.diagnosis.evidence.missing_law import MissingLaw, missing_law
-from autotune.diagnosis.evidence.unseen_run import UnseenRun, unseen_run
+from autotune.diagnosis.evidence.missing_law import MissingLaw
+from autotune.diagnosis.evidence.unseen_run import UnseenRun
 from autotune.diagnosis.result import Diagnosis, FoundEffect
-from autotune.diagnosis.selection.hypothesis import merged, penalised
+from autotune.equations.exports import as_text
+from autotune.equations.model import EquationModel
+from autotune.errors import InputError
+from autotune.models import Parameter
 from autotune.report.chain_diagram import chain_diagram
 from autotune.report.diagnosis_words import answers, in_the_model, objections, places_of, verdict_of
-from autotune.report.effect_words import clause, in_short, of_candidate, sentence, with_spread
+from autotune.report.effect_words import clause, in_short, number, of_candidate, sentence, with_spread
 from autotune.report.law_figures import acting_figure, file_names, free_run_figure, law_figure
-from autotune.report.number_tables import numbers_table
 from autotune.report.page import Figure, Page, Section, Table, Tone, write_page
 from autotune.report.screen_figures import curve_figure, over_time, screen_sections, trace_figures
 
@@ -56,21 +58,15 @@ def write_diagnosis_page(
         What led to the diagnosis, shown after its summary.
     """
     search = found.search
-    chosen = search.chosen.fit
-    laws = tuple(law for name in search.chosen.names if (law := missing_law(chosen, search.data, name)) is not None)
     known = _Evidence(
-        found=found,
-        run=unseen_run(search.nominal, search.retuned.fit, chosen, search.data),
-        laws=laws,
-        names=file_names(search.data.recordings),
-    )
+        found=found, run=search.unseen_run(), laws=search.laws(), names=file_names(search.recordings)
+    )  # fmt: skip
     named, possible = places_of(found)
-    model = search.retuned.fit.parametrisation.model
     page = Page(
         title=f"Diagnosis of {found.extended_model.name}",
         verdict=verdict_of(found),
         tone=_TONES[found.verdict],
-        drawing=chain_diagram(model, named, possible, throughout=chosen.sim.chain.levels > 1),
+        drawing=chain_diagram(search.drawn, named, possible, throughout=search.several_levels),
         answers=answers(found, known.run),
         sections=(*before, *_sections(known, controller)),
     )
@@ -87,8 +83,10 @@ def _sections(known: _Evidence, controller: Controller | None) -> tuple[Section,
         *described,
         _when(known),
         _against(known),
+        *_determined(found),
         *screen_sections(found, controller, known.names),
         traces,
+        *_equations(found),
     )
 
 
@@ -97,7 +95,7 @@ def _before_and_after(known: _Evidence) -> Section:
     found, run, q = known.found, known.run, known.found.fit
     search = found.search
     held = {"nominal": q.nominal, "retuned": q.retuned, "extended": q.extended}
-    if search.chosen.fit is search.retuned.fit:
+    if not search.has_effects:
         held.pop("extended")
     rows = [
         (name, "-" if run is None else _share(run.errors.get(name, float("nan"))), _share(error))
@@ -114,12 +112,51 @@ def _before_and_after(known: _Evidence) -> Section:
         title="Before and after, as one free run",
         text=text,
         figures=figures,
-        tables=(table, numbers_table(search.nominal, search.retuned.fit, search.chosen.fit)),
+        tables=(table, _numbers(found)),
         details=(
             "For this picture every number was fitted again without the stretch; which effects were chosen, not. Held-"
             "out stretches: the recordings cut into parts, each run with numbers fitted to the others.",
         ),
     )
+
+
+def _numbers(found: Diagnosis) -> Table:
+    """Return the model's numbers before and after, by block where it has blocks."""
+    extended, rows = found.search.has_effects, []
+    numbers = found.search.numbers()
+    of_blocks = any(n.block for n in numbers)
+    for n in numbers:
+        fits = (n.retuned, n.value) if extended else (n.retuned,)
+        said = [with_spread(Parameter(value=value, sd=sd)) if sd > 0.0 else number(value) for value, sd in fits]
+        rows.append((*((n.block,) if of_blocks else ()), n.name, n.unit or "-", number(n.nominal), *said))
+    header = (*(("block",) if of_blocks else ()), "number", "unit", "nominal", "retuned")
+    return Table(
+        header=(*header, "extended") if extended else header, rows=tuple(rows),
+        caption="Numbers of the model, with 95 % intervals.",
+    )  # fmt: skip
+
+
+def _determined(found: Diagnosis) -> tuple[Section, ...]:
+    """Show which combinations of numbers the recordings determine."""
+    rows = tuple(
+        (", ".join(one.parameters), f"{100.0 * one.narrowed:.3g} %", ", ".join(f"{c:+.2g}" for c in one.changes))
+        for one in found.search.combinations()
+    )
+    table = Table(header=("moves together", "left of the belief's width", "relative changes"), rows=rows)
+    text = "Combinations of numbers, the least determined first: 100 % is what was believed before."
+    return (Section(title="What the recordings determine", text=(text,), tables=(table,)),) if rows else ()
+
+
+def _equations(found: Diagnosis) -> tuple[Section, ...]:
+    """Show the equations to go on with, where the model is of equations."""
+    model = found.extended_model
+    if not isinstance(model, EquationModel):
+        return ()
+    try:
+        lines = as_text(model).splitlines()
+    except InputError:
+        lines = ["Effects on samples are listed in extended_model.toml."]
+    return (Section(title="The model to go on with", text=tuple(line for line in lines if line)),)
 
 
 def _share(error: float) -> str:
@@ -130,11 +167,11 @@ def _missing(known: _Evidence) -> tuple[Section, ...]:
     """Say what was added: sentences, curves, numbers; what the extended model has is said whatever the verdict."""
     found = known.found
     rows = [row for effect in found.effects for row in _effect_rows(effect)]
-    table = Table(header=("effect", "probability", "places", "parameter", "value (95 %)", "equation"), rows=tuple(rows))
+    table = Table(header=("effect", "probability", "at", "parameter", "value (95 %)", "equation"), rows=tuple(rows))
     figures = tuple(law_figure(law) for law in known.laws)
     if not rows and not figures and not found.extended_model.effects:
         return ()
-    without = [name for name in found.search.chosen.names if name not in {law.effect for law in known.laws}]
+    without = [name for name in _added(found) if name not in {law.effect for law in known.laws}]
     text = [] if rows else ["No effect is named."]
     text += [line for line in (in_the_model(found),) if line]
     text += [f"{sentence(clause(name))} That is no law over one signal: the free run shows what it does."
@@ -147,8 +184,8 @@ def _missing(known: _Evidence) -> tuple[Section, ...]:
             tables=(table,) if rows else (),
             details=(
                 "The dots are not computed from the curve: what the extended model leaves of the readings is traced"
-                " back through the linear chain to where the effect acts, bin by bin of its signal, and added to the"
-                " curve (component plus residual); the other numbers are held.",
+                " back through the model, to first order, to where the effect acts, bin by bin of its signal, and added"
+                " to the curve (component plus residual); the other numbers are held.",
             )
             if figures
             else (),
@@ -156,12 +193,22 @@ def _missing(known: _Evidence) -> tuple[Section, ...]:
     )
 
 
+def _added(found: Diagnosis) -> tuple[str, ...]:
+    """Return the effects that the extended model has beyond those that samples alone show."""
+    return tuple(e.name for e in found.extended_model.effects)
+
+
 def _effect_rows(effect: FoundEffect) -> list[tuple[str, ...]]:
     rows: list[tuple[str, ...]] = []
+    known = (effect.name, f"{effect.probability:.2f}", effect.at or ", ".join(effect.places))
     for i, (name, p) in enumerate(effect.parameters.items()):
-        first = (effect.name, f"{effect.probability:.2f}", ", ".join(effect.places)) if i == 0 else ("", "", "")
-        rows.append((*first, name.replace("_", " "), with_spread(p), effect.equation if i == 0 else ""))
-    return rows or [(effect.name, f"{effect.probability:.2f}", ", ".join(effect.places), "", "", effect.equation)]
+        first = known if i == 0 else ("", "", "")
+        same = effect.as_command.get(name)
+        value = with_spread(p) + (
+            f", as a command {with_spread(same)}" if same is not None and same.unit != p.unit else ""
+        )
+        rows.append((*first, name.replace("_", " "), value, effect.equation if i == 0 else ""))
+    return rows or [(*known, "", "", effect.equation)]
 
 
 def _described(description: Description, found: Diagnosis) -> Section:
@@ -199,13 +246,13 @@ def _when(known: _Evidence) -> Section:
         for effect in found.effects
         if _is_at_times(effect, known)
     ]
-    figures = [acting_figure(law, found.search.data.recordings, known.names) for law in known.laws]
+    figures = [acting_figure(law, found.search.recordings, known.names) for law in known.laws]
     title = "When it acts" if known.laws or found.effects else "What is left, along the recordings"
     return Section(title=title, text=tuple(text), figures=(*figures, over_time(found)))
 
 
 def _is_at_times(effect: FoundEffect, known: _Evidence) -> bool:
-    recordings = known.found.search.data.recordings
+    recordings = known.found.search.recordings
     ends = {(i, float(r.t[0]), float(r.t[-1])) for i, r in enumerate(recordings)}
     return set(effect.windows) != ends
 
@@ -218,19 +265,17 @@ def _times(effect: FoundEffect, known: _Evidence, most: int = 6) -> str:
 
 def _against(known: _Evidence) -> Section:
     """Say what speaks against the finding: rivals, what was not excited, what is left."""
-    found, s = known.found, known.found.search
+    found = known.found
     rows = [(of_candidate(c.name), f"{c.probability:.3f}") for c in found.candidates if c.probability >= _LEAST]
     odds = Table(
         header=("explanation", "probability"), rows=tuple(rows[:_RIVALS]),
-        caption="All explanations that were weighed, the likeliest first. An effect's own probability is the sum of"
-        " those that have it.",
+        caption="All explanations that were weighed, the likeliest first, by all rows and the parts that leave some"
+        " out. An effect's own probability is the sum of those that have it.",
     )  # fmt: skip
-    base = penalised(s.retuned)
-    # pruning and exchanging fit some combinations more than once
-    ranked = merged(s.others)
+    ranked = found.search.hypotheses()
     table = Table(
         header=("hypothesis", "decrease of chi-square, parameters paid for"),
-        rows=tuple((" + ".join(h.names), f"{base - penalised(h):.1f}") for h in ranked),
+        rows=tuple((name, f"{decrease:.1f}") for name, decrease in ranked),
     )
     return Section(
         title="What speaks against it",

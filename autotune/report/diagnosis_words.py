@@ -11,7 +11,7 @@ from autotune.diagnosis.evidence.missing_law import MissingLaw
 from autotune.diagnosis.evidence.unseen_run import UnseenRun
 from autotune.diagnosis.result import Diagnosis, FoundEffect, NextExperiment
 from autotune.effects import kind_of
-from autotune.report.effect_words import clause, in_short, joined, of_candidate, sentence, with_spread
+from autotune.report.effect_words import clause, in_short, joined, of_candidate, sentence, unit_of, with_spread
 
 #: Probability from which a statement is called sure, likely, and what is below that a guess.
 _SURE, _LIKELY = 0.9, 0.6
@@ -23,13 +23,13 @@ def verdict_of(found: Diagnosis) -> str:
     """Return the verdict in a sentence, effects in words with their names in brackets."""
     if found.verdict != "effect" or not found.effects:
         return found.sentences[0]
-    said = joined([f"{clause(e.name)} ({e.name}, probability {e.probability:.2f})" for e in found.effects])
-    rest = (
-        ""
-        if found.residual.is_noise or found.fit.comes_down_to_noise
-        else " Something smaller is missing as well: what is left is not noise."
-    )
+    said = joined([f"{clause(e.name)} ({_called(e)}, probability {e.probability:.2f})" for e in found.effects])
+    rest = "" if found.is_clean else " Something smaller is missing as well: what is left is not noise."
     return f"The model leaves physics out: {said}.{rest}"
+
+
+def _called(effect: FoundEffect) -> str:
+    return f"{effect.name} at {effect.at}" if effect.at else effect.name
 
 
 def places_of(found: Diagnosis) -> tuple[dict[str, list[str]], tuple[str, ...]]:
@@ -162,9 +162,9 @@ def objections(found: Diagnosis, run: UnseenRun | None, laws: Sequence[MissingLa
     said += _ranges(found)
     for effect in found.effects:
         said += _of_effect(effect)
-    if len(found.search.data.recordings) == 1:
+    if len(found.search.recordings) == 1:
         said.append("There is one recording: what is the rig's and what is that day's cannot be told apart.")
-    if not (found.residual.is_noise or found.fit.comes_down_to_noise):
+    if not found.is_clean:
         q = found.fit
         said.append(
             f"What is left is more than noise: {_percent(q.extended)} of the spread of y on held-out stretches, where "
@@ -175,18 +175,16 @@ def objections(found: Diagnosis, run: UnseenRun | None, laws: Sequence[MissingLa
 
 def _ranges(found: Diagnosis) -> list[str]:
     """Return between which values the effects were seen, each range once."""
-    model = found.extended_model
-    at_plant = next((b.unit for b in model.blocks if b.place == "actuator" and b.unit), model.input.unit)
-    seen: dict[tuple[str, float, float], list[str]] = {}
+    seen: dict[tuple[str, float, float, str], list[str]] = {}
     for effect in found.effects:
         r = effect.operating_range
         if r is not None:
-            seen.setdefault((r.signal, r.low, r.high), []).append(in_short(effect.name))
-    units = {"plant input": at_plant, "y": model.output.unit, "position": model.output.unit}
+            seen.setdefault((r.signal, r.low, r.high, r.unit), []).append(in_short(effect.name))
+    from_rest = {"plant input": " from the operating point", "position": " from the operating point"}
     return [
-        f"{joined(names).capitalize()}: seen for {signal}{'' if signal == 'y' else ' from the operating point'} "
-        f"between {low:.4g} and {high:.4g} {units.get(signal, '')}; beyond that nothing was excited."
-        for (signal, low, high), names in seen.items()
+        f"{joined(names).capitalize()}: seen for {signal}{from_rest.get(signal, '')} "
+        f"between {low:.4g} and {high:.4g}{unit_of(unit)}; beyond that nothing was excited."
+        for (signal, low, high, unit), names in seen.items()
     ]
 
 

@@ -25,8 +25,8 @@ from autotune.diagnosis.evidence.screens import (
     value_screen,
     window_screen,
 )
-from autotune.diagnosis.fitting.long_windows import spread_of
 from autotune.diagnosis.result import Diagnosis
+from autotune.diagnosis.selection.searched import Search
 from autotune.report import chart as go
 from autotune.report.page import BLUE, GREEN, GREY, ORANGE, Figure, Section, Table, add_line, lines_figure, thinned
 
@@ -50,13 +50,15 @@ def screen_sections(
     names : sequence of str
         The recordings' names for people; their numbers by default.
     """
-    return (_samples(found, controller), _residual(found, names), _signals(found))
+    samples = _samples(found, controller)
+    # what a residual goes with is asked along a linear chain
+    return (samples, _residual(found, names), _signals(found)) if isinstance(found.search, Search) else (samples,)
 
 
 def _samples(found: Diagnosis, controller: Controller | None) -> Section:
-    recordings = found.search.data.recordings
+    recordings = found.search.recordings
     stamps, values = stamp_screen(recordings), value_screen(recordings)
-    u_unit, y_unit = found.extended_model.input.unit, found.extended_model.output.unit
+    u_unit, y_unit = found.search.units
     steps = _histogram(np.concatenate(stamps.steps), "step between time stamps / sample time", (0.9, 1.1), log=True)
     taken = _histogram(values.values, f"y [{y_unit}]", (np.inf, -np.inf))
     figures = [
@@ -93,7 +95,7 @@ def _law(law: LawScreen, unit: str) -> go.Chart:
 
 def _residual(found: Diagnosis, names: Sequence[str]) -> Section:
     retuned, extended, data = found.search.retuned.fit, found.search.chosen.fit, found.search.data
-    y_unit = found.extended_model.output.unit
+    y_unit = found.search.units[1]
     spectrum = spectrum_screen(retuned, extended, data)
     figure = lines_figure("frequency [Hz]", f"power density [{y_unit}²/Hz]", log_x=True, log_y=True)
     add_line(figure, spectrum.frequency_hz, spectrum.retuned, "retuned", ORANGE)
@@ -128,27 +130,26 @@ def _residual(found: Diagnosis, names: Sequence[str]) -> Section:
 
 
 def over_time(found: Diagnosis) -> Figure:
-    """Draw the size of the residual over time, one recording after the other, in pieces no longer than its windows."""
-    data, unit = found.search.data, found.extended_model.output.unit
+    """Draw the size of the residual over time, one recording after the other, in pieces."""
+    search, unit = found.search, found.search.units[1]
     figure = lines_figure("t, one recording after the other [s]", f"rms residual [{unit}]")
     pieces, middles, at, row = [], [], 0.0, 0
-    longest = max(sum(len(r) for r in data.recordings) // PIECES, LEAST_PIECE)
-    for r, starts, stops in zip(data.recordings, data.starts, data.stops, strict=True):
-        for a, b in zip(starts, stops, strict=True):
-            cuts = np.linspace(a, b, max(1, round((b - a) / longest)) + 1).astype(np.int64)
-            pieces += [(row + i, row + j) for i, j in pairwise(cuts)]
-            middles += [at + 0.5 * (r.t[i] + r.t[j - 1]) - r.t[0] for i, j in pairwise(cuts)]
+    longest = max(sum(len(r) for r in search.recordings) // PIECES, LEAST_PIECE)
+    for r in search.recordings:
+        cuts = np.linspace(0, len(r), max(1, round(len(r) / longest)) + 1).astype(np.int64)
+        pieces += [(row + i, row + j) for i, j in pairwise(cuts)]
+        middles += [at + 0.5 * (r.t[i] + r.t[j - 1]) - r.t[0] for i, j in pairwise(cuts)]
         at, row = at + r.duration_s, row + len(r)
-    t = np.array(middles)
+    t, y = np.array(middles), np.concatenate([r.y for r in search.recordings])
     sizes = {}
-    fits = {"retuned": (found.search.retuned.fit, ORANGE), "extended": (found.search.chosen.fit, BLUE)}
-    if found.search.chosen.fit is found.search.retuned.fit:
-        fits.pop("extended")
-    for name, (fit, colour) in fits.items():
-        e = np.concatenate(fit.residuals)
-        sizes[name] = np.array([np.sqrt(np.mean(e[a:b] ** 2)) for a, b in pieces])
-        add_line(figure, t, sizes[name], name, colour)
-    noise = found.fit.noise_floor * spread_of(data)
+    for name, simulated in search.simulated().items():
+        squares = (y - np.concatenate(simulated)) ** 2
+        kept = [np.isfinite(squares[a:b]) for a, b in pieces]
+        means = [np.mean(squares[a:b][ok]) if ok.any() else 0.0 for (a, b), ok in zip(pieces, kept, strict=True)]
+        sizes[name] = np.sqrt(np.array(means))
+        add_line(figure, t, sizes[name], name, {"retuned": ORANGE, "extended": BLUE}[name])
+    spread = float(np.nanstd(y)) or 1.0
+    noise = found.fit.noise_floor * spread
     add_line(figure, t[[0, -1]], np.full(2, noise), "noise alone", GREY, dash="dot")
     figure.update_yaxes(rangemode="tozero")
     worst, usual = int(np.argmax(sizes["retuned"])), float(np.median(sizes["retuned"]))
@@ -185,7 +186,7 @@ def _signals(found: Diagnosis) -> Section:
     best = max(curves, key=lambda name: curves[name].explained)
     figures, rows = [], []
     for name, means in sorted(curves.items(), key=lambda pair: -pair[1].explained):
-        figure = lines_figure(_titled(name, found), f"residual [{found.extended_model.output.unit}]")
+        figure = lines_figure(_titled(name, found), f"residual [{found.search.units[1]}]")
         _add_means(figure, means, "retuned", ORANGE, search.data.noise.total_sd)
         share = "-"
         if name in after:
@@ -203,9 +204,8 @@ def _signals(found: Diagnosis) -> Section:
 
 def _titled(name: str, found: Diagnosis) -> str:
     """Return the title of a signal's axis, with its unit."""
-    model = found.extended_model
-    at_plant = next((b.unit for b in model.blocks if b.place == "actuator" and b.unit), model.input.unit)
-    u, y = model.input.unit, model.output.unit
+    blocks, (u, y) = found.search.retuned.fit.model.blocks, found.search.units
+    at_plant = next((b.unit for b in blocks if b.place == "actuator" and b.unit), u)
     units = {"command u": u, "command": u, "u_applied": u, "plant input": at_plant}
     units |= {"reading": y, "position": y, "level": y, "speed": f"{y}/s", "rate of the reading": f"{y}/s"}
     return f"{name} [{units.get(name) or '-'}]" if name in units else name
@@ -238,13 +238,11 @@ def curve_figure(curve: Curve, found: Diagnosis) -> go.Chart:
 def trace_figures(found: Diagnosis, names: Sequence[str]) -> tuple[Figure, ...]:
     """Return every recording with the retuned and the extended simulation, window by window."""
     figures, search = [], found.search
-    for i, (r, name) in enumerate(zip(search.data.recordings, names, strict=True)):
-        figure = lines_figure("t [s]", f"y [{found.extended_model.output.unit}]")
+    for i, (r, name, count) in enumerate(zip(search.recordings, names, search.runs(), strict=True)):
+        figure = lines_figure("t [s]", f"y [{search.units[1]}]")
         add_line(figure, *thinned(r.t, r.y), "measured", GREY, width=1.0)
-        add_line(figure, *thinned(r.t, search.retuned.fit.signals[i][:, 0]), "retuned", ORANGE)
-        if search.chosen.fit is not search.retuned.fit:
-            add_line(figure, *thinned(r.t, search.chosen.fit.signals[i][:, 0]), "extended", BLUE)
-        count = len(search.data.starts[i])
+        for model, simulated in search.simulated().items():
+            add_line(figure, *thinned(r.t, simulated[i]), model, {"retuned": ORANGE, "extended": BLUE}[model])
         how = "in one run" if count == 1 else f"in {count} windows, the state fitted at the start of each"
         figures.append(Figure(figure=figure, caption=f"{name}: measured, and simulated {how}.", height_px=HEIGHT))
     return tuple(figures)

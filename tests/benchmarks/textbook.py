@@ -1,7 +1,7 @@
 """Ten textbook plants as equations, each concealing ten effects in turn, one outside the catalogue, and none.
 
 ``python -m tests.benchmarks textbook`` makes the recordings by ``sim.textbook`` (integrators of its own) and gives them
-with the nominal equations to ``diagnose_equations``. TEXTBOOK_PLANTS names some (separated by commas), TEXTBOOK_SEED is
+with the nominal equations to ``diagnose``. TEXTBOOK_PLANTS names some (separated by commas), TEXTBOOK_SEED is
 the first seed (61), TEXTBOOK_OUT the folder that holds one JSON file a case: what is there is not run again,
 TEXTBOOK_ROWS the length of each recording where it is not the plant's own. WORKERS processes at once (1).
 """
@@ -50,7 +50,7 @@ def diagnosed(plant: Plant, case: Case, folder: Path) -> dict[str, Any]:
     """Return what the diagnosis of a case said, and how long it took."""
     from threadpoolctl import threadpool_limits
 
-    from autotune.diagnosis.equations import diagnose_equations
+    from autotune.diagnosis import diagnose
     from autotune.equations.read import read_equations
     from autotune.recording import read_recording
 
@@ -62,7 +62,7 @@ def diagnosed(plant: Plant, case: Case, folder: Path) -> dict[str, Any]:
     recordings = [read_recording(folder / f"rec{k}.csv") for k in range(2)]
     begin, cpu = time.perf_counter(), time.process_time()
     with threadpool_limits(1):
-        found = diagnose_equations(read_equations(folder / "model.toml"), recordings)
+        found = diagnose(read_equations(folder / "model.toml"), recordings)
     said = found.as_json()
     return {
         "verdict": said["verdict"],

@@ -6,10 +6,6 @@
     what a search asks of any model: fit it with effects, try one more, tell what numbers and starts can explain
 ``search``
     first order screens all candidates, fits decide, one effect after the other
-``found``
-    verdict, probabilities, sentences; diagnosis.json and the extended model
+``evidence``
+    what recordings show: what :func:`autotune.diagnosis.diagnose` asks of models of every kind
 """
-
-from autotune.diagnosis.equations.found import EquationDiagnosis, diagnose_equations
-
-__all__ = ["EquationDiagnosis", "diagnose_equations"]

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from autotune.arrays import BoolArray, FloatArray, IntArray, deviations_beside_prior
 from autotune.diagnosis.equations.bench import Bench, Outcome
-from autotune.diagnosis.equations.candidates import Signals, Trial
+from autotune.diagnosis.equations.candidates import Signals
 from autotune.diagnosis.equations.held_out import HELD_OUT
 from autotune.diagnosis.equations.sought import jumping, sought
 from autotune.diagnosis.evidence.stretches import stretches_in
@@ -17,9 +17,8 @@ from autotune.effects.in_equations import Scales
 from autotune.equations.black_box import BlackBox, driven, read_out
 from autotune.equations.effects import apply, at_reading, compile_with, with_values
 from autotune.equations.fit_data import Fitted
-from autotune.equations.model import EquationModel
 from autotune.equations.parameter_scales import slopes_of, values_of
-from autotune.equations.simulate import Compiled, Drive
+from autotune.equations.simulate import Compiled
 from autotune.errors import InputError
 from autotune.models import Effect
 from autotune.recording import Recording
@@ -28,7 +27,7 @@ from autotune.recording import Recording
 _STEP = 1e-2
 
 
-class ClosedBench:
+class ClosedBench(Bench):
     """A closed model on recordings; each recording is one run from the model's own start.
 
     Parameters
@@ -42,40 +41,16 @@ class ClosedBench:
     """
 
     def __init__(self, box: BlackBox, recordings: Sequence[Recording], good: Sequence[BoolArray]) -> None:
-        self._box, self._shell = box, box.shell()
-        self._recordings = tuple(
-            replace(r, y=np.where(ok, r.y, np.nan)) for r, ok in zip(recordings, good, strict=True)
-        )
-        self._rows = [np.isfinite(r.y) for r in self._recordings]
-        self.grows = 1.0
-        self._drives = []
-        for r in self._recordings:
-            r.require_finite(box.columns)
-            self._drives.append(Drive(t=r.t, inputs=np.column_stack([r[c] for c in box.columns])))
-
-    @property
-    def model(self) -> EquationModel:
-        """The shell: the same inputs, nothing inside."""
-        return self._shell
-
-    @property
-    def recordings(self) -> tuple[Recording, ...]:
-        """What was measured; readings that do not count are no numbers."""
-        return self._recordings
-
-    @property
-    def is_closed(self) -> bool:
-        """Only inputs and reading can be reached."""
-        return True
+        super().__init__(box.shell(), recordings, good)
+        self._box = box
 
     def _compiled(self, effects: Sequence[Effect]) -> Compiled:
         """Return the shell with the model's parameters and those of effects, dead times among them."""
-        compiled = compile_with(self._shell, effects)
+        compiled = compile_with(self.model, effects)
         u = np.concatenate([d.inputs[:, 0] for d in self._drives])
-        y = np.concatenate([r.y for r in self._recordings])
-        span = max(float(d.t[-1] - d.t[0]) for d in self._drives)
+        y = np.concatenate([r.y for r in self.recordings])
         size = float(np.std(u))
-        scales = Scales(u=size, y=float(np.nanstd(y)), duration_s=span, size=size, span=0.0, column=0.0)
+        scales = Scales(u=size, y=float(np.nanstd(y)), duration_s=self._duration_s, size=size, span=0.0, column=0.0)
         # a step of the finite differences is wide enough for what moves by jumps
         inside = tuple(p if p in jumping(compiled, effects) else sought(p, effects, lambda effect: scales)
                        for p in compiled.parameters)  # fmt: skip
@@ -86,14 +61,14 @@ class ClosedBench:
         p = values_of(compiled, z)
         values = {q.name: (float(v), 0.0) for q, v in zip(compiled.parameters, p, strict=True)}
         now = with_values(effects, values)
-        applied = apply(self._shell, now)
+        applied = apply(self.model, now)
         at_input = [e for e in applied.extensions if e.output is None]
         own = {q.name: values[q.name][0] for q in self._box.parameters}
         found = []
         for drive in self._drives:
             arriving = driven(self._box, at_input, applied.delays, applied.before(drive))
             y = self._box.simulation(own, arriving)
-            found.append(applied.after(read_out(y, drive, at_reading(self._shell, now))))
+            found.append(applied.after(read_out(y, drive, at_reading(self.model, now))))
         return found
 
     def _fit(
@@ -102,7 +77,7 @@ class ClosedBench:
         """Return a Gauss-Newton fit with Levenberg's damping, beliefs counted."""
         compiled = self._compiled(effects)
         which = np.flatnonzero([free and q.spread > 0.0 for q in compiled.parameters])
-        y = np.concatenate([r.y[ok] for r, ok in zip(self._recordings, rows, strict=True)])
+        y = np.concatenate([r.y[ok] for r, ok in zip(self.recordings, rows, strict=True)])
 
         def left(at: FloatArray) -> FloatArray:
             runs = self._simulated(compiled, effects, at)
@@ -157,7 +132,7 @@ class ClosedBench:
         whole = np.zeros((e.size, p.size))
         whole[:, which] = J / sd
         runs = self._simulated(compiled, effects, z)
-        residuals = tuple(r.y - y for r, y in zip(self._recordings, runs, strict=True))
+        residuals = tuple(r.y - y for r, y in zip(self.recordings, runs, strict=True))
         fitted = Fitted(
             compiled=compiled, parameters=p, sd=deviation, z=z, windows=(), simulated=tuple(runs), residuals=residuals,
             noise_sd=sd, jacobian=whole, converged=True,
@@ -187,30 +162,6 @@ class ClosedBench:
         """Return the model fitted with effects, from where another fit ended."""
         return self._fit(effects, self._start(self._compiled(effects), start), iterations, True, self._rows)
 
-    def shortened(self, outcome: Outcome) -> Outcome | None:
-        """Return nothing: a closed model starts where it starts."""
-        return None
-
-    def lengthened(self, outcome: Outcome) -> Outcome:
-        """Return the fit as it is."""
-        return outcome
-
-    def part(self, outcome: Outcome, rows: int) -> tuple[Bench, Outcome] | None:
-        """Return nothing: a recording is one run from the model's own start."""
-        return None
-
-    def carried(self, outcome: Outcome, iterations: int) -> Outcome:
-        """Return the fit as it is."""
-        return outcome
-
-    def is_stand_in(self, outcome: Outcome) -> bool:
-        """Return no: effects inside that could be one are not tried."""
-        return False
-
-    def is_sought_outside(self, effect: Effect) -> bool:
-        """Return no: dead times are fitted with the other numbers."""
-        return False
-
     def with_trial(self, outcome: Outcome, effect: Effect) -> FloatArray | None:
         """Return how the readings change at the rows that count with one more effect."""
         effects = (*outcome.effects, effect)
@@ -221,31 +172,16 @@ class ClosedBench:
         ])  # fmt: skip
         return d if np.all(np.isfinite(d)) else None
 
-    def each(self, one: Callable[[Trial], FloatArray | None], found: Sequence[Trial]) -> Iterable[FloatArray | None]:
-        """Return what a function makes of every trial, one after the other: there is one model."""
-        return map(one, found)
-
-    def explained(self, outcome: Outcome) -> FloatArray:
-        """Return an orthonormal basis of what numbers can explain at the rows that count."""
-        U, s, _ = np.linalg.svd(outcome.fitted.jacobian, full_matrices=False)
-        return np.asarray(U[:, s > 1.0])
-
-    def without_starts(self, outcome: Outcome, d: FloatArray) -> FloatArray:
-        """Return the change as it is: the start is inside the model."""
-        return d
-
     def signals(self, outcome: Outcome) -> Signals:
         """Return command, reading and sizes of inputs that take forces."""
         u = np.concatenate([d.inputs[:, 0] for d in self._drives])
-        dt = float(np.median(np.concatenate([np.diff(d.t) for d in self._drives])))
-        duration = max(float(d.t[-1] - d.t[0]) for d in self._drives)
         sizes = {one.column: float(np.std(u)) for one in self._box.inputs if one.kind}
         return Signals(u=u, y=np.concatenate(outcome.fitted.simulated), values={}, sizes=sizes, columns={}, lines=(),
-                       dt_s=dt, duration_s=duration, slow_s=0.05 * duration)  # fmt: skip
+                       dt_s=self._dt_s, duration_s=self._duration_s, slow_s=0.05 * self._duration_s)  # fmt: skip
 
     def left_out_squares(self, outcome: Outcome) -> FloatArray:
         """Return squared errors on stretches, the numbers fitted to the other ones."""
-        rows = [len(r) for r in self._recordings]
+        rows = [len(r) for r in self.recordings]
         labels = stretches_in(rows, [np.zeros(1, np.int64) for _ in rows], [np.array([n]) for n in rows])
         squares = np.zeros(1 + max(int(label.max(initial=-1)) for label in labels))
         for k in range(squares.size):
@@ -257,7 +193,7 @@ class ClosedBench:
 
     def held_out_error(self, outcome: Outcome, refits: bool) -> float:
         """Return the rms error on the last third of every recording, the numbers fitted to the rest."""
-        cut = [int((1.0 - HELD_OUT) * len(r)) for r in self._recordings]
+        cut = [int((1.0 - HELD_OUT) * len(r)) for r in self.recordings]
         first = [ok & (np.arange(ok.size) < k) for ok, k in zip(self._rows, cut, strict=True)]
         if refits:
             outcome = self._fit(outcome.effects, self._start(self._compiled(outcome.effects), outcome), 6, True, first)

@@ -16,7 +16,7 @@ from autotune.diagnosis.equations.candidates import Signals, Trial, form_of, val
 from autotune.diagnosis.equations.first_order import explained, start_bases, without_starts
 from autotune.diagnosis.equations.followed import followed, positions_of, sizes_of
 from autotune.diagnosis.equations.further import further_columns
-from autotune.diagnosis.equations.held_out import HELD_OUT, forecast_errors, free_run_errors, until
+from autotune.diagnosis.equations.held_out import HELD_OUT, bounded_errors, forecasts, free_run, until
 from autotune.diagnosis.equations.parts import standing_out, telling_windows
 from autotune.diagnosis.equations.sought import changed, outer, sought
 from autotune.diagnosis.evidence.stretches import stretches_in
@@ -30,7 +30,7 @@ from autotune.equations.linearise import growth_rate
 from autotune.equations.model import EquationModel, InputColumn
 from autotune.equations.parameter_scales import values_of as natural
 from autotune.equations.sensitivity import Windows, side_by_side
-from autotune.equations.simulate import Compiled, drive_of, simulate
+from autotune.equations.simulate import Compiled, simulate
 from autotune.errors import InputError
 from autotune.models import Effect
 from autotune.recording import Recording
@@ -57,8 +57,8 @@ LONGER_AND_LONGER, LENGTHENED = (0.25, 1.0), 12
 SHORTER = 8
 
 
-class EquationBench:
-    """Equations on recordings.
+class EquationBench(Bench):
+    """Equations on recordings: every state can be reached.
 
     Parameters
     ----------
@@ -70,39 +70,20 @@ class EquationBench:
         Rows whose reading counts.
     """
 
+    is_closed = False
+
     def __init__(self, model: EquationModel, recordings: Sequence[Recording], good: Sequence[BoolArray]) -> None:
         self._nominal, self._further = model, further_columns(model, recordings)
         # further columns drive nothing until an effect takes them; what is measured runs on between rows
         measured = (InputColumn(column=name, hold="linear") for name in self._further)
-        self._model = replace(model, inputs=(*model.inputs, *measured))
-        self._recordings = tuple(
-            replace(r, y=np.where(ok, r.y, np.nan)) for r, ok in zip(recordings, good, strict=True)
-        )
-        self._rows = [np.isfinite(r.y) for r in self.recordings]
-        self._drives = [drive_of(self._model, r) for r in self.recordings]
-        span = max(float(r.t[-1] - r.t[0]) for r in recordings)
+        super().__init__(replace(model, inputs=(*model.inputs, *measured)), recordings, good)
         dt = max(float(np.median(np.diff(r.t))) for r in recordings)
-        longest = min(span / WINDOWS, MOST_ROWS * dt)
+        longest = min(self._duration_s / WINDOWS, MOST_ROWS * dt)
         rate = growth_rate(model, recordings) if model.horizon_s is None else 0.0
         unstable = GROWTH / rate if rate * longest > GROWTH else None
         self._horizon_s = model.horizon_s or unstable
         self.grows = math.exp(GROWTH) if unstable else 1.0
         self.length_s = self._horizon_s or longest
-
-    @property
-    def model(self) -> EquationModel:
-        """The equations."""
-        return self._model
-
-    @property
-    def recordings(self) -> tuple[Recording, ...]:
-        """What was measured; readings that do not count are no numbers."""
-        return self._recordings
-
-    @property
-    def is_closed(self) -> bool:
-        """Every state can be reached."""
-        return False
 
     def retuned(self) -> Outcome:
         """Return the model with its own numbers retuned, on windows of the search's length."""
@@ -130,13 +111,22 @@ class EquationBench:
 
     def held_out_error(self, outcome: Outcome, refits: bool) -> float:
         """Return the rms error on the last third of every recording, the numbers fitted to the rest."""
+        runs = self.held_out_runs(outcome, refits)
+        each = zip(self.recordings, runs, strict=False)
+        e = np.concatenate([np.zeros(0), *(bounded_errors(r.y, run, first) for r, (run, first) in each)])
+        return float(np.sqrt(np.nanmean(e**2))) if e.size else float("inf")
+
+    def held_out_runs(self, outcome: Outcome, refits: bool) -> list[tuple[FloatArray, int]]:
+        """Return readings of the last third of every recording, (N,), NaN before, and the row that judging begins at.
+
+        The numbers are fitted to the rest; nothing is returned where that runs away.
+        """
         compiled = self._compiled(outcome.effects)
         cuts = [int((1.0 - HELD_OUT) * len(r)) for r in self.recordings]
         z = np.zeros(len(compiled.parameters))
         own = len(self.model.parameters)
         z[:own] = outcome.fitted.z[:own]
-        each = list(zip(self.recordings, cuts, outcome.fitted.windows, strict=True))
-        errors = []
+        each, runs = list(zip(self.recordings, cuts, outcome.fitted.windows, strict=True)), []
         try:
             windows = [until(w, k) for _, k, w in each]
             if refits:
@@ -146,13 +136,12 @@ class EquationBench:
             p = natural(compiled, z)
             for (r, k, _), drive, w in zip(each, self._drives, windows, strict=True):
                 if self._horizon_s is not None:
-                    errors.append(forecast_errors(compiled, p, drive, r.y, k, self._horizon_s))
+                    runs.append(forecasts(compiled, p, drive, r.y, k, self._horizon_s))
                 else:
-                    errors.append(free_run_errors(compiled, p, drive, r.y, w, k))
+                    runs.append(free_run(compiled, p, drive, r.y, w, k))
         except InputError:
-            return float("inf")
-        e = np.concatenate(errors)
-        return float(np.sqrt(np.nanmean(e**2)))
+            return []
+        return runs
 
     def left_out_squares(self, outcome: Outcome) -> FloatArray:
         """Return squared errors on stretches, the numbers fitted to the other ones."""
@@ -178,7 +167,7 @@ class EquationBench:
         place, column = where_of(effect), self._columns.get(effect.column, np.zeros(1))
         return Scales(
             u=float(np.std(self._columns[self.model.columns[0]])), y=float(np.nanstd(self._columns["y"])),
-            duration_s=max(float(r.t[-1] - r.t[0]) for r in self.recordings), size=self._sizes.get(place, 0.0),
+            duration_s=self._duration_s, size=self._sizes.get(place, 0.0),
             span=self._spans.get(place, 0.0), column=float(np.sqrt(np.mean(column**2))),
         )  # fmt: skip
 
@@ -333,10 +322,6 @@ class EquationBench:
         """Return what a function makes of every trial, several at a time."""
         return side_by_side(one, found)
 
-    def explained(self, outcome: Outcome) -> FloatArray:
-        """Return an orthonormal basis of what the numbers of a fit can explain, start states projected out."""
-        return explained(outcome.fitted)
-
     def without_starts(self, outcome: Outcome, d: FloatArray) -> FloatArray:
         """Return a change of the readings without what other start states make of it, to first order."""
         if self._bases_of is not outcome:
@@ -370,14 +355,12 @@ class EquationBench:
     def signals(self, outcome: Outcome) -> Signals:
         """Return states, differences across ports, and sizes of derivatives under a fit."""
         y, values = self._followed(outcome)
-        dt = float(np.median(np.concatenate([np.diff(r.t) for r in self.recordings])))
-        self._sizes = sizes_of(self.model, outcome.fitted.parameters, values, self._drives[0].inputs[:1], dt)
+        self._sizes = sizes_of(self.model, outcome.fitted.parameters, values, self._drives[0].inputs[:1], self._dt_s)
         self._spans = {
             place: float(np.ptp(values[name])) for place, name in positions_of(self.model).items() if name in values
         }  # fmt: skip
-        duration = max(float(r.t[-1] - r.t[0]) for r in self.recordings)
         u = np.concatenate([d.inputs[:, 0] for d in self._drives])
         columns = {name: self._columns[name] for name in self._further}
-        lines = standing_out(max(outcome.fitted.residuals, key=len), dt)
-        return Signals(u=u, y=y, values=values, sizes=self._sizes, columns=columns, lines=lines, dt_s=dt,
-                       duration_s=duration, slow_s=0.05 * duration)  # fmt: skip
+        lines = standing_out(max(outcome.fitted.residuals, key=len), self._dt_s)
+        return Signals(u=u, y=y, values=values, sizes=self._sizes, columns=columns, lines=lines, dt_s=self._dt_s,
+                       duration_s=self._duration_s, slow_s=0.05 * self._duration_s)  # fmt: skip

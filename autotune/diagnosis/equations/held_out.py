@@ -18,14 +18,15 @@ FAR_OFF = 10.0
 HELD_OUT, SETTLED = 1.0 / 3.0, 0.15
 
 
-def free_run_errors(
+def free_run(
     compiled: Compiled, p: FloatArray, drive: Drive, y: FloatArray, windows: Windows, row: int
-) -> FloatArray:
-    """Return the errors of one free run from a row to the end, its first part apart, which tells where it starts."""
+) -> tuple[FloatArray, int]:  # fmt: skip
+    """Return one free run from a row to the end, NaN before, and the row from which on it is judged.
+
+    Its first part tells where it starts.
+    """
     at, end = _continued(compiled, p, drive, y, windows, row), np.array([y.size])
-    run = simulate(compiled, p, drive, at.states, starts=at.starts, stops=end)
-    judged = slice(row + int(SETTLED * (y.size - row)), None)
-    return _bounded((y - run.y)[judged], y[judged], FAR_OFF * float(np.nanstd(y)))
+    return simulate(compiled, p, drive, at.states, starts=at.starts, stops=end).y, row + int(SETTLED * (y.size - row))
 
 
 def _continued(compiled: Compiled, p: FloatArray, drive: Drive, y: FloatArray, before: Windows, row: int) -> Windows:
@@ -50,13 +51,13 @@ def _continued(compiled: Compiled, p: FloatArray, drive: Drive, y: FloatArray, b
     return best
 
 
-def forecast_errors(
+def forecasts(
     compiled: Compiled, p: FloatArray, drive: Drive, y: FloatArray, row: int, horizon_s: float
-) -> FloatArray:
-    """Return the errors from a row on of forecasts, each from a state that the horizon before it tells."""
+) -> tuple[FloatArray, int]:  # fmt: skip
+    """Return forecasts, each from a state that the horizon before it tells, and the row that the first begins at."""
     edges, _ = window_rows(drive.t, horizon_s)
     edges = np.append(edges, y.size)
-    errors, most, guess = [], FAR_OFF * float(np.nanstd(y)), None
+    found, first, guess = np.full(y.size, np.nan), y.size, None
     for before, a, b in zip(edges, edges[1:], edges[2:], strict=False):
         if a < row:
             continue
@@ -64,17 +65,17 @@ def forecast_errors(
             compiled, p, drive, y, np.isfinite(y), np.array([before]), np.array([b]), share=(a - before) / (b - before),
             least=int(a - before), guess=guess,
         )  # fmt: skip
-        run = simulate(compiled, p, drive, w.states, starts=w.starts, stops=w.stops)
+        found[a:b] = simulate(compiled, p, drive, w.states, starts=w.starts, stops=w.stops).y[a:b]
         now = simulate(compiled, p, drive, w.states, starts=w.starts, stops=np.array([a])).ends[0]
-        guess = now if np.all(np.isfinite(now)) else None
-        errors.append(_bounded((y - run.y)[a:b], y[a:b], most))
-    return np.concatenate(errors) if errors else np.full(1, np.inf)
+        guess, first = now if np.all(np.isfinite(now)) else None, min(first, int(a))
+    return found, first
 
 
-def _bounded(e: FloatArray, y: FloatArray, most: float) -> FloatArray:
-    """Return errors no larger than a bound: where a simulation runs away, how far does not matter."""
+def bounded_errors(y: FloatArray, run: FloatArray, first: int) -> FloatArray:
+    """Return a run's errors from a row on, no larger than a bound: where it runs away, how far does not matter."""
+    most, e = FAR_OFF * float(np.nanstd(y)), y - run
     away = np.isfinite(y) & ~np.isfinite(e)
-    return np.clip(np.where(away, most, e), -most, most)
+    return np.asarray(np.clip(np.where(away, most, e), -most, most)[first:])
 
 
 def until(w: Windows, row: int) -> Windows:

@@ -130,6 +130,11 @@ class Searched:
         return self.best.table
 
     @property
+    def bench(self) -> Bench:
+        """The model on the rows that count."""
+        return self.best.bench
+
+    @property
     def retuned(self) -> Outcome:
         """The model with its own numbers retuned."""
         return self.judged[0].outcome

@@ -61,6 +61,12 @@ def is_settled(bench: Bench, one: Outcome, best: Outcome, limits: Thresholds) ->
 
 def is_slow(one: Outcome, noise: Noise, limits: Thresholds) -> bool:
     """Whether block means of a residual vary by more than its noise says, and chance brings."""
+    slow, chance = slow_power(one, noise)
+    return slow > limits.white + 2.0 * chance
+
+
+def slow_power(one: Outcome, noise: Noise) -> tuple[float, float]:
+    """Return the variance of block means of a residual over what its noise says, and what chance brings to it."""
     ratios, blocks = [], 0
     rho = noise.ar[0] if noise.ar else 0.0
     for residual in one.fitted.residuals:
@@ -70,7 +76,7 @@ def is_slow(one: Outcome, noise: Noise, limits: Thresholds) -> bool:
         wanted = noise.total_sd**2 / width * (1.0 + rho) / (1.0 - rho)
         ratios.append(float(np.mean(means**2)) / max(wanted, 1e-300))
         blocks += means.size
-    return float(np.mean(ratios)) > limits.white + 2.0 * math.sqrt(2.0 / blocks)
+    return float(np.mean(ratios)), math.sqrt(2.0 / blocks)
 
 
 def attempt(bench: Bench, effects: Sequence[Effect], start: Outcome, iterations: int) -> Outcome | None:

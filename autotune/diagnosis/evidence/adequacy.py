@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from autotune.arrays import FloatArray
-from autotune.diagnosis.evidence.constancy import Variation, largest_variation
+from autotune.diagnosis.evidence.constancy import UNASKED, Variation, largest_variation
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import Fit
 from autotune.diagnosis.fitting.retuning import BLOCKS, reduced_chi2, under_noise, whiteness
@@ -36,7 +36,7 @@ class ResidualTests:
     slow_chance : float
         Standard deviation that chance gives to it.
     varies : Variation
-        What would explain most of it among what swings, bends and goes past the chain.
+        What would explain most of it among what swings, bends and goes past the chain where that is asked.
     uneven : bool
         Whether samples show that some rows' noise is larger than others': the variance then says nothing.
     accounted : bool
@@ -49,7 +49,7 @@ class ResidualTests:
     reduced_chi2_chance: float
     slow: float
     slow_chance: float
-    varies: Variation
+    varies: Variation = UNASKED
     uneven: bool = False
     accounted: bool = False
     limits: Thresholds = field(default_factory=Thresholds)
@@ -86,9 +86,6 @@ class ResidualTests:
 
     def as_json(self) -> dict[str, Any]:
         """Return the content of the key ``residual`` of diagnosis.json."""
-        period = self.varies.period_s
-        varies = {"chi2": self.varies.gain, "places": list(self.varies.places), "what": self.varies.what,
-                  "period_s": period if math.isfinite(period) else None}  # fmt: skip
         return {
             "reduced_chi2": self.reduced_chi2,
             "reduced_chi2_chance": self.reduced_chi2_chance,
@@ -96,7 +93,7 @@ class ResidualTests:
             "slow_chance": self.slow_chance,
             "uneven": self.uneven,
             "accounted": self.accounted,
-            "varies": varies,
+            "varies": self.varies.as_json(),
         }
 
 

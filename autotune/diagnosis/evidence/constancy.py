@@ -13,6 +13,7 @@ import math
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.signal import lfilter
@@ -76,6 +77,17 @@ class Variation:
         if np.isfinite(self.period_s):
             return f"What is left swings with a period of about {self.period_s:.2g} s together with {self.what}."
         return f"What is left goes with {self.what}."
+
+    def as_json(self) -> dict[str, Any] | None:
+        """Return it for diagnosis.json; nothing where it was not asked."""
+        if self is UNASKED:
+            return None
+        period = self.period_s if np.isfinite(self.period_s) else None
+        return {"chi2": self.gain, "places": list(self.places), "what": self.what, "period_s": period}
+
+
+#: Where nobody asked what varies: equations have no path that is known to be linear.
+UNASKED = Variation(gain=0.0, places=(), what="", period_s=math.inf)
 
 
 def largest_variation(result: Fit, data: Data) -> Variation:

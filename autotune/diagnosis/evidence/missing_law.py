@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from autotune.arrays import BoolArray, FloatArray, IntArray
-from autotune.diagnosis.evidence.effect_line import ADDED, EffectLine, Signal, line_of, plant_unit
+from autotune.diagnosis.evidence.effect_line import ADDED, EffectLine, line_of, plant_unit
 from autotune.diagnosis.evidence.residual import filled
 from autotune.diagnosis.evidence.stretches import correlation_rows
 from autotune.diagnosis.fitting.data import Data
@@ -85,7 +85,7 @@ class MissingLaw:
     """
 
     effect: str
-    signal: Signal
+    signal: str
     unit: str
     value: str
     value_unit: str

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from autotune.diagnosis.gathering import evidence_of, keeping
+from autotune.diagnosis.gathering import evidence_of
 from autotune.diagnosis.thresholds import IN_USE
 from autotune.diagnosis.verdict import judged
 from autotune.effects import CATALOGUE
@@ -20,8 +20,8 @@ def test_an_effect_that_is_not_kept_is_missing_from_search_and_verdict() -> None
     evidence = evidence_of(servo_model(), recordings, None, rest, quiet, IN_USE)
     assert evidence.search.chosen.names == (DRAG,)
     assert judged(evidence) == "effect"
-    assert judged(keeping(evidence, {DRAG})) == "effect"
-    without = keeping(evidence, set())
+    assert judged(evidence.keeping({DRAG})) == "effect"
+    without = evidence.keeping(set())
     assert without.search.chosen.names == ()
     assert without.quality.extended == without.quality.retuned > evidence.quality.extended
     assert judged(without) == "unexplained"
@@ -35,5 +35,5 @@ def test_a_likely_effect_is_kept_though_the_leading_hypothesis_has_none() -> Non
     assert evidence.found is not None
     found = replace(evidence.found, chosen=evidence.found.retuned)
     leads = replace(evidence, found=found, search=found.as_search())
-    assert keeping(leads, {DRAG}).search.chosen.names == (DRAG,)
-    assert keeping(leads, set()).search.chosen.names == ()
+    assert leads.keeping({DRAG}).search.chosen.names == (DRAG,)
+    assert leads.keeping(set()).search.chosen.names == ()

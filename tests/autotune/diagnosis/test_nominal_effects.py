@@ -11,7 +11,6 @@ from typer.testing import CliRunner
 
 from autotune.cli import app
 from autotune.diagnosis.diagnose import diagnose
-from autotune.diagnosis.equations import diagnose_equations
 from autotune.effects import counted_as
 from autotune.errors import InputError
 from autotune.models import Block, Effect, Model, Parameter, Port, TransferFunction, read_model, write_model
@@ -91,12 +90,12 @@ def test_extended_equations_explain_the_same_recordings_with_nothing_left_out() 
         return float(-0.03 * np.tanh(x[1] / 0.002))
 
     recordings = [recorded(seed, friction, as_it_is, rows=600) for seed in (1, 2)]
-    found = diagnose_equations(model(), recordings)
+    found = diagnose(model(), recordings)
     assert [e.name for e in found.effects] == ["plant.coulomb_friction"]
-    again = diagnose_equations(found.equations, recordings)
+    again = diagnose(found.extended_model, recordings)
     assert again.verdict == "none"
     assert again.effects == ()
-    assert [e.name for e in again.equations.effects] == ["plant.coulomb_friction"]
+    assert [e.name for e in again.extended_model.effects] == ["plant.coulomb_friction"]
 
 
 @pytest.mark.parametrize("command", ["diagnose", "simulate", "check", "design", "margins"])

@@ -70,3 +70,13 @@ def test_a_nominal_model_that_goes_as_far_sets_how_far_others_may_go() -> None:
 
     assert safe_extension((far,), far, [recorded(far)], as_it_is, comparable=True) is far
     assert safe_extension((far,), linear, [recorded(linear)], as_it_is, comparable=False) is linear
+
+
+def test_a_nominal_model_that_runs_away_sets_no_bound() -> None:
+    """A levitating magnet leaves its gap whatever its numbers are: one run goes a thousand times as far as another."""
+
+    def unstable(u: FloatArray) -> FloatArray:
+        return bent(u) * np.where(np.abs(u) > 1.2, 1e3, 1.0)
+
+    assert safe_extension((explodes,), unstable, [recorded(bent)], as_it_is, comparable=False) is explodes
+    assert safe_extension((breaks_off,), unstable, [recorded(bent)], as_it_is, comparable=False) is breaks_off

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from autotune.diagnosis import diagnose
-from autotune.diagnosis.equations.found import diagnose_equations
 from autotune.diagnosis.evidence.operating_point import unmoved
 from autotune.models import Block, Model, Port, TransferFunction
 from autotune.recording import Recording
@@ -61,13 +60,9 @@ def test_a_part_in_which_an_effect_would_change_nothing_is_not_asked_of_it(as_eq
         y[k] = x
         x += (1.0 - np.exp(-0.1)) * (min(max(u[k], -1.0), 1.0) - x)
     r = Recording(t=0.1 * np.arange(rows), u=u, y=y + 0.02 * rng.normal(size=rows))
-    if as_equations:
-        told = diagnose_equations(one_state("(u - x)/tau", {"tau": {"value": 1.0}}), [r])
-        names, p = [e.name for e in told.effects], told.probabilities
-    else:
-        dynamics = TransferFunction(num=(1.0,), den=(1.0, 1.0))
-        valve = Block(name="valve", place="plant", dynamics=dynamics)
-        found = diagnose(Model(name="valve", input=Port(), output=Port(), blocks=(valve,)), [r])
-        names, p = [e.name for e in found.effects], tuple(e.probability for e in found.effects)
-    assert names == ["actuator.saturation"]
-    assert p[0] > 0.9
+    dynamics = TransferFunction(num=(1.0,), den=(1.0, 1.0))
+    valve = Block(name="valve", place="plant", dynamics=dynamics)
+    chain = Model(name="valve", input=Port(), output=Port(), blocks=(valve,))
+    found = diagnose(one_state("(u - x)/tau", {"tau": {"value": 1.0}}) if as_equations else chain, [r])
+    assert [e.name for e in found.effects] == ["actuator.saturation"]
+    assert found.effects[0].probability > 0.9

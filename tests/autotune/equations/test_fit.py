@@ -49,7 +49,7 @@ def test_what_the_recordings_tell_is_found_within_its_deviation(pair: list[Recor
 
 def test_a_combination_that_is_not_determined_is_told(pair: list[Recording]) -> None:
     found = retune(compile_model(model()), pair)
-    least = undetermined(found)
+    least = undetermined(combinations(found))
     assert len(least) == 1
     assert set(least[0].parameters) == {"m", "l"}
     assert least[0].changes[0] * least[0].changes[1] < 0.0

@@ -12,7 +12,7 @@ import pytest
 from typer.testing import CliRunner
 
 from autotune.cli import app
-from autotune.diagnosis.equations import diagnose_equations
+from autotune.diagnosis import diagnose
 from autotune.equations import Drive, compile_model, simulate
 from autotune.equations.black_box import BlackBox, from_function
 from autotune.equations.files import read_any_model
@@ -147,6 +147,6 @@ def test_a_step_function_is_retuned_like_any_model() -> None:
     u = np.repeat(np.random.default_rng(4).normal(0.0, 1.0, 20), 20)
     y = box.simulation({"K": 2.5, "T": 0.4}, Drive(t=t, inputs=u[:, None]))
     noisy = y + np.random.default_rng(5).normal(0.0, 0.01, 400)
-    found = diagnose_equations(box, [Recording(t=t, u=u, y=noisy)])
+    found = diagnose(box, [Recording(t=t, u=u, y=noisy)])
     assert found.verdict == "parameters"
-    np.testing.assert_allclose(found.searched.chosen.fitted.parameters, [2.5, 0.4], rtol=0.02)
+    np.testing.assert_allclose(found.search.found.chosen.fitted.parameters, [2.5, 0.4], rtol=0.02)

@@ -12,10 +12,10 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
+from autotune.diagnosis.chain_evidence import ChainEvidence
 from autotune.diagnosis.diagnose import WITHHELD, diagnose
 from autotune.diagnosis.findings import sentences_of
 from autotune.diagnosis.result import Diagnosis
-from autotune.diagnosis.verdict import Evidence
 from autotune.effects import ALL, CATALOGUE, kind_of
 from autotune.models import Block, Effect, Model, Parameter, Port, TransferFunction
 from autotune.report.chain_diagram import chain_diagram
@@ -122,10 +122,13 @@ def test_an_extended_model_without_what_was_found_is_not_said_to_have_it(tmp_pat
 
 def test_a_structure_is_called_right_only_where_nothing_larger_than_noise_is_left() -> None:
     found = servo_diagnosis(tuple(CATALOGUE))
-    evidence = Evidence(search=found.search, samples=(), residual=found.residual, quality=found.fit, offset=None)
+    evidence = ChainEvidence(
+        model=servo_model(), search=found.search, samples=(), residual=found.residual, quality_of=lambda: found.fit,
+        again=lambda *rest: pytest.fail("no part is asked"),
+    )  # fmt: skip
     assert not found.residual.is_noise
     assert "structure is right" not in sentences_of("parameters", (), evidence, ())[0]
-    down = replace(evidence, quality=replace(found.fit, extended=found.fit.noise_floor))
+    down = replace(evidence, quality_of=lambda: replace(found.fit, extended=found.fit.noise_floor))
     assert "structure is right" in sentences_of("parameters", (), down, ())[0]
 
 

@@ -6,14 +6,16 @@ import json
 from pathlib import Path
 
 import numpy as np
+import pytest
 from typer.testing import CliRunner
 
 from autotune.cli import app
-from autotune.diagnosis.equations import diagnose_equations
+from autotune.diagnosis import diagnose
 from autotune.equations import write_equations
 from autotune.errors import InputError
 from autotune.experiment.excitation import KINDS
-from autotune.experiment_design.in_equations import with_next_experiment_in_equations
+from autotune.experiment_design import with_next_experiment
+from autotune.models import Block, Model, Port, TransferFunction
 from autotune.recording import Recording, write_recording
 from tests.autotune.equations.models import model, one_state
 
@@ -63,7 +65,7 @@ def test_where_several_explanations_are_left_an_experiment_within_the_commands_i
         # a loss that comes and goes by itself, which no effect of the catalogue is
         kept = np.exp(-A * (1.0 + 0.6 * np.sign(np.sin(0.9 * k * DT))) * DT)
         x = kept * x + (1.0 - kept) * B / A * u[k]
-    found = with_next_experiment_in_equations(diagnose_equations(LAG, [Recording(t=DT * np.arange(800), u=u, y=y)]))
+    found = with_next_experiment(diagnose(LAG, [Recording(t=DT * np.arange(800), u=u, y=y)]))
     assert found.verdict == "unexplained"
     planned = found.as_json()["next_experiment"]
     assert planned["kind"] in KINDS
@@ -72,7 +74,7 @@ def test_where_several_explanations_are_left_an_experiment_within_the_commands_i
 
 
 def test_nothing_is_planned_where_nothing_is_left_out() -> None:
-    found = with_next_experiment_in_equations(diagnose_equations(LAG, [closed(2, 1.5)]))
+    found = with_next_experiment(diagnose(LAG, [closed(2, 1.5)]))
     assert found.verdict == "parameters"
     assert found.as_json()["next_experiment"] is None
 
@@ -88,10 +90,13 @@ def test_investigate_says_that_it_plans_for_chains(tmp_path: Path) -> None:
     assert "\n" not in str(run.exception)
 
 
-def test_spikes_smaller_than_the_reading_moves_are_found_in_what_a_simulation_leaves(tmp_path: Path) -> None:
+@pytest.mark.parametrize("of_chain", [False, True])
+def test_spikes_smaller_than_the_reading_moves_are_found_in_what_a_simulation_leaves(of_chain: bool) -> None:
     """Two beside each other as well: half of the variance that is left is theirs."""
     rng = np.random.default_rng(8)
-    quick = one_state("b*u - a*x", {"a": 8.0, "b": 8.0})
+    lag = Block(name="lag", place="plant", dynamics=TransferFunction(num=(1.0,), den=(0.125, 1.0)))
+    chain = Model(name="lag", input=Port(), output=Port(), blocks=(lag,))
+    quick = chain if of_chain else one_state("b*u - a*x", {"a": 8.0, "b": 8.0})
     t, u = DT * np.arange(900), np.repeat(rng.uniform(-1.0, 1.0, 300), 3)
     x, y, kept = 0.0, np.empty(900), np.exp(-8.0 * DT)
     for k in range(900):
@@ -99,9 +104,11 @@ def test_spikes_smaller_than_the_reading_moves_are_found_in_what_a_simulation_le
         x = kept * x + (1.0 - kept) * u[k]
     struck = np.array([80, 200, 201, 333, 460, 461, 590, 742, 811])
     y[struck] += 0.09 * rng.choice([-1.0, 1.0], struck.size)
-    found = diagnose_equations(quick, [Recording(t=t, u=u, y=y)])
+    found = diagnose(quick, [Recording(t=t, u=u, y=y)])
     assert found.verdict == "effect"
-    (outliers,) = found.samples
+    (outliers,) = found.effects
     assert outliers.name == "sensor.outliers"
-    assert set(np.flatnonzero(outliers.rows[0])) == set(struck)
-    assert found.effects == ()
+    rest = found.search.data.good[0] if of_chain else np.isfinite(found.search.found.bench.recordings[0].y)
+    spared = np.flatnonzero(~rest)
+    # a chain's start takes its first rows
+    assert set(spared[spared > 10]) == set(struck)

@@ -11,7 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 from autotune.cli import app
-from autotune.diagnosis.equations import diagnose_equations
+from autotune.diagnosis import diagnose
 from autotune.equations import write_equations
 from autotune.recording import Recording, write_recording
 from tests.autotune.equations.models import model
@@ -59,7 +59,7 @@ def as_it_is(u: np.ndarray) -> np.ndarray:
 
 
 def test_wrong_numbers_are_numbers_and_what_they_do_not_tell_is_told() -> None:
-    found = diagnose_equations(model(), [recorded(1, none, as_it_is), recorded(2, none, as_it_is)])
+    found = diagnose(model(), [recorded(1, none, as_it_is), recorded(2, none, as_it_is)])
     assert found.verdict == "parameters"
     assert not found.effects
     values = {p.name: p.value for p in found.extended_model.parameters}
@@ -94,7 +94,7 @@ def test_missing_physics_is_named_at_its_place_with_its_size(
     assert found["fit"]["extended"] < 0.3 * found["fit"]["retuned"]
     page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
     assert f"({name} at {place}, probability" in page
-    assert "rec1.csv: root mean square error" in page
+    assert "rec1.csv: measured, and simulated" in page
     simulated = CliRunner().invoke(
         app,
         ["simulate", "--model", str(tmp_path / "out" / "extended_model.toml"), files[1], "--out", f"{files[3]}.csv"],

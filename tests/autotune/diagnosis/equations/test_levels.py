@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from autotune.arrays import FloatArray
-from autotune.diagnosis.equations import diagnose_equations
+from autotune.diagnosis import diagnose
 from autotune.equations import EquationModel
 from autotune.recording import Recording
 from tests.autotune.equations.models import one_state
@@ -32,13 +32,13 @@ def recorded(seed: int, slope: Callable[[float, float], float], highest: float, 
 
 
 def test_a_tank_that_overflows_is_told_with_its_rim() -> None:
-    found = diagnose_equations(tank(), [recorded(i, lambda h, u: (u - h) / 5.0, 1.15) for i in (1, 2)])
+    found = diagnose(tank(), [recorded(i, lambda h, u: (u - h) / 5.0, 1.15) for i in (1, 2)])
     assert [(e.name, e.state) for e in found.effects] == [("plant.hard_stop", "h")]
     assert found.effects[0].parameters["high"].value == pytest.approx(1.15, abs=0.01)
 
 
 def test_a_gain_that_falls_with_the_level_is_told_with_its_slope() -> None:
     recordings = [recorded(i, lambda h, u: (u * (1.0 - 0.25 * h) - h) / 5.0, 1e9) for i in (3, 4)]
-    found = diagnose_equations(tank(), recordings)
+    found = diagnose(tank(), recordings)
     assert [(e.name, e.input) for e in found.effects] == [("plant.position_dependent_gain", "u")]
     assert found.effects[0].parameters["slope"].value == pytest.approx(-0.25, rel=0.15)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from autotune.arrays import FloatArray
-from autotune.diagnosis.equations import diagnose_equations
+from autotune.diagnosis import diagnose
 from autotune.diagnosis.equations.further import further_columns
 from autotune.equations.chain import chain_with_inputs
 from autotune.equations.files import forecast_any
@@ -58,7 +58,7 @@ def tank_model() -> object:
 
 @pytest.mark.parametrize(("lag_s", "at"), [(0.0, "x"), (3.0, "x"), (0.0, "reading")])
 def test_the_column_that_acts_is_named_with_its_place_its_gain_and_its_lag(lag_s: float, at: str) -> None:
-    found = diagnose_equations(tank_model(), [tank(1, lag_s, at), tank(2, lag_s, at)])
+    found = diagnose(tank_model(), [tank(1, lag_s, at), tank(2, lag_s, at)])
     (effect,) = found.as_json()["effects"]
     assert (effect["name"], effect["column"]) == ("environment.measured_input", "flow")
     assert effect["state"] == ("x" if at == "x" else None)
@@ -76,7 +76,7 @@ def test_the_column_that_acts_is_named_with_its_place_its_gain_and_its_lag(lag_s
 def test_the_extended_model_is_a_file_that_names_the_column(tmp_path: Path) -> None:
     from autotune.equations.files import write_any
 
-    found = diagnose_equations(tank_model(), [tank(1, 3.0, "x")])
+    found = diagnose(tank_model(), [tank(1, 3.0, "x")])
     write_any(found.extended_model, tmp_path / "extended.toml")
     again = read_any(tmp_path / "extended.toml")
     assert again.effects[0].column == "flow"
@@ -90,7 +90,7 @@ def test_the_extended_model_is_a_file_that_names_the_column(tmp_path: Path) -> N
 
 def test_a_column_that_does_nothing_is_not_named() -> None:
     r = [replace(one, extra={"other": one["other"]}) for one in (tank(5, 0.0, "none"), tank(6, 0.0, "none"))]
-    assert diagnose_equations(tank_model(), r).verdict == "parameters"
+    assert diagnose(tank_model(), r).verdict == "parameters"
 
 
 def test_what_is_a_signal_of_the_model_already_is_no_further_column() -> None:
@@ -126,8 +126,8 @@ def test_a_chain_with_a_measured_disturbance_finds_friction_and_further_columns(
                 w += 0.001 * (0.5 * slope[k] - w) / 0.3
         return Recording(t=t, u=u, y=y + 0.001 * random.normal(size=rows), extra={"slope": slope, "air": air})
 
-    found = diagnose_equations(chain, [belt(1, 1.0, 0.0), belt(2, 1.0, 0.0)])
+    found = diagnose(chain, [belt(1, 1.0, 0.0), belt(2, 1.0, 0.0)])
     assert [(e.name, e.state) for e in found.effects] == [("plant.coulomb_friction", "speed")]
     assert found.effects[0].parameters["level"].value == pytest.approx(1.0, rel=0.05)
-    found = diagnose_equations(chain, [belt(3, 0.0, 0.7), belt(4, 0.0, 0.7)])
+    found = diagnose(chain, [belt(3, 0.0, 0.7), belt(4, 0.0, 0.7)])
     assert [(e.name, e.column) for e in found.effects] == [("environment.measured_input", "air")]

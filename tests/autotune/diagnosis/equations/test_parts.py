@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from autotune.arrays import FloatArray
-from autotune.diagnosis.equations import diagnose_equations
+from autotune.diagnosis import diagnose
 from autotune.diagnosis.equations.equation_bench import EquationBench
 from autotune.diagnosis.equations.parts import telling_windows
 from autotune.equations import Drive, compile_model, simulate
@@ -48,11 +48,11 @@ def test_the_part_is_where_a_fit_leaves_most_and_has_windows_in_a_row() -> None:
 
 def test_an_effect_is_sought_on_a_part_and_judged_on_all_rows() -> None:
     recordings = [recorded(k, 3000, 0.3, slice(0, 3000)) for k in range(2)]
-    found = diagnose_equations(LAG, recordings)
+    found = diagnose(LAG, recordings)
     assert [e.name for e in found.effects] == ["actuator.saturation"]
     assert found.effects[0].parameters["high"].value == pytest.approx(0.3, abs=0.01)
-    assert all(one.residual.size == 6000 for one in (found.searched.chosen, *found.searched.tried))
-    assert found.errors[2] == pytest.approx(found.errors[3], rel=0.1)
+    assert all(one.residual.size == 6000 for one in (found.search.found.chosen, *found.search.found.tried))
+    assert found.fit.extended == pytest.approx(found.fit.noise_floor, rel=0.1)
 
 
 def swung(seed: int, size: float = 0.8, rows: int = 900) -> Recording:
@@ -68,12 +68,12 @@ def test_gravity_that_a_spring_stands_for_is_one_number() -> None:
     """m g l sin(theta) over one turn, from where the angle is zero; the spring comes to nothing."""
     states = [PENDULUM["state"][0], {**PENDULUM["state"][1], "derivative": "(u - c*omega - k*theta)/J"}]
     numbers = {"J": {"value": 0.05}, "c": {"value": 0.02}, "k": {"value": 1.3}}
-    found = diagnose_equations(model(state=states, parameters=numbers), [swung(1), swung(2)])
-    (gravity,) = found.effects
+    found = diagnose(model(state=states, parameters=numbers), [swung(1), swung(2)])
+    (gravity,) = found.extended_model.effects
     assert (gravity.name, gravity.state) == ("plant.sine_torque", "omega")
     assert set(gravity.parameters) == {"amplitude", "period"}
     # in units of the derivative: m g l / J
-    J = found.searched.chosen.fitted.parameters[0]
+    J = found.search.found.chosen.fitted.parameters[0]
     assert gravity.parameters["amplitude"].value * J == pytest.approx(0.5 * 9.81 * 0.3, rel=0.05)
 
 

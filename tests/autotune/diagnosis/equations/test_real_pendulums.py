@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from autotune.diagnosis.equations import EquationDiagnosis, diagnose_equations
+from autotune.diagnosis import Diagnosis, diagnose
 from autotune.equations.read import equations_of
 from autotune.recording import Recording, read_recording
 
@@ -14,7 +14,7 @@ from autotune.recording import Recording, read_recording
 SWINGS = {"m_03": (21.5, 0.06, 2400), "m_04": (40.0, 0.25, 2100)}
 
 
-def diagnosed(shared: Path, case: str, torque: str) -> EquationDiagnosis:
+def diagnosed(shared: Path, case: str, torque: str) -> Diagnosis:
     believed, damping, rows = SWINGS[case]
     file = shared / "real_cases" / case / "fit.csv"
     if not file.exists():
@@ -30,10 +30,10 @@ def diagnosed(shared: Path, case: str, torque: str) -> EquationDiagnosis:
         "parameters": {"c": {"value": damping, "spread": 0.5}, "k": {"value": believed}},
     }  # fmt: skip
     model = equations_of(content, "pendulum.toml")
-    return diagnose_equations(model, [few])
+    return diagnose(model, [few])
 
 
-def friction(found: EquationDiagnosis) -> float:
+def friction(found: Diagnosis) -> float:
     (level,) = (e.parameters["level"].value for e in found.effects if e.name == "plant.coulomb_friction")
     return float(level)
 
@@ -44,7 +44,7 @@ def test_with_gravity_in_the_equations_dry_friction_is_what_is_left_out(shared: 
     assert found.verdict == "effect"
     assert [e.name for e in found.effects] == ["plant.coulomb_friction"]
     assert found.effects[0].state == "omega"
-    nominal, retuned, extended, _ = found.errors
+    nominal, retuned, extended = found.fit.nominal, found.fit.retuned, found.fit.extended
     assert extended < 0.2 * min(nominal, retuned)
 
 

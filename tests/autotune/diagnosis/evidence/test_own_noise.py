@@ -9,7 +9,7 @@ from scipy.signal import lfilter
 from autotune.diagnosis import diagnose
 from autotune.diagnosis.evidence.own_noise import coloured_noise
 from autotune.diagnosis.findings import said_by
-from autotune.diagnosis.gathering import evidence_of, keeping
+from autotune.diagnosis.gathering import evidence_of
 from autotune.diagnosis.thresholds import IN_USE
 from autotune.diagnosis.verdict import judged
 from autotune.effects import CATALOGUE
@@ -51,7 +51,7 @@ def test_a_disturbance_of_its_own_rules_no_effect_out() -> None:
     assert evidence.own is not None
     assert judged(evidence) == "none"
     assert 0.0 < said_by(evidence)["actuator.backlash"] < 0.5
-    assert keeping(evidence, {"actuator.backlash"}).search.chosen.names == ()
+    assert evidence.keeping({"actuator.backlash"}).search.chosen.names == ()
 
 
 def test_wrong_numbers_are_told_beside_a_disturbance() -> None:

@@ -1,4 +1,4 @@
-"""A model's numbers by the names of its blocks, as given, retuned and with effects, in units that people use."""
+"""A chain's numbers by the names of its blocks, as given and as fitted, in units that people use."""
 
 from __future__ import annotations
 
@@ -8,68 +8,76 @@ import numpy as np
 
 from autotune.diagnosis.fitting.fit import Fit
 from autotune.diagnosis.fitting.parameters import Free, gain_block
-from autotune.models import Block, Model, Parameter
-from autotune.report.effect_words import number, with_spread
-from autotune.report.page import Table
+from autotune.models import Block, Model
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Number:
-    """What a free number is called, its value in a model, and whether it is searched as a logarithm."""
+class RetunedNumber:
+    """A number of a model: as given, retuned alone, and beside what was found, each fit with its 1-sigma.
 
-    block: str
+    Attributes
+    ----------
+    name, block, unit : str
+        What it is, the block that it belongs to ("" in equations), and its unit.
+    nominal : float
+        As the model file states it.
+    retuned, value : (float, float)
+        Value and 1-sigma (0 where it was held) with the nominal structure, and in the hypothesis to go on with.
+    """
+
     name: str
-    unit: str
+    block: str = ""
+    unit: str = ""
+    nominal: float
+    retuned: tuple[float, float]
+    value: tuple[float, float]
 
 
-def numbers_table(nominal: Fit, retuned: Fit, chosen: Fit) -> Table:
+def retuned_numbers(retuned: Fit, chosen: Fit) -> tuple[RetunedNumber, ...]:
     """Return the chain's numbers before and after, by block.
 
     Parameters
     ----------
-    nominal, retuned, chosen : Fit
-        Given numbers, fitted ones, and those beside the effects; the last two the same object where none were added.
+    retuned, chosen : Fit
+        Fitted numbers, and those beside the effects; the same object where none were added.
     """
-    extended = () if chosen is retuned else (chosen,)
-    header = ("block", "number", "unit", "nominal", "retuned", *("extended" for _ in extended))
-    given = retuned.parametrisation.model
-    rows = []
-    for free in retuned.parametrisation.free:
+    p, found = retuned.parametrisation, []
+    given = p.with_values(p.centre)
+    for i, free in enumerate(p.free):
         if free.kind == "effect":
             continue
-        known = _number(given, free)
-        before = _value(retuned.parametrisation.with_values(retuned.parametrisation.centre), free)
-        cells = [number(before)]
-        for one in (retuned, *extended):
-            j = next((k for k, f in enumerate(one.parametrisation.free) if f.name == free.name), None)
-            cells.append("-" if j is None else _fitted(one, j))
-        rows.append((known.block, known.name, known.unit or "-", *cells))
-    return Table(header=header, rows=tuple(rows), caption="Numbers of the chain, with 95 % intervals.")
+        beside = next((k for k, f in enumerate(chosen.parametrisation.free) if f.name == free.name), None)
+        before = _fitted(retuned, i)
+        block, name, unit = _called(p.model, free)
+        after = before if beside is None else _fitted(chosen, beside)
+        found.append(
+            RetunedNumber(name=name, block=block, unit=unit, nominal=_value(given, free), retuned=before, value=after)
+        )
+    return tuple(found)
 
 
-def _fitted(one: Fit, i: int) -> str:
+def _fitted(one: Fit, i: int) -> tuple[float, float]:
     free = one.parametrisation.free[i]
     value = _value(one.model, free)
-    sd = float(np.sqrt(max(one.covariance[i, i], 0.0))) * (abs(value) if free.positive else free.size)
-    return with_spread(Parameter(value=value, sd=sd))
+    return value, float(np.sqrt(max(one.covariance[i, i], 0.0))) * (abs(value) if free.positive else free.size)
 
 
-def _number(model: Model, free: Free) -> _Number:
-    """Return what a free number is called."""
+def _called(model: Model, free: Free) -> tuple[str, str, str]:
+    """Return a free number's block, name and unit."""
     if free.kind == "u_offset":
-        return _Number(block="input", name="operating point", unit=model.input.unit)
+        return "input", "operating point", model.input.unit
     if free.kind == "delay":
-        return _Number(block="chain", name="dead time", unit="s")
+        return "chain", "dead time", "s"
     if free.kind == "gain":
         at = gain_block(model.blocks)
-        return _Number(block=model.blocks[at].name, name="gain", unit=_gain_unit(model, at))
+        return model.blocks[at].name, "gain", _gain_unit(model, at)
     block = model.blocks[free.index[0]]
     power = _power(block, free)
     unit = "s" if power == 1 else f"s^{power}"
     if free.kind == "den":
         name = "time constant" if len(block.dynamics.den) == 2 else f"coefficient of s^{power} below"
-        return _Number(block=block.name, name=name.replace("s^1 ", "s "), unit=unit)
-    return _Number(block=block.name, name="time constant of the zero" if power == 1 else f"zeros, s^{power}", unit=unit)
+        return block.name, name.replace("s^1 ", "s "), unit
+    return block.name, "time constant of the zero" if power == 1 else f"zeros, s^{power}", unit
 
 
 def _power(block: Block, free: Free) -> int:

@@ -1,0 +1,234 @@
+"""What recordings show of a chain, and how its effects are read, kept, run and handed out."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from types import MappingProxyType
+
+import numpy as np
+
+from autotune.arrays import BoolArray
+from autotune.diagnosis.evidence.adequacy import residual_tests
+from autotune.diagnosis.evidence.description import Description, describe
+from autotune.diagnosis.evidence.held_out import held_out
+from autotune.diagnosis.evidence.misread import misread_columns
+from autotune.diagnosis.evidence.operating_point import unmoved
+from autotune.diagnosis.evidence.own_noise import OwnNoise
+from autotune.diagnosis.extended import extended_model, with_uncertainty
+from autotune.diagnosis.fitting.retuning import prepare, under_noise
+from autotune.diagnosis.readable import in_commands, readable
+from autotune.diagnosis.result import FoundEffect, OperatingRange, Verdict
+from autotune.diagnosis.safe_extension import safe_extension
+from autotune.diagnosis.selection.hypothesis import contradicted
+from autotune.diagnosis.selection.judged import of_likely
+from autotune.diagnosis.selection.judged_chain import Found, JudgedChain, at_both_scales
+from autotune.diagnosis.selection.probability import Candidate, probability_of, weighed
+from autotune.diagnosis.selection.searched import Search
+from autotune.diagnosis.simulation.chain import build_chain
+from autotune.diagnosis.simulation.forecast import forecast
+from autotune.diagnosis.verdict import Evidence
+from autotune.effects import STRUCTURES, kind_of
+from autotune.models import Effect, Model, Parameter
+from autotune.recording import Recording
+
+#: The effect that every fit has as a free number.
+OFFSET = "actuator.offset"
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ChainEvidence(Evidence):
+    """What recordings show of a chain.
+
+    Attributes
+    ----------
+    model : Model
+        The nominal chain.
+    search : Search
+        Hypotheses with their fits.
+    found : Found, optional
+        What a search found, where simulations do not run away and what is left is not noise of some rows.
+    own : OwnNoise, optional
+        What is left, where it is noise of its own colour.
+    again : callable
+        Returns what other recordings show among some effects, beginning with a hypothesis of these ones.
+    """
+
+    model: Model
+    search: Search
+    found: Found | None = None
+    own: OwnNoise | None = None
+    again: Callable[[Sequence[Recording], Collection[str], JudgedChain | None], ChainEvidence]
+
+    @property
+    def result(self) -> Search:
+        """What the search found."""
+        return self.search
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Effects of the hypothesis to go on with."""
+        return self.search.chosen.names
+
+    @cached_property
+    def candidates(self) -> tuple[Candidate, ...]:
+        """Every hypothesis with its probability, best first."""
+        if self.found is not None:
+            unknown = self.unknown_odds if self.residual.is_noise else self.limits.unknown_odds
+            return self.found.candidates(unknown)
+        return weighed({"none": 0.0}, 1.0, self.unknown_odds)
+
+    @property
+    def leading(self) -> tuple[tuple[str, ...], ...]:
+        """Effects of the leading hypotheses, the best first."""
+        return tuple(h.names for h in self.search.others)
+
+    @property
+    def more_than_noise(self) -> bool:
+        """Whether something was found, or the retuned model leaves more than noise."""
+        return self.found is not None and (bool(self.found.chosen.names) or not self.residual.is_noise)
+
+    @property
+    def varies_more(self) -> bool:
+        """Whether what varies beside chosen effects that leave noise explains more than it may where they are true."""
+        return self.found is not None and self.found.varies_more(self.limits)
+
+    @property
+    def jitter_explains_more(self) -> bool:
+        """Whether a clock that jitters explains more than what varies: it disturbs commands too."""
+        jitter = sum(s.evidence for s in self.samples if kind_of(s.name).sought == "residual")
+        return self.residual.varies.gain < self.limits.lesser_share * jitter
+
+    @cached_property
+    def contradicted(self) -> frozenset[str]:
+        """Chosen effects by whose name readings do not behave; asked where the model's error and not noise decides."""
+        if self.found is None or self.found.chosen.leaves_noise:
+            return frozenset()
+        return contradicted(self.search.chosen, self.search.data)
+
+    @property
+    def own_noise(self) -> str:
+        """What is said of a residual that is noise of its own colour."""
+        return "" if self.own is None else self.own.sentence
+
+    @property
+    def numbers(self) -> float:
+        """Decrease of chi-square that retuning brings beside the nominal numbers."""
+        if self.own is not None:
+            return self.own.numbers
+        retuned = self.search.retuned.fit
+        return self.search.nominal.chi2 - retuned.chi2 - retuned.penalty
+
+    def keeping(self, names: Collection[str]) -> ChainEvidence:
+        """Return the evidence with no other effects than those named: the hypothesis of them that was fitted."""
+        samples = tuple(s for s in self.samples if s.name in names)
+        kept = replace(self, samples=samples, offset=self.offset if OFFSET in names else None)
+        found = self.found
+        if found is None or self.own is not None:
+            return kept
+        best = of_likely(found.judged, names)
+        if best.names == found.chosen.names:
+            return kept
+        left, residual = at_both_scales(best, found.judged).spread_out() if best.names else found.retuned, self.residual
+        if found.chosen.leaves_noise or left.leaves_noise:
+            residual = residual_tests(left.fit, under_noise(left.fit, left.data), uneven=residual.uneven)
+        found = replace(found, chosen=left)
+        floor = self.quality.noise_floor
+        return replace(
+            kept, search=found.as_search(), residual=residual, quality_of=lambda: found.quality(floor), found=found
+        )
+
+    def on(self, part: Sequence[Recording]) -> tuple[ChainEvidence, Collection[str]]:
+        """Return what a part of the recordings shows, and effects that it cannot tell."""
+        known = {name for h in self.search.all for name in h.names} | {s.name for s in self.samples} | {OFFSET}
+        begun = None if self.found is None else self.found.chosen
+        there = self.again(part, known, begun)
+        cannot_tell = set(unmoved(self.model, part))
+        if there.found is not None:
+            fitted = self.search.chosen.fit
+            cannot_tell |= there.found.retuned.unfelt(fitted.model.effects[fitted.parametrisation.own :])
+        return there, cannot_tell
+
+    def described(self) -> list[tuple[float, FoundEffect]]:
+        """Return the chosen effects as people read them, and the offset that is one."""
+        chosen, found = self.search.chosen, []
+        for effect in with_uncertainty(chosen, chosen.fit.model.effects)[chosen.fit.parametrisation.own :]:
+            if effect.name not in self.contradicted and effect.name not in STRUCTURES:
+                found.append((self._lost_without(effect.name), self._described(effect)))
+        if self.offset is not None and not any(e.name in kind_of(OFFSET).same for _, e in found):
+            found.append((-math.inf, self._offset(self.offset.value, self.offset.sd)))
+        return found
+
+    def _offset(self, value: float, sd: float) -> FoundEffect:
+        kind, unit = kind_of(OFFSET), self.model.input.unit
+        parameters = {"offset": Parameter(value=value, sd=sd, unit=unit)}
+        return FoundEffect(
+            name=OFFSET, probability=1.0 / (1.0 + self.unknown_odds), places=kind.places,
+            parameters=MappingProxyType(parameters), equation=kind.equation, windows=self.everywhere,
+        )  # fmt: skip
+
+    def _lost_without(self, name: str) -> float:
+        """Return the penalised chi-square that is lost without a chosen effect, as far as that was fitted."""
+        rest = frozenset(self.names) - {name}
+        known = {frozenset(h.names): h.penalised_chi2 for h in reversed(self.search.all)}
+        return known.get(rest, self.search.retuned.penalised_chi2) - self.search.chosen.penalised_chi2
+
+    def _described(self, effect: Effect) -> FoundEffect:
+        kind, parameters = kind_of(effect.name), readable(effect)
+        return FoundEffect(
+            name=effect.name,
+            probability=probability_of(effect.name, self.candidates, self.limits.most_probable),
+            places=self.places(effect.name),
+            parameters=MappingProxyType(parameters),
+            equation=kind.equation,
+            windows=self.acting(effect.name, {key: q.value for key, q in effect.parameters.items()}),
+            operating_range=self._range(kind.place),
+            as_command=MappingProxyType(self._as_command(effect.name, parameters)),
+        )
+
+    def _as_command(self, name: str, parameters: Mapping[str, Parameter]) -> dict[str, Parameter]:
+        """Return sizes at the plant's input as the steady command that does the same."""
+        fitted, gain = self.search.chosen.fit.model, 1.0
+        for block in fitted.blocks:
+            if block.place != "actuator":
+                break
+            gain *= block.dynamics.num[-1] / block.dynamics.den[-1] if block.dynamics.den[-1] else math.inf
+        return in_commands(name, parameters, 1.0 / gain, self.model.input.unit) if gain else {}
+
+    def _range(self, place: str) -> OperatingRange:
+        column, name = {"plant": (2, "position"), "sensor": (0, "y")}.get(place, (3, "plant input"))
+        values = np.concatenate([s[:, column] for s in self.search.chosen.fit.signals])
+        at_plant = next((b.unit for b in self.model.blocks if b.place == "actuator" and b.unit), self.model.input.unit)
+        unit = at_plant if name == "plant input" else self.model.output.unit
+        return OperatingRange(signal=name, low=float(np.nanmin(values)), high=float(np.nanmax(values)), unit=unit)
+
+    def misread_columns(self) -> str:
+        """Say what is wrong with the columns, where the model then explains the recordings."""
+
+        def error_of(changed: Sequence[Recording], good: Sequence[BoolArray]) -> float:
+            data, retuned = prepare(self.model, changed, good, self.limits)
+            return held_out(retuned, data).retuned
+
+        return misread_columns(self.measured, self.model.input.offset, self.quality, self.limits, error_of)
+
+    @property
+    def measured(self) -> tuple[Recording, ...]:
+        """What was measured, all rows."""
+        return self.search.data.driving
+
+    def description(self) -> Description | None:
+        """Return what is left as a function of the signals."""
+        return describe(self.search.retuned.fit, self.search.data)
+
+    def handed_out(self, verdict: Verdict) -> tuple[Model, Model]:
+        """Return the chain to go on with, and the one that was wanted."""
+        wanted, nominal = extended_model(self, verdict), self.model
+        if wanted is nominal:
+            return nominal, nominal
+        # a model without what happened at a time of these recordings cannot follow them to their end
+        lasting = not any(kind_of(name).at_a_time for name in self.names)
+        comparable = lasting and bool(np.all(np.linalg.eigvals(build_chain(nominal).A).real < 0.0))
+        able = (wanted, self.search.retuned.fit.model)
+        return safe_extension(able, nominal, self.measured, forecast, comparable=comparable), wanted

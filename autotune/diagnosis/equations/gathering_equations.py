@@ -1,0 +1,98 @@
+"""All that recordings show of equations or of a closed model: samples, what a search finds, and what is beside it."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from functools import cache
+
+import numpy as np
+
+from autotune.arrays import BoolArray
+from autotune.controller import Controller
+from autotune.diagnosis.equations.bench import Bench, Outcome
+from autotune.diagnosis.equations.evidence import (
+    EquationEvidence,
+    bench_of,
+    held_out_quality,
+    residual_left,
+    spread_of,
+)
+from autotune.diagnosis.equations.judged import Searched
+from autotune.diagnosis.equations.search import search
+from autotune.diagnosis.evidence.law import law_effect
+from autotune.diagnosis.evidence.sample_gain import SimulatedRows, is_material, supported
+from autotune.diagnosis.evidence.samples import SampleEffect, spared
+from autotune.diagnosis.evidence.spoiled_rows import clear_samples, searched_beside
+from autotune.diagnosis.thresholds import Thresholds
+from autotune.effects import KINDS
+from autotune.equations.black_box import BlackBox
+from autotune.equations.model import EquationModel
+from autotune.progress import Progress, quiet
+from autotune.recording import Recording
+
+
+def evidence_of_equations(
+    model: EquationModel | BlackBox,
+    recordings: Sequence[Recording],
+    controller: Controller | None,
+    without: Sequence[str],
+    progress: Progress,
+    limits: Thresholds,
+    begun: Outcome | None = None,
+) -> EquationEvidence:
+    """Return all that the verdict rests on: samples, search, the residual, held-out rows.
+
+    Parameters
+    ----------
+    model, recordings, controller, without, progress, limits
+        As in :func:`autotune.diagnosis.diagnose.diagnose`.
+    begun : Outcome, optional
+        What predicted best on more rows: it is judged as well, from the numbers that it had there.
+
+    Raises
+    ------
+    InputError
+        A model that runs away.
+    """
+    own = {effect.name for effect in model.effects}
+
+    def retuned_rows(good: Sequence[BoolArray]) -> SimulatedRows:
+        bench = bench_of(model, recordings, good)
+        return _rows_of(bench.retuned(), recordings, bench, limits)
+
+    def searched(seen: list[SampleEffect]) -> tuple[Searched, SimulatedRows]:
+        bench = bench_of(model, recordings, spared(recordings, seen))
+        found = search(bench, [*without, *(s.name for s in seen)], progress, limits, begun)
+        return found, _rows_of(found.chosen, recordings, bench, limits)
+
+    seen = clear_samples(recordings, [name for name in without if name not in own], limits, retuned_rows)
+    found, seen = searched_beside(searched, seen, without)
+    run = _rows_of(found.chosen, recordings, found.bench, limits)
+    samples = [s for s in supported(seen, run) if s.name not in own]
+    samples = [s for s in samples if not found.taken.names or is_material(s, run)]
+    law = law_effect(recordings, controller, limits)
+    samples += [] if law is None or law.name in without else [law]
+    error_of = cache(lambda one: found.bench.held_out_error(one, one is not found.nominal) / spread_of(recordings))
+
+    def again(part: Sequence[Recording], known: Collection[str], begun: Outcome) -> EquationEvidence:
+        others = [*without, *(name for name in KINDS if name not in known)]
+        return evidence_of_equations(model, part, controller, others, quiet, limits, begun)
+
+    return EquationEvidence(
+        model=model, given=tuple(recordings), found=found, samples=tuple(samples),
+        residual=residual_left(found, samples), quality_of=cache(lambda: held_out_quality(found, error_of, recordings)),
+        error_of=error_of, again=again,
+    )  # fmt: skip
+
+
+def _rows_of(
+    outcome: Outcome, recordings: Sequence[Recording], bench: Bench, limits: Thresholds
+) -> SimulatedRows:  # fmt: skip
+    """Return the rows that a fit simulates."""
+    whole = [(np.zeros(1, dtype=np.int64), np.array([len(r)])) for r in recordings]
+    windows = [(w.starts, w.stops) for w in outcome.fitted.windows] or whole
+    return SimulatedRows(
+        recordings=tuple(recordings), good=tuple(np.isfinite(r.y) for r in bench.recordings),
+        starts=tuple(a for a, _ in windows), stops=tuple(b for _, b in windows),
+        simulated=outcome.fitted.simulated, limits=limits,
+    )  # fmt: skip
