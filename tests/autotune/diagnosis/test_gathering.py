@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from autotune.diagnosis.findings import found_effects, left_open
 from autotune.diagnosis.gathering import evidence_of
 from autotune.diagnosis.thresholds import IN_USE
 from autotune.diagnosis.verdict import judged
@@ -23,6 +24,11 @@ def test_an_effect_that_is_not_kept_is_missing_from_search_and_verdict() -> None
     assert judged(evidence.keeping({DRAG})) == "effect"
     without = evidence.keeping(set())
     assert without.search.chosen.names == ()
+    friction, larger = "plant.coulomb_friction", "plant.stribeck_friction"
+    said = {friction: 0.97, larger: 0.9, "actuator.lag": 0.2}
+    shown = found_effects(evidence, "effect")[0]
+    assert left_open([replace(shown, name=larger)], evidence, said)[0].endswith(": actuator.lag (0.20).")  # it has both
+    assert friction in left_open([shown], evidence, said)[0]
     assert without.quality.extended == without.quality.retuned > evidence.quality.extended
     assert judged(without) == "unexplained"
 
