@@ -324,7 +324,7 @@ class EffectKind:
         Whether it makes the plant hit something: after an impact no first order tells anything, the least change of any
         number shows, and start states are found anew.
     stand_in : callable, optional
-        Whether a fit came to where it is a simpler effect by this one's name.
+        Whether fitted numbers make it the same as a simpler effect.
     acts_in : callable, optional
         Recording (-1 for all) and time from which it acts; always and everywhere by default.
     readable : callable, optional

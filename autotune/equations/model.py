@@ -11,7 +11,7 @@ from typing import Literal, TypeAlias, get_args
 import numpy as np
 
 from autotune.arrays import FloatArray
-from autotune.equations.expressions import FUNCTIONS, RESERVED, Expression, names_in, parse
+from autotune.equations.expressions import FUNCTIONS, RESERVED, Expression, names_in
 from autotune.errors import InputError
 from autotune.models import Effect, Hold
 
@@ -322,8 +322,3 @@ def _no_loop(name: str, uses: Mapping[str, set[str]], where: str) -> None:
                 path.pop()
 
     follow(name)
-
-
-def as_expression(given: str | float | Expression, where: str = "expression") -> Expression:
-    """Return an expression that was given as text, as a number or as itself."""
-    return parse(str(given), where) if isinstance(given, str | int | float) else given

@@ -41,8 +41,9 @@ class DeviceOscillation(Oscillation):
 
     Notes
     -----
-    The device averages no more readings than it has room for. What the shorter average, and sampling at the tick, delay
-    less is added to the inserted delay; what the shorter average hides less is added to the hysteresis.
+    The device may have room for fewer readings in its average than the host. A shorter average delays the reading
+    less, and so does sampling at the tick: the difference is added to the inserted delay. It also lets more noise
+    through: the hysteresis is wider by that.
     """
 
     def __init__(self, rig: RunsRelay, before: Oscillation) -> None:

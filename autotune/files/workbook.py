@@ -157,7 +157,7 @@ def parquet_table(paths: Sequence[Path]) -> Table:
     Raises
     ------
     InputError
-        A file that is none, or the package that reads them is not installed.
+        A file is not Parquet, or the package that reads Parquet is not installed.
     """
     require_extra("parquet", "pyarrow")
     import pyarrow as pa

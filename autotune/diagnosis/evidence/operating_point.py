@@ -48,7 +48,7 @@ def _begins_with_a_step(model: Model, recording: Recording) -> bool:
 def offset_of(result: Fit, sigmas: float = Thresholds.offset_sigmas) -> Offset | None:
     """Return the operating point's shift where it is far outside its uncertainty.
 
-    A shift that wanders from window to window is none that stands: its uncertainty is that of the windows' mean.
+    A shift may wander from window to window: its uncertainty is at least that of the windows' mean.
     """
     for i, free in enumerate(result.parametrisation.free):
         if free.kind == "u_offset":

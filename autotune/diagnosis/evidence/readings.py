@@ -132,8 +132,8 @@ def spikes(y: FloatArray, good: BoolArray, sds: float = Thresholds.spike, least_
 def struck(residual: FloatArray, good: BoolArray, sds: float = Thresholds.spike) -> BoolArray:
     """Return the rows, one or two in a row, that stand out of the median of the seven around them.
 
-    For what a simulation leaves where lone spikes are known: two beside each other are not alone. Of readings that
-    move, a corner would stand out as well.
+    Lone spikes are found in the readings themselves; two spikes in neighbouring rows show only in a simulation's
+    residual, since a corner of readings that move would stand out as well.
 
     Parameters
     ----------

@@ -277,7 +277,7 @@ def parametrise(
 
 
 def _is_absent(value: float, neutral: float | None, positive: bool) -> bool:
-    """Whether a nominal effect's number is one that cannot be retuned: a limit that is none, or a size of 0."""
+    """Whether a nominal effect's number is one that cannot be retuned: a limit never reached, or a size of 0."""
     return value == neutral or value == 0.0 or abs(value) >= LARGEST or (positive and value < 0.0)
 
 

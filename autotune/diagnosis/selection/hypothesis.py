@@ -60,7 +60,7 @@ def merged(found: Sequence[Hypothesis]) -> list[Hypothesis]:
 
 
 def is_stand_in(h: Hypothesis, data: Data) -> bool:
-    """Whether one of its effects came to where it is a simpler one by another name."""
+    """Whether the fitted numbers make one of its effects the same as a simpler one."""
     added = h.fit.model.effects[h.fit.parametrisation.own :]
     able = [(e, kind_of(e.name)) for e in added if kind_of(e.name).stand_in is not None]
     if not able:

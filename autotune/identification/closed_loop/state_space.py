@@ -108,11 +108,6 @@ class InnovationModel:
             x = self.A @ x
         return np.stack(terms[:count])
 
-    def transformed(self, T: FloatArray) -> InnovationModel:
-        """Return the same model in the state coordinates T x; T is (n, n) and regular."""
-        inverse = np.linalg.inv(T)
-        return replace(self, A=T @ self.A @ inverse, B=T @ self.B, C=self.C @ inverse, K=T @ self.K)
-
     def with_delay_as_states(self) -> InnovationModel:
         """Return the same model with d = 0: the dead time is a chain of states."""
         model, n_u = self, self.B.shape[1]
