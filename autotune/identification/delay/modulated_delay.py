@@ -150,17 +150,28 @@ def modulated_delay(
     two_signs = isinstance(window, SinePower) and window.m % 2 == 0 and expansion is None
     signs = (1.0, -1.0) if two_signs else (0.0,)  # the wrong sign has its fixed point half a window away
     starts = _best_of_a_grid(recording, intervals, modulated)
-    freedom = len(intervals) - unknowns
-    clearly = float(f_distribution.isf(_BY_CHANCE, freedom, freedom)) if freedom > 0 else np.inf
-    most = clearly * min((residual for _, residual in starts), default=0.0) + _EXACT
+
+    def within(h: float) -> int:
+        return int(_inside(recording, intervals, h).sum())
+
+    def most(h: float) -> float:
+        """Return what a delay may leave beside all others, each with the intervals that it has in the record."""
+        own = within(h) - unknowns
+        if own <= 0:  # explained whatever the delay is: none of them is told from another
+            return np.inf if within(0.0) == unknowns else 0.0
+        others = ((within(other) - unknowns, left) for other, left in starts)
+        shares = (f_distribution.isf(_BY_CHANCE, own, n) * left for n, left in others if n > 0)
+        return float(min(shares, default=0.0)) + _EXACT
+
     found: list[ModulatedDelay] = []
     for start in (delay_s, *(h for h, _ in starts)):
         for sign in signs:
             result = _iterate(recording, intervals, modulated, start, sign, iterations)
-            found.append(replace(result, converged=result.converged and result.residual <= most))
-            if found[-1].converged:
+            found.append(replace(result, converged=result.converged and result.residual <= most(result.delay_s)))
+            if found[-1].converged and within(result.delay_s) == within(0.0):
                 return found[-1]
-    return min(found, key=lambda result: (not result.converged, result.residual))
+    # a delay that leaves hardly more intervals in the record than unknowns explains these, whatever it is
+    return min(found, key=lambda result: (not result.converged, -within(result.delay_s), result.residual))
 
 
 def _modulated(
