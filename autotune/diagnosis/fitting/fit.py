@@ -219,6 +219,29 @@ def fit(
     return _descended(problem, iterate, derivatives, may, iterations, rounds)
 
 
+def fit_from(
+    parametrisation: Parametrisation,
+    data: Data,
+    theta: FloatArray,
+    *,
+    iterations: int,
+    states: int = STEPS,
+    rounds: int = 2,
+) -> Fit:
+    """Fit from numbers that were found on other windows: start states first, then the numbers as well.
+
+    Parameters
+    ----------
+    parametrisation, data, theta, iterations, rounds
+        As of :func:`fit`.
+    states : int
+        Most Gauss-Newton steps of the start states, with the numbers held.
+    """
+    held = np.zeros(theta.size, dtype=bool)
+    begun = fit(parametrisation, data, theta, iterations=states, free=held)
+    return fit(parametrisation, data, begun.theta, begun.x0, iterations=iterations, rounds=rounds)
+
+
 def _descended(
     problem: Problem,
     iterate: Iterate,

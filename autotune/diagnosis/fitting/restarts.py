@@ -9,7 +9,7 @@ import numpy as np
 
 from autotune.arrays import FloatArray
 from autotune.diagnosis.fitting.data import Data
-from autotune.diagnosis.fitting.fit import Fit, fit, residual_at
+from autotune.diagnosis.fitting.fit import Fit, fit, fit_from, residual_at
 from autotune.diagnosis.fitting.parameters import Parametrisation
 from autotune.effects import kind_of
 from autotune.effects.base import EffectKind
@@ -42,10 +42,8 @@ def renewed(result: Fit, data: Data) -> Fit:
     Where dry friction held the plant while the numbers were still wrong, start states stay behind and hold the numbers
     back in turn: a little everywhere, so that no window stands out.
     """
-    p, held = result.parametrisation, np.zeros(result.theta.size, dtype=bool)
     for _ in range(RENEWALS):
-        begun = fit(p, data, result.theta, free=held, iterations=30)
-        again = fit(p, data, begun.theta, begun.x0, iterations=30, rounds=4)
+        again = fit_from(result.parametrisation, data, result.theta, states=30, iterations=30, rounds=4)
         if again.cost > result.cost - data.thresholds.restart_decrease:
             break
         result = again

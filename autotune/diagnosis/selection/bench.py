@@ -13,7 +13,7 @@ import numpy as np
 from autotune.arrays import FloatArray
 from autotune.diagnosis.evidence.stretches import correlation_rows, held_out_squares, rms
 from autotune.diagnosis.fitting.data import Data, as_white
-from autotune.diagnosis.fitting.fit import LAST_STEPS, RUNAWAY, STEPS, Fit, fit, start_states
+from autotune.diagnosis.fitting.fit import LAST_STEPS, RUNAWAY, STEPS, Fit, fit, fit_from, start_states
 from autotune.diagnosis.fitting.long_windows import spread_of
 from autotune.diagnosis.fitting.parameters import Parametrisation
 from autotune.diagnosis.selection.hypothesis import hypothesis, is_stand_in
@@ -95,9 +95,7 @@ class Bench:
 
     def shortened(self, result: Fit) -> Fit:
         """Return a fit to short windows from one to long windows: start states first, then the numbers as well."""
-        p, held = result.parametrisation, np.zeros(result.theta.size, dtype=bool)
-        begun = fit(p, self.few, result.theta, free=held, iterations=STEPS)
-        return fit(p, self.few, begun.theta, begun.x0, iterations=STEPS)
+        return fit_from(result.parametrisation, self.few, result.theta, iterations=STEPS)
 
     def finished(self, one: JudgedChain) -> JudgedChain | None:
         """Return a hypothesis fitted to the end, at the residual that it leaves; nothing if not better so."""

@@ -14,7 +14,7 @@ from autotune.diagnosis.evidence.constancy import largest_variation
 from autotune.diagnosis.evidence.held_out import FitQuality
 from autotune.diagnosis.evidence.stretches import judged_rows, rms
 from autotune.diagnosis.fitting.data import Data
-from autotune.diagnosis.fitting.fit import LAST_STEPS, RUNAWAY, STEPS, Fit, fit, residual_at
+from autotune.diagnosis.fitting.fit import LAST_STEPS, RUNAWAY, STEPS, Fit, fit, fit_from, residual_at
 from autotune.diagnosis.fitting.long_windows import spread_of
 from autotune.diagnosis.fitting.retuning import reduced_chi2, under_noise
 from autotune.diagnosis.fitting.spreading import spread_out
@@ -123,8 +123,7 @@ def at_both_scales(one: JudgedChain, found: Sequence[JudgedChain]) -> JudgedChai
     try:
         start = min((fit(p, both, theta, free=held, iterations=STEPS) for theta in thetas), key=lambda f: f.cost)
         joint = fit(p, both, start.theta, start.x0, iterations=LAST_STEPS)
-        there = fit(p, one.data, joint.theta, free=held, iterations=STEPS)
-        far = fit(p, one.data, there.theta, there.x0, rounds=0)  # with the derivatives of all numbers
+        far = fit_from(p, one.data, joint.theta, iterations=0, rounds=0)  # with the derivatives of all numbers
     except RUNAWAY:
         return one
     return replace(one, fit=replace(far, covariance=joint.covariance))

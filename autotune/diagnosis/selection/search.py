@@ -9,7 +9,7 @@ The steps of one search: the file is a little longer than others.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
@@ -19,7 +19,7 @@ from threadpoolctl import threadpool_limits
 from autotune.arrays import BoolArray
 from autotune.diagnosis.evidence.operating_point import unmoved
 from autotune.diagnosis.fitting.data import Data
-from autotune.diagnosis.fitting.fit import LAST_STEPS, RUNAWAY, STEPS, Fit, fit
+from autotune.diagnosis.fitting.fit import LAST_STEPS, RUNAWAY, STEPS, Fit, fit, fit_from
 from autotune.diagnosis.fitting.long_windows import cut, lengths_of
 from autotune.diagnosis.fitting.parameters import parametrise
 from autotune.diagnosis.fitting.restarts import realigned
@@ -270,19 +270,9 @@ def _begun(begun: JudgedChain | None, bench: Bench) -> list[JudgedChain]:
     """Return what predicted best on more rows, judged on these: a search of fewer rows may miss where it lies."""
     if begun is None:
         return []
-    p, held = begun.fit.parametrisation, np.zeros(begun.fit.theta.size, dtype=bool)
-
-    def on_these() -> Fit:
-        there = fit(p, bench.long, begun.fit.theta, free=held, iterations=STEPS)
-        return fit(p, bench.long, there.theta, there.x0, iterations=LAST_STEPS)
-
-    return _brought(on_these, begun.log_odds, bench)
-
-
-def _brought(fitted: Callable[[], Fit], log_odds: float, bench: Bench) -> list[JudgedChain]:
-    """Return a hypothesis that was found elsewhere, fitted and judged here; nothing where it runs away."""
     try:
-        judged = bench.finite(fitted(), log_odds)
+        there = fit_from(begun.fit.parametrisation, bench.long, begun.fit.theta, iterations=LAST_STEPS)
+        judged = bench.finite(there, begun.log_odds)
     except RUNAWAY:
         return []
     return [] if judged is None else [judged]
