@@ -154,12 +154,13 @@ def modulated_delay(
     def within(h: float) -> int:
         return int(_inside(recording, intervals, h).sum())
 
+    others = [(within(other) - unknowns, left) for other, left in starts]
+
     def most(h: float) -> float:
         """Return what a delay may leave beside all others, each with the intervals that it has in the record."""
         own = within(h) - unknowns
         if own <= 0:  # explained whatever the delay is: none of them is told from another
             return np.inf if within(0.0) == unknowns else 0.0
-        others = ((within(other) - unknowns, left) for other, left in starts)
         shares = (f_distribution.isf(_BY_CHANCE, own, n) * left for n, left in others if n > 0)
         return float(min(shares, default=0.0)) + _EXACT
 

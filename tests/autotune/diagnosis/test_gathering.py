@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import pytest
+
+from autotune.diagnosis.chain_evidence import ChainEvidence
 from autotune.diagnosis.findings import found_effects, left_open
 from autotune.diagnosis.gathering import evidence_of
 from autotune.diagnosis.thresholds import IN_USE
@@ -15,10 +18,15 @@ from tests.autotune.diagnosis.servo_rigs import servo_model, servo_recording
 DRAG = "plant.quadratic_drag"
 
 
-def test_an_effect_that_is_not_kept_is_missing_from_search_and_verdict() -> None:
+@pytest.fixture(scope="module")
+def evidence() -> ChainEvidence:
+    """Two recordings of a servo with a drag that its model lacks."""
     recordings = [servo_recording(seed, lambda x, v: -0.03 * v * abs(v)) for seed in (1, 2)]
     rest = [name for name in CATALOGUE if name not in (DRAG, "actuator.rate_limit")]
-    evidence = evidence_of(servo_model(), recordings, None, rest, quiet, IN_USE)
+    return evidence_of(servo_model(), recordings, None, rest, quiet, IN_USE)
+
+
+def test_an_effect_that_is_not_kept_is_missing_from_search_and_verdict(evidence: ChainEvidence) -> None:
     assert evidence.search.chosen.names == (DRAG,)
     assert judged(evidence) == "effect"
     assert judged(evidence.keeping({DRAG})) == "effect"
@@ -33,11 +41,8 @@ def test_an_effect_that_is_not_kept_is_missing_from_search_and_verdict() -> None
     assert judged(without) == "unexplained"
 
 
-def test_a_likely_effect_is_kept_though_the_leading_hypothesis_has_none() -> None:
+def test_a_likely_effect_is_kept_though_the_leading_hypothesis_has_none(evidence: ChainEvidence) -> None:
     """What is in many hypotheses may be likelier than not where no one of them leads."""
-    recordings = [servo_recording(seed, lambda x, v: -0.03 * v * abs(v)) for seed in (1, 2)]
-    rest = [name for name in CATALOGUE if name not in (DRAG, "actuator.rate_limit")]
-    evidence = evidence_of(servo_model(), recordings, None, rest, quiet, IN_USE)
     assert evidence.found is not None
     found = replace(evidence.found, chosen=evidence.found.retuned)
     leads = replace(evidence, found=found, search=found.as_search())
