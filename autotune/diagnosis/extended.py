@@ -86,16 +86,18 @@ def extended_model(evidence: ChainEvidence, verdict: Verdict) -> Model:
     effects = with_uncertainty(use, extended.effects)
     return replace(
         extended,
-        effects=(*(e if e.name in own else _ended(e, use.fit, found.data) for e in effects), *ends),
+        effects=(*(e if e.name in own else _ended(e, use.fit, found.data, nominal) for e in effects), *ends),
         input=replace(extended.input, recorded=_span([r.u for r in found.data.recordings])),
         output=replace(extended.output, recorded=_span([r.y for r in found.data.recordings])),
     )
 
 
-def _ended(effect: Effect, result: Fit, data: Data) -> Effect:
+def _ended(effect: Effect, result: Fit, data: Data, nominal: Model) -> Effect:
     """Return an effect with the ends of its law: one span beyond what was recorded, nearer where it would turn there.
 
-    Beyond them it adds what it adds there, so that an extended model is bounded wherever the linear one is.
+    Beyond them it adds what it adds there, so that an extended model is bounded wherever the linear one is. A bend of
+    the command goes on with the nominal model's gain there, and ends where the command changes its sign if none of that
+    sign was recorded: a bend that suits one sign says nothing of the other.
     """
     kind = kind_of(effect.name)
     if kind.goes_on is None:
@@ -111,7 +113,24 @@ def _ended(effect: Effect, result: Fit, data: Data) -> Effect:
         "high": high + _reach([kind.goes_on(values, high + b) for b in beyond], beyond),
     }
     given = {key: Parameter(value=value, unit=unit) for key, value in ends.items()}
+    if "slope" in values:
+        rest = -result.sim.u_offset
+        if low >= rest:
+            given["low"] = replace(given["low"], value=max(ends["low"], rest))
+        if high <= rest:
+            given["high"] = replace(given["high"], value=min(ends["high"], rest))
+        given["slope"] = Parameter(value=_gain_ratio(nominal, result.model))
     return replace(effect, parameters=MappingProxyType({**effect.parameters, **given}))
+
+
+def _gain_ratio(one: Model, other: Model) -> float:
+    """Return the ratio of two models' responses to a command that changes slowly; 1 where it says nothing."""
+    gains = []
+    for model in (one, other):
+        g = model.transfer_function()
+        gains.append(g.num[-1] / next(c for c in reversed(g.den) if c))
+    ratio = gains[0] / gains[1] if gains[1] else 1.0
+    return ratio if ratio > 0.0 else 1.0
 
 
 def _signal_of(place: str, result: Fit, data: Data) -> FloatArray:

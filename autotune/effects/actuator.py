@@ -93,12 +93,12 @@ def without_zone(w: float, half_width: float) -> float:
     return w - min(max(w, -half_width), half_width)
 
 
-def curved(w: float, second_order: float, third_order: float, low: float, high: float) -> float:
+def curved(w: float, second_order: float, third_order: float, slope: float, low: float, high: float) -> float:
     """Return a command through a curved characteristic, which runs straight on beyond its ends."""
     c = min(max(w, low), high)
     bent = c + second_order * c * c
     bent += third_order * bent * bent * bent
-    return w + (bent - c)
+    return bent + slope * (w - c)
 
 
 def rises(values: Values, w: float) -> bool:
@@ -246,6 +246,7 @@ ACTUATOR = (
         parameters=(
             Quantity(name="second_order", unit="1/{u}", role="amplitude", sign="real", neutral=0.0),
             Quantity(name="third_order", unit="1/{u}^2", role="amplitude", sign="real", neutral=0.0),
+            Quantity(name="slope", unit="", role="mark", sign="real", neutral=1.0),
             *ends("{u}"),
         ),
         lines=(Line(stage="command", does=curved),),

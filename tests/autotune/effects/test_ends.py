@@ -9,16 +9,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from autotune.arrays import FloatArray
 from autotune.diagnosis import diagnose
 from autotune.diagnosis.simulation.assembly import assemble
+from autotune.diagnosis.simulation.forecast import forecast
 from autotune.effects import ALL
 from autotune.models import Block, Effect, Model, Parameter, Port, TransferFunction
 from autotune.recording import Recording
 
 ENDED = [kind.name for kind in ALL if kind.goes_on is not None]
 T = 0.02 * np.arange(3000)
-#: Numbers that two sizes leave open: gravity of an arm, one turn of which is 6 units of travel.
-OTHERS = {"period": 6.0, "gravity": 1.0}
+#: Numbers that two sizes leave open: gravity of an arm, one turn of which is 6 units of travel; the gain beyond a bend.
+OTHERS = {"period": 6.0, "gravity": 1.0, "slope": 1.0}
 
 
 def plant(name: str, sizes: tuple[float, ...]) -> Model:
@@ -42,19 +44,44 @@ def test_a_law_is_bounded_wherever_the_linear_model_is(name: str, first: float, 
     assert float(np.abs(y).max()) < 4.0 * float(np.abs(linear).max())
 
 
-def test_the_ends_are_one_span_beyond_what_was_recorded_and_not_beyond_where_the_law_turns() -> None:
-    """tau dy/dt = -y + u - .15 u^2, solved exactly between samples, u in -2..2: the curve turns at u = 3.3."""
-    rng = np.random.default_rng(5)
-    u = np.repeat(rng.uniform(-2.0, 2.0, 60), 25)
-    keeps, y = np.exp(-0.05 / 0.4), np.zeros(u.size)
+def bent_lag(u: FloatArray, keeps: float) -> FloatArray:
+    """Return y of tau dy/dt = -y + u - .15 u^2, solved exactly between samples."""
+    y = np.zeros(u.size)
     for k in range(u.size - 1):
         y[k + 1] = keeps * y[k] + (1.0 - keeps) * (u[k] - 0.15 * u[k] ** 2)
+    return y
+
+
+def process(gain: float) -> Model:
+    """Return a lag of .4 s."""
+    lag = Block(name="lag", place="plant", dynamics=TransferFunction(num=(gain,), den=(0.4, 1.0)))
+    return Model(name="process", input=Port(), output=Port(), blocks=(lag,))
+
+
+def test_the_ends_are_one_span_beyond_what_was_recorded_and_not_beyond_where_the_law_turns() -> None:
+    """A bend whose curve turns at u = 3.3, with u in -2..2."""
+    rng = np.random.default_rng(5)
+    u = np.repeat(rng.uniform(-2.0, 2.0, 60), 25)
+    y = bent_lag(u, np.exp(-0.05 / 0.4))
     recording = Recording(t=0.05 * np.arange(u.size), u=u, y=y + 0.01 * rng.normal(size=u.size), name="r")
-    lag = Block(name="lag", place="plant", dynamics=TransferFunction(num=(1.0,), den=(0.4, 1.0)))
-    found = diagnose(Model(name="process", input=Port(), output=Port(), blocks=(lag,)), [recording])
+    found = diagnose(process(1.0), [recording])
     assert [e.name for e in found.effects] == ["actuator.nonlinear_gain"]
-    assert not {"low", "high"} & set(found.effects[0].parameters)
+    assert not {"low", "high", "slope"} & set(found.effects[0].parameters)
     law = found.extended_model.effects[0].parameters
     centre, span = found.extended_model.input.offset, float(np.ptp(u))
     assert law["low"].value == pytest.approx(u.min() - span - centre, abs=0.05 * span)
     assert law["high"].value == pytest.approx(1.0 / 0.3, rel=0.1)
+
+
+def test_a_bend_of_one_sign_of_the_command_goes_on_with_the_nominal_gain_on_the_other() -> None:
+    """The same with u in 0..3, beside a nominal gain of .8: what it does below 0 the recording does not say."""
+    rng = np.random.default_rng(5)
+    u = np.repeat(rng.uniform(0.0, 3.0, 60), 25)
+    u[:25] = 0.0
+    y = bent_lag(u, np.exp(-0.05 / 0.4))
+    recording = Recording(t=0.05 * np.arange(u.size), u=u, y=y + 0.01 * rng.normal(size=u.size), name="r")
+    model = diagnose(process(0.8), [recording]).extended_model
+    assert [e.name for e in model.effects] == ["actuator.nonlinear_gain"]
+    steps = Recording(t=0.05 * np.arange(400), u=np.repeat([0.0, -2.0], 200), y=np.zeros(400), name="steps")
+    simulated = forecast(model, steps)
+    assert simulated[-1] - simulated[199] == pytest.approx(-1.6, abs=0.02)
