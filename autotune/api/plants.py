@@ -81,7 +81,7 @@ def as_loop_plant(source: Any) -> PlantFit | None:
         return None
     from autotune.identification.closed_loop.loop_plant import loop_plant
 
-    return loop_plant(source.estimate)
+    return loop_plant(source.structures)
 
 
 def as_controller(source: Any) -> Controller:

@@ -184,7 +184,7 @@ def _points(
             raise IdentificationError(
                 found.excitation.sentence, where=longest.name, remedy="move the set-point, or dither"
             )
-        return found.design_points, loop_plant(found.estimate), found.warnings
+        return found.design_points, loop_plant(found.structures), found.warnings
     estimates, refusals = [], []
     for piece in record.pieces:
         try:

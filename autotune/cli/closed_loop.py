@@ -185,7 +185,7 @@ def closed_loop_json(result: ClosedLoopIdentification) -> dict[str, Any]:
     from autotune.points import points_to_json
 
     model = result.estimate.model
-    region = loop_region(result.estimate)
+    region = loop_region(result.structures)
     num, den = model.polynomials()
     verdict = result.excitation
     content: dict[str, Any] = {

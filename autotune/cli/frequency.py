@@ -90,7 +90,7 @@ def reduce(
     from autotune.identification.frequency.thinning import said, thinned
     from autotune.identification.reduced_file import write_reduced
     from autotune.identification.reduction import reduce_points, reduce_transfer_function
-    from autotune.points import LARGEST, SMALLEST, read_points, require_regions
+    from autotune.points import read_points, require_regions
 
     place = Output(out, inputs=(points, model), overwrite=overwrite)
     if (points is None) == (model is None):
@@ -105,13 +105,6 @@ def reduce(
     assert points is not None
     known = None
     if static_gain is not None:
-        if not SMALLEST <= abs(static_gain) <= LARGEST or not 1e-9 * abs(static_gain) <= (
-            abs(static_gain) if static_gain_sd is None else static_gain_sd
-        ):
-            raise InputError(
-                f"static gain {static_gain:g} with standard deviation {static_gain_sd}", where="--static-gain",
-                remedy="give a gain other than 0, known to no more than nine digits",
-            )  # fmt: skip
         known = (static_gain, static_gain_sd if static_gain_sd is not None else 0.01 * abs(static_gain))
     given = read_points(points)
     require_regions(given, str(points))

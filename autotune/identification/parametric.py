@@ -114,6 +114,8 @@ class PlantFit:
         Both ends of every principal axis, and directions between them; what depends linearly on the parameters has its
         extremes within a few per cent of the region's among them.
         """
+        if not self.covariance.any():
+            return (self.plant,)
         radius = math.sqrt(chi2.ppf(probability, self.parameters.size))
         values, vectors = np.linalg.eigh(self.covariance)
         axes = vectors * np.sqrt(np.maximum(values, 0.0))

@@ -31,7 +31,7 @@ from autotune.identification.envelope import (
 )
 from autotune.identification.parametric import PlantFit, fit_plant
 from autotune.models import TransferFunction
-from autotune.points import FrequencyPoint
+from autotune.points import LARGEST, SMALLEST, FrequencyPoint
 
 Kind: TypeAlias = Literal["self-regulating", "integrating"]
 Conditions: TypeAlias = Literal["regions", "estimates"]
@@ -299,8 +299,11 @@ def _static_sd(fit: PlantFit, points: Sequence[FrequencyPoint]) -> float:
 
 def _static_point(points: Sequence[FrequencyPoint], static_gain: tuple[float, float]) -> FrequencyPoint:
     value, sd = static_gain
-    if not (math.isfinite(value) and value != 0.0 and sd > 0.0):
-        raise IdentificationError("the static gain must be a number other than zero with a positive sd", where=_WHERE)
+    if not (SMALLEST <= abs(value) <= LARGEST and 1e-9 * abs(value) <= sd <= LARGEST):
+        raise IdentificationError(
+            f"static gain {value:g} with standard deviation {sd:g}", where=_WHERE,
+            remedy="give a gain other than 0, known to no more than nine digits",
+        )  # fmt: skip
     return FrequencyPoint(
         omega_rad_s=1e-6 * points[0].omega_rad_s,
         response=complex(value, 0.0),

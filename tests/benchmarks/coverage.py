@@ -97,7 +97,7 @@ def by_loop(seed: int, pole: float) -> BoolArray:
         error = point.response - complex(PLANT.response(np.array([point.omega_rad_s]))[0, 0, 0])
         parts = np.array([error.real, error.imag])
         responses.append(parts @ np.linalg.solve(np.array(point.covariance), parts) < CHI_SQUARE_2)
-    region = loop_region(found.estimate)
+    region = loop_region(found.structures)
     assert region is not None
     num, den = PLANT.polynomials()
     off = (np.concatenate([region.num, region.den[1:]]) - np.concatenate([num, den[1:]]))[list(region.free)]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -16,14 +17,14 @@ from autotune.points import FrequencyPoint
 _WORTHLESS = 0.5
 
 
-def without_hold(model: InnovationModel, response: tuple[FrequencyPoint, ...]) -> tuple[FrequencyPoint, ...]:
+def without_hold(model: InnovationModel, response: Sequence[FrequencyPoint]) -> tuple[FrequencyPoint, ...]:
     """Return the points of the plant itself, with the hold of the command taken out.
 
     Parameters
     ----------
     model : InnovationModel
         One input, one output, identified from commands held over each sample.
-    response : tuple of FrequencyPoint
+    response : sequence of FrequencyPoint
         Its response G(exp(j omega Ts)).
 
     Returns
@@ -31,7 +32,7 @@ def without_hold(model: InnovationModel, response: tuple[FrequencyPoint, ...]) -
     tuple of FrequencyPoint
         P(j omega) of the continuous plant whose step-invariant equivalent the model is. Where it has none (a pole on
         the negative real axis, which a sampled lag does not have) the response divided by that of the hold, up to half
-        the Nyquist frequency. Points known to less than 50 % are left out.
+        the Nyquist frequency.
     """
     dt_s = model.sample_time_s
     continuous = continuous_form(model)
@@ -48,11 +49,14 @@ def without_hold(model: InnovationModel, response: tuple[FrequencyPoint, ...]) -
             factor = complex(inner[0, 0]) * np.exp(-1j * omega * dt_s * model.input_delay) / point.response
         turn = np.array([[factor.real, -factor.imag], [factor.imag, factor.real]])
         c = turn @ np.array(point.covariance) @ turn.T
-        value = complex(point.response * factor)
-        if np.trace(c) / 2.0 < (_WORTHLESS * abs(value)) ** 2:
-            pair = ((float(c[0, 0]), float(c[0, 1])), (float(c[1, 0]), float(c[1, 1])))
-            points.append(replace(point, response=value, covariance=pair))
+        pair = ((float(c[0, 0]), float(c[0, 1])), (float(c[1, 0]), float(c[1, 1])))
+        points.append(replace(point, response=complex(point.response * factor), covariance=pair))
     return tuple(points)
+
+
+def worthwhile(points: Sequence[FrequencyPoint]) -> tuple[FrequencyPoint, ...]:
+    """Return the points that are known to better than 50 %."""
+    return tuple(p for p in points if np.trace(np.array(p.covariance)) / 2.0 < (_WORTHLESS * abs(p.response)) ** 2)
 
 
 def continuous_form(model: InnovationModel) -> tuple[FloatArray, FloatArray] | None:

@@ -19,22 +19,20 @@ from autotune.controller import Controller
 from autotune.errors import IdentificationError, InputError
 from autotune.identification.closed_loop.confidence import (
     Whiteness,
-    frequency_points,
     pole_covariance,
     residuals,
-    response_covariance,
     whiteness,
 )
 from autotune.identification.closed_loop.control_law import CONTRADICTION, LawCheck, check_law
 from autotune.identification.closed_loop.design_points import design_points
 from autotune.identification.closed_loop.dither_proposal import DitherLimits, DitherProposal, propose_dither
 from autotune.identification.closed_loop.gaps import usable_stretches
-from autotune.identification.closed_loop.hold import without_hold
 from autotune.identification.closed_loop.loop_excitation import ExcitationVerdict, judge, own_motion, require_excitation
 from autotune.identification.closed_loop.order import Candidate, choose_order, default_past_window, fixed_order
 from autotune.identification.closed_loop.prediction_error import PredictionErrorEstimate
 from autotune.identification.closed_loop.series import Series
 from autotune.identification.closed_loop.state_space import InnovationModel
+from autotune.identification.closed_loop.structures import Structures, Weighted
 from autotune.identification.closed_loop.subspace_direct import lagged_data
 from autotune.points import FrequencyPoint
 from autotune.progress import Progress, quiet
@@ -54,8 +52,8 @@ class ClosedLoopIdentification:
 
     Attributes
     ----------
-    estimate : PredictionErrorEstimate
-        Polished model in the recording's units.
+    structures : Structures
+        Polished model in the recording's units, and those of other orders and dead times that the record leaves open.
     poles : (n,) array
         In the z plane, slowest first.
     pole_covariance : (n, 2, 2) array
@@ -81,7 +79,7 @@ class ClosedLoopIdentification:
         What a reader should know before relying on the result.
     """
 
-    estimate: PredictionErrorEstimate
+    structures: Structures
     poles: ComplexArray
     pole_covariance: FloatArray
     response: tuple[FrequencyPoint, ...]
@@ -93,6 +91,11 @@ class ClosedLoopIdentification:
     whiteness: Whiteness
     law: LawCheck | None
     warnings: tuple[str, ...]
+
+    @property
+    def estimate(self) -> PredictionErrorEstimate:
+        """The polished model."""
+        return self.structures.chosen
 
 
 def identify_closed_loop(
@@ -144,8 +147,9 @@ def identify_closed_loop(
 
     Notes
     -----
-    Linear and time-invariant over the record; regions are asymptotic and presume white residuals (tested). Means are
-    removed and a constant is estimated, so operating points and integrators need no care.
+    Linear and time-invariant over the record; regions are asymptotic, presume white residuals (tested), and count other
+    orders and dead times that the record leaves open, where the order was chosen from it. Means are removed and a
+    constant is estimated, so operating points and integrators need no care.
     """
     pieces, left_out = usable_stretches(recording, max(_SHORTEST, 3 * (order or 0)))
     warnings = list(left_out)
@@ -157,11 +161,14 @@ def identify_closed_loop(
     u_1, y_1 = ((u - u.mean()) / scale_u)[:, None], ((y - y.mean()) / scale_y)[:, None]
     with threadpool_limits(1):  # threads spin longer on these small matrices than they work
         motion = _look(u_1, y_1, r, starts, recording.name)
-        estimate, evidence = _fitted(u_1, y_1, starts, order, delay, max_order, progress)
+        estimate, others, evidence = _fitted(u_1, y_1, starts, order, delay, max_order, progress)
         white = whiteness(estimate, residuals(estimate, u_1, y_1, starts))
-        estimate = in_units(estimate, scale_u, scale_y, dt_s)
+        found = Structures(
+            chosen=in_units(estimate, scale_u, scale_y, dt_s),
+            others=tuple((weight, in_units(one, scale_u, scale_y, dt_s)) for weight, one in others),
+        )
         omega = _grid(dt_s, len(y)) if omega_rad_s is None else _below_nyquist(omega_rad_s, dt_s)
-        result = _report(estimate, omega, law, motion, white)
+        result = _report(found, omega, law, motion, white)
         if not result.excitation.enough:
             result = replace(result, proposal=_proposal(result, limits or recorded_limits(u, y)))
     _further_warnings(result, evidence, r, warnings)
@@ -176,14 +183,14 @@ def _fitted(
     delay: int | None,
     max_order: int,
     progress: Progress,
-) -> tuple[PredictionErrorEstimate, tuple[Candidate, ...]]:
+) -> tuple[PredictionErrorEstimate, tuple[Weighted, ...], tuple[Candidate, ...]]:
     if order is None:
         choice = choose_order(u, y, max_order=max_order, progress=progress, starts=starts)
-        return choice.estimate, choice.evidence
+        return choice.estimate, choice.others, choice.evidence
     if order < 1 or (delay or 0) < 0:
         raise InputError(f"order {order}, delay {delay}", remedy="the order is at least 1, the dead time at least 0")
     progress(f"order {order}", 0.0)
-    return fixed_order(u, y, order, delay=delay or 0, starts=starts), ()
+    return fixed_order(u, y, order, delay=delay or 0, starts=starts), (), ()
 
 
 def _starts(pieces: Sequence[Recording]) -> tuple[int, ...]:
@@ -283,19 +290,19 @@ def _grid(sample_time_s: float, rows: int) -> FloatArray:
 
 
 def _report(
-    estimate: PredictionErrorEstimate, omega: FloatArray, law: LawCheck | None, motion: float, white: Whiteness
+    found: Structures, omega: FloatArray, law: LawCheck | None, motion: float, white: Whiteness
 ) -> ClosedLoopIdentification:
-    covariance = response_covariance(estimate, omega)[:, 0, 0]
-    response = frequency_points(estimate, omega)
-    plant = estimate.model.response(omega)[:, 0, 0]
+    estimate, response = found.chosen, found.response(omega)
+    covariance = np.array([point.covariance for point in response])
+    plant = np.array([point.response for point in response])
     loop = None if law is None or law.contradicts else law.controller.response(omega)
     return ClosedLoopIdentification(
-        estimate=estimate,
+        structures=found,
         poles=estimate.model.poles,
         pole_covariance=pole_covariance(estimate),
         response=response,
-        points=without_hold(estimate.model, response),
-        design_points=design_points(estimate, omega),
+        points=found.plant(omega),
+        design_points=design_points(found, omega),
         evidence=(),
         excitation=judge(omega, plant, covariance, controller=loop, motion=motion),
         proposal=None,

@@ -19,6 +19,7 @@ from autotune.errors import InputError
 from autotune.identification.closed_loop.hold import continuous_form
 from autotune.identification.closed_loop.prediction_error import PredictionErrorEstimate
 from autotune.identification.closed_loop.state_space import InnovationModel
+from autotune.identification.closed_loop.structures import Structures
 from autotune.identification.parametric import PlantFit
 from autotune.models import TransferFunction
 from autotune.schema import Number, Section, Time, validated
@@ -26,8 +27,10 @@ from autotune.text_files import read_json
 
 #: Halvings of a step from the estimate until the plant there has a continuous form.
 _HALVINGS = 40
-#: Highest order that a file may have.
-_MOST_ORDER = 60
+#: Highest order that a file may have, and other structures.
+_MOST_ORDER, _MOST_OTHERS = 60, 200
+#: Probability that the structures have together which a design keeps its margins on.
+PROBABLE = 0.95
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -50,6 +53,8 @@ class LoopRegion:
         Of those.
     degrees_of_freedom : int
         Rows less parameters.
+    others : tuple of LoopRegion
+        Of other orders and dead times that the record leaves open.
     """
 
     num: FloatArray
@@ -59,10 +64,12 @@ class LoopRegion:
     free: tuple[int, ...]
     covariance: FloatArray
     degrees_of_freedom: int
+    others: tuple[LoopRegion, ...] = ()
 
     def to_json(self) -> dict[str, Any]:
         """Return what ``closed_loop.json`` holds as ``plant_region``."""
-        return {
+        others = {"others": [one.to_json() for one in self.others]} if self.others else {}
+        return others | {
             "num": self.num.tolist(),
             "den": self.den.tolist(),
             "input_delay": self.input_delay,
@@ -82,8 +89,9 @@ class LoopRegion:
 
         Notes
         -----
-        The order is taken as known. A plant of the region that has no continuous form is replaced by the one on the
-        way from the estimate that has.
+        A plant of the region that has no continuous form is replaced by the one on the way from the estimate that has.
+        Other structures are there with their estimates alone. Their own regions are widest where a pole lies beside a
+        zero, which no loop feels, and would have static gains of both signs.
         """
         values, kept = np.concatenate([self.num, self.den[1:]]), list(self.free)
         plant = self._continuous(values)
@@ -110,6 +118,11 @@ class LoopRegion:
             degrees_of_freedom=self.degrees_of_freedom,
             bounds=np.array([[-np.inf] * size, [np.inf] * size]),
             build=of_free,
+            others=tuple(
+                replace(fit, covariance=np.zeros_like(fit.covariance))
+                for one in self.others
+                if (fit := one.plant_fit()) is not None
+            ),
             source="recording",
         )
 
@@ -139,14 +152,22 @@ class LoopRegion:
         )
 
 
-def loop_region(estimate: PredictionErrorEstimate) -> LoopRegion | None:
+def loop_region(found: Structures) -> LoopRegion | None:
     """Return the coefficients of the plant with their joint covariance; None where the covariance is not finite.
 
     Parameters
     ----------
-    estimate : PredictionErrorEstimate
-        Polished model, one input and one output, in the recording's units.
+    found : Structures
+        The chosen model; of the others those count that the record's most probable ones need to come to 95 %.
     """
+    region = _region(found.chosen)
+    if region is None:
+        return None
+    others = (_region(one) for one in found.probable(PROBABLE))
+    return replace(region, others=tuple(one for one in others if one is not None))
+
+
+def _region(estimate: PredictionErrorEstimate) -> LoopRegion | None:
     if not np.all(np.isfinite(estimate.covariance)):
         return None
     model = estimate.model
@@ -163,20 +184,20 @@ def loop_region(estimate: PredictionErrorEstimate) -> LoopRegion | None:
     )
 
 
-def loop_plant(estimate: PredictionErrorEstimate) -> PlantFit | None:
+def loop_plant(found: Structures) -> PlantFit | None:
     """Return the continuous plant of an identified loop and the joint region of its coefficients.
 
     Parameters
     ----------
-    estimate : PredictionErrorEstimate
-        Polished model, one input and one output, in the recording's units.
+    found : Structures
+        As for :func:`loop_region`.
 
     Returns
     -------
     PlantFit or None
         As :meth:`LoopRegion.plant_fit`; None also where the covariance is not finite.
     """
-    region = loop_region(estimate)
+    region = loop_region(found)
     return None if region is None else region.plant_fit()
 
 
@@ -190,6 +211,7 @@ class _Region(Section):
     free: Annotated[tuple[int, ...], Field(min_length=1, max_length=2 * _MOST_ORDER + 1)]
     covariance: Annotated[tuple[tuple[Number, ...], ...], Field(min_length=1, max_length=2 * _MOST_ORDER + 1)]
     degrees_of_freedom: Annotated[int, Field(ge=1)]
+    others: Annotated[tuple[_Region, ...], Field(max_length=_MOST_OTHERS)] = ()
 
     @model_validator(mode="after")
     def _fits(self) -> _Region:
@@ -225,7 +247,10 @@ def read_loop_region(path: str | os.PathLike[str]) -> LoopRegion | None:
     where = f"{path} plant_region"
     if not isinstance(region, dict):
         raise InputError("is no table of keys", where=where, remedy="write it with autotune identify closed-loop")
-    found = validated(_Region, region, where)
+    return _as_region(validated(_Region, region, where))
+
+
+def _as_region(found: _Region) -> LoopRegion:
     return LoopRegion(
         num=np.array(found.num),
         den=np.array(found.den),
@@ -234,6 +259,7 @@ def read_loop_region(path: str | os.PathLike[str]) -> LoopRegion | None:
         free=found.free,
         covariance=np.array(found.covariance),
         degrees_of_freedom=found.degrees_of_freedom,
+        others=tuple(_as_region(one) for one in found.others),
     )
 
 

@@ -25,6 +25,14 @@ from autotune.progress import Progress, quiet
 #: A higher order, or a dead time, must earn this much in the criterion (strong evidence by Raftery's scale): otherwise
 #: a pole that a zero nearly cancels, placed where the noise happens to have a line, would pass for dynamics.
 _CLEAR_GAIN = 6.0
+#: A dead time behind the best one by more than this is as good as refuted: its odds are below one in a thousand.
+_REFUTED = 30.0
+#: Units of the likelihood that count as one where structures are weighed: none of them is the true one to the noise.
+_TEMPERATURE = 2.0
+#: Dead times [rows] and orders beside them that are tried at least: the criterion may rise before it falls.
+_TRIED, _ORDERS = 12, 4
+#: Posterior probability below which a structure is not kept beside the chosen one.
+_LEAST_WEIGHT = 1e-3
 #: Accepted steps for a candidate; only the chosen one is polished to the end.
 _CANDIDATE_STEPS = 25
 #: Rows that the choice looks at; longer records are polished whole once it is made.
@@ -65,6 +73,8 @@ class OrderChoice:
     ----------
     estimate : PredictionErrorEstimate
         Polished model of the chosen order and dead time.
+    others : tuple of (float, PredictionErrorEstimate)
+        Models of other orders and dead times that the record leaves open, with their posterior probabilities.
     evidence : tuple of Candidate
         Every candidate, the best first.
     singular_values : (f n_y,) array
@@ -74,6 +84,7 @@ class OrderChoice:
     """
 
     estimate: PredictionErrorEstimate
+    others: tuple[tuple[float, PredictionErrorEstimate], ...]
     evidence: tuple[Candidate, ...]
     singular_values: FloatArray
     past_window: int
@@ -143,8 +154,10 @@ def choose_order(
 
     Notes
     -----
-    Consistent as the record grows; on a short record a mode that the data do not show is left out. A dead time is
-    named only where it buys a lower order by a clear gain.
+    Consistent as the record grows; on a short record a mode that the data do not show is left out. A higher order, or a
+    dead time, is named only where it earns a clear gain. What is not clear stays among the others, weighed by
+    exp(-c / 4), c the criterion of Hannan & Quinn (J. R. Statist. Soc. B 41, 1979), the least that a number must pay in
+    a consistent choice: the Bayesian one believes in few numbers too much to say what else may be.
     """
     series = Series(u=u, y=y, starts=starts)
     few = series.head(CHOICE_ROWS)
@@ -175,11 +188,13 @@ def choose_order(
             f"no model of order 1 to {max(highest, 1)} could be fitted to {cut} rows",
             remedy="record longer and excite the loop more",
         )
-    best = _parsimonious(fits)
-    for delay in range(1, _dead_time(data, cut) + 1):
+    most, hinted = min(max(_parsimonious(fits)[0] + 1, _ORDERS), highest), _dead_time(data, cut)
+    for delay in range(1, data.p):
         factor = _factor(few.delayed(delay), p=data.p)
-        for order in range(1, best[0]):
+        for order in range(1, most + 1):
             try_order(order, delay, factor)
+        if delay >= max(hinted, _TRIED) and _is_refuted(fits, delay):
+            break
     best = _parsimonious(fits)
     evidence = _evidence(fits)
     factor = _factor(series.head(_START_ROWS).delayed(best[1]), p=data.p)
@@ -187,7 +202,13 @@ def choose_order(
     if cut < len(u) or not estimate.converged:
         estimate = start_and_polish(factor, series, best[0], delay=best[1], feedthrough=feedthrough, offset=offset)
     values = pbsid_states(factor, min(factor.p, 10), feedthrough=feedthrough).singular_values
-    return OrderChoice(estimate=estimate, evidence=evidence, singular_values=values, past_window=factor.p)
+    return OrderChoice(
+        estimate=estimate,
+        others=_others(fits, best),
+        evidence=evidence,
+        singular_values=values,
+        past_window=factor.p,
+    )
 
 
 def fixed_order(
@@ -235,7 +256,10 @@ def _factor(series: Series, p: int | None = None, least: int = 10) -> LaggedData
 
 
 def _dead_time(data: LaggedData, rows: int) -> int:
-    """Return how many first impulse-response terms the long autoregression cannot tell from zero (99 %)."""
+    """Return how many first impulse-response terms the long autoregression cannot tell from zero (99 %).
+
+    Biased where a loop is hardly excited: it says how far dead times are tried at least.
+    """
     past, now_y = data.past(), data.now[1]
     left = data.R[past.stop :, now_y]
     variance = left.T @ left / max(rows - past.stop, 1)
@@ -259,8 +283,7 @@ def _dead_time(data: LaggedData, rows: int) -> int:
 
 
 def _parsimonious(fits: dict[tuple[int, int], PredictionErrorEstimate]) -> tuple[int, int]:
-    rows = min(estimate.rows for estimate in fits.values())
-    criterion = {key: _per_rows(fit, rows) for key, fit in fits.items()}
+    criterion = _criteria(fits)
     lowest = min(value for (_, delay), value in criterion.items() if delay == 0)
     prompt = min(key for key, value in criterion.items() if key[1] == 0 and value < lowest + _CLEAR_GAIN)
     late = [key for key in fits if key[1] > 0]
@@ -270,22 +293,51 @@ def _parsimonious(fits: dict[tuple[int, int], PredictionErrorEstimate]) -> tuple
     return best_late if criterion[prompt] - criterion[best_late] > _CLEAR_GAIN else prompt
 
 
-def _per_rows(estimate: PredictionErrorEstimate, rows: int) -> float:
-    """Return the criterion as if from ``rows`` rows: candidates with a dead time use a few rows fewer."""
+def _criteria(fits: dict[tuple[int, int], PredictionErrorEstimate]) -> dict[tuple[int, int], float]:
+    """Return the criterion of every candidate, as if from as many rows, relative to the best one."""
+    rows = min(estimate.rows for estimate in fits.values())
+    criterion = {key: _per_rows(fit, rows) for key, fit in fits.items()}
+    lowest = min(criterion.values())
+    return {key: value - lowest for key, value in criterion.items()}
+
+
+def _is_refuted(fits: dict[tuple[int, int], PredictionErrorEstimate], delay: int) -> bool:
+    """Whether no order explains the data with a dead time."""
+    return min((value for key, value in _criteria(fits).items() if key[1] == delay), default=math.inf) > _REFUTED
+
+
+def _others(
+    fits: dict[tuple[int, int], PredictionErrorEstimate], chosen: tuple[int, int]
+) -> tuple[tuple[float, PredictionErrorEstimate], ...]:
+    """Return the structures that the data leave open beside the chosen one, with their weights of all."""
+    rows = min(estimate.rows for estimate in fits.values())
+    criteria = {key: _per_rows(fit, rows, 2.0 * math.log(math.log(rows))) for key, fit in fits.items()}
+    lowest = min(criteria.values())
+    weights = {key: math.exp(-0.5 * (value - lowest) / _TEMPERATURE) for key, value in criteria.items()}
+    total = sum(weights.values())
+    kept = [(w / total, key) for key, w in weights.items() if key != chosen and w > _LEAST_WEIGHT * total]
+    return tuple((weight, fits[key]) for weight, key in kept)
+
+
+def _per_rows(estimate: PredictionErrorEstimate, rows: int, charge: float | None = None) -> float:
+    """Return the criterion as if from ``rows`` rows: candidates with a dead time use a few rows fewer.
+
+    Each number pays a charge, log rows by default.
+    """
     floor = 2.0 * estimate.model.C.shape[0] * float(np.log(_NOISE_FREE))
-    return float(rows * max(estimate.log_det, floor) + (estimate.bic - estimate.rows * estimate.log_det))
+    paid = estimate.bic - estimate.rows * estimate.log_det
+    share = 1.0 if charge is None else charge / math.log(estimate.rows)
+    return float(rows * max(estimate.log_det, floor) + share * paid)
 
 
 def _evidence(fits: dict[tuple[int, int], PredictionErrorEstimate]) -> tuple[Candidate, ...]:
-    rows = min(estimate.rows for estimate in fits.values())
-    criterion = {key: _per_rows(estimate, rows) for key, estimate in fits.items()}
-    lowest = min(criterion.values())
+    criterion = _criteria(fits)
     candidates = [
         Candidate(
             order=order,
             delay=delay,
             innovation_sd=float(np.exp(0.5 * fit.log_det / fit.model.C.shape[0])),
-            bic=criterion[order, delay] - lowest,
+            bic=criterion[order, delay],
         )
         for (order, delay), fit in fits.items()
     ]

@@ -220,3 +220,15 @@ def test_infinite_margins_are_null_in_json() -> None:
     assert content["gain"] is None
     assert content["stable"] is True
     assert content["phase_deg"] == pytest.approx(90.0)
+
+
+def test_a_dead_time_far_beyond_every_lag_is_refused_in_bounded_work() -> None:
+    """At a dead time of 9e18 s the integral took a minute and two gigabytes."""
+    lags = (TransferFunction(num=(1.0,), den=(tau, 1.0)) for tau in (0.016668, 0.36359))
+    plant = TransferFunction(num=(-65.5,), den=(1.0, 0.1), delay_s=float(2**63))
+    for lag in lags:
+        plant = plant * lag
+    with pytest.raises(DesignError, match="dead time is far beyond its lags"):
+        margins(plant, PIDController(K=-0.02, Ti_s=3.6))
+    slow = TransferFunction(num=(1.0,), den=(1.0, 1.0), delay_s=1000.0)
+    assert margins(slow, PIDController(K=1e-4, Ti_s=0.3)).stable

@@ -43,7 +43,7 @@ def identified(name: str, seed: int, noise: float = 0.05) -> ClosedLoopIdentific
 
 @pytest.mark.parametrize("name", PLANTS)
 def test_without_noise_it_is_the_plant(name: str) -> None:
-    fit = loop_plant(identified(name, 0, noise=0.0).estimate)
+    fit = loop_plant(identified(name, 0, noise=0.0).structures)
     omega = np.geomspace(0.05, 5.0, 20)
     assert fit is not None
     np.testing.assert_allclose(fit.plant.response(omega), PLANTS[name][0].response(omega), rtol=1e-6)
@@ -54,7 +54,7 @@ def test_the_region_holds_the_true_coefficients() -> None:
     num, den, _ = cont2discrete((PLANTS["resonant"][0].num, PLANTS["resonant"][0].den), TS)
     true, inside = np.array([*np.ravel(num)[1:], *den[1:]]), 0
     for seed in range(40):
-        fit = loop_plant(identified("resonant", seed).estimate)
+        fit = loop_plant(identified("resonant", seed).structures)
         assert fit is not None
         off = fit.parameters - true
         inside += bool(off @ np.linalg.solve(fit.covariance, off) < chi2.ppf(0.95, true.size))
@@ -65,7 +65,7 @@ def test_the_file_of_a_loop_keeps_the_region_and_a_design_uses_it(tmp_path: Path
     found = identified("resonant", 1)
     path = tmp_path / "closed_loop.json"
     path.write_text(json.dumps(closed_loop_json(found)), encoding="utf-8")
-    fit, read = loop_plant(found.estimate), read_loop_region(path)
+    fit, read = loop_plant(found.structures), read_loop_region(path)
     assert fit is not None
     assert read is not None
     again = read.plant_fit()

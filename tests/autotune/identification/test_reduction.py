@@ -102,6 +102,12 @@ def test_points_that_determine_the_static_gain_give_model_8() -> None:
     assert 2.0 / 30 < reduced.G_r * (reduced.omega_0r_rad_s or 0.0) < 2.2 / 30
 
 
+@pytest.mark.parametrize("given", [(1.0, 1e308), (1e308, 1.0), (1.0, 0.0), (0.0, 1.0), (1.0, 1e-12)])
+def test_a_static_gain_that_none_measures_is_refused_in_one_line(given: tuple[float, float]) -> None:
+    with pytest.raises(IdentificationError, match=r"static gain .* with standard deviation"):
+        reduce_points(measured(TANK, np.array([0.2, 0.25, 0.3, 0.36]), 0.004, 2), static_gain=given)
+
+
 def test_a_measured_static_gain_opens_model_8_to_relay_points() -> None:
     relay = measured(TANK, np.array([0.2, 0.25, 0.3, 0.36]), 0.004, 2)
     assert reduce_points(relay).integrating

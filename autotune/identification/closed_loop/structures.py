@@ -1,0 +1,110 @@
+"""Regions that count the structures which a record leaves open: other orders, other dead times.
+
+The covariance of one model's numbers presumes that its structure is the true one. A loop that is hardly excited leaves
+several open, whose responses differ by more than each one's own region says.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TypeAlias
+
+import numpy as np
+
+from autotune.arrays import FloatArray
+from autotune.errors import IdentificationError
+from autotune.identification.closed_loop.confidence import frequency_points
+from autotune.identification.closed_loop.hold import without_hold, worthwhile
+from autotune.identification.closed_loop.prediction_error import PredictionErrorEstimate
+from autotune.points import FrequencyPoint
+
+Weighted: TypeAlias = tuple[float, PredictionErrorEstimate]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Structures:
+    """A chosen model, and others that the record leaves open.
+
+    Attributes
+    ----------
+    chosen : PredictionErrorEstimate
+        Polished model, one input and one output, in the recording's units.
+    others : tuple of (float, PredictionErrorEstimate)
+        Likewise, with their posterior probabilities; the chosen one has what is left to 1.
+    """
+
+    chosen: PredictionErrorEstimate
+    others: tuple[Weighted, ...] = ()
+
+    def probable(self, share: float) -> tuple[PredictionErrorEstimate, ...]:
+        """Return the others that the most probable structures need to come to a share of the whole."""
+        before, kept = 1.0 - sum(weight for weight, _ in self.others), []
+        for weight, one in sorted(self.others, key=lambda pair: -pair[0]):
+            if before >= share:
+                break
+            before += weight
+            kept.append(one)
+        return tuple(kept)
+
+    def response(self, omega_rad_s: FloatArray) -> tuple[FrequencyPoint, ...]:
+        """Return G(exp(j omega Ts)) of the chosen model, with regions over all structures.
+
+        Parameters
+        ----------
+        omega_rad_s : (W,) array
+            Angular frequencies [rad/s].
+        """
+        mine = frequency_points(self.chosen, omega_rad_s)
+        return _over(mine, [(w, _response(one, omega_rad_s)) for w, one in self.others])
+
+    def plant(self, omega_rad_s: FloatArray) -> tuple[FrequencyPoint, ...]:
+        """Return the points of the plant of the chosen model, its command's hold taken out, where known to 50 %.
+
+        Parameters
+        ----------
+        omega_rad_s : (W,) array
+            Angular frequencies [rad/s].
+        """
+
+        def of(one: PredictionErrorEstimate, points: Sequence[FrequencyPoint]) -> Sequence[FrequencyPoint]:
+            return without_hold(one.model, points) if points else ()
+
+        mine = of(self.chosen, frequency_points(self.chosen, omega_rad_s))
+        return worthwhile(_over(mine, [(w, of(one, _response(one, omega_rad_s))) for w, one in self.others]))
+
+
+def _response(one: PredictionErrorEstimate, omega_rad_s: FloatArray) -> Sequence[FrequencyPoint]:
+    """Return the response of a model, nothing where the record does not determine it: then it contradicts nothing."""
+    try:
+        return frequency_points(one, omega_rad_s)
+    except IdentificationError:
+        return ()
+
+
+def _over(
+    chosen: Sequence[FrequencyPoint], others: Sequence[tuple[float, Sequence[FrequencyPoint]]]
+) -> tuple[FrequencyPoint, ...]:
+    """Return points with the mean square error about them over all structures.
+
+    References
+    ----------
+    Draper, J. R. Statist. Soc. B 57, 1995: the variance within structures and the variance between them.
+    """
+    own = 1.0 - sum(weight for weight, _ in others)
+    tables = [(weight, {p.omega_rad_s: p for p in points}) for weight, points in others]
+    result = []
+    for point in chosen:
+        there = [(w, table[point.omega_rad_s]) for w, table in tables if point.omega_rad_s in table]
+        covariance, total = own * np.array(point.covariance), own
+        for weight, other in there:
+            away = other.response - point.response
+            apart = np.array([away.real, away.imag])
+            covariance, total = (
+                covariance + weight * (np.array(other.covariance) + np.outer(apart, apart)),
+                total + weight,
+            )
+        c = covariance / total
+        pair = ((float(c[0, 0]), float(c[0, 1])), (float(c[1, 0]), float(c[1, 1])))
+        result.append(replace(point, covariance=pair))
+    return tuple(result)
