@@ -160,7 +160,7 @@ def _closed_loop(recording: Recording, true: TransferFunction | None) -> bool:
 
     require_answer([recording])
     points = identify_closed_loop(recording).points
-    return true is None or max(_apart(point, true) for point in points) > _SURE
+    return true is None or max((_apart(point, true) for point in points), default=0.0) > _SURE
 
 
 def _apart(point: FrequencyPoint, true: TransferFunction) -> float:
