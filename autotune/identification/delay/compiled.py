@@ -1,4 +1,4 @@
-"""Small compiled pieces of the delay identification: matrix exponential, normal equations, autocovariances."""
+"""Small compiled pieces of the delay identification: matrix exponential and normal equations."""
 
 from __future__ import annotations
 
@@ -173,15 +173,3 @@ def cholesky_solve(G: FloatArray, g: FloatArray, smallest_pivot: float) -> tuple
     for i in range(p):
         x[i] *= scale[i]
     return x, explained, True
-
-
-@njit(cache=True)
-def autocovariances(values: FloatArray, lags: int) -> FloatArray:
-    """Return the sums of products at lags 0..lags, divided by the number of rows, shape (lags + 1,)."""
-    result = np.zeros(lags + 1)
-    for lag in range(lags + 1):
-        total = 0.0
-        for k in range(lag, values.size):
-            total += values[k] * values[k - lag]
-        result[lag] = total / values.size
-    return result

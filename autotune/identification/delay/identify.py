@@ -21,11 +21,12 @@ from autotune.identification.delay.output_error import (
     polish,
     residuals,
     solve_linear,
-    whitening_filter,
+    widened,
 )
 from autotune.identification.delay.profile import profile
 from autotune.identification.delay.search import binned, scan, search
 from autotune.identification.dependence import latest_answer_s
+from autotune.identification.noise_colour import whitening_filter
 from autotune.models import Hold
 from autotune.progress import Progress, quiet
 from autotune.recording import Recording
@@ -225,11 +226,11 @@ def _polish_on_all_rows(
     for _ in range(_MINIMA):
         limit = min(best.h + 8.0 * float(sd) + 2.0 * step, largest)
         usable = data.usable_from(limit)
-        best, whitening = polish(usable, structure, best, max_delay_s=limit, coloured=coloured)
-        model = finish(usable, structure, best, whitening)
+        best, colour = polish(usable, structure, best, max_delay_s=limit, coloured=coloured)
+        model = finish(usable, structure, best, colour.whitening)
         _require_inside(data, model, largest)
         if model.standard_deviations[structure.order] < _LINEAR * abs(model.b):
-            return model
+            return widened(model, structure, colour)
         if structure.order >= _COMPARED_ORDER:
             _require_order(data, structure, best, model, largest)
         _require_determined(data, model, largest)
@@ -238,7 +239,7 @@ def _polish_on_all_rows(
             raise _undetermined(data, found.model, largest, f"nothing bounds {found.endless}")
         if found.lower is None:
             _require_determined(data, found.model, largest)
-            return found.model
+            return widened(found.model, structure, colour)
         best = found.lower
     raise _undetermined(data, model, largest, "several sets of parameters explain it alike")
 

@@ -15,7 +15,7 @@ from autotune.errors import IdentificationError, InputError
 from autotune.identification.delay.data import DelayData, prepare
 from autotune.identification.delay.model import DelayModel
 from autotune.identification.delay.online_modulating import DelayTracking, OnlineEstimator, OnlineSample
-from autotune.identification.delay.output_error import Structure, parameters, residuals, solve_linear, whitening_filter
+from autotune.identification.delay.output_error import Structure, colour_of, parameters, residuals, solve_linear
 from autotune.identification.delay.weighted_delay import weighted_delay
 from autotune.models import Hold
 from autotune.recording import Recording
@@ -82,8 +82,8 @@ def algebraic_delay(
     span = float(data.ty[-1] - data.ty[0])
     length = span / _INTERVALS if interval_s is None else interval_s
     _require_length(length, order, recording)
-    found = weighted_delay(data, order, length, start_s=start_s)
-    return _model(data, order, found.values, found.covariance)
+    values, covariance = weighted_delay(data, order, length, start_s=start_s)
+    return _model(data, order, values, covariance)
 
 
 def _require_length(length: float, order: int, recording: Recording) -> None:
@@ -143,29 +143,31 @@ def online_delay(
         response = _response(data, order, values)
         if response is None:
             return _model(data, order, values, last.covariance)
-        own, y, residual = response
+        own, y, residual, whitening = response
         values, before = seen - _values(followed(y, start_s)) + own, values
         noise = float(np.std(residual) / np.std(data.y))
         if np.all(np.abs(values - before) <= max(_ROUNDING, _SHARE_OF_NOISE * noise) * np.abs(values)):
             break
     corrected = values
     for _ in range(_MATCHES):  # the bias of least squares with noise in its regressors, at the estimate that it leaves
-        draws = _under_noise(lambda y: followed(y, start_s), y, residual, recording.name)
+        draws = _under_noise(
+            lambda y: followed(y, start_s), y, _noise_like(residual, whitening, len(y)), recording.name
+        )
         bias = np.mean(draws, axis=0) - _values(followed(y, start_s))
         corrected = values - bias
         response = _response(data, order, corrected)
         if response is None:
             break
-        own, y, residual = response
+        _, y, residual, whitening = response
     return _model(data, order, corrected, _spread(draws) + np.outer(bias, bias))
 
 
 def _under_noise(
-    followed: Callable[[FloatArray], OnlineSample], y: FloatArray, residual: FloatArray, name: str
+    followed: Callable[[FloatArray], OnlineSample], y: FloatArray, noise: Iterator[FloatArray], name: str
 ) -> FloatArray:
     """Return what is followed on a response under drawn noise, (draws, values); draws that lose lock are left out."""
     draws = []
-    for drawn in _noise_like(residual, len(y)):
+    for drawn in noise:
         with contextlib.suppress(IdentificationError):
             draws.append(_values(followed(y + drawn)))
     if len(draws) < _DRAWS // 2:
@@ -181,9 +183,9 @@ def _values(sample: OnlineSample) -> FloatArray:
     return np.array([*sample.a, sample.b, sample.delay_s])
 
 
-def _noise_like(residual: FloatArray, rows: int) -> Iterator[FloatArray]:
-    """Yield records of noise with the residual's variance and colour."""
-    colour = np.array([1.0, *whitening_filter(residual)])
+def _noise_like(residual: FloatArray, whitening: FloatArray, rows: int) -> Iterator[FloatArray]:
+    """Yield records of noise with the residual's variance and that colour."""
+    colour = np.array([1.0, *whitening])
     innovations = lfilter(colour, [1.0], residual)[colour.size - 1 :]
     rng = np.random.default_rng(0)
     for _ in range(_DRAWS):
@@ -197,8 +199,13 @@ def _spread(draws: FloatArray) -> FloatArray:
     return np.asarray(np.cov(draws.T) * open_left)
 
 
-def _response(data: DelayData, order: int, values: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray] | None:
-    """Return the best model with these a and h, its response and what that leaves of y; None if it overflows."""
+def _response(
+    data: DelayData, order: int, values: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray] | None:
+    """Return the best model with these a and h, its response, what that leaves of y, and what makes this white.
+
+    None if the response overflows.
+    """
     a, h = tuple(values[:order].tolist()), max(float(values[order + 1]), 0.0)
     usable = data.usable_from(h)
     point = solve_linear(usable, Structure(order=order), a, h)
@@ -206,7 +213,8 @@ def _response(data: DelayData, order: int, values: FloatArray) -> tuple[FloatArr
         return None
     y, residual = data.y.copy(), residuals(usable, point)
     y[-usable.y.size :] -= residual
-    return np.array([*a, point.theta[0], h]), y, residual
+    whitening = colour_of(usable, Structure(order=order), point).whitening
+    return np.array([*a, point.theta[0], h]), y, residual, whitening
 
 
 def _model(data: DelayData, order: int, values: FloatArray, covariance: FloatArray) -> DelayModel:

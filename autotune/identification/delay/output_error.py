@@ -9,21 +9,18 @@ autoregressive noise model independent of the plant.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import solve_toeplitz
 
 from autotune.arrays import BoolArray, FloatArray
 from autotune.errors import IdentificationError
-from autotune.identification.delay.compiled import autocovariances, cholesky_solve
+from autotune.identification.delay.compiled import cholesky_solve
 from autotune.identification.delay.data import DelayData
 from autotune.identification.delay.model import DelayModel
-from autotune.identification.delay.response import linear_part, normal_matrix, output
-
-_WHITE = np.empty(0)
-_MAX_AR = 12
+from autotune.identification.delay.response import linear_part, normal_matrix, output, sensitivities
+from autotune.identification.noise_colour import MAX_AR, WHITE, NoiseColour, noise_colour
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,6 +52,11 @@ class Structure:
         return np.array([*self.linear, not self.integrator, *[True] * self.order])
 
     @property
+    def free_parameters(self) -> BoolArray:
+        """Which of (a, b, h, constant, initial state) are free."""
+        return np.array([not self.integrator, *[True] * (self.order + 1), self.offset, *[True] * self.order])
+
+    @property
     def parameters(self) -> int:
         """How many there are."""
         return int(self.free.sum())
@@ -77,7 +79,7 @@ class Point:
 
 
 def solve_linear(
-    data: DelayData, structure: Structure, a: tuple[float, ...], h: float, whitening: FloatArray = _WHITE
+    data: DelayData, structure: Structure, a: tuple[float, ...], h: float, whitening: FloatArray = WHITE
 ) -> Point:
     """Return the best b, d and initial state for given (a, h); an unstable response that overflows costs infinity."""
     before = 0.0 if data.before is None else data.before
@@ -91,7 +93,7 @@ def minimise(
     start: Point,
     *,
     max_delay_s: float,
-    whitening: FloatArray = _WHITE,
+    whitening: FloatArray = WHITE,
     iterations: int = 30,
     tolerance: float = 1e-4,
     held: int | None = None,
@@ -170,7 +172,7 @@ def parameters(data: DelayData, point: Point) -> FloatArray:
     return np.array([*point.a, b, point.h, d - b * data.u_0 - point.a[0] * data.y_0, *initial])
 
 
-def finish(data: DelayData, structure: Structure, point: Point, whitening: FloatArray = _WHITE) -> DelayModel:
+def finish(data: DelayData, structure: Structure, point: Point, whitening: FloatArray = WHITE) -> DelayModel:
     """Return the model with its covariance at a minimum, the operating point added back.
 
     Raises
@@ -243,44 +245,56 @@ def residuals(data: DelayData, point: Point) -> FloatArray:
     )
 
 
-def whitening_filter(residual: FloatArray, max_order: int = _MAX_AR) -> FloatArray:
-    """Return the autoregressive filter that makes the residual white, its order by the Bayes information criterion.
+def colour_of(
+    data: DelayData,
+    structure: Structure,
+    point: Point,
+    *,
+    max_order: int = MAX_AR,
+    samples: NDArray[np.int64] | None = None,
+) -> NoiseColour:
+    """Return the colour of the noise that a point leaves.
 
     Parameters
     ----------
-    residual : (N,) array
-        Residual, row by row.
+    data : DelayData
+        The rows that were fitted.
+    structure : Structure
+        Which parameters are free.
+    point : Point
+        The fit.
     max_order : int
-        Largest order tried.
+        Largest order of the autoregression.
+    samples : (N,) array, optional
+        The sample that each row belongs to, ascending from 0: the colour is that of the means over samples.
 
     Returns
     -------
-    (p,) array
-        c_1..c_p of 1 + c_1 q^-1 + ..; empty where the residual is white.
-
-    Notes
-    -----
-    Rows are taken as equidistant; with jittered stamps the noise model is an approximation, the plant's is not.
+    NoiseColour
+        Its freedom is that of the free ones of (a, b, h, constant, initial state).
     """
-    N = residual.size
-    max_order = min(max_order, N // 20)
-    r = autocovariances(residual, max_order)
-    best, filter_best = N * np.log(r[0]), _WHITE
-    for order in range(1, max_order + 1):
-        c = -solve_toeplitz(r[:order], r[1 : order + 1])
-        variance = r[0] + c @ r[1 : order + 1]
-        if variance <= 0:
-            break
-        criterion = N * np.log(variance) + order * np.log(N)
-        if criterion < best:
-            best, filter_best = criterion, c
-    return np.asarray(filter_best, dtype=np.float64)
+    before = 0.0 if data.before is None else data.before
+    columns = sensitivities(data.tu, data.u, before, data.linear, data.ty, point.a, point.h, point.theta)
+    to_free = _to_parameters(data, structure, point)[np.ix_(structure.free_parameters, structure.free)]
+    in_parameters = np.linalg.solve(to_free.T, columns[:, structure.free].T).T
+    rows = np.column_stack([in_parameters, residuals(data, point)])
+    if samples is not None:
+        first = np.flatnonzero(np.diff(samples, prepend=-1))
+        rows = np.add.reduceat(rows, first) / np.diff(first, append=len(rows))[:, None]
+    return noise_colour(rows[:, :-1], rows[:, -1], max_order)
+
+
+def widened(model: DelayModel, structure: Structure, colour: NoiseColour) -> DelayModel:
+    """Return the model with standard deviations that, 1.96 times, make Student's 95 % intervals."""
+    wider = np.ones(len(model.covariance))
+    wider[structure.free_parameters] = colour.widening()
+    return replace(model, covariance=model.covariance * np.outer(wider, wider))
 
 
 def polish(
     data: DelayData, structure: Structure, start: Point, *, max_delay_s: float, coloured: bool = True
-) -> tuple[Point, FloatArray]:
-    """Fit from a starting point, find the noise's colour, fit again under it; return minimum and whitening filter.
+) -> tuple[Point, NoiseColour]:
+    """Fit from a starting point, find the noise's colour, fit again under it; return minimum and colour.
 
     Parameters
     ----------
@@ -309,23 +323,20 @@ def polish(
     point = minimise(
         data, structure, solve_linear(data, structure, start.a, start.h), max_delay_s=max_delay_s, iterations=50
     )
-    whitening = _WHITE
-    for _ in range(3 if coloured else 0):
-        before = whitening
-        whitening = whitening_filter(residuals(data, point))
-        if whitening.size == 0 and before.size == 0:
-            break
-        settled = whitening.size == before.size and np.max(np.abs(whitening - before)) < 1e-3
+    colour = colour_of(data, structure, point, max_order=MAX_AR if coloured else 0)
+    for _ in range(3 if colour.whitening.size else 0):
+        before = colour.whitening
         point = minimise(
             data,
             structure,
-            solve_linear(data, structure, point.a, point.h, whitening),
+            solve_linear(data, structure, point.a, point.h, before),
             max_delay_s=max_delay_s,
-            whitening=whitening,
+            whitening=before,
         )
-        if settled:
+        colour = colour_of(data, structure, point)
+        if colour.whitening.size == before.size and np.max(np.abs(colour.whitening - before), initial=0.0) < 1e-3:
             break
-    return point, whitening
+    return solve_linear(data, structure, point.a, point.h, colour.whitening), colour
 
 
 def _gram(

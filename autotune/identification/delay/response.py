@@ -310,6 +310,38 @@ def output(
 
 
 @njit(cache=True)
+def sensitivities(
+    tu: FloatArray,
+    u: FloatArray,
+    before: float,
+    linear: bool,
+    ty: FloatArray,
+    a: tuple[float, ...],
+    h: float,
+    theta: FloatArray,
+) -> FloatArray:
+    """Return the columns z, e, phi_0.., s.., -x' of :func:`normal_matrix` row by row, shape (N, 2n+3)."""
+    n = len(a)
+    columns = np.zeros((ty.size, 2 * n + 4))
+    coefficients = np.empty(n)
+    chains = np.zeros((n, n + 4))
+    for i in range(n):
+        coefficients[i] = a[i]
+        chains[i, 2 + i] = 1.0
+        chains[i, 3 + n] = theta[2 + i]
+    clock = np.array([ty[0], np.searchsorted(tu, ty[0] - h, side="right") - 1, 0.0])
+    first = 0
+    while first < ty.size:
+        pieces, count, outputs = _schedule(tu, u, before, linear, ty, h, clock)
+        F, which = _transitions(coefficients, pieces, count, 1e-13 * abs(clock[0]))
+        if not _propagate(a, F, which, pieces, chains, columns[first:]):
+            break
+        _propagate_sensitivities(a, theta[0], theta[1], F, which, pieces, chains, columns[first:])
+        first += outputs
+    return columns[:, : 2 * n + 3]
+
+
+@njit(cache=True)
 def linear_part(
     tu: FloatArray,
     u: FloatArray,

@@ -18,8 +18,9 @@ from threadpoolctl import threadpool_limits
 from autotune.arrays import ComplexArray, FloatArray
 from autotune.errors import IdentificationError
 from autotune.identification.delay.data import DelayData
-from autotune.identification.delay.output_error import Structure, residuals, solve_linear, whitening_filter
+from autotune.identification.delay.output_error import Structure, colour_of, residuals, solve_linear
 from autotune.identification.delay.weighted_equations import Weighted, Windows, minimise_weighted
+from autotune.identification.noise_colour import NoiseColour
 
 #: Largest harmonic of a window, intervals per length, and most intervals, which are then spaced out over the record.
 _HARMONICS, _OVERLAP, _MOST = 4, 3, 60
@@ -121,7 +122,9 @@ def _of_output(t: FloatArray, y: FloatArray, order: int, windows: Windows) -> Fl
     return np.column_stack([(-1.0) ** i * windows.of_signal(t, running, 0.0, i) for i in range(order + 1)])
 
 
-def weighted_delay(data: DelayData, order: int, length_s: float, *, start_s: float | None = None) -> Weighted:
+def weighted_delay(
+    data: DelayData, order: int, length_s: float, *, start_s: float | None = None
+) -> tuple[FloatArray, FloatArray]:
     """Return (a_0.., b, h, d) of a record by weighted modulated equations.
 
     Parameters
@@ -137,8 +140,8 @@ def weighted_delay(data: DelayData, order: int, length_s: float, *, start_s: flo
 
     Returns
     -------
-    Weighted
-        Its covariance is that of the values.
+    (n + 3,) array, (n + 3, n + 3) array
+        Values and covariance; its 1.96 standard deviations are 95 % intervals, the noise's colour being estimated.
 
     Raises
     ------
@@ -149,7 +152,7 @@ def weighted_delay(data: DelayData, order: int, length_s: float, *, start_s: flo
         return _weighted(data, order, length_s, start_s)
 
 
-def _weighted(data: DelayData, order: int, length_s: float, start_s: float | None) -> Weighted:
+def _weighted(data: DelayData, order: int, length_s: float, start_s: float | None) -> tuple[FloatArray, FloatArray]:
     largest = max(0.5 * (data.duration_s - length_s), 0.0)
     grid = np.arange(0.0, largest + 1e-12, length_s / (_HARMONICS + 2) / _GRID)
     found: list[tuple[float, FloatArray]] = []
@@ -178,8 +181,10 @@ def _minimum(equations: OneDelay, start: FloatArray, largest: float) -> Weighted
     return found if inside and found.freedom > 0 and np.all(np.isfinite(found.values)) else None
 
 
-def _settled(data: DelayData, order: int, length_s: float, values: FloatArray, largest: float) -> Weighted:
-    """Return the estimate with the colour of the noise, and with what quadrature leaves taken off."""
+def _settled(
+    data: DelayData, order: int, length_s: float, values: FloatArray, largest: float
+) -> tuple[FloatArray, FloatArray]:
+    """Return the estimate with the colour of the noise, and with what quadrature leaves taken off; its covariance."""
     n = order
     h = max(float(values[n + 1]), 0.0)
     usable = data.usable_from(h)
@@ -187,7 +192,8 @@ def _settled(data: DelayData, order: int, length_s: float, values: FloatArray, l
     found: Weighted | None = None
     for coloured in (False, True):
         for _ in range(_ROUNDS):
-            found = _minimum(_as_simulated(plain, usable, values, coloured=coloured), values, largest)
+            simulated, colour = _as_simulated(plain, usable, values, coloured=coloured)
+            found = _minimum(simulated, values, largest)
             if found is None:
                 raise _undetermined(data, order)
             sd = np.sqrt(np.diag(found.covariance))
@@ -197,32 +203,32 @@ def _settled(data: DelayData, order: int, length_s: float, values: FloatArray, l
     assert found is not None
     if not np.all(np.isfinite(found.covariance)) or not sd[n] < abs(values[n]):
         raise _undetermined(data, order)
-    return found
+    wider = np.ones(n + 3) if colour is None else colour.widening()[: n + 3]
+    return values, found.covariance * np.outer(wider, wider)
 
 
-def _as_simulated(plain: OneDelay, data: DelayData, values: FloatArray, *, coloured: bool) -> OneDelay:
-    """Return the equations less what they leave of the model's own response, under noise of the residual's colour."""
+def _as_simulated(
+    plain: OneDelay, data: DelayData, values: FloatArray, *, coloured: bool
+) -> tuple[OneDelay, NoiseColour | None]:
+    """Return the equations less what they leave of the model's own response, and under noise of the residual's colour.
+
+    The colour is that of the residual's means over samples, None where it is not asked for or rows are too few.
+    """
     n = plain.order
-    point = solve_linear(data, Structure(order=n), tuple(values[:n].tolist()), max(float(values[n + 1]), 0.0))
+    structure = Structure(order=n)
+    point = solve_linear(data, structure, tuple(values[:n].tolist()), max(float(values[n + 1]), 0.0))
     if not np.isfinite(point.cost):  # an unstable model's response overflows
-        return plain
+        return plain, None
     residual = residuals(data, point)
     ideal = replace(plain, of_y=_of_output(data.ty, data.y - residual, n, plain.windows))
     simulated = np.array([*point.a, point.theta[0], point.h, point.theta[1]])
     corrected = replace(plain, taken_off=ideal.left(simulated))
-    return _coloured(corrected, data.ty, residual) if coloured else corrected
-
-
-def _coloured(equations: OneDelay, t: FloatArray, residual: FloatArray) -> OneDelay:
-    """Return the equations under autoregressive noise, its model fitted to the residual's means over samples."""
-    width = equations.sample_s
-    at = np.floor((t - t[0]) / width).astype(np.int64)
-    rows = np.bincount(at)
-    means = np.bincount(at, residual)[rows > 0] / rows[rows > 0]
-    if means.size < _COLOURED_ROWS or not np.ptp(means) > 0.0:
-        return equations
-    noise = lfilter([1.0], [1.0, *whitening_filter(means)], equations.noise[..., ::-1])[..., ::-1]
-    return replace(equations, noise=np.asarray(noise))
+    at = np.floor((data.ty - data.ty[0]) / plain.sample_s).astype(np.int64)
+    if not coloured or np.unique(at).size < _COLOURED_ROWS or not np.ptp(residual) > 0.0:
+        return corrected, None
+    colour = colour_of(data, structure, point, samples=at)
+    noise = lfilter([1.0], [1.0, *colour.whitening], corrected.noise[..., ::-1])[..., ::-1]
+    return replace(corrected, noise=np.asarray(noise)), colour
 
 
 def _windows(data: DelayData, length_s: float, reach_s: float) -> Windows:

@@ -1,0 +1,239 @@
+"""Colour of the noise behind a fit's residual: autoregressive, by restricted likelihood, with what its estimate costs.
+
+A fit takes noise along, most of it where its own sensitivities lie, which for a plant is near frequency zero. A colour
+that is read off the residual alone lacks that noise, and intervals that rest on it are too narrow. The restricted
+likelihood is that of what the fit leaves, whatever the parameters are: the residual's products plus what the fit took.
+What an estimated colour leaves open beyond that is counted in degrees of freedom.
+
+References
+----------
+Patterson, Thompson, Recovery of inter-block information when block sizes are unequal, Biometrika 58, 1971.
+Cheang, Reinsel, Bias reduction of autoregressive estimates in time series regression model through restricted maximum
+likelihood, JASA 95, 2000.
+Giesbrecht, Burns, Two-stage analysis based on a mixed model, Biometrics 41, 1985 (degrees of freedom).
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from scipy.linalg import solve_toeplitz
+from scipy.optimize import minimize
+
+from autotune.arrays import FloatArray
+
+WHITE = np.empty(0)
+MAX_AR = 12
+#: Step of a difference quotient in arctanh of a partial correlation, whose standard deviation is that of 1/sqrt(rows).
+_DIFFERENCE = 1e-3
+#: Share of products below which they are rounding, as those of exact data are.
+_EXACT = 1e-12
+#: Columns of a fit less independent than this repeat others.
+_INDEPENDENT = 1e-10
+#: Partial correlation at which the search begins at most, and how far its arctanh goes.
+_STATIONARY, _FARTHEST = 0.9999, 9.0
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class NoiseColour:
+    """Autoregressive noise (1 + c_1 q^-1 + ..) w = innovation.
+
+    Attributes
+    ----------
+    whitening : (p,) array
+        c_1..c_p; empty where the noise is white.
+    freedom : (P,) array
+        Degrees of freedom of the variance of each parameter of the fit, infinite where nothing depends on the colour.
+    """
+
+    whitening: FloatArray
+    freedom: FloatArray
+
+    def widening(self) -> FloatArray:
+        """Return, for each parameter, by how much 1.96 standard deviations fall short of Student's 95 % interval."""
+        from scipy.stats import norm, t
+
+        return np.asarray(t.ppf(0.975, self.freedom) / norm.ppf(0.975), dtype=np.float64)
+
+
+def whitening_filter(residual: FloatArray, max_order: int = MAX_AR) -> FloatArray:
+    """Return the autoregressive filter that makes a residual white, its order by the Bayes information criterion.
+
+    Parameters
+    ----------
+    residual : (N,) array
+        Residual, row by row.
+    max_order : int
+        Largest order tried.
+
+    Returns
+    -------
+    (p,) array
+        c_1..c_p of 1 + c_1 q^-1 + ..; empty where the residual is white.
+
+    Notes
+    -----
+    Rows are taken as equidistant; with jittered stamps the noise model is an approximation, the plant's is not.
+    """
+    N = residual.size
+    max_order = min(max_order, N // 20)
+    r = autocovariances(residual, max_order)
+    best, filter_best = N * np.log(r[0]), WHITE
+    for order in range(1, max_order + 1):
+        c = -solve_toeplitz(r[:order], r[1 : order + 1])
+        variance = r[0] + c @ r[1 : order + 1]
+        if variance <= 0:
+            break
+        criterion = N * np.log(variance) + order * np.log(N)
+        if criterion < best:
+            best, filter_best = criterion, c
+    return np.asarray(filter_best, dtype=np.float64)
+
+
+@njit(cache=True)
+def autocovariances(values: FloatArray, lags: int) -> FloatArray:
+    """Return the sums of products at lags 0..lags, divided by the number of rows, shape (lags + 1,)."""
+    result = np.zeros(lags + 1)
+    for lag in range(lags + 1):
+        total = 0.0
+        for k in range(lag, values.size):
+            total += values[k] * values[k - lag]
+        result[lag] = total / values.size
+    return result
+
+
+def noise_colour(columns: FloatArray, residual: FloatArray, max_order: int = MAX_AR) -> NoiseColour:
+    """Return the colour of the noise behind a least-squares fit.
+
+    Parameters
+    ----------
+    columns : (N, P) array
+        The fit's sensitivities, row by row.
+    residual : (N,) array
+        What it left.
+    max_order : int
+        Largest order tried; 0 for noise that is known to be white.
+
+    Returns
+    -------
+    NoiseColour
+        Of the order that the residual asks for.
+    """
+    start = whitening_filter(residual, max_order)
+    likelihood = _Restricted.of(columns, residual, start.size)
+    partial = np.arctanh(_partial_correlations(start))
+    if start.size:
+        partial = minimize(likelihood.cost, partial, method="BFGS").x
+    return NoiseColour(whitening=_filter_of(np.tanh(partial)), freedom=likelihood.freedom(partial))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Restricted:
+    """Restricted likelihood of stationary autoregressive noise, as a function of arctanh of its partial correlations.
+
+    Attributes
+    ----------
+    rows : int
+        Number N of rows.
+    products : (p + 1, p + 1, R + 1, R + 1) array
+        Sums over t of x(t + i) x(t + j)^T for t = 0..N-1-i-j, x the orthonormal columns and the residual: the exact sum
+        of squares of stationary noise is quadratic in c with these (Box & Jenkins, Time Series Analysis, A7.4).
+    to_parameters : (P, R) array
+        From coordinates of the orthonormal columns.
+    """
+
+    rows: int
+    products: FloatArray
+    to_parameters: FloatArray
+
+    @classmethod
+    def of(cls, columns: FloatArray, residual: FloatArray, order: int) -> _Restricted:
+        size = np.linalg.norm(columns, axis=0)
+        size[size == 0.0] = 1.0
+        U, sizes, Vh = np.linalg.svd(columns / size, full_matrices=False)
+        kept = sizes > _INDEPENDENT * sizes[0]
+        signals = np.column_stack([U[:, kept], residual / max(float(np.linalg.norm(residual)), 1e-300)])
+        return cls(
+            rows=residual.size,
+            products=_products(signals, order),
+            to_parameters=(Vh[kept].T / sizes[kept]) / size[:, None],
+        )
+
+    def solved(self, partial: FloatArray) -> tuple[FloatArray, float, float]:
+        """Return the whitened columns' products, the sum of squares that they leave, and log |V| of the noise."""
+        kappa = np.tanh(np.clip(partial, -_FARTHEST, _FARTHEST))
+        colour = np.append(1.0, _filter_of(kappa))
+        gram = np.einsum("i,ijab,j->ab", colour, self.products, colour)
+        of_columns, across = gram[:-1, :-1], gram[:-1, -1]
+        of_columns = of_columns + _EXACT * float(np.trace(of_columns)) * np.eye(len(of_columns))
+        left = max(float(gram[-1, -1] - across @ np.linalg.solve(of_columns, across)), _EXACT)
+        return of_columns, left, float(-np.arange(1, kappa.size + 1) @ np.log1p(-(kappa**2)))
+
+    def cost(self, partial: FloatArray) -> float:
+        """Return minus the logarithm of the restricted likelihood, the innovations' variance at its best."""
+        of_columns, left, of_noise = self.solved(partial)
+        size = float(np.linalg.slogdet(of_columns)[1])
+        return float(0.5 * ((self.rows - len(of_columns)) * math.log(left) + of_noise + size))
+
+    def freedom(self, partial: FloatArray) -> FloatArray:
+        """Return 2 over the variance of the logarithm of each parameter's variance (Satterthwaite)."""
+        rank = self.to_parameters.shape[1]
+        scatter = np.full(len(self.to_parameters), 2.0 / max(self.rows - rank, 1))
+
+        def logarithm(at: FloatArray) -> FloatArray:
+            gram, left, _ = self.solved(at)
+            inverse = np.linalg.inv(gram)
+            sizes = np.einsum("pa,ab,pb->p", self.to_parameters, inverse, self.to_parameters)
+            return np.asarray(np.log(sizes * left))
+
+        for direction in _standard_directions(self.cost, partial):
+            scatter += (0.5 * (logarithm(partial + direction) - logarithm(partial - direction))) ** 2
+        return np.asarray(2.0 / scatter)
+
+
+def _standard_directions(cost: Callable[[FloatArray], float], at: FloatArray) -> FloatArray:
+    """Return directions one standard deviation long in which the minimum of a log likelihood is known, (p, p)."""
+    p = at.size
+    steps = _DIFFERENCE * np.eye(p)
+    hessian = np.empty((p, p))
+    for i, j in itertools.product(range(p), range(p)):
+        ends = [s * r * cost(at + s * steps[i] + r * steps[j]) for s in (1.0, -1.0) for r in (1.0, -1.0)]
+        hessian[i, j] = sum(ends) / (4.0 * _DIFFERENCE**2)
+    curvatures, vectors = np.linalg.eigh(hessian)
+    return np.asarray((vectors / np.sqrt(np.maximum(curvatures, 1.0))).T)
+
+
+def _products(signals: FloatArray, order: int) -> FloatArray:
+    n, width = signals.shape
+    products = np.empty((order + 1, order + 1, width, width))
+    for j in range(order + 1):
+        products[0, j] = signals[: n - j].T @ signals[j:]
+        for i in range(1, j + 1):  # one row less at either end
+            first = np.outer(signals[i - 1], signals[j - 1])
+            products[i, j] = products[i - 1, j - 1] - first - np.outer(signals[n - j], signals[n - i])
+        for i in range(j):
+            products[j, i] = products[i, j].T
+    return products
+
+
+def _filter_of(partial: FloatArray) -> FloatArray:
+    """Return c of a stationary filter from its partial correlations (Levinson)."""
+    colour = np.ones(1)
+    for kappa in partial:
+        padded = np.append(colour, 0.0)
+        colour = padded - kappa * padded[::-1]
+    return colour[1:]
+
+
+def _partial_correlations(whitening: FloatArray) -> FloatArray:
+    colour, partial = np.append(1.0, whitening), np.zeros(whitening.size)
+    for k in range(whitening.size, 0, -1):
+        kappa = float(np.clip(-colour[k], -_STATIONARY, _STATIONARY))
+        partial[k - 1] = kappa
+        colour = ((colour + kappa * colour[::-1]) / (1.0 - kappa**2))[:k]
+    return partial

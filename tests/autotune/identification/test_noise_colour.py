@@ -1,0 +1,113 @@
+"""The colour of the noise behind a fit: what is known of stationary autoregressions, and whether intervals hold."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.linalg import toeplitz
+from scipy.signal import lfilter
+
+from autotune.arrays import FloatArray
+from autotune.identification.noise_colour import NoiseColour, noise_colour, whitening_filter
+
+
+def coloured(rng: np.random.Generator, rows: int, pole: float) -> FloatArray:
+    white = rng.standard_normal(rows + 300)
+    return np.asarray(lfilter([1.0], [1.0, -pole], white)[300:])
+
+
+def slow_columns(rows: int) -> FloatArray:
+    """A constant, a trend and slow waves: a fit that takes noise along where that of a pole of .9 is strongest."""
+    t = np.arange(rows) / rows
+    waves = [wave(2.0 * np.pi * k * t) for k in (1, 2) for wave in (np.cos, np.sin)]
+    return np.column_stack([np.ones(rows), t, *waves])
+
+
+def whitened(colour: NoiseColour, signals: FloatArray) -> FloatArray:
+    return np.asarray(lfilter([1.0, *colour.whitening], [1.0], signals, axis=0)[colour.whitening.size :])
+
+
+def shares_inside(rows: int, pole: float, records: int, *, restricted: bool) -> FloatArray:
+    """Share of 95 % intervals of a regression's coefficients, all of them 0, that hold 0."""
+    X, rng = slow_columns(rows), np.random.default_rng(1)
+    inside = []
+    for _ in range(records):
+        y = coloured(rng, rows, pole)
+        residual = y - X @ np.linalg.lstsq(X, y, rcond=None)[0]
+        infinite = np.full(X.shape[1], np.inf)
+        plain = NoiseColour(whitening=whitening_filter(residual), freedom=infinite)
+        colour = noise_colour(X, residual) if restricted else plain
+        A, b = whitened(colour, X), whitened(colour, y)
+        found, cost, *_ = np.linalg.lstsq(A, b, rcond=None)
+        sd = np.sqrt(np.diag(np.linalg.inv(A.T @ A)) * cost[0] / (len(b) - X.shape[1]))
+        inside.append(np.abs(found) < 1.96 * sd * colour.widening())
+    return np.mean(inside, axis=0)
+
+
+@pytest.mark.parametrize("pole", [0.5, 0.9])
+def test_intervals_hold_although_the_colour_is_estimated_from_the_residual(pole: float) -> None:
+    """Of 3,600 intervals; with the colour of the residual alone fewer do."""
+    share = np.mean(shares_inside(800, pole, 600, restricted=True))
+    assert 0.935 < share < 0.965
+    assert np.mean(shares_inside(800, pole, 600, restricted=False)) < share - 0.005
+
+
+def test_what_the_fit_took_of_the_noise_is_not_missing_from_its_colour() -> None:
+    """Noise of a pole of .9 has 100 times its innovations' variance at frequency 0; the residual alone shows less."""
+    X, rng = slow_columns(300), np.random.default_rng(2)
+    restricted, plain = [], []
+    for _ in range(200):
+        y = coloured(rng, 300, 0.9)
+        residual = y - X @ np.linalg.lstsq(X, y, rcond=None)[0]
+        restricted.append(-np.sum(noise_colour(X, residual).whitening))
+        plain.append(-np.sum(whitening_filter(residual)))
+    assert np.median(restricted) == pytest.approx(0.9, abs=0.01)
+    assert np.median(plain) < 0.88
+
+
+@given(seed=st.integers(0, 1000), pole=st.floats(-0.8, 0.95), offset=st.floats(-1e6, 1e6), unit=st.floats(1e-6, 1e6))
+@settings(max_examples=30)
+def test_the_colour_depends_neither_on_the_unit_nor_on_the_parameters_chosen(
+    seed: int, pole: float, offset: float, unit: float
+) -> None:
+    rng = np.random.default_rng(seed)
+    X, y = slow_columns(200), coloured(rng, 200, pole)
+    turned = X @ rng.standard_normal((X.shape[1],) * 2)
+    residual = y - X @ np.linalg.lstsq(X, y, rcond=None)[0]
+    one = noise_colour(X, residual)
+    other = noise_colour(turned, unit * residual)
+    assert other.whitening == pytest.approx(one.whitening, abs=1e-3)
+    shifted = noise_colour(X, residual + 1e-3 * offset * X[:, 0])  # what lies in the columns is the fit's
+    if shifted.whitening.size == one.whitening.size and abs(offset) < 1.0:
+        assert shifted.whitening == pytest.approx(one.whitening, abs=1e-2)
+
+
+@given(seed=st.integers(0, 1000), pole=st.floats(-0.95, 0.95))
+@settings(max_examples=20)
+def test_degrees_of_freedom_are_never_more_than_the_rows_leave(seed: int, pole: float) -> None:
+    X, y = slow_columns(200), coloured(np.random.default_rng(seed), 200, pole)
+    residual = y - X @ np.linalg.lstsq(X, y, rcond=None)[0]
+    colour = noise_colour(X, residual)
+    assert np.all(colour.freedom <= 200 - X.shape[1] + 1e-9)
+    assert np.all(noise_colour(X, residual, max_order=0).freedom == pytest.approx(200 - X.shape[1]))
+
+
+def test_generalised_least_squares_under_the_filter_are_those_under_the_noise_covariance() -> None:
+    """The maximum of the restricted likelihood, against a search with the dense covariance of first-order noise."""
+    X, y = slow_columns(120), coloured(np.random.default_rng(3), 120, 0.8)
+    residual = y - X @ np.linalg.lstsq(X, y, rcond=None)[0]
+
+    def minus_log_likelihood(pole: float) -> float:
+        V = toeplitz(pole ** np.arange(120)) / (1.0 - pole**2)
+        of_columns = X.T @ np.linalg.solve(V, X)
+        step = np.linalg.solve(of_columns, X.T @ np.linalg.solve(V, residual))
+        left = residual - X @ step
+        cost = left @ np.linalg.solve(V, left)
+        dets = np.linalg.slogdet(V)[1] + np.linalg.slogdet(of_columns)[1]
+        return float(0.5 * ((120 - X.shape[1]) * np.log(cost) + dets))
+
+    poles = np.linspace(0.4, 0.99, 600)
+    best = poles[np.argmin([minus_log_likelihood(pole) for pole in poles])]
+    assert noise_colour(X, residual, max_order=1).whitening == pytest.approx([-best], abs=2e-3)
