@@ -14,6 +14,7 @@ import numpy as np
 
 from autotune.arrays import FloatArray
 from autotune.controller import PIDController
+from autotune.design.kernels import SampledPlant
 from autotune.design.margins import Margins
 from autotune.design.members import Members, crossovers, members_of
 from autotune.design.on_fit import TOLERANCE, design_on_plants
@@ -50,7 +51,8 @@ def design_on_structures(structures: ConsistentStructures, specification: Specif
     Notes
     -----
     The guarantee is that of the structures, sampled: see :mod:`autotune.identification.consistent_structures`. Of phase
-    and delay margin at a crossover below the points no more is said than the modulus margin leaves of them.
+    and delay margin at a crossover below the points no more is said than the modulus margin leaves of them. Beyond the
+    points the certificate says from which frequency on no plant's phase is relied on.
     """
     assert structures.nominal is not None
     try:
@@ -99,19 +101,30 @@ def _as_measured(
     """Return margins with phase and delay as far as points tell of them, and what is to be said of them.
 
     Where a plant crosses over below the lowest point its phase there is extrapolated. No loop of modulus margin M_m
-    has a phase margin below 2 asin(M_m/2) (Åström and Hägglund, Advanced PID Control, sec. 4.6): that is left.
+    has a phase margin below 2 asin(M_m/2) (Åström and Hägglund, Advanced PID Control, sec. 4.6): that is left, and
+    that over the frequency of the lowest point, above which no such crossover lies, wherever the plant's own is.
     """
-    lowest = float(structures.omega_points[0])
-    below = [float(w) for s in members.sampled for w in crossovers(s, controller) if w < lowest]
-    if not below:
-        return margins, ""
-    phase = 2.0 * math.asin(min(margins.modulus / 2.0, 1.0))
+    lowest, highest = float(structures.omega_points[0]), float(structures.omega_points[-1])
+    quiet = max([highest, *(_loud_until(s, controller, 1.0 - margins.modulus) for s in members.sampled)])
     remark = (
-        f"; the loop crosses over at {max(below):.3g} rad/s, below the lowest point: phase and delay margin are what "
-        "the modulus margin leaves of them, a point measured there shows more"
+        f"; from {lowest:.3g} to {highest:.3g} rad/s points bound these plants, below and above that margins rest on "
+        f"them alone, from {quiet:.3g} rad/s on not on their phase, since abs(L) is at most 1 - M_m there"
     )
-    delay = min(margins.delay_s, phase / max(below))
+    if not any(np.any(crossovers(s, controller) < lowest) for s in members.sampled):
+        return margins, remark
+    phase = 2.0 * math.asin(min(margins.modulus / 2.0, 1.0))
+    remark += (
+        "; the loop crosses over below the lowest point: phase and delay margin are what the modulus margin leaves of "
+        "them at any crossover there, a point measured there shows more"
+    )
+    delay = min(margins.delay_s, phase / lowest)
     return replace(margins, phase_rad=min(margins.phase_rad, phase), delay_s=delay), remark
+
+
+def _loud_until(plant: SampledPlant, controller: PIDController, most: float) -> float:
+    """Return the highest frequency [rad/s] at which abs(L) is above so much, 0 where there is none."""
+    loud = np.abs(plant.h * controller.response(plant.omega)) > most
+    return float(np.max(plant.omega[loud], initial=0.0))
 
 
 def where_to_measure(structures: ConsistentStructures) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -18,6 +19,7 @@ from autotune.design.robust import design_on_points
 from autotune.design.specification import Kind, Specification, spec1
 from autotune.design.synthesis import design
 from autotune.errors import DesignError
+from autotune.identification.consistent_structures import consistent_structures
 from autotune.models import TransferFunction
 from autotune.points import FrequencyPoint
 from tests.autotune.design.plants import BALL, EIGHT_LAGS, REDUCED, measured
@@ -151,8 +153,24 @@ def test_of_a_crossover_below_the_points_no_more_is_said_than_the_modulus_margin
     assert true.crossover_rad_s < points[0].omega_rad_s
     assert "below the lowest point" in found.certificate
     assert found.margins.phase_rad == pytest.approx(2.0 * math.asin(found.margins.modulus / 2.0))
+    assert found.margins.delay_s <= found.margins.phase_rad / points[0].omega_rad_s  # wherever the plant crosses over
     assert true.phase_rad >= found.margins.phase_rad
     assert true.delay_s >= found.margins.delay_s
+
+
+@pytest.mark.parametrize("damping", [0.02, 0.2])
+def test_beyond_the_frequency_that_a_certificate_names_no_phase_costs_modulus_margin(damping: float) -> None:
+    plant = TransferFunction(num=(1.0,), den=(1.0, 2.0 * damping, 1.0))
+    points = relative_points(plant, falling(plant, -165.0), 0.002, 1)
+    found = tune(points, noise_gain=5.0)
+    said = re.search(r"from (\S+) rad/s on not on their phase", found.certificate)
+    assert said is not None
+    quiet = float(said[1])
+    assert quiet >= points[-1].omega_rad_s * 0.995  # three digits are printed
+    omega = np.geomspace(1.02 * quiet, 1e3 * quiet, 2000)
+    for one in (plant, *consistent_structures(points).plants):
+        loudest = np.max(np.abs(one.response(omega) * found.controller.response(omega)))
+        assert 1.0 - loudest >= found.margins.modulus * 0.98
 
 
 def test_the_margins_of_an_unstable_plant_are_not_those_of_an_aperiodic_one_through_its_points() -> None:
