@@ -189,7 +189,7 @@ class _Restricted:
             gram, left, _ = self.solved(at)
             inverse = np.linalg.inv(gram)
             sizes = np.einsum("pa,ab,pb->p", self.to_parameters, inverse, self.to_parameters)
-            return np.asarray(np.log(sizes * left))
+            return np.asarray(np.log(np.maximum(sizes, np.finfo(np.float64).tiny) * left))
 
         for direction in _standard_directions(self.cost, partial):
             scatter += (0.5 * (logarithm(partial + direction) - logarithm(partial - direction))) ** 2
