@@ -106,9 +106,11 @@ def _as_measured(
     """
     lowest, highest = float(structures.omega_points[0]), float(structures.omega_points[-1])
     quiet = max([highest, *(_loud_until(s, controller, 1.0 - margins.modulus) for s in members.sampled)])
+    digit = 10.0 ** (math.floor(math.log10(quiet)) - 2)
     remark = (
-        f"; from {lowest:.3g} to {highest:.3g} rad/s points bound these plants, below and above that margins rest on "
-        f"them alone, from {quiet:.3g} rad/s on not on their phase, since abs(L) is at most 1 - M_m there"
+        f"; points bound these plants from {lowest:.3g} to {highest:.3g} rad/s; below and above, margins rest on the "
+        f"plants alone, from {math.ceil(quiet / digit) * digit:.3g} rad/s on no longer on their phase, since abs(L) is "
+        "at most 1 - M_m there"
     )
     if not any(np.any(crossovers(s, controller) < lowest) for s in members.sampled):
         return margins, remark
@@ -122,9 +124,10 @@ def _as_measured(
 
 
 def _loud_until(plant: SampledPlant, controller: PIDController, most: float) -> float:
-    """Return the highest frequency [rad/s] at which abs(L) is above so much, 0 where there is none."""
-    loud = np.abs(plant.h * controller.response(plant.omega)) > most
-    return float(np.max(plant.omega[loud], initial=0.0))
+    """Return the frequency of the plant's grid [rad/s] from which on abs(L) is at most so much, or its last one."""
+    loud = np.flatnonzero(np.abs(plant.h * controller.response(plant.omega)) > most)
+    after = int(loud[-1]) + 1 if loud.size else 0
+    return float(plant.omega[min(after, len(plant.omega) - 1)])
 
 
 def where_to_measure(structures: ConsistentStructures) -> str:

@@ -163,14 +163,14 @@ def test_beyond_the_frequency_that_a_certificate_names_no_phase_costs_modulus_ma
     plant = TransferFunction(num=(1.0,), den=(1.0, 2.0 * damping, 1.0))
     points = relative_points(plant, falling(plant, -165.0), 0.002, 1)
     found = tune(points, noise_gain=5.0)
-    said = re.search(r"from (\S+) rad/s on not on their phase", found.certificate)
+    said = re.search(r"from (\S+) rad/s on no longer on their phase", found.certificate)
     assert said is not None
     quiet = float(said[1])
-    assert quiet >= points[-1].omega_rad_s * 0.995  # three digits are printed
-    omega = np.geomspace(1.02 * quiet, 1e3 * quiet, 2000)
+    assert quiet >= points[-1].omega_rad_s
+    omega = np.geomspace(quiet, 1e3 * quiet, 2000)
     for one in (plant, *consistent_structures(points).plants):
         loudest = np.max(np.abs(one.response(omega) * found.controller.response(omega)))
-        assert 1.0 - loudest >= found.margins.modulus * 0.98
+        assert 1.0 - loudest >= found.margins.modulus * (1.0 - 1e-9)
 
 
 def test_the_margins_of_an_unstable_plant_are_not_those_of_an_aperiodic_one_through_its_points() -> None:
