@@ -19,6 +19,7 @@ import itertools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numba import njit
@@ -35,8 +36,8 @@ _DIFFERENCE = 1e-3
 _EXACT = 1e-12
 #: Columns of a fit less independent than this repeat others.
 _INDEPENDENT = 1e-10
-#: Partial correlation at which the search begins at most, and how far its arctanh goes.
-_STATIONARY, _FARTHEST = 0.9999, 9.0
+#: Partial correlation at which the search begins at most.
+_STATIONARY = 0.9999
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -47,11 +48,14 @@ class NoiseColour:
     ----------
     whitening : (p,) array
         c_1..c_p; empty where the noise is white.
+    variance : float
+        Of the innovation.
     freedom : (P,) array
-        Degrees of freedom of the variance of each parameter of the fit, infinite where nothing depends on the colour.
+        Degrees of freedom of the variance of each parameter of the fit.
     """
 
     whitening: FloatArray
+    variance: float
     freedom: FloatArray
 
     def widening(self) -> FloatArray:
@@ -59,6 +63,14 @@ class NoiseColour:
         from scipy.stats import norm, t
 
         return np.asarray(t.ppf(0.975, self.freedom) / norm.ppf(0.975), dtype=np.float64)
+
+
+@lru_cache
+def region_widening(freedom: float) -> float:
+    """Return the factor on a plane's covariance with which its 95 % region of known variance is that of Hotelling."""
+    from scipy.stats import chi2, f
+
+    return float(2.0 * f.ppf(0.95, 2, freedom) / chi2.ppf(0.95, 2))
 
 
 def whitening_filter(residual: FloatArray, max_order: int = MAX_AR) -> FloatArray:
@@ -129,7 +141,11 @@ def noise_colour(columns: FloatArray, residual: FloatArray, max_order: int = MAX
     partial = np.arctanh(_partial_correlations(start))
     if start.size:
         partial = minimize(likelihood.cost, partial, method="BFGS").x
-    return NoiseColour(whitening=_filter_of(np.tanh(partial)), freedom=likelihood.freedom(partial))
+    return NoiseColour(
+        whitening=_filter_of(likelihood.correlations(partial)),
+        variance=likelihood.variance(partial) * float(residual @ residual),
+        freedom=likelihood.freedom(partial),
+    )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -164,9 +180,14 @@ class _Restricted:
             to_parameters=(Vh[kept].T / sizes[kept]) / size[:, None],
         )
 
+    def correlations(self, partial: FloatArray) -> FloatArray:
+        """Return partial correlations; what lasts longer than the rows is told from a constant by none of them."""
+        most = 1.0 - 1.0 / self.rows
+        return np.asarray(np.clip(np.tanh(partial), -most, most), dtype=np.float64)
+
     def solved(self, partial: FloatArray) -> tuple[FloatArray, float, float]:
         """Return the whitened columns' products, the sum of squares that they leave, and log |V| of the noise."""
-        kappa = np.tanh(np.clip(partial, -_FARTHEST, _FARTHEST))
+        kappa = self.correlations(partial)
         colour = np.append(1.0, _filter_of(kappa))
         gram = np.einsum("i,ijab,j->ab", colour, self.products, colour)
         of_columns, across = gram[:-1, :-1], gram[:-1, -1]
@@ -179,6 +200,11 @@ class _Restricted:
         of_columns, left, of_noise = self.solved(partial)
         size = float(np.linalg.slogdet(of_columns)[1])
         return float(0.5 * ((self.rows - len(of_columns)) * math.log(left) + of_noise + size))
+
+    def variance(self, partial: FloatArray) -> float:
+        """Return the innovations' variance over the residual's sum of squares."""
+        of_columns, left, _ = self.solved(partial)
+        return left / max(self.rows - len(of_columns), 1)
 
     def freedom(self, partial: FloatArray) -> FloatArray:
         """Return 2 over the variance of the logarithm of each parameter's variance (Satterthwaite)."""

@@ -49,8 +49,8 @@ class HarmonicFit:
         Covariance of (Re c_n, Im c_n) for white noise of unit variance.
     residual : (N,) array
         What the fit leaves.
-    parameters : int
-        Number of fitted coefficients.
+    columns : (N, P) array
+        What was fitted: real parts of the harmonics, imaginary parts, drift, transients, each of unit size.
     slope : float
         Drift per second at the middle of the window.
     """
@@ -58,7 +58,7 @@ class HarmonicFit:
     coefficients: ComplexArray
     covariance_unit: FloatArray
     residual: FloatArray
-    parameters: int
+    columns: FloatArray
     slope: float
 
 
@@ -113,6 +113,6 @@ def fit_harmonics(
         coefficients=theta[:h] + 1j * theta[h : 2 * h],
         covariance_unit=covariance,
         residual=residual,
-        parameters=len(theta),
+        columns=design.T,
         slope=float(theta[2 * h + 1] / half) if drift_order >= 1 else 0.0,
     )

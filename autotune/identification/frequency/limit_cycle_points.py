@@ -22,6 +22,7 @@ from autotune.identification.frequency.reference_model import (
     free_responses,
     simulate_reference,
 )
+from autotune.identification.noise_colour import region_widening
 from autotune.points import FrequencyPoint
 
 _HIGHEST_HARMONIC = 9
@@ -135,7 +136,7 @@ def limit_cycle_points(
     good = inside & np.isfinite(y)
     orders = _orders(window, t, good, highest_harmonic)
     fit, reference, outliers = _corrected_fit(t, u, y, good, window, orders, known)
-    noise = noise_spectrum(fit.residual, window.period_s * window.periods / int(inside.sum()), fit.parameters)
+    noise = noise_spectrum(fit.columns, fit.residual, window.period_s * window.periods / int(inside.sum()))
     omega = window.omega_rad_s * np.array(orders)
     U = held_coefficients(t, u, omega, window.start_s, window.end_s)
     points = _points(omega, orders, U, fit, noise, reference, largest_relative_sd)
@@ -221,7 +222,8 @@ def _points(
         response = complex(base[i] + fit.coefficients[i] / U[i])
         inverse = 1.0 / U[i]
         turn = np.array([[inverse.real, -inverse.imag], [inverse.imag, inverse.real]])
-        covariance = variance[i] * turn @ fit.covariance_unit[i] @ turn.T
+        widening = region_widening(min(noise.freedom[i], noise.freedom[i + len(orders)]))
+        covariance = widening * variance[i] * turn @ fit.covariance_unit[i] @ turn.T
         sd = float(np.sqrt(np.trace(covariance) / 2.0))
         if order > 1 and sd > largest_relative_sd * abs(response):
             continue

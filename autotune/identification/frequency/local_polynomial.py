@@ -19,14 +19,11 @@ Mechanical Systems and Signal Processing 24, 2010.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import lru_cache
 
 import numpy as np
-from scipy.stats import f as f_distribution
 
 from autotune.arrays import BoolArray, ComplexArray, FloatArray
-
-_QUANTILE_95 = 5.991464547107979  # chi-square, two degrees of freedom
+from autotune.identification.noise_colour import region_widening
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -53,12 +50,7 @@ class LocalEstimate:
     @property
     def inflation(self) -> float:
         """Factor on the covariance with which the chi-square region holds 95 % although the noise is estimated."""
-        return _inflation(self.degrees_of_freedom)
-
-
-@lru_cache
-def _inflation(freedom: int) -> float:
-    return float(2.0 * f_distribution.ppf(0.95, 2, 2 * freedom) / _QUANTILE_95)
+        return region_widening(2.0 * self.degrees_of_freedom)
 
 
 def local_estimate(

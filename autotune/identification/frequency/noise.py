@@ -1,4 +1,4 @@
-"""Spectrum of the residual noise: autoregressive, its order chosen by the data, white when they do not object."""
+"""Spectrum of the noise behind a fit: autoregressive, its order chosen by the data, white when they do not object."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from autotune.arrays import FloatArray
+from autotune.identification.noise_colour import noise_colour
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -22,6 +23,8 @@ class NoiseSpectrum:
         Variance of w.
     coefficients : tuple of float
         a_1, a_2, ...; empty for white noise.
+    freedom : tuple of float
+        Degrees of freedom of the variance of each coefficient of the fit.
     sample_time_s : float
         Mean sample time [s].
     """
@@ -29,6 +32,7 @@ class NoiseSpectrum:
     sd: float
     innovation_variance: float
     coefficients: tuple[float, ...]
+    freedom: tuple[float, ...]
     sample_time_s: float
 
     @property
@@ -43,48 +47,29 @@ class NoiseSpectrum:
         return np.asarray(self.innovation_variance / np.abs(transfer) ** 2, dtype=np.float64)
 
 
-def noise_spectrum(
-    residual: FloatArray, sample_time_s: float, fitted_parameters: int, *, largest_order: int = 12
-) -> NoiseSpectrum:
-    """Estimate the spectrum of a fit's residual by Burg's recursion, the order by Akaike's criterion, corrected.
+def noise_spectrum(columns: FloatArray, residual: FloatArray, sample_time_s: float) -> NoiseSpectrum:
+    """Return the spectrum of the noise behind a least-squares fit.
 
     Parameters
     ----------
+    columns : (N, P) array
+        The fit's columns.
     residual : (N,) array
-        What a fit of ``fitted_parameters`` coefficients left.
+        What it left.
     sample_time_s : float
         Mean sample time [s].
-    fitted_parameters : int
-        Taken off the degrees of freedom of the variance.
-    largest_order : int
-        Highest order considered; at most a tenth of the samples.
 
     Notes
     -----
-    Time stamps that jitter are treated as uniform: right for the frequencies far below the sampling rate that a
-    limit cycle has. The criterion asks for 4 (not 2) per coefficient, so that white noise is mostly called white.
+    Harmonics of a few periods take most of the noise at low frequencies: the likelihood is the restricted one. Time
+    stamps that jitter are treated as uniform: right for the frequencies far below the sampling rate that a limit cycle
+    has.
     """
-    n = residual.size
-    freedom = n / max(n - fitted_parameters, 1)
-    variance = float(np.mean(residual**2))
-    forward, backward = residual.copy(), residual.copy()
-    polynomial, power = np.array([1.0]), variance
-    best_score, best_power, best = n * math.log(max(power, 1e-300)), power, polynomial
-    for order in range(1, min(largest_order, n // 10) + 1):
-        f, b = forward[order:], backward[order - 1 : -1]
-        energy = float(f @ f + b @ b)
-        if energy <= 0.0:
-            break
-        reflection = -2.0 * float(f @ b) / energy
-        forward[order:], backward[order:] = f + reflection * b, b + reflection * f
-        polynomial = np.append(polynomial, 0.0) + reflection * np.append(polynomial, 0.0)[::-1]
-        power *= 1.0 - reflection**2
-        score = n * math.log(max(power, 1e-300)) + 4.0 * order
-        if score < best_score:
-            best_score, best_power, best = score, power, polynomial
+    colour = noise_colour(columns, residual)
     return NoiseSpectrum(
-        sd=math.sqrt(variance * freedom),
-        innovation_variance=best_power * freedom,
-        coefficients=tuple(float(a) for a in best[1:]),
+        sd=math.sqrt(float(residual @ residual) / max(residual.size - columns.shape[1], 1)),
+        innovation_variance=colour.variance,
+        coefficients=tuple(float(c) for c in colour.whitening),
+        freedom=tuple(float(f) for f in colour.freedom),
         sample_time_s=sample_time_s,
     )

@@ -37,7 +37,7 @@ def shares_inside(rows: int, pole: float, records: int, *, restricted: bool) -> 
         y = coloured(rng, rows, pole)
         residual = y - X @ np.linalg.lstsq(X, y, rcond=None)[0]
         infinite = np.full(X.shape[1], np.inf)
-        plain = NoiseColour(whitening=whitening_filter(residual), freedom=infinite)
+        plain = NoiseColour(whitening=whitening_filter(residual), variance=1.0, freedom=infinite)
         colour = noise_colour(X, residual) if restricted else plain
         A, b = whitened(colour, X), whitened(colour, y)
         found, cost, *_ = np.linalg.lstsq(A, b, rcond=None)
