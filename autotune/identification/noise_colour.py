@@ -36,6 +36,8 @@ _DIFFERENCE = 1e-3
 _EXACT = 1e-12
 #: Columns of a fit less independent than this repeat others.
 _INDEPENDENT = 1e-10
+#: Least degrees of freedom: a logarithm of a variance that is known to no factor of e is not to be linearised.
+_LEAST_FREEDOM = 2.0
 #: Partial correlation at which the search begins at most.
 _STATIONARY = 0.9999
 
@@ -207,7 +209,7 @@ class _Restricted:
         return left / max(self.rows - len(of_columns), 1)
 
     def freedom(self, partial: FloatArray) -> FloatArray:
-        """Return 2 over the variance of the logarithm of each parameter's variance (Satterthwaite)."""
+        """Return 2 over the variance of the logarithm of each parameter's variance (Satterthwaite), 2 at least."""
         rank = self.to_parameters.shape[1]
         scatter = np.full(len(self.to_parameters), 2.0 / max(self.rows - rank, 1))
 
@@ -219,7 +221,7 @@ class _Restricted:
 
         for direction in _standard_directions(self.cost, partial):
             scatter += (0.5 * (logarithm(partial + direction) - logarithm(partial - direction))) ** 2
-        return np.asarray(2.0 / scatter)
+        return np.asarray(np.maximum(2.0 / scatter, _LEAST_FREEDOM))
 
 
 def _standard_directions(cost: Callable[[FloatArray], float], at: FloatArray) -> FloatArray:
