@@ -323,20 +323,21 @@ def polish(
     point = minimise(
         data, structure, solve_linear(data, structure, start.a, start.h), max_delay_s=max_delay_s, iterations=50
     )
-    colour = colour_of(data, structure, point, max_order=MAX_AR if coloured else 0)
-    for _ in range(3 if colour.whitening.size else 0):
-        before = colour.whitening
+    colour = colour_of(data, structure, point, max_order=0)
+    for _ in range(3 if coloured else 0):
+        found = colour_of(data, structure, point)
+        same = found.whitening.size == colour.whitening.size
+        if same and np.max(np.abs(found.whitening - colour.whitening), initial=0.0) < 1e-3:
+            break
+        colour = found
         point = minimise(
             data,
             structure,
-            solve_linear(data, structure, point.a, point.h, before),
+            solve_linear(data, structure, point.a, point.h, colour.whitening),
             max_delay_s=max_delay_s,
-            whitening=before,
+            whitening=colour.whitening,
         )
-        colour = colour_of(data, structure, point)
-        if colour.whitening.size == before.size and np.max(np.abs(colour.whitening - before), initial=0.0) < 1e-3:
-            break
-    return solve_linear(data, structure, point.a, point.h, colour.whitening), colour
+    return point, colour
 
 
 def _gram(
