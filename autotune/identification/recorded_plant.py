@@ -150,10 +150,11 @@ def _zero(recordings: Sequence[Recording], without: _Fitted) -> _Fitted | None:
     if best is without:
         return None
     tried: list[tuple[float, _Fitted]] = [(least, best)]
+    refused = without.criterion(rows) + EXCLUDED  # finite: the search draws parabolas through what it is told
 
     def cost(tau_s: float) -> float:
         one = _at_zero(recordings, best, tau_s)
-        tried.append((math.inf if one is None else one.criterion(rows), one or best))
+        tried.append((refused if one is None else one.criterion(rows), one or best))
         return tried[-1][0]
 
     low, high = sorted((0.4 * best.tau_s, 1.8 * best.tau_s))
