@@ -12,6 +12,7 @@ from typing import Any, Protocol
 from autotune.config.registers import GainSettings, RegisterMap, UnlockSettings
 from autotune.controller import PIDController
 from autotune.errors import InputError, LinkError
+from autotune.experiment.rig import Reading
 from drivers.gain_settings import controller_of, settings_of
 from drivers.kinds import Session
 from drivers.register_link import RegisterLink
@@ -22,6 +23,8 @@ from drivers.registers import Codec, blocks
 _FINE = 0.01
 #: signals without which the device's own controller cannot be tried: to start it, and to see what it does
 _TRIAL = ("automatic", "setpoint", "u_applied")
+#: relative difference between what was written to that controller and what is held, which is the device's own rounding
+_ROUNDED = 1e-3
 
 
 class GainRegisterRig(RegisterRig):
@@ -42,6 +45,9 @@ class GainRegisterRig(RegisterRig):
         self._unlock: UnlockSettings | None = registers.unlock
         self._gain_names = registers.gain_names
         self._parts = blocks([self._codecs[name] for name in self._gain_names.values()])
+        self._asked: dict[
+            str, float
+        ] = {}  # what the controller on trial was asked for, as its registers should hold it
 
     def read_gains(self) -> PIDController:
         """Return the gains the device's controller holds now."""
@@ -137,7 +143,15 @@ class GainRegisterRig(RegisterRig):
         self._release(setpoint)
         self._trial_setpoint = setpoint
         self._is_commanding, self._released_s = False, self._clock.now()
-        return self._held("setpoint", setpoint)
+        asked = {"automatic": 1.0, "setpoint": self._held("setpoint", setpoint), "load": 0.0}
+        # a device that refuses to say what it was asked for is not looked at
+        self._asked = {
+            name: value
+            for name, value in asked.items()
+            if name in self._codecs and math.isfinite(self._shown_by_device(name))
+        }
+        self._looks_s = self._clock.now()
+        return asked["setpoint"]
 
     def ask_controller(self, setpoint: float, load: float) -> tuple[float, float]:
         """Change what the device's own controller is asked for.
@@ -153,10 +167,18 @@ class GainRegisterRig(RegisterRig):
         -------
         setpoint, load : float
             As the registers hold them.
+
+        Raises
+        ------
+        LinkError
+            The controller was not asked for what was written before: another master asked it for something else.
         """
-        self._put("setpoint", setpoint)
-        if self.takes_load:
-            self._put("load", load)
+        self._check_asked()
+        asked = {"setpoint": setpoint} | ({"load": load} if self.takes_load else {})
+        for name, value in asked.items():
+            self._put(name, value)
+            if name in self._asked:
+                self._asked[name] = self._held(name, value)
         return self._held("setpoint", setpoint), self._held("load", load) if self.takes_load else 0.0
 
     def misread(self, controller: PIDController) -> dict[str, PIDController]:
@@ -191,6 +213,29 @@ class GainRegisterRig(RegisterRig):
         orders = ("word_order", "byte_order")
         wrong = {f"{order} of rig.registers.setpoint": self._otherwise("setpoint", right, order) for order in orders}
         return {name: value for name, value in wrong.items() if math.isfinite(value) and value != right}
+
+    def _looked_for_master(self, reading: Reading) -> Reading:
+        """Look now and then whether the controller on trial is still asked for what the host wrote, too."""
+        if self._is_released and self._may_look(reading, on_slow_line=self._takes_over):
+            self._check_asked()
+        return super()._looked_for_master(reading)
+
+    def _check_asked(self) -> None:
+        """Refuse to go on with a trial in which somebody else asks the controller for something."""
+        start_s = self._clock.now()
+        shown = self._read(tuple(self._asked))
+        self._has_looked(start_s)
+        for name, value in self._asked.items():
+            is_own = math.isclose(shown[name], value, rel_tol=_ROUNDED)
+            if not is_own and name == "setpoint" and self._takes_over:  # in manual it may have followed y
+                self._put(name, value)
+                continue
+            self._require(
+                is_own,
+                f"another master writes {name}, or the device's own program does: it holds {shown[name]:.6g} at"
+                f" {start_s - self._opened_s:.3g} s of this session, {value:.6g} was written",
+                "have nobody else write it while the controller is on trial",
+            )
 
     def _held(self, name: str, value: float) -> float:
         """Return what a register holds of a value."""

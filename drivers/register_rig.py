@@ -111,7 +111,7 @@ class RegisterRig:
         self._is_commanding = False
         self._opened_s = 0.0
         self._trial_setpoint = math.nan  # of the device's own controller, as a trial began
-        self._looks_s = math.inf  # when it is looked next whether the command is still ours; never where it cannot be
+        self._looks_s = math.inf  # when another master is looked for next; never where it cannot be
         self._foreign: deque[tuple[float, float]] = deque(maxlen=_FOREIGN)  # when it was not, and what was there
         self._released_s = math.nan  # when this session gave the actuator to the device's own controller
 
@@ -174,7 +174,7 @@ class RegisterRig:
             self._put("automatic", 0.0)
         self._await_command(1.0)
         # a device that holds another value than it was sent, or another's, has its command looked at no more
-        self._looks_s = self._clock.now() if self._shown_command() == self._command_held else math.inf
+        self._looks_s = self._clock.now() if self._shown_by_device("u") == self._command_held else math.inf
 
     def read(self) -> Reading:
         """Take one sample; feeds the dead-man when that is due.
@@ -278,6 +278,11 @@ class RegisterRig:
         """Whether this session gave the actuator to the device's own controller and watches it."""
         return math.isfinite(self._released_s)
 
+    @property
+    def _takes_over(self) -> bool:
+        """Whether that controller was given the actuator so lately that its program may not know it yet."""
+        return self._clock.now() - self._released_s < max(_TAKE_S, self._late_s)
+
     def _release(self, setpoint: float) -> None:
         """Let the device's own controller have the actuator, without a load; NaN leaves its set-point."""
         if "load" in self._codecs:
@@ -290,7 +295,7 @@ class RegisterRig:
 
     def _check_released(self, values: Mapping[str, float]) -> None:
         """Refuse a device that is some program cycles later still not run by its own controller."""
-        if not self._is_released or self._clock.now() - self._released_s < max(_TAKE_S, self._late_s):
+        if not self._is_released or self._takes_over:
             return
         self._require(
             values.get("in_command", 0.0) == 0.0,
@@ -343,12 +348,22 @@ class RegisterRig:
         """The command as its register holds it."""
         return self._codecs["u"].decode(self._codecs["u"].encode_within(self._u, *self._u_range))
 
-    def _shown_command(self) -> float:
-        """Return what the command's register holds now; NaN where a device refuses to say it."""
+    def _shown_by_device(self, name: str) -> float:
+        """Return what a register holds now; NaN where a device refuses to say it."""
         try:
-            return self._read(("u",))["u"]
+            return self._read((name,))[name]
         except LinkError:
             return math.nan
+
+    def _may_look(self, reading: Reading, *, on_slow_line: bool = False) -> bool:
+        """Return whether it is time to look for another master, on a line that has the time."""
+        has_time = on_slow_line or reading.latency_s <= _QUICK_S
+        return has_time and self._clock.now() >= self._looks_s and not reading.suspect
+
+    def _has_looked(self, start_s: float) -> None:
+        """Have the next look wait as its share of the time wants it; this one began at ``start_s`` [s]."""
+        now_s = self._clock.now()
+        self._looks_s = now_s + (now_s - start_s) / _LOOK_SHARE
 
     def _looked_for_master(self, reading: Reading) -> Reading:
         """Look now and then whether the command is still ours, and mark a sample before which it was not.
@@ -358,13 +373,11 @@ class RegisterRig:
         LinkError
             It was another's several times within a short while.
         """
+        if not self._is_commanding or not self._may_look(reading):
+            return reading
         now_s = self._clock.now()
-        if not self._is_commanding or now_s < self._looks_s:
-            return reading
-        if reading.suspect or reading.latency_s > _QUICK_S:
-            return reading
-        held, own = self._shown_command(), self._command_held
-        self._looks_s = now_s + (self._clock.now() - now_s) / _LOOK_SHARE
+        held, own = self._shown_by_device("u"), self._command_held
+        self._has_looked(now_s)
         if held == own or math.isnan(held):
             return reading
         self._foreign.append((now_s, held))

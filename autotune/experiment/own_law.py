@@ -82,6 +82,7 @@ def try_own_law(
                 rows.r, rows.load = rig.ask_controller(operating_y + asked[0], asked[1])
             rows.held.append((rows.r - operating_y, rows.load))
             loop.observe(extra={"r": rows.r})
+        rig.ask_controller(operating_y, 0.0)  # which looks whether all that was asked stood until now
     except ExperimentStopped as error:
         if (law := rows.law(rig, controller)) is not None and not law.is_given:
             error.what += f"; {law.sentence}"

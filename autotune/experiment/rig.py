@@ -251,7 +251,10 @@ class RunsOwnController(HoldsGains, Protocol):
         ...
 
     def ask_controller(self, setpoint: float, load: float) -> tuple[float, float]:
-        """Change set-point [y unit] and what is added to its output [u unit]; return both as the device holds them."""
+        """Change set-point [y unit] and what is added to its output [u unit]; return both as the device holds them.
+
+        Raises LinkError where somebody else has changed what it was asked for before.
+        """
         ...
 
     def misread(self, controller: PIDController) -> Mapping[str, PIDController]:

@@ -14,7 +14,7 @@ from typing import Any, NoReturn
 
 from autotune.config.procedure import DesignSettings
 from autotune.controller import PIDController, held_from_table
-from autotune.errors import AutotuneError, ExperimentStopped, InputError, OperatorStop
+from autotune.errors import AutotuneError, ExperimentStopped, InputError, LinkError, OperatorStop
 from autotune.experiment.judgement import Verification
 from autotune.experiment.rig import HoldsGains
 from autotune.interrupts import interrupt_deferred
@@ -244,6 +244,8 @@ def deploy(
         return Deployment(old=old, new=held, verification=None)
     try:
         verification = try_out(held)
+        if verification.accepted:
+            _require_held(rig, held)
     except BaseException as error:
         _take_back(rig, old, notes, error, "the verification was broken off")
     if verification.accepted:
@@ -252,6 +254,18 @@ def deploy(
     else:
         restore(rig, old, journal, audit=audit, why=verification.reason)
     return Deployment(old=old, new=held, verification=verification)
+
+
+def _require_held(rig: HoldsGains, tried: PIDController) -> None:
+    """Refuse to keep gains that are not those which were on trial."""
+    held = read_gains(rig)
+    if held != tried:
+        raise LinkError(
+            f"the rig holds K = {held.K:.4g}, T_I = {held.Ti_s:.4g} s after the trial"
+            f" where K = {tried.K:.4g}, T_I = {tried.Ti_s:.4g} s were tried: another master writes its gains",
+            where="hand-over of the gains",
+            remedy="end the other session; only one master may command",
+        )
 
 
 def restore(

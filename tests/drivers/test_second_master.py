@@ -12,12 +12,15 @@ import numpy as np
 import pytest
 
 from autotune.config import Config
+from autotune.controller import PIDController
 from autotune.errors import AutotuneError, ExperimentStopped, LinkError
 from autotune.experiment.foreign import CommandWatch
+from autotune.experiment.judgement import Verification
 from autotune.experiment.result import ExperimentResult
 from autotune.experiment.rig import Reading
 from autotune.experiment.run import run_experiment
 from autotune.experiment.verify import run_verification
+from autotune.pipeline.deployment import deploy
 from autotune.recording import read_recording
 from drivers.register_link import Answer
 from drivers.registers import Block
@@ -41,10 +44,16 @@ class WriteOnly(DirectLink):
         return super().read(block)
 
 
-def disturbed_rig(times_s: Sequence[float], *, without: tuple[str, ...] = (), shows_command: bool = True) -> Any:
-    """Return a rig of the ball into which another master writes 1 V at these times."""
+def disturbed_rig(
+    times_s: Sequence[float],
+    *,
+    without: tuple[str, ...] = (),
+    shows_command: bool = True,
+    written: tuple[str, int, list[int]] = ("holding", 0, ONE),
+) -> Any:
+    """Return a rig of the ball into which another master writes at these times, 1 V where nothing is said."""
     registers = {name: given for name, given in REGISTERS.items() if name not in without}
-    rig, device = virtual_rig(make_plant("ball", seed=1, noise=0.1), registers=registers)
+    rig, device = virtual_rig(make_plant("ball", seed=1, noise=0.1), registers=registers, gains=(-0.01, 6.0))
     left, clock = list(times_s), rig.clock
     if not shows_command:
         rig._link = WriteOnly(device, clock)  # type: ignore[arg-type]  # it is a virtual one
@@ -53,8 +62,8 @@ def disturbed_rig(times_s: Sequence[float], *, without: tuple[str, ...] = (), sh
     def sleep_until(t_s: float) -> None:
         while left and left[0] <= t_s:
             sleep(left.pop(0))
-            if device.by_host:
-                device.write("holding", 0, ONE, clock.now())
+            if device.by_host or device.value["automatic"]:
+                device.write(*written, clock.now())
         sleep(t_s)
 
     clock.sleep_until = sleep_until  # type: ignore[method-assign]  # whoever waits lives through it
@@ -144,6 +153,75 @@ def test_a_verification_that_another_master_disturbed_judges_no_gains(tmp_path: 
     when_s = recording.metadata["test_start_s"] + 3.0
     with pytest.raises(ExperimentStopped, match="another master writes the command: it was 1 at"):
         run_verification(disturbed_rig([when_s]), BALL, PI, BALL_FIT, tmp_path / "disturbed.csv")
+
+
+def trial_disturbed(written: tuple[str, int, list[int]], after_s: float, folder: Path) -> tuple[str, Any]:
+    """Hand gains over, with another master that writes so long after their trial begins; return what was said."""
+
+    def handed_over(times_s: Sequence[float], place: Path) -> tuple[str, Any]:
+        rig = disturbed_rig(times_s, written=written)
+
+        def trial(gains: PIDController) -> Verification:
+            return run_verification(rig, BALL, gains, BALL_FIT, place / "trial.csv", on_device=True)
+
+        try:
+            done = deploy(rig, PI, place / "journal.jsonl", agree=lambda *_: None, try_out=trial)
+        except AutotuneError as error:
+            return str(error), rig
+        return "kept" if done.kept else "not kept", rig
+
+    for name in ("alone", "disturbed"):
+        (folder / name).mkdir()
+    assert handed_over((), folder / "alone")[0] == "kept"
+    recording = read_recording(folder / "alone" / "trial.csv")
+    start_s, end_s = recording.metadata["test_start_s"], float(recording.t[-1])
+    return handed_over([start_s + after_s if after_s > 0.0 else end_s + after_s], folder / "disturbed")
+
+
+@pytest.mark.parametrize(
+    ("written", "after_s", "said"),
+    [
+        (("holding", 14, [5200]), 2.0, "another master writes setpoint.*holds 5.2 at"),
+        # right before the trial ends, when no response shows it any more
+        (("holding", 14, [5200]), -0.02, "another master writes setpoint.*holds 5.2 at"),
+        (("holding", 16, ONE), 2.0, "another master writes load.*holds 1 at"),
+        (("coil", 1, [0]), 2.0, "another master writes automatic.*holds 0 at"),
+        (("holding", 10, [0, 0xBF80]), -0.02, "the rig holds K = -1,.* after the trial where K = "),
+    ],
+    ids=["set-point", "set-point at the end", "load", "automatic", "gains at the end"],
+)
+def test_a_trial_in_which_another_master_asks_for_something_else_keeps_no_gains(
+    tmp_path: Path, written: tuple[str, int, list[int]], after_s: float, said: str
+) -> None:
+    found, rig = trial_disturbed(written, after_s, tmp_path)
+    assert re.search(said, found), found
+    assert "the old gains are in place again" in found
+    held = rig.read_gains()
+    assert (held.K, held.Ti_s) == (pytest.approx(-0.01), pytest.approx(6.0))
+    assert rig._link._device.output == BALL.limits.u_safe
+
+
+def test_a_set_point_that_follows_y_in_manual_is_asked_for_once_more_and_is_no_other_master(tmp_path: Path) -> None:
+    rig, device = virtual_rig(make_plant("ball", seed=1, noise=0.1), registers=REGISTERS, gains=(-0.01, 6.0))
+    clock, scan_s, in_manual_s = rig.clock, 0.02, [0.0]
+    sleep, y_followed = clock.sleep_until, []
+
+    def sleep_until(t_s: float) -> None:
+        sleep(t_s)
+        if not device.value["automatic"]:
+            in_manual_s[0] = clock.now()
+        if clock.now() - in_manual_s[0] < scan_s:  # the program has not seen yet that it is in automatic
+            y_followed.append(device.plant.measure())
+            device.show("setpoint", y_followed[-1])
+
+    clock.sleep_until = sleep_until  # type: ignore[method-assign]  # whoever waits lives through it
+
+    def trial(gains: PIDController) -> Verification:
+        return run_verification(rig, BALL, gains, BALL_FIT, tmp_path / "trial.csv", on_device=True)
+
+    done = deploy(rig, PI, tmp_path / "journal.jsonl", agree=lambda *_: None, try_out=trial)
+    assert np.std(y_followed) > 0.1
+    assert done.kept
 
 
 def seen(u: Sequence[float], shown: Sequence[float], tolerance: float = 0.2) -> list[float]:
