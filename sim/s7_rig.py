@@ -28,7 +28,6 @@ _FORMS = {
     "INT": ">h", "UINT": ">H", "WORD": ">H", "DINT": ">i", "UDINT": ">I", "DWORD": ">I", "TIME": ">i", "REAL": ">f",
     "LINT": ">q", "ULINT": ">Q", "LWORD": ">Q", "LREAL": ">d",
 }  # fmt: skip
-_CYCLE_S = 0.02
 #: event of a client that has written, and the part of the system status list with the operating state
 _WRITTEN, _OPERATING_STATE = 0x00040000, 0x0424
 
@@ -98,10 +97,9 @@ class S7Rig(ServedRig):
         self.cpu.start_to(self._address, self._port)
         try:
             self._ready.set()
-            while not stop.is_set():
-                self._refresh()
-                with contextlib.suppress(TimeoutError):
-                    await asyncio.wait_for(stop.wait(), _CYCLE_S)
+            living = asyncio.create_task(self._live())
+            await stop.wait()
+            living.cancel()
         finally:
             self.cpu.hang_up()
             self.cpu.stop()

@@ -60,6 +60,7 @@ class SerialRig:
     ) -> None:
         self.device = device
         self.starts = 1
+        self.late_s = 0.0  # as of a served rig
         self._y, self._u = (*y_span, y_full), (*u_span, u_full)
         self._beat = 0.0
         self._now_s = 0.0  # of the request that is being answered
@@ -99,7 +100,9 @@ class SerialRig:
         received = b""
         lines = [self._line]
         while not self._stop.is_set():
+            due_s = self.now_s + _LIVE_S
             ready, _, _ = select.select(lines, [], [], _LIVE_S)
+            self.late_s = max(self.late_s, self.now_s - due_s)
             self.device.live(self.now_s)
             if self._restart.is_set():
                 self._restart.clear()

@@ -10,7 +10,8 @@ from typing import Self
 
 from sim.register_device import RegisterDevice
 
-_LIVE_S = 0.02
+#: cycle in which the device lives while nobody asks [s]
+CYCLE_S = 0.02
 
 
 class ServedRig:
@@ -28,6 +29,8 @@ class ServedRig:
 
     #: longest wait for the server to listen, and for it to end [s]
     start_s = 10.0
+    #: how late the device was at most [s]: requests waited for as long, and the plant ran on under its last command
+    late_s = 0.0
 
     def __init__(self, device: RegisterDevice, where: object, name: str) -> None:
         self.device = device
@@ -78,5 +81,11 @@ class ServedRig:
     async def _live(self) -> None:
         """Keep the plant close to the wall clock also while nobody asks."""
         while True:
-            self.device.live(self.now_s)
-            await asyncio.sleep(_LIVE_S)
+            due_s = self.now_s + CYCLE_S
+            self._refresh()
+            await asyncio.sleep(CYCLE_S)
+            self.late_s = max(self.late_s, self.now_s - due_s)
+
+    def _refresh(self) -> None:
+        """Let the plant live until now."""
+        self.device.live(self.now_s)

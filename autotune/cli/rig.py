@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     from autotune.config.registers import RegisterSettings
     from autotune.config.rig import AnyModbusSettings
     from drivers.probe import ProbedDevice
+    from sim.serial_rig import SerialRig
+    from sim.served_rig import ServedRig
 
 _CONFIG = Annotated[Path, typer.Argument(metavar="CONFIG.toml", help="configuration of the rig")]
 
@@ -34,6 +36,7 @@ def rig(config: _CONFIG) -> None:
     from autotune.config import load_config
     from autotune.config.rig import OpcUaSettings, SerialSettings
     from autotune.config.s7 import S7Settings
+    from autotune.experiment.priority import spare_collections
 
     content = load_config(config)
     console = Console(highlight=False)
@@ -41,22 +44,24 @@ def rig(config: _CONFIG) -> None:
     with ExitStack() as serving:
         serving.enter_context(signals_heard(signal.SIGINT, signal.SIGTERM, by=lambda _: stop.set()))
         if isinstance(content.rig, SerialSettings):
-            serving.enter_context(served_on_line(content, content.rig))
+            server: ServedRig | SerialRig = serving.enter_context(served_on_line(content, content.rig))
             said = f"a microcontroller on {content.rig.device}"
         elif isinstance(content.rig, OpcUaSettings):
-            serving.enter_context(served_opcua(content, content.rig))
+            server = serving.enter_context(served_opcua(content, content.rig))
             said = f"OPC UA on {content.rig.endpoint}"
         elif isinstance(content.rig, S7Settings):
-            serving.enter_context(served_s7(content, content.rig))
+            server = serving.enter_context(served_s7(content, content.rig))
             said = f"a Siemens CPU on {content.rig.twin.listen if content.rig.twin else ''}:{content.rig.port}"
         else:
             settings = modbus_settings(content)
-            server = serving.enter_context(served(content, device_of(content)))
+            modbus = server = serving.enter_context(served(content, device_of(content)))
             console.print(_registers_of(content.name, settings))
-            said = f"{_address(settings, server.port)}, unit {settings.unit_id}"
+            said = f"{_address(settings, modbus.port)}, unit {settings.unit_id}"
+        spare_collections()  # a real plant does not stop for one
+        server.late_s = 0.0  # nobody was there yet
         console.print(f"serving {said}; Ctrl-C ends it", markup=False)
         stop.wait()
-    console.print("stopped")
+    console.print(f"stopped; the plant was up to {1e3 * server.late_s:.1f} ms late")
 
 
 def _registers_of(name: str, settings: AnyModbusSettings) -> Table:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import gc
 import sys
 
 import numpy as np
 
 from autotune.errors import IdentificationError
+from autotune.experiment.priority import spare_collections
 from autotune.identification.frequency.limit_cycle import WholePeriods
 from autotune.identification.frequency.limit_cycle_points import limit_cycle_points
 
@@ -22,8 +22,8 @@ def warm_up() -> None:
     """Estimate the points of a made-up limit cycle, and forget them.
 
     The first call in a process imports, and loads or compiles what is compiled: a third of a second, or several after
-    an installation. In the middle of a loop at 100 Hz that would be a link too slow. So would a full garbage collection
-    of all that is imported, 30 to 80 ms: what is in memory now is left out of those that come.
+    an installation. In the middle of a loop at 100 Hz that would be a link too slow, and so would a full garbage
+    collection of all that is imported.
     """
     t = 0.01 * np.arange(900, dtype=np.float64)
     u = np.where(np.sin(np.pi * t) >= 0.0, 1.0, -1.0)
@@ -32,6 +32,5 @@ def warm_up() -> None:
         points = limit_cycle_points(t, u, y, highest_harmonic=3).points
         window = WholePeriods(start_s=2.0, end_s=8.0, periods=3)
         limit_cycle_points(t, u, y, window=window, known=points)
-    gc.collect()
-    gc.freeze()
+    spare_collections()
     sys.setswitchinterval(SWITCH_S)

@@ -1,6 +1,8 @@
 """Runs on the ball behind Modbus TCP, with and without four busy processes beside them: how many are accepted.
 
 The served rig stands for a device with a processor of its own: it has real-time priority where the system grants that.
+A line says how late it was nevertheless, beside how late the host was at most to a sample, to a command after it, and
+with a reading on the link; a run that ended is counted as such, whoever was late.
 
 ``RUNS=3 python -m tests.benchmarks busy``: so many of each; ten where nothing is said. ``BUSY=4``: with four busy
 processes only. What else the computer does is told by its load beside each run.
@@ -8,16 +10,18 @@ processes only. What else the computer does is told by its load beside each run.
 
 from __future__ import annotations
 
-import json
+import math
 import os
 import re
 import subprocess
 import sys
 import tempfile
 import time
+import tomllib
 from contextlib import ExitStack, suppress
 from pathlib import Path
 
+from autotune.experiment.timing import Timing
 from tests.drivers.test_rig_commands import free_port
 
 CONFIG = Path(__file__).resolve().parents[2] / "configs" / "ball_modbus_tcp.toml"
@@ -49,18 +53,30 @@ def _run(busy: int) -> bool:
         served = subprocess.Popen([*command, "rig", str(path)], stdout=subprocess.PIPE, text=True, preexec_fn=_first)
         stack.callback(served.kill)
         assert served.stdout is not None
-        served.stdout.readline()  # it serves
+        while not served.stdout.readline().startswith("serving"):
+            assert served.poll() is None
         began_s = time.monotonic()
         out = Path(folder) / "out"
         done = subprocess.run([*command, "run", str(path), "--out", str(out)], capture_output=True, text=True)
-        timing = {}
-        if (out / "result.json").exists():
-            timing = json.loads((out / "result.json").read_text())["experiment"].get("timing", {})
+        took = f"{time.monotonic() - began_s:.0f} s, load {os.getloadavg()[0]:.0f}"
+        served.terminate()
+        device_late = served.communicate()[0].strip().splitlines()[-1]
         said = (done.stdout if done.returncode == 0 else done.stderr).strip().splitlines()
         line = next((text for text in said if text.startswith("Accepted")), said[-1] if said else "")
-        took = f"{time.monotonic() - began_s:.0f} s, load {os.getloadavg()[0]:.0f}"
-        print(f"  {busy} busy, {took}, missed {timing.get('missed')}: {line[:160]}", flush=True)
+        print(f"  {busy} busy, {took}, {_lateness(out)}; device {device_late}: {line[:160]}", flush=True)
         return done.returncode == 0
+
+
+def _lateness(out: Path) -> str:
+    """Say how late the host was at most in any of the run's recordings."""
+    timings = [Timing.from_table(tomllib.loads(file.read_text()).get("timing", {})) for file in out.rglob("*.toml")]
+    timings = [one for one in timings if one.rows]
+    late, decision, reading = (
+        f"{1e3 * max((getattr(one, name)[2] for one in timings), default=math.nan):.0f} ms"
+        for name in ("lateness_s", "decision_s", "latency_s")
+    )
+    missed = sum(one.missed for one in timings)
+    return f"missed {missed}, woken {late} late, decision {decision}, reading {reading}"
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import signal
 import socket
 import subprocess
@@ -80,6 +81,24 @@ def test_the_served_ball_can_be_probed_and_flown_and_ends_when_asked(tmp_path: P
         rig.close()
         process.send_signal(signal.SIGINT)
         assert process.wait(20) == 0
+
+
+def test_a_served_rig_that_was_held_up_says_for_how_long(tmp_path: Path) -> None:
+    config = load_config(path := config_like("ball_modbus_tcp.toml", tmp_path, port=free_port()))
+    with served(path) as process:
+        rig = open_rig(config.rig, u_range=(config.limits.u_min, config.limits.u_max), u_safe=config.limits.u_safe)
+        rig.open()
+        process.send_signal(signal.SIGSTOP)
+        with pytest.raises(LinkError, match="no answer"):  # after two attempts of 0.2 s
+            rig.read()
+        process.send_signal(signal.SIGCONT)
+        rig.make_safe()
+        rig.close()
+        process.send_signal(signal.SIGINT)
+        assert process.stdout is not None
+        said = re.search(r"stopped; the plant was up to ([\d.]+) ms late", process.stdout.read())
+        assert said is not None
+        assert 300 < float(said[1]) < 5000
 
 
 def test_a_serial_rig_makes_its_own_line_and_clears_it_away(tmp_path: Path) -> None:
