@@ -1,10 +1,11 @@
 """Faults of a controller in C that is not the project's own code: is each safe, named, and never called verified?
 
 The device (``tests/drivers/libmodbus_controller.c``: its own plant, clock and positional PI, on libmodbus) understands
-the gains otherwise, or the line to it fails, while a hand-over tries them. A line says whether they were kept, which K
-the device holds afterwards, what it puts out when the host has gone, and what was said. Then the fault campaign's
-faults of a TCP line, a second master, and a device that is busy and has no dead-man, each in a short relay session: a
-line says how long after its last command the device was at its safe output, by its own log.
+the gains otherwise, or another master writes to it, or the line to it fails, while a hand-over tries them. A line says
+whether they were kept, which K the device holds afterwards, what it puts out when the host has gone, and what was said.
+Then the fault campaign's faults of a TCP line, a second master, a device that is busy and has no dead-man, and a host's
+process that is stopped, killed or out of disk, each in a short relay session: a line says how long after its last
+command the device was at its safe output, by its own log.
 ``FAULTS=minutes`` runs those whose name has the pattern in it, ``MOMENTS=20`` strikes at so many moments of a session.
 """
 
@@ -18,7 +19,9 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +35,9 @@ from autotune.pipeline.deployment import deploy
 from drivers import open_rig
 from tests.autotune.experiment.test_verify import fitted
 from tests.drivers import campaign
-from tests.drivers.foreign_line import faults_on_controller
+from tests.drivers.foreign_line import controller_line, faults_on_controller
+from tests.drivers.lines import Line
+from tests.drivers.signals import SIGNALS, is_right, strike_process
 from tests.drivers.tcp_relay import Direction, Tamper, TcpRelay, refuses, unharmed
 from tests.drivers.test_own_controller import GAINS, LAGS, compiled_controller, controller, peer_config
 
@@ -91,6 +96,16 @@ def _for_a_while(tamper: Tamper, seconds: float) -> Callable[[TcpRelay], None]:
     return strike
 
 
+def _of_another_master(line: TcpRelay, *, address: int, value: float | bool) -> None:
+    """Write a register, or a coil where the value is a yes or no, by a connection of one's own."""
+    other = ModbusClient(host="127.0.0.1", port=line.port, auto_open=True)
+    if isinstance(value, bool):
+        assert other.write_single_coil(address, value)
+    else:
+        assert other.write_multiple_registers(address, list(struct.unpack(">2H", struct.pack(">f", value))))
+    other.close()
+
+
 def _silent(frame: bytes, direction: Direction) -> Sequence[tuple[float, bytes]]:
     return ()
 
@@ -107,6 +122,24 @@ FAULTS = (
     Fault("parallel form", "parallel", "parallel form"),
     Fault("wrong sign", "reversed", "the wrong sign"),
     Fault("set-point ten times", "tenfold", "wrong scale of the set-point: the device holds y at 10 times"),
+    Fault(
+        "set-point of another master",
+        "ideal",
+        "another master writes setpoint",
+        strike=partial(_of_another_master, address=14, value=5.2),
+    ),
+    Fault(
+        "another master ends automatic",
+        "ideal",
+        "another master writes automatic",
+        strike=partial(_of_another_master, address=1, value=False),
+    ),
+    Fault(
+        "gains of another master",
+        "ideal",
+        "the rig holds K = 0.51",
+        strike=partial(_of_another_master, address=10, value=0.51),
+    ),
     Fault("connection reset", "ideal", "behaves as predicted", kept=True, strike=_reset),
     Fault("busy for .35 s", "ideal", "behaves as predicted", kept=True, strike=_for_a_while(refuses(6), 0.35)),
     Fault("silent for .1 s", "ideal", "behaves as predicted", kept=True, strike=_for_a_while(_silent, 0.1)),
@@ -181,24 +214,48 @@ def sessions(program: Path, place: Path) -> list[bool]:
         if not re.search(os.environ.get("FAULTS", ""), fault.name):
             continue
         outcomes = [campaign.run_fault(fault, seed) for seed in range(int(os.environ.get("MOMENTS", "4")))]
-        wrong = [one for one in outcomes if not (one.is_good and any(re.search(end, one.ended) for end in fault.ends))]
-        right.append(not wrong)
-        said = (wrong or outcomes)[-1].ended[:120]
-        print(
-            f"{'WRONG' if wrong else 'right'}  {fault.name}: {len(outcomes) - len(wrong)} of {len(outcomes)} moments,"
-            f" safe {max(one.safe_after_s for one in outcomes):.3f} s after the last command at most,"
-            f" {sum(one.beyond_limits for one in outcomes)} commands beyond limits,"
-            f" {sum(one.bad_samples for one in outcomes)} samples nobody measured: {said}",
-            flush=True,
-        )
+        right.append(_tell(fault.name, outcomes, partial(_ends_so, fault.ends)))
     return right
+
+
+def _ends_so(ends: Sequence[str], outcome: campaign.Outcome) -> bool:
+    return outcome.is_good and any(re.search(end, outcome.ended) for end in ends)
+
+
+def processes(program: Path, place: Path) -> list[bool]:
+    """Print a line for each way in which the host's process ends or its disk is full; return which were right."""
+    right = []
+
+    def line(seed: int) -> AbstractContextManager[Line]:
+        return controller_line(program, Path(tempfile.mkdtemp(dir=place)), seed)
+
+    for number, _, _ in SIGNALS:
+        name = f"process: {number.name if number else 'disk full'}"
+        if not re.search(os.environ.get("FAULTS", ""), name):
+            continue
+        outcomes = [strike_process(number, seed, line) for seed in range(int(os.environ.get("MOMENTS", "4")))]
+        right.append(_tell(name, outcomes, partial(is_right, number)))
+    return right
+
+
+def _tell(name: str, outcomes: Sequence[campaign.Outcome], is_as_it_should: Callable[[campaign.Outcome], bool]) -> bool:
+    """Print the line of a fault, of its worst moment; return whether all were as they should be."""
+    wrong = [one for one in outcomes if not is_as_it_should(one)]
+    print(
+        f"{'WRONG' if wrong else 'right'}  {name}: {len(outcomes) - len(wrong)} of {len(outcomes)} moments,"
+        f" safe {max(one.safe_after_s for one in outcomes):.3f} s after the last command at most,"
+        f" {sum(one.beyond_limits for one in outcomes)} commands beyond limits,"
+        f" {sum(one.bad_samples for one in outcomes)} samples nobody measured: {(wrong or outcomes)[-1].ended[:120]}",
+        flush=True,
+    )
+    return not wrong
 
 
 def main() -> None:
     """Print a line for each fault, and how many were as they should be."""
     with tempfile.TemporaryDirectory() as place:
         program = compiled_controller(Path(place))
-        right = trials(program, Path(place)) + sessions(program, Path(place))
+        right = trials(program, Path(place)) + sessions(program, Path(place)) + processes(program, Path(place))
     print(f"safe, named and not called verified: {sum(right)} of {len(right)}")
 
 

@@ -107,7 +107,7 @@ def run_session(line: Line, fault: Fault, moment_s: float) -> Outcome:
     return Outcome(
         ended="completed" if error is None else str(error),
         exit_status=0 if error is None else error.exit_status,
-        safe_after_s=_safe_after(line.device, line.limits.u_safe, 0.0 if struck_s == float("inf") else struck_s),
+        safe_after_s=safe_after(line.device, line.limits.u_safe, 0.0 if struck_s == float("inf") else struck_s),
         beyond_limits=beyond_limits(line.device, line.limits),
         bad_samples=bad_samples(line.plant, recording.t, recording.y),
         rows=len(recording),
@@ -115,7 +115,7 @@ def run_session(line: Line, fault: Fault, moment_s: float) -> Outcome:
     )
 
 
-def _safe_after(device: Device, u_safe: float, struck_s: float) -> float:
+def safe_after(device: Device, u_safe: float, struck_s: float = 0.0) -> float:
     """Return the time from the last command that was taken to the safe output [s]; infinite if it is not there."""
     history = list(device.history)
     if abs(device.output - u_safe) > 1e-9:

@@ -1,31 +1,35 @@
-"""A session in a process of its own, for the tests that stop or starve it: ``PORT RECORDING.csv [BYTES]``."""
+"""A session in a process of its own, for the tests that stop or starve it: ``JSON RECORDING.csv [BYTES]``."""
 
 from __future__ import annotations
 
+import json
 import resource
 import sys
 
+from autotune.config.procedure import LimitSettings
+from autotune.config.rig import ModbusTcpSettings
 from autotune.errors import AutotuneError
 from autotune.experiment.limits import Envelope
 from autotune.experiment.loop import ControlLoop
 from autotune.recording import RecordingWriter
 from drivers import open_rig
-from tests.drivers.bench import U_SAFE, tcp_settings
 from tests.drivers.campaign import SAMPLE_S
-from tests.drivers.lines import LIMITS
 
 
 def main() -> None:
     """Run a relay until something stops it; no file may grow beyond the bytes, as on a disk that is full."""
     if len(sys.argv) > 3:
         resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[3]),) * 2)
-    rig = open_rig(tcp_settings(int(sys.argv[1])), u_range=(LIMITS.u_min, LIMITS.u_max), u_safe=U_SAFE)
-    envelope = Envelope(settings=LIMITS, sample_time_s=SAMPLE_S)
+    asked = json.loads(sys.argv[1])
+    limits, (level, above, below) = LimitSettings.model_validate(asked["limits"]), asked["relay"]
+    settings = ModbusTcpSettings.model_validate(asked["rig"])
+    rig = open_rig(settings, u_range=(limits.u_min, limits.u_max), u_safe=limits.u_safe)
+    envelope = Envelope(settings=limits, sample_time_s=SAMPLE_S)
     try:
         with ControlLoop(rig=rig, envelope=envelope, writer=RecordingWriter(sys.argv[2], ("t", "u", "y"), {})) as loop:
             tick = loop.tick
             while True:
-                tick = loop.step(loop.nearest(-0.4 if tick.y > 0.0 else 0.4))
+                tick = loop.step(loop.nearest(above if tick.y > level else below))
     except AutotuneError as error:
         sys.stderr.write(f"{error}\n")
         sys.exit(error.exit_status)

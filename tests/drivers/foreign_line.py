@@ -153,8 +153,9 @@ def controller_line(
                 relay.tamper = refuses(code, lambda: next(left, None) is not None)
 
             yield Line(
-                rig=rig, device=device, plant=device, random=random.Random(seed), settle=device.settle, set_harm=harm,
-                refuse=refuse, reset=relay.reset, restart=device.restart, undo=undo, limits=LIMITS, relay=RELAY,
+                rig=rig, settings=settings, device=device, plant=device, random=random.Random(seed),
+                settle=device.settle, set_harm=harm, refuse=refuse, reset=relay.reset, restart=device.restart,
+                undo=undo, limits=LIMITS, relay=RELAY,
             )  # fmt: skip
             rig.close()
     finally:

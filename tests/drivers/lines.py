@@ -13,6 +13,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from autotune.config.procedure import LimitSettings
+from autotune.config.rig import ModbusTcpSettings
 from autotune.experiment.rig import Rig
 from drivers import open_rig
 from sim.modbus_rig import ModbusRig, RtuTransport, TcpTransport
@@ -88,7 +89,8 @@ class Measured(Protocol):
 class Line:
     """A rig on a line, the device behind it, and the means to harm both.
 
-    ``settle`` waits until nobody moves the actuator any more; ``relay`` is the level of y at which a session switches,
+    ``settle`` waits until nobody moves the actuator any more; ``settings`` are the rig's, for a process of its own;
+    ``relay`` is the level of y at which a session switches,
     and its commands above and below that.
     """
 
@@ -97,6 +99,7 @@ class Line:
     plant: Measured
     random: random.Random
     settle: Callable[[], object]
+    settings: ModbusTcpSettings | None = None
     limits: LimitSettings = LIMITS
     relay: tuple[float, float, float] = (0.0, -0.4, 0.4)
     restart: Callable[[], None] = lambda: None
@@ -148,6 +151,7 @@ def tcp_line(seed: int) -> Iterator[Line]:
 
         yield Line(
             rig=rig,
+            settings=settings,
             device=device,
             plant=plant,
             random=random.Random(seed),

@@ -2,23 +2,29 @@
 
 from __future__ import annotations
 
+import json
 import random
 import signal
 import subprocess
 import sys
 import tempfile
 import threading
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 from autotune.recording import read_recording
-from sim.modbus_rig import ModbusRig, TcpTransport
-from sim.register_device import OutputChange
-from tests.drivers.bench import LIMIT_S, U_SAFE, register_device
-from tests.drivers.campaign import ATTEMPTS, NeverBegunError, Outcome, bad_samples, beyond_limits
-from tests.drivers.lines import LoggedServo
+from tests.drivers.bench import LIMIT_S
+from tests.drivers.campaign import ATTEMPTS, NeverBegunError, Outcome, bad_samples, beyond_limits, safe_after
+from tests.drivers.lines import Line, tcp_line
+
+#: how often the rig's own side is asked how many commands it got [s]
+ASKED_S = 0.02
 
 
-def strike_process(number: signal.Signals | None, seed: int) -> Outcome:
+def strike_process(
+    number: signal.Signals | None, seed: int, line: Callable[[int], AbstractContextManager[Line]] = tcp_line
+) -> Outcome:
     """Start a session in a child process, send it a signal after a random number of commands, and wait for the end.
 
     Without a signal the disk is full after as many rows. The recording is read back as the child left it.
@@ -26,54 +32,45 @@ def strike_process(number: signal.Signals | None, seed: int) -> Outcome:
     """
     for _ in range(ATTEMPTS):
         try:
-            return _session(number, seed)
+            with line(seed) as on_line:
+                return _session(on_line, number, seed)
         except NeverBegunError:
             continue
     raise NeverBegunError
 
 
-def _session(number: signal.Signals | None, seed: int) -> Outcome:
+def _session(line: Line, number: signal.Signals | None, seed: int) -> Outcome:
     strike_after = random.Random(seed).randrange(5, 60)
-    plant = LoggedServo(seed)
-    device = register_device(plant=plant)
-    commanded, released = threading.Event(), threading.Event()
-    commands = 0
-
-    def note(change: OutputChange) -> None:
-        nonlocal commands
-        commands += change.cause == "command"
-        if commands >= strike_after:
-            commanded.set()
-        if change.cause in ("dead-man", "given back"):
-            released.set()
-
-    device.on_change = note
-    with tempfile.TemporaryDirectory() as folder, ModbusRig(device, TcpTransport()) as server:
+    assert line.settings is not None
+    asked = {
+        "rig": line.settings.model_dump(mode="json", exclude_none=True),
+        "limits": line.limits.model_dump(mode="json", exclude_none=True),
+        "relay": line.relay,
+    }
+    with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "session.csv"
-        command = [sys.executable, "-m", "tests.drivers.child_session", str(server.port), str(path)]
+        command = [sys.executable, "-m", "tests.drivers.child_session", json.dumps(asked), str(path)]
         if number is None:
             command.append(str(ROW_BYTES * strike_after))
         root = Path(__file__).parents[2]
         with subprocess.Popen(command, cwd=root, stderr=subprocess.PIPE, text=True) as child:
             if number is not None:
-                while not commanded.wait(0.2):
+                while sum(change.cause == "command" for change in list(line.device.history)) < strike_after:
                     if child.poll() is not None:
                         raise NeverBegunError
+                    threading.Event().wait(ASKED_S)
                 child.send_signal(number)
             _, said = child.communicate(timeout=3 * LIMIT_S)
         if number is None and "link too slow" in said:
             raise NeverBegunError
-        assert released.wait(LIMIT_S)
+        line.settle()
         recording = read_recording(path)
-    history = list(device.history)
-    last = max(change.t_s for change in history if change.cause == "command")
-    safe = next(change.t_s for change in history if change.t_s >= last and abs(change.output - U_SAFE) < 1e-9)
     return Outcome(
         ended=said.strip(),
         exit_status=child.returncode,
-        safe_after_s=safe - last,
-        beyond_limits=beyond_limits(device),
-        bad_samples=bad_samples(plant, recording.t, recording.y),
+        safe_after_s=safe_after(line.device, line.limits.u_safe),
+        beyond_limits=beyond_limits(line.device, line.limits),
+        bad_samples=bad_samples(line.plant, recording.t, recording.y),
         rows=len(recording),
     )
 
