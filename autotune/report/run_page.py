@@ -368,6 +368,7 @@ def _verification_section(verification: Verification, signals: SignalSettings) -
                 rows=tuple(
                     (name, *(f"{value:.3g}" if math.isfinite(value) else "-" for value in values))
                     for name, *values in rows
+                    if any(map(math.isfinite, values))
                 ),
                 caption="Of the smoothed responses; what is left of the noise is in the scatter.",
             ),
@@ -376,7 +377,8 @@ def _verification_section(verification: Verification, signals: SignalSettings) -
             Figure(
                 figure=_step_figure(verification, signals),
                 caption="Measured loop and the band that holds 95 % of what plant uncertainty and noise predict:"
-                " set-point step on the left half, load step on the right.",
+                f" set-point step on the left half, {'load step' if _has_load(verification.test) else 'and back'}"
+                " on the right.",
                 height_px=500,
             ),
         ),
@@ -414,10 +416,14 @@ def _sentence(text: str) -> str:
 
 
 def _asked(test: StepTest, signals: SignalSettings) -> str:
-    step, load = f"Set-point step of {test.setpoint[0]:.3g} {signals.y_unit}", float(test.disturbance[-1])
-    if load == 0.0:
-        return f"{step}, then back; no load was tried, as the device takes none (rig.registers.load is not mapped)."
-    return f"{step}, then a load of {load:.3g} {signals.u_unit} added to the command."
+    step = f"Set-point step of {test.setpoint[0]:.3g} {signals.y_unit}"
+    if not _has_load(test):
+        return f"{step}, then back; no load was tried, as none is mapped in [rig]."
+    return f"{step}, then a load of {test.disturbance[-1]:.3g} {signals.u_unit} added to the command."
+
+
+def _has_load(test: StepTest) -> bool:
+    return float(test.disturbance[-1]) != 0.0
 
 
 def _step_figure(verification: Verification, signals: SignalSettings) -> Chart:

@@ -23,6 +23,7 @@ from autotune.experiment.verify import run_verification
 from autotune.models import TransferFunction
 from autotune.pipeline.deployment import deploy
 from autotune.recording import read_recording
+from autotune.report.run_page import verification_page
 from drivers import open_rig
 from sim.plant import make_plant
 from tests.autotune.experiment.test_verify import CONFIG as BALL
@@ -87,6 +88,10 @@ def test_without_a_register_for_the_load_the_set_point_comes_back_and_that_is_al
     assert found.accepted, found.reason
     assert not found.test.disturbance.any()
     assert found.test.setpoint[-1] == 0.0 < found.test.setpoint[0]
+    (section,) = verification_page("ball", BALL.signals, PI, found).sections
+    assert section.text[0] == "Set-point step of 1 V, then back; no load was tried, as none is mapped in [rig]."
+    assert "and back on the right" in section.figures[0].caption
+    assert [row[0] for row in section.tables[0].rows] == ["overshoot [%]", "rise to 90 % [s]"]
 
 
 @pytest.mark.parametrize("lacking", ["automatic", "setpoint", "u_applied"])
