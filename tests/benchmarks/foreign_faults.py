@@ -43,6 +43,8 @@ from tests.drivers.test_own_controller import GAINS, LAGS, compiled_controller, 
 
 #: moment of a fault on the line [s], in the middle of the trial
 MOMENT_S = 8.0
+#: within which the device's own law has begun [s]
+TRIAL_S = 60.0
 SAFE_U = 4.5
 OLD_K = 0.1
 #: after which the device takes its own safe output, and a little [s]
@@ -97,8 +99,12 @@ def _for_a_while(tamper: Tamper, seconds: float) -> Callable[[TcpRelay], None]:
 
 
 def _of_another_master(line: TcpRelay, *, address: int, value: float | bool) -> None:
-    """Write a register, or a coil where the value is a yes or no, by a connection of one's own."""
+    """Write a register, or a coil where the value is a yes or no, a second after the device's own law has begun."""
     other = ModbusClient(host="127.0.0.1", port=line.port, auto_open=True)
+    until_s = time.monotonic() + TRIAL_S
+    while other.read_coils(1, 1) != [True] and time.monotonic() < until_s:
+        time.sleep(0.1)
+    time.sleep(1.0)
     if isinstance(value, bool):
         assert other.write_single_coil(address, value)
     else:
