@@ -41,7 +41,7 @@ from tests.drivers.signals import SIGNALS, is_right, strike_process
 from tests.drivers.tcp_relay import Direction, Tamper, TcpRelay, refuses, unharmed
 from tests.drivers.test_own_controller import GAINS, LAGS, compiled_controller, controller, peer_config
 
-#: moment of a fault on the line [s], in the middle of the trial
+#: moment of a fault on the line [s]: the host is bringing the rig to its operating point, and commands it
 MOMENT_S = 8.0
 #: within which the device's own law has begun [s]
 TRIAL_S = 60.0
