@@ -302,9 +302,10 @@ def _follow(recording: Path, out: Output, settings: _Tracking, quiet_s: float) -
     quiet_since = time.monotonic()
     with out.growing() as table:
         while True:
-            if recording.stat().st_size > size:  # it may grow for long before the loop is in operation
-                size, quiet_since = recording.stat().st_size, time.monotonic()
-            record = _of_operation(recording, settings) if quiet_s == 0.0 else _readable(recording, settings)
+            record, grown = None, recording.stat().st_size
+            if grown > size:  # it may grow for long before the loop is in operation
+                size, quiet_since = grown, time.monotonic()
+                record = _of_operation(recording, settings) if quiet_s == 0.0 else _readable(recording, settings)
             if record is not None and len(record) > rows:
                 rows = len(record)
                 length = settings.window_s if settings.window_s is not None else 0.2 * record.duration_s

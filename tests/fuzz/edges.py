@@ -72,5 +72,7 @@ def edges(rng: random.Random, folder: Path) -> Call:
         if option.opts[0] in line:
             at = line.index(option.opts[0])
             del line[at : at + 2]
-        line = [*line, option.opts[0], rng.choice([*_edges(option), *ODD] if rng.random() < 0.5 else ODD)]
+        value = rng.choice([*_edges(option), *ODD] if rng.random() < 0.5 else ODD)
+        waits = option.opts[0] == "--follow" and value in {"1", "2", "1e9", "1_0", *_edges(option)}
+        line = [*line, option.opts[0], "0" if waits else value]  # it would wait for as long as it is told
     return line
