@@ -234,7 +234,23 @@ def summary(result: ClosedLoopIdentification) -> str:
     )
     late = f" and {model.input_delay} samples of dead time" if model.input_delay else ""
     sd = math.sqrt(float(model.innovation_covariance[0, 0]))
-    return f"order {model.order}{late}, poles {poles}, innovation sd {sd:.3g}; {result.excitation.sentence}"
+    found = f"order {model.order}{late}, poles {poles}, innovation sd {sd:.3g}"
+    return f"{found}; {_left_open(result)}{result.excitation.sentence}"
+
+
+def _left_open(result: ClosedLoopIdentification) -> str:
+    """Return what is said of other orders and dead times that the record leaves open; nothing where there are none."""
+    from autotune.identification.closed_loop.loop_plant import PROBABLE
+
+    others = result.structures.probable(PROBABLE)
+    if not others:
+        return ""
+    models = [one.model for one in (result.estimate, *others)]
+    orders, delays = ([one.order for one in models], [one.input_delay for one in models])
+    return (
+        f"the record leaves orders {min(orders)} to {max(orders)} and {min(delays)} to {max(delays)} samples of dead "
+        "time open, which count in the regions; "
+    )
 
 
 @app.command()
