@@ -83,6 +83,12 @@ def responses(points: Sequence[FrequencyPoint]) -> tuple[FloatArray, ComplexArra
     )
 
 
+def as_pairs(covariance: FloatArray) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Return a (2, 2) covariance of (re, im) as a point keeps it."""
+    (a, b), (c, d) = covariance.tolist()
+    return (a, b), (c, d)
+
+
 def points_to_json(points: Sequence[FrequencyPoint]) -> list[dict[str, Any]]:
     """Return the points in the fixed form of ``points.json``: gain, phase in degrees, covariance of (re, im)."""
     return [

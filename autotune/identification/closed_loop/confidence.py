@@ -17,7 +17,7 @@ from autotune.errors import IdentificationError
 from autotune.identification.closed_loop.prediction_error import PredictionErrorEstimate
 from autotune.identification.closed_loop.predictor_directions import Predictor
 from autotune.identification.closed_loop.series import Series
-from autotune.points import FrequencyPoint
+from autotune.points import FrequencyPoint, as_pairs
 
 #: Information matrices worse than this hold directions that the data say nothing about.
 _CONDITION_LIMIT = 1e13
@@ -162,7 +162,7 @@ def frequency_points(
         FrequencyPoint(
             omega_rad_s=float(omega),
             response=complex(value),
-            covariance=((float(c[0, 0]), float(c[0, 1])), (float(c[1, 0]), float(c[1, 1]))),
+            covariance=as_pairs(c),
             source="closed loop",
         )
         for omega, value, c in zip(omega_rad_s, response, covariance, strict=True)

@@ -11,7 +11,7 @@ from scipy.linalg import expm, logm
 
 from autotune.arrays import FloatArray
 from autotune.identification.closed_loop.state_space import InnovationModel
-from autotune.points import FrequencyPoint
+from autotune.points import FrequencyPoint, as_pairs
 
 #: A point less certain than this says nothing to a design.
 _WORTHLESS = 0.5
@@ -49,8 +49,7 @@ def without_hold(model: InnovationModel, response: Sequence[FrequencyPoint]) -> 
             factor = complex(inner[0, 0]) * np.exp(-1j * omega * dt_s * model.input_delay) / point.response
         turn = np.array([[factor.real, -factor.imag], [factor.imag, factor.real]])
         c = turn @ np.array(point.covariance) @ turn.T
-        pair = ((float(c[0, 0]), float(c[0, 1])), (float(c[1, 0]), float(c[1, 1])))
-        points.append(replace(point, response=complex(point.response * factor), covariance=pair))
+        points.append(replace(point, response=complex(point.response * factor), covariance=as_pairs(c)))
     return tuple(points)
 
 

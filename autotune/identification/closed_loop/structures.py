@@ -17,7 +17,7 @@ from autotune.errors import IdentificationError
 from autotune.identification.closed_loop.confidence import frequency_points
 from autotune.identification.closed_loop.hold import without_hold, worthwhile
 from autotune.identification.closed_loop.prediction_error import PredictionErrorEstimate
-from autotune.points import FrequencyPoint
+from autotune.points import FrequencyPoint, as_pairs
 
 Weighted: TypeAlias = tuple[float, PredictionErrorEstimate]
 
@@ -104,7 +104,5 @@ def _over(
                 covariance + weight * (np.array(other.covariance) + np.outer(apart, apart)),
                 total + weight,
             )
-        c = covariance / total
-        pair = ((float(c[0, 0]), float(c[0, 1])), (float(c[1, 0]), float(c[1, 1])))
-        result.append(replace(point, covariance=pair))
+        result.append(replace(point, covariance=as_pairs(covariance / total)))
     return tuple(result)

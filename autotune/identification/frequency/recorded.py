@@ -17,7 +17,7 @@ from autotune.identification.frequency.local_polynomial import LocalEstimate, lo
 from autotune.identification.frequency.reference_model import ReferenceModel, fit_reference, simulate_reference
 from autotune.identification.frequency.spectra import Spectra, clean_measurement, record_spectra
 from autotune.identification.frequency.windows import noted_windows, windowed_cycles
-from autotune.points import FrequencyPoint
+from autotune.points import FrequencyPoint, as_pairs
 from autotune.recording import Recording
 
 Excitation: TypeAlias = Literal["relay", "repeated command", "random or steps", "closed loop by way of r"]
@@ -377,16 +377,9 @@ def _merged(group: Sequence[FrequencyPoint]) -> tuple[FrequencyPoint, float]:
         group[0],
         omega_rad_s=omega,
         response=complex(mean[0], mean[1]),
-        covariance=_pairs(covariance),
+        covariance=as_pairs(covariance),
     )
     return point, float(np.einsum("ni,nij,nj->", apart, weights, apart))
-
-
-def _pairs(covariance: FloatArray) -> tuple[tuple[float, float], tuple[float, float]]:
-    return (
-        (float(covariance[0, 0]), float(covariance[0, 1])),
-        (float(covariance[1, 0]), float(covariance[1, 1])),
-    )
 
 
 def _judged(
@@ -405,7 +398,7 @@ def _judged(
         return (*notes, note), points
     excess = chi_square / freedom
     widened = tuple(
-        replace(point, covariance=_pairs(excess * np.array(point.covariance))) if len(group) > 1 else point
+        replace(point, covariance=as_pairs(excess * np.array(point.covariance))) if len(group) > 1 else point
         for point, group in zip(points, groups, strict=True)
     )
     note = (

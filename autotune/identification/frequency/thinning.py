@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from autotune.arrays import ComplexArray, FloatArray
-from autotune.points import FrequencyPoint
+from autotune.points import FrequencyPoint, as_pairs
 
 #: Points that a reduction or a design works on; the work grows with their square.
 MOST = 240
@@ -74,7 +74,7 @@ def _mean(omega: FloatArray, response: ComplexArray, covariance: FloatArray, fir
     return FrequencyPoint(
         omega_rad_s=centre,
         response=complex(mean[0], mean[1]),
-        covariance=((float(wide[0, 0]), float(wide[0, 1])), (float(wide[1, 0]), float(wide[1, 1]))),
+        covariance=as_pairs(wide),
         source=first.source,
     )
 
