@@ -11,8 +11,8 @@ from autotune.arrays import FloatArray
 from autotune.diagnosis.equations.equation_bench import EquationBench
 from autotune.diagnosis.equations.held_out import HELD_OUT, bounded_errors
 from autotune.diagnosis.equations.judged import Searched
-from autotune.diagnosis.equations.laws import law_in_equations
-from autotune.diagnosis.evidence.missing_law import MissingLaw
+from autotune.diagnosis.equations.laws import line_in_equations
+from autotune.diagnosis.evidence.missing_law import MissingLaw, law_of
 from autotune.diagnosis.evidence.unseen_run import UnseenRun
 from autotune.diagnosis.selection.retuned_numbers import RetunedNumber
 from autotune.diagnosis.thresholds import Thresholds
@@ -107,8 +107,8 @@ class EquationSearch:
         if not isinstance(self.found.bench, EquationBench):
             return ()
         chosen, own = self.found.chosen, len(self.model.effects)
-        found = (law_in_equations(self.found.bench, chosen, i) for i in range(own, len(chosen.effects)))
-        return tuple(law for law in found if law is not None)
+        lines = (line_in_equations(self.found.bench, chosen, i) for i in range(own, len(chosen.effects)))
+        return tuple(law for law in map(law_of, lines) if law is not None)
 
     def unseen_run(self) -> UnseenRun | None:
         """Return runs through the last third of the longest recording, the numbers fitted to the rest of all."""

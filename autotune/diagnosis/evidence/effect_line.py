@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
 from autotune.arrays import BoolArray, FloatArray
+from autotune.diagnosis.evidence.missing_law import LawLine
 from autotune.diagnosis.evidence.residual import filled
+from autotune.diagnosis.evidence.stretches import correlation_rows
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import Fit
 from autotune.diagnosis.simulation.assembly import values_of
@@ -33,7 +36,7 @@ _COLUMNS: Mapping[Signal, int] = {"true reading": 2, "position": 2, "level": 2, 
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class EffectLine:
+class EffectLine(LawLine):
     """A line of a fitted effect.
 
     Attributes
@@ -55,6 +58,11 @@ class EffectLine:
     number: int
     kind: EffectKind
     line: Line
+
+    @property
+    def name(self) -> str:
+        """The effect's name."""
+        return self.kind.name
 
     @property
     def asks(self) -> tuple[str, ...]:
@@ -118,6 +126,31 @@ class EffectLine:
                 )
             case _:
                 return y
+
+    @property
+    def turns_round(self) -> bool:
+        """Whether it turns round where its signal changes sign."""
+        return self.line.stage == "friction"
+
+    @property
+    def words(self) -> tuple[str, str, str, str]:
+        """The signal that it is drawn over with its unit, and what it gives with its unit."""
+        model, to = self.result.parametrisation.model, ADDED[self.line.stage][0]
+        if self.per_input:
+            given = "change of the plant's gain", "share"
+        elif to == "command":
+            given = "command that acts", model.input.unit
+        elif to == "plant":
+            given = "net inflow" if self.signal == "level" else "force at the plant's input", plant_unit(self.result)
+        else:
+            given = "flow at the lower level's input" if to == "last" else "reading", model.output.unit
+        return self.signal, self.unit, *given
+
+    def numbers(self) -> tuple[FloatArray, list[int], FloatArray]:
+        """Return the fit's numbers, which of them are the effect's own, and the covariance of these."""
+        free = enumerate(self.result.parametrisation.free)
+        own = [i for i, f in free if f.kind == "effect" and f.index[0] == self.number]
+        return self.result.theta, own, self.result.covariance[np.ix_(own, own)]
 
     def values(self) -> list[FloatArray]:
         """Return the signal, (N,) per recording; command, position, level and reading as absolute values."""
@@ -189,18 +222,25 @@ class EffectLine:
             "level": 0.0 if self.line.stage == "outflow" else value,
         }  # fmt: skip
 
-    def shows(self, columns: list[FloatArray]) -> FloatArray:
-        """Return how signals added where the effect acts show in the whitened residual, start states freed.
+    def traced_back(self, bins: Sequence[BoolArray]) -> tuple[FloatArray, FloatArray]:
+        """Return how much, added where it acts at the rows of each bin, explains the residual best, and its 1-sigma."""
+        factor = np.concatenate([filled(s)[:, 3] for s in self.result.signals]) if self.per_input else 1.0
+        splits = np.cumsum([len(r) for r in self.data.recordings])[:-1]
+        X = self._shows(np.split(np.column_stack([np.where(rows, factor, 0.0) for rows in bins]), splits))
+        norms = np.linalg.norm(X, axis=0)
+        scale = np.where(norms > 0.0, norms, 1.0)
+        X, e = X / scale, self.result.without_states(self.result.e)
+        inverse = np.linalg.pinv(X.T @ X, rcond=1e-9, hermitian=True)
+        beta = inverse @ (X.T @ e)
+        left = e - X @ beta
+        excess = max(1.0, float(left @ left) / max(self.data.rows - beta.size, 1))
+        variance = np.maximum(np.diag(inverse), 0.0) * excess * correlation_rows(self.result, self.data)
+        return beta / scale, np.where(norms > 0.0, np.sqrt(variance) / scale, math.inf)
 
-        Parameters
-        ----------
-        columns : list of (N, q) array
-            Per recording.
+    def _shows(self, columns: list[FloatArray]) -> FloatArray:
+        """Return how signals that are added where the effect acts show in the whitened residual, start states freed.
 
-        Returns
-        -------
-        (N, q) array
-            All recordings one after the other.
+        They are (N, q) per recording, and what they show is (N, q), all recordings one after the other.
         """
         sim, data = self.result.sim, self.data
         plain = replace(sim.linear(), u_offset=0.0, y_offset=0.0, linear_hold=False)

@@ -1,25 +1,19 @@
 """A found effect as a law over its signal: the curve with its band, and what the data say in bins around it.
 
-The bins do not come from the curve: what the extended model leaves of the readings is traced back through the linear
-chain to where the effect acts, bin by bin of its signal, and added to the curve (component plus residual). Where the
+The bins do not come from the curve: what the extended model leaves of the readings is traced back through the model
+to where the effect acts, bin by bin of its signal, and added to the curve (component plus residual). Where the
 law is right the bins lie on it to within their bars; where it is not they leave it, and show what it should be.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from autotune.arrays import BoolArray, FloatArray, IntArray
-from autotune.diagnosis.evidence.effect_line import ADDED, EffectLine, line_of, plant_unit
-from autotune.diagnosis.evidence.residual import filled
-from autotune.diagnosis.evidence.stretches import correlation_rows
-from autotune.diagnosis.fitting.data import Data
-from autotune.diagnosis.fitting.fit import Fit
-from autotune.effects import kind_of
 
 #: Bins over the signal: as many of these as the data tell apart; rows of a bin at least; points of the curve.
 BINS, LEAST_ROWS, POINTS = (12, 8, 5, 3, 2), 20, 161
@@ -95,17 +89,62 @@ class MissingLaw:
     rows: tuple[IntArray, ...]
 
 
-def missing_law(result: Fit, data: Data, name: str) -> MissingLaw | None:
+class LawLine(ABC):
+    """A fitted effect as a function of one signal, whatever the model is written as."""
+
+    @property
+    @abstractmethod
+    def name(self) -> str:
+        """The effect's name."""
+
+    @property
+    @abstractmethod
+    def words(self) -> tuple[str, str, str, str]:
+        """The signal that it is drawn over with its unit, and what it gives with its unit."""
+
+    @property
+    @abstractmethod
+    def is_whole(self) -> bool:
+        """Whether it is a characteristic from its signal to the same quantity, else something that is added."""
+
+    @property
+    def remembers(self) -> bool:
+        """Whether what it does depends on the way that its signal came."""
+        return False
+
+    @property
+    def turns_round(self) -> bool:
+        """Whether it may turn round where its signal changes sign."""
+        return True
+
+    @abstractmethod
+    def values(self) -> list[FloatArray]:
+        """Return the signal, (N,) per recording; all finite."""
+
+    @abstractmethod
+    def counts(self) -> BoolArray:
+        """Return the rows, all recordings one after the other, that count."""
+
+    @abstractmethod
+    def law(self, x: FloatArray, theta: FloatArray, number: int = 0) -> FloatArray:
+        """Return what it gives as its signal passes values, (K,), at numbers of the fit, in a recording."""
+
+    @abstractmethod
+    def numbers(self) -> tuple[FloatArray, list[int], FloatArray]:
+        """Return the fit's numbers, which of them are the effect's own, and the covariance of these."""
+
+    @abstractmethod
+    def traced_back(self, bins: Sequence[BoolArray]) -> tuple[FloatArray, FloatArray]:
+        """Return how much, added where it acts at the rows of each bin, explains the residual best, and its 1-sigma."""
+
+
+def law_of(line: LawLine | None) -> MissingLaw | None:
     """Return a fitted effect as a law over its signal.
 
     Parameters
     ----------
-    result : Fit
-        The extended model's fit.
-    data : Data
-        What it was fitted to.
-    name : str
-        An effect of its model.
+    line : LawLine, optional
+        The effect as a function of one signal, where it is one.
 
     Returns
     -------
@@ -115,55 +154,35 @@ def missing_law(result: Fit, data: Data, name: str) -> MissingLaw | None:
 
     Notes
     -----
-    First order: the residual is traced back through the linear chain at the operating point, and the other numbers are
-    held, so that the bars are those of the bins alone. Where a curve that changes the dynamics is far off, the bins go
-    a part of the way to the true law; at the right law they are on it. Rows whose errors go together count as one.
+    First order: the residual is traced back through the model at the fit, and the other numbers are held, so that the
+    bars are those of the bins alone. Where a curve that changes the dynamics is far off, the bins go a part of the way
+    to the true law; at the right law they are on it. Rows whose errors go together count as one.
 
     References
     ----------
     Larsen and McCleary, Technometrics 14, 1972: partial residual plots; Cook, Technometrics 35, 1993.
     """
-    number = next(i for i, e in enumerate(result.model.effects) if e.name == name)
-    line = line_of(result, data, number, kind_of(name))
     if line is None:
         return None
-    signal, counts = line.values(), line.counts()
+    signal, counts, theta = line.values(), line.counts(), line.numbers()[0]
     x = np.concatenate(signal)[counts]
     if x.size < 2 * LEAST_ROWS or not np.ptp(x) > 0.0:
         return None
-    value, unit = _given(line)
     rows = tuple(np.unique(np.linspace(0, s.size - 1, min(s.size, ROWS)).astype(np.int64)) for s in signal)
-    acts = [line.law(s[k], result.theta, i) for i, (s, k) in enumerate(zip(signal, rows, strict=True))]
+    acts = [line.law(s[k], theta, i) for i, (s, k) in enumerate(zip(signal, rows, strict=True))]
     if line.is_whole:
         acts = [a - s[k] for a, s, k in zip(acts, signal, rows, strict=True)]
+    over, unit, value, value_unit = line.words
     return MissingLaw(
-        effect=name,
-        signal=line.signal,
-        unit=line.unit,
-        value=value,
-        value_unit=unit,
-        is_whole=line.is_whole,
+        effect=line.name, signal=over, unit=unit, value=value, value_unit=value_unit, is_whole=line.is_whole,
         branches=tuple(_branch(line, way) for way in (("rising", "falling") if line.remembers else ("",))),
-        acts=tuple(acts),
-        rows=rows,
-    )
+        acts=tuple(acts), rows=rows,
+    )  # fmt: skip
 
 
-def _given(line: EffectLine) -> tuple[str, str]:
-    """Return what a line gives, in words, and its unit."""
-    model, to = line.result.parametrisation.model, ADDED[line.line.stage][0]
-    if line.per_input:
-        return "change of the plant's gain", "share"
-    if to == "command":
-        return "command that acts", model.input.unit
-    if to == "plant":
-        return "net inflow" if line.signal == "level" else "force at the plant's input", plant_unit(line.result)
-    return "flow at the lower level's input" if to == "last" else "reading", model.output.unit
-
-
-def _branch(line: EffectLine, way: str) -> Branch:
+def _branch(line: LawLine, way: str) -> Branch:
     """Return one branch: the curve with its band, and the bins."""
-    every, counts, theta = np.concatenate(line.values()), line.counts(), line.result.theta
+    every, counts, theta = np.concatenate(line.values()), line.counts(), line.numbers()[0]
     low, high = np.quantile(every[counts], [TAIL, 1.0 - TAIL])
     if way:
         # down and up again: what it remembers is then what a signal that comes from the far end leaves
@@ -180,22 +199,17 @@ def _branch(line: EffectLine, way: str) -> Branch:
     return Branch(name=way, x=x[order], law=law[order], sd=sd[order], at=at, found=found, error=error, rows=rows)
 
 
-def _band(line: EffectLine, x: FloatArray) -> FloatArray:
+def _band(line: LawLine, x: FloatArray) -> FloatArray:
     """Return the law's 1-sigma by the effect's own numbers."""
-    result = line.result
-    own = [i for i, f in enumerate(result.parametrisation.free) if f.kind == "effect" and f.index[0] == line.number]
+    theta, own, covariance = line.numbers()
+    if not own:
+        return np.zeros(x.size)
     columns = []
     for i in own:
-        both = []
-        for sign in (1.0, -1.0):
-            theta = result.theta.copy()
-            theta[i] += sign * NUDGE
-            both.append(line.law(x, theta))
-        columns.append((both[0] - both[1]) / (2.0 * NUDGE))
-    if not columns:
-        return np.zeros(x.size)
+        step = np.where(np.arange(theta.size) == i, NUDGE, 0.0)
+        columns.append((line.law(x, theta + step) - line.law(x, theta - step)) / (2.0 * NUDGE))
     D = np.column_stack(columns)
-    return np.asarray(np.sqrt(np.maximum(np.einsum("ki,ij,kj->k", D, result.covariance[np.ix_(own, own)], D), 0.0)))
+    return np.asarray(np.sqrt(np.maximum(np.einsum("ki,ij,kj->k", D, covariance, D), 0.0)))
 
 
 def _rising(x: FloatArray) -> BoolArray:
@@ -216,7 +230,7 @@ def _edges(x: FloatArray, bins: int, turns: bool) -> FloatArray:
 
 
 def _bins(
-    line: EffectLine, way: str, ends: tuple[float, float], curve: tuple[FloatArray, FloatArray]
+    line: LawLine, way: str, ends: tuple[float, float], curve: tuple[FloatArray, FloatArray]
 ) -> tuple[FloatArray, FloatArray, FloatArray, IntArray]:
     """Return mean signal, value, 1-sigma and rows of every bin that tells something."""
     masks = [_rising(s) if way == "rising" else ~_rising(s) if way else np.ones(s.size, bool) for s in line.values()]
@@ -225,14 +239,13 @@ def _bins(
     none = np.zeros(0)
     if counts.sum() < 2 * LEAST_ROWS:
         return none, none, none, np.zeros(0, dtype=np.int64)
-    factor = np.concatenate([filled(s)[:, 3] for s in line.result.signals]) if line.per_input else np.ones(signal.size)
     size = float(np.ptp(curve[1])) or float(np.max(np.abs(curve[1]))) or 1.0
     tried = []
     for bins in BINS:
-        members = list(_members(signal, counts, _edges(signal[counts], bins, line.line.stage == "friction")))
+        members = list(_members(signal, counts, _edges(signal[counts], bins, line.turns_round)))
         if not members:  # steps that the signal stands on between a few scattered values fill no bin alone
             continue
-        deviation, error = _traced_back(line, [np.where(m, factor, 0.0) for m in members])
+        deviation, error = line.traced_back(members)
         tried.append((members, deviation, error))
         if np.mean(error < TELLS * size) >= INFORMATIVE:
             break
@@ -245,21 +258,6 @@ def _bins(
     own = np.interp(at, *curve)  # the deviation belongs to the bin's mean signal
     rows = np.array([int((m & counts).sum()) for m in members], dtype=np.int64)
     return at[tells], (own + deviation)[tells], error[tells], rows[tells]
-
-
-def _traced_back(line: EffectLine, columns: list[FloatArray]) -> tuple[FloatArray, FloatArray]:
-    """Return how much of each signal, added where the effect acts, explains the residual best, and its 1-sigma."""
-    splits = np.cumsum([len(r) for r in line.data.recordings])[:-1]
-    X = line.shows(np.split(np.column_stack(columns), splits))
-    norms = np.linalg.norm(X, axis=0)
-    scale = np.where(norms > 0.0, norms, 1.0)
-    X, e = X / scale, line.result.without_states(line.result.e)
-    inverse = np.linalg.pinv(X.T @ X, rcond=1e-9, hermitian=True)
-    beta = inverse @ (X.T @ e)
-    left = e - X @ beta
-    excess = max(1.0, float(left @ left) / max(line.data.rows - beta.size, 1))
-    variance = np.maximum(np.diag(inverse), 0.0) * excess * correlation_rows(line.result, line.data)
-    return beta / scale, np.where(norms > 0.0, np.sqrt(variance) / scale, math.inf)
 
 
 def _members(signal: FloatArray, counts: BoolArray, edges: FloatArray) -> Iterator[BoolArray]:

@@ -8,13 +8,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from autotune.arrays import FloatArray
-from autotune.diagnosis.evidence.missing_law import MissingLaw, missing_law
+from autotune.diagnosis.evidence.effect_line import line_of
+from autotune.diagnosis.evidence.missing_law import MissingLaw, law_of
 from autotune.diagnosis.evidence.unseen_run import UnseenRun, unseen_run
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import Fit
 from autotune.diagnosis.selection.hypothesis import Hypothesis, merged, penalised
 from autotune.diagnosis.selection.retuned_numbers import RetunedNumber, retuned_numbers
 from autotune.diagnosis.thresholds import Thresholds
+from autotune.effects import kind_of
 from autotune.equations.identifiability import Combination, determined
 from autotune.models import Model
 from autotune.recording import Recording
@@ -115,8 +117,9 @@ class Search:
 
     def laws(self) -> tuple[MissingLaw, ...]:
         """Return the laws of the chosen effects over their signals, with the data in bins."""
-        found = (missing_law(self.chosen.fit, self.data, name) for name in self.chosen.names)
-        return tuple(law for law in found if law is not None)
+        chosen, own = self.chosen, self.chosen.fit.parametrisation.own
+        lines = (line_of(chosen.fit, self.data, own + i, kind_of(name)) for i, name in enumerate(chosen.names))
+        return tuple(law for law in map(law_of, lines) if law is not None)
 
     def unseen_run(self) -> UnseenRun | None:
         """Return free runs through a stretch that no number was fitted to."""

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from autotune.diagnosis.evidence.effect_line import line_of
-from autotune.diagnosis.evidence.missing_law import MissingLaw, missing_law
+from autotune.diagnosis.evidence.missing_law import MissingLaw, law_of
 from autotune.diagnosis.evidence.samples import inspect
 from autotune.diagnosis.evidence.unseen_run import unseen_run
 from autotune.diagnosis.fitting.data import Data
@@ -41,6 +41,11 @@ def fitted(name: str, factor: float) -> tuple[Fit, Data]:
     return fit(p, data, free=np.zeros(p.centre.size, dtype=bool)), data
 
 
+def law_by(result: Fit, data: Data, name: str) -> MissingLaw | None:
+    number = [effect.name for effect in result.model.effects].index(name)
+    return law_of(line_of(result, data, number, kind_of(name)))
+
+
 def off(law: MissingLaw, true: Callable[[np.ndarray], np.ndarray]) -> tuple[float, float, float]:
     """Return how far bins and curve are from the true law (rms), and the rms of the bins' deviation in bars."""
     (branch,) = law.branches
@@ -55,7 +60,7 @@ def off(law: MissingLaw, true: Callable[[np.ndarray], np.ndarray]) -> tuple[floa
 
 @pytest.mark.parametrize("name", LAWS)
 def test_the_bins_show_the_true_law_where_the_curve_has_another_size(name: str) -> None:
-    law = missing_law(*fitted(name, 0.7), name)
+    law = law_by(*fitted(name, 0.7), name)
     assert law is not None
     bins, curve, bars = off(law, LAWS[name][2])
     assert law.branches[0].at.size >= 3
@@ -66,7 +71,7 @@ def test_the_bins_show_the_true_law_where_the_curve_has_another_size(name: str) 
 
 @pytest.mark.parametrize("name", LAWS)
 def test_the_bins_lie_on_the_right_law_to_within_their_bars_and_contradict_its_absence(name: str) -> None:
-    law = missing_law(*fitted(name, 1.0), name)
+    law = law_by(*fitted(name, 1.0), name)
     assert law is not None
     (branch,) = law.branches
     assert off(law, LAWS[name][2])[2] < 2.0
@@ -77,7 +82,7 @@ def test_a_play_has_two_branches_and_its_middle_is_the_command() -> None:
     recordings = [servo_recording(3)]
     data, _ = prepare(servo_model(), recordings, inspect(recordings)[0])
     p = parametrise(servo_model(), [effect_with("actuator.backlash", [0.2])], 1.0, 0.02)
-    law = missing_law(fit(p, data, free=np.zeros(p.centre.size, dtype=bool)), data, "actuator.backlash")
+    law = law_by(fit(p, data, free=np.zeros(p.centre.size, dtype=bool)), data, "actuator.backlash")
     assert law is not None
     rising, falling = law.branches
     assert law.is_whole
@@ -92,7 +97,7 @@ def test_what_is_no_law_over_one_signal_is_not_drawn_as_one() -> None:
     data, _ = prepare(servo_model(), recordings, inspect(recordings)[0])
     for name in ("actuator.lag", "timing.dead_time"):
         p = parametrise(servo_model(), [effect_with(name, [0.05])], 1.0, 0.02)
-        assert missing_law(fit(p, data, free=np.zeros(p.centre.size, dtype=bool)), data, name) is None
+        assert law_by(fit(p, data, free=np.zeros(p.centre.size, dtype=bool)), data, name) is None
     known = fit(p, data, free=np.zeros(p.centre.size, dtype=bool))
     drawn = {name for name in CATALOGUE if line_of(known, data, 0, kind_of(name)) is not None}
     assert {"plant.quadratic_drag", "actuator.saturation", "sensor.nonlinear_gain", "environment.step_load"} <= drawn
@@ -131,7 +136,7 @@ def test_the_number_of_a_recording_goes_with_a_load_that_comes_in_it_alone() -> 
     recordings = [servo_recording(7, rows=400), servo_recording(8, rows=900)]
     data, _ = prepare(servo_model(), recordings, inspect(recordings)[0])
     p = parametrise(servo_model(), [effect_with("environment.step_load", [0.2, 4.0, 1e9, 1.0])], 1.0, 0.02)
-    law = missing_law(fit(p, data, free=np.zeros(p.centre.size, dtype=bool)), data, "environment.step_load")
+    law = law_by(fit(p, data, free=np.zeros(p.centre.size, dtype=bool)), data, "environment.step_load")
     assert law is not None
     assert np.all(law.acts[0] == 0.0)
     assert law.acts[1].max() == pytest.approx(0.2)
@@ -141,7 +146,7 @@ def test_a_signal_whose_rows_fill_no_bin_has_a_law_without_bins() -> None:
     r = servo_recording(6, rows=90)
     data, _ = prepare(servo_model(), [r], [np.isfinite(r.y)])
     p = parametrise(servo_model(), [effect_with("plant.quadratic_drag", [DRAG])], 1.0, 0.02)
-    law = missing_law(fit(p, data, free=np.zeros(p.centre.size, dtype=bool)), data, "plant.quadratic_drag")
+    law = law_by(fit(p, data, free=np.zeros(p.centre.size, dtype=bool)), data, "plant.quadratic_drag")
     assert law is not None
     (branch,) = law.branches
     assert branch.x.size > 0
