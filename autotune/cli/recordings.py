@@ -76,7 +76,10 @@ def _ask(role: str, columns: Sequence[str], guess: str) -> str:
 
 @app.command("import")
 def import_file(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="text of any delimiter, Excel, OpenDocument or Parquet")],
+    file: Annotated[
+        Path,
+        typer.Argument(metavar="FILE", help="text of any delimiter, Excel, OpenDocument, Parquet, MATLAB, HDF5 or MDF"),
+    ],
     out: Annotated[
         Path | None, typer.Option(metavar="REC.csv", help="recording to write; default the file's name with _recording")
     ] = None,

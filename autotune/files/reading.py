@@ -74,7 +74,7 @@ def read_recordings(
     ask: Ask | None = None,
     longest_gap_s: float | None = None,
 ) -> Reading:
-    """Read a file of any form: the project's own, text with any delimiter, a workbook, Parquet.
+    """Read a file of any form: the project's own, text with any delimiter, a workbook, Parquet, arrays.
 
     Parameters
     ----------

@@ -16,6 +16,8 @@ from autotune.errors import InputError, require_extra
 from autotune.files.cells import Cells
 from autotune.files.header import Header, read_header
 from autotune.files.long_form import one_column_per_tag
+from autotune.files.measurement_file import KINDS as MEASUREMENTS
+from autotune.files.measurement_file import measurement_table
 from autotune.files.table import FileForm, Table, bare_and_unit, listed
 from autotune.files.text_file import text_table
 
@@ -41,6 +43,8 @@ def open_table(path: Path, form: FileForm | None = None) -> Table:
         raise InputError("no such file", where=str(path), remedy="check the path")
     if kind in WORKBOOKS:
         return one_column_per_tag(_of_workbook(path, form))
+    if kind in MEASUREMENTS:
+        return measurement_table(path)
     return one_column_per_tag(parquet_table([path]) if kind in PARQUET else text_table(path, form))
 
 
