@@ -21,6 +21,7 @@ from autotune.recording import Recording
 from autotune.report.analysis_sections import analysis_sections, based_on, designed_text, gains_text, margins_sentence
 from autotune.report.chart import Chart, make_subplots
 from autotune.report.figures import axis_title, ratio_title, recording_figure
+from autotune.report.outlook import model_figures, numbers_table, outlook_section
 from autotune.report.page import BLUE, GREEN, GREY, ORANGE, PURPLE, RED, Figure, Page, Section, Table, add_line, thinned
 
 
@@ -54,6 +55,8 @@ def run_page(
     sections = [] if verification is None else [_verification_section(verification, signals)]
     if diagnosis is not None:
         sections.append(_diagnosis_section(diagnosis))
+    if verification is None:
+        sections += outlook_section(tuning.analysis, signals, tuning.old_controller)
     sections += reversed(analysis_sections(tuning.analysis, signals, experiment))
     sections.append(_experiment_section(recordings, experiment, signals))
     sections += _warnings_sections((*experiment.warnings, *tuning.analysis.warnings))
@@ -89,8 +92,11 @@ def analysis_page(
         Figure(figure=recording_figure(recording, signals.u_unit, signals.y_unit), caption=recording.name)
         for recording in recordings
     )
-    first = (Section(title="Recordings", figures=figures),) if figures else ()
+    figures = model_figures(analysis.fit, recordings, signals) or figures
+    tables = (numbers_table(analysis.fit, signals),)
+    first = (Section(title="The plant over the recordings", figures=figures, tables=tables),) if figures else ()
     sections = (
+        *outlook_section(analysis, signals),
         *reversed(analysis_sections(analysis, signals, None)),
         *first,
         *_warnings_sections((*notes, *analysis.warnings)),

@@ -1,0 +1,338 @@
+"""What a controller will do: steps of set-point and load with the band of all plants, slower and faster ones beside it.
+
+And what it rests on: the fitted plant run over the recordings, with its numbers and their intervals.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.signal import lfilter
+
+from autotune.arrays import ComplexArray, FloatArray
+from autotune.config.procedure import SignalSettings
+from autotune.controller import PIDController
+from autotune.design.law import PILaw
+from autotune.design.margins import Margins, margins
+from autotune.design.synthesis import design
+from autotune.errors import AutotuneError
+from autotune.experiment.prediction import Prediction, predict, sampled
+from autotune.identification.parametric import PlantFit
+from autotune.models import TransferFunction
+from autotune.pipeline import Analysis
+from autotune.recording import Recording
+from autotune.report.chart import Chart, make_subplots
+from autotune.report.figures import axis_title, ratio_title
+from autotune.report.page import BLUE, GREY, ORANGE, Figure, Section, Table, add_line, thinned
+
+#: Plants that are drawn from the region.
+DRAWS = 40
+#: Modulus margins of the controllers that are drawn beside the designed one, as far as they are apart from its own.
+FAMILY, APART = (0.4, 0.6, 0.7, 0.8), 0.04
+#: Samples of either step; how long one takes, in times of the crossover's and in T_I, and no less than in dead times.
+_SAMPLES, _CROSSOVERS, _INTEGRALS, _DEAD_TIMES = 500, 14.0, 5.0, 8.0
+#: Overshoot above which a set-point weight is offered, and the weights that are tried.
+OVERSHOOT, WEIGHTS = 0.1, (0.8, 0.6, 0.4, 0.2, 0.0)
+#: A response that leaves this many times the step is of a loop that is not stable: its band ends there.
+_FAR = 20.0
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Member:
+    """A controller of the family with what it is expected to do.
+
+    Attributes
+    ----------
+    name : str
+        For the slider.
+    controller : PIDController
+        Gains.
+    kept : Margins
+        On the fitted plant.
+    worst : float
+        Smallest modulus margin of the plants that were drawn; negative where one is not stable, NaN of none.
+    prediction : Prediction
+        Of a step of the set-point and one of the load.
+    """
+
+    name: str
+    controller: PIDController
+    kept: Margins
+    worst: float
+    prediction: Prediction
+
+
+def outlook_section(
+    analysis: Analysis, signals: SignalSettings, present: PIDController | None = None
+) -> tuple[Section, ...]:
+    """Return the section on what the loop is expected to do; none where the fitted plant's loop is not stable.
+
+    Parameters
+    ----------
+    analysis : Analysis
+        Plant and controller.
+    signals : SignalSettings
+        Units.
+    present : PIDController, optional
+        The gains in use today, drawn beside the new ones.
+    """
+    fit, controller = analysis.fit, analysis.controller
+    if not analysis.margins.stable or not math.isfinite(analysis.margins.crossover_rad_s):
+        return ()
+    plants = fit.draws(DRAWS, np.random.default_rng(0))
+    times, load = _times(analysis, present), abs(controller.K)
+    designed = _member("designed", fit.plant, plants, controller, times, load)
+    family = sorted([designed, *_family(analysis, times, load)], key=lambda member: member.kept.modulus, reverse=True)
+    before = None if present is None else _member("today", fit.plant, plants, present, times, load)
+    return (
+        Section(
+            title="What the loop will do",
+            text=(
+                f"Predicted, not measured: a step of the set-point by {_amount(1.0, signals.y_unit)}, then one of the"
+                f" load by {_amount(load, signals.u_unit)}. The band holds 95 % of {DRAWS} plants drawn from what the"
+                " data leave open.",
+                *_gained(designed, before),
+                *_weighted(designed, fit.plant, times, load),
+            ),
+            tables=(
+                Table(
+                    header=(
+                        "",
+                        ratio_title("K", signals.u_unit, signals.y_unit),
+                        "T_I [s]",
+                        "modulus margin",
+                        "worst drawn plant",
+                        "overshoot",
+                        f"peak under load [{signals.y_unit}]" if signals.y_unit else "peak under load",
+                        "load settled to 5 % [s]",
+                    ),
+                    rows=tuple(_row(one, float(times[1])) for one in (*([before] if before else []), *family)),
+                ),
+            ),
+            figures=(
+                Figure(
+                    figure=_figure(family, designed, before, times, signals),
+                    caption="The slider goes from careful to fast, to controllers of other modulus margins M_m on the"
+                    " fitted plant; the band is that of the designed one, which keeps what was asked on the region.",
+                    height_px=600,
+                ),
+            ),
+        ),
+    )
+
+
+def _amount(value: float, unit: str) -> str:
+    return f"{value:.3g} {unit}".strip()
+
+
+def _times(analysis: Analysis, present: PIDController | None) -> FloatArray:
+    """Return the instants of a prediction [s]: two steps, each long enough to settle."""
+    controller, crossover = analysis.controller, analysis.margins.crossover_rad_s
+    lasts = [_CROSSOVERS / crossover, _DEAD_TIMES * analysis.fit.plant.delay_s]
+    lasts += [_INTEGRALS * c.Ti_s for c in (controller, present) if c is not None and math.isfinite(c.Ti_s)]
+    each = min(max(lasts), 10.0 * max(lasts[0], lasts[1]))
+    return np.linspace(0.0, 2.0 * each, 2 * _SAMPLES, endpoint=False)
+
+
+def _member(
+    name: str, plant: TransferFunction, plants: Sequence[TransferFunction], controller: PIDController, t: FloatArray,
+    load: float,
+) -> Member:  # fmt: skip
+    """Return a controller with its margins and its predicted steps."""
+    law = PILaw(controller=controller, sample_time_s=float(t[1]))
+    disturbance, quiet = np.where(np.arange(t.size) >= _SAMPLES, load, 0.0), np.random.default_rng(0)
+    found = predict(plant, plants or (plant,), law, np.ones(t.size), disturbance, 0.0, quiet, u_rest=0.0)
+    if plants:
+        draws = np.clip(np.nan_to_num(found.y_draws, nan=_FAR), -_FAR, _FAR)
+        low, high = np.quantile(draws, [0.025, 0.975], axis=0)
+        found = replace(found, low=np.minimum(low, found.y), high=np.maximum(high, found.y))
+    each = [margins(one, controller) for one in plants]
+    worst = min((m.modulus if m.stable else -1.0 for m in each), default=math.nan)
+    return Member(name=name, controller=controller, kept=margins(plant, controller), worst=worst, prediction=found)
+
+
+def _gained(designed: Member, before: Member | None) -> tuple[str, ...]:
+    """Return by how much a load's error is smaller than with today's gains, where these hold the plant."""
+    if before is None or not before.kept.stable:
+        return ()
+    now, then = (float(np.sum(np.abs(one.prediction.y[_SAMPLES:] - 1.0))) for one in (designed, before))
+    times = f"{then / now:.2g} times smaller" if then > now else f"{now / then:.2g} times larger"
+    return (f"The integral of the error that a load leaves is {times} than with today's gains.",)
+
+
+def _weighted(designed: Member, plant: TransferFunction, t: FloatArray, load: float) -> tuple[str, ...]:
+    """Return a set-point weight under which the set-point's step overshoots less, where it overshoots much."""
+    if _overshoot(designed.prediction) <= OVERSHOOT or designed.controller.setpoint_weight != 1.0:
+        return ()
+    for weight in WEIGHTS:
+        tried = _member("", plant, (), replace(designed.controller, setpoint_weight=weight), t, load)
+        if _overshoot(tried.prediction) <= OVERSHOOT or weight == WEIGHTS[-1]:
+            before, after = (f"{100.0 * _overshoot(one.prediction):.0f} %" for one in (designed, tried))
+            return (
+                f"With a set-point weight b = {weight:g} the set-point's step overshoots {after} instead of {before};"
+                " what the loop makes of loads stays the same.",
+            )
+    return ()
+
+
+def _overshoot(prediction: Prediction) -> float:
+    """Return the largest excess over a unit step of the set-point."""
+    return max(float(np.max(prediction.y[:_SAMPLES])) - 1.0, 0.0)
+
+
+def _family(analysis: Analysis, times: FloatArray, load: float) -> list[Member]:
+    """Return controllers that keep other modulus margins on the fitted plant, none where there is none."""
+    asked, kind = analysis.design.specification, "pid" if analysis.controller.Td_s > 0.0 else "pi"
+    found = []
+    for modulus in FAMILY:
+        if abs(modulus - analysis.margins.modulus) < APART:
+            continue
+        # a phase margin of 45 deg would keep the faster ones from being faster
+        phase_rad = min(asked.phase_margin_rad, 2.0 * math.asin(0.5 * modulus))
+        other = replace(asked, modulus_margin=modulus, phase_margin_rad=phase_rad)
+        try:
+            controller = design(analysis.fit.plant, other, kind, certificate=False).controller  # type: ignore[arg-type]
+        except AutotuneError:
+            continue
+        found.append(_member(f"M_m {modulus:g}", analysis.fit.plant, (), controller, times, load))
+    return found
+
+
+def _row(member: Member, sample_s: float) -> tuple[str, ...]:
+    """Return a controller's row: gains, margins, overshoot, peak and how long a load takes."""
+    y, c = member.prediction.y, member.controller
+    second = y[_SAMPLES:] - 1.0
+    peak = float(np.max(np.abs(second)))
+    late = np.flatnonzero(np.abs(second) > 0.05 * peak)
+    settled = f"{sample_s * (late[-1] + 1):.3g}" if late.size and late[-1] < second.size - 1 else "not shown"
+    worst = "" if math.isnan(member.worst) else f"{member.worst:.3f}" if member.worst > 0.0 else "not stable"
+    overshoot = f"{100.0 * _overshoot(member.prediction):.0f} %"
+    gains = f"{c.K:.4g}", f"{c.Ti_s:.4g}", f"{member.kept.modulus:.3f}"
+    return (member.name, *gains, worst, overshoot, f"{peak:.3g}", settled)
+
+
+def _figure(
+    family: Sequence[Member], designed: Member, before: Member | None, t: FloatArray, signals: SignalSettings
+) -> Chart:
+    """Draw y over u for the designed controller, with today's beside it, and a slider to the others."""
+    chart = make_subplots(rows=2, shared_xaxes=True, vertical_spacing=0.06, row_heights=[0.64, 0.36])
+    if before is not None:
+        add_line(chart, t, before.prediction.y, "today", GREY, dash="dash", row=1, col=1)
+        add_line(chart, t, before.prediction.u, "today", GREY, dash="dash", row=2, col=1, showlegend=False)
+    band = {"mode": "lines", "line": {"width": 0}, "hoverinfo": "skip", "showlegend": False}
+    low, high = designed.prediction.low, designed.prediction.high
+    chart.add_scatter(x=t, y=low, row=1, col=1, **band)
+    chart.add_scatter(x=t, y=high, fill="tonexty", fillcolor="rgba(59,130,196,0.25)", row=1, col=1, **band)
+    fixed = len(chart.data)
+    for member in family:
+        shown = member is designed
+        add_line(chart, t, member.prediction.y, "y", BLUE, row=1, col=1, visible=shown)
+        add_line(chart, t, member.prediction.u, "u", ORANGE, row=2, col=1, visible=shown)
+    steps = []
+    for i, member in enumerate(family):
+        visible = [True] * fixed + [j // 2 == i for j in range(2 * len(family))]
+        steps.append({"method": "restyle", "args": [{"visible": visible}], "label": member.name})
+    slider = {
+        "active": list(family).index(designed), "steps": steps, "pad": {"t": 64, "b": 4}, "ticklen": 4, "x": 0.02,
+        "len": 0.94, "currentvalue": {"visible": False},
+    }  # fmt: skip
+    chart.update_layout(sliders=[slider] if len(family) > 1 else [])
+    chart.update_yaxes(title=axis_title("change of y", signals.y_unit), row=1, col=1)
+    chart.update_yaxes(title=axis_title("change of u", signals.u_unit), row=2, col=1)
+    chart.update_xaxes(title="time [s]", row=2, col=1)
+    return chart
+
+
+def model_figures(fit: PlantFit, recordings: Sequence[Recording], signals: SignalSettings) -> tuple[Figure, ...]:
+    """Return the recordings with the fitted plant run over them, each with its fit in per cent.
+
+    Parameters
+    ----------
+    fit : PlantFit
+        Plant.
+    recordings : sequence of Recording
+        Any of it; where the plant was fitted to them, that is said.
+    signals : SignalSettings
+        Units.
+
+    Notes
+    -----
+    The operating point and what was under way at the first row are fitted, nothing else is: one free run of the plant
+    under the recorded command. The fit is 100 (1 - |y - simulated| / |y - mean|), the usual figure of identification.
+    """
+    figures = []
+    for recording in recordings:
+        found = _run(fit.plant, recording)
+        if found is None:
+            continue
+        simulated, percent = found
+        chart = make_subplots(rows=2, shared_xaxes=True, vertical_spacing=0.06, row_heights=[0.62, 0.38])
+        add_line(chart, *thinned(recording.t, recording.y), "recorded", BLUE, width=1.0, row=1, col=1)
+        add_line(chart, *thinned(recording.t, simulated), "fitted plant", ORANGE, width=1.6, row=1, col=1)
+        add_line(chart, *thinned(recording.t, recording.u), "u", GREY, width=1.0, row=2, col=1, line_shape="hv")
+        chart.update_yaxes(title=axis_title("y", signals.y_unit), row=1, col=1)
+        chart.update_yaxes(title=axis_title("u", signals.u_unit), row=2, col=1)
+        chart.update_xaxes(title="time [s]", row=2, col=1)
+        own = "the rows that it was fitted to" if fit.source == "recording" else "rows that its points came from"
+        caption = f"{recording.name}: the fitted plant runs freely over {own}, and explains {percent:.0f} % of y."
+        figures.append(Figure(figure=chart, caption=caption))
+    return tuple(figures)
+
+
+def _run(plant: TransferFunction, recording: Recording) -> tuple[FloatArray, float] | None:
+    """Return y of a free run at every row, and its fit in per cent; None of uneven rows, or where it runs away."""
+    steps, y = np.diff(recording.t), recording.y
+    T_s = float(np.median(steps))
+    if y.size < 10 or float(np.max(np.abs(steps - T_s))) > 0.05 * T_s or not np.all(np.isfinite(recording.u)):
+        return None
+    num, den = sampled(plant, T_s)
+    forced = np.asarray(lfilter(num, den, recording.u - recording.u[0]), dtype=np.float64)
+    t = recording.t - recording.t[0]
+    # what was under way at the first row dies away, or goes on, as the plant's own modes; one at 0 is a constant
+    modes: list[FloatArray] = [np.ones(t.size)]
+    for k, pole in enumerate(np.atleast_1d(plant.poles)):
+        mode: ComplexArray = np.exp(np.clip((pole * t).real, -50.0, 50.0)) * np.exp(1j * (pole * t).imag)
+        modes += [mode.real if pole else t**1.0] + ([mode.imag] if pole.imag > 0.0 and k else [])
+    good = np.isfinite(y)
+    columns = np.column_stack(modes)
+    scale = np.linalg.norm(columns[good], axis=0)
+    scale[scale == 0.0] = 1.0
+    if not np.all(np.isfinite(forced)) or not np.any(good):
+        return None
+    x = np.linalg.lstsq(columns[good] / scale, (y - forced)[good], rcond=1e-9)[0]
+    simulated = forced + columns / scale @ x
+    spread = float(np.linalg.norm(y[good] - np.mean(y[good])))
+    return simulated, 100.0 * (1.0 - float(np.linalg.norm((y - simulated)[good])) / (spread or 1.0))
+
+
+def numbers_table(fit: PlantFit, signals: SignalSettings) -> Table:
+    """Return the plant's gain, lags and dead time with the ends of their 95 % intervals."""
+    drawn = [_numbers(plant) for plant in fit.draws(DRAWS * 5, np.random.default_rng(0))]
+    rows = []
+    for i, (name, value) in enumerate(_numbers(fit.plant)):
+        values = [one[i][1] for one in drawn if len(one) > i and one[i][0] == name]
+        told = len(values) > 0.9 * len(drawn) and fit.covariance.any()
+        low, high = np.quantile(values, [0.025, 0.975]) if told else (math.nan, math.nan)
+        rows.append((_titled(name, signals), f"{value:.4g}", f"{low:.4g} to {high:.4g}" if told else "not told"))
+    return Table(header=("fitted plant", "value", "95 %"), rows=tuple(rows))
+
+
+def _titled(name: str, signals: SignalSettings) -> str:
+    if name.startswith("gain"):
+        return ratio_title(name, signals.y_unit, f"{signals.u_unit} s" if "integrator" in name else signals.u_unit)
+    return name
+
+
+def _numbers(plant: TransferFunction) -> list[tuple[str, float]]:
+    """Return a plant's numbers as people know them, lags from the longest."""
+    gain = plant.num[-1] / plant.den[-1 - plant.integrators]
+    named = [("gain of the integrator" if plant.integrators else "gain", float(gain))]
+    poles = [p for p in np.atleast_1d(plant.poles) if p != 0.0 and p.imag >= 0.0]
+    lags = sorted((-1.0 / p.real for p in poles if p.imag == 0.0), key=lambda lag: -lag)
+    named += [(f"lag {i} [s]", float(lag)) for i, lag in enumerate(lags, 1)]
+    for p in (p for p in poles if p.imag > 0.0):
+        named += [("resonance [rad/s]", float(abs(p))), ("damping", float(-p.real / abs(p)))]
+    return [*named, ("dead time [s]", float(plant.delay_s))]
