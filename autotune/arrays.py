@@ -6,7 +6,6 @@ from typing import Any, SupportsFloat, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import solve_triangular
 
 FloatArray: TypeAlias = NDArray[np.float64]
 ComplexArray: TypeAlias = NDArray[np.complex128]
@@ -44,5 +43,5 @@ def deviations_beside_prior(J: FloatArray) -> FloatArray:
     product loses it to rounding where one number says a million times more than another, and may leave it negative.
     """
     R = np.linalg.qr(np.vstack([J, np.eye(J.shape[1])]), mode="r")
-    rows = solve_triangular(R, np.eye(J.shape[1]))
+    rows = np.linalg.solve(R, np.eye(J.shape[1]))  # its factors are I and R: substitution alone
     return np.asarray(np.linalg.norm(rows, axis=1))
