@@ -15,7 +15,8 @@ from autotune.recording import Recording
 
 
 def diagnosed(model: Any, recordings: Sequence[Recording], controller: Controller | None, **settings: Any) -> Any:
-    """Return the diagnosis of recordings."""
+    """Return the diagnosis of recordings, which shows itself as a table."""
+    import autotune.api.shown_diagnosis  # noqa: F401 - it registers the table
     from autotune.diagnosis import diagnose
     from autotune.equations.recorded_units import require_units_of_each_other, require_units_of_model
 

@@ -41,7 +41,7 @@ def _(result: Recording) -> tuple[str, Row, list[Row]]:
     units = result.metadata.get("units", {})
     columns = {"u": result.u, "y": result.y, **result.extra}
     rows = [
-        (name, str(units.get(name, "")), *(_number(f(values)) for f in (np.nanmin, np.nanmean, np.nanmax, np.nanstd)))
+        (name, str(units.get(name, "")), *(number(f(values)) for f in (np.nanmin, np.nanmean, np.nanmax, np.nanstd)))
         for name, values in columns.items()
     ]
     title = (
@@ -56,7 +56,7 @@ def _(result: Points) -> tuple[str, Row, list[Row]]:
     for point in result:
         gain_sd, phase_sd = polar_sd(point)
         phase = f"{math.degrees(point.phase_rad):.2f}", f"{math.degrees(phase_sd):.2g}"
-        rows.append((_number(point.omega_rad_s), _number(point.gain), f"{100 * gain_sd:.2g} %", *phase, point.source))
+        rows.append((number(point.omega_rad_s), number(point.gain), f"{100 * gain_sd:.2g} %", *phase, point.source))
     return f"{len(result)} frequency points", ("rad/s", "gain", "sd", "phase [deg]", "sd [deg]", "source"), [*rows]
 
 
@@ -66,20 +66,20 @@ def _(result: ReducedModel) -> tuple[str, Row, list[Row]]:
     values = [("G_r", result.G_r, result.sd[0]), ("w_d [rad/s]", result.omega_d_rad_s, result.sd[2])]
     if result.omega_0r_rad_s is not None:
         values.insert(1, ("w_0 [rad/s]", result.omega_0r_rad_s, result.sd[1]))
-    rows = [(name, _number(value), _share(sd) if sd else Cell("exact", 0.0)) for name, value, sd in values]
+    rows = [(name, number(value), _share(sd) if sd else Cell("exact", 0.0)) for name, value, sd in values]
     return f"Reduced model {form}", ("", "value", "sd"), [*rows, *((text,) for text in result.warnings)]
 
 
 @rows_of.register
 def _(result: Margins) -> tuple[str, Row, list[Row]]:
     rows = [
-        ("modulus margin", _number(result.modulus), ""),
-        ("phase margin", _number(math.degrees(result.phase_rad)), "deg"),
-        ("delay margin", _number(result.delay_s), "s"),
-        ("gain margin", _number(result.gain), ""),
-        ("crossover", _number(result.crossover_rad_s), "rad/s"),
-        ("noise gain", _number(result.noise_gain), "u/y"),
-        ("H2 norm", _number(result.h2), ""),
+        ("modulus margin", number(result.modulus), ""),
+        ("phase margin", number(math.degrees(result.phase_rad)), "deg"),
+        ("delay margin", number(result.delay_s), "s"),
+        ("gain margin", number(result.gain), ""),
+        ("crossover", number(result.crossover_rad_s), "rad/s"),
+        ("noise gain", number(result.noise_gain), "u/y"),
+        ("H2 norm", number(result.h2), ""),
     ]
     return (
         "Margins" if result.stable else "UNSTABLE: figures of the Nyquist curve, no margins",
@@ -90,9 +90,9 @@ def _(result: Margins) -> tuple[str, Row, list[Row]]:
 
 @rows_of.register
 def _(result: PIDController) -> tuple[str, Row, list[Row]]:
-    rows = [("K", _number(result.K), "u/y"), ("T_I", _number(result.Ti_s), "s")]
+    rows = [("K", number(result.K), "u/y"), ("T_I", number(result.Ti_s), "s")]
     if result.kind == "pid":
-        rows += [("T_D", _number(result.Td_s), "s"), ("T_f", _number(result.Tf_s), "s")]
+        rows += [("T_D", number(result.Td_s), "s"), ("T_f", number(result.Tf_s), "s")]
     return f"{result.kind.upper()} controller", ("", "", "unit"), [*rows]
 
 
@@ -101,7 +101,7 @@ def _(result: Design) -> tuple[str, Row, list[Row]]:
     rows: list[Row] = [*rows_of(result.controller)[2], *rows_of(result.margins)[2]]
     rows.append(("binding", ", ".join(result.binding) or "none", ""))
     if result.h2_lower_bound is not None:
-        rows.append(("least possible H2", _number(result.h2_lower_bound), ""))
+        rows.append(("least possible H2", number(result.h2_lower_bound), ""))
     if UNCERTAIN in result.certificate:
         rows.append((result.certificate[result.certificate.index(UNCERTAIN) :],))
     return f"Design: {result.kind.upper()}", ("", "", "unit"), [*rows]
@@ -110,10 +110,10 @@ def _(result: Design) -> tuple[str, Row, list[Row]]:
 @rows_of.register
 def _(result: Validation) -> tuple[str, Row, list[Row]]:
     rows = [
-        ("nu-gap of plant and model", _number(result.nu_gap)),
-        ("b with the model", _number(result.b_reduced)),
-        ("b with the plant", _number(result.b_rig)),
-        ("scaling k", _number(result.scaling)),
+        ("nu-gap of plant and model", number(result.nu_gap)),
+        ("b with the model", number(result.b_reduced)),
+        ("b with the plant", number(result.b_rig)),
+        ("scaling k", number(result.scaling)),
     ]
     return f"Criterion (10) {'holds' if result.holds else 'does not hold'}", ("", ""), [*rows]
 
@@ -124,21 +124,21 @@ def _(result: DelayModel) -> tuple[str, Row, list[Row]]:
     names = [*(f"a{i}" for i in range(n)), "b", "delay [s]", "constant"]
     # what a method estimates without a standard deviation has 0 or NaN there, which is none
     known = zip(names, result.values, sd, strict=False)
-    rows = [(name, _number(v), _number(s) if s > 0.0 else "") for name, v, s in known]
-    rows.append(("noise sd", _number(result.noise_sd), ""))
+    rows = [(name, number(v), number(s) if s > 0.0 else "") for name, v, s in known]
+    rows.append(("noise sd", number(result.noise_sd), ""))
     return f"x^({n}) = sum a_i x^(i) + b u(t - h)", ("", "value", "sd"), [*rows]
 
 
 @rows_of.register
 def _(result: TwoDelays) -> tuple[str, Row, list[Row]]:
     names, sds = ("a", "b", "h1 [s]", "h2 [s]"), result.standard_deviations
-    rows = [(name, _number(v), _number(s)) for name, v, s in zip(names, result.values, sds, strict=True)]
+    rows = [(name, number(v), number(s)) for name, v, s in zip(names, result.values, sds, strict=True)]
     return "x'' + a x(t - h1) = b u(t - h2)", ("", "value", "sd"), [*rows]
 
 
 @rows_of.register
 def _(result: InnovationModel) -> tuple[str, Row, list[Row]]:
-    rows = [(_pole(pole), _number(abs(pole))) for pole in result.poles]
+    rows = [(_pole(pole), number(abs(pole))) for pole in result.poles]
     return (
         f"State space of order {result.order}, sample time {result.sample_time_s:g} s",
         ("pole", "magnitude"),
@@ -151,7 +151,7 @@ def _(result: ClosedLoopIdentification) -> tuple[str, Row, list[Row]]:
     rows = []
     for pole, covariance in zip(result.poles, result.pole_covariance, strict=True):
         sd = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-        rows.append((_pole(pole), _number(sd[0]), _number(sd[1]) if pole.imag else ""))
+        rows.append((_pole(pole), number(sd[0]), number(sd[1]) if pole.imag else ""))
     said = dict.fromkeys((result.excitation.sentence, *result.warnings))
     title = f"Plant of order {result.estimate.model.order} from its loop"
     return title, ("pole", "sd (real)", "sd (imaginary)"), [*rows, *((text,) for text in said)]
@@ -164,7 +164,7 @@ def _(result: TransferFunction | DiscreteController) -> tuple[str, Row, list[Row
     order = "descending" if s == "s" else "ascending"
     rows = [("num", _numbers(result.num)), ("den", _numbers(result.den))]
     if isinstance(result, TransferFunction) and result.delay_s:
-        rows.append(("dead time [s]", _number(result.delay_s)))
+        rows.append(("dead time [s]", number(result.delay_s)))
     return f"Transfer function, {order} powers of {s}", ("", ""), [*rows]
 
 
@@ -176,14 +176,14 @@ def _(result: RST) -> tuple[str, Row, list[Row]]:
 
 @rows_of.register
 def _(result: Trajectory) -> tuple[str, Row, list[Row]]:
-    rows = [("duration [s]", _number(result.duration_s)), ("decided by", result.binding)]
+    rows = [("duration [s]", number(result.duration_s)), ("decided by", result.binding)]
     return f"Transition from {result.y[0]:.4g} to {result.y[-1]:.4g}", ("", ""), [*rows]
 
 
 @rows_of.register
 def _(result: Model) -> tuple[str, Row, list[Row]]:
     rows = [(block.name, block.place, *rows_of(block.dynamics)[2][0][1:], *rows_of(block.dynamics)[2][1][1:],
-             _number(block.dynamics.delay_s)) for block in result.blocks]  # fmt: skip
+             number(block.dynamics.delay_s)) for block in result.blocks]  # fmt: skip
     return f"Model {result.name}", ("block", "place", "num", "den", "delay [s]"), [*rows]
 
 
@@ -242,12 +242,13 @@ def _pole(pole: complex) -> Cell:
     return Cell(f"{pole.real:.5g} {pole.imag:+.5g}i" if pole.imag else f"{pole.real:.5g}", complex(pole))
 
 
-def _number(value: Any) -> Cell:
+def number(value: Any) -> Cell:
+    """Return a number as a table shows it."""
     return Cell(f"{float(value):.5g}", float(value))
 
 
 def _numbers(values: Sequence[float]) -> Cell:
-    return Cell(", ".join(map(_number, values)), tuple(map(float, values)))
+    return Cell(", ".join(map(number, values)), tuple(map(float, values)))
 
 
 def _share(value: float) -> Cell:
@@ -293,7 +294,7 @@ def to_pandas(result: Any) -> Any:
     if isinstance(result, Trajectory):
         return pd.DataFrame({"y": result.y, "u": result.u}, index=pd.Index(result.t_s, name="t"))
     points = result if isinstance(result, Points) else None
-    if points is None and not isinstance(result, SHOWN):
+    if points is None and rows_of.dispatch(type(result)) is rows_of.dispatch(object):  # it has no table of its own
         points = as_points(result)
     if points is not None:
         sds = [polar_sd(point) for point in points]

@@ -114,6 +114,18 @@ class ChainEvidence(Evidence):
         return "" if self.own is None else self.own.sentence
 
     @property
+    def unsaid(self) -> str:
+        """What the model does not say of itself, so that some effects were not looked for."""
+        model, chain = self.model, self.search.retuned.fit.sim.chain
+        told = model.output.unit or any(b.output or b.unit for b in model.blocks)
+        if told or chain.is_mechanical or not any(len(b.dynamics.den) == 2 for b in model.blocks):
+            return ""
+        return (
+            'The model does not say what y is. If it is a speed, output = "speed" in its block lets dry friction and'
+            " drag be looked for."
+        )
+
+    @property
     def numbers(self) -> float:
         """Decrease of chi-square that retuning brings beside the nominal numbers."""
         if self.own is not None:

@@ -112,6 +112,7 @@ def _diagnosis(
     if handed_out is not wanted and verdict != "unexplained":
         withheld = WITHHELD[handed_out is evidence.model]
     first, *rest = (columns,) if columns else sentences_of(verdict, effects, evidence, places, said)
+    unsaid = evidence.unsaid if verdict in ("effect", "unexplained") and not columns else ""
     return Diagnosis(
         verdict=verdict,
         effects=effects,
@@ -119,7 +120,7 @@ def _diagnosis(
         places=places,
         fit=evidence.quality,
         extended_model=handed_out,
-        sentences=(first, withheld, *rest) if withheld else (first, *rest),
+        sentences=(first, *(one for one in (unsaid, withheld) if one), *rest),
         is_clean=evidence.is_clean,
         residual=evidence.residual,
         search=evidence.result,

@@ -198,6 +198,11 @@ class Evidence(ABC):
         """What is said of a residual that is noise of its own colour."""
         return ""
 
+    @property
+    def unsaid(self) -> str:
+        """What the model does not say of itself, so that some effects were not looked for."""
+        return ""
+
     @cached_property
     def facts(self) -> frozenset[str]:
         """What holds, in the words of the table."""
