@@ -26,6 +26,10 @@ Tone: TypeAlias = Literal["good", "warn", "bad"]
 BLUE, ORANGE, GREEN, RED, GREY, PURPLE = "#3b82c4", "#d98200", "#0d9a72", "#d1495b", "#8a8a8a", "#a467b0"
 
 
+#: Rows of a table from which on it can be sorted and filtered.
+_MANY = 12
+
+
 @dataclass(frozen=True, kw_only=True)
 class Picture:
     """A curve as small as a word, for a cell of a table.
@@ -180,7 +184,8 @@ def write_page(page: Page, path: str | os.PathLike[str]) -> None:
         body.append(_section(section, i))
     drawn = any(section.figures for section in page.sections)
     charts = _CHARTS.replace("@PLOTLY@", _plotly()) if drawn else ""
-    parts = {"TITLE": _text(page.title), "BODY": "\n".join(body), "CHARTS": charts}
+    tables = _TABLES if any("class=many" in part for part in body) else ""
+    parts = {"TITLE": _text(page.title), "BODY": "\n".join(body), "CHARTS": tables + charts}
     # in one pass: what a part says is never looked at for the name of another
     write_whole(path, re.sub("@(TITLE|BODY|CHARTS)@", lambda found: parts[found[1]], _SHELL))
 
@@ -214,10 +219,14 @@ def _section(section: Section, number: int) -> str:
 
 
 def _table(table: Table) -> str:
-    head = "".join(f'<th scope="col">{_text(cell)}</th>' for cell in table.header)
+    many = len(table.rows) > _MANY
+    cells = (f"<button type='button'>{_text(cell)}</button>" if many else _text(cell) for cell in table.header)
+    head = "".join(f'<th scope="col">{cell}</th>' for cell in cells)
     rows = "".join("<tr>" + "".join(f"<td>{_cell(cell)}</td>" for cell in row) + "</tr>" for row in table.rows)
     caption = f'<p class="caption">{_text(table.caption)}</p>' if table.caption else ""
-    return f'{caption}<div class="wide"><table><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table></div>'
+    sought = '<input type="search" class="sought" placeholder="Filter rows" aria-label="Filter rows">' if many else ""
+    drawn = f"<table{' class=many' * many}><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table>"
+    return f'{caption}{sought}<div class="wide">{drawn}</div>'
 
 
 def _cell(cell: str | Picture) -> str:
@@ -315,7 +324,12 @@ a { color: inherit; }
 table { border-collapse: collapse; font-variant-numeric: tabular-nums; font-size: 0.93rem; }
 .caption { color: var(--faint); font-size: 0.93rem; margin-top: 1.2rem; }
 th, td { text-align: left; padding: 0.3rem 0.9rem 0.3rem 0; border-bottom: 1px solid var(--line); vertical-align: top; }
-th { font-weight: 600; }
+th { font-weight: 600; } th button { all: unset; cursor: pointer; }
+th button:focus-visible { outline: 2px solid var(--faint); }
+th[aria-sort="ascending"] button::after { content: " \\2191"; }
+th[aria-sort="descending"] button::after { content: " \\2193"; }
+.sought { font: inherit; padding: 0.25rem 0.6rem; margin-top: 0.6rem; width: min(100%, 22rem); }
+@media print { .sought { display: none; } }
 .answers { display: grid; gap: 0.8rem; margin: 1rem 0; }
 .answers { grid-template-columns: repeat(auto-fit, minmax(min(17rem, 100%), 1fr)); }
 .answers div { background: var(--card); padding: 0.6rem 0.9rem; border-radius: 6px; }
@@ -341,6 +355,27 @@ figure { margin: 1.1rem 0 1.6rem; } figcaption { color: var(--faint); font-size:
 @BODY@
 </main>
 @CHARTS@</body></html>
+"""
+
+_TABLES = """<script>
+const value = (row, at) => row.cells[at].textContent.trim();
+for (const table of document.querySelectorAll("table.many")) {
+  const body = table.tBodies[0], heads = [...table.tHead.rows[0].cells];
+  heads.forEach((head, at) => head.firstChild.addEventListener("click", () => {
+    const up = head.getAttribute("aria-sort") !== "ascending";
+    heads.forEach(one => one.removeAttribute("aria-sort"));
+    head.setAttribute("aria-sort", up ? "ascending" : "descending");
+    const rows = [...body.rows].map(row => [value(row, at), parseFloat(value(row, at)), row]);
+    const order = ([a, x], [b, y]) => isNaN(x) || isNaN(y) ? isNaN(x) - isNaN(y) || a.localeCompare(b) : x - y;
+    rows.sort((a, b) => up ? order(a, b) : order(b, a));
+    body.append(...rows.map(([, , row]) => row));
+  }));
+  table.parentElement.previousElementSibling.addEventListener("input", event => {
+    const words = event.target.value.toLowerCase().split(/\\s+/);
+    for (const row of body.rows) row.hidden = !words.every(word => row.textContent.toLowerCase().includes(word));
+  });
+}
+</script>
 """
 
 _CHARTS = """<noscript><p>The charts need JavaScript, all of which is in this file; no request is sent.</p></noscript>

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from autotune.report.chart import Chart, Scatter, make_subplots
 from autotune.report.figures import phase_axis
-from autotune.report.page import Figure, Page, Section, add_line, lines_figure, write_page
+from autotune.report.page import Figure, Page, Section, Table, add_line, lines_figure, write_page
 
 
 def test_a_trace_lands_on_the_axes_of_its_row_and_column():
@@ -83,6 +83,30 @@ def test_every_chart_is_drawn_without_a_request(tmp_path):
         browser.close()
     assert wrong == []
     assert [url for url in asked if not url.startswith(("file:", "blob:", "data:"))] == []
+
+
+@pytest.mark.system("chromium")
+def test_a_long_table_is_sorted_by_its_numbers_and_filtered_by_words(tmp_path):
+    playwright = pytest.importorskip("playwright.sync_api")
+    rows = tuple((f"LIC{i:03d}", f"{10.0 ** (i % 5 - 2):g}", "oven" if i % 3 else "tank") for i in range(30))
+    table = Table(header=("loop", "K", "area"), rows=(*rows, ("LIC999", "not designed", "tank")))
+    path, wrong = tmp_path / "page.html", []
+    write_page(Page(title="t", verdict="v", tone="good", sections=(Section(title="s", tables=(table,)),)), path)
+    with playwright.sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=shutil.which("chromium"), args=["--no-sandbox"])
+        opened = browser.new_page()
+        opened.on("pageerror", lambda error: wrong.append(str(error)))
+        opened.goto(path.as_uri())
+        opened.get_by_role("button", name="K").click()
+        shown = opened.locator("tbody tr td:nth-child(2)").all_text_contents()
+        assert [float(one) for one in shown[:-1]] == sorted(float(one) for one in shown[:-1])
+        assert shown[-1] == "not designed"
+        opened.get_by_role("button", name="K").click()
+        assert opened.locator("tbody tr td:nth-child(2)").all_text_contents()[1] == "100"
+        opened.get_by_role("searchbox").fill("tank lic0")
+        assert opened.locator("tbody tr:visible").count() == 10
+        browser.close()
+    assert wrong == []
 
 
 @given(delay_deg=st.floats(0.0, 20000.0), lowest=st.floats(-400.0, -5.0))
