@@ -107,6 +107,11 @@ class GainRegisterRig(RegisterRig):
         return f"{' and '.join(lacking)} {'is' if len(lacking) == 1 else 'are'} not mapped" if lacking else ""
 
     @property
+    def guards_trial(self) -> bool:
+        """Whether the device takes its safe output where the host falls silent while its controller is on trial."""
+        return "trial" in self._codecs
+
+    @property
     def takes_load(self) -> bool:
         """Whether a load can be added to the output of the device's own controller."""
         return "load" in self._codecs
@@ -140,10 +145,10 @@ class GainRegisterRig(RegisterRig):
             remedy = " and ".join(f"rig.registers.{name}" for name in _TRIAL)
             raise InputError(self.not_startable, where=self._link.where, remedy=f"map {remedy}")
         self._require(self._is_commanding, "the host is not in command", "open the rig first")
-        self._release(setpoint)
+        self._release(setpoint, on_trial=True)
         self._trial_setpoint = setpoint
         self._is_commanding, self._released_s = False, self._clock.now()
-        asked = {"automatic": 1.0, "setpoint": self._held("setpoint", setpoint), "load": 0.0}
+        asked = {"automatic": 1.0, "trial": 1.0, "setpoint": self._held("setpoint", setpoint), "load": 0.0}
         # a device that refuses to say what it was asked for is not looked at
         self._asked = {
             name: value

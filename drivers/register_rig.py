@@ -148,9 +148,10 @@ class RegisterRig:
             self._heart.begin()
             reading, values = self._sample()
             self._check_permissives(values)
-            held = self._read(("enable", "automatic"))
+            held = self._read(("enable", "automatic", "trial"))
             self._refuse_other_master(held | values)
-            runs = held.get("automatic") == 1.0
+            on_trial = held.get("trial") == 1.0  # a session that was killed left it: nobody's controller to go back to
+            runs = held.get("automatic") == 1.0 and not on_trial
             setpoint = self._read(("setpoint",)).get("setpoint", math.nan) if runs else math.nan
         except LinkError as error:
             self.close()
@@ -159,8 +160,10 @@ class RegisterRig:
         self._opened_s, self._looks_s, self._trial_setpoint = self._clock.now(), math.inf, math.nan
         self._foreign.clear()
         self._is_taken = True
-        if held.get("enable", 0.0) != 0.0:  # a session that was killed left it; a device's trip clears on its edge
-            self._put("enable", 0.0)
+        left = [name for name in ("enable", "trial") if held.get(name, 0.0) != 0.0]
+        if left:  # by a session that was killed; a device's trip clears on its edge
+            for name in (["automatic"] if on_trial else []) + left:
+                self._put(name, 0.0)
             self._clock.sleep_until(self._clock.now() + 2.0 * self._scan_s)
             reading, _ = self._sample()
         taken = reading.u_applied
@@ -261,7 +264,7 @@ class RegisterRig:
         self._require(
             (self._is_commanding or self._is_released) and former is not None, "no controller had the actuator", ""
         )
-        self._release(former.setpoint if former is not None else math.nan)
+        self._release(former.setpoint if former is not None else math.nan, on_trial=False)
         self._await_command(0.0)
         self._is_commanding, self._released_s = False, math.nan
         held = self._read(("automatic",))
@@ -283,12 +286,14 @@ class RegisterRig:
         """Whether that controller was given the actuator so lately that its program may not know it yet."""
         return self._clock.now() - self._released_s < max(_TAKE_S, self._late_s)
 
-    def _release(self, setpoint: float) -> None:
+    def _release(self, setpoint: float, *, on_trial: bool) -> None:
         """Let the device's own controller have the actuator, without a load; NaN leaves its set-point."""
         if "load" in self._codecs:
             self._put("load", 0.0)
         if math.isfinite(setpoint):
             self._put("setpoint", setpoint)
+        if "trial" in self._codecs:
+            self._put("trial", float(on_trial))
         self._put("automatic", 1.0)
         if "enable" in self._codecs:
             self._put("enable", 0.0)
@@ -307,7 +312,7 @@ class RegisterRig:
         self._is_commanding, self._released_s = False, math.nan
         self._u = self._u_safe
         self._write(self._first_blocks)  # a device that restarted has forgotten its safe output
-        for name in ("automatic", "enable", "load"):
+        for name in ("automatic", "enable", "load", "trial"):
             if name in self._codecs:
                 self._put(name, 0.0)
         if math.isfinite(self._trial_setpoint):  # whoever puts it in automatic next finds the operating point
@@ -328,7 +333,7 @@ class RegisterRig:
 
     def _refuse_other_master(self, shown: Mapping[str, float]) -> None:
         """Watch for a moving heartbeat where the device says, or may not say, that somebody commands it."""
-        told = [shown[name] for name in ("enable", "in_command") if name in shown]
+        told = [shown[name] for name in ("enable", "in_command", "trial") if name in shown]
         if "heartbeat" not in self._codecs or (told and not any(told)):
             return
         start_s = self._clock.now()

@@ -3,8 +3,9 @@
 Who moves the actuator::
 
     host         while ``enable`` is 1 (where it is not mapped: from the first command on); ``u`` is the output.
-    nobody       the dead-man ran out: the safe output; ``enable`` falls to 0 and has to be set again.
     controller   ``enable`` is 0 and ``automatic`` is 1: the device's PI, u = K (1 + 1/(Ti s)) (setpoint - y).
+    nobody       the dead-man ran out while the host moved it, or the controller while ``trial`` is 1: the safe output;
+                 ``enable`` and ``automatic`` fall to 0 and have to be set again.
     nobody       both are 0: the safe output; before the first command the output that the plant came with.
 """
 
@@ -58,7 +59,7 @@ class RegisterDevice:
         What it moves and measures.
     registers : mapping of str to RegisterSpec
         Signals ``y``, ``u`` and any of ``u_applied``, ``device_time``, ``heartbeat``, ``heartbeat_echo``, ``enable``,
-        ``in_command``, ``safe``, ``automatic``, ``setpoint``, ``load``, ``K``, ``Ti``, ``Td``, ``Tf``,
+        ``in_command``, ``safe``, ``automatic``, ``trial``, ``setpoint``, ``load``, ``K``, ``Ti``, ``Td``, ``Tf``,
         ``unlock``; others are held as they are written.
     u_safe : float
         Safe output until the host writes another [u unit].
@@ -110,6 +111,7 @@ class RegisterDevice:
             "heartbeat": 0.0,
             "enable": 0.0,
             "automatic": 0.0,
+            "trial": 0.0,
             "setpoint": 0.0,
             "load": 0.0,
             "K": gains[0],
@@ -155,7 +157,7 @@ class RegisterDevice:
         """Let the plant live until the device time ``now_s`` [s], through dead-man and controller ticks on the way."""
         while self._now_s < now_s:
             events = [now_s]
-            if self._by_host:
+            if self._is_watched:
                 events.append(self._fed_s + self.deadman_s)
             if self._is_automatic:
                 events.append(self._tick_s)
@@ -163,7 +165,7 @@ class RegisterDevice:
             if until > self._now_s:
                 self.plant.advance(self._output, until - self._now_s)
                 self._now_s = until
-            if self._by_host and until >= self._fed_s + self.deadman_s:
+            if self._is_watched and until >= self._fed_s + self.deadman_s:
                 self._release("dead-man")
             elif self._is_automatic and until >= self._tick_s:
                 self._control()
@@ -216,6 +218,11 @@ class RegisterDevice:
     def _is_automatic(self) -> bool:
         return not self._by_host and self._values["automatic"] == 1.0
 
+    @property
+    def _is_watched(self) -> bool:
+        """Whether the dead-man ends what moves the actuator."""
+        return self._by_host or (self._is_automatic and self._values["trial"] == 1.0)
+
     def _places(self, table: Table, address: int, count: int) -> list[tuple[Table, int]]:
         wanted = [(table, address + i) for i in range(count)]
         if not all(place in self._at for place in wanted):
@@ -257,6 +264,8 @@ class RegisterDevice:
                     self._fed_s = self._now_s
                 if self._by_host or "enable" not in self.registers:
                     self._command()
+            case "trial" if value == 1.0:
+                self._fed_s = self._now_s
             case "enable" if value == 1.0:
                 self._fed_s = self._now_s
                 self._command()

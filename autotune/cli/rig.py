@@ -179,6 +179,7 @@ def _expected(config: Config) -> dict[str, tuple[float, float]]:
         "in_command": bit,
         "enable": bit,
         "automatic": bit,
+        "trial": bit,
         "device_time": (0.0, 1e9),
         "Ti": (0.0, 1e6),
     }

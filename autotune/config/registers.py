@@ -17,7 +17,7 @@ RegisterType = Literal["int16", "uint16", "int32", "uint32", "int64", "uint64", 
 _BIT_TABLES = ("coil", "discrete")
 _WIDTH = {"int32": 2, "uint32": 2, "float32": 2, "int64": 4, "uint64": 4, "float64": 4}
 #: signals that are true or false
-LOGICAL = ("enable", "in_command", "automatic")
+LOGICAL = ("enable", "in_command", "automatic", "trial")
 
 
 class RegisterSettings(Section):
@@ -210,6 +210,9 @@ class RegisterMap(Section):
     in_command: RegisterSettings | None = _signal("1 while the device lets the host's command act; place it next to y")
     safe: RegisterSettings | None = _signal("output that the device sets when the host falls silent [u unit]")
     automatic: RegisterSettings | None = _signal("1 while the device's own controller may run")
+    trial: RegisterSettings | None = _signal(
+        "1 while its gains are on trial: where the heartbeat stands still, the device is safe in automatic too"
+    )
     setpoint: RegisterSettings | None = _signal("set-point of the device's own controller [y unit]")
     load: RegisterSettings | None = _signal(
         "added to the output of the device's own controller, for a load step of its verification [u unit]"
@@ -265,6 +268,8 @@ class RegisterMap(Section):
             raise ValueError("gains are mapped twice: give K, Ti, Td, Tf or [rig.registers.gains]")
         if self.heartbeat_echo is not None and self.heartbeat is None:
             raise ValueError("heartbeat_echo needs heartbeat")
+        if self.trial is not None and (self.heartbeat is None or self.automatic is None):
+            raise ValueError("trial needs heartbeat and automatic")
         if self.unlock is not None and not self.unlock.writable:
             raise ValueError(f"unlock is written by the host, so it cannot lie in table {self.unlock.table!r}")
         # the echo may be the heartbeat's own register, read back

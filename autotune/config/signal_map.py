@@ -77,6 +77,7 @@ class SignalMap(Section, Generic[One]):
     in_command: One | None = _signal("true while the device lets the host's command act")
     safe: One | None = _signal("output that the device sets when the host falls silent [u unit]")
     automatic: One | None = _signal("true while the device's own controller may run")
+    trial: One | None = _signal("true while gains are on trial: the heartbeat is watched in automatic too")
     setpoint: One | None = _signal("set-point of the device's own controller [y unit]")
     load: One | None = _signal("added to the output of the device's own controller [u unit]")
     K: One | None = _signal("proportional gain of the device's own controller [u unit/y unit]")

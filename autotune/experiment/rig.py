@@ -237,6 +237,11 @@ class RunsOwnController(HoldsGains, Protocol):
         ...
 
     @property
+    def guards_trial(self) -> bool:
+        """Whether the rig takes its safe output where the host falls silent while that controller is on trial."""
+        ...
+
+    @property
     def takes_load(self) -> bool:
         """Whether a load can be added to the output of the rig's own controller."""
         ...

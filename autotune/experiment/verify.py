@@ -35,8 +35,9 @@ from autotune.experiment.step_test import StepTest, plan_test
 from autotune.identification.parametric import PlantFit
 from autotune.recording import RecordingWriter
 
-#: What is said while the device regulates: no host takes the gains on trial back over a line that is gone.
-_OWN_STEPS = "steps of the device's own controller: stay at the rig, it goes on by itself if the line fails"
+#: What is said while the device regulates, and where no host takes gains on trial back over a line that is gone.
+_OWN_STEPS = "steps of the device's own controller"
+_UNGUARDED = ": stay at the rig, it goes on by itself if the line fails"
 
 
 def run_test(
@@ -192,7 +193,8 @@ def run_verification(
             y, u = run_test(loop, law, test, y_rest, known.midpoint, on_status)
         else:
             _hold(loop, known.midpoint)
-            tell = _teller(loop, test.settle + test.t.size, _OWN_STEPS, on_status)
+            said = _OWN_STEPS + ("" if own.guards_trial else _UNGUARDED)
+            tell = _teller(loop, test.settle + test.t.size, said, on_status)
             asked = test if own.takes_load else test.without_load()
             trial = try_own_law(loop, own, controller, asked, y_rest, tell)
     noise_sd = known.noise_sd if noise_sd is None else noise_sd

@@ -18,8 +18,8 @@ import struct
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -98,18 +98,30 @@ def _for_a_while(tamper: Tamper, seconds: float) -> Callable[[TcpRelay], None]:
     return strike
 
 
-def _of_another_master(line: TcpRelay, *, address: int, value: float | bool) -> None:
-    """Write a register, or a coil where the value is a yes or no, a second after the device's own law has begun."""
+@contextmanager
+def _own_law(line: TcpRelay) -> Iterator[ModbusClient]:
+    """Yield another master a second after the device's own law has begun."""
     other = ModbusClient(host="127.0.0.1", port=line.port, auto_open=True)
     until_s = time.monotonic() + TRIAL_S
     while other.read_coils(1, 1) != [True] and time.monotonic() < until_s:
         time.sleep(0.1)
     time.sleep(1.0)
-    if isinstance(value, bool):
-        assert other.write_single_coil(address, value)
-    else:
-        assert other.write_multiple_registers(address, list(struct.unpack(">2H", struct.pack(">f", value))))
+    yield other
     other.close()
+
+
+def _of_another_master(line: TcpRelay, *, address: int, value: float | bool) -> None:
+    """Write a register, or a coil where the value is a yes or no, while the device's own law runs."""
+    with _own_law(line) as other:
+        if isinstance(value, bool):
+            assert other.write_single_coil(address, value)
+        else:
+            assert other.write_multiple_registers(address, list(struct.unpack(">2H", struct.pack(">f", value))))
+
+
+def _while_it_regulates(tamper: Tamper, line: TcpRelay) -> None:
+    with _own_law(line):
+        line.tamper = tamper
 
 
 def _silent(frame: bytes, direction: Direction) -> Sequence[tuple[float, bytes]]:
@@ -152,6 +164,9 @@ FAULTS = (
     Fault("answers too late for good", "ideal", "no answer|link too slow", strike=_for_a_while(_late, math.inf)),
     Fault("silent for good", "ideal", "no answer", strike=_for_a_while(_silent, math.inf)),
     Fault("fails for good", "ideal", "failed to do it", strike=_for_a_while(refuses(4), math.inf)),
+    Fault("too late on trial", "ideal", "no answer|link too slow", strike=partial(_while_it_regulates, _late)),
+    Fault("silent on trial", "ideal", "no answer", strike=partial(_while_it_regulates, _silent)),
+    Fault("fails on trial", "ideal", "failed to do it", strike=partial(_while_it_regulates, refuses(4))),
 )
 
 

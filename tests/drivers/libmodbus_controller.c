@@ -8,9 +8,9 @@
  * who moves it (0 nobody, 1 host, 2 own), heartbeat.
  *
  * Input registers: 0-1 y, 2-3 output, 4 last heartbeat, 5 whether the host commands. Holding registers: 0-1 u, 2
- * heartbeat, 3-4 safe output, 10-11 K, 12-13 T_I in s, 14-15 set-point, 16-17 load. Coils: 0 host commands, 1 automatic.
- * Floats have their high word first. Without a new heartbeat for DEADMAN seconds, half a one if not
- * given, the host loses the output.
+ * heartbeat, 3-4 safe output, 10-11 K, 12-13 T_I in s, 14-15 set-point, 16-17 load. Coils: 0 host commands, 1 automatic,
+ * 2 trial. Floats have their high word first. Without a new heartbeat for DEADMAN seconds, half a one if not
+ * given, the host loses the output, and so does its own law while a trial is on.
  */
 #include <errno.h>
 #include <arpa/inet.h>
@@ -77,10 +77,11 @@ static void scan(modbus_mapping_t *memory, const char *law, double t)
     if (strcmp(law, "reversed") == 0)
         K = -K, slope = -slope;
 
-    if (held[2] != beat || !memory->tab_bits[0])
+    int watched = memory->tab_bits[0] || memory->tab_bits[2];
+    if (held[2] != beat || !watched)
         beat = held[2], fed = t;
-    if (memory->tab_bits[0] && t - fed > deadman)
-        memory->tab_bits[0] = 0;
+    if (watched && t - fed > deadman)
+        memory->tab_bits[0] = memory->tab_bits[1] = 0;
     int next = memory->tab_bits[0] ? HOST : memory->tab_bits[1] ? OWN : IDLE;
     if (next == OWN && mode != OWN)
         integral = output - K * e; /* without a bump */

@@ -26,8 +26,9 @@ _NODES = {
     "y": ("Double", "Y", False), "u_applied": ("Double", "U", False), "heartbeat_echo": ("UInt16", "HEARTBEAT", False),
     "in_command": ("Boolean", "IN_COMMAND", False), "u": ("Double", "U_HOST", True),
     "heartbeat": ("UInt16", "HEARTBEAT", True), "enable": ("Boolean", "ENABLE", True),
-    "automatic": ("Boolean", "AUTOMATIC", True), "safe": ("Double", "U_SAFE", True),
-    "setpoint": ("Double", "SETPOINT", True), "K": ("Double", "K", True), "Ti": ("Double", "TI", True),
+    "automatic": ("Boolean", "AUTOMATIC", True), "trial": ("Boolean", "TRIAL", True),
+    "safe": ("Double", "U_SAFE", True), "setpoint": ("Double", "SETPOINT", True), "K": ("Double", "K", True),
+    "Ti": ("Double", "TI", True),
 }  # fmt: skip
 
 

@@ -67,7 +67,7 @@ class ScannedPlc:
         self._shown: dict[str, list[int]] = {}
         self._tick = 0
         self._scanned = threading.Condition()
-        self._written = {f"MW{i}": 1 for i in (0, 3, 4)} | {f"MD{i}": 2 for i in range(2, 7)}
+        self._written = {f"MW{i}": 1 for i in (0, 3, 4, 5)} | {f"MD{i}": 2 for i in range(2, 7)}
 
     def __enter__(self) -> ScannedPlc:
         self._server.start()

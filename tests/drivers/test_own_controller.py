@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import subprocess
 from collections.abc import Iterator, Mapping
@@ -16,7 +17,7 @@ import tomli_w
 from autotune.config import Config, load_config
 from autotune.config.registers import RegisterMap
 from autotune.controller import PIDController
-from autotune.errors import AutotuneError, ExperimentStopped
+from autotune.errors import AutotuneError, ExperimentStopped, LinkError, NotTaken
 from autotune.experiment.judgement import Verification
 from autotune.experiment.run import run_experiment
 from autotune.experiment.verify import run_verification
@@ -25,12 +26,13 @@ from autotune.pipeline.deployment import deploy
 from autotune.recording import read_recording
 from autotune.report.run_page import verification_page
 from drivers import open_rig
+from drivers.gain_rig import GainRegisterRig
 from sim.plant import make_plant
 from tests.autotune.experiment.test_verify import CONFIG as BALL
 from tests.autotune.experiment.test_verify import FIT as BALL_FIT
 from tests.autotune.experiment.test_verify import PI, fitted
 from tests.drivers.bench import tcp_settings
-from tests.drivers.virtual_device import virtual_rig
+from tests.drivers.virtual_device import DirectLink, virtual_rig
 
 #: the ball's, and a register for the load
 REGISTERS: dict[str, Any] = {
@@ -43,6 +45,7 @@ REGISTERS: dict[str, Any] = {
     "safe": {"address": 3, "type": "uint16", "scale": 1e-3},
     "enable": {"table": "coil", "address": 0},
     "automatic": {"table": "coil", "address": 1},
+    "trial": {"table": "coil", "address": 2},
     "K": {"address": 10, "type": "float32", "word_order": "little"},
     "Ti": {"address": 12, "type": "uint32", "scale": 1e-3},
     "setpoint": {"address": 14, "type": "int16", "scale": 1e-3},
@@ -81,6 +84,83 @@ def test_the_devices_own_law_is_what_is_verified(tmp_path: Path) -> None:
     assert device.output == SAFE
     assert device.value["load"] == 0.0
     assert device.value["setpoint"] == BALL.operating_point.y  # what the next one in automatic goes to
+
+
+def cut_off(rig: Any, device: Any, folder: Path) -> list[str]:
+    """Try the ball's gains over a line that fails for good once they run; return what the operator was told."""
+    told: list[str] = []
+    begun = [math.inf]
+
+    def before() -> None:
+        if device.value["automatic"]:
+            begun[0] = min(begun[0], rig.clock.now())
+        if rig.clock.now() > begun[0] + 3.0:
+            raise LinkError("no answer", where="line")
+
+    rig._link.before = before
+    rig.write_gains(PI)
+    with pytest.raises(LinkError, match="Go to the rig"):
+        run_verification(
+            rig, BALL, PI, BALL_FIT, folder / "trial.csv", on_device=True, on_status=lambda s: told.append(s.message)
+        )
+    return told
+
+
+def test_a_trial_that_is_cut_off_ends_at_the_safe_output_and_the_next_host_takes_it_back(tmp_path: Path) -> None:
+    rig, device = virtual_rig(make_plant("ball", seed=1), registers=REGISTERS, gains=(-0.01, 6.0), deadman_s=0.5)
+    told = cut_off(rig, device, tmp_path)
+    assert "steps of the device's own controller" in told
+    assert not any("stay at the rig" in message for message in told)
+    device.live(rig.clock.now() + 1.0)
+    fell = next(change.t_s for change in device.history if change.cause == "dead-man")
+    fed = max(change.t_s for change in device.history if change.cause == "controller")
+    assert 0.0 <= fell - fed <= 0.5
+    assert device.output == SAFE
+    device.show("automatic", 1.0)  # by hand, on gains that nobody has verified: a host has to be there
+    device.live(rig.clock.now() + 2.0)
+    assert device.output == SAFE
+    rig._link.before = lambda: None
+    rig.open()
+    assert rig.former is None  # what ran on trial is nothing to go back to
+    rig.write(4.0)
+    assert (device.output, device.value["trial"], device.value["automatic"]) == (4.0, 0.0, 0.0)
+    rig.make_safe()
+    rig.close()
+
+
+def test_a_device_without_the_flag_regulates_on_and_the_operator_is_told_to_stay(tmp_path: Path) -> None:
+    registers = {name: given for name, given in REGISTERS.items() if name != "trial"}
+    rig, device = virtual_rig(make_plant("ball", seed=1), registers=registers, gains=(-0.01, 6.0), deadman_s=0.5)
+    told = cut_off(rig, device, tmp_path)
+    assert any("stay at the rig" in message for message in told)
+    device.live(rig.clock.now() + 2.0)
+    assert device.value["automatic"] == 1.0
+    assert device.output != SAFE
+
+
+def test_a_host_that_tries_gains_is_another_master_to_whoever_comes(tmp_path: Path) -> None:
+    rig, device = virtual_rig(make_plant("ball", seed=1), registers=REGISTERS, gains=(-0.01, 6.0))
+    rig.open()
+    rig.start_controller(5.0)
+    clock = rig.clock
+    other = GainRegisterRig(
+        DirectLink(device, clock), RegisterMap.model_validate(REGISTERS), u_range=(0.0, 10.0), u_safe=0.0, clock=clock
+    )
+    sleep = clock.sleep_until
+
+    def sleep_until(t_s: float) -> None:  # the first host lives on meanwhile
+        sleep(t_s)
+        clock.sleep_until = sleep
+        rig.feed()
+        clock.sleep_until = sleep_until
+
+    clock.sleep_until = sleep_until
+    with pytest.raises(NotTaken, match="another master commands the rig"):
+        other.open()
+    clock.sleep_until = sleep
+    rig.read()
+    rig.make_safe()
+    rig.close()
 
 
 def test_without_a_register_for_the_load_the_set_point_comes_back_and_that_is_all(tmp_path: Path) -> None:
@@ -214,6 +294,7 @@ PEER: dict[str, Any] = {
     "load": {"address": 16, **FLOAT},
     "enable": {"table": "coil", "address": 0},
     "automatic": {"table": "coil", "address": 1},
+    "trial": {"table": "coil", "address": 2},
 }
 
 

@@ -202,6 +202,22 @@ def test_the_pi_takes_over_without_a_bump_and_needs_no_host(rig: Any) -> None:
     assert rig(Y=5.5).value["U"] == pytest.approx(6.25, abs=0.01)
 
 
+def test_the_pi_on_trial_ends_with_its_host(rig: Any) -> None:
+    rig(ENABLE=True, U_HOST=6.0, HEARTBEAT=1)
+    rig(AUTOMATIC=True, TRIAL=True)
+    rig(ENABLE=False, HEARTBEAT=2)
+    assert [rig(HEARTBEAT=beat).value["MODE"] for beat in range(3, 100)] == [3] * 97
+    assert [rig().value["MODE"] for _ in range(60)] == [3] * 49 + [0] * 11
+    assert (rig.value["U"], rig.value["TRIPPED"]) == (1.0, True)
+    rig(HEARTBEAT=101)  # coming back to life is not enough
+    assert rig.value["U"] == 1.0
+    rig(AUTOMATIC=False)
+    assert not rig.value["TRIPPED"]
+    assert [rig(AUTOMATIC=True).value["MODE"] for _ in range(60)] == [3] * 50 + [0] * 10  # by hand: these gains still
+    rig(AUTOMATIC=False, TRIAL=False)
+    assert [rig(AUTOMATIC=True).value["MODE"] for _ in range(60)] == [3] * 60
+
+
 @pytest.mark.parametrize(
     "wrong", [{"K": NAN}, {"TI": NAN}, {"K": float("inf")}, {"Y": NAN}, {"SETPOINT": NAN}], ids=str
 )
