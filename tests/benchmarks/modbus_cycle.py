@@ -13,7 +13,7 @@ import subprocess
 import tempfile
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TypeAlias
 
@@ -25,6 +25,7 @@ from rich.table import Table
 
 from autotune.config.registers import RegisterMap
 from autotune.config.rig import ModbusRtuSettings, ModbusTcpSettings
+from autotune.experiment.priority import PRIORITY
 from drivers import open_rig
 from sim.serial_line import SerialLine
 
@@ -41,15 +42,27 @@ SLAVE = RegisterMap.model_validate(
 )
 
 
+def compiled(source: Path, folder: Path) -> Path:
+    """Compile a program in C that uses libmodbus, and return it."""
+    program = folder / source.stem
+    subprocess.run(["gcc", "-O2", "-I/usr/include/modbus", "-o", program, source, "-lmodbus"], check=True)
+    return program
+
+
 @contextmanager
-def slave(*words: str) -> Iterator[int]:
-    """Compile and run the slave in C; yield its port."""
-    source = Path(__file__).parents[1] / "drivers" / "libmodbus_slave.c"
+def slave(*words: str, before_others: bool = False) -> Iterator[int]:
+    """Compile and run the slave in C; yield its port.
+
+    Before others it has the loop's priority, where the system grants it: as a device with a processor of its own, it
+    does not wait for what else runs on this computer.
+    """
     with tempfile.TemporaryDirectory() as folder:
-        program = Path(folder) / "slave"
-        subprocess.run(["gcc", "-O2", "-I/usr/include/modbus", "-o", program, source, "-lmodbus"], check=True)
+        program = compiled(Path(__file__).parents[1] / "drivers" / "libmodbus_slave.c", Path(folder))
         with subprocess.Popen([program, *words], stdout=subprocess.PIPE, text=True) as process:
             assert process.stdout is not None
+            if before_others:
+                with suppress(OSError):
+                    os.sched_setscheduler(process.pid, os.SCHED_FIFO, os.sched_param(PRIORITY))
             yield int(process.stdout.readline().split()[1])
             process.kill()
 
