@@ -175,7 +175,9 @@ def test_rows_between_cycles_and_arrays_that_are_none_are_refused_before_the_rel
 def test_a_relay_in_the_device_needs_what_ends_it() -> None:
     table = settings_of("opc.tcp://127.0.0.1:1", CYCLE_S).model_dump(exclude_none=True)
     for lacking in ("heartbeat", "enable", "in_command"):
-        nodes = {name: node for name, node in table["nodes"].items() if name not in (lacking, "heartbeat_echo")}
+        nodes = {
+            name: node for name, node in table["nodes"].items() if name not in (lacking, "heartbeat_echo", "trial")
+        }
         with pytest.raises(ValueError, match=f"a relay in the device needs the nodes of {lacking}"):
             OpcUaSettings.model_validate(table | {"nodes": nodes})
     with pytest.raises(ValueError, match="needs scan_time_s"):

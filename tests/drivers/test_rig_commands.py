@@ -67,7 +67,7 @@ def test_the_served_ball_can_be_probed_and_flown_and_ends_when_asked(tmp_path: P
     with served(path) as process:
         done = CliRunner().invoke(app, ["probe", str(path)])
         assert done.exit_code == 0, done.output
-        assert "13 registers read, nothing written: all values are plausible" in done.output
+        assert "14 registers read, nothing written: all values are plausible" in done.output
         rig = open_rig(config.rig, u_range=(limits.u_min, limits.u_max), u_safe=limits.u_safe)
         rig.open()
         on_the_floor = rig.read().y
