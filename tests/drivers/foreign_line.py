@@ -185,7 +185,7 @@ def faults_on_controller(program: Path, folder: Path) -> tuple[Fault, ...]:
         line.set_harm(refuses(6, lambda: time.monotonic() < until_s))  # type: ignore[arg-type]  # as above
 
     of_tcp = (replace(fault, line=on()) for fault in FAULTS if fault.line is tcp_line)
-    alone = {"without": ("heartbeat", "heartbeat_echo"), "deadman_s": 1e9}
+    alone = {"without": ("heartbeat", "heartbeat_echo", "trial"), "deadman_s": 1e9}
     return (
         *of_tcp,
         Fault(name="second master, once", line=on(), ends=("completed",), strike=writes(1)),

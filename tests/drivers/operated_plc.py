@@ -6,7 +6,6 @@ import asyncio
 import time
 from collections.abc import Mapping
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 from asyncua import ua
@@ -18,6 +17,7 @@ from tests.drivers.iec_compiler import Blocks, CompiledInstance
 from tests.drivers.scanned_plc import STRUCTURED_TEXT, Lags
 
 FILES = ("relay.st", "pi.st", "rig.st", "operated.st")
+SOURCE = "".join((STRUCTURED_TEXT / name).read_text() for name in FILES)
 U_RANGE, U_SAFE, Y_RANGE, DEADMAN_S = (0.0, 10.0), 1.0, (0.2, 9.8), 1.0
 #: how often the server lets its program run the cycles that are due [s]
 _LOOK_S = 0.001
@@ -39,17 +39,16 @@ class Program:
     ----------
     plant : Lags
         Takes 0 .. 10 and shows 0 .. 10.
-    folder : Path
-        Where it is built.
+    blocks : Blocks
+        The compiled function blocks.
     cycle_s : float
         Cycle of its task [s].
     deadman_s : float
         Time without a new heartbeat after which the output is safe [s].
     """
 
-    def __init__(self, plant: Lags, folder: Path, cycle_s: float, deadman_s: float = DEADMAN_S) -> None:
-        self.blocks = Blocks("".join((STRUCTURED_TEXT / name).read_text() for name in FILES), folder)
-        self.block = CompiledInstance("OPERATED_RIG", self.blocks)
+    def __init__(self, plant: Lags, blocks: Blocks, cycle_s: float, deadman_s: float = DEADMAN_S) -> None:
+        self.block = CompiledInstance("OPERATED_RIG", blocks)
         self.plant, self.cycle_s, self.cycles = plant, cycle_s, 0
         self.outputs: list[float] = []  # of every cycle
         self.measured: list[float] = []

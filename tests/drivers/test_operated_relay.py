@@ -21,6 +21,7 @@ from autotune.identification.frequency.limit_cycle_points import limit_cycle_poi
 from drivers import open_rig
 from drivers.opcua_rig import probe_kind
 from drivers.operated_relay import OperatedRelayRig
+from tests.drivers.iec_compiler import Blocks
 from tests.drivers.operated_plc import DEADMAN_S, U_RANGE, U_SAFE, OperatedPlc, Program, settings_of
 from tests.drivers.scanned_plc import Lags
 from tests.drivers.test_rig_commands import free_port
@@ -34,8 +35,8 @@ LIMITS = (1.0, 9.0)
 class Bench:
     """The PLC with a quiet plant, and the rig on it."""
 
-    def __init__(self, folder: Path) -> None:
-        self.program = Program(Lags(LAGS_S, noise=0.0), folder, CYCLE_S)
+    def __init__(self, blocks: Blocks) -> None:
+        self.program = Program(Lags(LAGS_S, noise=0.0), blocks, CYCLE_S)
         self.endpoint = f"opc.tcp://127.0.0.1:{free_port()}"
         self.served = OperatedPlc(self.program, self.endpoint)
         rig = open_rig(settings_of(self.endpoint, CYCLE_S), u_range=U_RANGE, u_safe=U_SAFE)
@@ -60,8 +61,8 @@ class Bench:
 
 
 @pytest.fixture
-def bench(tmp_path: Path) -> Iterator[Bench]:
-    made = Bench(tmp_path)
+def bench(rig_blocks: Blocks) -> Iterator[Bench]:
+    made = Bench(rig_blocks)
     with made.served:
         yield made
         made.rig.close()
@@ -186,12 +187,12 @@ def test_a_relay_in_the_device_needs_what_ends_it() -> None:
 
 @pytest.mark.slow
 @pytest.mark.timeout(600)
-def test_a_run_with_the_relay_in_the_plc_is_accepted_and_kept(tmp_path: Path) -> None:
+def test_a_run_with_the_relay_in_the_plc_is_accepted_and_kept(tmp_path: Path, rig_blocks: Blocks) -> None:
     from autotune.pipeline import tune
 
     endpoint = f"opc.tcp://127.0.0.1:{free_port()}"
     lags_s = (0.5, 0.15)
-    program = Program(Lags(lags_s), tmp_path / "plc", CYCLE_S, deadman_s=2.0)
+    program = Program(Lags(lags_s), rig_blocks, CYCLE_S, deadman_s=2.0)
     content: dict[str, Any] = {
         "name": "plc",
         "rig": settings_of(endpoint, CYCLE_S).model_dump(mode="json", exclude_none=True),

@@ -256,6 +256,7 @@ def test_a_write_touches_no_register_in_between() -> None:
         ({"u": {"address": 1}}, "y and u overlap at holding 1"),
         ({"K": {"address": 9}}, "K and Ti must be mapped together"),
         ({"heartbeat_echo": {"address": 9}}, "heartbeat_echo needs heartbeat"),
+        ({"trial": {"address": 9}}, "trial needs heartbeat and automatic"),
         ({"y": {"address": 0, "table": "coil", "type": "int16"}}, "coils and discrete inputs hold a bit"),
         ({"y": {"address": 65535, "type": "int32"}}, "ends beyond 65535"),
         ({"y": {"address": 0, "scale": 0}}, "scale = 0"),

@@ -20,12 +20,12 @@ from autotune.design.law import PILaw
 from autotune.experiment.relay import RelaySettings
 from tests.drivers.iec_compiler import Blocks, CompiledInstance, generated_c
 from tests.drivers.laws import LAWS, RELAYS, longest_pending, measurements, pi_outputs, relay_outputs
+from tests.drivers.operated_plc import FILES
 from tests.drivers.structured_text import Instance, function_blocks
 
 FOLDER = Path(__file__).parents[2] / "drivers" / "firmware" / "structured_text"
 
 
-FILES = ("relay.st", "pi.st", "rig.st", "operated.st")
 NAN = float("nan")
 
 #: Makes an instance of a block by its name.
@@ -37,16 +37,11 @@ def blocks() -> dict[str, Any]:
     return function_blocks(FOLDER / name for name in FILES)
 
 
-@pytest.fixture(scope="session")
-def compiled(tmp_path_factory: pytest.TempPathFactory) -> Blocks:
-    return Blocks("".join((FOLDER / name).read_text() for name in FILES), tmp_path_factory.mktemp("blocks"))
-
-
 @pytest.fixture(params=["interpreted", pytest.param("compiled", marks=pytest.mark.system("gcc"))])
 def make(request: pytest.FixtureRequest, blocks: dict[str, Any]) -> Make:
     if request.param == "interpreted":
         return lambda name: Instance(name, blocks)
-    compiled: Blocks = request.getfixturevalue("compiled")
+    compiled: Blocks = request.getfixturevalue("rig_blocks")
     return lambda name: CompiledInstance(name, compiled)
 
 
