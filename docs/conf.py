@@ -12,6 +12,7 @@ from typing import Any
 
 from docutils import nodes
 from docutils.utils.math.latex2mathml import tex2mathml
+from pygments.lexers.special import TextLexer
 
 HERE = Path(__file__).resolve().parent
 
@@ -80,6 +81,7 @@ def setup(app: Any) -> dict[str, bool]:
         inline_renderers=(lambda translator, node: _formula(translator, node, block=False), None),
         block_renderers=(lambda translator, node: _formula(translator, node, block=True), None),
     )
+    app.add_lexer("st", TextLexer)  # Structured Text has none; by that name comes Smalltalk's
     app.connect("autodoc-process-docstring", _plain)
     app.connect("autodoc-skip-member", _has_its_own_page)
     return {"parallel_read_safe": True}

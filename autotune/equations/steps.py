@@ -1,12 +1,13 @@
-"""Single steps: Dormand and Prince's explicit 5(4) pair [1]_, and an L-stable Rosenbrock 2(3) pair [2]_.
+"""Single steps: Dormand and Prince's explicit 5(4) pair, and an L-stable Rosenbrock 2(3) pair.
 
 Where Hairer's test finds the problem stiff, the run goes on with the second.
 
 References
 ----------
-.. [1] E. Hairer, S. P. Norsett, G. Wanner, Solving Ordinary Differential Equations I, 2nd ed., table II.5.2; the test
-   for stiffness is in volume II, eq. (IV.2.26).
-.. [2] L. F. Shampine, M. W. Reichelt, The MATLAB ODE suite, SIAM J. Sci. Comput. 18, 1997, sec. 3.
+E. Hairer, S. P. Norsett, G. Wanner, Solving Ordinary Differential Equations I, 2nd ed., table II.5.2 of the explicit
+pair; the test for stiffness is in volume II, eq. (IV.2.26).
+
+L. F. Shampine, M. W. Reichelt, The MATLAB ODE suite, SIAM J. Sci. Comput. 18, 1997, sec. 3, of the Rosenbrock pair.
 """
 
 from __future__ import annotations

@@ -1,11 +1,11 @@
 """Switched terms along an integration: modes that hold within a step, crossings, and sliding on a surface.
 
 Where both sides of a switching function's zero lead back to it (dry friction at rest, a rate limiter that has caught
-up) the state slides there with Filippov's convex combination [1]_: friction sticks, exactly.
+up) the state slides there with Filippov's convex combination: friction sticks, exactly.
 
 References
 ----------
-.. [1] A. F. Filippov, Differential Equations with Discontinuous Righthand Sides, Kluwer, 1988, ch. 2.
+A. F. Filippov, Differential Equations with Discontinuous Righthand Sides, Kluwer, 1988, ch. 2.
 """
 
 from __future__ import annotations
