@@ -244,6 +244,16 @@ def test_the_pi_takes_over_without_a_bump_and_outlives_a_silent_host(device: Dev
     assert device.tick(510) == 40
 
 
+def test_the_pi_on_trial_ends_with_its_host(device: Device) -> None:
+    device.ask(Kind.TAKE, 40, 1000, 15000, 300)
+    device.ask(Kind.EXCHANGE, 6000)
+    device.tick(500)
+    device.ask(Kind.TRY, -2.0, 0.5, 500.0, 0.0, 10, 60000, 0, 1023)
+    outputs = [device.tick(500) for _ in range(400)]
+    assert outputs == [6000] * 300 + [40] * 100
+    assert device.ask(Kind.GET_LAW).values == (Kind.GET_LAW, 3)  # nobody regulates
+
+
 def test_the_pi_says_how_it_runs_and_goes_on_so_after_a_host(device: Device) -> None:
     assert device.ask(Kind.GET_LAW).values == (Kind.GET_LAW, 3)
     device.ask(Kind.TAKE, 40, 1000, 15000, 300)
