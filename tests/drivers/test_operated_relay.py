@@ -192,7 +192,9 @@ def test_a_run_with_the_relay_in_the_plc_is_accepted_and_kept(tmp_path: Path, ri
 
     endpoint = f"opc.tcp://127.0.0.1:{free_port()}"
     lags_s = (0.5, 0.15)
-    program = Program(Lags(lags_s), rig_blocks, CYCLE_S, deadman_s=2.0)
+    plant = Lags(lags_s)
+    plant.advance(U_SAFE, 20.0)  # at rest there, however soon the host comes
+    program = Program(plant, rig_blocks, CYCLE_S, deadman_s=2.0)
     content: dict[str, Any] = {
         "name": "plc",
         "rig": settings_of(endpoint, CYCLE_S).model_dump(mode="json", exclude_none=True),
