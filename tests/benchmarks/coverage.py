@@ -18,7 +18,12 @@ import autotune as at
 from autotune.arrays import BoolArray, FloatArray
 from autotune.errors import AutotuneError
 from autotune.identification.closed_loop.confidence import inside_region
+from autotune.identification.closed_loop.identify import identify_closed_loop
 from autotune.identification.closed_loop.loop_plant import loop_region
+from autotune.identification.frequency.limit_cycle_points import limit_cycle_points
+from autotune.points import FrequencyPoint
+from tests.autotune.identification.relay_loop import BALL, last_periods, relay_loop
+from tests.autotune.identification.test_structures import loop
 from tests.benchmarks.delay import wilson
 from tests.loop_example import PLANT
 
@@ -28,7 +33,8 @@ LAGS = at.TransferFunction(num=(2.0,), den=(6.0, 5.0, 1.0), delay_s=0.5)
 OF_LAGS = np.array([-1.0 / 6.0, -5.0 / 6.0, 1.0 / 3.0, 0.5])
 OF_TWO = np.array([2.7, 1.5, 2.0, 4.0])
 TS = 0.1
-COLOURS = {"white": 0.0, "AR(.9)": 0.9}
+#: Poles of the noise; that of short loops has one of its own, from 0 to .98, in each record.
+COLOURS = {"white": 0.0, "AR(.9)": 0.9, "of any colour": float("nan")}
 CHI_SQUARE_2 = 5.991
 
 
@@ -38,10 +44,10 @@ def noise(rows: int, sd: float, pole: float, rng: np.random.Generator) -> FloatA
     return np.asarray(sd * lfilter([np.sqrt(1.0 - pole**2)], [1.0, -pole], white)[200:])
 
 
-def lags_record(seed: int, pole: float, sd: float) -> at.Recording:
-    """120 s of the lags under a random binary command held for 1 to 5 s; y reaches about 1.5."""
+def lags_record(seed: int, pole: float, sd: float, rows: int = 1200) -> at.Recording:
+    """Rows of .1 s of the lags under a random binary command held for 1 to 5 s; y reaches about 1.5."""
     rng = np.random.default_rng(seed)
-    u = np.concatenate([np.full(int(rng.integers(10, 51)), rng.choice([-1.0, 1.0])) for _ in range(130)])[:1200]
+    u = np.concatenate([np.full(int(rng.integers(10, 51)), rng.choice([-1.0, 1.0])) for _ in range(130)])[:rows]
     num, den, _ = cont2discrete((LAGS.num, LAGS.den), TS)
     late = np.concatenate([np.zeros(round(LAGS.delay_s / TS)), u])[: u.size]
     y = lfilter(np.ravel(num), den, late) + noise(u.size, sd, pole, rng)
@@ -72,16 +78,43 @@ def by_two_delays(seed: int, pole: float) -> BoolArray:
     return within(model.values, model.standard_deviations, OF_TWO)
 
 
-def by_points(seed: int, pole: float) -> BoolArray:
-    """Regions of the points of a recording, all together and each for itself; up to eight."""
-    inside = []
-    for point in at.frequency_points(lags_record(seed, pole, 0.03)):
-        error = point.response - complex(LAGS.response(np.array([point.omega_rad_s]))[0])
-        parts = np.array([error.real, error.imag])
-        inside.append(parts @ np.linalg.solve(np.array(point.covariance), parts) < CHI_SQUARE_2)
-    if not inside:
+def inside(point: FrequencyPoint, plant: at.TransferFunction) -> bool:
+    """Whether a point's 95 % region holds the plant."""
+    error = point.response - complex(plant.response(np.array([point.omega_rad_s]))[0])
+    parts = np.array([error.real, error.imag])
+    return bool(parts @ np.linalg.solve(np.array(point.covariance), parts) < CHI_SQUARE_2)
+
+
+def by_points(rows: int) -> Callable[[int, float], BoolArray]:
+    """Regions of the points of a recording, all together; up to eight."""
+
+    def once(seed: int, pole: float) -> BoolArray:
+        points = at.frequency_points(lags_record(seed, pole, 0.03, rows))
+        return np.array([np.mean([inside(point, LAGS) for point in points])])
+
+    return once
+
+
+def by_relay(seed: int, pole: float) -> BoolArray:
+    """Regions of the fundamental of a relay on plant (23) at 10 ms: ten periods near -180 degrees, four with delay."""
+    found = []
+    for delay, step, periods in ((0, 0.5, 10), (50, 0.3, 4)):
+        rows = int(100 * (20 + periods * (1.0 + 0.05 * delay)))
+        added, hysteresis = noise(rows, 0.2, pole, np.random.default_rng(seed)), 1.0 if pole else 0.4
+        t, u, y = relay_loop(BALL, d=step, hysteresis=hysteresis, delay=delay, noise=added)
+        use = last_periods(t, u, periods, step)
+        found.append(inside(limit_cycle_points(t[use], u[use], y[use]).points[0], BALL))
+    return np.array(found)
+
+
+def by_short_loop(seed: int, pole: float) -> BoolArray:
+    """Regions of points of 300 to 2000 rows of a loop with 1 to 7 rows of dead time, and of those that designs take."""
+    recording, plant = loop(60_000 + seed)
+    found = identify_closed_loop(recording)
+    shares = [np.mean([inside(p, plant) for p in points]) for points in (found.points, found.design_points) if points]
+    if len(shares) < 2:
         raise AutotuneError("no point", where="coverage")
-    return np.array([np.mean(inside)])
+    return np.array(shares)
 
 
 def by_loop(seed: int, pole: float) -> BoolArray:
@@ -109,7 +142,10 @@ ROWS: dict[str, tuple[Callable[[int, float], BoolArray], tuple[str, ...], tuple[
     "output error": (by_delay("output-error"), ("a0", "a1", "b", "h"), ("white", "AR(.9)")),
     "algebraic": (by_delay("algebraic"), ("a0", "a1", "b", "h"), ("white", "AR(.9)")),
     "two delays": (by_two_delays, ("a", "b", "h1", "h2"), ("white", "AR(.9)")),
-    "points": (by_points, ("regions",), ("white", "AR(.9)")),
+    "points": (by_points(1200), ("regions",), ("white", "AR(.9)")),
+    "points of 600 rows": (by_points(600), ("regions",), ("white", "AR(.9)")),
+    "relay": (by_relay, ("at -180 deg", "with delay"), ("white", "AR(.9)")),
+    "short loop": (by_short_loop, ("points", "design points"), ("of any colour",)),
     "loop": (by_loop, ("poles", "response", "joint region"), ("white",)),
     "online": (by_delay("online"), ("a0", "a1", "b", "h"), ("white", "AR(.9)")),
 }

@@ -1,7 +1,8 @@
 """Local polynomial estimate: G and the leakage are smooth over neighbouring lines, noise and excitation are not.
 
 On the lines around omega: E(k) = G(omega_k) X(k) + T(omega_k) + V(k), G and T in the span of 1, omega and 1/omega.
-Least squares removes the leakage T (transient, drift, ends of the record) and gives the noise level from what is left.
+Least squares removes the leakage T (transient, drift, ends of the record) and gives the noise level from what is left;
+lines come weighted so that noise is about as large on each, since one level is all that a window's residual tells.
 1/omega in place of the usual omega^2 is as good in a narrow window, and exact for integrators and ramps in a wide one.
 
 A wide window, as one at the lowest lines is, holds more of G than three terms follow; what they miss goes with X and is
@@ -68,9 +69,9 @@ def local_estimate(
     omega_rad_s : (n,) array
         Lines of the window [rad/s].
     X : (n,) complex array
-        Regressor: held command in open loop, set-point in closed loop.
+        Regressor, weighted: held command in open loop, set-point in closed loop.
     Z : (n, q) complex array
-        Outputs.
+        Outputs, weighted alike.
     centre_rad_s : float
         Where the gain is wanted [rad/s], within the window.
     excited : (n,) array, optional

@@ -222,7 +222,7 @@ def _reference(points: Sequence[FrequencyPoint], spectra: Spectra, integrating: 
     omega = np.array([point.omega_rad_s for point in points])
     G = np.array([point.response for point in points])
     sd = np.array([_relative_sd(point) for point in points]) * np.abs(G)
-    strength = np.interp(omega, spectra.omega_rad_s, _smooth(np.abs(spectra.U)))
+    strength = np.interp(omega, spectra.omega_rad_s, _smooth(spectra.weight * np.abs(spectra.U)))
     return fit_reference(omega, G, sd, strength, integrating=integrating)
 
 
@@ -255,8 +255,8 @@ def _on_excited_lines(spectra: Spectra, repeats: int) -> list[LocalEstimate]:
         window = slice(low, low + 2 * half + 1)
         one = local_estimate(
             spectra.omega_rad_s[window],
-            spectra.U[window],
-            spectra.E[window, None],
+            (spectra.weight * spectra.U)[window],
+            (spectra.weight * spectra.E)[window, None],
             float(spectra.omega_rad_s[line]),
             excited=_near(excited, int(line), window),
         )
@@ -274,8 +274,9 @@ def _near(excited: BoolArray, line: int, window: slice) -> BoolArray:
 def _on_grid(spectra: Spectra, per_decade: int) -> list[LocalEstimate]:
     """Estimate on a grid that is the same for every recording, from windows that do not overlap."""
     omega = spectra.omega_rad_s
-    X = spectra.U if spectra.R is None else spectra.R
-    Z = spectra.E[:, None] if spectra.R is None else np.column_stack([spectra.E, spectra.U])
+    X = spectra.weight * (spectra.U if spectra.R is None else spectra.R)
+    outputs = (spectra.E,) if spectra.R is None else (spectra.E, spectra.U)
+    Z: ComplexArray = np.stack([spectra.weight * output for output in outputs], axis=1)
     first = math.ceil(per_decade * math.log10(omega[0]))
     last = math.floor(per_decade * math.log10(omega[-1]))
     found, free = [], 0

@@ -8,6 +8,7 @@ import numpy as np
 
 from autotune.arrays import BoolArray, ComplexArray, FloatArray
 from autotune.errors import IdentificationError
+from autotune.identification.noise_colour import WHITE, whitening_filter
 
 #: Part of y that may be missing or wild before the record is refused.
 _LARGEST_BAD_PART = 0.05
@@ -28,12 +29,15 @@ class Spectra:
         Of the held command, exact where the stamps are uniform.
     R : (K,) complex array or None
         Of the set-point.
+    weight : (K,) array
+        Of each line in a least-squares fit: what is in E, with it, is about as large on all lines.
     """
 
     omega_rad_s: FloatArray
     E: ComplexArray
     U: ComplexArray
     R: ComplexArray | None
+    weight: FloatArray
 
 
 def clean_measurement(t: FloatArray, y: FloatArray, name: str) -> tuple[FloatArray, int]:
@@ -120,9 +124,18 @@ def record_spectra(
         within = np.exp(-0.5j * omega * step) / np.sinc(omega * step / (2.0 * np.pi))
         e = np.interp(grid, t, e)
         r = np.interp(grid, t, r) if r is not None else None
+    e = e - e.mean()
     return Spectra(
         omega_rad_s=omega,
-        E=np.fft.rfft(e - e.mean())[k] / n,
+        E=np.fft.rfft(e)[k] / n,
         U=np.fft.rfft(levels)[k] / n * within,
         R=np.fft.rfft(r - r.mean())[k] / n if r is not None else None,
+        weight=_whitening(e, omega * step),
     )
+
+
+def _whitening(e: FloatArray, omega: FloatArray) -> FloatArray:
+    """Return the gain of the filter that makes e white at some frequencies [rad/row]; 1 where e is zero."""
+    colour = whitening_filter(e) if np.any(e) else WHITE
+    delays = np.exp(-1j * np.outer(omega, np.arange(1, colour.size + 1)))
+    return np.asarray(np.abs(1.0 + delays @ colour))

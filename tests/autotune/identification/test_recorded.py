@@ -233,7 +233,7 @@ def test_two_halves_of_a_real_recording_give_points_of_the_right_size(shared: Pa
     for name, model in (("1", "model.toml"), ("2", "model_2.toml")):
         estimates = [frequency_points(read_recording(folder / f"{part}_{name}.csv")) for part in ("fit", "test")]
         combined = combine(estimates)
-        assert len(combined.points) >= 3
+        assert sum(np.sqrt(point.covariance[0][0]) < 0.5 * point.gain for point in combined.points) >= 2
         believed = read_model(folder / model).transfer_function()
         lowest = combined.points[0]
         ratio = lowest.response / complex(believed.response(np.array([lowest.omega_rad_s]))[0])
@@ -273,7 +273,8 @@ def test_regions_of_a_window_hold_the_truth_whether_or_not_three_terms_follow_it
     assert 0.93 <= np.mean(inside) <= 0.98
 
 
-def test_regions_hold_the_truth_under_autoregressive_noise_where_a_rough_model_follows_it() -> None:
-    """Two lags, 400 records: .927 with the noise's share taken off the squared bias."""
-    shares = [float(by_points(seed, 0.9)[0]) for seed in range(400)]
-    assert 0.93 <= np.mean(shares) <= 0.97
+@pytest.mark.parametrize("rows", [1200, 600])
+def test_regions_hold_the_truth_under_autoregressive_noise_where_a_rough_model_follows_it(rows: int) -> None:
+    """Two lags, 400 records: .934 and .925 where noise is taken for equally large on all lines of a window."""
+    shares = [float(by_points(rows)(seed, 0.9)[0]) for seed in range(400)]
+    assert 0.94 <= np.mean(shares) <= 0.97
