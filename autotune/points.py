@@ -193,9 +193,6 @@ def _point(entry: Any, where: str) -> FrequencyPoint:
     return FrequencyPoint(
         omega_rad_s=omega,
         response=complex(gain * np.exp(1j * math.radians(phase_deg))),
-        covariance=(
-            (float(covariance[0, 0]), float(covariance[0, 1])),
-            (float(covariance[1, 0]), float(covariance[1, 1])),
-        ),
+        covariance=as_pairs(covariance),
         source=str(entry.get("source", "file"))[:80],
     )

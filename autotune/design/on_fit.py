@@ -15,7 +15,7 @@ import numpy as np
 
 from autotune.arrays import FloatArray
 from autotune.controller import PIDController
-from autotune.design.members import members_of
+from autotune.design.members import Members, members_of
 from autotune.design.specification import Design, Kind, Specification
 from autotune.design.synthesis import design
 from autotune.errors import DesignError
@@ -68,8 +68,9 @@ def design_on_fit(
             where="fitted plant",
             remedy="record the plant under steps of the command, which shows resonances, or design on a model of it",
         )
-    found, worst = design_on_plants(fit.plant, fit.border(probability), specification, kind)
-    if worst < -2.0 * TOLERANCE:
+    border = members_of(fit.border(probability), specification)
+    found, slack = design_on_plants(fit.plant, border, specification, kind)
+    if np.min(slack) < -2.0 * TOLERANCE:
         raise DesignError(
             "no controller was found that keeps the margins on the whole region of the fitted plant",
             where="synthesis",
@@ -83,9 +84,9 @@ def design_on_fit(
 
 
 def design_on_plants(
-    nominal: TransferFunction, members: Sequence[TransferFunction], specification: Specification, kind: Kind
-) -> tuple[Design, float]:
-    """Return the controller of least norm on ``nominal`` that all members keep, and the least slack among them.
+    nominal: TransferFunction, members: Members, specification: Specification, kind: Kind
+) -> tuple[Design, FloatArray]:
+    """Return the controller of least norm on ``nominal`` that all members keep, and their (S, 3) slacks.
 
     Members that miss a constraint become constraints of the next round, until none does.
 
@@ -94,16 +95,15 @@ def design_on_plants(
     DesignError
         Nothing of this structure keeps the constraints on the members that were violated so far.
     """
-    every = members_of(members, specification)
     chosen: list[int] = []
     for _ in range(ROUNDS):
-        found = design(nominal, specification, kind, also=[members[i] for i in chosen], certificate=False)
-        slack = every.slacks(found.controller, specification)
+        found = design(nominal, specification, kind, also=members.chosen(chosen).plants, certificate=False)
+        slack = members.slacks(found.controller, specification)
         worst = missed(slack)
         if worst <= set(chosen):
             break
         chosen += sorted(worst - set(chosen))
-    return found, float(np.min(slack))
+    return found, slack
 
 
 def missed(slack: FloatArray) -> set[int]:

@@ -55,16 +55,16 @@ def design_on_structures(structures: ConsistentStructures, specification: Specif
     points the certificate says from which frequency on no plant's phase is relied on.
     """
     assert structures.nominal is not None
+    members = members_of(structures.plants, specification)
     try:
-        found, _ = design_on_plants(structures.nominal, structures.plants, specification, kind)
+        found, slack = design_on_plants(structures.nominal, members, specification, kind)
     except DesignError as error:
         raise DesignError(
             f"no {kind.upper()} was found that all plants through the points keep ({error.what})",
             where="points",
             remedy=f"{error.remedy}; or {where_to_measure(structures)}",
         ) from None
-    members = members_of(structures.plants, specification)
-    require_kept(members.slacks(found.controller, specification), structures, specification)
+    require_kept(slack, structures, specification)
     least, remark = _as_measured(members.least(found.margins, found.controller), members, found.controller, structures)
     return replace(
         found,

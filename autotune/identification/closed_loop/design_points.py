@@ -44,4 +44,4 @@ def design_points(found: Structures, grid_rad_s: FloatArray) -> tuple[FrequencyP
     low = max(_LOWEST * critical, float(grid[0]))
     high = min(_HIGHEST * critical, float(grid[-1]), 0.49 * math.pi / estimate.model.sample_time_s)
     omega = np.geomspace(low, high, max(_FEWEST, estimate.model.order))
-    return found.plant(omega)
+    return found.points(omega)[1]

@@ -292,7 +292,7 @@ def _grid(sample_time_s: float, rows: int) -> FloatArray:
 def _report(
     found: Structures, omega: FloatArray, law: LawCheck | None, motion: float, white: Whiteness
 ) -> ClosedLoopIdentification:
-    estimate, response = found.chosen, found.response(omega)
+    estimate, (response, points) = found.chosen, found.points(omega)
     covariance = np.array([point.covariance for point in response])
     plant = np.array([point.response for point in response])
     loop = None if law is None or law.contradicts else law.controller.response(omega)
@@ -301,7 +301,7 @@ def _report(
         poles=estimate.model.poles,
         pole_covariance=pole_covariance(estimate),
         response=response,
-        points=found.plant(omega),
+        points=points,
         design_points=design_points(found, omega),
         evidence=(),
         excitation=judge(omega, plant, covariance, controller=loop, motion=motion),

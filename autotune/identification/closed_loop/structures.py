@@ -47,31 +47,26 @@ class Structures:
             kept.append(one)
         return tuple(kept)
 
-    def response(self, omega_rad_s: FloatArray) -> tuple[FrequencyPoint, ...]:
-        """Return G(exp(j omega Ts)) of the chosen model, with regions over all structures.
+    def points(self, omega_rad_s: FloatArray) -> tuple[tuple[FrequencyPoint, ...], tuple[FrequencyPoint, ...]]:
+        """Return G(exp(j omega Ts)) of the chosen model and points of its plant, with regions over all structures.
 
         Parameters
         ----------
         omega_rad_s : (W,) array
             Angular frequencies [rad/s].
+
+        Returns
+        -------
+        response : tuple of FrequencyPoint
+            At every frequency.
+        plant : tuple of FrequencyPoint
+            The command's hold taken out, where known to 50 %.
         """
         mine = frequency_points(self.chosen, omega_rad_s)
-        return _over(mine, [(w, _response(one, omega_rad_s)) for w, one in self.others])
-
-    def plant(self, omega_rad_s: FloatArray) -> tuple[FrequencyPoint, ...]:
-        """Return the points of the plant of the chosen model, its command's hold taken out, where known to 50 %.
-
-        Parameters
-        ----------
-        omega_rad_s : (W,) array
-            Angular frequencies [rad/s].
-        """
-
-        def of(one: PredictionErrorEstimate, points: Sequence[FrequencyPoint]) -> Sequence[FrequencyPoint]:
-            return without_hold(one.model, points) if points else ()
-
-        mine = of(self.chosen, frequency_points(self.chosen, omega_rad_s))
-        return worthwhile(_over(mine, [(w, of(one, _response(one, omega_rad_s))) for w, one in self.others]))
+        others = [(weight, one.model, _response(one, omega_rad_s)) for weight, one in self.others]
+        plants = [(weight, without_hold(model, points) if points else ()) for weight, model, points in others]
+        response = _over(mine, [(weight, points) for weight, _, points in others])
+        return response, worthwhile(_over(without_hold(self.chosen.model, mine), plants))
 
 
 def _response(one: PredictionErrorEstimate, omega_rad_s: FloatArray) -> Sequence[FrequencyPoint]:

@@ -27,6 +27,18 @@ _BLOCK = 2048  # pieces that are carried at once
 
 
 @njit(cache=True)
+def _begin(
+    tu: FloatArray, ty: FloatArray, a: tuple[float, ...], h: float, theta: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return a_0.., chains (columns z, e, phi_0.., s, x; rows the derivatives) and clock at the first output."""
+    n = len(a)
+    coefficients, chains = np.empty(n), np.zeros((n, n + 4))
+    for i in range(n):
+        coefficients[i], chains[i, 2 + i], chains[i, 3 + n] = a[i], 1.0, theta[2 + i]
+    return coefficients, chains, np.array([ty[0], np.searchsorted(tu, ty[0] - h, side="right") - 1, 0.0])
+
+
+@njit(cache=True)
 def _schedule(
     tu: FloatArray, u: FloatArray, before: float, linear: bool, ty: FloatArray, h: float, clock: FloatArray
 ) -> tuple[FloatArray, int, int]:
@@ -235,13 +247,7 @@ def normal_matrix(
     order = whitening.size
     width = 2 * n + 4 if sensitive else 3 + n
     gram = np.zeros((width, width))
-    coefficients = np.empty(n)
-    chains = np.zeros((n, n + 4))  # columns z, e, phi_0.., s, x; rows the derivatives
-    for i in range(n):
-        coefficients[i] = a[i]
-        chains[i, 2 + i] = 1.0
-        chains[i, 3 + n] = theta[2 + i]
-    clock = np.array([ty[0], np.searchsorted(tu, ty[0] - h, side="right") - 1, 0.0])
+    coefficients, chains, clock = _begin(tu, ty, a, h, theta)
     rows = np.zeros((order + _BLOCK, width))
     white = np.empty((_BLOCK, width))
     first = 0
@@ -291,12 +297,7 @@ def output(
     """Return x at the output times, NaN from where it overflows; parameters as in :func:`normal_matrix`."""
     n = len(a)
     x = np.full(ty.size, np.nan)
-    coefficients = np.empty(n)
-    chains = np.zeros((n, n + 4))
-    for i in range(n):
-        coefficients[i] = a[i]
-        chains[i, 2 + i] = 1.0
-    clock = np.array([ty[0], np.searchsorted(tu, ty[0] - h, side="right") - 1, 0.0])
+    coefficients, chains, clock = _begin(tu, ty, a, h, theta)
     rows = np.zeros((_BLOCK, 2 + n))
     first = 0
     while first < ty.size:
@@ -323,13 +324,7 @@ def sensitivities(
     """Return the columns z, e, phi_0.., s.., -x' of :func:`normal_matrix` row by row, shape (N, 2n+3)."""
     n = len(a)
     columns = np.zeros((ty.size, 2 * n + 4))
-    coefficients = np.empty(n)
-    chains = np.zeros((n, n + 4))
-    for i in range(n):
-        coefficients[i] = a[i]
-        chains[i, 2 + i] = 1.0
-        chains[i, 3 + n] = theta[2 + i]
-    clock = np.array([ty[0], np.searchsorted(tu, ty[0] - h, side="right") - 1, 0.0])
+    coefficients, chains, clock = _begin(tu, ty, a, h, theta)
     first = 0
     while first < ty.size:
         pieces, count, outputs = _schedule(tu, u, before, linear, ty, h, clock)

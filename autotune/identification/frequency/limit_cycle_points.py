@@ -23,7 +23,7 @@ from autotune.identification.frequency.reference_model import (
     simulate_reference,
 )
 from autotune.identification.noise_colour import region_widening
-from autotune.points import FrequencyPoint
+from autotune.points import FrequencyPoint, as_pairs
 
 _HIGHEST_HARMONIC = 9
 _OUTLIER_SD = 6.0
@@ -237,10 +237,7 @@ def _points(
             FrequencyPoint(
                 omega_rad_s=float(omega[i]),
                 response=response,
-                covariance=(
-                    (float(covariance[0, 0]), float(covariance[0, 1])),
-                    (float(covariance[1, 0]), float(covariance[1, 1])),
-                ),
+                covariance=as_pairs(covariance),
                 source="relay" if order == 1 else "harmonic",
             )
         )
