@@ -12,7 +12,7 @@ from autotune.arrays import FloatArray
 _TERMS = 10  # of the exponential series: with a norm up to 1/4 the remainder is below 1e-13
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def transitions(a: FloatArray, durations: FloatArray) -> FloatArray:
     """Return the blocks (E, S, G, H) of the transitions of (s, x, w, v): x^(n) = sum a_i x^(i) + w, w' = v, s likewise.
 
@@ -93,7 +93,7 @@ def transitions(a: FloatArray, durations: FloatArray) -> FloatArray:
     return result
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _blocks(matrix: FloatArray, n: int) -> FloatArray:
     """Return the blocks E, S, G, H of a matrix over (s, x, w, v), side by side."""
     blocks = np.empty((n, 2 * n + 4))
@@ -102,7 +102,7 @@ def _blocks(matrix: FloatArray, n: int) -> FloatArray:
     return blocks
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _square(blocks: FloatArray, tau: float) -> None:
     """Replace the transition over tau by that over 2 tau: E^2, E S + S E, E G + S H + G J, E H + H J."""
     n = blocks.shape[0]
@@ -126,7 +126,7 @@ def _square(blocks: FloatArray, tau: float) -> None:
             blocks[i, 2 * n + 2 + j] = H
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def cholesky_solve(G: FloatArray, g: FloatArray, smallest_pivot: float) -> tuple[FloatArray, float, bool]:
     """Return x of G x = g, g^T x and whether every pivot, relative to its diagonal entry, exceeds the smallest.
 

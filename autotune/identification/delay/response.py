@@ -26,7 +26,7 @@ _NEGLIGIBLE = 1e-150
 _BLOCK = 2048  # pieces that are carried at once
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _begin(
     tu: FloatArray, ty: FloatArray, a: tuple[float, ...], h: float, theta: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -38,7 +38,7 @@ def _begin(
     return coefficients, chains, np.array([ty[0], np.searchsorted(tu, ty[0] - h, side="right") - 1, 0.0])
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _schedule(
     tu: FloatArray, u: FloatArray, before: float, linear: bool, ty: FloatArray, h: float, clock: FloatArray
 ) -> tuple[FloatArray, int, int]:
@@ -85,7 +85,7 @@ def _schedule(
     return pieces, count, k - first
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _transitions(
     a: FloatArray, pieces: FloatArray, count: int, resolution: float
 ) -> tuple[FloatArray, NDArray[np.int64]]:
@@ -106,7 +106,7 @@ def _transitions(
     return transitions(a, known[:found]), which
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _propagate(
     a: tuple[float, ...],
     F: FloatArray,
@@ -149,7 +149,7 @@ def _propagate(
     return bool(abs(chains[0, 0]) + abs(chains[0, 1 + n]) < _OVERFLOW)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _propagate_sensitivities(
     a: tuple[float, ...],
     b: float,
@@ -194,7 +194,7 @@ def _propagate_sensitivities(
         carried[i, n + 2] = s[i]
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def normal_matrix(
     tu: FloatArray,
     u: FloatArray,
@@ -272,7 +272,7 @@ def normal_matrix(
     return gram, bool(np.all(np.isfinite(gram)))
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _filter(rows: FloatArray, whitening: FloatArray, skip: int, count: int, white: FloatArray) -> None:
     p = whitening.size
     for k in range(skip, count):
@@ -283,7 +283,7 @@ def _filter(rows: FloatArray, whitening: FloatArray, skip: int, count: int, whit
             white[k, c] = total
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def output(
     tu: FloatArray,
     u: FloatArray,
@@ -310,7 +310,7 @@ def output(
     return x
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def sensitivities(
     tu: FloatArray,
     u: FloatArray,
@@ -336,7 +336,7 @@ def sensitivities(
     return columns[:, : 2 * n + 3]
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def linear_part(
     tu: FloatArray,
     u: FloatArray,
