@@ -36,8 +36,8 @@ class FrequencyPoint:
     covariance : ((float, float), (float, float))
         Covariance of (real part, imaginary part) of ``response``.
     source : str
-        Which estimate it is: ``relay`` (fundamental of a limit cycle), ``harmonic``, ``local polynomial``,
-        ``spectral``, ``closed loop``.
+        Which estimate it is: ``relay`` (fundamental of a limit cycle), ``sweep`` (all rows of a relay sweep together),
+        ``harmonic``, ``local polynomial``, ``spectral``, ``closed loop``.
     """
 
     omega_rad_s: float

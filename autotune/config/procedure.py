@@ -102,6 +102,13 @@ class ExperimentSettings(Section):
         float, Field(gt=0, lt=0.5, description="relative standard deviation at which a point is good enough")
     ] = 0.004
     budget_s: Annotated[Time, Field(description="rig time for the sweep [s]")] = 60.0
+    together: Annotated[
+        bool,
+        Field(
+            description="estimate all points together from three limit cycles where a test allows it, which takes half"
+            " the time; false: a limit cycle for each"
+        ),
+    ] = True
 
     @model_validator(mode="after")
     def _apart(self) -> ExperimentSettings:

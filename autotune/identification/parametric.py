@@ -62,6 +62,8 @@ class PlantFit:
         What was fitted.
     largest_residual : float
         Largest distance of a point from the plant, relative to its gain; 0 of a fit in time.
+    shared_errors : float
+        What the covariances of points that this plant gave are multiplied by where their errors count as independent.
     """
 
     plant: TransferFunction
@@ -77,6 +79,7 @@ class PlantFit:
     others: tuple[PlantFit, ...] = ()
     source: Literal["points", "recording"] = "points"
     largest_residual: float = 0.0
+    shared_errors: float = 1.0
 
     @property
     def p_value(self) -> float:
@@ -154,17 +157,20 @@ def fit_plant(points: Sequence[FrequencyPoint]) -> PlantFit:
         raise IdentificationError(
             f"{len(points)} frequency point(s)", where="fit of the plant", remedy="measure at least three frequencies"
         )
+    return not_excluded(fit_structures(points))
+
+
+def fit_structures(points: Sequence[FrequencyPoint]) -> list[PlantFit]:
+    """Return every structure that so many points can determine, fitted to them; parameters as of :func:`fit_plant`."""
     ordered = sorted(points, key=lambda point: point.omega_rad_s)
     omega = np.array([point.omega_rad_s for point in ordered])
     measured = np.array([point.response for point in ordered])
     whitener = np.array([_whitener(point) for point in ordered])
-    fits = [
-        fit
+    return [
+        _fit_structure(omega, measured, whitener, integrating, lags)
         for integrating, lags in product((False, True), range(_MAX_LAGS + 1))
         if (integrating or lags) and 2 * len(points) >= lags + 2
-        for fit in [_fit_structure(omega, measured, whitener, integrating, lags)]
     ]
-    return not_excluded(fits)
 
 
 def not_excluded(fits: Sequence[PlantFit]) -> PlantFit:

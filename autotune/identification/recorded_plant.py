@@ -114,6 +114,16 @@ def fit_recordings(recordings: Sequence[Recording], progress: Progress = quiet) 
     return not_excluded([_with_zero(recordings, one, rows) if one.tau_s else _joined(one, rows) for one in found])
 
 
+def plant_fit(models: Sequence[tuple[DelayModel, bool]]) -> PlantFit:
+    """Return the fit of one recording's models, each with whether it integrates, that its rows do not exclude."""
+    found = [
+        _Fitted(structure=_Structure(order=model.order, integrator=integrator), models=(model,))
+        for model, integrator in models
+    ]
+    rows = [min(model.rows for model, _ in models)]
+    return not_excluded([_joined(one, rows) for one in found])
+
+
 def _leading(recording: Recording, tau_s: float) -> Recording:
     """Return the recording with the command (1 + tau s) u: a jump of u acts once more, over the rows around it."""
     return replace(recording, u=recording.u + tau_s * np.gradient(recording.u, recording.t))

@@ -17,6 +17,8 @@ from autotune.identification.frequency.local_polynomial import LocalEstimate, lo
 from autotune.identification.frequency.reference_model import ReferenceModel, fit_reference, simulate_reference
 from autotune.identification.frequency.spectra import Spectra, clean_measurement, record_spectra
 from autotune.identification.frequency.windows import noted_windows, windowed_cycles
+from autotune.identification.parametric import PlantFit
+from autotune.identification.sweep_noted import estimate_again, is_noted
 from autotune.points import FrequencyPoint, as_pairs
 from autotune.recording import Recording
 
@@ -45,12 +47,15 @@ class FrequencyEstimate:
         The limit cycles, where it was a relay's.
     notes : tuple of str
         What was left out or corrected, and why.
+    fit : PlantFit or None
+        The plant that gave the points, where all rows of a sweep did together.
     """
 
     points: tuple[FrequencyPoint, ...]
     excitation: Excitation
     cycles: tuple[LimitCycle, ...] = ()
     notes: tuple[str, ...] = ()
+    fit: PlantFit | None = None
 
 
 def sessions(recordings: Sequence[Recording]) -> list[list[Recording]]:
@@ -63,12 +68,20 @@ def session_points(session: Sequence[Recording], *, largest_relative_sd: float =
     """Estimate the plant's frequency response from recordings that belong together, see :func:`sessions`.
 
     Recordings whose sidecar notes limit cycles give the very points that the experiment ended with: the fundamentals,
-    each with the others in its rough model. Parameters and errors as of :func:`frequency_points`.
+    each with the others in its rough model, or those of all rows together. Parameters and errors as of
+    :func:`frequency_points`.
     """
+    last = noted_windows(session[-1])
+    if is_noted(session[-1].metadata, len(last)):  # a sitting before it was not gone on with
+        session = session[-1:]
     cycles = windowed_cycles([one for recording in session for one in noted_windows(recording)])
     if not cycles:
         return frequency_points(session[0], largest_relative_sd=largest_relative_sd)
-    points = sorted((cycle.points[0] for cycle in cycles), key=lambda point: point.omega_rad_s)
+    own = [cycle.points[0] for cycle in cycles]
+    together = estimate_again(session[-1], own)
+    if together is not None:
+        return FrequencyEstimate(points=together.points, excitation="relay", cycles=cycles, fit=together.fit)
+    points = sorted(own, key=lambda point: point.omega_rad_s)
     return FrequencyEstimate(points=tuple(points), excitation="relay", cycles=cycles)
 
 
