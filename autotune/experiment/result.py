@@ -12,6 +12,7 @@ from autotune.experiment.leaving import SAFE
 from autotune.experiment.loop import Timing
 from autotune.experiment.relay import RelaySettings
 from autotune.identification.frequency.describing import DescribingFunctionEstimate
+from autotune.identification.sweep_estimate import SweepEstimate
 from autotune.points import FrequencyPoint
 
 
@@ -163,9 +164,9 @@ class ExperimentResult:
     Attributes
     ----------
     segments : tuple of Segment
-        One per point, in the order they were measured.
+        The limit cycles, in the order they were measured.
     points : tuple of FrequencyPoint
-        The fundamentals, ascending in frequency.
+        From all rows together where those allow it, else the cycles' fundamentals; ascending in frequency.
     plant_sign : int
         Sign of the plant's gain.
     u_rest, u_rest_sd : float
@@ -188,6 +189,10 @@ class ExperimentResult:
         What the reader should know.
     output : str
         Who moves the actuator since, as the rig confirmed it.
+    together : SweepEstimate or None
+        What gave the points, where all rows together did.
+    by_itself : str
+        Why each point is of its own limit cycle, where estimating them together was tried.
     """
 
     segments: tuple[Segment, ...]
@@ -204,3 +209,5 @@ class ExperimentResult:
     reason: str
     warnings: tuple[str, ...]
     output: str = SAFE
+    together: SweepEstimate | None = None
+    by_itself: str = ""

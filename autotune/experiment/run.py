@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 
 from autotune.config import Config
-from autotune.config.procedure import ExperimentSettings
 from autotune.errors import AutotuneError, ExperimentStopped
 from autotune.experiment.approach import Known, approach, find_midpoint, preflight
 from autotune.experiment.cycles import Earlier, refined
@@ -22,9 +21,12 @@ from autotune.experiment.relay import RelaySettings
 from autotune.experiment.result import ExperimentResult, Part, Segment, State, Status
 from autotune.experiment.return_to_setpoint import return_by_relay, setpoint_before
 from autotune.experiment.rig import Rig, RunsRelay, ShowsOutput
-from autotune.experiment.sweep import missing_phases, sweep, sweep_warnings
+from autotune.experiment.sweep import missing_phases, sweep
+from autotune.experiment.sweep_warnings import sweep_warnings
+from autotune.experiment.together import is_together
 from autotune.identification.frequency.windows import Rows
-from autotune.recording import RecordingWriter
+from autotune.identification.sweep_noted import estimate_again, reason_noted
+from autotune.recording import Recording, RecordingWriter
 
 #: rows whose mean is compared with that of as many rows before, to see whether y stands still
 REST_ROWS = 50
@@ -88,10 +90,13 @@ def run_experiment(
     """
     earlier = earlier or Earlier()
     if not missing_phases(config.experiment, earlier):
-        final = refined(earlier.segments, earlier.rows, config.signals.sample_time_s)
+        last_part = len(earlier.recordings) - 1
+        kept = [one for one in earlier.segments if one.part == last_part or not is_together(earlier)]
+        final = refined(kept, earlier.rows, config.signals.sample_time_s)
         last = earlier.recordings[-1].metadata
-        known = Known(first_move_s=math.nan, link_rad_s=last.get("link_rad_s", math.inf))
-        return _result(final, config.experiment, earlier.parts, Timing.from_table(last.get("timing", {})), known)
+        known = Known(first_move_s=last.get("first_move_s", math.nan), link_rad_s=last.get("link_rad_s", math.inf))
+        timing = Timing.from_table(last.get("timing", {}))
+        return _result(final, config, earlier.parts, timing, known, last, earlier.rows(last_part))
     extra = further_columns(rig)
     writer = RecordingWriter(recording, ("t", "u", "y", *extra), recording_metadata(config))
     with ControlLoop(rig=rig, envelope=envelope_of(config), writer=writer, extra=extra) as loop:
@@ -103,7 +108,8 @@ def run_experiment(
 
     # all cycles together, which takes many samples' time: the rig has been handed back
     final = refined(swept.segments, rows, config.signals.sample_time_s)
-    result = _result(final, config.experiment, (*earlier.parts, swept.part), loop.timing, swept.known)
+    parts = (*earlier.parts, swept.part)
+    result = _result(final, config, parts, loop.timing, swept.known, loop.metadata, loop.history())
     return replace(result, output=loop.metadata["ended"]["output"], warnings=(*result.warnings, *loop.foreign))
 
 
@@ -157,7 +163,7 @@ def experiment_on(
         raise
     part = Part(
         recording=loop.recording.name,
-        points=len(segments) - len(earlier.segments),
+        points=sum(one.part == len(earlier.recordings) for one in segments),
         rig_time_s=loop.tick.t_s,
         sweep_time_s=loop.tick.t_s - known.first_move_s,
         ended="completed",
@@ -240,13 +246,24 @@ def bring_to_operating_point(
 
 
 def _result(
-    segments: tuple[Segment, ...], wanted: ExperimentSettings, parts: tuple[Part, ...], timing: Timing, known: Known
+    segments: tuple[Segment, ...],
+    config: Config,
+    parts: tuple[Part, ...],
+    timing: Timing,
+    known: Known,
+    noted: Mapping[str, Any],
+    rows: Rows,
 ) -> ExperimentResult:
     u_means = np.array([segment.u_mean for segment in segments])
     spread = float(np.std(u_means, ddof=1)) if u_means.size > 1 else math.nan
+    points = tuple(sorted((segment.point for segment in segments), key=lambda point: point.omega_rad_s))
+    recording = Recording(t=rows[0], u=rows[1], y=rows[2], metadata=noted, name="sweep")
+    together = estimate_again(recording, [segment.point for segment in segments])
+    if together is not None:
+        points = together.points
     return ExperimentResult(
         segments=segments,
-        points=tuple(sorted((segment.point for segment in segments), key=lambda point: point.omega_rad_s)),
+        points=points,
         plant_sign=segments[-1].settings.plant_sign,
         u_rest=float(np.mean(u_means)),
         u_rest_sd=spread / math.sqrt(u_means.size),
@@ -257,7 +274,9 @@ def _result(
         sweep_time_s=sum(part.sweep_time_s for part in parts),
         parts=parts,
         reason="completed",
-        warnings=(*sweep_warnings(segments, wanted, known.link_rad_s), *_missed(timing)),
+        warnings=(*sweep_warnings(segments, config.experiment, known.link_rad_s, together), *_missed(timing)),
+        together=together,
+        by_itself=reason_noted(noted),
     )
 
 

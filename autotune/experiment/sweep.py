@@ -6,19 +6,31 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
-import numpy as np
-
 from autotune.config.procedure import ExperimentSettings, OperatingPointSettings
 from autotune.errors import ExperimentStopped, IdentificationError
 from autotune.experiment.approach import Known
 from autotune.experiment.cycles import Earlier, measured
+from autotune.experiment.dwell import Dwell, further_periods
+from autotune.experiment.limit_cycle_run import LEAST_PERIODS, run_limit_cycle
 from autotune.experiment.limits import Envelope
 from autotune.experiment.loop import ControlLoop
-from autotune.experiment.oscillation import PATIENCE, Oscillation, mean_command
-from autotune.experiment.plan import Choice, Goal, allot, choose, phase_targets, time_s, within_reach
+from autotune.experiment.oscillation import Oscillation
+from autotune.experiment.plan import (
+    Choice,
+    Goal,
+    LocalModel,
+    allot,
+    choose,
+    lag_beyond_integrator,
+    phase_targets,
+    time_s,
+    within_reach,
+)
 from autotune.experiment.relay import RelaySettings
 from autotune.experiment.result import Cycle, Segment, State
-from autotune.identification.frequency.limit_cycle import WholePeriods
+from autotune.experiment.sweep_warnings import relative_sd, sweep_warnings
+from autotune.experiment.together import estimate_beside, goes_on, is_together, was_tried
+from autotune.identification.sweep_noted import NOTED, note_of
 
 #: part of limits.swing that a limit cycle is planned for: the rest is for a mid-point that is not quite right
 PEAK_SHARE = 0.87
@@ -26,12 +38,8 @@ PEAK_SHARE = 0.87
 FIRST_PEAK_SHARE = 0.79
 #: part of the amplitude so foreseen that it reaches for sure
 FIRST_SURE = 0.9
-LEAST_PERIODS = 2
-#: residual of a limit cycle over that of the others (median) from which on it is said; under noise alone the largest of
-#: 200 points was 1.05
-UNEVEN = 1.1
-#: asymmetry of the duty (part of the period, less one half) from which on the mid-point is corrected within a point
-LARGEST_ASYMMETRY = 0.12
+#: limit cycles whose rows are estimated together
+FEW = 3
 
 Show = Callable[[str, float, Known, RelaySettings], None]
 
@@ -46,6 +54,10 @@ def sweep(
     earlier: Earlier,
 ) -> tuple[tuple[Segment, ...], Known]:
     """Measure a point at every phase that is wanted and not yet measured, within the budget of rig time.
+
+    Three limit cycles, at the ends and in the middle of the range, are run first, and their rows estimated together;
+    where the rows say that they may be, and all points are known well enough then, the sweep ends. Else every phase
+    gets a limit cycle of its own.
 
     Parameters
     ----------
@@ -71,38 +83,93 @@ def sweep(
     ends = _ends_deg(wanted, earlier)
     if not earlier.segments:
         ends = within_reach(ends, known.points[0], known.plant_sign)
-    targets = _missing(ends, wanted, earlier)
+    targets = list(_missing(ends, wanted, earlier))
     end_s = known.first_move_s + wanted.budget_s - earlier.swept_s
-    part, count = len(earlier.recordings), len(earlier.segments)
-    segments = list(earlier.segments)
-    if segments:
-        known = replace(
-            known,
-            points=tuple(one.point for one in segments),
-            swept=True,
-            warnings=sweep_warnings(segments, wanted, known.link_rad_s),
-        )
+    run = _Sweep(loop=loop, y_centre=point.y, wanted=wanted, oscillation=oscillation, show=show, earlier=earlier)
     loop.note(first_move_s=known.first_move_s, phases_deg=list(ends))
-    for i, target in enumerate(targets):
-        goal = _goal(loop.envelope, wanted.relay_amplitude, known)
-        choices = [_choice(goal, point.y, known, one) for one in targets[i:]]
-        left_s = end_s - loop.tick.t_s
-        sure = 1.0 if known.swept else FIRST_SURE
-        periods = allot(choices, goal, wanted.gain_sd, LEAST_PERIODS, left_s, sure)
-        expected_s = sum(time_s(choice, count) for choice, count in zip(choices, periods, strict=True))
-        show(
-            f"point {count + i + 1} of {count + len(targets)}: {math.degrees(target):.0f} deg",
-            expected_s,
-            known,
-            choices[0].settings,
-        )
-        reserved_s = sum(time_s(choice, LEAST_PERIODS) for choice in choices[1:])
-        foreseen = known.swept and wanted.relay_amplitude is None
-        window = _measure(oscillation, choices[0], periods[0], end_s - reserved_s, settled=i > 0, foreseen=foreseen)
+    run.know(known)
+    every = phase_targets(*ends, wanted.points)
+    if wanted.together and targets and len(every) >= FEW and not was_tried(earlier):
+        # few and short cycles that an earlier sitting left are quicker run again than gone on with
+        run.segments = []
+        left = _together(run, every, end_s)
+        if left is None:
+            return tuple(run.segments), run.known
+        targets = left
+        run.segments = [*earlier.segments, *run.segments]
+    run.measure_each()
+    _one_by_one(run, targets, end_s)
+    return tuple(run.segments), run.known
+
+
+class _Sweep:
+    """A sweep on its way: its limit cycles so far, and what they tell.
+
+    Attributes
+    ----------
+    segments : list of Segment
+        Finished limit cycles, the earlier ones first.
+    known : Known
+        What was learnt.
+    settled : bool
+        Whether the relay is at the extremum of y of a cycle of the same peak.
+    by_itself : bool
+        Whether each point is of its own cycle: then it is said how well it is known.
+    """
+
+    def __init__(
+        self,
+        *,
+        loop: ControlLoop,
+        y_centre: float,
+        wanted: ExperimentSettings,
+        oscillation: Oscillation,
+        show: Show,
+        earlier: Earlier,
+    ) -> None:
+        self.loop, self.y_centre, self.wanted, self.oscillation = loop, y_centre, wanted, oscillation
+        self._show, self._part = show, len(earlier.recordings)
+        self.segments = list(earlier.segments)
+        self.settled, self.by_itself = False, False
+        self.known = Known()
+
+    def know(self, known: Known) -> None:
+        """Take what is known, and the points measured so far."""
+        if self.segments:
+            points = tuple(one.point for one in self.segments)
+            warnings = sweep_warnings(self.segments, self.wanted, known.link_rad_s) if self.by_itself else ()
+            known = replace(known, points=points, swept=True, warnings=warnings)
+        self.known = known
+
+    def measure_each(self) -> None:
+        """Go on with a point of each cycle's own rows, the best known of each phase; a cycle replaces its phase's."""
+        best = {one.phase_rad: one for one in sorted(self.segments, key=relative_sd, reverse=True)}
+        self.by_itself = True
+        self.segments = [one for one in self.segments if best[one.phase_rad] is one]
+        self.know(self.known)
+
+    def tell(self, message: str, remaining_s: float, settings: RelaySettings | None = None) -> None:
+        """Say what happens."""
+        self._show(message, remaining_s, self.known, settings or self.oscillation.settings)
+
+    @property
+    def goal(self) -> Goal:
+        """What the next limit cycle works under."""
+        return _goal(self.loop.envelope, self.wanted.relay_amplitude, self.known)
+
+    def choices(self, phases_rad: Sequence[float]) -> list[Choice]:
+        """Return the settings for the phases as the plant is known now."""
+        return [_choice(self.goal, self.y_centre, self.known, phase) for phase in phases_rad]
+
+    def cycle(self, choice: Choice, periods: int, until_s: float) -> None:
+        """Run a limit cycle of so many whole periods, or until its time is over, and take its point."""
+        loop, known = self.loop, self.known
+        foreseen = known.swept and self.wanted.relay_amplitude is None
+        window = run_limit_cycle(self.oscillation, choice, periods, until_s, settled=self.settled, foreseen=foreseen)
         cycle = Cycle(
-            part=part,
-            phase_rad=target,
-            settings=oscillation.settings,
+            part=self._part,
+            phase_rad=choice.phase_rad,
+            settings=self.oscillation.settings,
             start_s=window.start_s,
             end_s=window.end_s,
             periods=window.periods,
@@ -111,22 +178,116 @@ def sweep(
             segment = measured(cycle, loop.history(), loop.sample_time_s, known.points if known.swept else ())
         except IdentificationError as error:
             raise ExperimentStopped(error.what, where=State.SWEEP.value, remedy=error.remedy) from error
-        segments.append(segment)
-        loop.note(relay=[one.to_table() for one in segments[count:]])
-        known = replace(
-            known,
-            midpoint=segment.u_mean,
-            noise_sd=segment.noise_sd,
-            points=(*(known.points if known.swept else ()), segment.point),
-            swept=True,
-            warnings=sweep_warnings(segments, wanted, known.link_rad_s),
+        if self.by_itself:
+            self.segments = [one for one in self.segments if one.phase_rad != choice.phase_rad]
+        self.segments.append(segment)
+        self.settled = True
+        loop.note(relay=[one.to_table() for one in self.segments if one.part == self._part])
+        self.know(replace(known, midpoint=segment.u_mean, noise_sd=segment.noise_sd))
+
+
+def _one_by_one(run: _Sweep, targets: Sequence[float], end_s: float) -> None:
+    """Give every phase a limit cycle of its own, as long as its point needs or the budget allows."""
+    count = len(run.segments)
+    for i, target in enumerate(targets):
+        choices = run.choices(targets[i:])
+        sure = 1.0 if run.known.swept else FIRST_SURE
+        periods = allot(choices, run.goal, run.wanted.gain_sd, LEAST_PERIODS, end_s - run.loop.tick.t_s, sure)
+        expected_s = sum(time_s(choice, count) for choice, count in zip(choices, periods, strict=True))
+        said = f"point {count + i + 1} of {count + len(targets)}: {math.degrees(target):.0f} deg"
+        run.tell(said, expected_s, choices[0].settings)
+        reserved_s = sum(time_s(choice, LEAST_PERIODS) for choice in choices[1:])
+        run.cycle(choices[0], periods[0], end_s - reserved_s)
+
+
+def _together(run: _Sweep, targets: Sequence[float], end_s: float) -> list[float] | None:
+    """Run few limit cycles and estimate their rows together; return which phases need a cycle of their own, if any."""
+    loop = run.loop
+    first = (targets[0], targets[len(targets) // 2], targets[-1])
+    unvisited = [phase for phase in targets if phase not in first]
+    others = [phase if run.known.plant_sign > 0 else phase + math.pi for phase in unvisited]
+    for i, target in enumerate(first):
+        choices = run.choices(first[i:])
+        remaining_s = sum(time_s(choice, LEAST_PERIODS) for choice in choices)
+        run.tell(f"all points together, {math.degrees(target):.0f} deg", remaining_s, choices[0].settings)
+        run.cycle(choices[0], LEAST_PERIODS, end_s)
+    while True:
+        run.tell("estimating all points together", 0.0)
+        found = estimate_beside(run.oscillation, run.segments, others, run.known.first_move_s)
+        run.settled = not goes_on(loop)
+        why = found if isinstance(found, str) else found.refused
+        if loop.monitor.commands.found:
+            why = "commands of another master"
+        if why or isinstance(found, str) or found.worst_sd <= run.wanted.gain_sd:
+            break
+        choices = run.choices(first)
+        periods = _further(run, choices, found.worst_sd, end_s - loop.tick.t_s)
+        if not any(periods):
+            break
+        most = max(range(len(first)), key=lambda i: periods[i] * 2.0 * math.pi / choices[i].omega_rad_s)
+        remaining_s = sum(time_s(choice, count) for choice, count in zip(choices, periods, strict=True) if count)
+        said = f"all points together, known to {100 * found.worst_sd:.2g} %: {math.degrees(first[most]):.0f} deg again"
+        run.tell(said, remaining_s, choices[most].settings)
+        run.cycle(choices[most], periods[most], end_s)
+    estimate = None if isinstance(found, str) else found
+    loop.note(**{NOTED: note_of(estimate, why, len(run.segments), others)})
+    if not why:
+        return None
+    run.tell(f"each point by itself: {why}", math.nan)
+    run.settled = False
+    return _by_themselves(run, first, unvisited, end_s)
+
+
+def _further(run: _Sweep, choices: Sequence[Choice], sd: float, left_s: float) -> tuple[int, ...]:
+    """Return the further periods that each of the limit cycles needs, for all points to be as good as is wanted."""
+    noise, middle = max(run.known.noise_sd, 1e-300), sorted(run.known.points, key=lambda point: point.omega_rad_s)[1]
+    model = LocalModel.through(middle.omega_rad_s, middle.gain, lag_beyond_integrator(middle, run.known.plant_sign))
+    done = [
+        Dwell(
+            omega_rad_s=one.point.omega_rad_s,
+            signal=4.0 / math.pi * one.settings.amplitude * one.point.gain / noise,
+            periods=one.periods,
         )
-    return tuple(segments), known
+        for one in run.segments
+    ]
+    ahead = [
+        Dwell(omega_rad_s=one.omega_rad_s, signal=one.y_amplitude / noise, periods=LEAST_PERIODS) for one in choices
+    ]
+    factor = run.wanted.gain_sd / sd
+    return further_periods(done, ahead, model, run.loop.sample_time_s, factor=factor, left_s=left_s)
+
+
+def _by_themselves(run: _Sweep, first: Sequence[float], others: Sequence[float], end_s: float) -> list[float]:
+    """Return the phases to be measured by themselves: those without a cycle, and the others again as time allows.
+
+    The first three cycles are short, and followed on each other over large changes, whose transients a point by itself
+    takes for its own: the coarsest are run again first.
+    """
+    wanted = list(others)
+    left_s = end_s - run.loop.tick.t_s - sum(time_s(one, LEAST_PERIODS) for one in run.choices(others))
+    sds = {one.phase_rad: relative_sd(one) for one in run.segments}
+    for phase in sorted(first, key=lambda phase: -sds[phase]):
+        needed_s = time_s(run.choices([phase])[0], LEAST_PERIODS)
+        if needed_s <= left_s:
+            wanted.append(phase)
+            left_s -= needed_s
+    return sorted(wanted)
 
 
 def missing_phases(wanted: ExperimentSettings, earlier: Earlier) -> tuple[float, ...]:
-    """Return the phases of the positive-gain plant that no finished cycle has aimed at, in their order [rad]."""
+    """Return the phases of the positive-gain plant that are still to be measured, in their order [rad]."""
+    if is_together(earlier):
+        return ()
     return _missing(_ends_deg(wanted, earlier), wanted, earlier)
+
+
+def phases_between(ends_deg: Sequence[float], wanted: ExperimentSettings, segments: Sequence[Segment]) -> list[float]:
+    """Return the wanted phases of a range [deg] that no limit cycle aimed at [rad]."""
+    return [phase for phase in phase_targets(ends_deg[0], ends_deg[1], wanted.points) if not _is_aimed(phase, segments)]
+
+
+def _is_aimed(phase_rad: float, segments: Sequence[Segment]) -> bool:
+    return any(math.isclose(phase_rad, one.phase_rad) for one in segments)
 
 
 def _ends_deg(wanted: ExperimentSettings, earlier: Earlier) -> tuple[float, float]:
@@ -137,46 +298,7 @@ def _ends_deg(wanted: ExperimentSettings, earlier: Earlier) -> tuple[float, floa
 
 
 def _missing(ends_deg: tuple[float, float], wanted: ExperimentSettings, earlier: Earlier) -> tuple[float, ...]:
-    done = [one.phase_rad for one in earlier.segments]
-    targets = phase_targets(*ends_deg, wanted.points)
-    return tuple(phase for phase in targets if not any(math.isclose(phase, other) for other in done))
-
-
-def sweep_warnings(segments: Sequence[Segment], experiment: ExperimentSettings, link_rad_s: float) -> tuple[str, ...]:
-    """Return what the reader should know of points not as good as was wanted, or beyond what the link supports."""
-    wanted = experiment.gain_sd
-    sds = [math.sqrt(float(np.trace(one.point.covariance)) / 2.0) / one.point.gain for one in segments]
-    beyond = tuple(
-        f"point at {omega:.3g} rad/s is beyond the {link_rad_s:.3g} rad/s that this link supports: its phase may be off"
-        f" by {math.degrees(wanted * omega / link_rad_s):.2g} deg, use a link with less latency"
-        for omega in (one.point.omega_rad_s for one in segments)
-        if omega > link_rad_s
-    )
-    coarse = [sd > 1.1 * wanted for sd in sds]
-    if not any(coarse):
-        return beyond
-    enough_s = experiment.budget_s * (max(sds) / wanted) ** 2  # a variance falls as the time grows
-    residual = _over_others(segments)
-    worst = max((i for i, one in enumerate(coarse) if one), key=lambda i: residual[i])
-    at, first = segments[worst], ""
-    if residual[worst] > UNEVEN:
-        first = (
-            f"look for an actuator at its limit, a load, or a start that had not settled at {at.start_s:.4g} to"
-            f" {at.end_s:.4g} s, where y swings less evenly than elsewhere; else "
-        )
-    return (
-        *beyond,
-        f"{sum(coarse)} of {len(sds)} points are known to {100 * max(sds):.2g} % at worst, {100 * wanted:.2g} % was"
-        f" wanted: {first}set experiment.budget_s = {float(f'{enough_s:.2g}'):g}",
-    )
-
-
-def _over_others(segments: Sequence[Segment]) -> list[float]:
-    """Return every cycle's residual over the median of the others; 1 where there are too few to compare."""
-    noise = np.array([one.noise_sd for one in segments])
-    if noise.size < 3:
-        return [1.0] * noise.size
-    return [float(own / np.median(np.delete(noise, i))) for i, own in enumerate(noise)]
+    return tuple(phases_between(ends_deg, wanted, earlier.segments))
 
 
 def _goal(envelope: Envelope, amplitude: float | None, known: Known) -> Goal:
@@ -203,77 +325,3 @@ def _choice(goal: Goal, y_centre: float, known: Known, phase_rad: float) -> Choi
         y_centre=y_centre,
         plant_sign=known.plant_sign,
     )
-
-
-def _measure(
-    oscillation: Oscillation, choice: Choice, wanted: int, until_s: float, *, settled: bool, foreseen: bool
-) -> WholePeriods:
-    """Run one setting for whole periods, or until its time is over.
-
-    Parameters
-    ----------
-    oscillation : Oscillation
-        The relay, at the extremum of y.
-    choice : Choice
-        The setting.
-    wanted : int
-        Whole periods to measure.
-    until_s : float
-        When to end with fewer, but with no fewer than the least [s].
-    settled : bool
-        Whether the cycle before had the same peak: then this one is settled from its first row on.
-    foreseen : bool
-        Whether measured points say that the setting keeps within the swing.
-    """
-    loop = oscillation.loop
-    step_s = loop.sample_time_s
-    oscillation.change(
-        choice.settings,
-        patience_s=PATIENCE * math.pi / choice.omega_rad_s,
-        turning_s=choice.turning_s,
-        foreseen=foreseen,
-    )
-    # sample times count here and not rows: some may have been missed
-    start, start_row, lead = loop.tick.slot if settled else -1, oscillation.start_row, 0
-    turning = round(choice.turning_s / step_s)
-    skip = 0  # edges before the cycle that is measured
-    foreign = loop.monitor.commands.found
-    disturbed = len(foreign)
-    while True:
-        tick, switched = oscillation.step()
-        if len(foreign) > disturbed:  # its command was not this cycle's: anew, when it has died away for a period
-            disturbed, skip, start = len(foreign), len(oscillation.edges) + 1, -1
-        edges = oscillation.slots[skip:]
-        if switched and len(edges) > 2 and _rebalanced(oscillation):
-            skip, start = len(oscillation.edges) - 1, -1
-            continue
-        if start < 0 and edges:
-            start, start_row, lead = edges[0] + turning, oscillation.edges[skip], turning
-        if len(edges) < 2 * LEAST_PERIODS:
-            continue
-        period = (edges[-1] + edges[-2] - edges[1] - edges[0]) / (len(edges) - 2)
-        periods = max(LEAST_PERIODS, min(wanted, int((until_s / step_s - start) / period)))
-        # the next setting takes over at the extremum of y: not before it, and not when the next switch is near
-        since_switch = tick.slot - edges[-1]
-        at_extremum = turning <= since_switch <= turning + 0.15 * period
-        if tick.slot < start + periods * period + 1 or not at_extremum:
-            continue
-        t = loop.history(start_row)[0]
-        t = t[int(np.searchsorted(t, t[0] + (lead - 0.5) * step_s)) :]
-        # a sample time on the clock of the stamps, which may be the device's
-        slot_s = (t[-1] - t[0]) / round((t[-1] - t[0]) / step_s)
-        return WholePeriods(start_s=float(t[0]), end_s=float(t[0] + periods * period * slot_s), periods=periods)
-
-
-def _rebalanced(oscillation: Oscillation) -> bool:
-    """Correct the mid-point where the last period was lopsided, and say whether it was."""
-    settings = oscillation.settings
-    mean = mean_command(oscillation.loop, oscillation.edges)
-    if abs(mean - settings.midpoint) / settings.amplitude <= 2.0 * LARGEST_ASYMMETRY:
-        return False
-    step = oscillation.loop.envelope.u_step
-    midpoint = step * round(mean / step) if step > 0.0 else mean
-    if midpoint == settings.midpoint:
-        return False
-    oscillation.move_midpoint(midpoint)
-    return True

@@ -17,6 +17,10 @@ from sim.imperfections import Fault, FaultyPlant
 CONFIG = Path(__file__).resolve().parents[3] / "configs" / "ball_sim.toml"
 
 
+#: a limit cycle for each point: faults that come at a certain time of such a sweep
+EACH: dict[str, Any] = {"experiment": {"together": False}}
+
+
 def ball_config(**sections: dict[str, Any]) -> Config:
     """Return the ball's configuration, as it is shipped, with some keys of some sections replaced."""
     config = load_config(CONFIG)

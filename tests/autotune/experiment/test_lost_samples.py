@@ -19,7 +19,7 @@ from autotune.recording import read_recording
 from drivers.simulated import SimulatedRig
 from sim.imperfections import Fault, FaultyPlant
 from sim.plant import make_plant
-from tests.autotune.experiment.rigs import ball_config
+from tests.autotune.experiment.rigs import EACH, ball_config
 
 
 class BusyComputer(SimulatedRig):
@@ -39,7 +39,7 @@ class BusyComputer(SimulatedRig):
 
 
 def swept(folder: Path, share: float) -> ExperimentResult:
-    return run_experiment(BusyComputer(share), ball_config(), folder / f"{share:g}.csv")
+    return run_experiment(BusyComputer(share), ball_config(**EACH), folder / f"{share:g}.csv")
 
 
 def test_forty_percent_of_lost_samples_do_not_stretch_the_relays_delay(tmp_path: Path) -> None:
@@ -88,4 +88,4 @@ def test_a_swing_that_is_left_while_samples_are_lost_is_the_links_and_not_the_ac
 
     rig.plant = FaultyPlant(rig.plant, [Fault(kind="inverted actuator", start_s=45.0, value=5.0)])
     with pytest.raises(LinkError, match=r"link too slow: \d+ % of the latest samples were missed, and y"):
-        run_experiment(rig, ball_config(), tmp_path / "asleep.csv", on_status=fall_asleep)
+        run_experiment(rig, ball_config(**EACH), tmp_path / "asleep.csv", on_status=fall_asleep)

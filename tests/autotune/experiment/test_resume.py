@@ -15,20 +15,20 @@ from autotune.experiment.result import ExperimentResult, Status
 from autotune.experiment.run import run_experiment
 from autotune.points import FrequencyPoint
 from autotune.recording import read_recording
-from tests.autotune.experiment.rigs import CONFIG, ball_config, ball_rig
+from tests.autotune.experiment.rigs import CONFIG, EACH, ball_config, ball_rig
 
 SAMPLE_S = 0.01
 
 CHILD = """
 import os, signal, sys
 from autotune.experiment.run import run_experiment
-from tests.autotune.experiment.rigs import ball_config, ball_rig
+from tests.autotune.experiment.rigs import EACH, ball_config, ball_rig
 
 def kill_in_the_third_setting(progress):
     if len(progress.points) == 2:
         os.kill(os.getpid(), signal.SIGKILL)
 
-run_experiment(ball_rig(seed=7), ball_config(), sys.argv[1], on_status=kill_in_the_third_setting)
+run_experiment(ball_rig(seed=7), ball_config(**EACH), sys.argv[1], on_status=kill_in_the_third_setting)
 """
 
 
@@ -39,7 +39,7 @@ def stop_in_the_third_setting(progress: Status) -> None:
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> ExperimentResult:
-    return run_experiment(ball_rig(seed=7), ball_config(), tmp_path_factory.mktemp("whole") / "recording.csv")
+    return run_experiment(ball_rig(seed=7), ball_config(**EACH), tmp_path_factory.mktemp("whole") / "recording.csv")
 
 
 @pytest.fixture(scope="module")
@@ -55,7 +55,7 @@ def killed(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def resumed(killed: Path) -> tuple[ExperimentResult, Earlier]:
     earlier = read_earlier([killed], SAMPLE_S)
     return run_experiment(
-        ball_rig(seed=7), ball_config(), killed.with_name("recording-2.csv"), earlier=earlier
+        ball_rig(seed=7), ball_config(**EACH), killed.with_name("recording-2.csv"), earlier=earlier
     ), earlier
 
 

@@ -1,0 +1,155 @@
+"""A sweep whose points are estimated together: when that is done, when it is refused, and what is kept of it."""
+
+from __future__ import annotations
+
+import math
+import threading
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from autotune.errors import ExperimentStopped
+from autotune.experiment.cycles import read_earlier
+from autotune.experiment.dwell import Dwell, further_periods
+from autotune.experiment.plan import LocalModel, phase_targets
+from autotune.experiment.result import ExperimentResult, Status
+from autotune.experiment.run import run_experiment
+from autotune.experiment.sweep import missing_phases
+from autotune.identification.frequency.recorded import session_points
+from autotune.identification.sweep_estimate import gain_phase_sd
+from autotune.recording import read_recording
+from drivers.simulated import SimulatedRig
+from sim.ball import make_ball
+from sim.imperfections import Fault, FaultyPlant
+from tests.autotune.experiment.rigs import EACH, ball_config, ball_rig
+from tests.benchmarks._joint_plants import CASES, LinearPlant
+
+SAMPLE_S = 0.01
+
+
+@pytest.fixture(scope="module")
+def swept(tmp_path_factory: pytest.TempPathFactory) -> tuple[ExperimentResult, Path]:
+    path = tmp_path_factory.mktemp("together") / "recording.csv"
+    return run_experiment(ball_rig(seed=7), ball_config(), path), path
+
+
+def test_all_points_are_known_as_well_as_is_wanted_in_half_the_time(
+    swept: tuple[ExperimentResult, Path], tmp_path: Path
+) -> None:
+    result, _ = swept
+    each = run_experiment(ball_rig(seed=7), ball_config(**EACH), tmp_path / "each.csv")
+    wanted = ball_config().experiment
+    assert result.together is not None
+    assert len(result.points) == len(each.points) == wanted.points
+    assert result.sweep_time_s < 0.6 * each.sweep_time_s
+    assert all(max(gain_phase_sd(point)) <= wanted.gain_sd for point in result.points)
+    targets = phase_targets(*wanted.phases_deg, wanted.points)
+    reached = sorted(float(np.angle(-point.response)) for point in result.points)
+    assert reached == pytest.approx(targets, abs=math.radians(5.0))
+
+
+def test_the_recording_gives_the_same_points_again_and_no_rig_is_needed(
+    swept: tuple[ExperimentResult, Path], tmp_path: Path
+) -> None:
+    result, path = swept
+    again = session_points([read_recording(path)])
+    assert again.points == result.points
+    assert again.fit is not None
+    assert result.together is not None
+    assert again.fit.plant == result.together.fit.plant
+    earlier = read_earlier([path], SAMPLE_S)
+    assert missing_phases(ball_config().experiment, earlier) == ()
+    rig = ball_rig(seed=7)
+    assert run_experiment(rig, ball_config(), tmp_path / "never.csv", earlier=earlier).points == result.points
+    assert rig.clock.now() == 0.0
+
+
+def test_a_recording_that_lost_a_cycle_is_not_taken_for_a_whole_sweep(
+    swept: tuple[ExperimentResult, Path], tmp_path: Path
+) -> None:
+    _, path = swept
+    lines = path.read_bytes().splitlines(keepends=True)
+    (tmp_path / "recording.csv").write_bytes(b"".join(lines[: int(0.8 * len(lines))]))
+    (tmp_path / "recording.toml").write_bytes(path.with_suffix(".toml").read_bytes())
+    earlier = read_earlier([tmp_path / "recording.csv"], SAMPLE_S)
+    assert missing_phases(ball_config().experiment, earlier)
+
+
+@pytest.mark.parametrize("start_s", [16.0, 20.0, 24.0, 28.0])
+@pytest.mark.parametrize("share", [0.85, 0.93])
+def test_an_actuator_that_clips_in_mid_sweep_gives_no_points_of_all_rows_that_are_wrong(
+    start_s: float, share: float, tmp_path: Path
+) -> None:
+    whole = run_experiment(ball_rig(seed=3), ball_config(), tmp_path / "whole.csv")
+    hit = next((one for one in whole.segments if one.end_s > start_s), whole.segments[-1])
+    level = hit.settings.midpoint + share * hit.settings.amplitude
+    plant = FaultyPlant(make_ball(seed=3, noise=0.35), [Fault(kind="saturated actuator", start_s=start_s, value=level)])
+    try:
+        result = run_experiment(SimulatedRig(plant, u_safe=0.0), ball_config(), tmp_path / "clipped.csv")
+    except ExperimentStopped:
+        return
+    if result.together is not None:
+        truth = plant.response(np.array([point.omega_rad_s for point in result.points]))
+        for point, expected in zip(result.points, truth, strict=True):
+            assert abs(point.response / expected - 1.0) < 4.0 * ball_config().experiment.gain_sd
+    else:
+        assert result.by_itself
+
+
+@pytest.mark.parametrize("name", ["inverse response 0.6", "resonance at 5, damping 0.1"])
+def test_what_is_no_equation_of_low_order_gets_a_cycle_for_each_point(name: str, tmp_path: Path) -> None:
+    case = next(case for case in CASES if case.name == name)
+    rig = SimulatedRig(LinearPlant(case, seed=2), u_safe=5.0)
+    told: list[Status] = []
+    result = run_experiment(rig, case.config(together=True), tmp_path / "r.csv", on_status=told.append)
+    assert result.together is None
+    assert "the rows show other dynamics" in result.by_itself
+    assert any(result.by_itself in one.message for one in told)
+    assert len({one.phase_rad for one in result.segments}) == len(result.points) == 5
+
+
+def test_a_load_step_in_the_sweep_is_told_and_sends_it_to_cycles_of_their_own(tmp_path: Path) -> None:
+    case = next(case for case in CASES if case.name == "integrator, lag 1, dead time 0.05")
+    case = replace(case, load=0.006, load_s=8.0 * case.time_s)
+    result = run_experiment(
+        SimulatedRig(LinearPlant(case, seed=1), u_safe=5.0), case.config(together=True), tmp_path / "r.csv"
+    )
+    assert result.together is None
+    assert "a drift or a load" in result.by_itself
+
+
+class GoingOn(SimulatedRig):
+    """A simulated rig whose clock says that time goes on: the estimate runs beside the loop."""
+
+    def __init__(self, seed: int) -> None:
+        super().__init__(FaultyPlant(make_ball(seed=seed, noise=0.35), []), u_safe=0.0)
+        self.clock.goes_on = True  # type: ignore[attr-defined]
+        self.beside = 0
+
+    def write(self, u: float) -> None:
+        super().write(u)
+        self.beside += any(one.name == "estimate of the sweep" for one in threading.enumerate())
+
+
+def test_the_relay_goes_on_while_the_estimate_runs_beside_it(tmp_path: Path) -> None:
+    rig = GoingOn(seed=7)
+    result = run_experiment(rig, ball_config(limits={"time_s": 4000.0}), tmp_path / "r.csv")
+    assert rig.beside > 0
+    assert len(result.points) == 5
+    assert np.abs(read_recording(tmp_path / "r.csv").between(result.segments[0].start_s, 1e9).y - 5.0).max() < 3.4
+
+
+def test_the_dwell_goes_where_a_period_tells_most() -> None:
+    model = LocalModel(k=60.0, tau_s=0.36)
+    omegas = (4.35, 2.36, 1.1)
+    run = [Dwell(omega_rad_s=omega, signal=13.0, periods=2) for omega in omegas]
+    half = further_periods(run, run, model, 0.01, factor=0.5, left_s=1e4)
+    more = further_periods(run, run, model, 0.01, factor=0.25, left_s=1e4)
+    assert sum(count * one.period_s for count, one in zip(more, run, strict=True)) > sum(
+        count * one.period_s for count, one in zip(half, run, strict=True)
+    )
+    assert further_periods(run, run, model, 0.01, factor=1.0, left_s=1e4) == (0, 0, 0)
+    assert further_periods(run, run, model, 0.01, factor=0.5, left_s=1.0) == (0, 0, 0)
+    assert half[0] > 0  # the short periods of the fast end come cheap
