@@ -176,14 +176,20 @@ def _gains(controller: Path | None, design: Path | None, run: Path | None) -> PI
 
 def _plant(run: Path | None, points: Path | None) -> tuple[Measured, PlantFit]:
     """Return what is known of the rig, and the plant that its loop is predicted with."""
+    from autotune.identification.frequency.recorded import session_points
     from autotune.identification.parametric import fit_plant
-    from autotune.pipeline.folder import Measured, read_measured
+    from autotune.pipeline.folder import Measured, read_measured, recordings
     from autotune.points import read_points
+    from autotune.recording import read_recording
 
     if points is not None:
         measured = Measured(points=read_points(points))
     elif run is not None:
         measured = read_measured(run)
+        if any(point.source == "sweep" for point in measured.points):  # they share their errors: the rows' own plant
+            fit = session_points([read_recording(path) for path in recordings(run)]).fit
+            if fit is not None:
+                return measured, fit
     else:
         raise InputError(
             "there is nothing to predict the loop with",

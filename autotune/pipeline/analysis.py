@@ -27,7 +27,7 @@ from autotune.identification.consistent_structures import consistent_structures
 from autotune.identification.parametric import PlantFit, fit_plant
 from autotune.identification.reduction import ReducedModel, reduce_points
 from autotune.pipeline.one_thread import on_one_thread
-from autotune.points import FrequencyPoint
+from autotune.points import FrequencyPoint, as_pairs
 from autotune.progress import Progress, quiet
 
 #: Below this phase [deg] a PI has no use for a point, and another turn could not be told from a rise.
@@ -150,6 +150,7 @@ def analyse(
     left_out = len(measured) - len(usable)
     beyond = (f"{left_out} points past {LOWEST_PHASE_DEG:g} deg were left out: a PI has no use for them",)
     fit = fit_plant(usable) if fit is None else fit
+    usable = _as_independent(usable, fit)
     facts = facts or LoopFacts()
     asked, noise_source = specification(settings, fit, facts, _highest(usable, fit, facts))
     reduced = _reduced(usable, fit)
@@ -351,7 +352,8 @@ def _on_structures(
 def looked_at(analysis: Analysis, controller: PIDController) -> tuple[Check, ...]:
     """Return the checks of another controller than the designed one, as of gains that a rig rounds."""
     asked = analysis.design.specification
-    return _checks(analysis.source, of_use(analysis.points), analysis.fit, controller, asked)
+    usable = _as_independent(of_use(analysis.points), analysis.fit)
+    return _checks(analysis.source, usable, analysis.fit, controller, asked)
 
 
 def _binding_words(design: Design, noise_source: str, fit: PlantFit, settings: DesignSettings) -> tuple[str, ...]:
@@ -395,6 +397,13 @@ def of_use(points: Sequence[FrequencyPoint]) -> list[FrequencyPoint]:
     of_positive_gain = phase - 180.0 * math.ceil((phase[0] - 30.0) / 180.0)
     beyond = np.flatnonzero(of_positive_gain < LOWEST_PHASE_DEG)
     return ordered[: int(beyond[0])] if beyond.size else ordered
+
+
+def _as_independent(points: Sequence[FrequencyPoint], fit: PlantFit) -> list[FrequencyPoint]:
+    """Return points whose errors may count as independent: those of one fit share them, and get wider regions."""
+    if fit.shared_errors == 1.0:
+        return list(points)
+    return [replace(one, covariance=as_pairs(fit.shared_errors * np.array(one.covariance))) for one in points]
 
 
 def _reduced(points: Sequence[FrequencyPoint], fit: PlantFit) -> ReducedModel | AutotuneError:

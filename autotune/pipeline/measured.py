@@ -11,6 +11,7 @@ from autotune.design.noise import LoopFacts, noise_of
 from autotune.errors import AutotuneError
 from autotune.identification.dependence import require_answer
 from autotune.identification.frequency.recorded import FrequencyEstimate, combine, session_points, sessions
+from autotune.identification.frequency.windows import noted_windows
 from autotune.identification.parametric import PlantFit
 from autotune.identification.recorded_plant import fit_recordings
 from autotune.pipeline.one_thread import on_one_thread
@@ -33,7 +34,7 @@ class Measured:
     points : tuple of FrequencyPoint
         Of all recordings and files.
     fit : PlantFit or None
-        Of plain recordings; None where the points are to be fitted.
+        Of plain recordings, or of all rows of a sweep together; None where the points are to be fitted.
     facts : LoopFacts
         Noise, span of the command and sample time of the recordings.
     notes : tuple of str
@@ -66,9 +67,11 @@ def measured_of(
     AutotuneError
         y does not answer u beyond chance, or neither points nor a fit can be had of them.
     """
-    if recordings:
+    # an experiment that noted its limit cycles has seen y answer, and few of them say little of it
+    plain = [one for one in recordings if not noted_windows(one)]
+    if plain:
         progress("asking whether y answers u", 0.0)
-        require_answer(recordings)
+        require_answer(plain)
     estimates: list[FrequencyEstimate] = []
     notes: list[str] = []
     reason: AutotuneError | None = None
@@ -79,7 +82,7 @@ def measured_of(
             reason = reason or error
             notes.append(f"no frequency points: {error}")
     combined = combine(estimates) if estimates else None
-    fit: PlantFit | None = None
+    fit = combined.fit if combined is not None and not given else None
     if recordings and not given and all(one.excitation in _PLAIN for one in estimates):
         try:
             fit = fit_recordings(recordings, progress)

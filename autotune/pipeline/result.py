@@ -112,6 +112,8 @@ def _experiment_json(experiment: ExperimentResult | None, reason: str) -> dict[s
         "noise_sd": experiment.noise_sd,
         "plant_sign": experiment.plant_sign,
         "timing": asdict(experiment.timing),
+        "together": None if experiment.together is None else experiment.together.to_json(),
+        "by_itself": experiment.by_itself,
     }
 
 

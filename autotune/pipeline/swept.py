@@ -48,8 +48,10 @@ def analyse_sweep(
     """
     analysis: Analysis | None = None
     reason: AutotuneError | None = None
+    # points of all rows together share their errors: the plant is that of the rows, not one fitted to the points
+    fit = None if experiment.together is None else experiment.together.fit
     try:
-        analysis = analyse(experiment.points, settings, facts=facts)
+        analysis = analyse(experiment.points, settings, fit=fit, facts=facts)
     except (IdentificationError, DesignError) as error:
         reason = error
     if analysis is not None and not contradict(analysis.fit):
