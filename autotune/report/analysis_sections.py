@@ -93,6 +93,10 @@ def _points_section(analysis: Analysis, signals: SignalSettings, experiment: Exp
             "Each point is the ratio of the recorded measurement's Fourier coefficient to that of the recorded,"
             " held command over whole periods; its region counts the noise that was found beside the oscillation."
             if all(point.source in _RELAY_SOURCES for point in analysis.points)
+            else "All points are of the differential equation with dead time that was fitted to all rows of the sweep,"
+            " averaged over its orders: their errors go together. Each region counts the noise, and what the orders"
+            " differ by."
+            if _is_of_rows(analysis)
             else "Colours tell the estimates apart: relay points come from whole periods of a limit cycle,"
             " closed-loop points from a model of the loop under control, others from a band of frequencies. Each"
             " region counts the noise of its own experiment."
@@ -167,15 +171,25 @@ def _wrapped(angle_rad: float) -> float:
     return (angle_rad + math.pi) % (2 * math.pi) - math.pi
 
 
+def _fitted_to(analysis: Analysis) -> str:
+    if analysis.fit.source == "recording":
+        return "through the recording"
+    return "to all rows of the sweep" if _is_of_rows(analysis) else "through the points"
+
+
+def _is_of_rows(analysis: Analysis) -> bool:
+    return bool(analysis.points) and all(point.source == "sweep" for point in analysis.points)
+
+
 def _model_section(analysis: Analysis, signals: SignalSettings) -> Section:
     reduced, fit = analysis.reduced, analysis.fit
     fitted = (
-        f"A transfer function was fitted through the {'points' if fit.source == 'points' else 'recording'}:"
+        f"A transfer function was fitted {_fitted_to(analysis)}:"
         f" {_transfer_text(fit, signals)}."
         # of a recording the noise is estimated from the same residual: its chi-square would say nothing
         + (
             f" Chi-square {fit.chi_square:.1f} with {fit.degrees_of_freedom} degrees of freedom."
-            if fit.source == "points"
+            if fit.source == "points" and not _is_of_rows(analysis)
             else ""
         )
         + (f" {len(fit.others)} other structure(s) are not excluded by the data." if fit.others else "")

@@ -15,6 +15,9 @@ from autotune.experiment.judgement import Verification, smoothed
 from autotune.experiment.leaving import sentence
 from autotune.experiment.result import ExperimentResult, Segment
 from autotune.experiment.step_test import StepTest
+from autotune.experiment.sweep_warnings import relative_sd
+from autotune.identification.sweep_adequacy import TESTS
+from autotune.identification.sweep_estimate import LEVEL
 from autotune.pipeline import Analysis, Tuning
 from autotune.pipeline.deployment import Deployment
 from autotune.recording import Recording
@@ -302,12 +305,13 @@ def _experiment_section(
             f"The command that holds the operating point is {experiment.u_rest:.4g} ± {1.96 * experiment.u_rest_sd:.2g}"
             f" {signals.u_unit}; the measurement's noise has a standard deviation of {experiment.noise_sd:.3g}"
             f" {signals.y_unit}.",
+            *_together_text(experiment),
             f"It ended because: {experiment.reason}; {sentence(experiment.output)}.",
             f"Link latency {_milliseconds(timing.latency_s)}, lateness of the loop {_milliseconds(timing.lateness_s)},"
             f"{_decision(timing.decision_s)}"
             f" (median, 99 %, worst); {timing.missed} sample(s) missed, {timing.unusable} unusable.",
         ),
-        tables=(sittings,) if len(parts) > 1 else (),
+        tables=(*((sittings,) if len(parts) > 1 else ()), _dwell_table(experiment)),
         figures=(
             *figures,
             Figure(
@@ -317,6 +321,30 @@ def _experiment_section(
             ),
         ),
     )
+
+
+def _together_text(experiment: ExperimentResult) -> tuple[str, ...]:
+    """Say whether the points are of all rows together, and what the rows said of it."""
+    found = experiment.together
+    if found is None:
+        return (f"Each point is of a limit cycle of its own: {experiment.by_itself}.",) if experiment.by_itself else ()
+    tests = ", ".join(f"{what} {p:.2g}" for what, p in zip(TESTS, found.p_values, strict=True))
+    return (
+        f"The points are estimated together from all rows between {found.start_s:.4g} and {found.end_s:.4g} s. What the"
+        f" fitted equation leaves shows nothing else: the probabilities of as much by noise alone are {tests}; below"
+        f" {LEVEL / len(TESTS):.2g} each point would have been measured by itself.",
+    )
+
+
+def _dwell_table(experiment: ExperimentResult) -> Table:
+    """Return where the sweep's time went."""
+    rows = []
+    for i, one in enumerate(experiment.segments, start=1):
+        dwell = f"{one.end_s - one.start_s:.1f}"
+        cells = (f"{i}", f"{math.degrees(one.phase_rad):.0f}", f"{one.point.omega_rad_s:.3g}", f"{one.periods}", dwell)
+        rows.append((*cells, f"{100 * relative_sd(one):.2g} %"))
+    header = ("cycle", "aimed at [deg]", "ω [rad/s]", "periods", "dwell [s]", "its own rows know its point to")
+    return Table(header=header, rows=tuple(rows))
 
 
 def _decision(values: tuple[float, float, float]) -> str:
