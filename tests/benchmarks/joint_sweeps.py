@@ -1,0 +1,124 @@
+"""Sweeps whose points are estimated together, beside a limit cycle for each: other plants, and classes violated.
+
+Every plant is swept both ways on the same noise. *error* is the largest of a sweep's relative errors over the standard
+deviation that is wanted, the median of its seeds; *covered* is the share of points within their 95 % regions, of all
+sweeps, whichever way their points were made; *time* is the median of the sweeps' times over that of one by one, a limit
+cycle for each point.
+
+``SEEDS=5`` runs each so often, 3 where nothing is said; ``CASE=tanks`` those whose name has the pattern in it;
+``VIOLATED=1`` runs the ball's linear twin with play, a curve, a drift and a load instead.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import tempfile
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from autotune.arrays import FloatArray
+from autotune.errors import AutotuneError
+from autotune.experiment.run import run_experiment
+from drivers.simulated import SimulatedRig
+from tests.benchmarks._joint_plants import CASES, Case, LinearPlant
+from tests.benchmarks.relay_points import CHI2_95
+
+VIOLATIONS: dict[str, dict[str, float]] = {
+    "nothing": {},
+    "play of 1 % of the range": {"play": 0.01},
+    "play of 0.3 % of the range": {"play": 0.003},
+    "curve of 5 %": {"curve": 0.05},
+    "curve of 15 %": {"curve": 0.15},
+    "drift of 0.5 % in ten periods": {"drift": 0.005},
+    "drift of 2 % in ten periods": {"drift": 0.02},
+    "load step of 0.5 %": {"load": 0.005},
+    "load step of 2 %": {"load": 0.02},
+}
+#: plants whose class is violated: an integrator with a lag like the ball's, and two lags with dead time
+VIOLATED = ("integrator, lag 1, dead time 0.05", "lags 1 and 0.3, dead time 0.2", "tanks (1.0, 0.5, 0.2), dead time")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Outcome:
+    """One sweep: relative errors, chi-square of each point, time [s], and why its points are not of all rows."""
+
+    errors: FloatArray
+    chi2: FloatArray
+    time_s: float
+    why: str
+
+
+def outcome(case: Case, seed: int, *, together: bool) -> Outcome:
+    """Sweep a plant."""
+    plant = LinearPlant(case, seed=seed)
+    with tempfile.TemporaryDirectory() as folder:
+        rig = SimulatedRig(plant, u_safe=5.0)
+        result = run_experiment(rig, case.config(together=together), Path(folder) / "sweep.csv")
+    truth = plant.response(np.array([point.omega_rad_s for point in result.points]))
+    misses = np.array([point.response for point in result.points]) - truth
+    chi2 = []
+    for point, miss in zip(result.points, misses, strict=True):
+        vector = np.array([miss.real, miss.imag])
+        chi2.append(float(vector @ np.linalg.solve(np.array(point.covariance), vector)))
+    begun = result.segments[0].start_s  # the search for the mid-point is the same both ways
+    end = max(one.end_s for one in result.segments)
+    return Outcome(errors=np.abs(misses / truth), chi2=np.array(chi2), time_s=end - begun, why=result.by_itself)
+
+
+def covered(outcomes: list[Outcome]) -> float:
+    """Return the share of the points that lie within their regions."""
+    return float(np.mean(np.concatenate([one.chi2 for one in outcomes]) < CHI2_95)) if outcomes else float("nan")
+
+
+def main() -> None:
+    """Print a line for each plant, and the sums."""
+    seeds, wanted = int(os.environ.get("SEEDS", "3")), os.environ.get("CASE", "")
+    cases = [case for case in CASES if re.search(wanted, case.name)]
+    if os.environ.get("VIOLATED"):
+        chosen = [case for case in CASES if case.name in VIOLATED]
+        cases = [
+            replace(case, name=f"{said}: {case.name}", load_s=10.0 * case.time_s, **what)
+            for said, what in VIOLATIONS.items()
+            for case in chosen
+        ]
+    every: dict[bool, list[Outcome]] = {True: [], False: []}
+    ratios, failed = [], 0
+    print(f"{'plant':>60}: together; error, covered both ways; time over that of one by one")
+    for case in cases:
+        own: dict[bool, list[Outcome]] = {True: [], False: []}
+        for seed in range(1, seeds + 1):
+            try:
+                pair = {together: outcome(case, seed, together=together) for together in (True, False)}
+            except AutotuneError as error:
+                failed += 1
+                print(f"{case.name} {seed}: {error}", flush=True)
+                continue
+            for together, found in pair.items():
+                own[together].append(found)
+        if not own[True]:
+            continue
+        for together, outcomes in own.items():
+            every[together] += outcomes
+        times = {way: float(np.median([one.time_s for one in outcomes])) for way, outcomes in own.items()}
+        ratios.append(times[True] / times[False])
+        sd = case.config(together=True).experiment.gain_sd
+        worst = {way: float(np.median([one.errors.max() for one in outcomes])) / sd for way, outcomes in own.items()}
+        used = sum(not one.why for one in own[True])
+        print(
+            f"{case.name:>60}: {used} of {len(own[True])}; {worst[True]:5.2f} {worst[False]:5.2f};"
+            f" {covered(own[True]):.3f} {covered(own[False]):.3f}; {ratios[-1]:.2f}"
+            f" {'; '.join(sorted({one.why for one in own[True] if one.why}))}",
+            flush=True,
+        )
+    jointly = [one for one in every[True] if not one.why]
+    print(f"{len(every[True])} sweeps, {failed} stopped; points of all rows together in {len(jointly)}")
+    print(
+        f"covered: {covered(every[True]):.3f}, one by one {covered(every[False]):.3f}; together: {covered(jointly):.3f}"
+    )
+    inside = np.mean([bool(np.all(one.chi2 < CHI2_95)) or bool(one.why) for one in every[True]])
+    print(f"sent to cycles of their own, or all points inside their regions: {inside:.3f}")
+    quarters = np.quantile(ratios, [0.25, 0.5, 0.75]).round(2)
+    print(f"time over that of one by one, quartiles of the plants: {quarters}")
