@@ -209,7 +209,8 @@ def _together(run: _Sweep, targets: Sequence[float], end_s: float) -> list[float
     for i, target in enumerate(first):
         choices = run.choices(first[i:])
         remaining_s = sum(time_s(choice, LEAST_PERIODS) for choice in choices)
-        run.tell(f"all points together, {math.degrees(target):.0f} deg", remaining_s, choices[0].settings)
+        said = f"limit cycle {i + 1} of {FEW}: {math.degrees(target):.0f} deg, for all points together"
+        run.tell(said, remaining_s, choices[0].settings)
         run.cycle(choices[0], LEAST_PERIODS, end_s)
     while True:
         run.tell("estimating all points together", 0.0)
@@ -226,7 +227,7 @@ def _together(run: _Sweep, targets: Sequence[float], end_s: float) -> list[float
             break
         most = max(range(len(first)), key=lambda i: periods[i] * 2.0 * math.pi / choices[i].omega_rad_s)
         remaining_s = sum(time_s(choice, count) for choice, count in zip(choices, periods, strict=True) if count)
-        said = f"all points together, known to {100 * found.worst_sd:.2g} %: {math.degrees(first[most]):.0f} deg again"
+        said = f"all points are known to {100 * found.worst_sd:.2g} %: {math.degrees(first[most]):.0f} deg again"
         run.tell(said, remaining_s, choices[most].settings)
         run.cycle(choices[most], periods[most], end_s)
     estimate = None if isinstance(found, str) else found

@@ -26,12 +26,12 @@ from tests.drivers.campaign import Outcome
 CONFIG = Path(__file__).parents[2] / "configs" / "ball_sim.toml"
 OLD = PIDController(K=-0.01, Ti_s=6.0)
 
-#: state (and for the sweep the point), and up to how many commands into it the operator waits
+#: state (and for the sweep the limit cycle), and up to how many commands into it the operator waits
 STATES: dict[str, int] = {
     State.PREFLIGHT.value: 50,
     State.APPROACH.value: 400,
     State.MIDPOINT.value: 200,
-    **{f"point {k}": 250 for k in range(1, 6)},
+    **{f"limit cycle {k}": 250 for k in range(1, 4)},
     State.VERIFY.value: 2000,
     "hand-over": 3,
 }

@@ -85,7 +85,7 @@ class Growing:
 @pytest.fixture
 def growing(whole: Path, tmp_path: Path) -> Growing:
     folder = Growing(whole, tmp_path)
-    folder.until("point 2 of 5", 2000)
+    folder.until("limit cycle 2 of 3", 2000)
     return folder
 
 
@@ -130,9 +130,9 @@ def test_the_picture_follows_the_data_and_nothing_is_asked_of_another_machine(
 ) -> None:
     asked: list[str] = []
     page = opened(beside.url, asked)
-    expect(page.get_by_role("status")).to_have_text(re.compile("point 2 of 5"), timeout=LIMIT_MS)
+    expect(page.get_by_role("status")).to_have_text(re.compile("limit cycle 2 of 3"), timeout=LIMIT_MS)
     seen = set()
-    for word, rows in (("point 2 of 5", 2500), ("point 4 of 5", 2500), ("all points measured", 6000)):
+    for word, rows in (("limit cycle 2 of 3", 2500), ("limit cycle 3 of 3", 2500), ("all points measured", 6000)):
         page.wait_for_function(f"seen => ({PIXELS})().length > 20000 && !seen.includes(({PIXELS})())", arg=list(seen))
         seen.add(page.evaluate(PIXELS))
         growing.until(word, rows)
@@ -221,7 +221,7 @@ def test_a_whole_run_on_a_rig_process_is_followed_and_decided_in_the_browser(
         page = opened(run.stdout.readline().split()[-1])
         status, plane, ellipses = page.get_by_role("status"), "document.querySelector('.plane canvas').toDataURL()", []
         for number in (1, 2, 3):
-            expect(status).to_have_text(re.compile(f"point {number} of 3"), timeout=LIMIT_MS)
+            expect(status).to_have_text(re.compile(f"limit cycle {number} of 3"), timeout=LIMIT_MS)
             page.wait_for_function(f"seen => !seen.includes({plane})", arg=ellipses)
             ellipses.append(page.evaluate(plane))
         expect(status).to_have_text(re.compile("new gains. Keep them"), timeout=2 * LIMIT_MS)
