@@ -149,7 +149,7 @@ def _live(out: Path, folder: Path) -> None:
 
     folder.mkdir()
     events = (out / "progress.jsonl").read_text(encoding="utf-8").splitlines(keepends=True)
-    until = next(i for i, event in enumerate(events) if "limit cycle 3 of" in event)
+    until = next(i for i, event in enumerate(events) if "estimating all points together" in event)
     (folder / "progress.jsonl").write_text("".join(events[:until]), encoding="utf-8")
     now_s = json.loads(events[until])["elapsed_s"] - 1.0
     rows = (out / "recording.csv").read_text(encoding="utf-8").splitlines(keepends=True)
