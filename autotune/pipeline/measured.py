@@ -83,9 +83,10 @@ def measured_of(
             notes.append(f"no frequency points: {error}")
     combined = combine(estimates) if estimates else None
     fit = combined.fit if combined is not None and not given else None
-    if recordings and not given and all(one.excitation in _PLAIN for one in estimates):
+    few = fit is None and combined is not None and len(combined.points) < _LEAST_POINTS
+    if recordings and not given and (few or all(one.excitation in _PLAIN for one in estimates)):
         try:
-            fit = fit_recordings(recordings, progress)
+            fit = fit_recordings([_from_first_cycle(one) for one in recordings], progress)
         except AutotuneError as error:
             notes.append(str(error))
             reason = reason or error
@@ -95,6 +96,12 @@ def measured_of(
     return Measured(
         points=points, fit=fit, facts=_facts(recordings), notes=(*notes, *(combined.notes if combined else ()))
     )
+
+
+def _from_first_cycle(recording: Recording) -> Recording:
+    """Return the rows from the first noted limit cycle on: before it the plant was brought from rest."""
+    windows = noted_windows(recording)
+    return recording.between(windows[0].window.start_s, float(recording.t[-1])) if windows else recording
 
 
 def _facts(recordings: Sequence[Recording]) -> LoopFacts:

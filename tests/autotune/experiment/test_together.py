@@ -19,6 +19,7 @@ from autotune.experiment.run import run_experiment
 from autotune.experiment.sweep import missing_phases
 from autotune.identification.frequency.recorded import session_points
 from autotune.identification.sweep_estimate import gain_phase_sd
+from autotune.pipeline.measured import measured_of
 from autotune.recording import read_recording
 from drivers.simulated import SimulatedRig
 from sim.ball import make_ball
@@ -48,6 +49,18 @@ def test_all_points_are_known_as_well_as_is_wanted_in_half_the_time(
     targets = phase_targets(*wanted.phases_deg, wanted.points)
     reached = sorted(float(np.angle(-point.response)) for point in result.points)
     assert reached == pytest.approx(targets, abs=math.radians(5.0))
+
+
+def test_a_sweep_that_was_stopped_with_few_points_tells_of_the_plant_by_its_rows(tmp_path: Path) -> None:
+    rig, path = ball_rig(seed=7), tmp_path / "stopped.csv"
+    with pytest.raises(ExperimentStopped, match="time over"):
+        run_experiment(rig, ball_config(limits={"time_s": 30.0}), path)
+    found = measured_of([read_recording(path)])
+    assert len(found.points) < 3
+    assert found.fit is not None
+    omega = np.array([1.5, 2.5, 4.0])
+    truth = make_ball(seed=7).response(omega)
+    assert np.abs(found.fit.plant.response(omega) / truth - 1.0).max() < 0.08
 
 
 def test_the_recording_gives_the_same_points_again_and_no_rig_is_needed(
