@@ -25,8 +25,8 @@ from autotune.models import TransferFunction
 from autotune.pipeline import Analysis
 from autotune.recording import Recording
 from autotune.report.chart import Chart, make_subplots
-from autotune.report.figures import axis_title, ratio_title
-from autotune.report.page import BLUE, GREY, ORANGE, Figure, Section, Table, add_line, thinned
+from autotune.report.figures import axis_title, ratio_title, recording_figure
+from autotune.report.page import BLUE, GREEN, GREY, ORANGE, Figure, Section, Table, add_line, thinned
 
 #: Plants that are drawn from the region.
 DRAWS = 40
@@ -269,13 +269,8 @@ def model_figures(fit: PlantFit, recordings: Sequence[Recording], signals: Signa
         if found is None:
             continue
         simulated, percent = found
-        chart = make_subplots(rows=2, shared_xaxes=True, vertical_spacing=0.06, row_heights=[0.62, 0.38])
-        add_line(chart, *thinned(recording.t, recording.y), "recorded", BLUE, width=1.0, row=1, col=1)
-        add_line(chart, *thinned(recording.t, simulated), "fitted plant", ORANGE, width=1.6, row=1, col=1)
-        add_line(chart, *thinned(recording.t, recording.u), "u", GREY, width=1.0, row=2, col=1, line_shape="hv")
-        chart.update_yaxes(title=axis_title("y", signals.y_unit), row=1, col=1)
-        chart.update_yaxes(title=axis_title("u", signals.u_unit), row=2, col=1)
-        chart.update_xaxes(title="time [s]", row=2, col=1)
+        chart = recording_figure(recording, signals.u_unit, signals.y_unit)
+        add_line(chart, *thinned(recording.t, simulated), "fitted plant", GREEN, width=1.6, row=1, col=1)
         own = "the rows that it was fitted to" if fit.source == "recording" else "rows that its points came from"
         caption = f"{recording.name}: the fitted plant runs freely over {own}, and explains {percent:.0f} % of y."
         figures.append(Figure(figure=chart, caption=caption))
@@ -293,9 +288,9 @@ def _run(plant: TransferFunction, recording: Recording) -> tuple[FloatArray, flo
     t = recording.t - recording.t[0]
     # what was under way at the first row dies away, or goes on, as the plant's own modes; one at 0 is a constant
     modes: list[FloatArray] = [np.ones(t.size)]
-    for k, pole in enumerate(np.atleast_1d(plant.poles)):
+    for pole in (p for p in np.atleast_1d(plant.poles) if p.imag >= 0.0):
         mode: ComplexArray = np.exp(np.clip((pole * t).real, -50.0, 50.0)) * np.exp(1j * (pole * t).imag)
-        modes += [mode.real if pole else t**1.0] + ([mode.imag] if pole.imag > 0.0 and k else [])
+        modes += [mode.real, mode.imag] if pole.imag else [mode.real if pole else t]
     good = np.isfinite(y)
     columns = np.column_stack(modes)
     scale = np.linalg.norm(columns[good], axis=0)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
+from dataclasses import replace
 
 import control
 import numpy as np
@@ -128,6 +129,15 @@ def test_a_plant_explains_all_of_its_own_recording(gain: float, lag: float, dela
     found = re.search(r"explains (-?\d+) % of y", figure.caption)
     assert found is not None
     assert int(found[1]) >= 99
+
+
+def test_a_plant_that_rings_explains_its_own_decay():
+    t = 0.1 * np.arange(400)
+    plant = TransferFunction(num=(1.0,), den=(1.0, 0.2, 1.0))
+    decay = np.exp(-0.1 * t) * np.sin(math.sqrt(0.99) * t)  # from a speed, with the command at rest
+    recording = Recording(t=t, u=np.full(t.size, 2.0), y=2.0 + decay, name="ringing")
+    (figure,) = model_figures(replace(known(OVEN), plant=plant), (recording,), SIGNALS)
+    assert "explains 100 % of y" in figure.caption
 
 
 def test_intervals_of_the_numbers_hold_what_the_region_does(analysis: Analysis) -> None:
