@@ -25,6 +25,7 @@ from scipy.stats import chi2
 
 from autotune.arrays import ComplexArray, FloatArray
 from autotune.identification.delay.data import prepare
+from autotune.identification.envelope import polar_sd
 from autotune.identification.frequency.limit_cycle import WholePeriods
 from autotune.identification.parametric import PlantFit
 from autotune.identification.recorded_plant import plant_fit
@@ -70,21 +71,12 @@ class SweepEstimate:
     @property
     def worst_sd(self) -> float:
         """Largest standard deviation of a gain, relative, or of a phase, a degree counted as one per cent."""
-        return max(max(gain_phase_sd(point)) for point in self.points)
+        return max(max(gain, math.degrees(phase) / 100.0) for gain, phase in map(polar_sd, self.points))
 
     def to_json(self) -> dict[str, Any]:
         """Return what ``result.json`` says of it."""
         tests = dict(zip(TESTS, self.p_values, strict=True))
         return {"start_s": self.start_s, "end_s": self.end_s, "p_values": tests}
-
-
-def gain_phase_sd(point: FrequencyPoint) -> tuple[float, float]:
-    """Return the standard deviations of a point's gain, relative, and of its phase in hundreds of degrees."""
-    turn = np.array([point.response.real, point.response.imag]) / point.gain**2
-    along, across = turn, np.array([-turn[1], turn[0]])
-    covariance = np.array(point.covariance)
-    gain, phase = (math.sqrt(max(float(one @ covariance @ one), 0.0)) for one in (along, across))
-    return gain, math.degrees(phase) / 100.0
 
 
 def estimate_sweep(

@@ -17,8 +17,8 @@ from autotune.experiment.plan import LocalModel, phase_targets
 from autotune.experiment.result import ExperimentResult, Status
 from autotune.experiment.run import run_experiment
 from autotune.experiment.sweep import missing_phases
+from autotune.identification.envelope import polar_sd
 from autotune.identification.frequency.recorded import session_points
-from autotune.identification.sweep_estimate import gain_phase_sd
 from autotune.pipeline.measured import measured_of
 from autotune.recording import read_recording
 from drivers.simulated import SimulatedRig
@@ -45,7 +45,8 @@ def test_all_points_are_known_as_well_as_is_wanted_in_half_the_time(
     assert result.together is not None
     assert len(result.points) == len(each.points) == wanted.points
     assert result.sweep_time_s < 0.6 * each.sweep_time_s
-    assert all(max(gain_phase_sd(point)) <= wanted.gain_sd for point in result.points)
+    for gain_sd, phase_sd in map(polar_sd, result.points):
+        assert max(gain_sd, math.degrees(phase_sd) / 100.0) <= wanted.gain_sd
     targets = phase_targets(*wanted.phases_deg, wanted.points)
     reached = sorted(float(np.angle(-point.response)) for point in result.points)
     assert reached == pytest.approx(targets, abs=math.radians(5.0))
