@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import signal
-import threading
+import time
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
@@ -26,6 +26,8 @@ if TYPE_CHECKING:
     from sim.serial_rig import SerialRig
     from sim.served_rig import ServedRig
 
+#: how often whoever serves a rig looks whether a signal came [s]
+_LOOKS_S = 0.1
 _CONFIG = Annotated[Path, typer.Argument(metavar="CONFIG.toml", help="configuration of the rig")]
 
 
@@ -40,9 +42,9 @@ def rig(config: _CONFIG) -> None:
 
     content = load_config(config)
     console = Console(highlight=False)
-    stop = threading.Event()
+    heard: list[signal.Signals] = []
     with ExitStack() as serving:
-        serving.enter_context(signals_heard(signal.SIGINT, signal.SIGTERM, by=lambda _: stop.set()))
+        serving.enter_context(signals_heard(signal.SIGINT, signal.SIGTERM, by=heard.append))
         if isinstance(content.rig, SerialSettings):
             server: ServedRig | SerialRig = serving.enter_context(served_on_line(content, content.rig))
             said = f"a microcontroller on {content.rig.device}"
@@ -60,7 +62,8 @@ def rig(config: _CONFIG) -> None:
         spare_collections()  # a real plant does not stop for one
         server.late_s = 0.0  # nobody was there yet
         console.print(f"serving {said}; Ctrl-C ends it", markup=False)
-        stop.wait()
+        while not heard:  # a wait without end is not ended by a signal that another thread takes
+            time.sleep(_LOOKS_S)
     console.print(f"stopped; the plant was up to {1e3 * server.late_s:.1f} ms late")
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import re
 import signal
@@ -103,6 +104,17 @@ def test_a_served_rig_that_was_held_up_says_for_how_long(tmp_path: Path) -> None
         said = re.search(r"stopped; the plant was up to ([\d.]+) ms late", process.stdout.read())
         assert said is not None
         assert 300 < float(said[1]) < 5000
+
+
+@pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="threads of another process are listed on Linux only")
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_served_rig_ends_by_a_signal_that_another_thread_takes(tmp_path: Path, number: signal.Signals) -> None:
+    """The kernel gives a signal to any thread where the main one is held up, as while a stopped process goes on."""
+    path = config_like("ball_modbus_tcp.toml", tmp_path, port=free_port())
+    with served(path) as process:
+        threads = {int(one.name) for one in Path(f"/proc/{process.pid}/task").iterdir()} - {process.pid}
+        assert ctypes.CDLL(None).tgkill(process.pid, min(threads), number) == 0
+        assert process.wait(20) == 0
 
 
 def test_a_serial_rig_makes_its_own_line_and_clears_it_away(tmp_path: Path) -> None:
