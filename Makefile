@@ -23,7 +23,7 @@ imports: $(VENV)/.test
 	$(BIN)/lint-imports
 
 unit: $(VENV)/.test
-	$(BIN)/pytest -n auto
+	$(BIN)/pytest -n auto --durations 30
 
 # damaged files, odd options and places that cannot be written, against every command that reads or writes them
 FUZZ_INPUTS ?= 50000
