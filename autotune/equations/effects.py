@@ -1,9 +1,10 @@
 """Effects of the catalogue in models of equations, as their records state them (:mod:`autotune.effects`).
 
-Where it acts is said by the effect itself: ``state`` (added to its derivative, in the derivative's unit), ``port``
-(a force, torque, flow or heat of the port's unit), ``input`` (a column), or nothing for the output and the first
-input. In the expressions below ``V`` is the speed (``across`` of the port, or the state), ``X`` the position, level
-or temperature that goes with it.
+Where it acts is said by the effect itself: ``state`` (added to its derivative, in the derivative's unit, and to those
+of other states as they share a force of the model there, see :mod:`autotune.equations.shared_forces`), ``port`` (a
+force, torque, flow or heat of the port's unit), ``input`` (a column), or nothing for the output and the first input. In
+the expressions below ``V`` is the speed (``across`` of the port, or the state), ``X`` the position, level or
+temperature that goes with it.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from autotune.effects.in_equations import InEquations
 from autotune.equations.expressions import Call, Expression, Name, parse, substituted, to_text
 from autotune.equations.model import EquationModel, Extension, ModelParameter, State
 from autotune.equations.samples import OPERATIONS, quantised
+from autotune.equations.shared_forces import joint_at
 from autotune.equations.simulate import Compiled, Drive, Held, compile_model
 from autotune.errors import InputError
 from autotune.models import Effect, Parameter
@@ -205,7 +207,23 @@ def extension_of(model: EquationModel, effect: Effect, number: int = 0) -> Exten
     if not effect.state:
         raise InputError(f"{effect.name} does not say where it acts", where=model.name,
                          remedy='add state = "NAME" or port = "NAME"')  # fmt: skip
-    return replace(made, derivative={effect.state: tree})
+    return replace(made, derivative=at_state(model, effect.state, tree))
+
+
+def at_state(model: EquationModel, state: str, tree: Expression) -> dict[str, Expression]:
+    """Return what a force on a state adds to derivatives: to its own, and to those that share the model's force there.
+
+    Parameters
+    ----------
+    model : EquationModel
+        The model.
+    state : str
+        Where the force acts.
+    tree : Expression
+        What it adds to that state's derivative.
+    """
+    shares = joint_at(model, state).shares
+    return {state: tree, **{name: Call("*", (tree, share)) for name, share in shares.items()}}
 
 
 def form_of(effect: Effect, model: EquationModel) -> InEquations:
@@ -273,7 +291,8 @@ def _speed_and_position(model: EquationModel, effect: Effect) -> tuple[Expressio
         if effect.state:
             raise InputError(f"no state {effect.state!r}", where=model.name, remedy="name a state of the model")
         return None, None
-    return Name(name), Name(state.of) if state.of else Name(name)
+    joint = joint_at(model, name)
+    return joint.speed, joint.position
 
 
 def position_under(model: EquationModel, across: Expression) -> Expression | None:
@@ -342,4 +361,8 @@ def equation_of(model: EquationModel, effect: Effect) -> str:
     if form.acts in ("input", "reading"):
         signal = column if form.acts == "input" else "y"
         return f"{signal} -> {to_text(substituted(tree, lambda name: Name(signal) if name == 'value' else None))}"
-    return f"{effect.port} = {to_text(tree)}" if effect.port else f"d {effect.state}/dt: + {to_text(tree)}"
+    if effect.port:
+        return f"{effect.port} = {to_text(tree)}"
+    shares = joint_at(model, effect.state).shares.items()
+    also = "".join(f"; d {name}/dt: that times {to_text(share)}" for name, share in shares)
+    return f"d {effect.state}/dt: + {to_text(tree)}{also}"

@@ -33,6 +33,30 @@ def stiction(t: FloatArray, u: FloatArray, band: float) -> FloatArray:
     return w
 
 
+@njit(cache=True)
+def lagged(t: FloatArray, u: FloatArray, time_constant_s: float, straight: bool) -> FloatArray:
+    """Return what follows u behind a lag, exact at the rows, at rest before the first one.
+
+    Parameters
+    ----------
+    t, u : (N,) arrays
+        Time stamps [s], and the signal.
+    time_constant_s : float
+        Of the lag [s], positive.
+    straight : bool
+        Whether u runs straight from row to row, or is held.
+    """
+    w = np.empty_like(u)
+    w[0] = u[0]
+    for k in range(u.size - 1):
+        step = t[k + 1] - t[k]
+        kept = np.exp(-step / time_constant_s)
+        w[k + 1] = kept * w[k] + (1.0 - kept) * u[k]
+        if straight and step > 0.0:
+            w[k + 1] += (u[k + 1] - u[k]) * (1.0 - time_constant_s / step * (1.0 - kept))
+    return w
+
+
 def quantised(values: FloatArray, step: float) -> FloatArray:
     """Return values on a converter's steps; a step of 0 leaves them."""
     return step * np.floor(values / step + 0.5) if step > 0.0 else values

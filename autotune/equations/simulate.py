@@ -9,8 +9,10 @@ import numpy as np
 
 from autotune.arrays import FloatArray, IntArray
 from autotune.equations import kernel
+from autotune.equations.expressions import Call, Name
 from autotune.equations.model import EquationModel, Extension, ModelParameter
 from autotune.equations.native import Translator
+from autotune.equations.samples import lagged
 from autotune.equations.tape import Program, translate
 from autotune.errors import InputError
 from autotune.recording import Recording
@@ -40,6 +42,21 @@ class Held:
     transform: Callable[[FloatArray, FloatArray, float], FloatArray] | None = None
 
 
+@dataclass(frozen=True, kw_only=True)
+class Lag:
+    """A state of an extension that is a recorded column behind a lag: the column's past tells it at every row.
+
+    Attributes
+    ----------
+    state, column, parameter : int
+        Of the program's states, of the model's inputs, and of the parameters: its time constant.
+    """
+
+    state: int
+    column: int
+    parameter: int
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Compiled:
     """A model with its extensions, ready to be driven.
@@ -59,6 +76,8 @@ class Compiled:
         Outputs beside y.
     held : tuple of Held
         What is done to inputs before they drive the equations, in this order.
+    lags : tuple of Lag
+        States whose start no window may choose, since recorded columns tell it.
     most_steps : float
         Steps between two rows, on average, that a simulation may take.
     spare_steps : float
@@ -71,6 +90,7 @@ class Compiled:
     parameters: tuple[ModelParameter, ...]
     signals: tuple[str, ...] = ()
     held: tuple[Held, ...] = ()
+    lags: tuple[Lag, ...] = ()
     most_steps: float = kernel.MOST_ON_AVERAGE
     spare_steps: float = kernel.SPARE_STEPS
 
@@ -163,8 +183,22 @@ def compile_model(
     parameters = (*model.parameters, *(p for e in extensions for p in e.parameters), *(one.parameter for one in held))
     return Compiled(
         model=model, extensions=tuple(extensions), program=program, parameters=parameters, signals=tuple(signals),
-        held=tuple(held),
+        held=tuple(held), lags=_lags(model, extensions, program, [p.name for p in parameters]),
     )  # fmt: skip
+
+
+def _lags(
+    model: EquationModel, extensions: Sequence[Extension], program: Program, parameters: Sequence[str]
+) -> tuple[Lag, ...]:
+    """Return the states of extensions whose derivative is (a recorded column less the state) over a parameter."""
+    found = []
+    for one in (state for extension in extensions for state in extension.states):
+        match one.derivative:
+            case Call("/", (Call("-", (Name(column), Name(own))), Name(constant))) if own == one.name:
+                if column in model.columns and constant in parameters:
+                    at = program.states.index(own), model.columns.index(column), parameters.index(constant)
+                    found.append(Lag(state=at[0], column=at[1], parameter=at[2]))
+    return tuple(found)
 
 
 def drive_of(model: EquationModel, recording: Recording) -> Drive:
@@ -203,7 +237,7 @@ def simulate(
     drive : Drive
         Time stamps and inputs. Transforms of samples (a quantiser, a shuffled clock) are applied to these arrays.
     start_states : (W, n) array
-        State at each window's first row, in the order of ``compiled.states``.
+        State at each window's first row, in the order of ``compiled.states``; of ``compiled.lags`` it is not looked at.
     starts, stops : (W,) int arrays, optional
         Rows where windows start and before which they end; by default one window over all rows, or each to the next.
     delays : (m,) array, optional
@@ -231,6 +265,12 @@ def simulate(
             f"start states of shape {states.shape} for {first.size} window(s) of {program.slopes.size} states",
             where="simulate",
         )
+    if compiled.lags:
+        states = states.copy()
+    for lag in compiled.lags:
+        straight, constant = compiled.model.inputs[lag.column].hold == "linear", float(parameters[lag.parameter])
+        behind = lagged(drive.t, np.ascontiguousarray(drive.inputs[:, lag.column]), constant, straight)
+        states[:, lag.state] = np.interp(drive.t[first] - late[lag.column], drive.t, behind)
     outputs = np.full((program.outputs.size, rows), np.nan)
     ends, status = np.full(states.shape, np.nan), np.zeros((first.size, 3))
     native = _TRANSLATOR.native(program.code, program.still, program.dynamic, int(np.sum(last - first)))

@@ -9,6 +9,7 @@ from types import MappingProxyType
 import numpy as np
 
 from autotune.arrays import FloatArray
+from autotune.diagnosis.equations.followed import positions_of, speeds_of
 from autotune.effects import ALL, KINDS
 from autotune.effects.in_equations import Around, InEquations, Tried
 from autotune.equations.effects import where_of
@@ -165,13 +166,14 @@ def _places(model: EquationModel, form: InEquations, s: Signals, black_box: bool
 def _around(model: EquationModel, s: Signals, key: str, name: str) -> Around:
     """Return what the recordings show around a place."""
     state = next((one for one in model.states if one.name == name), None)
-    u, v, size = s.u - model.inputs[0].offset, s.values.get(name, np.zeros(1)), s.sizes.get(name, 1.0)
+    u, size = s.u - model.inputs[0].offset, s.sizes.get(name, 1.0)
+    v = s.values.get(speeds_of(model).get(name, name), np.zeros(1))
     if not key:
         v, size = s.y, float(np.nanstd(s.y)) + 1e-300
     elif name == model.columns[0]:
         v, size = u, float(np.std(u)) + 1e-300
     held = next((one.name for one in model.states if one.kind in ("position", "level", "temperature")), "")
-    of = f"{name}:position" if key == "port" else state.of if state else held if key == "input" else ""
+    of = held if key == "input" else positions_of(model)[name] if key == "port" or (state and state.of) else ""
     rate = float(np.std(np.diff(v) / s.dt_s)) if key == "port" else 0.0
     return Around(
         size=size, v=v, x=s.values.get(of, v), has_position=of in s.values, is_angle=_is_angle(model, key, name),

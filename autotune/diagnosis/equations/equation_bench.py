@@ -136,7 +136,7 @@ class EquationBench(Bench):
             p = natural(compiled, z)
             for (r, k, _), drive, w in zip(each, self._drives, windows, strict=True):
                 if self._horizon_s is not None:
-                    runs.append(forecasts(compiled, p, drive, r.y, k, self._horizon_s))
+                    runs.append(forecasts(compiled, p, drive, r.y, w, k, self._horizon_s))
                 else:
                     runs.append(free_run(compiled, p, drive, r.y, w, k))
         except InputError:

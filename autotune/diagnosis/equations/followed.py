@@ -8,10 +8,11 @@ import numpy as np
 
 from autotune.arrays import FloatArray
 from autotune.equations.effects import compile_with, position_under
-from autotune.equations.expressions import Expression, Number, to_text
+from autotune.equations.expressions import Expression, Name, Number, to_text
 from autotune.equations.fit_data import Fitted
 from autotune.equations.model import EquationModel, Extension
 from autotune.equations.sensitivity import Windows
+from autotune.equations.shared_forces import Joint, joint_at
 from autotune.equations.simulate import Compiled, Drive, compile_model, derivatives, simulate
 from autotune.models import Effect
 
@@ -33,6 +34,8 @@ def followed(
     wanted = {name: name for name in model.state_names}
     wanted |= {one.name: to_text(one.across) for one in model.ports if one.across is not None}
     wanted |= {f"{name}:position": text for name, text in positions.items() if text}
+    for name, joint in _apart(model).items():
+        wanted |= {f"{name}:speed": to_text(joint.speed), f"{name}:position": to_text(joint.position)}
     compiled = compile_with(model, effects, list(wanted.values()))
     runs: list[FloatArray] = []
     for drive, w in zip(drives, fitted.windows, strict=True):
@@ -45,7 +48,20 @@ def followed(
 
 def positions_of(model: EquationModel) -> dict[str, str]:
     """Return the name of the position that goes with each state and port."""
-    return {s.name: s.of or s.name for s in model.states} | {one.name: f"{one.name}:position" for one in model.ports}
+    apart = [*(one.name for one in model.ports), *_apart(model)]
+    return {s.name: s.of or s.name for s in model.states} | {name: f"{name}:position" for name in apart}
+
+
+def speeds_of(model: EquationModel) -> dict[str, str]:
+    """Return the name of the speed that a force at each state and port goes with."""
+    names = [*model.state_names, *(one.name for one in model.ports)]
+    return {name: name for name in names} | {name: f"{name}:speed" for name in _apart(model)}
+
+
+def _apart(model: EquationModel) -> dict[str, Joint]:
+    """Return the states at which a force goes with another speed than the state's own."""
+    joints = {name: joint_at(model, name) for name in model.state_names}
+    return {name: joint for name, joint in joints.items() if joint.speed != Name(name)}
 
 
 def sizes_of(

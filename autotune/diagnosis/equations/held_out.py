@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from autotune.arrays import FloatArray
+from autotune.arrays import FloatArray, IntArray
 from autotune.equations.fit_data import window_rows
 from autotune.equations.sensitivity import Windows
 from autotune.equations.simulate import Compiled, Drive, simulate
-from autotune.equations.starts import fitted_starts
+from autotune.equations.starts import LEAST, fitted_starts
 
 #: Spreads of y that an error counts at most: a simulation that runs away is that wrong.
 FAR_OFF = 10.0
@@ -34,40 +35,52 @@ def _continued(compiled: Compiled, p: FloatArray, drive: Drive, y: FloatArray, b
 
     From rest alone dry friction that holds a state would hide from the readings where that state is.
     """
-    at, end, good = np.array([row]), np.array([y.size]), np.isfinite(y)
-    until = np.array([row + max(int(SETTLED * (y.size - row)), 1)])
-    guesses: list[FloatArray | None] = [None]
-    if before.starts.size:
-        run = simulate(compiled, p, drive, before.states[-1:], starts=before.starts[-1:], stops=at)
-        guesses += [run.ends[0]] if np.all(np.isfinite(run.ends)) else []
-    best, least = None, np.inf
-    for guess in guesses:
-        w = fitted_starts(compiled, p, drive, y, good, at, end, guess=guess, share=SETTLED)
-        e = (y - simulate(compiled, p, drive, w.states, starts=at, stops=until).y)[at[0] : until[0]]
-        left = float(np.nansum(e**2)) if np.all(np.isfinite(e[good[at[0] : until[0]]])) else np.inf
-        if best is None or left < least:
-            best, least = w, left
+    window = np.array([row]), np.array([y.size])
+    return _started(compiled, p, drive, y, window, [_reached(compiled, p, drive, before, row)], SETTLED, LEAST)
+
+
+def _reached(compiled: Compiled, p: FloatArray, drive: Drive, known: Windows, row: int) -> FloatArray | None:
+    """Return the state that the last of known windows which begin before a row leads to there; else nothing."""
+    k = np.flatnonzero(known.starts <= row)[-1:]
+    if not k.size:
+        return None
+    state = simulate(compiled, p, drive, known.states[k], starts=known.starts[k], stops=np.array([row])).ends[0]
+    return np.array(state) if np.all(np.isfinite(state)) else None
+
+
+def _started(
+    compiled: Compiled, p: FloatArray, drive: Drive, y: FloatArray, window: tuple[IntArray, IntArray],
+    guesses: Sequence[FloatArray | None], share: float, least: int,
+) -> Windows:  # fmt: skip
+    """Return a window begun from rest, or from a guess, whatever the readings of a share of its rows fit better."""
+    (at, end), good = window, np.isfinite(y)
+    first, last = int(at[0]), int(at[0] + max(int(share * (end[0] - at[0])), 1))
+    best, smallest = None, np.inf
+    for guess in (None, *(one for one in guesses if one is not None)):
+        w = fitted_starts(compiled, p, drive, y, good, at, end, guess=guess, share=share, least=least)
+        e = (y - simulate(compiled, p, drive, w.states, starts=at, stops=np.array([last])).y)[first:last]
+        left = float(np.nansum(e**2)) if np.all(np.isfinite(e[good[first:last]])) else np.inf
+        if best is None or left < smallest:
+            best, smallest = w, left
     assert best is not None
     return best
 
 
 def forecasts(
-    compiled: Compiled, p: FloatArray, drive: Drive, y: FloatArray, row: int, horizon_s: float
+    compiled: Compiled, p: FloatArray, drive: Drive, y: FloatArray, windows: Windows, row: int, horizon_s: float
 ) -> tuple[FloatArray, int]:  # fmt: skip
     """Return forecasts, each from a state that the horizon before it tells, and the row that the first begins at."""
     edges, _ = window_rows(drive.t, horizon_s)
     edges = np.append(edges, y.size)
-    found, first, guess = np.full(y.size, np.nan), y.size, None
+    found, first = np.full(y.size, np.nan), y.size
     for before, a, b in zip(edges, edges[1:], edges[2:], strict=False):
         if a < row:
             continue
-        w = fitted_starts(
-            compiled, p, drive, y, np.isfinite(y), np.array([before]), np.array([b]), share=(a - before) / (b - before),
-            least=int(a - before), guess=guess,
-        )  # fmt: skip
-        found[a:b] = simulate(compiled, p, drive, w.states, starts=w.starts, stops=w.stops).y[a:b]
-        now = simulate(compiled, p, drive, w.states, starts=w.starts, stops=np.array([a])).ends[0]
-        guess, first = now if np.all(np.isfinite(now)) else None, min(first, int(a))
+        guess = _reached(compiled, p, drive, windows, int(before))
+        share, window = (a - before) / (b - before), (np.array([before]), np.array([b]))
+        windows = _started(compiled, p, drive, y, window, [guess], share, int(a - before))
+        found[a:b] = simulate(compiled, p, drive, windows.states, starts=windows.starts, stops=windows.stops).y[a:b]
+        first = min(first, int(a))
     return found, first
 
 

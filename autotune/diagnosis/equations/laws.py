@@ -20,6 +20,7 @@ from autotune.diagnosis.equations.sizes import units_at
 from autotune.diagnosis.evidence.missing_law import LawLine
 from autotune.effects import KINDS
 from autotune.equations.effects import (
+    at_state,
     compile_with,
     form_of,
     local_names,
@@ -222,4 +223,4 @@ def _added(line: EquationLine, tree: Expression) -> Extension:
         return Extension(name=MARK, input={column: Call("+", (Name("value"), tree))})
     if effect.port:
         return Extension(name=MARK, port={effect.port: tree})
-    return Extension(name=MARK, derivative={effect.state: tree})
+    return Extension(name=MARK, derivative=at_state(line.bench.model, effect.state, tree))

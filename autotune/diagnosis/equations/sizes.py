@@ -9,10 +9,10 @@ import numpy as np
 
 from autotune.arrays import FloatArray
 from autotune.diagnosis.equations.bench import Bench, Outcome
-from autotune.diagnosis.equations.followed import positions_of
+from autotune.diagnosis.equations.followed import positions_of, speeds_of
 from autotune.diagnosis.result import OperatingRange
 from autotune.effects import KINDS
-from autotune.equations.effects import where_of
+from autotune.equations.effects import at_state, where_of
 from autotune.equations.expressions import Number
 from autotune.equations.linearise import Linear, linearise_at
 from autotune.equations.model import EquationModel, Extension
@@ -78,11 +78,12 @@ def command_of(bench: Bench, outcome: Outcome, effect: Effect) -> float:
 
 def _unit_force(model: EquationModel, linear: Linear, effect: Effect) -> FloatArray:
     """Return how a unit at an effect's state or port changes the derivatives."""
-    if effect.state:
-        return np.array([float(name == effect.state) for name in model.state_names])
     x, inputs, compiled = linear.states[None, :], linear.inputs[None, :], compile_model(model)
     p = compiled.parameter_vector
-    acting = compile_model(model, [Extension(name="unit", port={effect.port: Number(1.0)})])
+    unit = Extension(name="unit", port={effect.port: Number(1.0)})
+    if effect.state:
+        unit = Extension(name="unit", derivative=at_state(model, effect.state, Number(1.0)))
+    acting = compile_model(model, [unit])
     return np.asarray((derivatives(acting, p, x, inputs)[0] - derivatives(compiled, p, x, inputs)[0])[0])
 
 
@@ -95,7 +96,7 @@ def spans_at(bench: Bench, outcome: Outcome, effect: Effect) -> OperatingRange |
     elif place == model.columns[0]:
         values, name, unit = signals.u, place, units["u"]
     elif place in signals.values:
-        values, name, unit = signals.values[place], place, units["v"]
+        values, name, unit = signals.values[speeds_of(model)[place]], place, units["v"]
     else:
         return None
     return OperatingRange(signal=name, low=float(np.nanmin(values)), high=float(np.nanmax(values)), unit=unit)

@@ -71,3 +71,22 @@ def test_no_window_is_longer_than_was_asked_for_by_more_than_a_tenth(rows: int, 
     assert stops[-1] == rows
     np.testing.assert_array_equal(starts[1:], stops[:-1])
     assert np.max(stops - starts) * DT <= 1.1 * length + 2.0 * DT
+
+
+@given(
+    cuts=st.lists(st.integers(1, 398), min_size=1, max_size=5), stated=st.floats(-9.0, 9.0), tau=st.floats(0.01, 50.0)
+)
+@settings(max_examples=40, deadline=None)
+def test_no_window_chooses_what_a_recorded_column_was_before_it(cuts: list[int], stated: float, tau: float) -> None:
+    """A state of a lag that each window may choose is a load of its own for each: any column would then explain one."""
+    wind = np.cumsum(np.random.default_rng(3).normal(size=400))
+    base = one_state("u - x", input=[{"column": "u"}, {"column": "wind", "hold": "linear"}])
+    parameters = {key: Parameter(value=value) for key, value in {"gain": 0.3, "time_constant": tau}.items()}
+    effect = Effect(name="environment.measured_input", state="x", column="wind", parameters=parameters)
+    compiled = compile_with(base, [effect], signals=["x"])
+    drive = Drive(t=DT * np.arange(400), inputs=np.column_stack([np.zeros(400), wind]))
+    whole = simulate(compiled, compiled.parameter_vector, drive, np.array([[1.0, stated]]))
+    starts = np.array([0, *sorted(set(cuts))])
+    states = np.column_stack([whole.outputs[starts, 1], np.full(starts.size, stated)])
+    parts = simulate(compiled, compiled.parameter_vector, drive, states, starts=starts)
+    np.testing.assert_allclose(parts.y, whole.y, rtol=1e-4, atol=1e-4)
