@@ -168,7 +168,7 @@ def deployment_page(name: str, signals: SignalSettings, done: Deployment) -> Pag
         word = "Kept" if verification.by == "device" else "Written and read back"
         verdict = f"{word}: {new}; {verification.reason}; {verification.whose}."
     else:
-        verdict = f"Not kept: {new}; {verification.reason}. The old gains are in place again."
+        verdict = f"Not kept: {new}; {verification.reason}. The old gains are in place."
     gains = Table(
         header=(
             "",
