@@ -239,6 +239,7 @@ def _command(rig: HoldsGains, restore: Callable[[], None]) -> Iterator[None]:
     try:
         rig.open()
         yield
+        rig.read()  # whether the host still commands
     except BaseException as error:
         with interrupt_deferred():
             farewell = leave(rig, error, restore)

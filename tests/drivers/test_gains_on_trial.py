@@ -18,7 +18,7 @@ import pytest
 from autotune.config import Config, load_config
 from autotune.config.registers import RegisterMap
 from autotune.controller import PIDController
-from autotune.errors import ExperimentStopped, OperatorStop
+from autotune.errors import ExperimentStopped, LinkError, OperatorStop
 from autotune.experiment.judgement import Verification
 from autotune.experiment.result import Status
 from autotune.experiment.rig import TrialGains
@@ -81,6 +81,7 @@ class Regulating:
         regulating(self.rig)
         self.journal = self.folder / "journal.jsonl"
         self.before_verdict: list[tuple[float, float, bool]] = []
+        self.judged = False
 
     @property
     def gains(self) -> tuple[float, float]:
@@ -93,6 +94,7 @@ class Regulating:
         )
         self.rig.clock.sleep_until(self.rig.clock.now() + 2.0)  # what the verdict takes
         self.before_verdict = self.scans.unwatched()
+        self.judged = True
         return found
 
     def deploy(self) -> Deployment:
@@ -174,6 +176,22 @@ def test_a_controller_that_the_host_cannot_start_gets_gains_only_once_the_hosts_
     assert one.before_verdict == []
     assert one.gains == pytest.approx((PI.K, PI.Ti_s), rel=1e-5)
     assert one.steps() == ["read", "writing", "host's law verified; the device's own law not tried"]
+
+
+def test_a_dead_man_that_acts_while_accepted_gains_are_written_keeps_none(tmp_path: Path) -> None:
+    one = Regulating(tmp_path)
+    write, clock = one.rig.write_gains, one.rig.clock
+
+    def write_gains(controller: PIDController) -> None:
+        write(controller)
+        if one.judged and pytest.approx(OLD[0], rel=1e-5) != controller.K:
+            clock.sleep_until(clock.now() + 2.0 * DEADMAN_S)
+
+    one.rig.write_gains = write_gains
+    with pytest.raises(LinkError, match=r"the device took the actuator back.*the old gains are in place again"):
+        one.deploy()
+    assert one.gains == pytest.approx(OLD, rel=1e-5)
+    assert (one.device.output, one.device.value["automatic"]) == (BALL.limits.u_safe, 0.0)
 
 
 def test_writes_that_take_longer_than_the_dead_man_end_nothing_and_are_a_gap_in_the_rows(tmp_path: Path) -> None:
