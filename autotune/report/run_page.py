@@ -180,7 +180,7 @@ def deployment_page(name: str, signals: SignalSettings, done: Deployment) -> Pag
         ),
         rows=tuple(
             (label, *(f"{value:.5g}" for value in (c.K, c.Ti_s, c.Td_s, c.Tf_s)), "in the rig" if held else "")
-            for label, c, held in (("old", done.old, not done.kept), ("new, as read back", done.new, done.kept))
+            for label, c, held in (("old", done.old, not done.kept), ("new", done.new, done.kept))
         ),
     )
     return Page(
