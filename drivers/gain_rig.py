@@ -65,9 +65,14 @@ class GainRegisterRig(RegisterRig):
             The device's form cannot express the controller.
         """
         held = self._decoded(self._encoded(controller))
-        if "PWeighting" not in self._gains.settings:  # a weight of the set-point leaves feedback and margins alone
+        if not self.takes_weight:  # a weight of the set-point leaves feedback and margins alone
             held = replace(held, setpoint_weight=controller.setpoint_weight)
         return held
+
+    @property
+    def takes_weight(self) -> bool:
+        """Whether a weight of the set-point can be written."""
+        return "PWeighting" in self._gains.settings
 
     def coarse(self, controller: PIDController) -> tuple[str, ...]:
         """Return which registers move a setting by more than half a percent, each with a scale that would not."""
@@ -84,6 +89,8 @@ class GainRegisterRig(RegisterRig):
 
     def write_gains(self, controller: PIDController) -> None:
         """Write gains and read them back; where that fails the old ones are written again.
+
+        The dead-man is fed meanwhile where the host commands.
 
         Raises
         ------
@@ -157,6 +164,22 @@ class GainRegisterRig(RegisterRig):
         }
         self._looks_s = self._clock.now()
         return asked["setpoint"]
+
+    def take_command(self) -> None:
+        """Take the actuator back from the device's own controller, and hold the output that it applied last.
+
+        Nothing where the host has it already. ``trial`` stays: gains that are in the device are still on trial.
+
+        Raises
+        ------
+        LinkError
+            The device does not let the host command.
+        """
+        if self._is_commanding:
+            return
+        self._require(self._is_released, "the host did not give the actuator away", "open the rig first")
+        self._released_s = math.nan
+        self._take(self._sample()[0].u_applied, was_automatic=True)
 
     def ask_controller(self, setpoint: float, load: float) -> tuple[float, float]:
         """Change what the device's own controller is asked for.
@@ -275,8 +298,10 @@ class GainRegisterRig(RegisterRig):
     def _write_checked(self, words: Sequence[list[int]]) -> None:
         self._key(self._unlock.code if self._unlock is not None else None)
         for block, wanted in zip(self._parts, words, strict=True):
+            self.feed()
             self._link.write(block.table, block.address, wanted)
         for block, wanted in zip(self._parts, words, strict=True):
+            self.feed()
             held = list(self._link.read(block).words)
             if held != wanted:
                 raise LinkError(f"read back {held} where {wanted} was written", where=self._link.where)

@@ -166,16 +166,7 @@ class RegisterRig:
                 self._put(name, 0.0)
             self._clock.sleep_until(self._clock.now() + 2.0 * self._scan_s)
             reading, _ = self._sample()
-        taken = reading.u_applied
-        low, high = self._u_range
-        self._u = taken if low <= taken <= high else self._u_safe  # NaN compares false
-        self._is_commanding = True
-        self._write(self._first_blocks)
-        if "enable" in self._codecs:
-            self._put("enable", 1.0)
-        elif runs:
-            self._put("automatic", 0.0)
-        self._await_command(1.0)
+        self._take(reading.u_applied, was_automatic=runs)
         # a device that holds another value than it was sent, or another's, has its command looked at no more
         self._looks_s = self._clock.now() if self._shown_by_device("u") == self._command_held else math.inf
 
@@ -285,6 +276,18 @@ class RegisterRig:
     def _takes_over(self) -> bool:
         """Whether that controller was given the actuator so lately that its program may not know it yet."""
         return self._clock.now() - self._released_s < max(_TAKE_S, self._late_s)
+
+    def _take(self, applied: float, *, was_automatic: bool) -> None:
+        """Take command at the output that the device applies, at the safe output where it does not say."""
+        low, high = self._u_range
+        self._u = applied if low <= applied <= high else self._u_safe  # NaN compares false
+        self._is_commanding = True
+        self._write(self._first_blocks)
+        if "enable" in self._codecs:
+            self._put("enable", 1.0)
+        elif was_automatic:
+            self._put("automatic", 0.0)
+        self._await_command(1.0)
 
     def _release(self, setpoint: float, *, on_trial: bool) -> None:
         """Let the device's own controller have the actuator, without a load; NaN leaves its set-point."""

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from autotune.config import Config
     from autotune.controller import PIDController
     from autotune.experiment.judgement import Verification
-    from autotune.experiment.rig import HoldsGains, Rig
+    from autotune.experiment.rig import HoldsGains, Rig, TrialGains
     from autotune.identification.parametric import PlantFit
     from autotune.pipeline.audit import AuditLog
     from autotune.pipeline.folder import Measured
@@ -64,7 +64,7 @@ def deploy(
     ] = None,
     reason: Annotated[str | None, typer.Option(metavar="TEXT", help="why that person approves")] = None,
 ) -> None:
-    """Write gains into the rig's own controller, read them back, verify the loop; else restore the old gains."""
+    """Try gains in the rig's own controller, and write them for good where the loop behaves as predicted."""
     from autotune.config import load_config
     from autotune.pipeline.approval import approval_of
     from autotune.pipeline.audit import audit_log
@@ -97,10 +97,10 @@ def deploy(
         if not yes and not typer.confirm("Write the new gains?"):
             raise InputError("refused: nothing was written", where="autotune deploy")
 
-    def try_out(held: PIDController) -> Verification:
+    def try_out(held: PIDController, gains: TrialGains | None) -> Verification:
         assert measured is not None
         assert fit is not None
-        return _verify(rig, content, held, fit, measured, folder, on_device=True)
+        return _verify(rig, content, held, fit, measured, folder, gains=gains)
 
     trial = try_out if verify else None
     done = hand_over(rig, new, folder / JOURNAL, agree=agree, try_out=trial, audit=audit)
@@ -225,7 +225,8 @@ def _folder(config: Path, run: Path | None, out: Path | None) -> Path:
 
 def _restore_interrupted(rig: HoldsGains, journal: Path, console: Console, yes: bool, audit: AuditLog) -> None:
     """Offer to write the old gains back where an earlier hand-over did not come to its end."""
-    from autotune.pipeline.deployment import Journal, restore
+    from autotune.pipeline.deployment import restore
+    from autotune.pipeline.journal import Journal
 
     old = Journal(journal).unfinished()
     if old is None:
@@ -246,7 +247,15 @@ def _restore_interrupted(rig: HoldsGains, journal: Path, console: Console, yes: 
 
 
 def _verify(
-    rig: Rig, config: Config, gains: PIDController, fit: PlantFit, measured: Measured, folder: Path, *, on_device: bool
+    rig: Rig,
+    config: Config,
+    controller: PIDController,
+    fit: PlantFit,
+    measured: Measured,
+    folder: Path,
+    *,
+    on_device: bool = False,
+    gains: TrialGains | None = None,
 ) -> Verification:
     from autotune.experiment.verify import run_verification
     from autotune.pipeline.folder import VERIFICATION, next_free
@@ -255,12 +264,13 @@ def _verify(
         return run_verification(
             rig,
             config,
-            gains,
+            controller,
             fit,
             next_free(folder / VERIFICATION, ".toml"),
             u_rest=measured.u_rest,
             noise_sd=measured.noise_sd,
             on_device=on_device,
+            gains=gains,
             on_status=bar.show,
         )
 

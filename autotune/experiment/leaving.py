@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from autotune.errors import AutotuneError, LinkError, NotTaken, OperatorStop
-from autotune.experiment.rig import HandsBack, Rig
+from autotune.experiment.rig import HandsBack, Rig, RunsOwnController
 
 SAFE = "safe output"
 NOT_TAKEN = "not taken: nothing was written to the rig"
@@ -37,7 +38,7 @@ class Farewell:
     is_confirmed: bool = True
 
 
-def leave(rig: Rig, error: BaseException | None) -> Farewell:
+def leave(rig: Rig, error: BaseException | None, restore: Callable[[], None] | None = None) -> Farewell:
     """Make the rig safe or give it back to its own controller, close it, and say how it was left; raises nothing.
 
     Parameters
@@ -47,20 +48,27 @@ def leave(rig: Rig, error: BaseException | None) -> Farewell:
     error : BaseException or None
         What ended the session. Where it came to its end, or the operator ended it, a controller that ran before gets
         the actuator back; after a limit or a fault the rig is made safe and the controller is left to a person.
+    restore : callable, optional
+        Puts back what the session changed in the rig's own controller: under the host's command before that controller
+        gets the actuator, or once the rig is safe. Whoever gives it looks whether it has been done.
     """
-    farewell = _left(rig, error)
+    farewell = _left(rig, error, restore)
     with contextlib.suppress(Exception):  # a driver may raise what it likes here: the rig is left already
         rig.close()
     return farewell
 
 
-def _left(rig: Rig, error: BaseException | None) -> Farewell:
+def _left(rig: Rig, error: BaseException | None, restore: Callable[[], None] | None) -> Farewell:
     if isinstance(error, NotTaken):
         return Farewell(output=NOT_TAKEN)
     former = rig.former if isinstance(rig, HandsBack) else None
     failed = ""
     if former is not None and isinstance(rig, HandsBack) and _is_orderly(error):
         try:
+            if restore is not None:
+                if isinstance(rig, RunsOwnController):
+                    rig.take_command()
+                restore()
             rig.hand_back()
         except Exception as cause:
             failed = _words(cause)
@@ -70,6 +78,9 @@ def _left(rig: Rig, error: BaseException | None) -> Farewell:
         rig.make_safe()
     except Exception as cause:
         return Farewell(output=UNSAFE, note=GO_TO_THE_RIG, error=_words(cause), is_confirmed=False)
+    if restore is not None:
+        with contextlib.suppress(Exception):
+            restore()
     if former is None:
         return Farewell(output=SAFE)
     note = f"its own controller was in {former} before and was not restored: give it the actuator back at the rig"

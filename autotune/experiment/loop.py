@@ -6,7 +6,7 @@ import contextlib
 import math
 import signal
 from collections import deque
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
@@ -85,6 +85,8 @@ class ControlLoop:
         Judges readings; the procedure tells it what noise to expect.
     metadata : dict
         Goes into the sidecar at the end.
+    restore : callable or None
+        Puts back what the procedure changed in the rig, see :func:`~autotune.experiment.leaving.leave`.
 
     Raises
     ------
@@ -98,6 +100,7 @@ class ControlLoop:
         self.watch = Watch()
         self.monitor = ReadingMonitor(envelope.patience, envelope.sample_time_s)
         self.metadata: dict[str, Any] = {}
+        self.restore: Callable[[], None] | None = None
         self._writer = writer
         self._extra = tuple(extra)
         self._rows = RecentRows(writer.path)
@@ -222,6 +225,26 @@ class ControlLoop:
         self._wait()
         self._reading = self.rig.read()
         self.tick = self._judged(self._reading, u=self.applied)
+        return self.tick
+
+    def hold_while(self, action: Callable[[], None]) -> Tick:
+        """Hold the command while something on the rig takes longer than a sample may, and return the sample after it.
+
+        The samples meanwhile are not taken and none of the losses; the rows' times show the gap. The command is
+        repeated before and after, which feeds the dead-man; the rig's own ends a gap that is too long.
+        """
+        u = self.tick.u
+        self._write_row(u, {})
+        self.rig.write(u)
+        action()
+        self.rig.write(u)
+        gap = max(0, int((self.rig.clock.now() - self._deadline_s) / self.sample_time_s))
+        self._deadline_s += gap * self.sample_time_s
+        self.monitor.recent = ()  # how far y may get from one sample to the next says nothing of a gap
+        self.tick = replace(self.tick, slot=self.tick.slot + gap)
+        self._wait()
+        self._reading = self.rig.read()
+        self.tick = self._judged(self._reading, u=u)
         return self.tick
 
     def begin(self, reading: Reading) -> None:
@@ -369,7 +392,7 @@ class ControlLoop:
 
     def _leave(self, error: BaseException | None) -> None:
         """Leave the rig, and write down how and why; raises only where the end itself has to be one."""
-        farewell = leave(self.rig, error)
+        farewell = leave(self.rig, error, self.restore)
         unconfirmed = None
         if error is None and not farewell.is_confirmed:
             error = unconfirmed = LinkError(

@@ -255,6 +255,10 @@ class RunsOwnController(HoldsGains, Protocol):
         """Give it the actuator at a set-point [y unit], readings go on; return the set-point as the device holds it."""
         ...
 
+    def take_command(self) -> None:
+        """Take the actuator back from it, the output held where it is; nothing where the host has it already."""
+        ...
+
     def ask_controller(self, setpoint: float, load: float) -> tuple[float, float]:
         """Change set-point [y unit] and what is added to its output [u unit]; return both as the device holds them.
 
@@ -271,9 +275,29 @@ class RunsOwnController(HoldsGains, Protocol):
         ...
 
 
+class TrialGains(Protocol):
+    """Gains that are in a rig's own controller for as long as it is on trial; both are called while the host commands.
+
+    Whoever made them keeps a record of what the rig holds, and may be asked to take out what was never put in.
+    """
+
+    def put_in(self) -> None:
+        """Write the new gains."""
+        ...
+
+    def take_out(self) -> None:
+        """Write the old gains again, where that is still to be done."""
+        ...
+
+
 @runtime_checkable
 class RoundsGains(HoldsGains, Protocol):
     """A rig whose registers hold gains in steps: what they can hold is the controller."""
+
+    @property
+    def takes_weight(self) -> bool:
+        """Whether a weight of the set-point can be written."""
+        ...
 
     def holdable(self, controller: PIDController) -> PIDController:
         """Return the controller that the rig would hold after these gains were written; nothing is written."""

@@ -25,7 +25,7 @@ class Tick:
     u : float
         Command held until now [u unit].
     slot : int
-        Number of the sample time that it belongs to: ahead of ``k`` by the samples that were missed.
+        Number of the sample time that it belongs to: ahead of ``k`` by the samples that were missed or not taken.
     """
 
     k: int

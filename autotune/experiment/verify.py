@@ -22,7 +22,7 @@ from autotune.experiment.loop import ControlLoop
 from autotune.experiment.own_law import law_of, try_own_law
 from autotune.experiment.result import State, Status
 from autotune.experiment.return_to_setpoint import is_near, setpoint_before
-from autotune.experiment.rig import Exchanges, HoldsGains, Rig, RunsLaws, RunsOwnController
+from autotune.experiment.rig import Exchanges, HoldsGains, Rig, RunsLaws, RunsOwnController, TrialGains
 from autotune.experiment.run import (
     OnStatus,
     bring_to_operating_point,
@@ -140,6 +140,7 @@ def run_verification(
     u_rest: float | None = None,
     noise_sd: float | None = None,
     on_device: bool = False,
+    gains: TrialGains | None = None,
     on_status: OnStatus | None = None,
 ) -> Verification:
     """Bring the rig to its operating point, close the loop with the new controller, test it and leave the rig safe.
@@ -161,6 +162,9 @@ def run_verification(
         [y unit]; found on the way to the operating point where they are not known.
     on_device : bool
         Whether the rig's own controller holds the gains: then it is what is tried, where the host may start it.
+    gains : TrialGains, optional
+        The gains where that controller does not hold them yet and is to be tried: they are put in right before it gets
+        the actuator, and taken out again before it gets it back from the host for good.
     on_status : callable, optional
         Told where the procedure is.
 
@@ -178,7 +182,7 @@ def run_verification(
     test = plan_test(config, law, fit, crossover_rad_s, u_rest)
     if noise_sd is not None:
         _require_telling(expectation(test, law, fit, noise_sd, u_rest=config.operating_point.u_guess))
-    own, untried = _own_controller(rig, on_device)
+    own, untried = _own_controller(rig, on_device or gains is not None)
     extra = ("r", *further_columns(rig))
     writer = RecordingWriter(recording, ("t", "u", "y", *extra), recording_metadata(config))
     y_rest, trial = config.operating_point.y, None
@@ -196,6 +200,9 @@ def run_verification(
             said = _OWN_STEPS + ("" if own.guards_trial else _UNGUARDED)
             tell = _teller(loop, test.settle + test.t.size, said, on_status)
             asked = test if own.takes_load else test.without_load()
+            if gains is not None:
+                loop.restore = gains.take_out
+                loop.hold_while(gains.put_in)
             trial = try_own_law(loop, own, controller, asked, y_rest, tell)
     noise_sd = known.noise_sd if noise_sd is None else noise_sd
     if own is not None and trial is not None:

@@ -3,123 +3,21 @@
 from __future__ import annotations
 
 import contextlib
-import json
-import os
-from collections.abc import Callable
-from dataclasses import asdict, dataclass
-from datetime import UTC, datetime
-from enum import StrEnum
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import NoReturn
 
 from autotune.config.procedure import DesignSettings
-from autotune.controller import PIDController, held_from_table
-from autotune.errors import AutotuneError, ExperimentStopped, InputError, LinkError, OperatorStop
+from autotune.controller import PIDController
+from autotune.errors import AutotuneError, ExperimentStopped, LinkError, OperatorStop
 from autotune.experiment.judgement import Verification
-from autotune.experiment.rig import HoldsGains
+from autotune.experiment.leaving import leave, say
+from autotune.experiment.rig import HoldsGains, RoundsGains, RunsOwnController, TrialGains
 from autotune.interrupts import interrupt_deferred
 from autotune.pipeline.audit import AuditLog
 from autotune.pipeline.held_gains import held_by
-from autotune.run_log import jsonable
-from autotune.text_files import read_text
-
-
-class Step(StrEnum):
-    """What a line of the journal says of its gains."""
-
-    READ = "read"
-    WRITING = "writing"
-    WRITTEN = "written and read back"
-    ON_TRIAL = "written and read back, on trial"
-    KEPT = "verified, kept"
-    HOST_ONLY = "host's law verified; the device's own law not tried"
-    RESTORING = "restoring"
-    RESTORED = "restored"
-
-
-#: last steps after which the rig's gains are new ones unverified, or unknown
-OPEN_ENDS = (Step.WRITING, Step.ON_TRIAL, Step.RESTORING)
-
-
-class Journal:
-    """``journal.jsonl``: one JSON object per step, with its gains and its time, appended before the step is taken.
-
-    Parameters
-    ----------
-    path : Path
-        File to append to; made by the first note.
-    audit : AuditLog, optional
-        Gets a line for every step that changes the rig's gains.
-    """
-
-    def __init__(self, path: Path, audit: AuditLog | None = None) -> None:
-        self.path = path
-        self.audit = audit
-        self._old: PIDController | None = None
-
-    def note(self, step: Step, controller: PIDController, why: str = "") -> None:
-        """Append a step and bring it to the disk; in the audit log with why it is taken.
-
-        Raises
-        ------
-        ExperimentStopped
-            The file cannot be written.
-        """
-        where = self.path
-        at = datetime.now(UTC).isoformat(timespec="milliseconds")
-        line = json.dumps(jsonable({"gains": step.value, "at": at, **asdict(controller)}))
-        try:
-            with self.path.open("a", encoding="utf-8") as file:
-                file.write(line + "\n")
-                file.flush()
-                os.fsync(file.fileno())
-            if step is Step.READ:
-                self._old = controller
-            elif self.audit is not None:
-                where = self.audit.path
-                self.audit.note(step.value, old=self._old or controller, new=controller, why=why)
-        except OSError as error:
-            raise ExperimentStopped(
-                f"the journal cannot be written ({error.strerror})",
-                where=str(where),
-                remedy="free space on the disk; no gains are written that are not in it first",
-            ) from error
-
-    def unfinished(self) -> PIDController | None:
-        """Return the gains to go back to where the last hand-over was interrupted, None where it was not.
-
-        Raises
-        ------
-        InputError
-            The file is not a journal, or the gains in it are no finite numbers.
-        """
-        if not self.path.exists():
-            return None
-        notes = self._notes()
-        if not notes or notes[-1][0] not in OPEN_ENDS:
-            return None
-        gains = next((gains for step, gains in reversed(notes) if step is Step.READ), None)
-        if gains is None:
-            raise self._no_journal("its end is open and no gains were read before")
-        return held_from_table(gains, str(self.path))
-
-    def _notes(self) -> list[tuple[Step, dict[str, Any]]]:
-        """Return the steps with their gains; a line without its end was cut off before its step was taken."""
-        text = read_text(self.path)
-        notes = []
-        for number, line in enumerate(text[: text.rfind("\n") + 1].splitlines(), start=1):
-            try:
-                note = json.loads(line)
-                note.pop("at", None)
-                notes.append((Step(note.pop("gains")), note))
-            except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
-                raise self._no_journal(f"line {number} says no step") from None
-        return notes
-
-    def _no_journal(self, why: str) -> InputError:
-        return InputError(
-            f"not a journal of gains: {why}", where=str(self.path), remedy="move it away, and check the rig's gains"
-        )
+from autotune.pipeline.journal import Journal, Step
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -210,15 +108,19 @@ def deploy(
     journal: Path,
     *,
     agree: Callable[[PIDController, PIDController], None],
-    try_out: Callable[[PIDController], Verification] | None,
+    try_out: Callable[[PIDController, TrialGains | None], Verification] | None,
     audit: AuditLog | None = None,
 ) -> Deployment:
-    """Hand new gains to the rig's own controller, try them, and take them back unless they behave as predicted.
+    """Try new gains on the rig, and hand them to its own controller where the loop behaves as predicted.
+
+    Where the host can start that controller the gains are in it for the trial, and only while the host commands or
+    watches; otherwise the host's law is tried and the gains are written once it is accepted. Accepted gains are written
+    while the host commands, where it can, so that no controller runs on half of them.
 
     Parameters
     ----------
     rig : HoldsGains
-        Closed; it is connected to for every step, and only the trial takes its actuator.
+        Closed; it is connected to for every step.
     controller : PIDController
         New gains.
     journal : Path
@@ -226,7 +128,8 @@ def deploy(
     agree : callable
         Shown the old and the new gains before anything is written; raises where they are refused.
     try_out : callable or None
-        Runs the verification with the gains as the rig read them back; None keeps them without.
+        Runs the verification with the gains as the rig will hold them; given what puts them into its own controller,
+        None where the host's law is tried. None writes the gains without a trial, whoever has the actuator.
     audit : AuditLog, optional
         Gets a line for every change of the rig's gains.
 
@@ -239,33 +142,113 @@ def deploy(
     old = read_gains(rig)
     agree(old, controller)
     notes.note(Step.READ, old)
-    held = _write(rig, controller, old, notes, Step.ON_TRIAL if try_out else Step.WRITTEN)
     if try_out is None:
+        held = _write(rig, controller, old, notes, Step.WRITTEN)
         return Deployment(old=old, new=held, verification=None)
+    new = _as_held(rig, controller, old)
+    startable = isinstance(rig, RunsOwnController) and not rig.not_startable
+    trial = _Trial(rig, new, old, notes)
     try:
-        verification = try_out(held)
-        if verification.accepted:
-            _require_held(rig, held)
+        verification = try_out(new, trial if startable else None)
+        trial.require_over(verification)
     except BaseException as error:
-        _take_back(rig, old, notes, error, "the verification was broken off")
-    if verification.accepted:
-        step = Step.KEPT if verification.by == "device" else Step.HOST_ONLY
-        notes.note(step, held, f"{verification.whose}; {verification.reason}")
-    else:
-        restore(rig, old, journal, audit=audit, why=verification.reason)
+        if not trial.was_written:
+            raise
+        trial.broken_off(error, "the verification was broken off")
+    if not verification.accepted:
+        with contextlib.suppress(ExperimentStopped):  # a full disk changes nothing of it
+            notes.note(Step.REFUSED, new, verification.reason)
+        return Deployment(old=old, new=new, verification=verification)
+    step = Step.KEPT if verification.by == "device" else Step.HOST_ONLY
+    why = f"{verification.whose}; {verification.reason}"
+    held = trial.keep(step, why) if startable else _write(rig, new, old, notes, step, why)
     return Deployment(old=old, new=held, verification=verification)
 
 
-def _require_held(rig: HoldsGains, tried: PIDController) -> None:
-    """Refuse to keep gains that are not those which were on trial."""
-    held = read_gains(rig)
-    if held != tried:
-        raise LinkError(
-            f"the rig holds K = {held.K:.4g}, T_I = {held.Ti_s:.4g} s after the trial"
-            f" where K = {tried.K:.4g}, T_I = {tried.Ti_s:.4g} s were tried: another master writes its gains",
-            where="hand-over of the gains",
-            remedy="end the other session; only one master may command",
-        )
+def _as_held(rig: HoldsGains, controller: PIDController, old: PIDController) -> PIDController:
+    """Return what the rig's own controller computes with the new gains: they rounded, its set-point weight its own."""
+    held = held_by(rig, controller, DesignSettings())
+    has_weight_of_its_own = isinstance(rig, RoundsGains) and not rig.takes_weight
+    return replace(held, setpoint_weight=old.setpoint_weight) if has_weight_of_its_own else held
+
+
+class _Trial:
+    """New gains in a rig's own controller while the host commands or watches it, and the old ones back afterwards.
+
+    Parameters
+    ----------
+    rig : HoldsGains
+        Its own controller.
+    new, old : PIDController
+        Gains.
+    notes : Journal
+        Takes every step before it is taken.
+    """
+
+    def __init__(self, rig: HoldsGains, new: PIDController, old: PIDController, notes: Journal) -> None:
+        self._rig, self._new, self._old, self._notes = rig, new, old, notes
+        self._is_in = False  # whether the rig may hold the new gains, or half of them
+        self.was_written = False
+        self._held = self._found = new  # right after they were put in, and before they were taken out
+
+    def put_in(self, done: Step = Step.ON_TRIAL, why: str = "") -> None:
+        """Write the new gains and read them back."""
+        self._notes.note(Step.WRITING, self._new, why)
+        self._is_in = self.was_written = True
+        self._rig.write_gains(self._new)
+        self._held = self._found = self._rig.read_gains()
+        self._notes.note(done, self._held, why)
+
+    def take_out(self) -> None:
+        """Write the old gains again, where that is still to be done; look first what the rig holds."""
+        if self._is_in:
+            with contextlib.suppress(LinkError):
+                self._found = self._rig.read_gains()
+            _write_back(self._rig, self._old, self._notes, "the trial is over")
+            self._is_in = False
+
+    def require_over(self, verification: Verification) -> None:
+        """Refuse to go on with a rig that still has the gains of the trial, or that had others during it."""
+        if self._is_in:
+            raise LinkError("the old gains were not taken", where="hand-over of the gains", remedy="check the link")
+        if verification.accepted and self._found != self._held:
+            raise LinkError(
+                f"the rig holds K = {self._found.K:.4g}, T_I = {self._found.Ti_s:.4g} s after the trial where"
+                f" K = {self._held.K:.4g}, T_I = {self._held.Ti_s:.4g} s were tried: another master writes its gains",
+                where="hand-over of the gains",
+                remedy="end the other session; only one master may command",
+            )
+
+    def keep(self, step: Step, why: str) -> PIDController:
+        """Write the new gains for good, and return them as the rig holds them."""
+        try:
+            with _command(self._rig, self.take_out), interrupt_deferred():
+                self.put_in(step, why)
+        except BaseException as error:
+            self.broken_off(error, "the hand-over was broken off")
+        return self._held
+
+    def broken_off(self, error: BaseException, what: str) -> NoReturn:
+        """Have the old gains in place, and raise an error of the same kind that says so."""
+        _take_back(self._rig, self._old, self._notes, error, what, is_done=not self._is_in)
+
+
+@contextlib.contextmanager
+def _command(rig: HoldsGains, restore: Callable[[], None]) -> Iterator[None]:
+    """Have the host command meanwhile, and whoever had the actuator have it again; after an error restore first."""
+    try:
+        rig.open()
+        yield
+        rig.read()  # whether the host still commands
+    except BaseException as error:
+        with interrupt_deferred():
+            farewell = leave(rig, error, restore)
+        say(error, farewell.note)
+        raise
+    with interrupt_deferred():
+        farewell = leave(rig, None)
+    if farewell.note:
+        raise LinkError(farewell.note, where="hand-over of the gains", remedy="look at the rig before anything else")
 
 
 def restore(
@@ -291,14 +274,17 @@ def restore(
     LinkError
         They could not be written and read back.
     """
-    notes = Journal(journal, audit)
+    try:
+        _write_back(rig, old, Journal(journal, audit), why)
+    finally:
+        rig.close()
+
+
+def _write_back(rig: HoldsGains, old: PIDController, notes: Journal, why: str) -> None:
     # a full disk must not keep new gains: the journal is open-ended already, and stays so where the end is missing
     with contextlib.suppress(ExperimentStopped):
         notes.note(Step.RESTORING, old, why)
-    try:
-        rig.write_gains(old)
-    finally:
-        rig.close()
+    rig.write_gains(old)
     with contextlib.suppress(ExperimentStopped):
         notes.note(Step.RESTORED, old, why)
 
@@ -327,14 +313,23 @@ def _write(
     return held
 
 
-def _take_back(rig: HoldsGains, old: PIDController, notes: Journal, error: BaseException, what: str) -> NoReturn:
+def _take_back(
+    rig: HoldsGains,
+    old: PIDController,
+    notes: Journal,
+    error: BaseException,
+    what: str,
+    *,
+    is_done: bool = False,
+) -> NoReturn:
     """Restore the old gains after whatever ended a hand-over, and raise one of its kind that says what they are now.
 
     A second Ctrl-C waits until they are in place.
     """
     try:
         with interrupt_deferred():
-            restore(rig, old, notes.path, audit=notes.audit, why=what)
+            if not is_done:
+                restore(rig, old, notes.path, audit=notes.audit, why=what)
         state, remedy = "the old gains are in place again", "check the link and the rig, and deploy again"
     except KeyboardInterrupt:  # the one that waited
         state, remedy = "the old gains are in place again", "deploy again when ready"

@@ -15,7 +15,7 @@ from autotune.errors import AutotuneError, ExperimentStopped, OperatorStop
 from autotune.experiment.cycles import Earlier
 from autotune.experiment.judgement import Verification
 from autotune.experiment.result import ExperimentResult, State, Status
-from autotune.experiment.rig import HoldsGains, Rig, RunsOwnController
+from autotune.experiment.rig import HoldsGains, Rig, RunsOwnController, TrialGains
 from autotune.experiment.run import OnStatus, run_experiment
 from autotune.experiment.sweep import missing_phases
 from autotune.experiment.verify import run_verification
@@ -210,10 +210,10 @@ def _hand_over(
     deploy: bool,
     on_status: OnStatus,
 ) -> _Handed:
-    """Verify the controller and hand it over: first the gains, then the trial, where the rig's own law can be tried."""
+    """Verify the controller and hand it over; where the rig's own law can be tried it is what is verified."""
     audit = audit_log(config, out, "run")
 
-    def verified(controller: PIDController, on_device: bool) -> Verification:
+    def verified(controller: PIDController, gains: TrialGains | None = None) -> Verification:
         found = run_verification(
             rig,
             config,
@@ -222,7 +222,7 @@ def _hand_over(
             log.recording(next_free(out / VERIFICATION, ".toml")),
             u_rest=experiment.u_rest,
             noise_sd=experiment.noise_sd,
-            on_device=on_device,
+            gains=gains,
             on_status=on_status,
         )
         log.verified(found)
@@ -235,11 +235,11 @@ def _hand_over(
             analysis.controller,
             out / JOURNAL,
             agree=lambda old, new: None,
-            try_out=lambda held: verified(held, on_device=True),
+            try_out=verified,
             audit=audit,
         )
         return _Handed(verification=done.verification, old=done.old, deployed=done.kept)
-    verification = verified(analysis.controller, on_device=False) if verify else None
+    verification = verified(analysis.controller) if verify else None
     accepted = verification is not None and verification.accepted
     if not isinstance(rig, HoldsGains):
         return _Handed(verification=verification)

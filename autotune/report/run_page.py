@@ -168,7 +168,7 @@ def deployment_page(name: str, signals: SignalSettings, done: Deployment) -> Pag
         word = "Kept" if verification.by == "device" else "Written and read back"
         verdict = f"{word}: {new}; {verification.reason}; {verification.whose}."
     else:
-        verdict = f"Not kept: {new}; {verification.reason}. The old gains are in place again."
+        verdict = f"Not kept: {new}; {verification.reason}. The old gains are in place."
     gains = Table(
         header=(
             "",
@@ -180,7 +180,7 @@ def deployment_page(name: str, signals: SignalSettings, done: Deployment) -> Pag
         ),
         rows=tuple(
             (label, *(f"{value:.5g}" for value in (c.K, c.Ti_s, c.Td_s, c.Tf_s)), "in the rig" if held else "")
-            for label, c, held in (("old", done.old, not done.kept), ("new, as read back", done.new, done.kept))
+            for label, c, held in (("old", done.old, not done.kept), ("new", done.new, done.kept))
         ),
     )
     return Page(

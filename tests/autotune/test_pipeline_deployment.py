@@ -29,9 +29,11 @@ from autotune.controller import PIDController
 from autotune.errors import DesignError, ExperimentStopped, InputError, LinkError, OperatorStop
 from autotune.experiment.judgement import Verification
 from autotune.experiment.loop import ControlLoop
+from autotune.experiment.rig import TrialGains
 from autotune.experiment.run import envelope_of
 from autotune.pipeline.audit import AuditLog, audit_log, user
-from autotune.pipeline.deployment import Journal, Step, deploy, hand_over, restore
+from autotune.pipeline.deployment import deploy, hand_over, restore
+from autotune.pipeline.journal import Journal, Step
 from autotune.points import FrequencyPoint, points_to_json
 from autotune.recording import RecordingWriter
 from drivers.simulated import SimulatedRig
@@ -102,12 +104,16 @@ def refused(old: PIDController, new: PIDController) -> None:
     raise InputError("refused: nothing was written")
 
 
-def verified(accepted: bool, by: Literal["host", "device"] = "device") -> Any:
-    """Return a trial that ends at once with the verdict; what is under test is what follows from it."""
+def verified(rig: Any, accepted: bool, by: Literal["host", "device"] = "device") -> Any:
+    """Return a trial on a rig that ends at once with the verdict; what is under test is what follows from it."""
     curve: Any = None
 
-    def try_out(held: PIDController) -> Verification:
+    def try_out(held: PIDController, gains: TrialGains | None) -> Verification:
         figures: Any = None
+        if gains is not None:
+            gains.put_in()
+            gains.take_out()
+            rig.close()
         return Verification(
             accepted=accepted, reason="", test=curve, y=curve, u=curve, prediction=curve,
             rms_error=0.0, allowed=0.0, measured=figures, predicted=figures, predicted_sd=figures, by=by,
@@ -117,35 +123,42 @@ def verified(accepted: bool, by: Literal["host", "device"] = "device") -> Any:
 
 
 def test_gains_are_written_read_back_tried_and_kept(line: Line, tmp_path: Path) -> None:
-    tried = []
+    tried, rig = [], line.rig()
     journal = tmp_path / "journal.jsonl"
 
-    def try_out(held: PIDController) -> Verification:
+    def try_out(held: PIDController, gains: TrialGains | None) -> Verification:
+        assert gains is not None
+        gains.put_in()
         tried.append((held, line.gains, steps(journal)))
-        return verified(True)(held)
+        gains.take_out()
+        assert line.gains == OLD
+        rig.close()
+        return verified(rig, True)(held, None)
 
-    done = deploy(line.rig(), NEW, journal, agree=agreed, try_out=try_out)
+    done = deploy(rig, NEW, journal, agree=agreed, try_out=try_out)
     assert done.kept
     assert (done.old, done.new, line.gains) == (OLD, NEW, NEW)
     assert tried == [(NEW, NEW, ["read", "writing", "written and read back, on trial"])]
-    assert steps(journal)[-1] == "verified, kept"
+    assert steps(journal)[-4:] == ["restoring", "restored", "writing", "verified, kept"]
     assert Journal(journal).unfinished() is None
 
 
 def test_gains_whose_law_ran_in_the_host_alone_are_never_called_kept(line: Line, tmp_path: Path) -> None:
+    rig = line.rig()
     journal = tmp_path / "journal.jsonl"
-    done = deploy(line.rig(), NEW, journal, agree=agreed, try_out=verified(True, by="host"))
+    done = deploy(rig, NEW, journal, agree=agreed, try_out=verified(rig, True, by="host"))
     assert (done.kept, line.gains) == (True, NEW)
     assert steps(journal)[-1] == "host's law verified; the device's own law not tried"
     assert Journal(journal).unfinished() is None
 
 
 def test_gains_that_do_not_verify_are_taken_back(line: Line, tmp_path: Path) -> None:
+    rig = line.rig()
     journal = tmp_path / "journal.jsonl"
-    done = deploy(line.rig(), NEW, journal, agree=agreed, try_out=verified(False))
+    done = deploy(rig, NEW, journal, agree=agreed, try_out=verified(rig, False))
     assert not done.kept
     assert line.gains == OLD
-    assert steps(journal)[-2:] == ["restoring", "restored"]
+    assert steps(journal)[-3:] == ["restoring", "restored", "not accepted, the old gains stay"]
 
 
 def test_nothing_is_written_where_the_gains_are_refused(line: Line, tmp_path: Path) -> None:
@@ -253,10 +266,15 @@ def test_a_line_that_breaks_during_the_trial_takes_the_gains_back(line: Line, tm
     config = load_config(ROOT / "configs" / "servo_sim.toml")
     rig = line.rig()
 
-    def try_out(held: PIDController) -> Verification:
+    def try_out(held: PIDController, gains: TrialGains | None) -> Verification:
+        assert gains is not None
         writer = RecordingWriter(tmp_path / "trial.csv", ("t", "u", "y"))
         with ControlLoop(rig=rig, envelope=envelope_of(config), writer=writer) as loop:
             while True:
+                if loop.tick.k == 3:
+                    loop.restore = gains.take_out
+                    loop.hold_while(gains.put_in)
+                    assert line.gains == NEW
                 if loop.tick.k == 5:
                     line.relay.tamper = lambda frame, direction: ()
                     line.device.on_change = healed
@@ -449,21 +467,22 @@ def lines(log: AuditLog) -> list[dict[str, Any]]:
 def test_the_audit_log_says_who_changed_what_when_from_where_and_why(line: Line, tmp_path: Path) -> None:
     log = audit_of(tmp_path)
     before = datetime.now(UTC)
-    deploy(patient(line), NEW, tmp_path / "journal.jsonl", agree=agreed, try_out=verified(True), audit=log)
+    rig = patient(line)
+    deploy(rig, NEW, tmp_path / "journal.jsonl", agree=agreed, try_out=verified(rig, True), audit=log)
     held = PIDController(K=NEW.K, Ti_s=NEW.Ti_s)
-    deploy(patient(line), OLD, tmp_path / "journal.jsonl", agree=lambda *_: None, try_out=verified(False), audit=log)
+    deploy(rig, OLD, tmp_path / "journal.jsonl", agree=lambda *_: None, try_out=verified(rig, False), audit=log)
     found = lines(log)
     assert [one["verdict"] for one in found] == [
-        "writing", "written and read back, on trial", "verified, kept",
-        "writing", "written and read back, on trial", "restoring", "restored",
+        "writing", "written and read back, on trial", "restoring", "restored", "writing", "verified, kept",
+        "writing", "written and read back, on trial", "restoring", "restored", "not accepted, the old gains stay",
     ]  # fmt: skip
     for one in found:
         assert (one["who"], one["host"], one["command"]) == (user(), socket.gethostname(), "deploy")
         assert before <= datetime.fromisoformat(one["at"]) <= datetime.now(UTC)
         assert datetime.fromisoformat(one["at"]).utcoffset() == timedelta(0)
         assert one["configuration"] == log.configuration
-    assert (found[2]["old"]["K"], found[2]["new"]["K"]) == (OLD.K, held.K)
-    assert (found[-1]["old"]["K"], found[-1]["new"]["K"]) == (held.K, held.K)  # the old gains again
+    assert (found[5]["old"]["K"], found[5]["new"]["K"]) == (OLD.K, held.K)
+    assert (found[-2]["old"]["K"], found[-2]["new"]["K"]) == (held.K, held.K)  # the old gains again
 
 
 def asking(path: Path, table: str) -> list[str]:

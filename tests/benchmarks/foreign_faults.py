@@ -30,6 +30,7 @@ from pyModbusTCP.client import ModbusClient
 from autotune.controller import PIDController
 from autotune.errors import AutotuneError
 from autotune.experiment.judgement import Verification
+from autotune.experiment.rig import TrialGains
 from autotune.experiment.verify import run_verification
 from autotune.pipeline.deployment import deploy
 from drivers import open_rig
@@ -180,11 +181,11 @@ def run_fault(fault: Fault, program: Path, folder: Path) -> Outcome:
         rig: Any = open_rig(config.rig, u_range=(0.0, 10.0), u_safe=SAFE_U)
         striker = threading.Timer(MOMENT_S, fault.strike, (line,)) if fault.strike is not None else None
 
-        def trial(gains: PIDController) -> Verification:
+        def trial(held: PIDController, gains: TrialGains | None) -> Verification:
             if striker is not None:
                 striker.start()
             return run_verification(
-                rig, config, gains, fit, folder / "trial.csv", u_rest=5.0, noise_sd=1e-3, on_device=True
+                rig, config, held, fit, folder / "trial.csv", u_rest=5.0, noise_sd=1e-3, gains=gains
             )
 
         kept = False

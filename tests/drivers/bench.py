@@ -92,7 +92,7 @@ def servo() -> Servo:
     return Servo(ServoSettings(load=0.1, noise=0.001), seed=1)
 
 
-def register_device(registers: RegisterMap = REGISTERS, plant: Any = None) -> RegisterDevice:
+def register_device(registers: RegisterMap = REGISTERS, plant: Any = None, **device: Any) -> RegisterDevice:
     return RegisterDevice(
         plant if plant is not None else servo(),
         {name: spec_of(register) for name, register in registers.mapped().items()},
@@ -100,6 +100,7 @@ def register_device(registers: RegisterMap = REGISTERS, plant: Any = None) -> Re
         u_range=U_RANGE,
         deadman_s=DEADMAN_S,
         gains=(1.5, 2.0),
+        **device,
     )
 
 

@@ -17,7 +17,7 @@ from autotune.experiment.result import ExperimentResult, State, Status
 from autotune.experiment.run import run_experiment
 from autotune.experiment.verify import run_verification
 from autotune.pipeline import Analysis, analyse, hand_over
-from autotune.pipeline.deployment import Journal
+from autotune.pipeline.journal import Journal
 from autotune.recording import read_recording
 from drivers.simulated import SimulatedRig
 from sim.plant import make_plant

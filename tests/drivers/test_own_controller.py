@@ -19,6 +19,7 @@ from autotune.config.registers import RegisterMap
 from autotune.controller import PIDController
 from autotune.errors import AutotuneError, ExperimentStopped, LinkError, NotTaken
 from autotune.experiment.judgement import Verification
+from autotune.experiment.rig import TrialGains
 from autotune.experiment.run import run_experiment
 from autotune.experiment.verify import run_verification
 from autotune.models import TransferFunction
@@ -206,8 +207,8 @@ def test_what_a_device_understands_otherwise_is_named_and_never_kept(
     rig, held = virtual_rig(make_plant("ball", seed=1), registers=REGISTERS, gains=(-0.01, 6.0), **device)
     old = rig.read_gains()
 
-    def trial(gains: PIDController) -> Verification:
-        return run_verification(rig, BALL, gains, BALL_FIT, tmp_path / "trial.csv", on_device=True)
+    def trial(held: PIDController, gains: TrialGains | None) -> Verification:
+        return run_verification(rig, BALL, held, BALL_FIT, tmp_path / "trial.csv", gains=gains)
 
     try:
         done = deploy(rig, PI, tmp_path / "journal.jsonl", agree=lambda *_: None, try_out=trial)
@@ -363,9 +364,9 @@ def test_a_controller_in_c_is_verified_or_named(
         config = peer_config(port, tmp_path)
         rig: Any = open_rig(config.rig, u_range=(0.0, 10.0), u_safe=4.5)
 
-        def trial(gains: PIDController) -> Verification:
+        def trial(held: PIDController, gains: TrialGains | None) -> Verification:
             return run_verification(
-                rig, config, gains, fit, tmp_path / "trial.csv", u_rest=5.0, noise_sd=1e-3, on_device=True
+                rig, config, held, fit, tmp_path / "trial.csv", u_rest=5.0, noise_sd=1e-3, gains=gains
             )
 
         said = ""

@@ -17,7 +17,7 @@ from autotune.errors import AutotuneError, ExperimentStopped, LinkError
 from autotune.experiment.foreign import CommandWatch
 from autotune.experiment.judgement import Verification
 from autotune.experiment.result import ExperimentResult
-from autotune.experiment.rig import Reading
+from autotune.experiment.rig import Reading, TrialGains
 from autotune.experiment.run import run_experiment
 from autotune.experiment.verify import run_verification
 from autotune.pipeline.deployment import deploy
@@ -161,8 +161,8 @@ def trial_disturbed(written: tuple[str, int, list[int]], after_s: float, folder:
     def handed_over(times_s: Sequence[float], place: Path) -> tuple[str, Any]:
         rig = disturbed_rig(times_s, written=written)
 
-        def trial(gains: PIDController) -> Verification:
-            return run_verification(rig, BALL, gains, BALL_FIT, place / "trial.csv", on_device=True)
+        def trial(held: PIDController, gains: TrialGains | None) -> Verification:
+            return run_verification(rig, BALL, held, BALL_FIT, place / "trial.csv", gains=gains)
 
         try:
             done = deploy(rig, PI, place / "journal.jsonl", agree=lambda *_: None, try_out=trial)
@@ -216,8 +216,8 @@ def test_a_set_point_that_follows_y_in_manual_is_asked_for_once_more_and_is_no_o
 
     clock.sleep_until = sleep_until  # type: ignore[method-assign]  # whoever waits lives through it
 
-    def trial(gains: PIDController) -> Verification:
-        return run_verification(rig, BALL, gains, BALL_FIT, tmp_path / "trial.csv", on_device=True)
+    def trial(held: PIDController, gains: TrialGains | None) -> Verification:
+        return run_verification(rig, BALL, held, BALL_FIT, tmp_path / "trial.csv", gains=gains)
 
     done = deploy(rig, PI, tmp_path / "journal.jsonl", agree=lambda *_: None, try_out=trial)
     assert np.std(y_followed) > 0.1
