@@ -245,7 +245,20 @@ def read_model(path: str | os.PathLike[str]) -> Model:
 
 
 def model_of(content: Mapping[str, Any], where: str) -> Model:
-    """Return the chain that a TOML content states; ``where`` names it in messages."""
+    """Return the chain that a TOML content states.
+
+    Parameters
+    ----------
+    content : mapping
+        The decoded TOML.
+    where : str
+        Names it in messages.
+
+    Raises
+    ------
+    InputError
+        A key that is not known, or a value that no model has; names it.
+    """
     _known(content, {"name", "input", "output", "block", "effect", "reduced"}, where)
     blocks, effects = _tables(content, "block", where), _tables(content, "effect", where)
     if not blocks:
@@ -349,7 +362,20 @@ def _block(table: Mapping[str, Any], where: str) -> Block:
 
 
 def effect_of(table: Mapping[str, Any], where: str) -> Effect:
-    """Return the effect that an ``[[effect]]`` table states; ``where`` names it in messages."""
+    """Return the effect that an ``[[effect]]`` table states.
+
+    Parameters
+    ----------
+    table : mapping
+        The decoded TOML.
+    where : str
+        Names it in messages.
+
+    Raises
+    ------
+    InputError
+        A key that is not known, or a value that no effect has; names it.
+    """
     acts = ("at", "state", "input", "port", "column")
     _known(table, {"name", "parameters", "equation", *acts}, where)
     name = _text(table, "name", "", where)
@@ -385,7 +411,15 @@ def write_model(model: Model, path: str | os.PathLike[str], equations: Mapping[s
 
 
 def model_content(model: Model, equations: Mapping[str, str] | None = None) -> dict[str, Any]:
-    """Return the tables of a model file, as :func:`write_model` writes them."""
+    """Return the tables of a model file, as :func:`write_model` writes them.
+
+    Parameters
+    ----------
+    model : Model
+        The chain.
+    equations : mapping of str to str, optional
+        For the reader, the equation of an effect by its name.
+    """
     content: dict[str, Any] = {
         "name": model.name,
         "input": _port_table(model.input),
@@ -415,7 +449,15 @@ def _block_table(block: Block) -> dict[str, Any]:
 
 
 def effect_table(effect: Effect, equation: str | None) -> dict[str, Any]:
-    """Return the ``[[effect]]`` table of an effect, with its equation for the reader."""
+    """Return the ``[[effect]]`` table of an effect, with its equation for the reader.
+
+    Parameters
+    ----------
+    effect : Effect
+        With its parameters; a standard deviation that is not known is left out.
+    equation : str or None
+        For the reader alone.
+    """
     table: dict[str, Any] = {"name": effect.name}
     places = {key: getattr(effect, key) for key in ("at", "state", "input", "port", "column")}
     table |= {key: value for key, value in places.items() if value}

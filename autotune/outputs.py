@@ -80,6 +80,13 @@ def _umask() -> int:
 def append_whole(file: io.FileIO, line: bytes) -> None:
     """Append a line to an unbuffered file, whole or not at all: a disk that fills leaves no half line behind.
 
+    Parameters
+    ----------
+    file : io.FileIO
+        Open for writing, unbuffered.
+    line : bytes
+        With its line end.
+
     Raises
     ------
     OSError
@@ -98,6 +105,13 @@ def append_whole(file: io.FileIO, line: bytes) -> None:
 
 def write_json(path: str | os.PathLike[str], content: Any) -> None:
     """Write JSON by :func:`write_whole`.
+
+    Parameters
+    ----------
+    path : path
+        Replaced where it exists.
+    content : object
+        Of dicts, lists, texts and finite numbers.
 
     Raises
     ------
@@ -231,6 +245,13 @@ class OutputFolder:
 def claim(out: Path, *, inputs: Sequence[Path | None] = ()) -> None:
     """Refuse a place for a file that grows while the work goes on, as :class:`Output` does, before the work.
 
+    Parameters
+    ----------
+    out : Path
+        The file that will grow.
+    inputs : sequence of Path or None
+        Files that it must not be.
+
     Raises
     ------
     InputError
@@ -359,7 +380,15 @@ def _told(out: Path) -> Iterator[None]:
 
 
 def unwritable(error: Exception, out: Path) -> InputError:
-    """Return the refusal of a place that cannot be written."""
+    """Return the refusal of a place that cannot be written.
+
+    Parameters
+    ----------
+    error : Exception
+        What the system said.
+    out : Path
+        The place, where the error names none.
+    """
     name = getattr(error, "filename", None)
     where = str(out) if not isinstance(name, str) or ".part-" in name else name
     remedies = {

@@ -37,7 +37,15 @@ def _link(settings: S7Settings, *, exclusive: bool = True) -> S7Link:
 
 
 def open_kind(settings: S7Settings, session: Session) -> Rig:
-    """Return the rig, with its own controller's gains where they are mapped."""
+    """Return the rig, with its own controller's gains where they are mapped.
+
+    Parameters
+    ----------
+    settings : S7Settings
+        The table ``[rig]``.
+    session : Session
+        What it is opened for.
+    """
     return open_registers(_link(settings), settings, session, TypedGainRig)
 
 
@@ -47,7 +55,15 @@ def reached_by(settings: S7Settings) -> Reach:
 
 
 def probe_kind(settings: S7Settings, expected: Mapping[str, tuple[float, float]]) -> ProbedDevice:
-    """Return every mapped signal, read once; one that the CPU refuses has its refusal as a warning."""
+    """Return every mapped signal, read once; one that the CPU refuses has its refusal as a warning.
+
+    Parameters
+    ----------
+    settings : S7Settings
+        The table ``[rig]``.
+    expected : mapping of str to (float, float)
+        Range within which a signal's engineering value is plausible.
+    """
     link = _link(settings, exclusive=False)
     link.connect()
     registers, signals = codecs(settings.registers.mapped()), settings.signals.mapped()

@@ -136,7 +136,15 @@ class Campaign:
         }
 
     def keep(self, loop: LoopSettings, finding: Finding) -> Row:
-        """Write the result of a loop, whole or not at all; return its row as it will be read again."""
+        """Write the result of a loop, whole or not at all; return its row as it will be read again.
+
+        Parameters
+        ----------
+        loop : LoopSettings
+            What was asked of the loop.
+        finding : Finding
+            What came of it.
+        """
         path = self.file(loop.name)
         path.parent.mkdir(parents=True, exist_ok=True)
         content: dict[str, Any] = {"asked": self._digest(loop)} | finding.to_json()

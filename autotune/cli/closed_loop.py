@@ -95,7 +95,7 @@ def closed_loop(
         model = model_of_recording(
             data, method=method.value, order=order, controller=law, more=more, windows=_windows(f, p, n_cl, psi)
         )
-        place.json(model_json(model, method.value))
+        place.json(_model_json(model, method.value))
         poles = ", ".join(f"{pole:.4g}" for pole in model.poles)
         typer.echo(f"order {model.order} by {method.value}, poles {poles}")
         typer.echo(f"wrote {out}")
@@ -126,7 +126,7 @@ def _windows(f: int | None, p: int | None, n_cl: int | None, psi: str | None) ->
     return Windows(**settings_of(Windows, {"f": f, "p": p, "n_cl": n_cl, "Psi": psi}, where="identify closed-loop"))
 
 
-def model_json(model: InnovationModel, method: str) -> dict[str, Any]:
+def _model_json(model: InnovationModel, method: str) -> dict[str, Any]:
     """Return the content of ``closed_loop.json`` of a model without regions."""
     single = model.B.shape[1] == 1 and len(model.C) == 1
     content: dict[str, Any] = {

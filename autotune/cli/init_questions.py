@@ -70,7 +70,22 @@ def _checked(convert: Callable[[str], Any]) -> Callable[[str], Any]:
 
 
 def one_of(answer: str, known: Collection[str], flag: str) -> str:
-    """Return an answer that is one of the known ones; refuse any other."""
+    """Return an answer that is one of the known ones; refuse any other.
+
+    Parameters
+    ----------
+    answer : str
+        What was given.
+    known : collection of str
+        What may be.
+    flag : str
+        Its option, for the refusal.
+
+    Raises
+    ------
+    InputError
+        Any other answer.
+    """
     if answer not in known:
         raise InputError(f"{answer!r} is none of {', '.join(known)}", where=flag)
     return answer

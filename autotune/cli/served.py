@@ -136,6 +136,15 @@ def _form_of(config: Config, registers: RegisterMap) -> dict[str, Any]:
 def served(config: Config, device: RegisterDevice, *, refuse: Refusal | None = None) -> Iterator[ModbusRig]:
     """Serve a device at the address of the configuration until the context ends.
 
+    Parameters
+    ----------
+    config : Config
+        With a Modbus rig.
+    device : RegisterDevice
+        What answers.
+    refuse : callable, optional
+        Which requests are refused, and how.
+
     Raises
     ------
     InputError
@@ -164,6 +173,15 @@ def served(config: Config, device: RegisterDevice, *, refuse: Refusal | None = N
 @contextmanager
 def served_opcua(config: Config, settings: OpcUaSettings, users: Mapping[str, str] | None = None) -> Iterator[OpcUaRig]:
     """Serve the configuration's twin behind an OPC UA server at its endpoint until the context ends.
+
+    Parameters
+    ----------
+    config : Config
+        With a twin.
+    settings : OpcUaSettings
+        Endpoint and nodes.
+    users : mapping of str to str, optional
+        Passwords by user name; without them anybody may come.
 
     Raises
     ------
@@ -195,6 +213,13 @@ def served_opcua(config: Config, settings: OpcUaSettings, users: Mapping[str, st
 def served_s7(config: Config, settings: S7Settings) -> Iterator[S7Rig]:
     """Serve the configuration's twin as a Siemens CPU at its address until the context ends.
 
+    Parameters
+    ----------
+    config : Config
+        With a twin.
+    settings : S7Settings
+        Address and data blocks.
+
     Raises
     ------
     InputError
@@ -220,6 +245,13 @@ def s7_places(settings: S7Settings) -> dict[str, ServedPlace]:
 @contextmanager
 def served_on_line(config: Config, settings: SerialSettings) -> Iterator[SerialRig]:
     """Serve the configuration's twin as a microcontroller on a serial line until the context ends.
+
+    Parameters
+    ----------
+    config : Config
+        With a twin.
+    settings : SerialSettings
+        The line.
 
     Raises
     ------

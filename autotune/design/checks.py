@@ -68,7 +68,19 @@ class Check:
 def on_plants(
     plants: Sequence[TransferFunction], controller: PIDController, specification: Specification, what: str
 ) -> Check:
-    """Return the check on the worst of some plants."""
+    """Return the check on the worst of some plants.
+
+    Parameters
+    ----------
+    plants : sequence of TransferFunction
+        At least one.
+    controller : PIDController
+        What is checked.
+    specification : Specification
+        The margins that were asked for.
+    what : str
+        The plants in words.
+    """
     found = [_signed(margins(plant, controller)) for plant in plants]
     asked = np.array([specification.modulus_margin, specification.phase_margin_rad])
     worst = min(found, key=lambda pair: float(np.min(np.array(pair[:2]) / asked)))
@@ -86,6 +98,15 @@ def on_points(points: Sequence[FrequencyPoint], controller: PIDController, speci
 
     A region that only touches the circle says nothing against the controller: what the points say together about the
     plant at their frequencies is narrower than each one's own region, and is what the fit's region stands for.
+
+    Parameters
+    ----------
+    points : sequence of FrequencyPoint
+        At least one, with covariance.
+    controller : PIDController
+        What is checked.
+    specification : Specification
+        The margins that were asked for.
     """
     C = controller.response(np.array([point.omega_rad_s for point in points]))
     farthest = []

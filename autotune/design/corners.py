@@ -78,6 +78,15 @@ def plainest(
 
     A search in logarithms of the gains comes as near to a PI as it has steps: its T_d of 1e-30 s says nothing, and no
     device holds it.
+
+    Parameters
+    ----------
+    found : sequence of (4,) array
+        Controllers (K, T_I, T_d, T_f) that keep the constraints, times in s.
+    log_norm : callable
+        Logarithm of a (4,) controller's norm.
+    kept : callable
+        Whether a (4,) controller keeps the constraints.
     """
     cut = [p * np.array([1.0, 1.0, 0.0, 0.0]) for p in found]
     plain = [p for p in cut if kept(p)]

@@ -78,9 +78,23 @@ def order_at_zero(system: TransferFunction) -> int:
 
 
 def integral(f: Callable[[FloatArray], FloatArray], edges: FloatArray, relative_tolerance: float) -> float:
-    """Return the integral over the panels between the edges, each halved until two Gauss rules agree.
+    """Return the integral over log omega between the edges, each panel halved until two Gauss rules agree.
 
     The integration variable is log omega; ``edges`` is (M,), positive and ascending [rad/s].
+
+    Parameters
+    ----------
+    f : callable
+        The integrand over log omega, from frequencies [rad/s] of any shape to values of the same.
+    edges : (M,) array
+        Of the panels [rad/s], positive and ascending.
+    relative_tolerance : float
+        Of the whole integral.
+
+    Raises
+    ------
+    DesignError
+        It does not converge in bounded work.
     """
     a, b = np.log(edges[:-1]), np.log(edges[1:])
     total = 0.0

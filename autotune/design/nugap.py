@@ -22,7 +22,18 @@ from autotune.models import TransferFunction
 
 
 def chordal_distance(P1: ComplexArray, P2: ComplexArray) -> FloatArray:
-    """Return abs(P1 - P2)/sqrt((1 + abs(P1)^2)(1 + abs(P2)^2)), the distance on the Riemann sphere, 0 to 1."""
+    """Return abs(P1 - P2)/sqrt((1 + abs(P1)^2)(1 + abs(P2)^2)), the distance on the Riemann sphere, 0 to 1.
+
+    Parameters
+    ----------
+    P1, P2 : (N,) complex array
+        Two responses at the same frequencies.
+
+    Returns
+    -------
+    (N,) array
+        The distances.
+    """
     a1, a2 = np.abs(P1), np.abs(P2)
     # written with reciprocals where the gain is large, so that an integrator does not overflow
     return np.asarray(np.abs(P1 - P2) / (np.hypot(1.0, a1) * np.hypot(1.0, a2)))
@@ -68,6 +79,15 @@ def nu_gap(P1: Plant, P2: Plant, *, scaling: float = 1.0) -> float:
 def generalized_stability_margin(plant: Plant, controller: Controller, *, scaling: float = 1.0) -> float:
     """Return b(C/k, k P) = min over omega of abs(1 + P C)/sqrt((1 + abs(k P)^2)(1 + abs(C/k)^2)); 0 if unstable.
 
+    Parameters
+    ----------
+    plant : Plant
+        P, continuous.
+    controller : Controller
+        C.
+    scaling : float
+        k [u unit/y unit].
+
     References
     ----------
     Le & Mendes 2010, equation (10); Vinnicombe 1993.
@@ -91,6 +111,13 @@ def _local_margin(loop: ContinuousLoop | SampledLoop, omega: FloatArray, scaling
 
 def optimal_stability_margin(plant: Plant, *, scaling: float = 1.0) -> float:
     """Return the largest b(C, k P) that any controller reaches: sqrt(1 - ||[N; M]||_H^2) = 1/sqrt(1 + rho(X Y)).
+
+    Parameters
+    ----------
+    plant : Plant
+        P, continuous, rational and proper.
+    scaling : float
+        k [u unit/y unit].
 
     Raises
     ------
@@ -126,6 +153,18 @@ def optimal_stability_margin(plant: Plant, *, scaling: float = 1.0) -> float:
 
 def loop_scaling(plant: Plant, controller: Controller) -> float:
     """Return the loop's own scaling k = abs(C) at the highest crossover, so that k P and C/k both have gain 1 there.
+
+    Parameters
+    ----------
+    plant : Plant
+        P, continuous.
+    controller : Controller
+        C.
+
+    Returns
+    -------
+    float
+        k [u unit/y unit].
 
     Raises
     ------

@@ -78,7 +78,16 @@ def design_on_structures(structures: ConsistentStructures, specification: Specif
 
 
 def require_kept(slack: FloatArray, structures: ConsistentStructures, specification: Specification) -> None:
-    """Refuse a controller that plants through the points do not keep, given their (S, 3) slacks.
+    """Refuse a controller that plants through the points do not keep.
+
+    Parameters
+    ----------
+    slack : (S, 3) array
+        Slacks of modulus, phase and delay margin on S plants.
+    structures : ConsistentStructures
+        What the points allow; says where to measure.
+    specification : Specification
+        For the message.
 
     Raises
     ------

@@ -126,7 +126,15 @@ def place_poles(plant: TransferFunction, poles: Sequence[complex]) -> RST:
 
 
 def closed_loop_poles(plant: TransferFunction, controller: RST) -> ComplexArray:
-    """Return the roots of A S + B R [rad/s]."""
+    """Return the roots of A S + B R [rad/s].
+
+    Parameters
+    ----------
+    plant : TransferFunction
+        B/A, without dead time.
+    controller : RST
+        Polynomials R, S and T.
+    """
     polynomial = np.polyadd(np.polymul(plant.den, controller.S), np.polymul(plant.num, controller.R))
     return np.asarray(np.roots(polynomial), dtype=np.complex128)
 

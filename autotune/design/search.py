@@ -59,7 +59,15 @@ class Problem:
         return -1.0 if asked is None else asked
 
     def norms_and_slacks(self, grid: FloatArray, thin: int = 1) -> tuple[FloatArray, FloatArray]:
-        """Return (M,) squared norms on the first plant and (M, S, 4) slacks on all plants of the (M, 4) controllers."""
+        """Return (M,) squared norms on the first plant and (M, S, 4) slacks on all plants of the (M, 4) controllers.
+
+        Parameters
+        ----------
+        grid : (M, 4) array
+            Rows of K, T_I, T_d, T_f, sign taken out, times in s.
+        thin : int
+            Every ``thin``-th frequency is looked at.
+        """
         found = []
         for plant in self.sampled:
             s = plant.thinned(thin) if thin > 1 else plant
@@ -68,16 +76,36 @@ class Problem:
         return np.asarray(found[0].squared_norm), slacks
 
     def slacks_of(self, plant: int, figures: Figures) -> FloatArray:
-        """Return (..., 4) slacks of the figures on a plant."""
+        """Return the slacks of the figures on a plant.
+
+        Parameters
+        ----------
+        plant : int
+            Which one; the first alone is held to the noise gain.
+        figures : Figures
+            Each of shape (...).
+
+        Returns
+        -------
+        (..., 4) array
+            Slacks of modulus, phase, noise gain and delay; infinite where nothing is asked.
+        """
         slacks = self.specification.slacks(figures)
         if plant > 0:
             slacks[..., 2] = np.inf
         return slacks
 
     def exact_slacks(self, parameters: FloatArray, coarse: FloatArray) -> FloatArray:
-        """Return (S, 4) slacks refined between the grid's frequencies, given ``coarse``, those on the grid.
+        """Return (S, 4) slacks refined between the grid's frequencies.
 
         Whether a loop is stable is taken from the grid's count: a negative modulus margin.
+
+        Parameters
+        ----------
+        parameters : (4,) array
+            K, T_I, T_d, T_f, sign taken out, times in s.
+        coarse : (S, 4) array
+            Slacks on the grids.
         """
         controller = self.controller(parameters)
         found = [
@@ -119,10 +147,17 @@ def _exact_figures(
 
 
 def polished(problem: Problem, starts: FloatArray) -> PIDController:
-    """Return the best controller reached from the (S, 4) starting values, its constraints corrected to the exact ones.
+    """Return the best controller reached from the starting values, its constraints corrected to the exact ones.
 
     Parameters with value 0 stay 0. Where the corrections do not settle on the feasible side, a little more is asked
     for, and where no search ends there, the best of the starting values that is feasible exactly is returned.
+
+    Parameters
+    ----------
+    problem : Problem
+        Plants and constraints.
+    starts : (S, 4) array
+        Rows of K, T_I, T_d, T_f, sign taken out, times in s; a 0 stays 0.
 
     Raises
     ------
@@ -172,10 +207,10 @@ def _corrected(problem: Problem, starts: FloatArray) -> FloatArray | None:
 
 
 def _best_of(problem: Problem, starts: FloatArray, offset: FloatArray) -> tuple[float, FloatArray]:
-    return min((local_search(problem, start, offset) for start in starts), key=lambda item: item[0])
+    return min((_local_search(problem, start, offset) for start in starts), key=lambda item: item[0])
 
 
-def local_search(problem: Problem, start: FloatArray, offset: FloatArray) -> tuple[float, FloatArray]:
+def _local_search(problem: Problem, start: FloatArray, offset: FloatArray) -> tuple[float, FloatArray]:
     """Return the norm and the (4,) parameters at a local optimum: sequential quadratic programming in log gains.
 
     ``offset`` (S, 4) is added to what the constraints ask for. The norm is infinite where no feasible point was found.
@@ -260,6 +295,8 @@ def admissible(problem: Problem, starts: FloatArray) -> FloatArray:
 
     Parameters
     ----------
+    problem : Problem
+        Plants and constraints.
     starts : (S, 4) array
         Controllers that keep not all constraints, the most promising first; parameters with value 0 stay 0.
     """
@@ -288,7 +325,17 @@ def admissible(problem: Problem, starts: FloatArray) -> FloatArray:
 
 
 def separate(nodes: FloatArray, distance: float, most: int) -> FloatArray:
-    """Return the first of the (M, 4) controllers and those after it that are no neighbours: a start for each basin."""
+    """Return the first of the (M, 4) controllers and those after it that are no neighbours: a start for each basin.
+
+    Parameters
+    ----------
+    nodes : (M, 4) array
+        Controllers, the best first.
+    distance : float
+        Largest difference of a logarithm within which two are neighbours.
+    most : int
+        How many are returned at most.
+    """
     kept: list[FloatArray] = []
     for node in nodes:
         free = node > 0.0

@@ -35,7 +35,7 @@ def stepped(t: float, number: float, amplitude: float, time: float, end: float, 
     return amplitude if (recording < 0.0 or number == recording) and time <= t < end else 0.0
 
 
-def regained(w: float, t: float, number: float, change: float, time: float, end: float, recording: float) -> float:
+def _regained(w: float, t: float, number: float, change: float, time: float, end: float, recording: float) -> float:
     """Return a command whose gain is another one from a time on."""
     return w + stepped(t, number, change, time, end, recording) * w
 
@@ -248,7 +248,7 @@ ENVIRONMENT = (
         words=("a switched gain", "from a time on a command does more, or less, than before"),
         equation="w = (u - u0) (1 + change) from the time on: a pump, a voltage, another mode of working",
         parameters=_step_of("change", ""),
-        lines=(Line(stage="command", does=regained),),
+        lines=(Line(stage="command", does=_regained),),
         sought="rig",
         search=_switch_times,
         acts_in=_acts_in,

@@ -52,25 +52,25 @@ def dry(v: float, level: float) -> float:
     return level
 
 
-def yielded(z: float, through: float, level: float, transition: float) -> float:
+def _yielded(z: float, through: float, level: float, transition: float) -> float:
     """Return the force of a damper that yields: dry friction over the speed of a plant that is a law."""
     if transition > 0.0:
         return z + level * math.tanh(through / transition)
     return z + (math.copysign(level, through) if through != 0.0 else 0.0)
 
 
-def dropping(v: float, level: float, breakaway: float, stribeck_speed: float) -> float:
+def _dropping(v: float, level: float, breakaway: float, stribeck_speed: float) -> float:
     """Return the level of a friction that falls from breakaway as the speed grows."""
     ratio = v / stribeck_speed
     return level + (breakaway - level) * math.exp(-ratio * ratio)
 
 
-def dragged(v: float, gain: float, coefficient: float) -> float:
+def _dragged(v: float, gain: float, coefficient: float) -> float:
     """Return a drag as a force at the plant's input."""
     return -(coefficient * v * abs(v) / gain)
 
 
-def hardened(x: float, coefficient: float, low: float, high: float) -> float:
+def _hardened(x: float, coefficient: float, low: float, high: float) -> float:
     """Return the force of a spring that grows with the cube of the travel."""
     c = min(max(x, low), high)
     return -(coefficient * c * c * c)
@@ -81,7 +81,7 @@ def weighed(w: float, x: float, slope: float, low: float, high: float) -> float:
     return slope * min(max(x, low), high) * w
 
 
-def cogging(
+def _cogging(
     x: float,
     y_offset: float,
     gain: float,
@@ -105,7 +105,7 @@ def rising(x: float, gain: float, coefficient: float) -> float:
     return -(coefficient * x * abs(x) / gain)
 
 
-def held_back(turned: float, amplitude: float) -> float:
+def _held_back(turned: float, amplitude: float) -> float:
     """Return the force of a hysteresis."""
     return -(amplitude * turned)
 
@@ -116,12 +116,12 @@ def turn(dx: float, width: float, turned: float) -> float:
     return min(max(turned + travel - abs(travel) * turned, -1.0), 1.0)
 
 
-def radiated(x: float, gain: float, kelvin: float, coefficient: float) -> float:
+def _radiated(x: float, gain: float, kelvin: float, coefficient: float) -> float:
     """Return what the fourth power adds to the linear loss that the plant's own lag stands for."""
     return -(coefficient * ((kelvin + x) ** 4 - kelvin**4 - 4.0 * kelvin**3 * x) / gain)
 
 
-def leaked(x: float, gain: float, rate: float, low: float, high: float) -> float:
+def _leaked(x: float, gain: float, rate: float, low: float, high: float) -> float:
     """Return a leak as a force at the plant's input."""
     return -(rate * min(max(x, low), high) / gain)
 
@@ -136,7 +136,7 @@ def outflow(level: float, gain: float, operating_level: float) -> float:
     return _excess(level, operating_level) / gain
 
 
-def lower_outflow(x: float, level: float, gain_last: float, operating_level: float, operating_level_2: float) -> float:
+def _lower_outflow(x: float, level: float, gain_last: float, operating_level: float, operating_level_2: float) -> float:
     """Return the same for a lower tank: it gets the upper one's true outflow and gives a square-root one itself."""
     if operating_level_2 <= 0.0:
         return 0.0
@@ -287,7 +287,7 @@ PLANT = (
             # of a damper, whose plant is a law: speed over which its force turns round
             Quantity(name="transition", unit="{f}", role="shape", neutral=0.0),
         ),
-        lines=(Line(stage="friction", does=dry), Line(stage="sensor", does=yielded)),
+        lines=(Line(stage="friction", does=dry), Line(stage="sensor", does=_yielded)),
         sub_steps=2,
         needs=RUBBING,
         suits=RUBBING,
@@ -313,7 +313,7 @@ PLANT = (
             Quantity(name="breakaway", unit="{f}", role="amplitude"),
             Quantity(name="stribeck_speed", unit="{v}", role="shape", nonzero=True),
         ),
-        lines=(Line(stage="friction", does=dropping),),
+        lines=(Line(stage="friction", does=_dropping),),
         sub_steps=2,
         needs=MECHANICAL,
         suits=MECHANICAL,
@@ -355,7 +355,7 @@ PLANT = (
         words=("drag", "drag grows with the square of the speed"),
         equation="tau dv/dt = -v - coefficient v |v| + gain w",
         parameters=(Quantity(name="coefficient", unit="1/({v})", role="amplitude"),),
-        lines=(Line(stage="force", does=dragged),),
+        lines=(Line(stage="force", does=_dragged),),
         needs=MECHANICAL,
         suits=MECHANICAL,
         starts=lambda s: [(0.05 / s.v,), (0.5 / s.v,)],
@@ -373,7 +373,7 @@ PLANT = (
         words=("curved spring", "the spring's stiffness changes with the travel"),
         equation="force = -coefficient x^3",
         parameters=(Quantity(name="coefficient", unit="{f}/{y}^3", role="amplitude", sign="real"), *ends("{y}")),
-        lines=(Line(stage="force", does=hardened),),
+        lines=(Line(stage="force", does=_hardened),),
         goes_on=lambda values, x: values["coefficient"] * values["gain"] > 0.0,
         needs=TRAVEL,
         suits=TRAVEL,
@@ -446,7 +446,7 @@ PLANT = (
             # of a lower tank, where there are two one above the other
             Quantity(name="operating_level_2", unit="{y}", role="shape", neutral=0.0, nonzero=True),
         ),
-        lines=(Line(stage="force", does=outflow), Line(stage="outflow", does=lower_outflow)),
+        lines=(Line(stage="force", does=outflow), Line(stage="outflow", does=_lower_outflow)),
         suits=LEVEL,
         starts=lambda s: [(c * s.x,) * (2 if s.levels == 2 else 1) for c in (1.5, 6.0)],
         odds={"level": 1.0},
@@ -491,7 +491,7 @@ PLANT = (
             Quantity(name="amplitude", unit="{f}", role="amplitude"),
             Quantity(name="width", unit="{y}", role="shape", nonzero=True),
         ),
-        lines=(Line(stage="force", does=held_back), Line(stage="travel", does=turn)),
+        lines=(Line(stage="force", does=_held_back), Line(stage="travel", does=turn)),
         memory=Memory(name="turned", start="zero"),
         starts=lambda s: [(0.05 * s.f, c * s.x) for c in (0.05, 0.3)],
         rough=True,
@@ -519,7 +519,7 @@ PLANT = (
         words=("radiation", "heat is lost by radiation, with the fourth power of the temperature"),
         equation="tau dx/dt = -x - coefficient (T^4 - T0^4 - 4 T0^3 x) + gain w, T = T0 + x absolute",
         parameters=(Quantity(name="coefficient", unit="1/K^3", role="amplitude"),),
-        lines=(Line(stage="force", does=radiated),),
+        lines=(Line(stage="force", does=_radiated),),
         suits=LEVEL,
         possible=_kelvin,
         starts=lambda s: [(c / (s.x_offset + _ICE) ** 3,) for c in (0.02, 0.3)],
@@ -559,7 +559,7 @@ PLANT = (
         words=("leak", "the plant loses what it has stored"),
         equation="force = -rate x / gain: the plant loses what it has stored",
         parameters=(Quantity(name="rate", unit="{v}/({y})", role="amplitude", sign="real"), *ends("{y}")),
-        lines=(Line(stage="force", does=leaked),),
+        lines=(Line(stage="force", does=_leaked),),
         goes_on=lambda values, x: values["rate"] > 0.0,
         suits=INTEGRATING,
         starts=lambda s: [(0.02 * abs(s.f * s.gain) / s.x,)],
@@ -583,7 +583,7 @@ PLANT = (
             Quantity(name="gravity", unit="", role="mark", neutral=0.0),
             *ends("{y}"),  # of gravity: unwound, an arm would turn on and on where nobody has seen it
         ),
-        lines=(Line(stage="force", does=cogging),),
+        lines=(Line(stage="force", does=_cogging),),
         goes_on=lambda values, x: True,
         needs=TRAVEL,
         suits=TRAVEL,

@@ -94,7 +94,7 @@ def apply(model: EquationModel, effects: Sequence[Effect] | None = None) -> Appl
             case "nothing":
                 pass
             case _:
-                extensions.append(extension_of(model, effect, number))
+                extensions.append(_extension_of(model, effect, number))
     if np.any(delays < 0.0):
         raise InputError("the dead time is negative", where=model.name, remedy="check inputs and effects")
 
@@ -154,7 +154,7 @@ def compile_with(
     return compile_model(model, (*apply(model, effects).extensions, *further), signals, held)
 
 
-def extension_of(model: EquationModel, effect: Effect, number: int = 0) -> Extension:
+def _extension_of(model: EquationModel, effect: Effect, number: int = 0) -> Extension:
     """Return an effect in the model's language; its parameters are named ``EFFECT_NUMBER_KEY``.
 
     Raises

@@ -93,10 +93,10 @@ def from_control(system: Any, name: str = "") -> Model | EquationModel:
         return from_coefficients(tf.num[0][0], tf.den[0][0], name=name)
     import control
 
-    return from_state_space(control.ss(system), name)
+    return _from_state_space(control.ss(system), name)
 
 
-def from_state_space(system: Any, name: str) -> EquationModel:
+def _from_state_space(system: Any, name: str) -> EquationModel:
     """Return a state space with several inputs as equations; entries that are neither 0 nor 1 become parameters."""
     labels = [label if label.isidentifier() else f"x{i + 1}" for i, label in enumerate(system.state_labels)]
     columns = [label if label.isidentifier() else f"u{i + 1}" for i, label in enumerate(system.input_labels)]

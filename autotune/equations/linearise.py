@@ -91,13 +91,13 @@ def growth_rate(model: EquationModel, recordings: Sequence[Recording]) -> float:
     recordings : sequence of Recording
         Their medians are the operating point; where nothing rests under these inputs the rate is not known, and 0.
     """
-    linear = at_recordings(model, recordings)
+    linear = _at_recordings(model, recordings)
     return 0.0 if linear is None else max(float(np.max(np.linalg.eigvals(linear.A).real, initial=0.0)), 0.0)
 
 
 def settles(model: EquationModel, recordings: Sequence[Recording]) -> bool:
     """Whether a deviation from where recordings are dies out, as far as a rest is known there."""
-    linear = at_recordings(model, recordings)
+    linear = _at_recordings(model, recordings)
     return linear is not None and bool(np.all(np.linalg.eigvals(linear.A).real < 0.0))
 
 
@@ -119,7 +119,7 @@ def linearise_at(model: EquationModel, states: FloatArray, inputs: FloatArray) -
     return Linear(A=A, B=B, C=C, D=D, states=states, inputs=inputs, y=y, delays_s=applied.delays)
 
 
-def at_recordings(model: EquationModel, recordings: Sequence[Recording]) -> Linear | None:
+def _at_recordings(model: EquationModel, recordings: Sequence[Recording]) -> Linear | None:
     """Return a model linearised at the medians of recordings; nothing where nothing rests there."""
     inputs = np.array([float(np.median(np.concatenate([r[name] for r in recordings]))) for name in model.columns])
     y = float(np.nanmedian(np.concatenate([r.y for r in recordings])))

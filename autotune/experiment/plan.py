@@ -91,7 +91,17 @@ class LocalModel:
 
     @classmethod
     def through(cls, omega_rad_s: float, gain: float, lag_rad: float) -> LocalModel:
-        """Return the model with this gain, and this phase lag beyond -90 deg [rad], at ``omega_rad_s``."""
+        """Return the model with this gain and phase at a frequency.
+
+        Parameters
+        ----------
+        omega_rad_s : float
+            Where [rad/s].
+        gain : float
+            Of the plant there [y unit/u unit].
+        lag_rad : float
+            Phase lag there beyond -90 deg [rad].
+        """
         tau = math.tan(max(lag_rad, 0.0)) / omega_rad_s
         a = math.tan(max(-lag_rad, 0.0)) * omega_rad_s
         return cls(k=gain * math.hypot(omega_rad_s, a) * math.hypot(1.0, tau * omega_rad_s), tau_s=tau, a_rad_s=a)
@@ -185,7 +195,15 @@ def within_reach(ends_deg: tuple[float, float], first: FrequencyPoint, plant_sig
 
 
 def lag_beyond_integrator(point: FrequencyPoint, plant_sign: int) -> float:
-    """Return by how much the positive-gain plant's phase lies below -90 deg, in (-pi/2, 3 pi/2) [rad]."""
+    """Return by how much the positive-gain plant's phase lies below -90 deg, in (-pi/2, 3 pi/2) [rad].
+
+    Parameters
+    ----------
+    point : FrequencyPoint
+        Of the plant.
+    plant_sign : int
+        1 or -1, sign of the plant's gain.
+    """
     phase = float(np.angle(point.response * plant_sign))
     return -phase % (2.0 * math.pi) - math.pi / 2.0
 
@@ -196,6 +214,15 @@ def predicted(points: Sequence[FrequencyPoint], plant_sign: int, phase_rad: floa
     The tangent of the lag beyond -90 deg is close to a power of omega for everything that lags by more, the tangent of
     the lag itself for what lags by less: it is interpolated, and beyond the known points extrapolated, on logarithmic
     axes.
+
+    Parameters
+    ----------
+    points : sequence of FrequencyPoint
+        Those that are known.
+    plant_sign : int
+        1 or -1, sign of the plant's gain.
+    phase_rad : float
+        Phase of the positive-gain plant [rad].
 
     Raises
     ------
@@ -294,12 +321,29 @@ def expected_sd(noise_sd: float, y_amplitude: float, samples: float) -> float:
 
     It is the Cramer-Rao bound of the fundamental of a periodic signal of this amplitude, the drift known, times what it
     costs that drift and transient are estimated with it.
+
+    Parameters
+    ----------
+    noise_sd : float
+        Standard deviation of a sample's noise [y unit].
+    y_amplitude : float
+        Of the fundamental [y unit].
+    samples : float
+        In the window.
     """
     return ESTIMATED_TOO * noise_sd / y_amplitude * math.sqrt(2.0 / max(samples, 1.0))
 
 
 def time_s(choice: Choice, periods: int) -> float:
-    """Return the rig time that a limit cycle of so many whole periods is expected to take [s]."""
+    """Return the rig time that a limit cycle of so many whole periods is expected to take [s].
+
+    Parameters
+    ----------
+    choice : Choice
+        States the frequency.
+    periods : int
+        Whole periods.
+    """
     return (periods + 0.1) * 2.0 * math.pi / choice.omega_rad_s
 
 

@@ -100,7 +100,7 @@ def run_experiment(
     extra = further_columns(rig)
     writer = RecordingWriter(recording, ("t", "u", "y", *extra), recording_metadata(config))
     with ControlLoop(rig=rig, envelope=envelope_of(config), writer=writer, extra=extra) as loop:
-        swept = experiment_on(loop, config, earlier=earlier, on_status=on_status)
+        swept = _experiment_on(loop, config, earlier=earlier, on_status=on_status)
     sitting = len(earlier.recordings)
 
     def rows(number: int) -> Rows:
@@ -132,7 +132,7 @@ class Swept:
     part: Part
 
 
-def experiment_on(
+def _experiment_on(
     loop: ControlLoop, config: Config, *, earlier: Earlier | None = None, on_status: OnStatus | None = None
 ) -> Swept:
     """Go through the states on an open loop; the plant is left at rest, under the command that holds it.

@@ -276,13 +276,21 @@ def _by_themselves(run: _Sweep, first: Sequence[float], others: Sequence[float],
 
 
 def missing_phases(wanted: ExperimentSettings, earlier: Earlier) -> tuple[float, ...]:
-    """Return the phases of the positive-gain plant that are still to be measured, in their order [rad]."""
+    """Return the phases of the positive-gain plant that are still to be measured, in their order [rad].
+
+    Parameters
+    ----------
+    wanted : ExperimentSettings
+        What is asked of the sweep.
+    earlier : Earlier
+        What was measured of it.
+    """
     if is_together(earlier):
         return ()
     return _missing(_ends_deg(wanted, earlier), wanted, earlier)
 
 
-def phases_between(ends_deg: Sequence[float], wanted: ExperimentSettings, segments: Sequence[Segment]) -> list[float]:
+def _phases_between(ends_deg: Sequence[float], wanted: ExperimentSettings, segments: Sequence[Segment]) -> list[float]:
     """Return the wanted phases of a range [deg] that no limit cycle aimed at [rad]."""
     return [phase for phase in phase_targets(ends_deg[0], ends_deg[1], wanted.points) if not _is_aimed(phase, segments)]
 
@@ -299,7 +307,7 @@ def _ends_deg(wanted: ExperimentSettings, earlier: Earlier) -> tuple[float, floa
 
 
 def _missing(ends_deg: tuple[float, float], wanted: ExperimentSettings, earlier: Earlier) -> tuple[float, ...]:
-    return tuple(phases_between(ends_deg, wanted, earlier.segments))
+    return tuple(_phases_between(ends_deg, wanted, earlier.segments))
 
 
 def _goal(envelope: Envelope, amplitude: float | None, known: Known) -> Goal:

@@ -155,6 +155,15 @@ class Signals:
 def signals_of(table: Table, roles: Roles, form: FileForm) -> Signals:
     """Return the signals of a table.
 
+    Parameters
+    ----------
+    table : Table
+        As it was opened.
+    roles : Roles
+        Which column is what.
+    form : FileForm
+        What was said of the file.
+
     Raises
     ------
     InputError
@@ -197,6 +206,15 @@ def _flag_of(table: Table, name: str, pattern: str | None) -> str:
 def stamp_form(table: Table, time: Sequence[str], form: FileForm) -> StampForm:
     """Return how a table's stamps are written: as is said, or as is found out.
 
+    Parameters
+    ----------
+    table : Table
+        As it was opened.
+    time : sequence of str
+        Columns of the stamp.
+    form : FileForm
+        What was said of the file.
+
     Raises
     ------
     InputError
@@ -220,7 +238,24 @@ def stamp_form(table: Table, time: Sequence[str], form: FileForm) -> StampForm:
 
 
 def stamps_of(table: Table, time: Sequence[str], cells: Mapping[str, Cells], form: StampForm) -> FloatArray:
-    """Return a table's stamps in seconds."""
+    """Return a table's stamps in seconds.
+
+    Parameters
+    ----------
+    table : Table
+        As it was opened.
+    time : sequence of str
+        Columns of the stamp.
+    cells : mapping of str to cells
+        N rows of these columns.
+    form : StampForm
+        How they are written.
+
+    Returns
+    -------
+    (N,) array
+        Stamps [s]; dates since 1970, numbers since their own zero.
+    """
     if isinstance(cells[time[0]], np.ndarray) and time[0] in table.in_seconds:
         return np.asarray(cells[time[0]])
     clock = [name for name in time if _is_clock(table, name)]

@@ -293,7 +293,15 @@ def _held_share(table: Table, name: str) -> float:
 
 
 def confirmed(roles: Roles, answers: Mapping[str, str]) -> Roles:
-    """Return the roles with what somebody answered."""
+    """Return the roles with what somebody answered.
+
+    Parameters
+    ----------
+    roles : Roles
+        As they were found out.
+    answers : mapping of str to str
+        Columns by signal: t, u, y or r.
+    """
     names = replace(roles.names, **dict(answers))
     time = (answers["t"],) if "t" in answers else roles.time
     taken = {*time, names.u, names.y, names.r}

@@ -64,7 +64,15 @@ class Layout:
 
 
 def beginning(path: Path, form: FileForm) -> tuple[Layout, str]:
-    """Return layout and encoding of a text file too long to be read whole, from its first megabyte."""
+    """Return layout and encoding of a text file too long to be read whole, from its first megabyte.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    form : FileForm
+        What was said of it.
+    """
     text, encoding = decode(path, form.encoding, _BEGINNING_BYTES)
     return _layout(path, text.splitlines()[:-1] or text.splitlines(), form), encoding
 
@@ -93,7 +101,22 @@ def _layout(path: Path, lines: Sequence[str], form: FileForm) -> Layout:
 
 
 def decode(path: Path, encoding: str | None = None, most: int = -1) -> tuple[str, str]:
-    """Return a file's text and its encoding: what its first bytes say, UTF-8, or else that of Windows."""
+    """Return a file's text and its encoding: what its first bytes say, UTF-8, or else that of Windows.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    encoding : str, optional
+        Its encoding, where that is known.
+    most : int
+        Longest part that is read [bytes], cut to whole lines; all where negative.
+
+    Raises
+    ------
+    InputError
+        It cannot be read, or there is no such encoding.
+    """
     try:
         with path.open("rb") as file:
             content = file.read(most)
@@ -116,7 +139,15 @@ def decode(path: Path, encoding: str | None = None, most: int = -1) -> tuple[str
 
 
 def split(lines: Iterable[str], delimiter: str) -> Iterator[list[str]]:
-    """Yield the cells of each line."""
+    """Yield the cells of each line.
+
+    Parameters
+    ----------
+    lines : iterable of str
+        Lines of a file.
+    delimiter : str
+        Between its cells; a blank stands for any white space.
+    """
     if delimiter == " ":
         return (line.split() for line in lines)
     return _cells_of(lines, delimiter)
@@ -162,7 +193,19 @@ def _with_commented_names(
 
 
 def table_of(path: Path, layout: Layout, encoding: str, form: FileForm) -> Table:
-    """Return the lines of a layout as a table."""
+    """Return the lines of a layout as a table.
+
+    Parameters
+    ----------
+    path : Path
+        The file, for messages.
+    layout : Layout
+        Its lines, delimiter and header.
+    encoding : str
+        How it was decoded, for the notes.
+    form : FileForm
+        What was said of it.
+    """
     lines, delimiter, header = layout.lines, layout.delimiter, layout.header
     names = header.names
 

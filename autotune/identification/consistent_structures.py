@@ -135,7 +135,15 @@ class Evidence:
 
 
 def evidence_of(points: Sequence[FrequencyPoint], probability: float) -> Evidence:
-    """Return the points whitened, with the distance that holds the plant with ``probability``."""
+    """Return the points whitened, with the distance within which the plant lies at a probability.
+
+    Parameters
+    ----------
+    points : sequence of FrequencyPoint
+        At least one, with covariance.
+    probability : float
+        Of the region, between 0 and 1.
+    """
     ordered = sorted(points, key=lambda point: point.omega_rad_s)
     omega = np.array([point.omega_rad_s for point in ordered])
     omega_0 = float(np.exp(np.mean(np.log(omega))))

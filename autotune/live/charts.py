@@ -66,7 +66,15 @@ class Pictures:
 
 
 def strip_options(story: Story, span_s: float) -> Options:
-    """Return y with its limits and the set-point over u with its limits, for the last ``span_s`` [s]."""
+    """Return y with its limits and the set-point over u with its limits, for the last seconds of a run.
+
+    Parameters
+    ----------
+    story : Story
+        The run as read so far.
+    span_s : float
+        How far back the chart reaches [s].
+    """
     now_s = story.now_s
     t, u, y, r = story.rows.since(now_s - span_s)
     u_unit, y_unit = story.units

@@ -94,7 +94,19 @@ class Analysis:
 def specification(
     settings: DesignSettings, plant: PlantFit, facts: LoopFacts, highest_rad_s: float
 ) -> tuple[Specification, str]:
-    """Return the constraints that the configuration asks for, and where the noise gain comes from."""
+    """Return the constraints that the configuration asks for, and where the noise gain comes from.
+
+    Parameters
+    ----------
+    settings : DesignSettings
+        What the configuration asks for.
+    plant : PlantFit
+        The fitted plant.
+    facts : LoopFacts
+        What is known of the loop besides.
+    highest_rad_s : float
+        Highest measured frequency [rad/s].
+    """
     modulus, phase_rad = settings.margins
     noise_gain, words = settings.noise_gain, "asked for"
     if noise_gain is None:
@@ -350,7 +362,15 @@ def _on_structures(
 
 
 def looked_at(analysis: Analysis, controller: PIDController) -> tuple[Check, ...]:
-    """Return the checks of another controller than the designed one, as of gains that a rig rounds."""
+    """Return the checks of another controller than the designed one, as of gains that a rig rounds.
+
+    Parameters
+    ----------
+    analysis : Analysis
+        With points, fit and specification.
+    controller : PIDController
+        The one that is checked.
+    """
     asked = analysis.design.specification
     usable = _as_independent(of_use(analysis.points), analysis.fit)
     return _checks(analysis.source, usable, analysis.fit, controller, asked)

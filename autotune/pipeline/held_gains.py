@@ -61,7 +61,15 @@ def held_by(
 
 
 def on_registers(analysis: Analysis, held: PIDController) -> Analysis:
-    """Return the analysis with the gains as the rig holds them, and their margins in place of the exact gains'."""
+    """Return the analysis with the gains as the rig holds them, and their margins in place of the exact gains'.
+
+    Parameters
+    ----------
+    analysis : Analysis
+        With the exact gains.
+    held : PIDController
+        The gains as the registers hold them.
+    """
     if held == analysis.controller:
         return analysis
     plant = analysis.fit.plant

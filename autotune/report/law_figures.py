@@ -34,7 +34,7 @@ def file_names(recordings: Sequence[Recording]) -> tuple[str, ...]:
     return tuple(f"{name} ({i})" for i, name in enumerate(names))
 
 
-def with_unit(name: str, unit: str) -> str:
+def _with_unit(name: str, unit: str) -> str:
     """Return an axis's title."""
     return f"{name} [{unit}]" if unit else f"{name} [-]"
 
@@ -55,11 +55,11 @@ def free_run_figure(run: UnseenRun, name: str) -> Figure:
     low, high = float(np.nanmin(run.y)), float(np.nanmax(run.y))
     span = (high - low) or 1.0
     figure.update_yaxes(
-        title=with_unit("y", run.unit), range=[low - _MARGIN * span, high + _MARGIN * span], row=1, col=1
+        title=_with_unit("y", run.unit), range=[low - _MARGIN * span, high + _MARGIN * span], row=1, col=1
     )
     widest = 1.15 * max((float(np.nanquantile(np.abs(e), 0.995)) for e in shown), default=span)
     widest = min(widest, span) or span
-    figure.update_yaxes(title=with_unit("residual", run.unit), range=[-widest, widest], row=2, col=1)
+    figure.update_yaxes(title=_with_unit("residual", run.unit), range=[-widest, widest], row=2, col=1)
     figure.update_xaxes(title="t [s]", row=2, col=1)
     for a, b in zip(run.starts_s, run.heads_s, strict=True):
         figure.add_vrect(a, b, fillcolor="rgba(128,128,128,0.16)", line={"width": 0}, layer="below")
@@ -82,7 +82,7 @@ def _said_of(run: UnseenRun, name: str) -> str:
 def law_figure(law: MissingLaw) -> Figure:
     """Draw a law over its signal with its 95 % band, and the bins of the data with their bars."""
     value = law.value if law.is_whole else f"added {law.value}"
-    figure = lines_figure(with_unit(law.signal, law.unit), with_unit(value, law.value_unit))
+    figure = lines_figure(_with_unit(law.signal, law.unit), _with_unit(value, law.value_unit))
     ends = np.array([min(b.x.min() for b in law.branches), max(b.x.max() for b in law.branches)])
     add_line(figure, ends, ends if law.is_whole else np.zeros(2), "without it", ORANGE, dash="dash")
     for branch in law.branches:
@@ -136,7 +136,7 @@ def _add_band(figure: go.Chart, branch: Branch, colour: str) -> None:
 
 def acting_figure(law: MissingLaw, recordings: Sequence[Recording], names: Sequence[str]) -> Figure:
     """Draw what an effect adds along the recordings, one after the other."""
-    figure = lines_figure("t, one recording after the other [s]", with_unit("added", law.value_unit))
+    figure = lines_figure("t, one recording after the other [s]", _with_unit("added", law.value_unit))
     at, marks = 0.0, []
     for r, rows, added, name in zip(recordings, law.rows, law.acts, names, strict=True):
         # where windows begin, a speed may be far off for a row or two

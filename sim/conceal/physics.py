@@ -209,20 +209,20 @@ def chain_output(s: Floats, p: Physics) -> float:
 
 
 @njit(cache=True)
-def rk4(t: float, h: float, s: Floats, ramp: Floats, direction: float, mode: int, p: Physics, work: Floats) -> Floats:
+def _rk4(t: float, h: float, s: Floats, ramp: Floats, direction: float, mode: int, p: Physics, work: Floats) -> Floats:
     """One classical Runge-Kutta step; ``ramp`` = (value at start, target, start time) of the command."""
     k1, k2, k3, k4 = work[0], work[1], work[2], work[3]
-    derivative(t, s, command_at(t, ramp, p), direction, mode, p, k1)
-    e = command_at(t + 0.5 * h, ramp, p)
+    derivative(t, s, _command_at(t, ramp, p), direction, mode, p, k1)
+    e = _command_at(t + 0.5 * h, ramp, p)
     derivative(t + 0.5 * h, s + 0.5 * h * k1, e, direction, mode, p, k2)
     derivative(t + 0.5 * h, s + 0.5 * h * k2, e, direction, mode, p, k3)
-    derivative(t + h, s + h * k3, command_at(t + h, ramp, p), direction, mode, p, k4)
+    derivative(t + h, s + h * k3, _command_at(t + h, ramp, p), direction, mode, p, k4)
     out: Floats = s + h / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
     return out
 
 
 @njit(cache=True)
-def command_at(t: float, ramp: Floats, p: Physics) -> float:
+def _command_at(t: float, ramp: Floats, p: Physics) -> float:
     """Command after the rate limit: from the value it had towards the target, never faster than the limit."""
     if p.rate_limit == np.inf:
         return float(ramp[1])
@@ -241,7 +241,7 @@ def crossing(s: Floats, direction: float, mode: int, p: Physics) -> float:
 
 
 @njit(cache=True)
-def leaves(t: float, s: Floats, mode: int, p: Physics) -> bool:
+def _leaves(t: float, s: Floats, mode: int, p: Physics) -> bool:
     """Whether a stuck or stopped body starts to move."""
     d = drive(t, s, p)
     if mode == STUCK:
@@ -255,7 +255,7 @@ def leaves(t: float, s: Floats, mode: int, p: Physics) -> bool:
 def settle(t: float, s: Floats, direction: float, mode: int, p: Physics) -> tuple[float, int]:
     """Mode and direction just after an event; the state is put exactly on the event."""
     if mode != FREE:
-        if not leaves(t, s, mode, p):
+        if not _leaves(t, s, mode, p):
             return direction, mode
         return float(np.sign(drive(t, s, p))), FREE
     body = POSITION if p.integrating > 0.0 else SPEED
@@ -266,7 +266,7 @@ def settle(t: float, s: Floats, direction: float, mode: int, p: Physics) -> tupl
         return direction, STOPPED
     if p.breakaway > 0.0 and direction * s[SPEED] <= 1e-12:
         s[SPEED] = 0.0
-        if leaves(t, s, STUCK, p):
+        if _leaves(t, s, STUCK, p):
             return float(np.sign(drive(t, s, p))), FREE
         return direction, STUCK
     return direction, FREE
@@ -281,16 +281,16 @@ def advance(
         step = min(h, end - t)
         if mode != FREE:
             direction, mode = settle(t, s, direction, mode, p)
-        after = rk4(t, step, s, ramp, direction, mode, p, work)
+        after = _rk4(t, step, s, ramp, direction, mode, p, work)
         if mode == FREE and crossing(after, direction, mode, p) < 0.0:
             low, high = 0.0, step
             for _ in range(BISECTIONS):
                 middle = 0.5 * (low + high)
-                if crossing(rk4(t, middle, s, ramp, direction, mode, p, work), direction, mode, p) < 0.0:
+                if crossing(_rk4(t, middle, s, ramp, direction, mode, p, work), direction, mode, p) < 0.0:
                     high = middle
                 else:
                     low = middle
-            s[:] = rk4(t, high, s, ramp, direction, mode, p, work)
+            s[:] = _rk4(t, high, s, ramp, direction, mode, p, work)
             t += high
             direction, mode = settle(t, s, direction, mode, p)
             continue

@@ -109,7 +109,7 @@ def _free_runs(A: Floats, b0: Floats, b1: Floats, u: Floats, rows: int, begin: i
     return out
 
 
-def observability(steps: Steps, length: int) -> Floats:
+def _observability(steps: Steps, length: int) -> Floats:
     """Rows c A^k, shape (length, n)."""
     out: Floats = _powers(steps.A, steps.c, length)
     return out
@@ -136,12 +136,12 @@ def residuals(chain: Chain, u: Floats, y: Floats, Ts: float, window: int) -> Flo
     count = len(y) // window
     runs = _free_runs(steps.A, steps.b_before, steps.b_after, u - chain.u_offset, steps.rows, 0, count, window)
     e = y[: count * window].reshape(count, window) - chain.y_offset - runs
-    q, _ = np.linalg.qr(observability(steps, window))
+    q, _ = np.linalg.qr(_observability(steps, window))
     out: Floats = (e - (e @ q) @ q.T).ravel()
     return out
 
 
-def degrees_lost(chain: Chain, window: int) -> float:
+def _degrees_lost(chain: Chain, window: int) -> float:
     """Factor that makes the rms residual of white noise its standard deviation."""
     n = 2 + int(chain.integrating) + int(chain.tau_sensor > 0.0)
     return float(np.sqrt(window / (window - n)))
@@ -198,13 +198,13 @@ def retune(
         if gain < tolerance:
             break
     chain = _moved(nominal, at)
-    return chain, float(np.sqrt(np.mean(e**2)) * degrees_lost(nominal, window))
+    return chain, float(np.sqrt(np.mean(e**2)) * _degrees_lost(nominal, window))
 
 
 def forecast_error(chain: Chain, u: Floats, y: Floats, Ts: float, horizon: int) -> Floats:
     """Errors of forecasts over one horizon each, started from the state fitted to the two horizons before."""
     steps = discretise(chain, Ts)
-    rows = observability(steps, 3 * horizon)
+    rows = _observability(steps, 3 * horizon)
     fit = np.linalg.pinv(rows[: 2 * horizon])
     errors = []
     du = u - chain.u_offset

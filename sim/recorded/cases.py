@@ -98,7 +98,7 @@ def ratio(ready: Ready, put: Put, seed: int) -> tuple[float, Floats]:
     return rms / ready.noise, numbers
 
 
-def search_size(ready: Ready, effect: Effect, strength: str, seed: int) -> Put:
+def _search_size(ready: Ready, effect: Effect, strength: str, seed: int) -> Put:
     """Return the effect at a size at which the residual has grown as the strength says.
 
     Raises
@@ -156,7 +156,7 @@ def make(seed: int, rigs: Sequence[Ready]) -> Made:
             continue
         for strength in (str(one) for one in rng.permutation(list(STRENGTHS))):
             try:
-                put = search_size(ready, effect, strength, seed)
+                put = _search_size(ready, effect, strength, seed)
                 return _made(ready, effect, strength, put, seed, passed_over)
             except RefusedError as why:
                 passed_over.append(f"{effect.name}, {strength}: {why}")

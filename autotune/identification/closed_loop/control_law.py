@@ -105,7 +105,7 @@ def check_law(
     reference = np.zeros_like(u) if r is None else r
     rows, step = _unsaturated(u), _resolution(u)
     checks = []
-    for law in discrete_laws(controller, sample_time_s):
+    for law in _discrete_laws(controller, sample_time_s):
         for late in (0, 1):  # computed from this row's measurement, or from the one before
             num = (0.0,) * late + law.num
             named = DiscreteController(num=num, den=law.den, sample_time_s=sample_time_s)
@@ -115,7 +115,7 @@ def check_law(
     return min(checks, key=lambda check: check.unexplained)
 
 
-def discrete_laws(controller: Controller, sample_time_s: float) -> tuple[DiscreteController, ...]:
+def _discrete_laws(controller: Controller, sample_time_s: float) -> tuple[DiscreteController, ...]:
     """Return the discrete laws that a controller file can mean at a sample time.
 
     Raises

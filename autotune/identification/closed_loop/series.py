@@ -73,7 +73,13 @@ class Series:
         return Series(u=u, y=y, starts=tuple(int(start) for start in starts))
 
     def less(self, u: FloatArray, y: FloatArray) -> Series:
-        """Return the series about an operating point."""
+        """Return the series about an operating point.
+
+        Parameters
+        ----------
+        u, y : (n_u,), (n_y,) arrays
+            The operating point, taken off every row.
+        """
         return replace(self, u=self.u - u, y=self.y - y)
 
     def states(self, predictor: Predictor) -> FloatArray:
@@ -83,7 +89,15 @@ class Series:
         return np.array([_fitted_state(predictor, u, y) for u, y in self.stretches])
 
     def errors(self, predictor: Predictor, states: FloatArray) -> FloatArray:
-        """Return the innovations, (N, n_y), each stretch from its state."""
+        """Return the innovations, (N, n_y), each stretch from its state.
+
+        Parameters
+        ----------
+        predictor : Predictor
+            Order n.
+        states : (stretches, n) array
+            Where each stretch begins.
+        """
         parts = [
             innovations(predictor.F, predictor.H, x0, u, y) for x0, (u, y) in zip(states, self.stretches, strict=True)
         ]
@@ -96,7 +110,15 @@ class Series:
         return np.asarray(sum(parts), dtype=np.float64)
 
     def moving(self, predictor: Predictor, directions: FloatArray) -> FloatArray:
-        """Return the directions that steps are taken along: without those of the initial state where it is found."""
+        """Return the directions that steps are taken along: none of initial states that are fitted stretch by stretch.
+
+        Parameters
+        ----------
+        predictor : Predictor
+            Whose parameters they change.
+        directions : (entries, P) array
+            All of them.
+        """
         return directions[:, ~_of_state(predictor, directions)] if self.is_cut else directions
 
     def normal_equations(

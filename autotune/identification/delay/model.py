@@ -106,7 +106,15 @@ def _or_null(values: FloatArray) -> list[float | None]:
 
 
 def write_delay_model(model: DelayModel, path: str | os.PathLike[str]) -> None:
-    """Write ``delay.json``."""
+    """Write ``delay.json``.
+
+    Parameters
+    ----------
+    model : DelayModel
+        What is written.
+    path : path
+        Replaced where it exists.
+    """
     write_json(path, model.to_json())
 
 

@@ -81,7 +81,21 @@ class Point:
 def solve_linear(
     data: DelayData, structure: Structure, a: tuple[float, ...], h: float, whitening: FloatArray = WHITE
 ) -> Point:
-    """Return the best b, d and initial state for given (a, h); an unstable response that overflows costs infinity."""
+    """Return the best b, d and initial state for given (a, h); an unstable response that overflows costs infinity.
+
+    Parameters
+    ----------
+    data : DelayData
+        The record.
+    structure : Structure
+        Which parameters are free.
+    a : tuple of n floats
+        Coefficients a_0..a_{n-1}.
+    h : float
+        Delay [s].
+    whitening : (p,) array
+        Coefficients of the filter that makes the noise white.
+    """
     before = 0.0 if data.before is None else data.before
     theta, cost = linear_part(data.tu, data.u, before, data.linear, data.ty, data.y, a, h, structure.offset, whitening)
     return Point(a=a, h=h, theta=theta, cost=cost, rows=data.ty.size - whitening.size)
@@ -165,7 +179,20 @@ def _damped_step(gram: FloatArray, free: NDArray[np.intp], n: int, damping: floa
 
 
 def parameters(data: DelayData, point: Point) -> FloatArray:
-    """Return (a_0.., b, delay, constant, initial state) of a point, the operating point added back."""
+    """Return (a_0.., b, delay, constant, initial state) of a point, the operating point added back.
+
+    Parameters
+    ----------
+    data : DelayData
+        Holds the operating point.
+    point : Point
+        Of order n.
+
+    Returns
+    -------
+    (2n + 3,) array
+        In the units of y, u and s.
+    """
     b, d = float(point.theta[0]), float(point.theta[1])
     initial = point.theta[2:].copy()
     initial[0] += data.y_0
@@ -174,6 +201,17 @@ def parameters(data: DelayData, point: Point) -> FloatArray:
 
 def finish(data: DelayData, structure: Structure, point: Point, whitening: FloatArray = WHITE) -> DelayModel:
     """Return the model with its covariance at a minimum, the operating point added back.
+
+    Parameters
+    ----------
+    data : DelayData
+        The record.
+    structure : Structure
+        Which parameters are free.
+    point : Point
+        The minimum.
+    whitening : (p,) array
+        Coefficients of the filter that makes the noise white.
 
     Raises
     ------
@@ -238,7 +276,20 @@ def _to_parameters(data: DelayData, structure: Structure, point: Point) -> Float
 
 
 def residuals(data: DelayData, point: Point) -> FloatArray:
-    """Return y - x at the output times [y unit]."""
+    """Return y - x at the output times.
+
+    Parameters
+    ----------
+    data : DelayData
+        N rows of y.
+    point : Point
+        The candidate.
+
+    Returns
+    -------
+    (N,) array
+        In y's unit; NaN from where the response overflows.
+    """
     before = 0.0 if data.before is None else data.before
     return np.asarray(
         data.y - output(data.tu, data.u, before, data.linear, data.ty, point.a, point.h, point.theta), dtype=np.float64
@@ -285,7 +336,17 @@ def colour_of(
 
 
 def widened(model: DelayModel, structure: Structure, colour: NoiseColour) -> DelayModel:
-    """Return the model with standard deviations that, 1.96 times, make Student's 95 % intervals."""
+    """Return the model with standard deviations that, 1.96 times, make Student's 95 % intervals.
+
+    Parameters
+    ----------
+    model : DelayModel
+        As :func:`finish` left it.
+    structure : Structure
+        Which parameters are free.
+    colour : NoiseColour
+        Of the residual, with its degrees of freedom.
+    """
     wider = np.ones(len(model.covariance))
     wider[structure.free_parameters] = colour.widening()
     return replace(model, covariance=model.covariance * np.outer(wider, wider))

@@ -294,7 +294,25 @@ def output(
     h: float,
     theta: FloatArray,
 ) -> FloatArray:
-    """Return x at the output times, NaN from where it overflows; parameters as in :func:`normal_matrix`."""
+    """Return x at the output times, (N,), NaN from where it overflows.
+
+    Parameters
+    ----------
+    tu, u : (M,) array
+        Input and its time stamps [s].
+    before : float
+        Input before the record.
+    linear : bool
+        Whether the input runs linearly between its stamps (else it is held).
+    ty : (N,) array
+        Output times [s].
+    a : tuple of n floats
+        Coefficients a_0..a_{n-1}.
+    h : float
+        Delay [s], at least 0.
+    theta : (2+n,) array
+        b, d and the initial state.
+    """
     n = len(a)
     x = np.full(ty.size, np.nan)
     coefficients, chains, clock = _begin(tu, ty, a, h, theta)
@@ -321,7 +339,25 @@ def sensitivities(
     h: float,
     theta: FloatArray,
 ) -> FloatArray:
-    """Return the columns z, e, phi_0.., s.., -x' of :func:`normal_matrix` row by row, shape (N, 2n+3)."""
+    """Return the columns z, e, phi_0.., s.., -x' of :func:`normal_matrix` row by row, shape (N, 2n+3).
+
+    Parameters
+    ----------
+    tu, u : (M,) array
+        Input and its time stamps [s].
+    before : float
+        Input before the record.
+    linear : bool
+        Whether the input runs linearly between its stamps (else it is held).
+    ty : (N,) array
+        Output times [s].
+    a : tuple of n floats
+        Coefficients a_0..a_{n-1}.
+    h : float
+        Delay [s], at least 0.
+    theta : (2+n,) array
+        b, d and the initial state.
+    """
     n = len(a)
     columns = np.zeros((ty.size, 2 * n + 4))
     coefficients, chains, clock = _begin(tu, ty, a, h, theta)
@@ -349,7 +385,32 @@ def linear_part(
     offset: bool,
     whitening: FloatArray,
 ) -> tuple[FloatArray, float]:
-    """Return the best b, d and initial state for given (a, h), and the sum of squares; infinite where not finite."""
+    """Return the best b, d and initial state for given (a, h), and the sum of squares; infinite where not finite.
+
+    Parameters
+    ----------
+    tu, u : (M,) array
+        Input and its time stamps [s].
+    before : float
+        Input before the record.
+    linear : bool
+        Whether the input runs linearly between its stamps (else it is held).
+    ty, y : (N,) array
+        Output and its time stamps [s].
+    a : tuple of n floats
+        Coefficients a_0..a_{n-1}.
+    h : float
+        Delay [s], at least 0.
+    offset : bool
+        Whether d is estimated.
+    whitening : (p,) array
+        As of :func:`normal_matrix`.
+
+    Returns
+    -------
+    tuple
+        The (2+n,) theta, and the sum of squares [y unit^2].
+    """
     n = len(a)
     theta = np.zeros(2 + n)
     gram, finite = normal_matrix(tu, u, before, linear, ty, y, a, h, theta, False, whitening)

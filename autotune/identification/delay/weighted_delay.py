@@ -67,7 +67,17 @@ class OneDelay:
 
     @classmethod
     def of(cls, data: DelayData, order: int, windows: Windows) -> OneDelay:
-        """Return the equations of a record."""
+        """Return the equations of a record.
+
+        Parameters
+        ----------
+        data : DelayData
+            The record.
+        order : int
+            Order n.
+        windows : Windows
+            What the equations are modulated with.
+        """
         width = max(windows.length_s / _SAMPLES, float(data.ty[-1] - data.ty[0]) / (data.ty.size - 1))
         samples = np.arange(windows.starts[0] + 0.5 * width, windows.starts[-1] + windows.length_s, width)
         return cls(

@@ -90,6 +90,13 @@ class Weighted:
 def minimise_weighted(equations: Equations, start: FloatArray) -> Weighted:
     """Return the minimum of the weighted equations in whose valley a start lies.
 
+    Parameters
+    ----------
+    equations : Equations
+        With the derivatives' steps.
+    start : (P,) array
+        Values of the unknowns.
+
     Raises
     ------
     LinAlgError
@@ -168,11 +175,31 @@ class Windows:
         return self.starts.size * (2 * self.harmonics + 1)
 
     def running(self, t: FloatArray, values: FloatArray, held: bool) -> list[ComplexArray]:
-        """Return the running integrals of a signal that :meth:`of_signal` takes."""
+        """Return the running integrals of a signal that :meth:`of_signal` takes.
+
+        Parameters
+        ----------
+        t, values : (N,) array
+            Time stamps [s] and the signal.
+        held : bool
+            Whether it is held between rows (else linear).
+        """
         return [running_fourier(t, values, float(omega), held) for omega in self._omega]
 
     def of_signal(self, t: FloatArray, running: list[ComplexArray], shift_s: float, derivative: int) -> FloatArray:
-        """Return the integrals of v(t - shift) against the windows' derivative, (windows,)."""
+        """Return the integrals of v(t - shift) against the windows' derivative, (windows,).
+
+        Parameters
+        ----------
+        t : (N,) array
+            Time stamps [s].
+        running : list of (N,) complex array
+            As of :meth:`running`.
+        shift_s : float
+            How late the signal acts [s].
+        derivative : int
+            Order of the windows' derivative.
+        """
         first = self.starts - shift_s
         parts = []
         for omega, sums in zip(self._omega, running, strict=True):
@@ -181,7 +208,17 @@ class Windows:
         return self._combined(parts, derivative)
 
     def on(self, t: FloatArray, shift_s: float, derivative: int) -> FloatArray:
-        """Return the windows' derivative at every t + shift, (windows, times)."""
+        """Return the windows' derivative at every t + shift, (windows, times).
+
+        Parameters
+        ----------
+        t : (N,) array
+            Times [s].
+        shift_s : float
+            Added to them [s].
+        derivative : int
+            Order of the windows' derivative.
+        """
         s = t + shift_s - self.starts[:, None]
         inside = (s > 0.0) & (s < self.length_s)
         return self._combined([np.where(inside, np.exp(1j * omega * s), 0.0) for omega in self._omega], derivative)

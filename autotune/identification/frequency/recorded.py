@@ -70,6 +70,13 @@ def session_points(session: Sequence[Recording], *, largest_relative_sd: float =
     Recordings whose sidecar notes limit cycles give the very points that the experiment ended with: the fundamentals,
     each with the others in its rough model, or those of all rows together. Parameters and errors as of
     :func:`frequency_points`.
+
+    Parameters
+    ----------
+    session : sequence of Recording
+        In the order in which they were made.
+    largest_relative_sd : float
+        Points with a larger standard deviation over their gain are left out.
     """
     last = noted_windows(session[-1])
     if is_noted(session[-1].metadata, len(last)):  # a sitting before it was not gone on with
