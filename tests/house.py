@@ -92,6 +92,8 @@ def packages() -> dict[str, Package]:
     counted: dict[str, Package] = {}
     for path in sorted(path for top in ("autotune", "drivers", "sim") for path in (ROOT / top).rglob("*.py")):
         parts = path.relative_to(ROOT).parts
+        if "__pycache__" in parts:  # compiled simulations are kept there with their source
+            continue
         name = "/".join(parts[:2]) if parts[0] == "autotune" and len(parts) > 2 else parts[0]
         package = counted.setdefault(name, Package(name))
         text = path.read_text(encoding="utf-8")

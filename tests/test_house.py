@@ -14,7 +14,7 @@ from tests.house import Package, Routine, packages, routines_of
 UNDOCUMENTED = {
     "autotune": 3,
     "autotune/batch": 1,
-    "autotune/diagnosis": 218,
+    "autotune/diagnosis": 171,
     "autotune/effects": 19,
     "autotune/equations": 53,
     "autotune/experiment": 5,
