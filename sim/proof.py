@@ -22,7 +22,6 @@ from sim.conceal.cases import write
 from sim.score import Mark, mark
 
 Json = dict[str, Any]
-FIRST_PROOF_SEED = 100_000  # below: calibration
 STOPPED = 130  # exit status of a program that the operator stopped
 
 

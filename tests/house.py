@@ -19,7 +19,7 @@ class Routine:
     """A function or method: where it is, and what its docstring says."""
 
     place: str
-    lines: int
+    lines: int  # without the docstring, which is to be as long as its parameters ask for
     compiled: bool
     parameters: tuple[str, ...]  # of a public one that is called from Python; else none
     arrays: bool  # it takes or returns an array
@@ -74,9 +74,11 @@ def routines_of(tree: ast.AST, place: str, public: bool = True) -> Iterator[Rout
             hidden = node.name.startswith("_") or "overload" in marks or any(COMMAND.search(mark) for mark in marks)
             kinds = [ast.unparse(kind) for arg in given if (kind := arg.annotation)]
             kinds += [ast.unparse(node.returns)] if node.returns else []
+            doc = node.body[0] if ast.get_docstring(node) else None
+            said = (doc.end_lineno or doc.lineno) - doc.lineno + 1 if doc else 0
             yield Routine(
                 place=f"{place}:{node.name}",
-                lines=(node.end_lineno or node.lineno) - node.lineno + 1,
+                lines=(node.end_lineno or node.lineno) - node.lineno + 1 - said,
                 compiled=any(COMPILED.match(mark) for mark in marks),
                 parameters=names if public and not hidden else (),
                 arrays=any("Array" in kind for kind in kinds),

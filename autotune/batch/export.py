@@ -17,7 +17,7 @@ from autotune.files.signal_names import Roles, SignalNames, find_roles
 from autotune.files.stamps import seconds
 from autotune.files.table import Table, listed
 from autotune.files.text_file import beginning
-from autotune.files.workbook import PARQUET, WORKBOOKS, open_table, parquet_table
+from autotune.files.workbook import PARQUET, open_table, parquet_table
 from autotune.progress import Progress
 
 _BLOCK_BYTES = 16 << 20
@@ -90,16 +90,6 @@ def _roles(table: Table, loop: LoopSettings, export: ExportSettings) -> Roles:
             remedy="name them with u and y of the loop, and time in [export]",
         )
     return Roles(time=found.time, names=found.names, unsure=(), others=())
-
-
-def columns_of(path: Path, export: ExportSettings) -> list[str]:
-    """Return the names of a file's columns."""
-    kind = path.suffix.lower()
-    if kind in PARQUET:
-        return list(parquet_table([path]).names)
-    if kind in WORKBOOKS:
-        return list(open_table(path, export.form()).names)
-    return list(beginning(path, export.form())[0].header.names)
 
 
 def to_parquet(path: Path, out: Path, wanted: Sequence[str], export: ExportSettings, advance: Progress) -> None:

@@ -32,7 +32,15 @@ _BANDS_TRIED = (0.002, 0.6, 75)
 
 
 def limit_starts(low: float, high: float, cuts: tuple[float, ...]) -> list[tuple[float, ...]]:
-    """Return starts for two limits: the upper alone, the lower alone, both; one that does not act lies far outside."""
+    """Return starts for two limits: the upper alone, the lower alone, both; one that does not act lies far outside.
+
+    Parameters
+    ----------
+    low, high : float
+        Range of the signal, in its unit.
+    cuts : tuple of float
+        Shares of the range that a limit cuts off.
+    """
     span = high - low
     far = (low - 10.0 * span, high + 10.0 * span)
     starts: list[tuple[float, ...]] = []
@@ -43,7 +51,17 @@ def limit_starts(low: float, high: float, cuts: tuple[float, ...]) -> list[tuple
 
 
 def converted(u: float, step: float, origin: float) -> float:
-    """Return a converter's level for a command."""
+    """Return a converter's level for a command.
+
+    Parameters
+    ----------
+    u : float
+        Command [u unit].
+    step : float
+        Between two levels [u unit].
+    origin : float
+        One of the levels [u unit].
+    """
     return origin + step * math.floor((u - origin) / step + 0.5)
 
 
@@ -59,7 +77,17 @@ def _levels_around(values: Values, span: float, wide: float, turn: float) -> lis
 
 
 def followed(w: float, width: float, held: float) -> tuple[float, float]:
-    """Return the far side of a play, and where it stays."""
+    """Return the far side of a play, and where it stays.
+
+    Parameters
+    ----------
+    w : float
+        Near side [u unit].
+    width : float
+        Of the play [u unit].
+    held : float
+        Far side before [u unit].
+    """
     half = 0.5 * width
     held = min(max(held, w - half), w + half)
     return held, held
@@ -94,7 +122,19 @@ def _without_zone(w: float, half_width: float) -> float:
 
 
 def curved(w: float, second_order: float, third_order: float, slope: float, low: float, high: float) -> float:
-    """Return a command through a curved characteristic, which runs straight on beyond its ends."""
+    """Return a command through a curved characteristic, which runs straight on beyond its ends.
+
+    Parameters
+    ----------
+    w : float
+        Command about the operating point [u unit].
+    second_order, third_order : float
+        Of the curve [1/u unit, 1/u unit^2].
+    slope : float
+        Slope beyond the ends.
+    low, high : float
+        The ends [u unit].
+    """
     c = min(max(w, low), high)
     bent = c + second_order * c * c
     bent += third_order * bent * bent * bent
@@ -102,7 +142,15 @@ def curved(w: float, second_order: float, third_order: float, slope: float, low:
 
 
 def rises(values: Values, w: float) -> bool:
-    """Whether a curved characteristic still rises."""
+    """Whether a curved characteristic still rises.
+
+    Parameters
+    ----------
+    values : mapping of str to float
+        The effect's parameters.
+    w : float
+        Command about the operating point [u unit].
+    """
     bent = w + values["second_order"] * w * w
     return (1.0 + 2.0 * values["second_order"] * w) * (1.0 + 3.0 * values["third_order"] * bent * bent) > 0.0
 

@@ -48,7 +48,15 @@ LEAST_WIDTH = 1.0 / 300.0
 
 
 def dry(v: float, level: float) -> float:
-    """Return the level of a friction that does not depend on speed."""
+    """Return the level of a friction that does not depend on speed.
+
+    Parameters
+    ----------
+    v : float
+        Speed [y unit/s]; not used.
+    level : float
+        Of the friction, as a force at the plant's input.
+    """
     return level
 
 
@@ -77,7 +85,19 @@ def _hardened(x: float, coefficient: float, low: float, high: float) -> float:
 
 
 def weighed(w: float, x: float, slope: float, low: float, high: float) -> float:
-    """Return what a gain over position adds to the plant's input."""
+    """Return what a gain over position adds to the plant's input.
+
+    Parameters
+    ----------
+    w : float
+        Plant input.
+    x : float
+        Position about the operating point [y unit].
+    slope : float
+        Of the gain over position, as a share [1/y unit].
+    low, high : float
+        Where it ends [y unit].
+    """
     return slope * min(max(x, low), high) * w
 
 
@@ -101,7 +121,17 @@ def _cogging(
 
 
 def rising(x: float, gain: float, coefficient: float) -> float:
-    """Return what a loss that grows with the square of the difference adds to the linear one."""
+    """Return what a loss that grows with the square of the difference adds to the linear one.
+
+    Parameters
+    ----------
+    x : float
+        Level about the operating point [y unit].
+    gain : float
+        From force to level.
+    coefficient : float
+        Of the square [1/y unit].
+    """
     return -(coefficient * x * abs(x) / gain)
 
 
@@ -111,7 +141,17 @@ def _held_back(turned: float, amplitude: float) -> float:
 
 
 def turn(dx: float, width: float, turned: float) -> float:
-    """Return how far a hysteresis has turned after a travel."""
+    """Return how far a hysteresis has turned after a travel.
+
+    Parameters
+    ----------
+    dx : float
+        Travel [y unit].
+    width : float
+        Travel over which it turns [y unit].
+    turned : float
+        How far it had turned, -1 to 1.
+    """
     travel = dx / width
     return min(max(turned + travel - abs(travel) * turned, -1.0), 1.0)
 
@@ -132,7 +172,17 @@ def _excess(x: float, level: float) -> float:
 
 
 def outflow(level: float, gain: float, operating_level: float) -> float:
-    """Return what the first level's outflow lacks, as a force at the plant's input."""
+    """Return what the first level's outflow lacks, as a force at the plant's input.
+
+    Parameters
+    ----------
+    level : float
+        First level about the operating point [y unit].
+    gain : float
+        From force to level.
+    operating_level : float
+        Level at the operating point [y unit].
+    """
     return _excess(level, operating_level) / gain
 
 
@@ -144,7 +194,17 @@ def _lower_outflow(x: float, level: float, gain_last: float, operating_level: fl
 
 
 def stopped(x: float, v: float, y_offset: float, low: float, high: float) -> tuple[float, float]:
-    """Hold the position inside hard stops; an impact on a stop is inelastic."""
+    """Hold the position inside hard stops; an impact on a stop is inelastic.
+
+    Parameters
+    ----------
+    x, v : float
+        Position [y unit] and speed [y unit/s] after a sub-step.
+    y_offset : float
+        Reading at position 0 [y unit].
+    low, high : float
+        The stops, as readings [y unit].
+    """
     if x > high - y_offset:
         x = high - y_offset
         v = min(v, 0.0)

@@ -15,7 +15,17 @@ _LJUNG = "Ljung, System Identification, 2nd ed., sec. 5.1"
 
 
 def curved(z: float, second_order: float, third_order: float, low: float, high: float) -> float:
-    """Return a reading through a curved characteristic, which runs straight on beyond its ends."""
+    """Return a reading through a curved characteristic, which runs straight on beyond its ends.
+
+    Parameters
+    ----------
+    z : float
+        Reading about the operating point [y unit].
+    second_order, third_order : float
+        Of the curve [1/y unit, 1/y unit^2].
+    low, high : float
+        Where it runs straight on [y unit].
+    """
     c = min(max(z, low), high)
     bent = c + second_order * c * c
     bent += third_order * bent * bent * bent

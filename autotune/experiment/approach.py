@@ -25,8 +25,6 @@ from autotune.points import FrequencyPoint
 PREFLIGHT_SAMPLES = 60
 #: share of these that may take longer than 0.8 of the sample time
 SLOW_SHARE = 0.05
-#: readings that a movement is judged on
-LOOK_BACK = 8
 #: smoothing of the relay while nothing is known of the plant
 FIRST_SMOOTHING = 5
 #: how far below the lower end of the hover's bracket the ramp starts, and above the upper it ends, in u_uncertainty

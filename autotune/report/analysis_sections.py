@@ -396,7 +396,15 @@ def _certificate(analysis: Analysis) -> str:
 
 
 def gains_text(controller: PIDController, signals: SignalSettings) -> str:
-    """Return a controller's gains in words, with units."""
+    """Return a controller's gains in words, with units.
+
+    Parameters
+    ----------
+    controller : PIDController
+        The gains.
+    signals : SignalSettings
+        Names the units.
+    """
     if controller.K == 0.0:
         return "no controller (K = 0)"
     unit = f" {signals.u_unit}/{signals.y_unit}" if signals.u_unit and signals.y_unit else ""
@@ -405,7 +413,15 @@ def gains_text(controller: PIDController, signals: SignalSettings) -> str:
 
 
 def designed_text(design: Design, signals: SignalSettings) -> str:
-    """Return the gains of a design in words; an integral controller as what it is, and as the PI that acts like it."""
+    """Return the gains of a design in words; an integral controller as what it is, and as the PI that acts like it.
+
+    Parameters
+    ----------
+    design : Design
+        What is told.
+    signals : SignalSettings
+        Names the units.
+    """
     c, words = design.controller, gains_text(design.controller, signals)
     if not design.is_integral:
         return words
@@ -424,7 +440,15 @@ def based_on(analysis: Analysis) -> str:
 
 
 def margins_sentence(analysis: Analysis, signals: SignalSettings) -> str:
-    """Return the margins on the fitted plant in a sentence."""
+    """Return the margins on the fitted plant in a sentence.
+
+    Parameters
+    ----------
+    analysis : Analysis
+        With its margins.
+    signals : SignalSettings
+        Names the units.
+    """
     m = analysis.margins
     h2 = _with_unit(m.h2, f"{signals.y_unit} √s", signals.u_unit) if signals.y_unit else f"{m.h2:.4g}"
     return (

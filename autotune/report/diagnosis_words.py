@@ -46,7 +46,15 @@ def places_of(found: Diagnosis) -> tuple[dict[str, list[str]], tuple[str, ...]]:
 
 
 def answers(found: Diagnosis, run: UnseenRun | None) -> tuple[tuple[str, str], ...]:
-    """Return what was found, how sure that is, and what to do."""
+    """Return what was found, how sure that is, and what to do.
+
+    Parameters
+    ----------
+    found : Diagnosis
+        The result.
+    run : UnseenRun or None
+        A free run through what was not fitted.
+    """
     return (("What was found", _found(found)), ("How sure", _sure(found, run)), ("What to do", _to_do(found)))
 
 
@@ -157,7 +165,17 @@ def in_the_model(found: Diagnosis) -> str:
 
 
 def objections(found: Diagnosis, run: UnseenRun | None, laws: Sequence[MissingLaw]) -> tuple[str, ...]:
-    """Return what a sceptic would hold against the finding: rivals, what was not excited, what is left."""
+    """Return what a sceptic would hold against the finding: rivals, what was not excited, what remains unexplained.
+
+    Parameters
+    ----------
+    found : Diagnosis
+        The result.
+    run : UnseenRun or None
+        A free run through what was not fitted.
+    laws : sequence of MissingLaw
+        What is missing over the signals it goes with.
+    """
     said = [*_rivals(found), *_unseen(run), *_bins(laws)]
     said += _ranges(found)
     for effect in found.effects:

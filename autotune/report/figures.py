@@ -66,7 +66,22 @@ def recording_figure(
 
 
 def frequencies(points: Sequence[FrequencyPoint], decades: float = 0.7, count: int = 400) -> FloatArray:
-    """Return a logarithmic grid that covers the points and some decades beyond them [rad/s]."""
+    """Return a logarithmic grid that covers the points and some decades beyond them.
+
+    Parameters
+    ----------
+    points : sequence of FrequencyPoint
+        At least one.
+    decades : float
+        How far it goes on, both ways.
+    count : int
+        Frequencies.
+
+    Returns
+    -------
+    (count,) array
+        Angular frequencies [rad/s].
+    """
     omega = [point.omega_rad_s for point in points]
     return np.geomspace(min(omega) * 10**-decades, max(omega) * 10**decades, count, dtype=np.float64)
 
@@ -219,7 +234,19 @@ def nyquist_figure(
 def nichols_figure(
     loops: Sequence[Curve], omega: FloatArray, modulus_margin: float, phase_margin_rad: float
 ) -> go.Chart:
-    """Draw loops in the Black-Nichols plane: gain in dB over phase, with the required margins."""
+    """Draw loops in the Black-Nichols plane: gain in dB over phase, with the required margins.
+
+    Parameters
+    ----------
+    loops : sequence of Curve
+        The open loops.
+    omega : (N,) array
+        Angular frequencies [rad/s].
+    modulus_margin : float
+        As required.
+    phase_margin_rad : float
+        As required [rad].
+    """
     figure = go.Chart()
     circle = -1 + modulus_margin * np.exp(1j * np.linspace(0, 2 * np.pi, 181))
     phase_deg = np.degrees(np.angle(circle)) % 360 - 360
@@ -243,7 +270,17 @@ def nichols_figure(
 
 
 def sensitivity_figure(loops: Sequence[Curve], omega: FloatArray, modulus_margin: float) -> go.Chart:
-    """Draw abs(S) in dB with the bound that the modulus margin sets, the inverse of it."""
+    """Draw abs(S) in dB with the bound that the modulus margin sets, the inverse of it.
+
+    Parameters
+    ----------
+    loops : sequence of Curve
+        The open loops.
+    omega : (N,) array
+        Angular frequencies [rad/s].
+    modulus_margin : float
+        As required.
+    """
     figure = go.Chart()
     for curve in loops:
         S = 1.0 / (1.0 + curve.system.response(omega))
@@ -263,12 +300,30 @@ def usual_range(values: FloatArray) -> list[float]:
 
 
 def axis_title(name: str, unit: str) -> str:
-    """Return the title of an axis."""
+    """Return the title of an axis.
+
+    Parameters
+    ----------
+    name : str
+        Of the signal.
+    unit : str
+        Its unit; may be empty.
+    """
     return f"{name} [{unit or 'unit not given'}]"
 
 
 def ratio_title(name: str, over: str, under: str, and_under: str = "") -> str:
-    """Return a name with the unit of a ratio, where both of its units are given."""
+    """Return a name with the unit of a ratio, where both of its units are given.
+
+    Parameters
+    ----------
+    name : str
+        Of the ratio.
+    over, under : str
+        Units of its two parts; may be empty.
+    and_under : str
+        A further unit under the line.
+    """
     if not (over and under):
         return name
     below = f"{under} {and_under}".strip()
@@ -295,7 +350,20 @@ def gain_phase_bars(point: FrequencyPoint) -> tuple[float, float]:
 
 
 def region(point: FrequencyPoint, factor: complex) -> ComplexArray:
-    """Return the edge of the point's 95 % region times a complex factor."""
+    """Return the edge of the point's 95 % region times a complex factor.
+
+    Parameters
+    ----------
+    point : FrequencyPoint
+        With covariance.
+    factor : complex
+        What it is multiplied by, as by a controller's response.
+
+    Returns
+    -------
+    (49,) complex array
+        The closed edge.
+    """
     radii, directions = point.region_radii(0.95)
     angle = np.linspace(0, 2 * np.pi, 49)
     edge = directions @ (radii[:, np.newaxis] * np.array([np.cos(angle), np.sin(angle)]))

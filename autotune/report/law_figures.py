@@ -40,7 +40,15 @@ def _with_unit(name: str, unit: str) -> str:
 
 
 def free_run_figure(run: UnseenRun, name: str) -> Figure:
-    """Draw a free run of all models through a stretch, the residual below."""
+    """Draw a free run of all models through a stretch, the residual below.
+
+    Parameters
+    ----------
+    run : UnseenRun
+        The stretch, and each model's run through it.
+    name : str
+        Of its recording.
+    """
     figure = make_subplots(rows=2, cols=1, shared_xaxes=True, vertical_spacing=0.05, row_heights=[0.66, 0.34])
     add_line(figure, *thinned(run.t, run.y), "measured", GREY, width=2.4, row=1, col=1)
     shown: list[FloatArray] = []
@@ -135,7 +143,17 @@ def _add_band(figure: go.Chart, branch: Branch, colour: str) -> None:
 
 
 def acting_figure(law: MissingLaw, recordings: Sequence[Recording], names: Sequence[str]) -> Figure:
-    """Draw what an effect adds along the recordings, one after the other."""
+    """Draw what an effect adds along the recordings, one after the other.
+
+    Parameters
+    ----------
+    law : MissingLaw
+        What the effect adds, row by row.
+    recordings : sequence of Recording
+        Those it was found on.
+    names : sequence of str
+        One for each.
+    """
     figure = lines_figure("t, one recording after the other [s]", _with_unit("added", law.value_unit))
     at, marks = 0.0, []
     for r, rows, added, name in zip(recordings, law.rows, law.acts, names, strict=True):

@@ -304,7 +304,15 @@ def _run(plant: TransferFunction, recording: Recording) -> tuple[FloatArray, flo
 
 
 def numbers_table(fit: PlantFit, signals: SignalSettings) -> Table:
-    """Return the plant's gain, lags and dead time with the ends of their 95 % intervals."""
+    """Return the plant's gain, lags and dead time with the ends of their 95 % intervals.
+
+    Parameters
+    ----------
+    fit : PlantFit
+        The fitted plant, with the region of its numbers.
+    signals : SignalSettings
+        Names the units.
+    """
     drawn = [_numbers(plant) for plant in fit.draws(DRAWS * 5, np.random.default_rng(0))]
     rows = []
     for i, (name, value) in enumerate(_numbers(fit.plant)):

@@ -136,7 +136,15 @@ def thinned(t: FloatArray, y: FloatArray, points: int = 3000) -> tuple[FloatArra
 
 
 def lines_figure(x_title: str, y_title: str, *, log_x: bool = False, log_y: bool = False) -> Chart:
-    """Return an empty chart with titled axes, for traces to be added."""
+    """Return an empty chart with titled axes, for traces to be added.
+
+    Parameters
+    ----------
+    x_title, y_title : str
+        With units.
+    log_x, log_y : bool
+        Whether the axis is logarithmic.
+    """
     figure = Chart()
     figure.update_xaxes(title=x_title, type="log" if log_x else "linear")
     figure.update_yaxes(title=y_title, type="log" if log_y else "linear")
@@ -154,7 +162,25 @@ def add_line(
     width: float = 1.6,
     **place: Any,
 ) -> None:
-    """Add a curve; ``place`` takes plotly's ``row`` and ``col`` and trace settings such as ``showlegend``."""
+    """Add a curve.
+
+    Parameters
+    ----------
+    figure : Chart
+        The chart, changed in place.
+    x, y : (N,) array
+        The curve, in the axes' units; NaN interrupts it.
+    name : str
+        In the legend.
+    colour : str
+        As of CSS.
+    dash : str
+        As of plotly.
+    width : float
+        Of the line [px].
+    **place : object
+        ``row`` and ``col``, and settings of plotly's scatter such as ``showlegend``.
+    """
     at = {key: place.pop(key) for key in ("row", "col") if key in place}
     trace = Scatter(x=x, y=y, name=name, mode="lines", line={"color": colour, "dash": dash, "width": width}, **place)
     figure.add_trace(trace, **at)

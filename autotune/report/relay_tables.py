@@ -45,7 +45,17 @@ def feedback(law: Law) -> Controller:
 
 
 def crossing(plant: TransferFunction, level: float, omega: FloatArray) -> float:
-    """Return the highest frequency at which abs(H) falls through a level [rad/s]; NaN where the grid shows none."""
+    """Return the highest frequency at which abs(H) falls through a level [rad/s]; NaN where the grid shows none.
+
+    Parameters
+    ----------
+    plant : TransferFunction
+        H, time in s.
+    level : float
+        The gain [y unit/u unit].
+    omega : (N,) array
+        Angular frequencies [rad/s], ascending.
+    """
     gain = np.abs(plant.response(omega)) / level
     above = np.flatnonzero(gain >= 1.0)
     if above.size == 0 or above[-1] == omega.size - 1:
@@ -101,7 +111,17 @@ def asymptotic_bandwidth(plant: TransferFunction, noise_gain: float, omega: Floa
 
 
 def bandwidth_words(plant: TransferFunction, noise_gain: float, omega: FloatArray) -> str:
-    """Return (26) and the limit on the plant itself in a sentence; empty where there is neither."""
+    """Return (26) and the limit on the plant itself in a sentence; empty where there is neither.
+
+    Parameters
+    ----------
+    plant : TransferFunction
+        H, time in s.
+    noise_gain : float
+        N_max [u unit/y unit].
+    omega : (N,) array
+        Angular frequencies [rad/s], ascending.
+    """
     line, limit = asymptotic_bandwidth(plant, noise_gain, omega), bandwidth_limit(plant, noise_gain, omega)
     words = (
         []

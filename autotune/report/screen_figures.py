@@ -228,7 +228,15 @@ def _band(figure: go.Chart, x: FloatArray, y: FloatArray, half: FloatArray, colo
 
 
 def curve_figure(curve: Curve, found: Diagnosis) -> go.Chart:
-    """Return the picture of a description's free curve with its 95 % band."""
+    """Return the picture of a description's free curve with its 95 % band.
+
+    Parameters
+    ----------
+    curve : Curve
+        The curve with its standard deviation.
+    found : Diagnosis
+        Names the units.
+    """
     figure = lines_figure(_titled(curve.signal, found), f"missing [{curve.unit or '-'}]")
     _band(figure, curve.x, curve.value, 1.96 * curve.sd, GREEN)
     add_line(figure, curve.x, curve.value, "free curve", GREEN)
@@ -236,7 +244,15 @@ def curve_figure(curve: Curve, found: Diagnosis) -> go.Chart:
 
 
 def trace_figures(found: Diagnosis, names: Sequence[str]) -> tuple[Figure, ...]:
-    """Return every recording with the retuned and the extended simulation, window by window."""
+    """Return every recording with the retuned and the extended simulation, window by window.
+
+    Parameters
+    ----------
+    found : Diagnosis
+        With its simulations.
+    names : sequence of str
+        One for each recording.
+    """
     figures, search = [], found.search
     for i, (r, name, count) in enumerate(zip(search.recordings, names, search.runs(), strict=True)):
         figure = lines_figure("t [s]", f"y [{search.units[1]}]")

@@ -63,11 +63,6 @@ class Chain:
         rates = rates[rates > 1e-9]
         return float(1.0 / np.min(rates)) if len(rates) else 0.0
 
-    @property
-    def passes_constants(self) -> bool:
-        """Whether a constant command reaches the output."""
-        return all(b.num[-1] != 0.0 for b in self.blocks)
-
 
 @dataclass(frozen=True, kw_only=True)
 class Steps:
