@@ -19,9 +19,9 @@ from pydantic import Field, field_validator, model_validator
 from autotune.arrays import ComplexArray, FloatArray, is_real
 from autotune.errors import InputError
 from autotune.models import TransferFunction
-from autotune.outputs import write_whole
 from autotune.schema import LONGEST_S, SHORTEST_S, Number, Section, Time, shortened, validated
 from autotune.text_files import checked_path, read_json, read_toml
+from autotune.whole_files import write_whole
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -22,8 +22,8 @@ from scipy.optimize import minimize_scalar
 from autotune.arguments import checked
 from autotune.arrays import FloatArray, is_real
 from autotune.errors import InputError
-from autotune.outputs import append_whole, write_whole
 from autotune.text_files import checked_path, printable, read_toml
+from autotune.whole_files import append_whole, write_whole
 
 #: Largest size of a value that is computed with: far beyond every unit, far from where squares overflow.
 LARGEST = 1e15

@@ -34,8 +34,8 @@ from autotune.errors import AutotuneError, ExperimentStopped, OperatorStop
 from autotune.experiment.judgement import Verification, smoothed
 from autotune.experiment.result import Status
 from autotune.models import TransferFunction
-from autotune.outputs import append_whole
 from autotune.points import FrequencyPoint, points_to_json
+from autotune.whole_files import append_whole
 
 #: rows of a step response that are kept for a picture
 PICTURE_ROWS = 400

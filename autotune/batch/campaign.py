@@ -19,9 +19,10 @@ from autotune.batch.loop import Finding, Work
 from autotune.batch.row import Row
 from autotune.batch.settings import CampaignSettings, LoopSettings, matches
 from autotune.errors import InputError
-from autotune.outputs import Output, unwritable, write_whole
+from autotune.outputs import Output, unwritable
 from autotune.progress import Progress
 from autotune.version import __version__
+from autotune.whole_files import write_whole
 
 RESULTS, REPORT = "results.parquet", "report.html"
 

@@ -27,7 +27,8 @@ from autotune.errors import AutotuneError, IdentificationError
 from autotune.experiment_design.next_experiment import with_next_experiment
 from autotune.identification.closed_loop.identify import identify_closed_loop
 from autotune.identification.closed_loop.loop_plant import loop_plant
-from autotune.identification.frequency.recorded import FrequencyEstimate, combine, frequency_points
+from autotune.identification.frequency.recorded import combine, frequency_points
+from autotune.identification.frequency.spectral_points import FrequencyEstimate
 from autotune.identification.parametric import PlantFit
 from autotune.model_file import read_model
 from autotune.pipeline import Analysis, Measured, analyse, analysis_json, measured_of

@@ -56,7 +56,8 @@ class ModelOfRig:
         answers : mapping
             What the questions gave.
         """
-        from autotune.models import Block, Model, Port, write_model
+        from autotune.model_tables import write_model
+        from autotune.models import Block, Model, Port
 
         place = self.place(config)
         if place is None or self.dynamics is None:

@@ -11,7 +11,7 @@ from rich.progress import Progress
 from rich.table import Table
 
 from autotune.errors import InputError
-from autotune.outputs import write_whole
+from autotune.whole_files import write_whole
 
 if TYPE_CHECKING:
     from sim.proof import Campaign

@@ -15,7 +15,8 @@ from autotune.cli.common import OVERWRITE, ProgressBar, new_folder, rig_of, ungu
 from autotune.cli.live import LISTEN, PORT, TOKEN_FILE
 from autotune.cli.recordings import R, T, U, Y, read_all, signal_names
 from autotune.errors import ExperimentStopped, InputError
-from autotune.outputs import OutputFolder, write_json
+from autotune.outputs import OutputFolder
+from autotune.whole_files import write_json
 
 if TYPE_CHECKING:
     from autotune.config import Config

@@ -19,7 +19,8 @@ from autotune.equations.forecast import forecast
 from autotune.equations.model import EquationModel
 from autotune.equations.read import content_of, equations_of, write_equations
 from autotune.errors import InputError
-from autotune.models import Model, read_model, write_model
+from autotune.model_tables import read_model, write_model
+from autotune.models import Model
 from autotune.recording import Recording
 from autotune.text_files import read_toml
 

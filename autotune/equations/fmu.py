@@ -29,7 +29,7 @@ from autotune.equations.black_box import BlackBox
 from autotune.equations.read import input_of, parameter_of
 from autotune.equations.simulate import Drive
 from autotune.errors import InputError
-from autotune.models import effect_of
+from autotune.model_tables import effect_of
 
 _KEYS = {"name", "fmu", "input", "output", "parameters", "effect"}
 

@@ -23,7 +23,8 @@ from autotune.equations.model import (
 )
 from autotune.equations.units import check_units
 from autotune.errors import InputError
-from autotune.models import Hold, effect_of, effect_table
+from autotune.model_tables import effect_of, effect_table
+from autotune.models import Hold
 from autotune.text_files import read_toml
 
 _TOP = {"name", "input", "output", "state", "parameters", "define", "port", "horizon_s", "effect"}

@@ -6,9 +6,9 @@ import math
 from dataclasses import replace
 from statistics import median
 
-from autotune.experiment.approach import Known
 from autotune.experiment.loop import ControlLoop
 from autotune.experiment.oscillation import Oscillation
+from autotune.experiment.preflight import Known
 from autotune.experiment.rig import HandsBack, Rig
 
 #: distance from the set-point, as a part of limits.swing, that counts as there; noise is added

@@ -12,11 +12,12 @@ import numpy as np
 
 from autotune.config import Config
 from autotune.errors import AutotuneError, ExperimentStopped
-from autotune.experiment.approach import Known, approach, find_midpoint, preflight
+from autotune.experiment.approach import approach, find_midpoint
 from autotune.experiment.cycles import Earlier, refined
 from autotune.experiment.device import DeviceOscillation
 from autotune.experiment.limits import Envelope, Watch
 from autotune.experiment.loop import ControlLoop, Timing
+from autotune.experiment.preflight import Known, preflight
 from autotune.experiment.relay import RelaySettings
 from autotune.experiment.result import ExperimentResult, Part, Segment, State, Status
 from autotune.experiment.return_to_setpoint import return_by_relay, setpoint_before

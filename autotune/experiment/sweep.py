@@ -8,7 +8,6 @@ from dataclasses import replace
 
 from autotune.config.procedure import ExperimentSettings, OperatingPointSettings
 from autotune.errors import ExperimentStopped, IdentificationError
-from autotune.experiment.approach import Known
 from autotune.experiment.cycles import Earlier, measured
 from autotune.experiment.dwell import Dwell, further_periods
 from autotune.experiment.limit_cycle_run import LEAST_PERIODS, run_limit_cycle
@@ -26,6 +25,7 @@ from autotune.experiment.plan import (
     time_s,
     within_reach,
 )
+from autotune.experiment.preflight import Known
 from autotune.experiment.relay import RelaySettings
 from autotune.experiment.result import Cycle, Segment, State
 from autotune.experiment.sweep_warnings import relative_sd, sweep_warnings

@@ -13,7 +13,8 @@ from autotune.arrays import ComplexArray, FloatArray
 from autotune.errors import AutotuneError, IdentificationError
 from autotune.identification.delay.data import DelayData
 from autotune.identification.delay.model import DelayModel
-from autotune.identification.delay.output_error import Point, Structure, finish, minimise, solve_linear
+from autotune.identification.delay.output_error import Point, Structure, minimise, solve_linear
+from autotune.identification.delay.output_error_model import finish
 from autotune.identification.parametric import fit_structures
 from autotune.points import FrequencyPoint
 

@@ -13,9 +13,9 @@ import tomli_w
 from autotune.config import Config, load_config
 from autotune.errors import InputError
 from autotune.experiment.cycles import Earlier, read_earlier
-from autotune.outputs import write_whole
 from autotune.points import FrequencyPoint, read_points
 from autotune.text_files import read_json
+from autotune.whole_files import write_whole
 
 RECORDING, VERIFICATION, RESULT, JOURNAL = "recording.csv", "verification.csv", "result.json", "journal.jsonl"
 PROGRESS, CONFIG, REPORT, CONTROLLER = "progress.jsonl", "config.toml", "report.html", "controller.toml"

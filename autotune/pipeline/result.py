@@ -13,11 +13,11 @@ from autotune.diagnosis.result import Diagnosis
 from autotune.experiment.judgement import Verification
 from autotune.experiment.result import ExperimentResult
 from autotune.experiment.running_law import RunningLaw
-from autotune.outputs import write_whole
 from autotune.pipeline.analysis import Analysis
 from autotune.pipeline.folder import CONTROLLER
 from autotune.points import points_to_json
 from autotune.run_log import jsonable
+from autotune.whole_files import write_whole
 
 
 def write_result(

@@ -15,8 +15,9 @@ import pytest
 
 from autotune import outputs
 from autotune.errors import InputError
-from autotune.outputs import Output, OutputFolder, append_whole, claim, write_json, write_whole
+from autotune.outputs import Output, OutputFolder, claim
 from autotune.recording import RecordingWriter, read_recording
+from autotune.whole_files import append_whole, write_json, write_whole
 
 
 def test_nothing_that_exists_is_overwritten_unless_it_is_asked_for(tmp_path: Path) -> None:

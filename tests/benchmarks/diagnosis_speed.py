@@ -25,7 +25,8 @@ from rich.table import Table
 
 from autotune.diagnosis.diagnose import diagnose
 from autotune.diagnosis.simulation.assembly import assemble
-from autotune.models import Block, Model, Port, TransferFunction, write_model
+from autotune.model_tables import write_model
+from autotune.models import Block, Model, Port, TransferFunction
 from autotune.recording import Recording
 from tests.autotune.diagnosis.servo_rigs import servo_model, servo_recording
 

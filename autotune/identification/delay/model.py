@@ -12,8 +12,8 @@ import numpy as np
 from autotune.arrays import ComplexArray, FloatArray
 from autotune.errors import InputError
 from autotune.models import TransferFunction
-from autotune.outputs import write_json
 from autotune.text_files import read_json
+from autotune.whole_files import write_json
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -18,7 +18,8 @@ from threadpoolctl import threadpool_limits
 from autotune.arrays import ComplexArray, FloatArray
 from autotune.errors import IdentificationError
 from autotune.identification.delay.data import DelayData
-from autotune.identification.delay.output_error import Structure, colour_of, residuals, solve_linear
+from autotune.identification.delay.output_error import Structure, residuals, solve_linear
+from autotune.identification.delay.output_error_model import colour_of
 from autotune.identification.delay.weighted_equations import Weighted, Windows, minimise_weighted
 from autotune.identification.noise_colour import NoiseColour
 

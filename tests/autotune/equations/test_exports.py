@@ -20,7 +20,8 @@ from autotune.equations.files import read_any_model
 from autotune.equations.flatten import flattened
 from autotune.equations.linearise import as_chain, linearise, transfer_function
 from autotune.errors import InputError
-from autotune.models import Effect, Parameter, TransferFunction, read_model
+from autotune.model_tables import read_model
+from autotune.models import Effect, Parameter, TransferFunction
 from tests.autotune.equations.models import model, one_state
 
 T = np.arange(300) * 0.02
