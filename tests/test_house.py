@@ -6,7 +6,7 @@ import ast
 
 import pytest
 
-from tests.house import Package, Routine, packages, routines_of
+from tests.house import ROOT, Package, Routine, packages, routines_of
 
 # How many public functions of a package do not yet document all of their parameters. Packages that are not named are
 # whole. It was not done when the rule came, and a wrong unit is worse than none, so that each is read before it is
@@ -33,6 +33,11 @@ def test_no_new_public_function_lacks_documented_parameters(counted: dict[str, P
     for name, package in counted.items():
         bare = [f"{r.place}: {', '.join(r.undocumented)}" for r in package.public if r.undocumented]
         assert len(bare) <= UNDOCUMENTED.get(name, 0), "\n".join([f"{name}: a section Parameters is missing", *bare])
+
+
+def test_the_page_on_architecture_names_every_package(counted: dict[str, Package]) -> None:
+    page = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+    assert [name for name in counted if f"| `{name}` |" not in page] == []
 
 
 def test_a_parameter_is_documented_where_the_section_on_parameters_names_it() -> None:
