@@ -10,7 +10,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 LONGEST_FILE, LONGEST_FUNCTION = 300, 60
-COMPILED = re.compile(r"^@?(numba\.)?(njit|jit|vectorize|guvectorize|cfunc)\b")
+COMPILED = re.compile(r"^@?(numba\.)?(njit|jit|vectorize|guvectorize|cfunc|in_place)\b")
 COMMAND = re.compile(r"\.(command|callback)\(")  # its parameters are documented beside them, for --help
 
 

@@ -72,6 +72,13 @@ def _description(path: Path) -> Any:
 def fmu_of(content: Mapping[str, Any], where: str) -> BlackBox:
     """Return the model that a file's content states; the FMU's path counts from the file's folder.
 
+    Parameters
+    ----------
+    content : mapping
+        The decoded TOML.
+    where : str
+        Its file, for messages and for the FMU's path.
+
     Raises
     ------
     InputError

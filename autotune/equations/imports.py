@@ -18,6 +18,15 @@ from autotune.models import Block, Model, Port, TransferFunction
 def from_coefficients(num: Any, den: Any, delay_s: float = 0.0, name: str = "plant") -> Model:
     """Return a chain of one block from coefficients in descending powers of s.
 
+    Parameters
+    ----------
+    num, den : sequence of float
+        Descending powers of s [rad/s].
+    delay_s : float
+        Dead time [s].
+    name : str
+        Of the model.
+
     Raises
     ------
     InputError
@@ -34,6 +43,15 @@ def from_coefficients(num: Any, den: Any, delay_s: float = 0.0, name: str = "pla
 
 def from_matlab(num: str, den: str, delay_s: float = 0.0, name: str = "plant") -> Model:
     """Return a chain of one block from vectors as MATLAB prints them: ``"[1 2]"``, ``"1, 3.5, 0"``.
+
+    Parameters
+    ----------
+    num, den : str
+        Descending powers of s [rad/s].
+    delay_s : float
+        Dead time [s].
+    name : str
+        Of the model.
 
     Raises
     ------

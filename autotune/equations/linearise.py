@@ -96,7 +96,15 @@ def growth_rate(model: EquationModel, recordings: Sequence[Recording]) -> float:
 
 
 def settles(model: EquationModel, recordings: Sequence[Recording]) -> bool:
-    """Whether a deviation from where recordings are dies out, as far as a rest is known there."""
+    """Whether a deviation from where recordings are dies out, as far as a rest is known there.
+
+    Parameters
+    ----------
+    model : EquationModel
+        The model.
+    recordings : sequence of Recording
+        Say where it rests.
+    """
     linear = _at_recordings(model, recordings)
     return linear is not None and bool(np.all(np.linalg.eigvals(linear.A).real < 0.0))
 
@@ -145,7 +153,15 @@ def _differences(
 
 
 def transfer_function(linear: Linear, column: int = 0) -> TransferFunction:
-    """Return the transfer function from one input to y, with its dead time."""
+    """Return the transfer function from one input to y, with its dead time.
+
+    Parameters
+    ----------
+    linear : Linear
+        The linearisation.
+    column : int
+        Place of the input.
+    """
     from scipy.signal import ss2tf
 
     num, den = ss2tf(linear.A, linear.B[:, [column]], linear.C, linear.D[:, [column]])
@@ -154,7 +170,15 @@ def transfer_function(linear: Linear, column: int = 0) -> TransferFunction:
 
 
 def as_chain(model: EquationModel, linear: Linear) -> Model:
-    """Return the linearisation from the command as a chain of one block, offsets at the operating point."""
+    """Return the linearisation from the command as a chain of one block, offsets at the operating point.
+
+    Parameters
+    ----------
+    model : EquationModel
+        Names and units.
+    linear : Linear
+        Its linearisation.
+    """
     block = Block(name="linearisation", place="plant", dynamics=transfer_function(linear))
     return Model(
         name=f"{model.name}, linearised",
