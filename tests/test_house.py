@@ -15,7 +15,7 @@ UNDOCUMENTED = {
     "autotune/diagnosis": 171,
     "autotune/experiment": 5,
     "autotune/pipeline": 2,
-    "sim": 104,
+    "sim": 103,
 }
 
 

@@ -148,22 +148,6 @@ def _transfer_text(fit: PlantFit, signals: SignalSettings) -> str:
 
 def _loop_section(analysis: Analysis, signals: SignalSettings) -> Section:
     controller, spec = analysis.controller, analysis.design.specification
-    omega = frequency_grid(analysis, 1.3)
-    loops = (
-        Curve(name="fitted plant", system=_Loop(plant=analysis.fit.plant, controller=controller), colour=BLUE),
-        *(
-            []
-            if analysis.reduced is None
-            else [
-                Curve(
-                    name="reduced model" if (_reduced_modulus(analysis) or 0.0) > 0.0 else "reduced model (unstable)",
-                    system=_Loop(plant=analysis.reduced, controller=controller),
-                    colour=GREEN,
-                    dash="dash",
-                )
-            ]
-        ),
-    )
     design, m, d = analysis.design, analysis.margins, analysis.design.margins
     binding, u, y = ", ".join(design.binding) or "none", signals.u_unit, signals.y_unit
     rows = (
@@ -196,20 +180,41 @@ def _loop_section(analysis: Analysis, signals: SignalSettings) -> Section:
         ),
         details=(_certificate(analysis),),
         detail_tables=(_price_table(analysis, signals),),
-        figures=(
-            Figure(
-                figure=nyquist_figure(loops, analysis.points, controller, omega, spec.modulus_margin),
-                caption=f"Nyquist: {_outside(analysis)}; ellipses are the points' 95 % regions times C.",
-                square=True,
-            ),
-            Figure(
-                figure=nichols_figure(loops, omega, spec.modulus_margin, spec.phase_margin_rad),
-                caption="Black-Nichols: the required phase margin as a bar, the modulus margin as a closed curve.",
-            ),
-            Figure(
-                figure=sensitivity_figure(loops, omega, spec.modulus_margin),
-                caption="Sensitivity: its peak is the inverse of the modulus margin.",
-            ),
+        figures=_loop_figures(analysis),
+    )
+
+
+def _loop_figures(analysis: Analysis) -> tuple[Figure, ...]:
+    controller, spec = analysis.controller, analysis.design.specification
+    omega = frequency_grid(analysis, 1.3)
+    loops = (
+        Curve(name="fitted plant", system=_Loop(plant=analysis.fit.plant, controller=controller), colour=BLUE),
+        *(
+            []
+            if analysis.reduced is None
+            else [
+                Curve(
+                    name="reduced model" if (_reduced_modulus(analysis) or 0.0) > 0.0 else "reduced model (unstable)",
+                    system=_Loop(plant=analysis.reduced, controller=controller),
+                    colour=GREEN,
+                    dash="dash",
+                )
+            ]
+        ),
+    )
+    return (
+        Figure(
+            figure=nyquist_figure(loops, analysis.points, controller, omega, spec.modulus_margin),
+            caption=f"Nyquist: {_outside(analysis)}; ellipses are the points' 95 % regions times C.",
+            square=True,
+        ),
+        Figure(
+            figure=nichols_figure(loops, omega, spec.modulus_margin, spec.phase_margin_rad),
+            caption="Black-Nichols: the required phase margin as a bar, the modulus margin as a closed curve.",
+        ),
+        Figure(
+            figure=sensitivity_figure(loops, omega, spec.modulus_margin),
+            caption="Sensitivity: its peak is the inverse of the modulus margin.",
         ),
     )
 
