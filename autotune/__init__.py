@@ -97,7 +97,7 @@ _HOMES = {
     "OnlineEstimator": "autotune.identification.delay.online_modulating",
     "TransferFunction": "autotune.models",
     "Recording": "autotune.recording",
-    "read_model": "autotune.models",
+    "read_model": "autotune.model_tables",
     "read_controller": "autotune.controller",
 }
 

@@ -37,7 +37,7 @@ BESIDE = os.environ.get("DIAGNOSIS_BESIDE", "")
 ONCE = """
 import sys, time
 from autotune.diagnosis.diagnose import diagnose
-from autotune.models import read_model
+from autotune.model_tables import read_model
 from autotune.recording import read_recording
 model, *paths = sys.argv[1:]
 recordings = [read_recording(path) for path in paths]
