@@ -12,10 +12,10 @@ from autotune.arrays import BoolArray, FloatArray
 from autotune.batch.settings import ExportSettings, LoopSettings, matches
 from autotune.errors import InputError
 from autotune.files.cells import Cells
-from autotune.files.reading import Signals, signals_of, stamp_form, stamps_of
 from autotune.files.signal_names import Roles, SignalNames, find_roles
 from autotune.files.stamps import seconds
 from autotune.files.table import Table, listed
+from autotune.files.table_signals import Signals, signals_of, stamp_form, stamps_of
 from autotune.files.text_file import beginning
 from autotune.files.workbook import PARQUET, open_table, parquet_table
 from autotune.progress import Progress

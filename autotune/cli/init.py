@@ -13,12 +13,12 @@ from autotune.cli import app
 from autotune.cli.init_keys import REGISTER, Table, add_registers, register, set_keys
 from autotune.cli.init_model import EXAMPLE, ModelOfRig, model_of_rig
 from autotune.cli.init_questions import Questions, one_of, pair
+from autotune.cli.init_text import text_of
 from autotune.errors import InputError
 from autotune.outputs import Output
 
 if TYPE_CHECKING:
     from drivers.kinds import Kind
-from autotune.cli.init_text import text_of
 
 Plant = Literal["ball", "servo", "two_tank", "thermal"]
 #: samples of a sweep: some 15 to 40 a period, a few periods for each of five points, and the way there

@@ -18,7 +18,8 @@ from autotune.design.kernels import SampledPlant, sampled_plant
 from autotune.design.load_error import least_error, load_step
 from autotune.design.loop import Plant, transfer_function_of
 from autotune.design.margins import margins
-from autotune.design.search import Problem, admissible, polished, separate
+from autotune.design.search import Problem, polished
+from autotune.design.search_starts import admissible, separate
 from autotune.design.specification import Design, Kind, Specification
 from autotune.errors import DesignError
 

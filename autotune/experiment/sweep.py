@@ -12,19 +12,10 @@ from autotune.experiment.cycles import Earlier, measured
 from autotune.experiment.dwell import Dwell, further_periods
 from autotune.experiment.limit_cycle_run import LEAST_PERIODS, run_limit_cycle
 from autotune.experiment.limits import Envelope
+from autotune.experiment.local_model import LocalModel, lag_beyond_integrator
 from autotune.experiment.loop import ControlLoop
 from autotune.experiment.oscillation import Oscillation
-from autotune.experiment.plan import (
-    Choice,
-    Goal,
-    LocalModel,
-    allot,
-    choose,
-    lag_beyond_integrator,
-    phase_targets,
-    time_s,
-    within_reach,
-)
+from autotune.experiment.plan import Choice, Goal, allot, choose, phase_targets, time_s, within_reach
 from autotune.experiment.preflight import Known
 from autotune.experiment.relay import RelaySettings
 from autotune.experiment.result import Cycle, Segment, State

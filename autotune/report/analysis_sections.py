@@ -17,13 +17,8 @@ from autotune.experiment.result import ExperimentResult
 from autotune.identification.parametric import PlantFit
 from autotune.pipeline import Analysis
 from autotune.report.analysis_words import based_on, with_units
-from autotune.report.figures import (
-    Curve,
-    nichols_figure,
-    nyquist_figure,
-    ratio_title,
-    sensitivity_figure,
-)
+from autotune.report.figures import Curve, ratio_title
+from autotune.report.loop_diagrams import nichols_figure, nyquist_figure, sensitivity_figure
 from autotune.report.maker_forms import maker_table
 from autotune.report.page import BLUE, GREEN, Figure, Section, Table
 from autotune.report.points_section import frequency_grid, is_of_rows, points_section

@@ -18,7 +18,8 @@ from autotune.identification.reduction import ReducedModel
 from autotune.models import TransferFunction
 from autotune.points import FrequencyPoint
 from autotune.report.chart import make_subplots
-from autotune.report.figures import Curve, bode_figure, nichols_figure, sensitivity_figure
+from autotune.report.figures import Curve, bode_figure
+from autotune.report.loop_diagrams import nichols_figure, sensitivity_figure
 from autotune.report.page import BLUE, GREEN, ORANGE, PURPLE, RED, Figure, Page, Section, add_line
 from autotune.report.relay_tables import PAPER_PI, Law, bandwidth_words, feedback, printed_tables, tables
 
