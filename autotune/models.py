@@ -23,6 +23,7 @@ Place: TypeAlias = Literal["actuator", "plant", "sensor"]
 _SPEED = re.compile(r"speed|velocity|\brpm\b")
 _SPEED_UNIT = re.compile(r"^(m|mm|cm|km|rad|deg|°|rev|turns?)/(s|min|h)$|^rpm$|^1/min$")
 Hold: TypeAlias = Literal["zero", "linear"]
+
 #: Most blocks of a chain and most coefficients of a polynomial: far beyond any plant, far before work becomes a wait.
 MOST_BLOCKS, MOST_COEFFICIENTS = 50, 40
 #: Largest size of a number in a model file; where arithmetic overflows, a result would be none.

@@ -21,10 +21,13 @@ if TYPE_CHECKING:
     from drivers.kinds import Kind
 
 Plant = Literal["ball", "servo", "two_tank", "thermal"]
+
 #: samples of a sweep: some 15 to 40 a period, a few periods for each of five points, and the way there
 SWEEP_SAMPLES = 1e4
+
 #: half-width of the noise of a twin's sensor, over the range of y, and steps of its converter over that range
 NOISE, CONVERTER = 1e-3, 4096
+
 #: what is known of the simulated plants
 PLANTS: Mapping[Plant, Table] = {
     "ball": {

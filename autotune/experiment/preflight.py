@@ -24,6 +24,7 @@ SLOW_SHARE = 0.05
 #: least share of readings in preflight that differ from the one before, for a sensor of which that can be expected
 RESTLESS = 0.05
 SMALL = 1e-9
+
 Tell = Callable[[str], None]
 
 

@@ -24,6 +24,7 @@ from autotune.text_files import checked_path
 
 #: What asks somebody for a column: what for, the file's columns, the best guess.
 Ask: TypeAlias = Callable[[str, Sequence[str], str], str]
+
 _ROLE = {"t": "time", "u": "command", "y": "measurement", "r": "set-point"}
 
 

@@ -18,6 +18,7 @@ from autotune.points import FrequencyPoint
 First: TypeAlias = Literal["none", "integrator", "lag", "unstable", "pair"]
 Second: TypeAlias = Literal["none", "lag", "pair"]
 Zero: TypeAlias = Literal["none", "real", "pair"]
+
 #: what a structure of low order need not represent, as a share of the gain
 _RESOLUTION = 1e-3
 #: damping above which a pair of roots may lie anywhere

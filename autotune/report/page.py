@@ -22,8 +22,10 @@ from autotune.text_files import shown
 from autotune.whole_files import write_whole
 
 Tone: TypeAlias = Literal["good", "warn", "bad"]
+
 #: Colours told apart in print and by colour-blind readers (Okabe & Ito), legible on white and on black.
 BLUE, ORANGE, GREEN, RED, GREY, PURPLE = "#3b82c4", "#d98200", "#0d9a72", "#d1495b", "#8a8a8a", "#a467b0"
+
 #: Rows of a table from which on it can be sorted and filtered.
 _MANY = 12
 

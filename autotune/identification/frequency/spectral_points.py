@@ -21,6 +21,7 @@ from autotune.points import FrequencyPoint
 from autotune.recording import Recording
 
 Excitation: TypeAlias = Literal["relay", "repeated command", "random or steps", "closed loop by way of r"]
+
 #: Frequencies per decade: the finer grid where it gives enough points, wider windows where the data are poorer.
 _PER_DECADE = (10, 5, 3, 2)
 _ENOUGH_POINTS = 4
