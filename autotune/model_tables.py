@@ -56,7 +56,7 @@ def model_of(content: Mapping[str, Any], where: str) -> Model:
     InputError
         A key that is not known, or a value that no model has; names it.
     """
-    _known(content, {"name", "input", "output", "block", "effect", "reduced"}, where)
+    _require_keys(content, {"name", "input", "output", "block", "effect", "reduced"}, where)
     blocks, effects = _tables(content, "block", where), _tables(content, "effect", where)
     if not blocks:
         raise InputError("no [[block]]", where=where, remedy="a model needs at least one block")
@@ -72,7 +72,7 @@ def model_of(content: Mapping[str, Any], where: str) -> Model:
 def _tables(content: Mapping[str, Any], key: str, where: str) -> list[Any]:
     tables = content.get(key, [])
     if not isinstance(tables, list):
-        raise InputError(f"{key} = {_shown(tables)}", where=where, remedy=f"write tables [[{key}]]")
+        raise InputError(f"{key} = {_as_text(tables)}", where=where, remedy=f"write tables [[{key}]]")
     if len(tables) > MOST_BLOCKS:
         raise InputError(f"{len(tables)} [[{key}]]", where=where, remedy=f"give at most {MOST_BLOCKS}")
     return tables
@@ -81,36 +81,36 @@ def _tables(content: Mapping[str, Any], key: str, where: str) -> list[Any]:
 def _text(table: Mapping[str, Any], key: str, default: str, where: str) -> str:
     value = table.get(key, default)
     if not isinstance(value, str) or len(value) > 200:
-        raise InputError(f"{key} = {_shown(value)}", where=where, remedy="write a text of at most 200 characters")
+        raise InputError(f"{key} = {_as_text(value)}", where=where, remedy="write a text of at most 200 characters")
     return value
 
 
-def _shown(value: Any) -> str:
+def _as_text(value: Any) -> str:
     text = repr(value)
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 
-def _known(table: Any, keys: set[str], where: str) -> None:
+def _require_keys(table: Any, keys: set[str], where: str) -> None:
     if not isinstance(table, Mapping):
-        raise InputError(f"{_shown(table)} is no table", where=where, remedy=f"write keys: {', '.join(sorted(keys))}")
+        raise InputError(f"{_as_text(table)} is no table", where=where, remedy=f"write keys: {', '.join(sorted(keys))}")
     for key in table:
         if key not in keys:
-            raise InputError(f"unknown key {_shown(key)}", where=where, remedy=f"known are {', '.join(sorted(keys))}")
+            raise InputError(f"unknown key {_as_text(key)}", where=where, remedy=f"known are {', '.join(sorted(keys))}")
 
 
 def _real(value: Any, key: str, where: str) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= LARGEST:
-        raise InputError(f"{key} = {_shown(value)}", where=where, remedy=f"write a number within +-{LARGEST:g}")
+        raise InputError(f"{key} = {_as_text(value)}", where=where, remedy=f"write a number within +-{LARGEST:g}")
     if 0.0 < abs(value) < SMALLEST:
         raise InputError(f"{key} = {value!r}", where=where, remedy=f"write 0, or a size of at least {SMALLEST:g}")
     return float(value)
 
 
 def _port(table: Mapping[str, Any], where: str) -> Port:
-    _known(table, {"unit", "offset", "hold", "recorded"}, where)
+    _require_keys(table, {"unit", "offset", "hold", "recorded"}, where)
     hold = table.get("hold", "zero")
     if hold not in get_args(Hold):
-        raise InputError(f"hold = {_shown(hold)}", where=where, remedy='write "zero" (held command) or "linear"')
+        raise InputError(f"hold = {_as_text(hold)}", where=where, remedy='write "zero" (held command) or "linear"')
     return Port(
         unit=_text(table, "unit", "", where),
         offset=_real(table.get("offset", 0.0), "offset", where),
@@ -121,24 +121,24 @@ def _port(table: Mapping[str, Any], where: str) -> Port:
 
 def _range(values: Any, where: str) -> tuple[float, float]:
     if not isinstance(values, list) or len(values) != 2:
-        raise InputError(f"recorded = {_shown(values)}", where=where, remedy="write [lowest, highest]")
+        raise InputError(f"recorded = {_as_text(values)}", where=where, remedy="write [lowest, highest]")
     low, high = (_real(value, "recorded", where) for value in values)
     if low > high:
-        raise InputError(f"recorded = {_shown(values)}", where=where, remedy="write [lowest, highest]")
+        raise InputError(f"recorded = {_as_text(values)}", where=where, remedy="write [lowest, highest]")
     return low, high
 
 
 def _block(table: Mapping[str, Any], where: str) -> Block:
-    _known(table, {"name", "place", "num", "den", "delay", "output", "unit"}, where)
+    _require_keys(table, {"name", "place", "num", "den", "delay", "output", "unit"}, where)
     place = table.get("place", "plant")
     if place not in get_args(Place):
-        raise InputError(f"place = {_shown(place)}", where=where, remedy=f"write one of {', '.join(get_args(Place))}")
+        raise InputError(f"place = {_as_text(place)}", where=where, remedy=f"write one of {', '.join(get_args(Place))}")
     coefficients = {}
     for key in ("num", "den"):
         values = table.get(key, [1.0])
         if not isinstance(values, list) or not 0 < len(values) <= MOST_COEFFICIENTS:
             raise InputError(
-                f"{key} = {_shown(values)}",
+                f"{key} = {_as_text(values)}",
                 where=where,
                 remedy=f"write a list of 1 to {MOST_COEFFICIENTS} numbers in descending powers of s",
             )
@@ -174,14 +174,14 @@ def effect_of(table: Mapping[str, Any], where: str) -> Effect:
         A key that is not known, or a value that no effect has; names it.
     """
     acts = ("at", "state", "input", "port", "column")
-    _known(table, {"name", "parameters", "equation", *acts}, where)
+    _require_keys(table, {"name", "parameters", "equation", *acts}, where)
     name = _text(table, "name", "", where)
     if "." not in name:
-        raise InputError(f"name = {_shown(name)}", where=where, remedy="write PLACE.EFFECT of the catalogue")
+        raise InputError(f"name = {_as_text(name)}", where=where, remedy="write PLACE.EFFECT of the catalogue")
     parameters = {}
     written = table.get("parameters", {})
     if not isinstance(written, dict):
-        raise InputError(f"parameters = {_shown(written)}", where=where, remedy="write a table of parameters")
+        raise InputError(f"parameters = {_as_text(written)}", where=where, remedy="write a table of parameters")
     for key, entry in written.items():
         given = entry if isinstance(entry, dict) else {"value": entry}
         sd = _real(given["sd"], f"{key}.sd", where) if "sd" in given else float("nan")

@@ -32,7 +32,7 @@ LARGEST = 1e30
 SMALLEST = 1e-30
 
 
-def _trimmed(coefficients: Sequence[float]) -> tuple[float, ...]:
+def _trim(coefficients: Sequence[float]) -> tuple[float, ...]:
     values = [float(value) for value in coefficients]
     while len(values) > 1 and values[0] == 0.0:
         values.pop(0)
@@ -64,8 +64,8 @@ class TransferFunction:
         lists = all(isinstance(one, tuple | list | np.ndarray) and len(one) for one in (self.num, self.den))
         if not lists or not all(is_real(v) and math.isfinite(v) for v in (*self.num, *self.den, self.delay_s)):
             raise InputError("num, den and delay must be finite numbers", where="transfer function")
-        object.__setattr__(self, "num", _trimmed(self.num))
-        object.__setattr__(self, "den", _trimmed(self.den))
+        object.__setattr__(self, "num", _trim(self.num))
+        object.__setattr__(self, "den", _trim(self.den))
         if self.den == (0.0,):
             raise InputError("the denominator is zero", where="transfer function")
         if self.delay_s < 0.0:

@@ -64,7 +64,7 @@ class Output:
         with _beside(Path(tempfile.gettempdir()) if special else _folder(self.path.parent)) as folder:
             write(folder / self.path.name)
             if special:
-                with _told(self.path):
+                with _refuse_where_unwritable(self.path):
                     self.path.write_bytes((folder / self.path.name).read_bytes())
             else:
                 _move(folder / self.path.name, self.path, self._overwrite)
@@ -81,7 +81,7 @@ class Output:
             It cannot be written; what was there before still is.
         """
         if _is_special(self.path):
-            with _told(self.path), self.path.open("w", encoding="utf-8") as stream:
+            with _refuse_where_unwritable(self.path), self.path.open("w", encoding="utf-8") as stream:
                 yield stream
             return
         with _beside(_folder(self.path.parent)) as folder:
@@ -163,7 +163,7 @@ def claim(out: Path, *, inputs: Sequence[Path | None] = ()) -> None:
 
 
 def _claim(out: Path, inputs: Sequence[Path | None], overwrite: bool) -> None:
-    with _told(out):
+    with _refuse_where_unwritable(out):
         try:
             found = os.stat(out)
         except FileNotFoundError:
@@ -200,7 +200,7 @@ def _is_special(out: Path) -> bool:
 
 
 def _folder(folder: Path) -> Path:
-    with _told(folder):
+    with _refuse_where_unwritable(folder):
         folder.mkdir(parents=True, exist_ok=True)
     return folder
 
@@ -208,7 +208,7 @@ def _folder(folder: Path) -> Path:
 def _prove(folder: Path) -> None:
     """Show that a folder can be made and written to, and leave nothing of it: what is refused later leaves none."""
     missing = []
-    with _told(folder):
+    with _refuse_where_unwritable(folder):
         missing = [one for one in (folder, *folder.parents) if not one.exists()]
     try:
         with _beside(_folder(folder)):
@@ -225,7 +225,7 @@ def _beside(folder: Path) -> Iterator[Path]:
     """Yield a new folder in the folder, which proves that it can be written, and leave nothing of it behind."""
     part: Path | None = None
     try:
-        with _told(folder), interrupt_deferred():
+        with _refuse_where_unwritable(folder), interrupt_deferred():
             part = Path(tempfile.mkdtemp(prefix=".part-", dir=folder))
         yield part
     except OSError as error:
@@ -248,7 +248,7 @@ def _remove(part: Path | None) -> None:
 
 
 def _move(part: Path, out: Path, overwrite: bool) -> None:
-    with _told(out):
+    with _refuse_where_unwritable(out):
         with part.open("rb+") as file:
             os.fsync(file.fileno())
         if overwrite:
@@ -267,7 +267,7 @@ def _move(part: Path, out: Path, overwrite: bool) -> None:
 
 
 @contextmanager
-def _told(out: Path) -> Iterator[None]:
+def _refuse_where_unwritable(out: Path) -> Iterator[None]:
     """Turn an error of the operating system into one line; one of another file keeps that file's name."""
     try:
         yield

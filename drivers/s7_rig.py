@@ -69,7 +69,7 @@ def probe_kind(settings: S7Settings, expected: Mapping[str, tuple[float, float]]
     registers, signals = codecs(settings.registers.mapped()), settings.signals.mapped()
     try:
         state = link.state()
-        found = [_probed(link, codec, signals[name], expected.get(name)) for name, codec in registers.items()]
+        found = [_probe_signal(link, codec, signals[name], expected.get(name)) for name, codec in registers.items()]
         refused = {one.name for one in found if math.isnan(one.value)}
         readable = [codec for name, codec in registers.items() if name in SAMPLE and name not in refused]
         pace = f"; {tell_pace(link, readable)}" if readable else ""
@@ -79,7 +79,7 @@ def probe_kind(settings: S7Settings, expected: Mapping[str, tuple[float, float]]
     return ProbedDevice(description=f"{link.where}, {said}{pace}", signals=tuple(found))
 
 
-def _probed(link: S7Link, codec: Codec, signal: S7Signal, expected: tuple[float, float] | None) -> ProbedSignal:
+def _probe_signal(link: S7Link, codec: Codec, signal: S7Signal, expected: tuple[float, float] | None) -> ProbedSignal:
     try:
         words = link.read(blocks([codec])[0]).words
     except LinkError as error:

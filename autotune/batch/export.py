@@ -135,7 +135,7 @@ def to_parquet(path: Path, out: Path, wanted: Sequence[str], export: ExportSetti
                     cells: Mapping[str, Cells] = {name: _texts(batch.column(name)) for name in time}
                     micro = np.rint(1e6 * stamps_of(table, time, cells, stamp))
                     stamps = pa.array(micro, from_pandas=True).cast(pa.int64()).cast(pa.timestamp("us"))
-                    columns = [stamps, *(_pointed(batch.column(name), table.decimal) for name in kept)]
+                    columns = [stamps, *(_with_decimal_point(batch.column(name), table.decimal) for name in kept)]
                     writer.write_table(pa.Table.from_arrays(columns, schema=pa.schema(fields)))
                     advance(path.name, file.tell() / size)
     except pa.ArrowInvalid as error:
@@ -178,7 +178,7 @@ def _texts(column: Any) -> list[str]:
     return ["" if cell is None else cell for cell in column.to_pylist()]
 
 
-def _pointed(column: Any, decimal: str) -> Any:
+def _with_decimal_point(column: Any, decimal: str) -> Any:
     """Return numbers with a decimal point; a Parquet file no longer says which mark its text has."""
     import pyarrow.compute as pc
 

@@ -235,10 +235,10 @@ def summary(result: ClosedLoopIdentification) -> str:
     late = f" and {model.input_delay} samples of dead time" if model.input_delay else ""
     sd = math.sqrt(float(model.innovation_covariance[0, 0]))
     found = f"order {model.order}{late}, poles {poles}, innovation sd {sd:.3g}"
-    return f"{found}; {_left_open(result)}{result.excitation.sentence}"
+    return f"{found}; {_alternatives_text(result)}{result.excitation.sentence}"
 
 
-def _left_open(result: ClosedLoopIdentification) -> str:
+def _alternatives_text(result: ClosedLoopIdentification) -> str:
     """Return what is said of other orders and dead times that the record leaves open; nothing where there are none."""
     from autotune.identification.closed_loop.loop_plant import PROBABLE
 

@@ -160,11 +160,11 @@ def init(
         twin.place(config)  # refused before anything is asked in vain
     answers: Table = {}
     if simulated and isinstance(twin, str):
-        content = _simulated(twin)
+        content = _simulated_config(twin)
     else:
         given = {"host": host, "device": device, "recording": recording, "y_span": y_span, "u_span": u_span}
         given |= {"endpoint": endpoint, "y_node": y_node, "u_node": u_node, "y_place": y_place, "u_place": u_place}
-        reached = _reached(questions, chosen, given | {"y": y_register, "u": u_register})
+        reached = _ask_rig(questions, chosen, given | {"y": y_register, "u": u_register})
         if registers and not chosen.has_registers:
             raise InputError(f'kind = "{chosen.name}" has no registers', where="--register", remedy="leave it out")
         add_registers(reached.get("registers", {}), registers or ())
@@ -179,7 +179,7 @@ def init(
             "u": questions.ask("--u", u, "command that holds it there, about", float),
         }
         questions.require()
-        played = _played(twin, config, answers)
+        played = _settings_of_twin(twin, config, answers)
         content = _real(reached | (played if simulated else {"twin": played} if played else {}), answers)
     content = {"name": config.stem, **content}
     set_keys(content, keys or ())
@@ -209,14 +209,14 @@ def _plant_or_model(answer: str) -> str | ModelOfRig:
         ) from None
 
 
-def _played(twin: Plant | ModelOfRig | None, config: Path, answers: Table) -> Table:
+def _settings_of_twin(twin: Plant | ModelOfRig | None, config: Path, answers: Table) -> Table:
     """Return what a simulated rig, or the twin of a real one, is to play: of a model with the usual sensor."""
     if isinstance(twin, ModelOfRig):
         span = abs(answers["y_range"][1] - answers["y_range"][0])
         return {
             "model": twin.path(config),
-            "noise": _rounded(NOISE * span),
-            "resolution": _rounded(span / CONVERTER),
+            "noise": _round(NOISE * span),
+            "resolution": _round(span / CONVERTER),
         }
     return {} if twin is None else {"plant": twin, **PLANTS[twin].get("rig", {})}
 
@@ -235,7 +235,7 @@ _CUSTOM = {f"{which}_file": f"certificates/{name}" for which, name in
            {"ca": "ca.pem", "cert": "host.pem", "key": "host.key", "server_cert": "server.pem"}.items()}  # fmt: skip
 
 
-def _reached(questions: Questions, kind: Kind, given: Mapping[str, Any]) -> Table:
+def _ask_rig(questions: Questions, kind: Kind, given: Mapping[str, Any]) -> Table:
     """Return the table [rig] of a rig that is there: what the settings of its kind have keys for is asked."""
     keys = kind.settings.model_fields
     rig: Table = {"kind": kind.name} | {key: name for key, name in _CUSTOM.items() if key in keys}
@@ -259,7 +259,7 @@ def _reached(questions: Questions, kind: Kind, given: Mapping[str, Any]) -> Tabl
     return rig
 
 
-def _simulated(plant: Plant) -> Table:
+def _simulated_config(plant: Plant) -> Table:
     known = dict(PLANTS[plant])
     return {"rig": {"kind": "simulated", "plant": plant, **known.pop("rig", {})}, **known}
 
@@ -272,19 +272,19 @@ def _real(rig: Table, answers: Table) -> Table:
     if not room > 0.0:
         raise InputError(f"y = {answers['y']:g} is not within {y_min:g}..{y_max:g}", where="operating_point.y")
     # a quarter of the room leaves the rest to overshoot; rounded to what a person would have written
-    swing = _rounded(0.25 * room)
+    swing = _round(0.25 * room)
     T_s = answers["sample_time_s"]
-    budget_s = max(60.0, _rounded(SWEEP_SAMPLES * T_s))
+    budget_s = max(60.0, _round(SWEEP_SAMPLES * T_s))
     return {
         "rig": rig,
         "signals": {name: answers[name] for name in ("sample_time_s", "u_unit", "y_unit")},
         "limits": {"u_min": u_min, "u_max": u_max, "u_safe": answers["u_safe"],
                    "y_min": y_min, "y_max": y_max, "swing": swing, "time_s": 4.0 * budget_s},
         "operating_point": {"y": answers["y"], "u_guess": answers["u"],
-                            "u_uncertainty": _rounded(0.05 * (u_max - u_min)), "approach": "hold"},
+                            "u_uncertainty": _round(0.05 * (u_max - u_min)), "approach": "hold"},
         "experiment": {"points": 5, "budget_s": budget_s},
     }  # fmt: skip
 
 
-def _rounded(value: float) -> float:
+def _round(value: float) -> float:
     return float(f"{value:.2g}")

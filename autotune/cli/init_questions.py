@@ -42,7 +42,7 @@ class Questions:
             if default is None:
                 self._missing.append(flag)
             return default
-        return typer.prompt(question, default=default, value_proc=_checked(convert))
+        return typer.prompt(question, default=default, value_proc=_ask_again_where_refused(convert))
 
     def require(self) -> None:
         """Refuse where an answer is missing.
@@ -57,7 +57,7 @@ class Questions:
             raise InputError(f"{flags}: no answer", where="autotune init", remedy="give them, or call it at a terminal")
 
 
-def _checked(convert: Callable[[str], Any]) -> Callable[[str], Any]:
+def _ask_again_where_refused(convert: Callable[[str], Any]) -> Callable[[str], Any]:
     """Let a question be asked again where its answer is refused."""
 
     def check(answer: str) -> Any:

@@ -157,7 +157,7 @@ def served(config: Config, device: RegisterDevice, *, refuse: Refusal | None = N
             # a pseudo-terminal knows no parity
             parity = settings.parity if twin.device else "N"
             transport = RtuTransport(device=end, baud=settings.baud, parity=parity, stop_bits=settings.stop_bits)
-            with _started(ModbusRig(device, transport, unit_id=settings.unit_id, refuse=refuse)) as rig:
+            with _start(ModbusRig(device, transport, unit_id=settings.unit_id, refuse=refuse)) as rig:
                 yield rig
         return
     ca_file = settings.ca_file if isinstance(settings, ModbusTlsSettings) else None
@@ -166,7 +166,7 @@ def served(config: Config, device: RegisterDevice, *, refuse: Refusal | None = N
     transport_tcp = TcpTransport(
         address=twin.listen, port=settings.port, ca_file=ca_file, cert_file=twin.cert_file, key_file=twin.key_file
     )
-    with _started(ModbusRig(device, transport_tcp, unit_id=settings.unit_id, refuse=refuse)) as rig:
+    with _start(ModbusRig(device, transport_tcp, unit_id=settings.unit_id, refuse=refuse)) as rig:
         yield rig
 
 
@@ -205,7 +205,7 @@ def served_opcua(config: Config, settings: OpcUaSettings, users: Mapping[str, st
     if settings.security_policy != "None":
         trusted = str(Path(str(settings.cert_file)).parent)
         security = Security(cert_file=twin.cert_file, key_file=twin.key_file, trusted=trusted, users=users)
-    with _started(OpcUaRig(device_of(config), nodes, settings.endpoint, security)) as rig:
+    with _start(OpcUaRig(device_of(config), nodes, settings.endpoint, security)) as rig:
         yield rig
 
 
@@ -228,7 +228,7 @@ def served_s7(config: Config, settings: S7Settings) -> Iterator[S7Rig]:
     from sim.s7_rig import S7Rig
 
     twin = _twin(settings)
-    with _started(S7Rig(device_of(config), s7_places(settings), twin.listen, settings.port)) as rig:
+    with _start(S7Rig(device_of(config), s7_places(settings), twin.listen, settings.port)) as rig:
         yield rig
 
 
@@ -285,7 +285,7 @@ def _twin(settings: AnyModbusSettings | OpcUaSettings | S7Settings | SerialSetti
 
 
 @contextmanager
-def _started(rig: _Served) -> Iterator[_Served]:
+def _start(rig: _Served) -> Iterator[_Served]:
     try:
         rig.__enter__()
     except ConnectionError as error:

@@ -81,7 +81,7 @@ def on_plants(
     what : str
         The plants in words.
     """
-    found = [_signed(margins(plant, controller)) for plant in plants]
+    found = [_margins_signed_by_stability(margins(plant, controller)) for plant in plants]
     asked = np.array([specification.modulus_margin, specification.phase_margin_rad])
     worst = min(found, key=lambda pair: float(np.min(np.array(pair[:2]) / asked)))
     modulus, phase, stable = worst
@@ -89,7 +89,7 @@ def on_plants(
     return Check(on=what, kept=kept, modulus=modulus, phase_rad=phase, stable=stable)
 
 
-def _signed(m: Margins) -> tuple[float, float, bool]:
+def _margins_signed_by_stability(m: Margins) -> tuple[float, float, bool]:
     return (m.modulus, m.phase_rad, True) if m.stable else (-m.modulus, -abs(m.phase_rad), False)
 
 

@@ -52,7 +52,7 @@ def disturbance_h2(loop: OpenLoop, relative_tolerance: float = 1e-9) -> float:
     if not loop.is_stable:
         return math.inf
     if isinstance(loop, SampledLoop):
-        return _sampled(loop, relative_tolerance)
+        return _norm_of_sampled(loop, relative_tolerance)
     assert isinstance(loop, ContinuousLoop)
     if order_at_zero(loop.plant) - min(order_at_zero(loop.plant) + order_at_zero(loop.controller), 0) < 1:
         return math.inf
@@ -127,7 +127,7 @@ def _rule(
     return np.asarray((values @ weights) * half)
 
 
-def _sampled(loop: SampledLoop, relative_tolerance: float) -> float:
+def _norm_of_sampled(loop: SampledLoop, relative_tolerance: float) -> float:
     T_s = loop.controller.sample_time_s
     if abs(np.sum(loop.controller.den)) > 1e-12 * np.sum(np.abs(loop.controller.den)):
         return math.inf

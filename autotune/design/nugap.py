@@ -66,7 +66,7 @@ def nu_gap(P1: Plant, P2: Plant, *, scaling: float = 1.0) -> float:
     Vinnicombe 1993; Le & Mendes 2010, equation (10).
     """
     H1, H2 = transfer_function_of(P1), transfer_function_of(P2)
-    if not _winding_condition(_scaled(H1, scaling), _scaled(H2, scaling)):
+    if not _winding_condition(_scale(H1, scaling), _scale(H2, scaling)):
         return 1.0
     omega = _pair_grid(H1, H2, scaling)
 
@@ -128,7 +128,7 @@ def optimal_stability_margin(plant: Plant, *, scaling: float = 1.0) -> float:
     ----------
     McFarlane & Glover 1990, with X and Y of the control and filtering Riccati equations.
     """
-    H = _scaled(transfer_function_of(plant), scaling)
+    H = _scale(transfer_function_of(plant), scaling)
     if H.delay_s > 0.0 or not H.is_proper:
         raise DesignError(
             "the optimal stability margin is computed for proper plants without dead time", where="nu-gap"
@@ -246,7 +246,7 @@ def validate(rig: Plant, reduced: Plant, controller: Controller, *, scaling: flo
     )
 
 
-def _scaled(system: TransferFunction, k: float) -> TransferFunction:
+def _scale(system: TransferFunction, k: float) -> TransferFunction:
     return TransferFunction(num=tuple(k * b for b in system.num), den=system.den, delay_s=system.delay_s)
 
 
@@ -262,7 +262,7 @@ def _winding_condition(H1: TransferFunction, H2: TransferFunction) -> bool:
     wno(1 + P_1~ P_2) + eta(P_1) - eta_0(P_2) - eta~(P_2) = 0, evaluated as the argument of the polynomial form along
     the axis, which needs no indentation around poles on it.
     """
-    N1, M1 = _mirrored(H1.num), _mirrored(H1.den)
+    N1, M1 = _mirror(H1.num), _mirror(H1.den)
     N2, M2 = np.array(H2.num), np.array(H2.den)
     n1, n2 = len(M1) - 1, len(M2) - 1
     lag = H2.delay_s - H1.delay_s
@@ -281,7 +281,7 @@ def _winding_condition(H1: TransferFunction, H2: TransferFunction) -> bool:
     return turned is not None and round(turned / (2.0 * np.pi)) == 0
 
 
-def _mirrored(coefficients: tuple[float, ...]) -> FloatArray:
+def _mirror(coefficients: tuple[float, ...]) -> FloatArray:
     """Coefficients of p(-s)."""
     values = np.array(coefficients)
     return np.asarray(values * (-1.0) ** np.arange(len(values) - 1, -1, -1))

@@ -163,7 +163,7 @@ def polished(problem: Problem, starts: FloatArray) -> PIDController:
     DesignError
         Not even a starting value keeps the constraints between the frequencies of the grid.
     """
-    best = _corrected(problem, starts)
+    best = _search_corrected(problem, starts)
     if best is not None and np.sum(best > 0.0) == _PI_GAINS:
         best = out_of_corner(problem, best)
     shape = (len(problem.plants), 4)
@@ -183,7 +183,7 @@ def polished(problem: Problem, starts: FloatArray) -> PIDController:
     return problem.controller(best)
 
 
-def _corrected(problem: Problem, starts: FloatArray) -> FloatArray | None:
+def _search_corrected(problem: Problem, starts: FloatArray) -> FloatArray | None:
     """Return the best parameters, the constraints on the grid shifted until they are the exact ones; None if none."""
     offset = np.zeros((len(problem.plants), 4))
     best: tuple[float, FloatArray] | None = None

@@ -275,13 +275,13 @@ def _result(
         sweep_time_s=sum(part.sweep_time_s for part in parts),
         parts=parts,
         reason="completed",
-        warnings=(*sweep_warnings(segments, config.experiment, known.link_rad_s, together), *_missed(timing)),
+        warnings=(*sweep_warnings(segments, config.experiment, known.link_rad_s, together), *_missed_text(timing)),
         together=together,
         by_itself=reason_noted(noted),
     )
 
 
-def _missed(timing: Timing) -> tuple[str, ...]:
+def _missed_text(timing: Timing) -> tuple[str, ...]:
     """Return what the reader should know of samples that were missed."""
     if timing.missed_share <= NOTABLE_SHARE:
         return ()

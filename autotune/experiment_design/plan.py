@@ -98,7 +98,7 @@ def _within_swing(
         planned = planned_recording(found.search.retuned.fit.sim, conditions, smaller)
         if planned is None:
             continue
-        plan, y = _told(found, hypotheses, smaller, planned)
+        plan, y = _rate_excitation(found, hypotheses, smaller, planned)
         if np.max(np.abs(y - conditions.y), initial=0.0) <= conditions.limits.swing:
             return [plan]
     return []
@@ -221,7 +221,7 @@ def _rest(sim: Simulator, y: float) -> tuple[FloatArray, float]:
     return rest[: chain.order], float(rest[chain.order])
 
 
-def _told(
+def _rate_excitation(
     found: Diagnosis, hypotheses: dict[str, tuple[Hypothesis, float]], one: Excitation, planned: Recording
 ) -> tuple[Plan, FloatArray]:
     """Return an excitation with its expected discrimination, and all readings that the hypotheses predict."""

@@ -92,16 +92,16 @@ def read_recordings(
     if given == SignalNames() and form == FileForm() and is_own_form(path):
         return Reading(recordings=(read_recording(path),), names=SignalNames(t="t", u="u", y="y"))
     table = open_table(path, form)
-    roles = _confirmed(table, find_roles(table, given), ask)
+    roles = _confirm(table, find_roles(table, given), ask)
     signals = signals_of(table, roles, form)
-    said, notes = _said(table, roles, signals.stamp), list(signals.notes)
+    said, notes = _describe(table, roles, signals.stamp), list(signals.notes)
     metadata = {**read_sidecar(path), "units": _units(table, roles), "file": _origin(path, table, roles, signals.stamp)}
     parts = parts_of(signals.columns, longest_gap_s, notes, str(path))
     recordings = tuple(_recording(part, metadata, str(path), i) for i, part in enumerate(parts))
     return Reading(recordings=recordings, names=roles.names, said=said, notes=tuple(notes))
 
 
-def _confirmed(table: Table, roles: Roles, ask: Ask | None) -> Roles:
+def _confirm(table: Table, roles: Roles, ask: Ask | None) -> Roles:
     """Ask for what is not sure, or refuse the file with the line that would do."""
     if not roles.unsure:
         return roles
@@ -185,7 +185,7 @@ def _origin(path: Path, table: Table, roles: Roles, stamp: StampForm) -> dict[st
     return {"name": path.name, "columns": columns, "form": table.form, "stamps": stamp.text}
 
 
-def _said(table: Table, roles: Roles, stamp: StampForm) -> str:
+def _describe(table: Table, roles: Roles, stamp: StampForm) -> str:
     names = {role: name for role, name in vars(roles.names).items() if name and role != "t"}
     taken = ", ".join(f"{role} = {table.described(name)}" for role, name in names.items())
     time = " + ".join(roles.time)

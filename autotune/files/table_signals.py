@@ -124,7 +124,7 @@ def stamp_form(table: Table, time: Sequence[str], form: FileForm) -> StampForm:
         return StampForm(text=f"numbers, {form.time_unit_s:g} s each", unit_s=form.time_unit_s, decimal=table.decimal)
     if time[0] in table.in_seconds:
         return StampForm(text="time stamps")
-    found = detect_form(_joined(table.sample, time[:2]), time[0], table.units.get(time[0], ""), table.decimal)
+    found = detect_form(_join_stamps(table.sample, time[:2]), time[0], table.units.get(time[0], ""), table.decimal)
     if found is not None:
         return found
     cells = [str(cell) for cell in table.sample[time[0]] if str(cell).strip()]
@@ -157,7 +157,7 @@ def stamps_of(table: Table, time: Sequence[str], cells: Mapping[str, Cells], for
     if isinstance(cells[time[0]], np.ndarray) and time[0] in table.in_seconds:
         return np.asarray(cells[time[0]])
     clock = [name for name in time if _is_clock(table, name)]
-    t = seconds(_joined(cells, [time[0], *clock]) if clock else cells[time[0]], form, table.path)
+    t = seconds(_join_stamps(cells, [time[0], *clock]) if clock else cells[time[0]], form, table.path)
     for name in time[1:]:
         if name not in clock:
             t = t + 1e-3 * numbers(cells[name], table.decimal)[0]
@@ -169,7 +169,7 @@ def _is_clock(table: Table, name: str) -> bool:
     return found is not None and found.text == "time of day" and table.names.index(name) > 0
 
 
-def _joined(cells: Mapping[str, Cells], time: Sequence[str]) -> Cells:
+def _join_stamps(cells: Mapping[str, Cells], time: Sequence[str]) -> Cells:
     """Return date and time of day as one stamp where they stand in two columns."""
     first = cells[time[0]]
     if len(time) < 2 or isinstance(first, np.ndarray) or not any(":" in str(cell) for cell in cells[time[1]]):

@@ -83,7 +83,7 @@ def _layout(path: Path, lines: Sequence[str], form: FileForm) -> Layout:
     tried = [form.delimiter] if form.delimiter else list(_DELIMITERS)
     best: tuple[float, str, Header] | None = None
     for delimiter in tried:
-        rows = [_stripped(row) for row in split([line for _, line in body], delimiter)]
+        rows = [_strip(row) for row in split([line for _, line in body], delimiter)]
         found = read_header(rows, form.skip_rows)
         fit = 0.0 if found is None else _consistency(rows[found.first_row :])
         if found is not None and len(found.names) > 1 and (best is None or fit > best[0] + 0.05):
@@ -162,7 +162,7 @@ def _cells_of(lines: Iterable[str], delimiter: str) -> Iterator[list[str]]:
         ) from None
 
 
-def _stripped(row: Sequence[str]) -> list[str]:
+def _strip(row: Sequence[str]) -> list[str]:
     return [cell.strip().strip('"').strip() for cell in row]
 
 
@@ -185,7 +185,7 @@ def _with_commented_names(
     if header.rows or at == 0 or not lines[at - 1].lstrip().startswith(_COMMENT):
         return header
     above = lines[at - 1].lstrip().lstrip("#%/ ")
-    rows = [_stripped(row) for row in split([above, *[line for _, line in body[header.first_row :]]], delimiter)]
+    rows = [_strip(row) for row in split([above, *[line for _, line in body[header.first_row :]]], delimiter)]
     found = read_header(rows)
     if found is None or found.rows != 1 or len(found.names) != len(header.names):
         return header

@@ -64,7 +64,7 @@ def _starts(structure: Structure, evidence: Evidence, rng: np.random.Generator) 
     return np.clip(x, lower + margin, upper - margin), lower, upper
 
 
-def _fitted(structure: Structure, evidence: Evidence, rng: np.random.Generator) -> FloatArray:
+def _fit(structure: Structure, evidence: Evidence, rng: np.random.Generator) -> FloatArray:
     """Return the (K, P) parameters within the region that least squares ends at from several starts.
 
     Levenberg and Marquardt's method, for all starts at once; what would leave the bounds stays on them.
@@ -98,7 +98,7 @@ def _fitted(structure: Structure, evidence: Evidence, rng: np.random.Generator) 
     return np.asarray(x[inside])
 
 
-def _sampled(structure: Structure, evidence: Evidence, fitted: FloatArray, rng: np.random.Generator) -> FloatArray:
+def _sample(structure: Structure, evidence: Evidence, fitted: FloatArray, rng: np.random.Generator) -> FloatArray:
     """Return (M, P) parameters spread over the region: the stretch move of Goodman & Weare (2010), flat inside."""
     lower, upper = bounds(structure, evidence)
 
@@ -200,11 +200,11 @@ def _consistent(points: tuple[FrequencyPoint, ...], probability: float) -> Consi
         size = len(structure.names)
         if size > min(least + _MORE, 2 * len(points) - 1):
             continue
-        fitted = _fitted(structure, evidence, rng)
+        fitted = _fit(structure, evidence, rng)
         if not len(fitted):
             continue
         least = min(least, size)
-        sample = _sampled(structure, evidence, fitted, rng)
+        sample = _sample(structure, evidence, fitted, rng)
         plants += [_built(structure, x, evidence) for x in sample[rng.permutation(len(sample))[:_KEPT]]]
         structures.append(structure)
         sizes = np.sum(evidence.residuals(responses(structure, fitted, evidence.omega)) ** 2, axis=1)

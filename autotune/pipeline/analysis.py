@@ -165,7 +165,7 @@ def analyse(
     usable = _as_independent(usable, fit)
     facts = facts or LoopFacts()
     asked, noise_source = specification(settings, fit, facts, _highest(usable, fit, facts))
-    reduced = _reduced(usable, fit)
+    reduced = _reduce(usable, fit)
     bases = _bases(usable, fit, lambda: reduced, asked, settings.kind)
     progress("designing", 0.0)
     source, found, looked = _first_kept(bases, settings.source, usable, fit)
@@ -218,7 +218,7 @@ def on_measured(
     IdentificationError, DesignError
         On no basis is there a controller that keeps its margins on all of it; the reason is that of the first.
     """
-    return _first_kept(_bases(points, fit, lambda: _reduced(points, fit), asked, kind), "auto", points, fit)
+    return _first_kept(_bases(points, fit, lambda: _reduce(points, fit), asked, kind), "auto", points, fit)
 
 
 def on_reduced_model(
@@ -426,7 +426,7 @@ def _as_independent(points: Sequence[FrequencyPoint], fit: PlantFit) -> list[Fre
     return [replace(one, covariance=as_pairs(fit.shared_errors * np.array(one.covariance))) for one in points]
 
 
-def _reduced(points: Sequence[FrequencyPoint], fit: PlantFit) -> ReducedModel | AutotuneError:
+def _reduce(points: Sequence[FrequencyPoint], fit: PlantFit) -> ReducedModel | AutotuneError:
     """Return the reduced model of the points, or why there is none."""
     try:
         return reduce_points(points, fit=fit if fit.source == "points" else None)

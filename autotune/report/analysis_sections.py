@@ -60,7 +60,7 @@ def analysis_sections(
     )
 
 
-def _fitted_to(analysis: Analysis) -> str:
+def _source_text(analysis: Analysis) -> str:
     if analysis.fit.source == "recording":
         return "through the recording"
     return "to all rows of the sweep" if is_of_rows(analysis) else "through the points"
@@ -69,7 +69,7 @@ def _fitted_to(analysis: Analysis) -> str:
 def _model_section(analysis: Analysis, signals: SignalSettings) -> Section:
     reduced, fit = analysis.reduced, analysis.fit
     fitted = (
-        f"A transfer function was fitted {_fitted_to(analysis)}:"
+        f"A transfer function was fitted {_source_text(analysis)}:"
         f" {_transfer_text(fit, signals)}."
         # of a recording the noise is estimated from the same residual: its chi-square would say nothing
         + (

@@ -22,12 +22,12 @@ _DIGITS = 7
 
 def Scatter(**settings: Any) -> Trace:  # noqa: N802 - plotly's own name
     """Return a trace of points or lines; the settings are plotly's, ``line_shape`` for ``line: {shape}``."""
-    return {"type": "scatter", **_nested(settings)}
+    return {"type": "scatter", **_nest(settings)}
 
 
 def Bar(**settings: Any) -> Trace:  # noqa: N802 - plotly's own name
     """Return a trace of bars."""
-    return {"type": "bar", **_nested(settings)}
+    return {"type": "bar", **_nest(settings)}
 
 
 def make_subplots(
@@ -122,7 +122,7 @@ class Chart:
 
     def update_layout(self, **settings: Any) -> None:
         """Set what holds for the whole chart."""
-        self.layout |= _nested(settings)
+        self.layout |= _nest(settings)
 
     def update_xaxes(self, row: int | None = None, col: int | None = None, **settings: Any) -> None:
         """Set horizontal axes: all, or those of a row or a column.
@@ -186,7 +186,7 @@ class Chart:
 
     def add_shape(self, **settings: Any) -> None:
         """Draw a shape."""
-        self.layout["shapes"].append(_nested(settings))
+        self.layout["shapes"].append(_nest(settings))
 
     def add_annotation(self, *, row: int | None = None, col: int | None = None, **settings: Any) -> None:
         """Write a text at a place.
@@ -201,7 +201,7 @@ class Chart:
         if row is not None or col is not None:
             name = self._name(row or 1, col or 1)
             settings = {"xref": f"x{name}", "yref": f"y{name}", **settings}
-        self.layout["annotations"].append(_nested(settings))
+        self.layout["annotations"].append(_nest(settings))
 
     def to_json(self) -> str:
         """Return traces and layout as JSON, numbers to seven digits, no number as null."""
@@ -214,10 +214,10 @@ class Chart:
         for i in range(self.rows * self.cols):
             if row in (None, i // self.cols + 1) and col in (None, i % self.cols + 1):
                 own = self.layout.setdefault(f"{axis}{_suffix(i)}", {})
-                own |= _nested(settings)
+                own |= _nest(settings)
 
 
-def _nested(settings: Mapping[str, Any]) -> dict[str, Any]:
+def _nest(settings: Mapping[str, Any]) -> dict[str, Any]:
     """Return the settings with ``line_shape`` and the like inside their group, and a title as plotly.js wants it."""
     nested: dict[str, Any] = {}
     for key, value in settings.items():

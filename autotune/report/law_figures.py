@@ -71,10 +71,10 @@ def free_run_figure(run: UnseenRun, name: str) -> Figure:
     figure.update_xaxes(title="t [s]", row=2, col=1)
     for a, b in zip(run.starts_s, run.heads_s, strict=True):
         figure.add_vrect(a, b, fillcolor="rgba(128,128,128,0.16)", line={"width": 0}, layer="below")
-    return Figure(figure=figure, caption=_said_of(run, name), height_px=460)
+    return Figure(figure=figure, caption=_caption_of_run(run, name), height_px=460)
 
 
-def _said_of(run: UnseenRun, name: str) -> str:
+def _caption_of_run(run: UnseenRun, name: str) -> str:
     errors = ", ".join(
         f"{model} {100 * e:.3g} %" if math.isfinite(e) else f"{model} runs away" for model, e in run.errors.items()
     )
@@ -106,10 +106,10 @@ def law_figure(law: MissingLaw) -> Figure:
                     error_y={"type": "data", "array": 1.96 * branch.error, "color": GREY, "thickness": 1.2, "width": 3},
                 )
             )  # fmt: skip
-    return Figure(figure=figure, caption=_said_of_law(law), height_px=360)
+    return Figure(figure=figure, caption=_caption_of_law(law), height_px=360)
 
 
-def _said_of_law(law: MissingLaw) -> str:
+def _caption_of_law(law: MissingLaw) -> str:
     bins = sum(b.at.size for b in law.branches)
     near = sum(int(np.sum(np.abs(b.found - _at(b)) < 1.96 * _both(b))) for b in law.branches)
     told = sum(int(np.sum(np.abs(b.found - (b.at if law.is_whole else 0.0)) > 1.96 * b.error)) for b in law.branches)

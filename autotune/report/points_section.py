@@ -137,13 +137,13 @@ def _described_table(points: Sequence[FrequencyPoint], sign: int, experiment: Ex
     for point in points:
         found = described.get(point.omega_rad_s)
         if found is not None:
-            turned = _wrapped(found.phase_rad - float(np.angle(sign * point.response)))
+            turned = _wrap_angle(found.phase_rad - float(np.angle(sign * point.response)))
             gain = f"{100 * (found.gain / point.gain - 1):+.0f} %"
             rows.append((f"{point.omega_rad_s:.4g}", gain, f"{math.degrees(turned):+.1f}"))
     return Table(header=("ω [rad/s]", "gain error", "phase error [deg]"), rows=tuple(rows)) if rows else None
 
 
-def _wrapped(angle_rad: float) -> float:
+def _wrap_angle(angle_rad: float) -> float:
     return (angle_rad + math.pi) % (2 * math.pi) - math.pi
 
 

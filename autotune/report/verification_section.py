@@ -40,7 +40,7 @@ def verification_section(verification: Verification, signals: SignalSettings) ->
     return Section(
         title="Verification on the rig",
         text=(
-            _asked(verification.test, signals),
+            _test_text(verification.test, signals),
             sentence(f"{verification.whose}: {verification.reason}"),
             *((sentence(law.sentence),) if (law := verification.running_law) is not None else ()),
         ),
@@ -72,7 +72,7 @@ def sentence(text: str) -> str:
     return f"{text[0].upper()}{text[1:]}."
 
 
-def _asked(test: StepTest, signals: SignalSettings) -> str:
+def _test_text(test: StepTest, signals: SignalSettings) -> str:
     step = f"Set-point step of {test.setpoint[0]:.3g} {signals.y_unit}"
     if not _has_load(test):
         return f"{step}, then back; no load was tried, as none is mapped in [rig]."

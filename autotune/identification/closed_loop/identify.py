@@ -156,12 +156,12 @@ def identify_closed_loop(
     longest, starts = max(pieces, key=len), _starts(pieces)
     u, y, r = _columns(pieces)
     dt_s = longest.sample_time_s
-    law = _checked_law(longest, controller, r is not None, warnings)
+    law = _check_law(longest, controller, r is not None, warnings)
     scale_u, scale_y = float(np.std(u)), float(np.std(y))
     u_1, y_1 = ((u - u.mean()) / scale_u)[:, None], ((y - y.mean()) / scale_y)[:, None]
     with threadpool_limits(1):  # threads spin longer on these small matrices than they work
         motion = _look(u_1, y_1, r, starts, recording.name)
-        estimate, others, evidence = _fitted(u_1, y_1, starts, order, delay, max_order, progress)
+        estimate, others, evidence = _fit(u_1, y_1, starts, order, delay, max_order, progress)
         white = whiteness(estimate, residuals(estimate, u_1, y_1, starts))
         found = Structures(
             chosen=_in_units(estimate, scale_u, scale_y, dt_s),
@@ -175,7 +175,7 @@ def identify_closed_loop(
     return replace(result, evidence=evidence, warnings=tuple(warnings))
 
 
-def _fitted(
+def _fit(
     u: FloatArray,
     y: FloatArray,
     starts: tuple[int, ...],
@@ -211,7 +211,7 @@ def _columns(pieces: Sequence[Recording]) -> tuple[FloatArray, FloatArray, Float
     return u, y, r if np.all(np.isfinite(r)) else None
 
 
-def _checked_law(
+def _check_law(
     recording: Recording, controller: Controller | None, has_r: bool, warnings: list[str]
 ) -> LawCheck | None:
     if controller is None:

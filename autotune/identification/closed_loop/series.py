@@ -86,7 +86,7 @@ class Series:
         """Return the initial state of each stretch, (stretches, n): the predictor's own where there is one only."""
         if not self.is_cut:
             return predictor.x0[None]
-        return np.array([_fitted_state(predictor, u, y) for u, y in self.stretches])
+        return np.array([_fit_state(predictor, u, y) for u, y in self.stretches])
 
     def errors(self, predictor: Predictor, states: FloatArray) -> FloatArray:
         """Return the innovations, (N, n_y), each stretch from its state.
@@ -146,7 +146,7 @@ class Series:
             whole: FloatArray = parts[0]
             return whole
         of_state = np.append(_of_state(predictor, directions), False)
-        return np.asarray(sum(_eliminated(part, of_state) for part in parts), dtype=np.float64)
+        return np.asarray(sum(_eliminate_state(part, of_state) for part in parts), dtype=np.float64)
 
 
 def _of_state(predictor: Predictor, directions: FloatArray) -> BoolArray:
@@ -155,7 +155,7 @@ def _of_state(predictor: Predictor, directions: FloatArray) -> BoolArray:
     return moves
 
 
-def _fitted_state(predictor: Predictor, u: FloatArray, y: FloatArray) -> FloatArray:
+def _fit_state(predictor: Predictor, u: FloatArray, y: FloatArray) -> FloatArray:
     """Return the initial state (n,) of a stretch with the least errors, corrected once for rounding."""
     n, entries = len(predictor.x0), predictor.packed().size
     inner = np.eye(entries, n, n - entries)
@@ -168,7 +168,7 @@ def _fitted_state(predictor: Predictor, u: FloatArray, y: FloatArray) -> FloatAr
     return x0
 
 
-def _eliminated(total: FloatArray, of_state: BoolArray) -> FloatArray:
+def _eliminate_state(total: FloatArray, of_state: BoolArray) -> FloatArray:
     """Return the normal equations of the other columns, those of the state at their best for every step."""
     own, cross, rest = total[np.ix_(of_state, of_state)], total[np.ix_(~of_state, of_state)], ~of_state
     return np.asarray(total[np.ix_(rest, rest)] - cross @ _inverse(own) @ cross.T, dtype=np.float64)

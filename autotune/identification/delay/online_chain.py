@@ -198,7 +198,7 @@ def step_row(
             whole = np.ones((C.shape[0], A.size))
             whole[:, : A.size - 1] = C
             C = whole
-        _averaged(C, D, A, R, slow, spread, scalars, step, n, lam, memory_s, offset)
+        _solve_averaged(C, D, A, R, slow, spread, scalars, step, n, lam, memory_s, offset)
     if delayed and t[k] - scalars[FIRST_T] > after and A[n] != 0.0:
         lacking = A[n + 1] / A[n]
         moved = max(step * rate * lacking, -scalars[H])  # u is not known ahead of its time
@@ -259,7 +259,7 @@ def step_rows(
 
 
 @njit(cache=True)
-def _averaged(
+def _solve_averaged(
     C: FloatArray,
     D: FloatArray,
     A: FloatArray,

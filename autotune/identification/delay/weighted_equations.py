@@ -103,14 +103,14 @@ def minimise_weighted(equations: Equations, start: FloatArray) -> Weighted:
         Equations that noise on y does not enter.
     """
     values = np.asarray(start, dtype=np.float64)
-    here = _evaluated(equations, values)
+    here = _evaluate(equations, values)
     settled = False
     for _ in range(_ROUNDS):
         size = np.maximum(np.linalg.norm(here.jacobian, axis=0), np.finfo(np.float64).tiny)
         step = -np.linalg.lstsq(here.jacobian / size, here.whitened, rcond=1e-10)[0] / size
         far = float(np.linalg.norm(here.jacobian @ step)) / max(np.sqrt(here.cost / max(here.freedom, 1)), 1e-300)
         for _halving in range(8):
-            trial = _evaluated(equations, values + step)
+            trial = _evaluate(equations, values + step)
             if trial.cost <= here.cost or far < 1e-2:
                 break
             step, far = 0.5 * step, 0.5 * far
@@ -133,7 +133,7 @@ class _Evaluated:
     freedom: int
 
 
-def _evaluated(equations: Equations, values: FloatArray) -> _Evaluated:
+def _evaluate(equations: Equations, values: FloatArray) -> _Evaluated:
     """Return the whitened equations and their derivatives, those of the output that noise is taken off."""
     e, G = equations.left(values), equations.of_noise(values)
     scale = np.linalg.norm(G, axis=1)

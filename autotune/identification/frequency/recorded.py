@@ -138,13 +138,13 @@ def combine(estimates: Sequence[FrequencyEstimate]) -> FrequencyEstimate:
             groups[-1].append(point)
         else:
             groups.append([point])
-    merged = [_merged(group) for group in groups]
+    merged = [_merge(group) for group in groups]
     chi_square = sum(one[1] for one in merged)
     freedom = sum(2 * (len(group) - 1) for group in groups)
     notes = tuple(note for one in estimates for note in one.notes)
     result = tuple(one[0] for one in merged)
     if freedom:
-        notes, result = _judged(groups, result, chi_square, freedom, notes)
+        notes, result = _judge(groups, result, chi_square, freedom, notes)
     return FrequencyEstimate(
         points=result,
         excitation=estimates[0].excitation,
@@ -153,7 +153,7 @@ def combine(estimates: Sequence[FrequencyEstimate]) -> FrequencyEstimate:
     )
 
 
-def _merged(group: Sequence[FrequencyPoint]) -> tuple[FrequencyPoint, float]:
+def _merge(group: Sequence[FrequencyPoint]) -> tuple[FrequencyPoint, float]:
     """Return the weighted mean of points at one frequency and the chi-square of their disagreement."""
     if len(group) == 1:
         return group[0], 0.0
@@ -173,7 +173,7 @@ def _merged(group: Sequence[FrequencyPoint]) -> tuple[FrequencyPoint, float]:
     return point, float(np.einsum("ni,nij,nj->", apart, weights, apart))
 
 
-def _judged(
+def _judge(
     groups: Sequence[Sequence[FrequencyPoint]],
     points: tuple[FrequencyPoint, ...],
     chi_square: float,

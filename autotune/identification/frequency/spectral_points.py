@@ -89,7 +89,7 @@ def points_of_spectra(recording: Recording, largest_relative_sd: float) -> Frequ
     kept: tuple[FrequencyPoint, ...] = ()
     tried = 0
     for per_decade in _PER_DECADE:
-        estimates, reference = _corrected(t, u, y, r, highest, repeat=repeat, per_decade=per_decade)
+        estimates, reference = _estimate_corrected(t, u, y, r, highest, repeat=repeat, per_decade=per_decade)
         points = [point for one in estimates if (point := _point(one, reference, source)) is not None]
         enough = tuple(point for point in points if _relative_sd(point, reference) <= largest_relative_sd)
         if len(enough) > len(kept):
@@ -119,7 +119,7 @@ def _moving_setpoint(recording: Recording) -> FloatArray | None:
     return r if float(np.max(np.abs(cross))) > limit else None
 
 
-def _corrected(
+def _estimate_corrected(
     t: FloatArray,
     u: FloatArray,
     y: FloatArray,
