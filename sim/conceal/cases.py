@@ -162,7 +162,17 @@ def _answer(d: Draw, records: list[Record], physics: Physics, made: tuple[Sized,
 
 
 def write(seed: int, folder: Path, answer_file: Path) -> dict[str, Any]:
-    """Write the case of one seed: model, recordings and sidecars to ``folder``, the answer to ``answer_file``."""
+    """Write the case of one seed, and its answer.
+
+    Parameters
+    ----------
+    seed : int
+        Of the case.
+    folder : Path
+        For what the tool is given.
+    answer_file : Path
+        For the answer, elsewhere.
+    """
     d, records, answer = make(seed)
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "model.toml").write_text(model_file(d.rig), encoding="utf-8")

@@ -40,7 +40,15 @@ class Steps:
 
 
 def discretise(chain: Chain, Ts: float) -> Steps:
-    """Exact step of the chain over one sample time with the command's switch inside it."""
+    """Return the exact step of the chain over one sample time with the command's switch inside it.
+
+    Parameters
+    ----------
+    chain : Chain
+        The nominal form.
+    Ts : float
+        Sample time [s].
+    """
     lags = [(chain.tau_actuator, 1.0), (chain.tau_plant, chain.K)]
     if chain.integrating:
         lags.append((np.inf, 1.0))
@@ -131,7 +139,19 @@ def _powers(A: Floats, c: Floats, length: int) -> Floats:
 
 
 def residuals(chain: Chain, u: Floats, y: Floats, Ts: float, window: int) -> Floats:
-    """Residuals of free runs over whole windows, each window's starting state fitted."""
+    """Residuals of free runs over whole windows, each window's starting state fitted.
+
+    Parameters
+    ----------
+    chain : Chain
+        The nominal form.
+    u, y : (N,) array
+        Command and reading.
+    Ts : float
+        Sample time [s].
+    window : int
+        Rows of a window.
+    """
     steps = discretise(chain, Ts)
     count = len(y) // window
     runs = _free_runs(steps.A, steps.b_before, steps.b_after, u - chain.u_offset, steps.rows, 0, count, window)
@@ -162,6 +182,19 @@ def retune(
     """Refit gain, lags, delay (each within a factor of two) and one offset by damped, projected Gauss-Newton.
 
     Returns the refitted chain and its rms residual.
+
+    Parameters
+    ----------
+    nominal : Chain
+        Where it begins.
+    records : list of ((N,) array, (N,) array)
+        u and y of each recording.
+    Ts : float
+        Sample time [s].
+    window : int
+        Rows of a window.
+    tolerance : float
+        Relative decrease of the sum of squares below which it ends.
     """
     count = 4 if nominal.integrating else 5
     bound = np.full(5, np.log(2.0))
@@ -202,7 +235,19 @@ def retune(
 
 
 def forecast_error(chain: Chain, u: Floats, y: Floats, Ts: float, horizon: int) -> Floats:
-    """Errors of forecasts over one horizon each, started from the state fitted to the two horizons before."""
+    """Errors of forecasts over one horizon each, started from the state fitted to the two horizons before.
+
+    Parameters
+    ----------
+    chain : Chain
+        The nominal form.
+    u, y : (N,) array
+        Command and reading.
+    Ts : float
+        Sample time [s].
+    horizon : int
+        Rows of a forecast.
+    """
     steps = discretise(chain, Ts)
     rows = _observability(steps, 3 * horizon)
     fit = np.linalg.pinv(rows[: 2 * horizon])

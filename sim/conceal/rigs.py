@@ -143,7 +143,19 @@ def _process(rng: np.random.Generator, variant: str) -> NominalRig:
 
 
 def truth(rng: np.random.Generator, rig: NominalRig, exact: bool, offset: bool) -> Physics:
-    """Draw the rig as it is: every number within 20 % of its nominal value, the operating point shifted where asked."""
+    """Draw the rig as it is: every number within 20 % of its nominal value, the operating point shifted where asked.
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+        Source of the numbers.
+    rig : NominalRig
+        As it is believed to be.
+    exact : bool
+        Whether every number is the nominal one.
+    offset : bool
+        Whether the operating point is shifted.
+    """
     chain = rig.chain
     factors = np.ones(5) if exact else rng.uniform(0.8, 1.2, 5)
     shift = {BALL: 0.03, SERVO: 0.07, PROCESS: 0.0}[rig.rig] * float(rng.uniform(-1.0, 1.0)) if offset else 0.0

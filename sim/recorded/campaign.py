@@ -156,7 +156,15 @@ def _marked(campaign: Campaign, seed: int, before: Json, reached: float) -> Reco
 
 
 def raises_alarm(said: Json, before: Json) -> bool:
-    """Whether something is said of a changed recording that was not said of the recording as it is."""
+    """Whether something is said of a changed recording that was not said of the recording as it is.
+
+    Parameters
+    ----------
+    said : mapping
+        Of the changed recording.
+    before : mapping
+        Of the recording as it is.
+    """
     worse = said["verdict"] in ALARMS and before["verdict"] not in (*ALARMS, "effect")
     return bool(_new_names(said, before)) or worse or (said["verdict"] == "failed" != before["verdict"])
 
@@ -167,7 +175,15 @@ def _new_names(said: Json, before: Json) -> set[str]:
 
 
 def as_json(campaign: RecordedCampaign, marks: Sequence[RecordedMark]) -> Json:
-    """Return marks, what was said of the recordings as they are, and what was passed over, for ``proof.json``."""
+    """Return marks, what was said of the recordings as they are, and what was passed over, for ``proof.json``.
+
+    Parameters
+    ----------
+    campaign : RecordedCampaign
+        Its folder and rigs.
+    marks : sequence of RecordedMark
+        One for each case.
+    """
     plain = campaign.as_recorded
     return {
         "marks": [{**asdict(m.mark), "before": m.before, "not_counted": m.not_counted} for m in marks],
