@@ -197,7 +197,7 @@ class RunsRelay(Rig, Protocol):
         row_s : float
             Time between two rows [s].
         time_s : float
-            When the device ends it [s].
+            How long it may run before the device ends it [s].
         y_range : (float, float)
             Lowest and highest y; beyond them the device ends it [y unit].
         """
@@ -235,7 +235,7 @@ class RunsLaws(RunsRelay, Exchanges, Protocol):
         row_s : float
             Time between two rows [s].
         time_s : float
-            When the device ends it [s].
+            How long it may run before the device ends it [s].
         y_range : (float, float)
             Lowest and highest y; beyond them the device ends it [y unit].
         """
