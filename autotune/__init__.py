@@ -68,7 +68,8 @@ if TYPE_CHECKING:
     from autotune.controller import PIDController as PI  # noqa: N814 - as people write it
     from autotune.controller import read_controller
     from autotune.identification.delay.online_modulating import OnlineEstimator
-    from autotune.models import TransferFunction, read_model
+    from autotune.model_tables import read_model
+    from autotune.models import TransferFunction
     from autotune.recording import Recording
 
 #: name -> module and name there
@@ -96,7 +97,7 @@ _HOMES = {
     "OnlineEstimator": "autotune.identification.delay.online_modulating",
     "TransferFunction": "autotune.models",
     "Recording": "autotune.recording",
-    "read_model": "autotune.models",
+    "read_model": "autotune.model_tables",
     "read_controller": "autotune.controller",
 }
 

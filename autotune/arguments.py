@@ -25,6 +25,17 @@ T = TypeVar("T")
 def one_of(value: Any, allowed: Iterable[str], *, name: str, where: str, default: str | None = None) -> Any:
     """Return ``value`` if it is one of the allowed words, in whatever case it is written.
 
+    Parameters
+    ----------
+    value : object
+        What was given.
+    allowed : iterable of str
+        The words, in lower case.
+    name, where : str
+        The argument and the function, for the refusal.
+    default : str, optional
+        Stands for None.
+
     Raises
     ------
     InputError
@@ -66,7 +77,9 @@ def settings_of(
             raise InputError(f"no setting {name!r}", where=where, remedy=_nearest(name, known))
     hints = _hints(function)
     return {
-        name: of_type(value, hints.get(name, Any), name=name, where=where, endless=parameters[name].default == math.inf)
+        name: _of_type(
+            value, hints.get(name, Any), name=name, where=where, endless=parameters[name].default == math.inf
+        )
         for name, value in settings.items()
     }
 
@@ -82,7 +95,9 @@ def checked(function: Callable[P, T]) -> Callable[P, T]:
         for name, value in given.arguments.items():
             if name in hints:
                 endless = signature.parameters[name].default in (math.inf, -math.inf)
-                given.arguments[name] = of_type(value, hints[name], name=name, where=function.__name__, endless=endless)
+                given.arguments[name] = _of_type(
+                    value, hints[name], name=name, where=function.__name__, endless=endless
+                )
         return function(*given.args, **given.kwargs)
 
     return call
@@ -98,7 +113,7 @@ def _hints(function: Callable[..., Any]) -> dict[str, Any]:
     return get_type_hints(SimpleNamespace(__annotations__=given), globalns=getattr(function, "__globals__", None))
 
 
-def of_type(value: Any, hint: Any, *, name: str, where: str, endless: bool = False) -> Any:
+def _of_type(value: Any, hint: Any, *, name: str, where: str, endless: bool = False) -> Any:
     """Return a value as the type that an annotation asks for: numbers as float or int, sequences element by element.
 
     Raises
@@ -109,7 +124,7 @@ def of_type(value: Any, hint: Any, *, name: str, where: str, endless: bool = Fal
     origin, inner = get_origin(hint), get_args(hint)
 
     def each(values: Iterable[Any], hints: Iterable[Any]) -> Iterator[Any]:
-        return (of_type(one, wanted, name=name, where=where) for one, wanted in zip(values, hints, strict=False))
+        return (_of_type(one, wanted, name=name, where=where) for one, wanted in zip(values, hints, strict=False))
 
     if hint is Any:
         return value
@@ -159,8 +174,8 @@ def _of_one(value: Any, hints: list[Any], *, name: str, where: str, endless: boo
     """Return a value as the first of some types that it fits."""
     for hint in hints[:-1]:
         with suppress(InputError):
-            return of_type(value, hint, name=name, where=where, endless=endless)
-    return of_type(value, hints[-1], name=name, where=where, endless=endless)
+            return _of_type(value, hint, name=name, where=where, endless=endless)
+    return _of_type(value, hints[-1], name=name, where=where, endless=endless)
 
 
 def _array(value: Any, *, name: str, where: str) -> FloatArray:
@@ -177,6 +192,17 @@ def number(
     value: Any, *, name: str, where: str, above: float = -math.inf, below: float = math.inf, whole: bool = False
 ) -> float:
     """Return a finite number strictly between two bounds.
+
+    Parameters
+    ----------
+    value : object
+        What was given; a bool or a text is no number.
+    name, where : str
+        The argument and the function, for the refusal.
+    above, below : float
+        The bounds, themselves not allowed; in the value's unit.
+    whole : bool
+        Whether it must be a whole number.
 
     Raises
     ------

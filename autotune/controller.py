@@ -19,9 +19,9 @@ from pydantic import Field, field_validator, model_validator
 from autotune.arrays import ComplexArray, FloatArray, is_real
 from autotune.errors import InputError
 from autotune.models import TransferFunction
-from autotune.outputs import write_whole
 from autotune.schema import LONGEST_S, SHORTEST_S, Number, Section, Time, shortened, validated
 from autotune.text_files import checked_path, read_json, read_toml
+from autotune.whole_files import write_whole
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -237,7 +237,14 @@ def read_designed(path: str | os.PathLike[str]) -> PIDController:
 
 
 def pid_from_table(table: Any, where: str) -> PIDController:
-    """Return the PI or PID of a design's or a result's JSON; ``where`` is for messages.
+    """Return the PI or PID of a design's or a result's JSON.
+
+    Parameters
+    ----------
+    table : object
+        The decoded JSON.
+    where : str
+        Names it in messages.
 
     Raises
     ------
@@ -252,9 +259,16 @@ def pid_from_table(table: Any, where: str) -> PIDController:
 
 
 def held_from_table(table: Any, where: str) -> PIDController:
-    """Return gains that were read from a rig and noted, to be written back as they were; ``where`` is for messages.
+    """Return gains that were read from a rig and noted, to be written back as they were.
 
     A device as delivered may hold K = 0 or a negative time: they are what it held. What is not a number is refused.
+
+    Parameters
+    ----------
+    table : object
+        The decoded JSON.
+    where : str
+        Names it in messages.
 
     Raises
     ------
@@ -286,7 +300,20 @@ def _rational(content: dict[str, Any], where: str) -> Controller:
 
 
 def write_controller(controller: Controller, path: str | os.PathLike[str]) -> None:
-    """Write a controller file that :func:`read_controller` reads back to an equal controller."""
+    """Write a controller file that :func:`read_controller` reads back to an equal controller.
+
+    Parameters
+    ----------
+    controller : Controller
+        What is written.
+    path : path
+        The TOML file; replaced where it exists.
+
+    Raises
+    ------
+    OSError
+        The file cannot be written; what was there before is unchanged.
+    """
     content: dict[str, Any]
     match controller:
         case PIDController():

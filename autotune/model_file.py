@@ -5,8 +5,8 @@ from __future__ import annotations
 import os
 from typing import TYPE_CHECKING
 
+from autotune.model_tables import read_model as read_chain
 from autotune.models import Model
-from autotune.models import read_model as read_chain
 
 if TYPE_CHECKING:
     from autotune.equations.files import AnyModel
@@ -18,7 +18,7 @@ def read_model(path: str | os.PathLike[str]) -> Model:
     Raises
     ------
     InputError
-        As :func:`autotune.models.read_model`; an unknown effect, with the list of known ones.
+        As :func:`autotune.model_tables.read_model`; an unknown effect, with the list of known ones.
     """
     model = read_chain(path)
     if model.effects:

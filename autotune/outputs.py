@@ -9,8 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import io
-import json
 import os
 import shutil
 import stat
@@ -23,94 +21,10 @@ from typing import Any, TextIO
 from autotune.errors import InputError
 from autotune.interrupts import interrupt_deferred
 from autotune.text_files import reason
+from autotune.whole_files import write_json
 
 #: Errors of a file system that has no hard links.
 _NO_LINKS = (errno.EPERM, errno.ENOTSUP, errno.EOPNOTSUPP, errno.EACCES, errno.EMLINK, errno.ENOSYS, errno.EXDEV)
-
-
-def write_whole(path: str | os.PathLike[str], content: str | bytes, *, sync: bool = True) -> None:
-    """Write a file whole or not at all: beside its place, brought to the disk, renamed; an existing one is replaced.
-
-    Parameters
-    ----------
-    path : path
-        Place of the file; commands claim theirs by :class:`Output` or :class:`OutputFolder` first.
-    content : str or bytes
-        A text is written as UTF-8.
-    sync : bool
-        Whether to wait until it is on the disk, which takes 10 to 100 ms; without, it outlives a killed process and not
-        a power failure. A control loop does not wait.
-
-    Raises
-    ------
-    OSError
-        It cannot be written; what was there before still is.
-    """
-    place = Path(path)
-    data = content.encode() if isinstance(content, str) else content
-    if place.exists() and not place.is_file():  # a device or a pipe has no place beside it
-        place.write_bytes(data)
-        return
-    with interrupt_deferred():
-        _write_beside(place, data, sync)
-
-
-def _write_beside(place: Path, data: bytes, sync: bool) -> None:
-    handle, part = tempfile.mkstemp(prefix=".part-", dir=place.parent)
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(data)
-            file.flush()
-            os.fchmod(file.fileno(), 0o666 & ~_umask())
-            if sync:
-                os.fsync(file.fileno())
-        os.replace(part, place)
-    except BaseException:
-        with contextlib.suppress(OSError):
-            os.unlink(part)
-        raise
-
-
-def _umask() -> int:
-    mask = os.umask(0o077)
-    os.umask(mask)
-    return mask
-
-
-def append_whole(file: io.FileIO, line: bytes) -> None:
-    """Append a line to an unbuffered file, whole or not at all: a disk that fills leaves no half line behind.
-
-    Raises
-    ------
-    OSError
-        It cannot be written; the file ends with the line before.
-    """
-    end = file.seek(0, os.SEEK_END)
-    try:
-        rest = memoryview(line)
-        while rest:
-            rest = rest[file.write(rest) :]
-    except OSError:
-        with contextlib.suppress(OSError):
-            file.truncate(end)
-        raise
-
-
-def write_json(path: str | os.PathLike[str], content: Any) -> None:
-    """Write JSON by :func:`write_whole`.
-
-    Raises
-    ------
-    InputError
-        A number in it is not finite: the result is none.
-    """
-    try:
-        text = json.dumps(content, indent=2, allow_nan=False)
-    except ValueError:
-        raise InputError(
-            "the result has a number that is not finite", where=Path(path).name, remedy="check the size of the inputs"
-        ) from None
-    write_whole(path, text + "\n")
 
 
 class Output:
@@ -150,7 +64,7 @@ class Output:
         with _beside(Path(tempfile.gettempdir()) if special else _folder(self.path.parent)) as folder:
             write(folder / self.path.name)
             if special:
-                with _told(self.path):
+                with _refuse_where_unwritable(self.path):
                     self.path.write_bytes((folder / self.path.name).read_bytes())
             else:
                 _move(folder / self.path.name, self.path, self._overwrite)
@@ -167,7 +81,7 @@ class Output:
             It cannot be written; what was there before still is.
         """
         if _is_special(self.path):
-            with _told(self.path), self.path.open("w", encoding="utf-8") as stream:
+            with _refuse_where_unwritable(self.path), self.path.open("w", encoding="utf-8") as stream:
                 yield stream
             return
         with _beside(_folder(self.path.parent)) as folder:
@@ -231,6 +145,13 @@ class OutputFolder:
 def claim(out: Path, *, inputs: Sequence[Path | None] = ()) -> None:
     """Refuse a place for a file that grows while the work goes on, as :class:`Output` does, before the work.
 
+    Parameters
+    ----------
+    out : Path
+        The file that will grow.
+    inputs : sequence of Path or None
+        Files that it must not be.
+
     Raises
     ------
     InputError
@@ -242,7 +163,7 @@ def claim(out: Path, *, inputs: Sequence[Path | None] = ()) -> None:
 
 
 def _claim(out: Path, inputs: Sequence[Path | None], overwrite: bool) -> None:
-    with _told(out):
+    with _refuse_where_unwritable(out):
         try:
             found = os.stat(out)
         except FileNotFoundError:
@@ -279,7 +200,7 @@ def _is_special(out: Path) -> bool:
 
 
 def _folder(folder: Path) -> Path:
-    with _told(folder):
+    with _refuse_where_unwritable(folder):
         folder.mkdir(parents=True, exist_ok=True)
     return folder
 
@@ -287,7 +208,7 @@ def _folder(folder: Path) -> Path:
 def _prove(folder: Path) -> None:
     """Show that a folder can be made and written to, and leave nothing of it: what is refused later leaves none."""
     missing = []
-    with _told(folder):
+    with _refuse_where_unwritable(folder):
         missing = [one for one in (folder, *folder.parents) if not one.exists()]
     try:
         with _beside(_folder(folder)):
@@ -304,7 +225,7 @@ def _beside(folder: Path) -> Iterator[Path]:
     """Yield a new folder in the folder, which proves that it can be written, and leave nothing of it behind."""
     part: Path | None = None
     try:
-        with _told(folder), interrupt_deferred():
+        with _refuse_where_unwritable(folder), interrupt_deferred():
             part = Path(tempfile.mkdtemp(prefix=".part-", dir=folder))
         yield part
     except OSError as error:
@@ -327,7 +248,7 @@ def _remove(part: Path | None) -> None:
 
 
 def _move(part: Path, out: Path, overwrite: bool) -> None:
-    with _told(out):
+    with _refuse_where_unwritable(out):
         with part.open("rb+") as file:
             os.fsync(file.fileno())
         if overwrite:
@@ -346,7 +267,7 @@ def _move(part: Path, out: Path, overwrite: bool) -> None:
 
 
 @contextmanager
-def _told(out: Path) -> Iterator[None]:
+def _refuse_where_unwritable(out: Path) -> Iterator[None]:
     """Turn an error of the operating system into one line; one of another file keeps that file's name."""
     try:
         yield
@@ -359,7 +280,15 @@ def _told(out: Path) -> Iterator[None]:
 
 
 def unwritable(error: Exception, out: Path) -> InputError:
-    """Return the refusal of a place that cannot be written."""
+    """Return the refusal of a place that cannot be written.
+
+    Parameters
+    ----------
+    error : Exception
+        What the system said.
+    out : Path
+        The place, where the error names none.
+    """
     name = getattr(error, "filename", None)
     where = str(out) if not isinstance(name, str) or ".part-" in name else name
     remedies = {

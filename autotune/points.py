@@ -130,7 +130,14 @@ def read_points(path: str | os.PathLike[str]) -> tuple[FrequencyPoint, ...]:
 
 
 def points_from_json(entries: Sequence[Any], where: str) -> tuple[FrequencyPoint, ...]:
-    """Return the points of the entries that :func:`points_to_json` wrote; ``where`` is for messages.
+    """Return the points of the entries that :func:`points_to_json` wrote.
+
+    Parameters
+    ----------
+    entries : sequence
+        The decoded JSON, one entry a point.
+    where : str
+        Names them in messages.
 
     Raises
     ------

@@ -21,4 +21,12 @@ class Progress(Protocol):
 
 
 def quiet(what: str, share: float, /) -> None:
-    """Tell nobody."""
+    """Tell nobody.
+
+    Parameters
+    ----------
+    what : str
+        As of :class:`Progress`.
+    share : float
+        As of :class:`Progress`.
+    """

@@ -22,8 +22,8 @@ from scipy.optimize import minimize_scalar
 from autotune.arguments import checked
 from autotune.arrays import FloatArray, is_real
 from autotune.errors import InputError
-from autotune.outputs import append_whole, write_whole
 from autotune.text_files import checked_path, printable, read_toml
+from autotune.whole_files import append_whole, write_whole
 
 #: Largest size of a value that is computed with: far beyond every unit, far from where squares overflow.
 LARGEST = 1e15
@@ -150,7 +150,18 @@ class Recording:
         return InputError(what, where=self.name, remedy=f"cut the recording at the gap{further}")
 
     def between(self, start_s: float, end_s: float) -> Recording:
-        """Return the rows with ``start_s <= t < end_s``, time stamps unchanged."""
+        """Return the rows with ``start_s <= t < end_s``, time stamps unchanged.
+
+        Parameters
+        ----------
+        start_s, end_s : float
+            In the recording's own time stamps [s]; infinite where there is no end.
+
+        Raises
+        ------
+        InputError
+            One of them is not a number.
+        """
         if not (is_real(start_s) and is_real(end_s)):
             said = f"from {start_s!r} to {end_s!r}"[:200]
             raise InputError(said, where=self.name, remedy="give two times in s, infinite where there is no end")
@@ -498,7 +509,15 @@ class RecordingWriter:
 
 
 def write_recording(recording: Recording, path: str | os.PathLike[str]) -> None:
-    """Write a whole recording and its sidecar, replacing what is there."""
+    """Write a whole recording and its sidecar, replacing what is there.
+
+    Parameters
+    ----------
+    recording : Recording
+        N rows; its metadata become the sidecar.
+    path : path
+        The CSV file; the sidecar lies beside it with the ending ``.toml``.
+    """
     path = Path(path)
     columns = {"t": recording.t, "u": recording.u, "y": recording.y, **recording.extra}
     np.savetxt(

@@ -34,8 +34,8 @@ from autotune.errors import AutotuneError, ExperimentStopped, OperatorStop
 from autotune.experiment.judgement import Verification, smoothed
 from autotune.experiment.result import Status
 from autotune.models import TransferFunction
-from autotune.outputs import append_whole
 from autotune.points import FrequencyPoint, points_to_json
+from autotune.whole_files import append_whole
 
 #: rows of a step response that are kept for a picture
 PICTURE_ROWS = 400
@@ -92,7 +92,19 @@ class RunLog:
         reduced: TransferFunction | None,
         controller: PIDController,
     ) -> None:
-        """Say what follows from the points."""
+        """Say what follows from the points.
+
+        Parameters
+        ----------
+        points : tuple of FrequencyPoint
+            What was measured.
+        plant : TransferFunction
+            Fitted to them.
+        reduced : TransferFunction or None
+            The reduced model, where there is one.
+        controller : PIDController
+            The design.
+        """
         self._write(
             "analysis",
             points=points_to_json(points),
@@ -120,7 +132,17 @@ class RunLog:
         )
 
     def gains(self, old: PIDController | None, new: PIDController, *, deployed: bool) -> None:
-        """Say which gains there are, and whether the rig holds the new ones."""
+        """Say which gains there are, and whether the rig holds the new ones.
+
+        Parameters
+        ----------
+        old : PIDController or None
+            What the rig held before; None where that is not known.
+        new : PIDController
+            The design.
+        deployed : bool
+            Whether the rig holds it.
+        """
         self._write("gains", old=asdict(old) if old is not None else None, new=asdict(new), deployed=deployed)
 
     def waiting(self, patience_s: float) -> None:

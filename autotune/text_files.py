@@ -95,7 +95,7 @@ def read_toml(path: str | os.PathLike[str]) -> dict[str, Any]:
     InputError
         As :func:`read_text`; not TOML, nested too deep, or a name or text with a control character.
     """
-    content: dict[str, Any] = _parsed(path, tomllib.loads, "TOML")
+    content: dict[str, Any] = _parse(path, tomllib.loads, "TOML")
     return content
 
 
@@ -107,14 +107,14 @@ def read_json(path: str | os.PathLike[str]) -> Any:
     InputError
         As :func:`read_text`; not JSON, nested too deep, or a name or text with a control character.
     """
-    return _parsed(path, lambda text: json.loads(text, parse_constant=_no_number), "JSON")
+    return _parse(path, lambda text: json.loads(text, parse_constant=_no_number), "JSON")
 
 
 def _no_number(word: str) -> NoReturn:
     raise ValueError(f"{word} is no number of JSON")
 
 
-def _parsed(path: str | os.PathLike[str], parse: Callable[[str], Any], kind: str) -> Any:
+def _parse(path: str | os.PathLike[str], parse: Callable[[str], Any], kind: str) -> Any:
     text = read_text(path)
     try:
         content = parse(text)

@@ -215,7 +215,15 @@ class DeviceLawRig(SerialLineRig):
 
 
 def open_kind(settings: SerialSettings, session: Session) -> SerialLineRig:
-    """Return the rig that ``[rig] kind = "serial"`` describes, its laws run by the host or by the device."""
+    """Return the rig that ``[rig] kind = "serial"`` describes, its laws run by the host or by the device.
+
+    Parameters
+    ----------
+    settings : SerialSettings
+        The table ``[rig]``.
+    session : Session
+        What it is opened for.
+    """
     on_line = DeviceLawRig if settings.relay == "device" else SerialLineRig
     return on_line(settings, u_range=session.u_range, u_safe=session.u_safe)
 
@@ -226,5 +234,13 @@ def reached_by(settings: SerialSettings) -> Reach:
 
 
 def probe_kind(settings: SerialSettings, expected: Mapping[str, tuple[float, float]]) -> ProbedDevice:
-    """Return who the microcontroller is, a sample and its gains."""
+    """Return who the microcontroller is, a sample and its gains.
+
+    Parameters
+    ----------
+    settings : SerialSettings
+        The table ``[rig]``.
+    expected : mapping of str to (float, float)
+        Range within which a signal's engineering value is plausible.
+    """
     return probe_line(settings, expected=expected)

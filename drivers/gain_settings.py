@@ -19,6 +19,13 @@ def settings_of(gains: GainSettings, controller: PIDController) -> dict[str, flo
 
     Where the device has no setting for its action, the settings that carry a gain carry its sign.
 
+    Parameters
+    ----------
+    gains : GainSettings
+        The map of the device's gains.
+    controller : PIDController
+        What it is to run.
+
     Raises
     ------
     InputError

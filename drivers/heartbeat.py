@@ -63,14 +63,30 @@ class Heartbeat:
         return self._first_s < math.inf
 
     def allows(self, echo: float, asked_s: float) -> bool:
-        """Return whether the device that was asked at ``asked_s`` [s] may show this echo."""
+        """Return whether the device may show this echo.
+
+        Parameters
+        ----------
+        echo : float
+            The beat that the device shows.
+        asked_s : float
+            When it was asked [s].
+        """
         if self.is_own(echo, asked_s):
             return True
         # what an earlier session left is shown until the first of our own
         return not self._is_seen and asked_s - self._first_s <= self._late_s
 
     def is_own(self, echo: float, asked_s: float) -> bool:
-        """Return whether the echo is of a beat of this session that the device may still show; from then on all are."""
+        """Return whether the echo is of a beat of this session that the device may still show; from then on all are.
+
+        Parameters
+        ----------
+        echo : float
+            The beat that the device shows.
+        asked_s : float
+            When it was asked [s].
+        """
         late = (until_s for beat, until_s in self._earlier if beat == echo)
         own = self.is_begun and (echo == self.value or any(asked_s - until_s <= self._late_s for until_s in late))
         self._is_seen = self._is_seen or own

@@ -99,7 +99,15 @@ class Kind:
         return rig_kind_of(self.settings)
 
     def open(self, settings: Section, session: Session) -> Rig:
-        """Return the rig, not yet opened."""
+        """Return the rig, not yet opened.
+
+        Parameters
+        ----------
+        settings : Section
+            The table ``[rig]``.
+        session : Session
+            What it is opened for.
+        """
         rig: Rig = import_module(self.driver).open_kind(settings, session)
         return rig
 
@@ -110,6 +118,13 @@ class Kind:
 
     def probe(self, settings: Section, expected: Mapping[str, tuple[float, float]]) -> Any:
         """Read everything once; nothing is written.
+
+        Parameters
+        ----------
+        settings : Section
+            The table ``[rig]``.
+        expected : mapping of str to (float, float)
+            Range within which a signal's engineering value is plausible.
 
         Returns
         -------
@@ -215,7 +230,15 @@ _BY_SETTINGS = {kind.settings: kind for kind in KINDS}
 
 
 def not_installed(error: ModuleNotFoundError, extra: str) -> InputError:
-    """Return what is said where a kind's library is absent: the extra of its name brings it."""
+    """Return what is said where a kind's library is absent: the extra of its name brings it.
+
+    Parameters
+    ----------
+    error : ModuleNotFoundError
+        What the import raised.
+    extra : str
+        Name of the kind, and of the extra.
+    """
     remedy = f'pip install "relay-autotune[{extra}]"'
     return InputError(f"{error.name} is not installed", where=f'kind = "{extra}"', remedy=remedy)
 

@@ -213,6 +213,15 @@ class ModbusLink:
     def write(self, table: str, address: int, words: Sequence[int]) -> bool:
         """Write side-by-side registers in one request, or one coil.
 
+        Parameters
+        ----------
+        table : str
+            "holding" or "coil".
+        address : int
+            Of the first register.
+        words : sequence of int
+            16 bits each; of a coil one, 0 or 1.
+
         Returns
         -------
         suspect : bool

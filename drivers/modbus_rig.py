@@ -14,7 +14,15 @@ from drivers.probe import ProbedRegister, probe
 
 
 def open_kind(settings: AnyModbusSettings, session: Session) -> Rig:
-    """Return the rig, with its own controller's gains where they are mapped."""
+    """Return the rig, with its own controller's gains where they are mapped.
+
+    Parameters
+    ----------
+    settings : AnyModbusSettings
+        The table ``[rig]``.
+    session : Session
+        What it is opened for.
+    """
     return open_registers(ModbusLink(settings), settings, session, GainRegisterRig, permissives=settings.permissives)
 
 
@@ -32,5 +40,13 @@ def reached_by(settings: AnyModbusSettings) -> Reach:
 
 
 def probe_kind(settings: AnyModbusSettings, expected: Mapping[str, tuple[float, float]]) -> tuple[ProbedRegister, ...]:
-    """Return every mapped register and permissive, read once."""
+    """Return every mapped register and permissive, read once.
+
+    Parameters
+    ----------
+    settings : AnyModbusSettings
+        The table ``[rig]``.
+    expected : mapping of str to (float, float)
+        Range within which a signal's engineering value is plausible.
+    """
     return probe(settings, expected=expected)

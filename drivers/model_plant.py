@@ -26,6 +26,15 @@ _AT_REST = 1e-9
 def model_plant(settings: PlantSettings, path: str, *, u_start: float) -> ModelPlant:
     """Return the plant of a model file.
 
+    Parameters
+    ----------
+    settings : PlantSettings
+        Noise, resolution and seed of its sensor.
+    path : str
+        The model file.
+    u_start : float
+        Command under which it rests at first [u unit].
+
     Raises
     ------
     InputError
@@ -108,7 +117,14 @@ class ModelPlant:
         return self._look(self._states, self._acting(self._time_s))[1]
 
     def advance(self, u: float, dt_s: float) -> None:
-        """Hold the command ``u`` [u unit] for ``dt_s`` [s].
+        """Hold a command for a time.
+
+        Parameters
+        ----------
+        u : float
+            Command that is held [u unit].
+        dt_s : float
+            How long [s].
 
         Raises
         ------

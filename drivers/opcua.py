@@ -148,6 +148,15 @@ class OpcUaLink:
     def write(self, table: str, address: int, words: Sequence[int]) -> bool:
         """Write nodes that lie side by side in the map, in one request that the server confirms node by node.
 
+        Parameters
+        ----------
+        table : str
+            As the map has it.
+        address : int
+            Of the first word.
+        words : sequence of int
+            16 bits each.
+
         Raises
         ------
         LinkError
@@ -189,6 +198,13 @@ class OpcUaLink:
 
     def write_numbers(self, place: str, numbers: Sequence[float]) -> None:
         """Write the numbers of an array, all in one request.
+
+        Parameters
+        ----------
+        place : str
+            The array's node.
+        numbers : sequence of float
+            All of its elements.
 
         Raises
         ------

@@ -32,7 +32,15 @@ def _link(settings: OpcUaSettings, *, exclusive: bool = True) -> OpcUaLink:
 
 
 def open_kind(settings: OpcUaSettings, session: Session) -> Rig:
-    """Return the rig, with its own controller's gains where they are mapped, and its own relay where it has one."""
+    """Return the rig, with its own controller's gains where they are mapped, and its own relay where it has one.
+
+    Parameters
+    ----------
+    settings : OpcUaSettings
+        The table ``[rig]``.
+    session : Session
+        What it is opened for.
+    """
     link = _link(settings)
     if settings.relay is None:
         return open_registers(link, settings, session, TypedGainRig)
@@ -51,7 +59,15 @@ def reached_by(settings: OpcUaSettings) -> Reach:
 
 
 def probe_kind(settings: OpcUaSettings, expected: Mapping[str, tuple[float, float]]) -> ProbedDevice:
-    """Return every mapped node, read once; types and rights are looked at on the way."""
+    """Return every mapped node, read once; types and rights are looked at on the way.
+
+    Parameters
+    ----------
+    settings : OpcUaSettings
+        The table ``[rig]``.
+    expected : mapping of str to (float, float)
+        Range within which a signal's engineering value is plausible.
+    """
     link = _link(settings, exclusive=False)
     link.connect()
     found, mapped = [], codecs(settings.registers.mapped())

@@ -40,12 +40,27 @@ class Arrays(Protocol):
         ...
 
     def write_numbers(self, place: str, numbers: Sequence[float]) -> None:
-        """Write the numbers of an array."""
+        """Write the numbers of an array.
+
+        Parameters
+        ----------
+        place : str
+            The array.
+        numbers : sequence of float
+            All of its elements.
+        """
         ...
 
 
 def tell_relay(arrays: Arrays, relay: RelayNodes) -> str:
     """Look at both arrays, write nothing, and return what the device says of its relay.
+
+    Parameters
+    ----------
+    arrays : Arrays
+        What reads them.
+    relay : RelayNodes
+        Where they are.
 
     Raises
     ------

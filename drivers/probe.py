@@ -126,8 +126,8 @@ def probe_line(settings: SerialSettings, *, expected: Mapping[str, tuple[float, 
     finally:
         link.disconnect()
     who = Command(int(state) & 3).name.lower()
-    per_count = (_scaled(1.0, settings.u_span, u_full) - settings.u_span[0]) / (
-        _scaled(1.0, settings.y_span, y_full) - settings.y_span[0]
+    per_count = (_scale(1.0, settings.u_span, u_full) - settings.u_span[0]) / (
+        _scale(1.0, settings.y_span, y_full) - settings.y_span[0]
     )
     return ProbedDevice(
         description=(
@@ -135,8 +135,8 @@ def probe_line(settings: SerialSettings, *, expected: Mapping[str, tuple[float, 
             f" commanded by {who}"
         ),
         signals=(
-            _counted("y", y, y_full, settings.y_span, expected.get("y")),
-            _counted("u_applied", u, u_full, settings.u_span, None),
+            _probe_count("y", y, y_full, settings.y_span, expected.get("y")),
+            _probe_count("u_applied", u, u_full, settings.u_span, None),
             ProbedSignal(name="device_time", raw=f"{time_us:g} us", value=1e-6 * time_us),
             ProbedSignal(name="K", raw=f"{K:g} counts/count", value=K * per_count),
             ProbedSignal(name="Ti", raw=f"{Ti_s:g} s", value=Ti_s),
@@ -144,14 +144,14 @@ def probe_line(settings: SerialSettings, *, expected: Mapping[str, tuple[float, 
     )
 
 
-def _scaled(count: float, span: tuple[float, float], full: float) -> float:
+def _scale(count: float, span: tuple[float, float], full: float) -> float:
     return span[0] + count * (span[1] - span[0]) / full
 
 
-def _counted(
+def _probe_count(
     name: str, count: float, full: float, span: tuple[float, float], expected: tuple[float, float] | None
 ) -> ProbedSignal:
-    value = _scaled(count, span, full)
+    value = _scale(count, span, full)
     warnings = []
     if expected is not None and not expected[0] <= value <= expected[1]:
         warnings.append(f"{value:.6g}, expected {expected[0]:g}..{expected[1]:g}; check rig.{name}_span and the wiring")

@@ -51,5 +51,15 @@ class RegisterLink(Protocol):
         ...
 
     def write(self, table: str, address: int, words: Sequence[int]) -> bool:
-        """Write words, and return whether that is suspect."""
+        """Write words, and return whether that is suspect.
+
+        Parameters
+        ----------
+        table : str
+            Which of the device's tables.
+        address : int
+            Of the first word.
+        words : sequence of int
+            16 bits each.
+        """
         ...

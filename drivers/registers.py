@@ -107,7 +107,15 @@ class Codec:
         return self.decode_from(struct.pack(f">{len(words)}H", *words), 0)
 
     def decode_from(self, data: bytes, at: int) -> float:
-        """Return the engineering value at a place [bytes] in registers as they came over the line."""
+        """Return the engineering value at a place in registers.
+
+        Parameters
+        ----------
+        data : bytes
+            Registers as they came over the line, the high byte of each first.
+        at : int
+            Where the value begins [bytes].
+        """
         if self._count is None:
             return float(data[at + 1] == self._codes[0])
         if self._is_plain:

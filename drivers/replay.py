@@ -136,7 +136,15 @@ class ExchangeReplayRig(ReplayRig):
 
 
 def open_kind(settings: ReplaySettings, session: Session) -> ReplayRig:
-    """Return the rig that ``[rig] kind = "replay"`` describes."""
+    """Return the rig that ``[rig] kind = "replay"`` describes.
+
+    Parameters
+    ----------
+    settings : ReplaySettings
+        The table ``[rig]``.
+    session : Session
+        What it is opened for; not used.
+    """
     recording = read_recording(settings.recording)
     kind = ExchangeReplayRig if recording.metadata.get("rig") == "serial" else ReplayRig
     return kind(recording, tolerance=settings.tolerance)

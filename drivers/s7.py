@@ -172,6 +172,15 @@ class S7Link:
     def write(self, table: str, address: int, words: Sequence[int]) -> bool:
         """Write places whose registers lie side by side in the map, in as few requests as their addresses allow.
 
+        Parameters
+        ----------
+        table : str
+            As the map has it.
+        address : int
+            Of the first word.
+        words : sequence of int
+            16 bits each.
+
         Raises
         ------
         LinkError

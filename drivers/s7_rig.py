@@ -37,7 +37,15 @@ def _link(settings: S7Settings, *, exclusive: bool = True) -> S7Link:
 
 
 def open_kind(settings: S7Settings, session: Session) -> Rig:
-    """Return the rig, with its own controller's gains where they are mapped."""
+    """Return the rig, with its own controller's gains where they are mapped.
+
+    Parameters
+    ----------
+    settings : S7Settings
+        The table ``[rig]``.
+    session : Session
+        What it is opened for.
+    """
     return open_registers(_link(settings), settings, session, TypedGainRig)
 
 
@@ -47,13 +55,21 @@ def reached_by(settings: S7Settings) -> Reach:
 
 
 def probe_kind(settings: S7Settings, expected: Mapping[str, tuple[float, float]]) -> ProbedDevice:
-    """Return every mapped signal, read once; one that the CPU refuses has its refusal as a warning."""
+    """Return every mapped signal, read once; one that the CPU refuses has its refusal as a warning.
+
+    Parameters
+    ----------
+    settings : S7Settings
+        The table ``[rig]``.
+    expected : mapping of str to (float, float)
+        Range within which a signal's engineering value is plausible.
+    """
     link = _link(settings, exclusive=False)
     link.connect()
     registers, signals = codecs(settings.registers.mapped()), settings.signals.mapped()
     try:
         state = link.state()
-        found = [_probed(link, codec, signals[name], expected.get(name)) for name, codec in registers.items()]
+        found = [_probe_signal(link, codec, signals[name], expected.get(name)) for name, codec in registers.items()]
         refused = {one.name for one in found if math.isnan(one.value)}
         readable = [codec for name, codec in registers.items() if name in SAMPLE and name not in refused]
         pace = f"; {tell_pace(link, readable)}" if readable else ""
@@ -63,7 +79,7 @@ def probe_kind(settings: S7Settings, expected: Mapping[str, tuple[float, float]]
     return ProbedDevice(description=f"{link.where}, {said}{pace}", signals=tuple(found))
 
 
-def _probed(link: S7Link, codec: Codec, signal: S7Signal, expected: tuple[float, float] | None) -> ProbedSignal:
+def _probe_signal(link: S7Link, codec: Codec, signal: S7Signal, expected: tuple[float, float] | None) -> ProbedSignal:
     try:
         words = link.read(blocks([codec])[0]).words
     except LinkError as error:

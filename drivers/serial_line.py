@@ -137,6 +137,15 @@ class SerialLink:
     def ask(self, kind: Kind, *values: float, retries: int | None = None) -> tuple[Frame, float, bool]:
         """Ask until an answer carries the request's number.
 
+        Parameters
+        ----------
+        kind : Kind
+            Of the request.
+        *values : float
+            What it carries.
+        retries : int, optional
+            Attempts after the first; those of the settings when absent.
+
         Returns
         -------
         answer : Frame
@@ -168,7 +177,15 @@ class SerialLink:
         raise LinkError(f"no answer to {kind.name}", where=self.where, remedy=_CABLE)
 
     def send(self, kind: Kind, *values: float) -> None:
-        """Send a request whose answer arrives among the streamed rows."""
+        """Send a request whose answer arrives among the streamed rows.
+
+        Parameters
+        ----------
+        kind : Kind
+            Of the request.
+        *values : float
+            What it carries.
+        """
         self._sequence = (self._sequence + 1) & 0xFFFF
         self._write(encode(Frame(kind=kind, sequence=self._sequence, values=values)))
 

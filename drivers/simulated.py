@@ -120,5 +120,13 @@ class SimulatedRig:
 
 
 def open_kind(settings: SimulatedRigSettings, session: Session) -> SimulatedRig:
-    """Return the rig that ``[rig] kind = "simulated"`` describes, not yet opened."""
+    """Return the rig that ``[rig] kind = "simulated"`` describes, not yet opened.
+
+    Parameters
+    ----------
+    settings : SimulatedRigSettings
+        The table ``[rig]``.
+    session : Session
+        What it is opened for.
+    """
     return SimulatedRig(plant_of(settings, u_safe=session.u_safe), u_safe=session.u_safe, controller=session.controller)

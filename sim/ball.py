@@ -78,7 +78,17 @@ def make_ball(*, seed: int = 0, noise: float | None = None, start: str | None = 
 
 
 def linear_ball(*, hover: float = U_NOMINAL, noise: float = 0.0, seed: int = 0) -> Ball:
-    """Return the ball without ends, converters and saturation, starting afloat: (23) and nothing else."""
+    """Return the ball without ends, converters and saturation, starting afloat: (23) and nothing else.
+
+    Parameters
+    ----------
+    hover : float
+        Command that holds it afloat [V].
+    noise : float
+        Half-width of the uniform noise [V].
+    seed : int
+        Of the noise.
+    """
     return Ball(BallSettings(hover=hover, noise=noise, bits=None, ends=False, start=Y_NOMINAL), seed=seed)
 
 
@@ -122,7 +132,15 @@ class Ball:
         return float(self._x[3])
 
     def advance(self, u: float, dt_s: float) -> None:
-        """Hold ``u`` [V] for ``dt_s`` [s]: exact integration, with the tube's ends found to 1 ns."""
+        """Hold a command: exact integration, with the tube's ends found to 1 ns.
+
+        Parameters
+        ----------
+        u : float
+            Command that is held [V].
+        dt_s : float
+            How long [s].
+        """
         self._u_applied = self._converted(u)
         _advance(self._x, self._u_applied - self.settings.hover, dt_s, self.settings.ends)
         self._time_s += dt_s

@@ -55,7 +55,20 @@ class BoundedConnection(ServerRequestHandler):
             min(waiting, key=lambda one: one._number).end()
 
     def callback_data(self, data: bytes, addr: tuple[Any, ...] | None = None) -> int:
-        """Count the requests that are whole."""
+        """Count the requests that are whole.
+
+        Parameters
+        ----------
+        data : bytes
+            What has arrived and was not used yet.
+        addr : tuple, optional
+            Where it came from.
+
+        Returns
+        -------
+        int
+            How much of it is used [bytes].
+        """
         used = int(super().callback_data(data, addr))
         self._requests += self.last_pdu is not None
         return used

@@ -81,7 +81,15 @@ class FaultyPlant:
             raise ConnectionError("link cut")
 
     def advance(self, u: float, dt_s: float) -> None:
-        """Hold what the faults leave of the command for ``dt_s`` [s]."""
+        """Hold what the faults leave of a command.
+
+        Parameters
+        ----------
+        u : float
+            Command that is held [u unit].
+        dt_s : float
+            How long [s].
+        """
         for fault in self._active():
             match fault.kind:
                 case "stuck actuator":

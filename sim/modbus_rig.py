@@ -116,7 +116,7 @@ class ModbusRig(ServedRig):
         await asyncio.sleep(0.01)
 
     def _server(self) -> ModbusTcpServer | ModbusSerialServer:
-        server = self._library_server(sim_device(self.device.registers, self._unit_id, self._serve_request))
+        server = self._library_server(_sim_device(self.device.registers, self._unit_id, self._serve_request))
         server.context = _OneUnit(server.context)  # type: ignore[assignment]  # the two methods it is asked
         if isinstance(self._transport, TcpTransport):
             server.callback_new_connection = partial(BoundedConnection, server)  # type: ignore[method-assign]
@@ -206,7 +206,7 @@ class _OneUnit:
             raise NoSuchIdException
 
 
-def sim_device(
+def _sim_device(
     registers: dict[str, RegisterSpec],
     unit_id: int,
     serve: Callable[..., object],

@@ -36,7 +36,15 @@ class Plant(Protocol):
         ...
 
     def advance(self, u: float, dt_s: float) -> None:
-        """Hold the command ``u`` [u unit] for ``dt_s`` [s]."""
+        """Hold a command.
+
+        Parameters
+        ----------
+        u : float
+            Command that is held [u unit].
+        dt_s : float
+            How long [s].
+        """
         ...
 
     def measure(self) -> float:

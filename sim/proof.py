@@ -22,7 +22,6 @@ from sim.conceal.cases import write
 from sim.score import Mark, mark
 
 Json = dict[str, Any]
-FIRST_PROOF_SEED = 100_000  # below: calibration
 STOPPED = 130  # exit status of a program that the operator stopped
 
 
@@ -86,6 +85,13 @@ def singles(campaign: Campaign) -> dict[str, list[int]]:
 def diagnose(campaign: Campaign, seed: int) -> None:
     """Let the tool diagnose one case; one that is diagnosed already stays as it is.
 
+    Parameters
+    ----------
+    campaign : Campaign
+        Its folder and cases.
+    seed : int
+        Of the case.
+
     Raises
     ------
     InterruptedError
@@ -115,7 +121,15 @@ def _run(campaign: Campaign, words: list[str]) -> subprocess.CompletedProcess[st
 
 
 def mark_all(campaign: Campaign, chosen: Sequence[int]) -> list[Mark]:
-    """Reveal the answers and mark the chosen cases; a tool that failed on a case is marked as having said nothing."""
+    """Reveal the answers and mark the chosen cases; a tool that failed on a case is marked as having said nothing.
+
+    Parameters
+    ----------
+    campaign : Campaign
+        Its folder and cases.
+    chosen : sequence of int
+        Seeds of the cases.
+    """
     return [_mark(campaign, seed) for seed in chosen]
 
 
@@ -134,7 +148,17 @@ def _mark(campaign: Campaign, seed: int) -> Mark:
 
 
 def forecast_nrmse(recording: Path, simulated: Path, answer: Json) -> float:
-    """Forecast error over the standard deviation of y, on the rows two horizons after the first."""
+    """Forecast error over the standard deviation of y, on the rows two horizons after the first.
+
+    Parameters
+    ----------
+    recording : Path
+        What was measured.
+    simulated : Path
+        The forecast.
+    answer : mapping
+        Of the case; has the horizon [s].
+    """
     rows = np.loadtxt(recording, delimiter=",", skiprows=1)
     forecast = np.loadtxt(simulated, delimiter=",", skiprows=1)
     late = rows[:, 0] >= rows[0, 0] + 2.0 * answer["horizon"]
@@ -144,7 +168,15 @@ def forecast_nrmse(recording: Path, simulated: Path, answer: Json) -> float:
 
 
 def keep_failures(campaign: Campaign, marks: Sequence[Mark]) -> Path:
-    """Write what was concealed and what was said for every failure, one line each, worst kind first."""
+    """Write what was concealed and what was said for every failure, one line each, worst kind first.
+
+    Parameters
+    ----------
+    campaign : Campaign
+        Its folder and cases.
+    marks : sequence of Mark
+        One for each case.
+    """
     lines = []
     for m in sorted((m for m in marks if m.failed), key=lambda m: (m.kind, m.true_names, m.case)):
         answer = campaign.out / "sealed" / f"{m.case}.json"

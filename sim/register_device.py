@@ -150,7 +150,15 @@ class RegisterDevice:
         return self._values
 
     def show(self, name: str, value: float) -> None:
-        """Have the device show a value of a signal of its own: a door, a switch."""
+        """Have the device show a value of a signal of its own: a door, a switch.
+
+        Parameters
+        ----------
+        name : str
+            Of the signal.
+        value : float
+            In its unit.
+        """
         self._values[name] = value
 
     def live(self, now_s: float) -> None:
@@ -171,7 +179,18 @@ class RegisterDevice:
                 self._control()
 
     def read(self, table: Table, address: int, count: int, now_s: float) -> list[int]:
-        """Return the registers at the device time ``now_s`` [s]; one measurement per request.
+        """Return registers; one measurement per request.
+
+        Parameters
+        ----------
+        table : Table
+            Which of the device's tables.
+        address : int
+            Of the first register.
+        count : int
+            How many.
+        now_s : float
+            The device's time [s].
 
         Raises
         ------
@@ -186,7 +205,18 @@ class RegisterDevice:
         return [self._word(place, shown) for place in places]
 
     def write(self, table: Table, address: int, words: Sequence[int], now_s: float) -> None:
-        """Take registers from the host at the device time ``now_s`` [s].
+        """Take registers from the host.
+
+        Parameters
+        ----------
+        table : Table
+            Which of the device's tables.
+        address : int
+            Of the first register.
+        words : sequence of int
+            16 bits each.
+        now_s : float
+            The device's time [s].
 
         Raises
         ------

@@ -47,7 +47,15 @@ class RegisterSpec:
 
 
 def to_words(value: float, spec: RegisterSpec) -> list[int]:
-    """Return the registers that show a value; beyond the register's range it sticks at the end, as in real devices."""
+    """Return the registers that show a value; beyond the register's range it sticks at the end, as in real devices.
+
+    Parameters
+    ----------
+    value : float
+        In engineering units.
+    spec : RegisterSpec
+        How the register holds it.
+    """
     if spec.says is not None:
         code = spec.says[1 if value else 0]
         count = float(code << spec.bit if spec.bit is not None else code)
@@ -75,7 +83,15 @@ def to_words(value: float, spec: RegisterSpec) -> list[int]:
 
 
 def from_words(words: list[int], spec: RegisterSpec) -> float:
-    """Return the value that was written into the registers."""
+    """Return the value that was written into the registers.
+
+    Parameters
+    ----------
+    words : list of int
+        16 bits each, as many as the register has.
+    spec : RegisterSpec
+        How the register holds it.
+    """
     if spec.type == "bit":
         return float(bool(words[0])) if spec.says is None else float(words[0] == spec.says[1])
     words = words if spec.word_order == "big" else words[::-1]

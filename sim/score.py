@@ -154,6 +154,13 @@ def calibration_error(statements: Sequence[tuple[float, bool]], bins: int = 10) 
     """Average the distance between stated probability and share of right statements over bins of probability.
 
     Its bias is upward: a perfectly calibrated source of n statements scores about 0.4 / sqrt(n / bins).
+
+    Parameters
+    ----------
+    statements : sequence of (float, bool)
+        The probability that was stated, and whether it was right.
+    bins : int
+        Bins of probability.
     """
     if not statements:
         return math.nan

@@ -29,7 +29,19 @@ _UNKNOWN, _LENGTH, _NOT_IN_COMMAND, _RANGE = 1, 2, 3, 4
 def device_on_line(
     plant: Plant, *, u_range: tuple[float, float], u_safe: float, gains: tuple[float, float] = (0.0, 1.0)
 ) -> RegisterDevice:
-    """Return the device that :class:`SerialRig` puts on a line; it gets its dead-man time from the host."""
+    """Return the device that :class:`SerialRig` puts on a line; it gets its dead-man time from the host.
+
+    Parameters
+    ----------
+    plant : Plant
+        What it moves.
+    u_range : (float, float)
+        Range of its output [u unit].
+    u_safe : float
+        Output at rest [u unit].
+    gains : (float, float)
+        K [u unit/y unit] and T_I [s] of its own controller.
+    """
     return RegisterDevice(plant, _WORDS, u_safe=u_safe, u_range=u_range, gains=gains)
 
 

@@ -107,7 +107,15 @@ class Servo:
         return self._turned + sum(self._lags)
 
     def advance(self, u: float, dt_s: float) -> None:
-        """Hold ``u`` [V] for ``dt_s`` [s]."""
+        """Hold a command.
+
+        Parameters
+        ----------
+        u : float
+            Command that is held [V].
+        dt_s : float
+            How long [s].
+        """
         limit = self.settings.u_max
         self._u_applied = min(max(u, -limit), limit)
         net = self._u_applied - self.settings.load

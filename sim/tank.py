@@ -169,7 +169,15 @@ class TwoTank:
         return float(self._x[3])
 
     def advance(self, u: float, dt_s: float) -> None:
-        """Hold ``u`` [V] for ``dt_s`` [s]; fourth-order steps of at most 0.1 s."""
+        """Hold a command; fourth-order steps of at most 0.1 s.
+
+        Parameters
+        ----------
+        u : float
+            Command that is held [V].
+        dt_s : float
+            How long [s].
+        """
         self._u_applied = min(max(u, 0.0), _U_MAX["tanks"])
         p = self.settings
         constants = np.array([p.area, p.outlet, p.pump, p.tau_pump, p.tau_sensor, p.height])
@@ -225,7 +233,15 @@ class Heater:
         return float(self._x[2]) - _ZERO_C
 
     def advance(self, u: float, dt_s: float) -> None:
-        """Hold ``u`` [%] for ``dt_s`` [s]; fourth-order steps of at most 0.25 s."""
+        """Hold a command; fourth-order steps of at most 0.25 s.
+
+        Parameters
+        ----------
+        u : float
+            Command that is held [%].
+        dt_s : float
+            How long [s].
+        """
         self._u_applied = min(max(u, 0.0), _U_MAX["heater"])
         p = self.settings
         radiation = p.emissivity * _STEFAN_BOLTZMANN * p.surface

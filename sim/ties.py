@@ -118,7 +118,15 @@ class Servo:
         return self._x
 
     def advance(self, u: float, dt_s: float) -> None:
-        """Hold ``u`` [V] for ``dt_s`` [s]."""
+        """Hold a command.
+
+        Parameters
+        ----------
+        u : float
+            Command that is held [V].
+        dt_s : float
+            How long [s].
+        """
         self._u = u
         steps = max(1, round(dt_s / 0.002))
         faded = math.exp(-dt_s / steps / TAU)
@@ -162,7 +170,15 @@ def draw(seed: int) -> Tie:
 
 
 def write(tie: Tie, folder: Path) -> None:
-    """Write ``model.toml``, ``config.toml`` and the gentle recording ``first.csv`` of a tie with its sidecar."""
+    """Write ``model.toml``, ``config.toml`` and the gentle recording ``first.csv`` of a tie with its sidecar.
+
+    Parameters
+    ----------
+    tie : Tie
+        What is left out, and its size.
+    folder : Path
+        For the files.
+    """
     random = np.random.default_rng((tie.seed, 2))
     gain, tau = GAIN * random.uniform(0.85, 1.15), TAU * random.uniform(0.85, 1.15)
     folder.mkdir(parents=True, exist_ok=True)

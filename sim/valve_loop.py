@@ -91,9 +91,21 @@ class Surroundings:
 
 
 def simulate_loop(loop: ValveLoop, around: Surroundings) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return controller output [%], measurement and true valve position [%] in every cycle, each (N,) array.
+    """Return controller output [%], measurement and true valve position [%] in every cycle.
 
     The operating point is u = 50 %, y = 0. The controller reads y, then acts; its output is held for one cycle.
+
+    Parameters
+    ----------
+    loop : ValveLoop
+        Plant, valve and controller.
+    around : Surroundings
+        Set-point, load and noise in N cycles.
+
+    Returns
+    -------
+    u, y, position : (N,) array
+        In %, in y's unit, and in %.
     """
     plant = (loop.gain, loop.lag_s, loop.second_lag_s, 1.0 if loop.integrating else 0.0)
     delay = round(loop.dead_time_s / loop.cycle_s * _STEPS)

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from autotune.models import read_model
+from autotune.model_tables import read_model
 from tests.benchmarks._rival_cases import Case
 from tests.benchmarks._rival_forecasts import gaussian_process, narx, nrmse, windows
 from tests.benchmarks._rival_sindy import sindy

@@ -15,7 +15,24 @@ from autotune.recording import Recording
 
 
 def diagnosed(model: Any, recordings: Sequence[Recording], controller: Controller | None, **settings: Any) -> Any:
-    """Return the diagnosis of recordings, which shows itself as a table."""
+    """Return the diagnosis of recordings, which shows itself as a table.
+
+    Parameters
+    ----------
+    model : object
+        A model, or what :func:`autotune.diagnose` takes for one.
+    recordings : sequence of Recording
+        With the model's u and y.
+    controller : Controller or None
+        The law that closed the loop, if one did.
+    **settings : object
+        Keyword arguments of :func:`autotune.diagnosis.diagnose`.
+
+    Raises
+    ------
+    InputError
+        A setting that is not known, or units that do not fit the model or each other.
+    """
     import autotune.api.shown_diagnosis  # noqa: F401 - it registers the table
     from autotune.diagnosis import diagnose
     from autotune.equations.recorded_units import require_units_of_each_other, require_units_of_model
@@ -28,7 +45,27 @@ def diagnosed(model: Any, recordings: Sequence[Recording], controller: Controlle
 
 
 def simulated(model: Any, recording: Recording, horizon_s: float | None) -> FloatArray:
-    """Return y simulated with a recording's u, of a chain, of equations or of an FMU."""
+    """Return y simulated with a recording's u, of a chain, of equations or of an FMU.
+
+    Parameters
+    ----------
+    model : object
+        A model, or what :func:`autotune.simulate` takes for one.
+    recording : Recording
+        N rows, evenly sampled; its u drives the model.
+    horizon_s : float or None
+        Length of the windows [s] before which the state is estimated anew; None for one free run.
+
+    Returns
+    -------
+    (N,) array
+        y [y unit].
+
+    Raises
+    ------
+    InputError
+        Units that do not fit, or a recording with gaps.
+    """
     from autotune.diagnosis import forecast
     from autotune.equations.files import forecast_any
     from autotune.equations.recorded_units import require_units_of_model

@@ -27,7 +27,15 @@ class Model:
     @staticmethod
     @checked
     def from_equations(content: Mapping[str, Any], name: str = "model") -> EquationModel:
-        """Return equations from a mapping with the keys of a model file: ``input``, ``output``, ``state``, .."""
+        """Return equations from a mapping with the keys of a model file: ``input``, ``output``, ``state``, ..
+
+        Parameters
+        ----------
+        content : mapping
+            The tables of a model file.
+        name : str
+            Where ``content`` has none.
+        """
         from autotune.equations.read import equations_of
 
         return equations_of({"name": name, **content}, str(content.get("name", name)))
@@ -35,7 +43,15 @@ class Model:
     @staticmethod
     @checked
     def from_control(system: Any, name: str = "") -> Chain | EquationModel:
-        """Return a continuous system of python-control: a chain, or equations where it has several inputs."""
+        """Return a continuous system of python-control: a chain, or equations where it has several inputs.
+
+        Parameters
+        ----------
+        system : control.TransferFunction or control.StateSpace
+            Continuous; time in s.
+        name : str
+            Of the model.
+        """
         from autotune.equations.imports import from_control
 
         return from_control(system, name)
@@ -43,7 +59,15 @@ class Model:
     @staticmethod
     @checked
     def from_text(text: str, name: str = "plant") -> Chain:
-        """Return a transfer function as people write it: ``-65.5/(s(0.36s+1)) e^-0.1s``, zpk, gain and lags."""
+        """Return a transfer function as people write it: ``-65.5/(s(0.36s+1)) e^-0.1s``, zpk, gain and lags.
+
+        Parameters
+        ----------
+        text : str
+            In s [rad/s], dead time as ``e^-0.1s`` [s].
+        name : str
+            Of the model.
+        """
         from autotune.equations.imports import from_coefficients
         from autotune.equations.transfer_text import parse_transfer_function
 
@@ -60,7 +84,21 @@ class Model:
         columns: Sequence[str] = ("u",),
         name: str = "function",
     ) -> BlackBox:
-        """Return a step function as a model: ``step(state, inputs, parameters, dt_s) -> (next_state, y)``."""
+        """Return a step function as a model: ``step(state, inputs, parameters, dt_s) -> (next_state, y)``.
+
+        Parameters
+        ----------
+        step : callable
+            From state, (columns,) inputs, parameters and time step [s] to the next state and y.
+        state : object
+            At the first row.
+        parameters : mapping of str to float
+            Names and nominal values of what may be fitted.
+        columns : sequence of str
+            The recording's columns that are the inputs, in order.
+        name : str
+            Of the model.
+        """
         from autotune.equations.black_box import from_function
 
         return from_function(step, state, parameters, columns=columns, name=name)

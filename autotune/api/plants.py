@@ -9,7 +9,8 @@ from autotune.api.python_control import from_control
 from autotune.controller import Controller, DiscreteController, PIDController, read_controller
 from autotune.design.rst import RST
 from autotune.errors import InputError
-from autotune.models import LARGEST, SMALLEST, Model, TransferFunction, read_model
+from autotune.model_tables import read_model
+from autotune.models import LARGEST, SMALLEST, Model, TransferFunction
 
 if TYPE_CHECKING:
     from autotune.identification.parametric import PlantFit

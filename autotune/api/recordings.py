@@ -111,7 +111,20 @@ def _numbers(values: Any, column: str) -> FloatArray:
 
 
 def recordings(source: Source, **names: str) -> list[Recording]:
-    """Return one or several recordings; a list or tuple is several."""
+    """Return one or several recordings; a list or tuple is several.
+
+    Parameters
+    ----------
+    source : table, arrays, file, Recording, or a list of these
+        As :func:`autotune.read` takes them.
+    **names : str
+        Which column is t, u, y or r.
+
+    Raises
+    ------
+    InputError
+        The list is empty, or one of them is no recording.
+    """
     several = source if isinstance(source, list | tuple) else [source]
     if not several:
         raise InputError("no recording", where="read", remedy="give at least one")

@@ -19,9 +19,10 @@ from autotune.batch.loop import Finding, Work
 from autotune.batch.row import Row
 from autotune.batch.settings import CampaignSettings, LoopSettings, matches
 from autotune.errors import InputError
-from autotune.outputs import Output, unwritable, write_whole
+from autotune.outputs import Output, unwritable
 from autotune.progress import Progress
 from autotune.version import __version__
+from autotune.whole_files import write_whole
 
 RESULTS, REPORT = "results.parquet", "report.html"
 
@@ -136,7 +137,15 @@ class Campaign:
         }
 
     def keep(self, loop: LoopSettings, finding: Finding) -> Row:
-        """Write the result of a loop, whole or not at all; return its row as it will be read again."""
+        """Write the result of a loop, whole or not at all; return its row as it will be read again.
+
+        Parameters
+        ----------
+        loop : LoopSettings
+            What was asked of the loop.
+        finding : Finding
+            What came of it.
+        """
         path = self.file(loop.name)
         path.parent.mkdir(parents=True, exist_ok=True)
         content: dict[str, Any] = {"asked": self._digest(loop)} | finding.to_json()

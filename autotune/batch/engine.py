@@ -63,7 +63,7 @@ def cluster(workers: int | None = None, scheduler: str | None = None, *, process
     """
     if scheduler is None:
         tasks = workers or CPU_COUNT
-        with dask.config.set(_EMBEDDED), _embedded(tasks, processes) as local, Client(local) as client:
+        with dask.config.set(_EMBEDDED), _start_embedded(tasks, processes) as local, Client(local) as client:
             yield client
         return
     try:
@@ -89,7 +89,7 @@ async def _reached(scheduler: str) -> None:
     await comm.close()
 
 
-def _embedded(tasks: int, processes: bool) -> LocalCluster:
+def _start_embedded(tasks: int, processes: bool) -> LocalCluster:
     """Start the embedded cluster; a Ctrl-C meanwhile waits until it stands, and its processes never hear one.
 
     A terminal sends Ctrl-C to every process of the command. A signal that is blocked where a process is started is

@@ -12,12 +12,12 @@ from autotune.arrays import BoolArray, FloatArray
 from autotune.batch.settings import ExportSettings, LoopSettings, matches
 from autotune.errors import InputError
 from autotune.files.cells import Cells
-from autotune.files.reading import Signals, signals_of, stamp_form, stamps_of
 from autotune.files.signal_names import Roles, SignalNames, find_roles
 from autotune.files.stamps import seconds
 from autotune.files.table import Table, listed
+from autotune.files.table_signals import Signals, signals_of, stamp_form, stamps_of
 from autotune.files.text_file import beginning
-from autotune.files.workbook import PARQUET, WORKBOOKS, open_table, parquet_table
+from autotune.files.workbook import PARQUET, open_table, parquet_table
 from autotune.progress import Progress
 
 _BLOCK_BYTES = 16 << 20
@@ -92,16 +92,6 @@ def _roles(table: Table, loop: LoopSettings, export: ExportSettings) -> Roles:
     return Roles(time=found.time, names=found.names, unsure=(), others=())
 
 
-def columns_of(path: Path, export: ExportSettings) -> list[str]:
-    """Return the names of a file's columns."""
-    kind = path.suffix.lower()
-    if kind in PARQUET:
-        return list(parquet_table([path]).names)
-    if kind in WORKBOOKS:
-        return list(open_table(path, export.form()).names)
-    return list(beginning(path, export.form())[0].header.names)
-
-
 def to_parquet(path: Path, out: Path, wanted: Sequence[str], export: ExportSettings, advance: Progress) -> None:
     """Turn a text export into Parquet, block by block, so that each loop reads its own columns only.
 
@@ -145,7 +135,7 @@ def to_parquet(path: Path, out: Path, wanted: Sequence[str], export: ExportSetti
                     cells: Mapping[str, Cells] = {name: _texts(batch.column(name)) for name in time}
                     micro = np.rint(1e6 * stamps_of(table, time, cells, stamp))
                     stamps = pa.array(micro, from_pandas=True).cast(pa.int64()).cast(pa.timestamp("us"))
-                    columns = [stamps, *(_pointed(batch.column(name), table.decimal) for name in kept)]
+                    columns = [stamps, *(_with_decimal_point(batch.column(name), table.decimal) for name in kept)]
                     writer.write_table(pa.Table.from_arrays(columns, schema=pa.schema(fields)))
                     advance(path.name, file.tell() / size)
     except pa.ArrowInvalid as error:
@@ -188,7 +178,7 @@ def _texts(column: Any) -> list[str]:
     return ["" if cell is None else cell for cell in column.to_pylist()]
 
 
-def _pointed(column: Any, decimal: str) -> Any:
+def _with_decimal_point(column: Any, decimal: str) -> Any:
     """Return numbers with a decimal point; a Parquet file no longer says which mark its text has."""
     import pyarrow.compute as pc
 

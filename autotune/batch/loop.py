@@ -27,7 +27,8 @@ from autotune.errors import AutotuneError, IdentificationError
 from autotune.experiment_design.next_experiment import with_next_experiment
 from autotune.identification.closed_loop.identify import identify_closed_loop
 from autotune.identification.closed_loop.loop_plant import loop_plant
-from autotune.identification.frequency.recorded import FrequencyEstimate, combine, frequency_points
+from autotune.identification.frequency.recorded import combine, frequency_points
+from autotune.identification.frequency.spectral_points import FrequencyEstimate
 from autotune.identification.parametric import PlantFit
 from autotune.model_file import read_model
 from autotune.pipeline import Analysis, Measured, analyse, analysis_json, measured_of
@@ -137,7 +138,7 @@ def _finding(work: Work, row: Row) -> Finding:
         model = read_model(loop.model)
         require_units_of_model(model, pieces)
         found = with_next_experiment(diagnose(model, pieces, present))
-        return Finding(row=_diagnosed(row, found), result=found.as_json())
+        return Finding(row=_add_diagnosis(row, found), result=found.as_json())
     if settings.task == "design" and settings.method == "frequency":
         measured = measured_of(record.pieces)
     else:
@@ -152,7 +153,7 @@ def _finding(work: Work, row: Row) -> Finding:
         return Finding(row=row, points=points_to_json(points))
     analysis = analyse(points, settings.design, fit=measured.fit, facts=measured.facts, compare=False)
     return Finding(
-        row=_designed(row, analysis, present, settings), points=points_to_json(points), result=analysis_json(analysis)
+        row=_add_design(row, analysis, present, settings), points=points_to_json(points), result=analysis_json(analysis)
     )
 
 
@@ -188,7 +189,7 @@ def _points(
     estimates, refusals = [], []
     for piece in record.pieces:
         try:
-            estimates.append(_opened(piece))
+            estimates.append(_estimate_points(piece))
         except IdentificationError as error:
             refusals.append(error)
     if not estimates:
@@ -200,7 +201,7 @@ def _points(
     return combined.points, None, (*combined.notes, left_out)
 
 
-def _opened(piece: Recording) -> FrequencyEstimate:
+def _estimate_points(piece: Recording) -> FrequencyEstimate:
     """Estimate points, but not from a loop that nothing but its own feedback moved: they would lie at -1/C."""
     estimate = frequency_points(piece)
     r = piece.extra.get("r")
@@ -213,7 +214,7 @@ def _opened(piece: Recording) -> FrequencyEstimate:
     return estimate
 
 
-def _designed(row: Row, analysis: Analysis, present: Controller | None, settings: CampaignSettings) -> Row:
+def _add_design(row: Row, analysis: Analysis, present: Controller | None, settings: CampaignSettings) -> Row:
     reduced, c, m = analysis.reduced, analysis.controller, analysis.margins
     row = replace(
         _with_notes(row, analysis.warnings),
@@ -231,11 +232,11 @@ def _designed(row: Row, analysis: Analysis, present: Controller | None, settings
         **plant_figures(analysis.fit.plant),
     )
     if present is not None:
-        row = _compared(row, present, margins(analysis.fit.plant, present), settings)
+        row = _judge_present(row, present, margins(analysis.fit.plant, present), settings)
     return row
 
 
-def _compared(row: Row, present: Controller, m: Margins, settings: CampaignSettings) -> Row:
+def _judge_present(row: Row, present: Controller, m: Margins, settings: CampaignSettings) -> Row:
     """Judge the controller that the loop runs with by the margins that were asked for, and beside the new one."""
     asked_modulus, asked_phase = settings.design.margins
     row = replace(
@@ -260,7 +261,7 @@ def _compared(row: Row, present: Controller, m: Margins, settings: CampaignSetti
     return row
 
 
-def _diagnosed(row: Row, found: Diagnosis) -> Row:
+def _add_diagnosis(row: Row, found: Diagnosis) -> Row:
     attention: dict[str, Attention] = {"none": "fine", "parameters": "look", "effect": "act", "unexplained": "act"}
     fit = found.fit
     grave = attention[found.verdict] == "act"

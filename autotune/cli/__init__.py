@@ -59,6 +59,7 @@ from autotune.cli import (  # noqa: E402, F401, I001
     live,
     frequency,
     delay,
+    watch,
     closed_loop,
     design,
     references,

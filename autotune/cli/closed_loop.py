@@ -95,7 +95,7 @@ def closed_loop(
         model = model_of_recording(
             data, method=method.value, order=order, controller=law, more=more, windows=_windows(f, p, n_cl, psi)
         )
-        place.json(model_json(model, method.value))
+        place.json(_model_json(model, method.value))
         poles = ", ".join(f"{pole:.4g}" for pole in model.poles)
         typer.echo(f"order {model.order} by {method.value}, poles {poles}")
         typer.echo(f"wrote {out}")
@@ -126,7 +126,7 @@ def _windows(f: int | None, p: int | None, n_cl: int | None, psi: str | None) ->
     return Windows(**settings_of(Windows, {"f": f, "p": p, "n_cl": n_cl, "Psi": psi}, where="identify closed-loop"))
 
 
-def model_json(model: InnovationModel, method: str) -> dict[str, Any]:
+def _model_json(model: InnovationModel, method: str) -> dict[str, Any]:
     """Return the content of ``closed_loop.json`` of a model without regions."""
     single = model.B.shape[1] == 1 and len(model.C) == 1
     content: dict[str, Any] = {
@@ -235,10 +235,10 @@ def summary(result: ClosedLoopIdentification) -> str:
     late = f" and {model.input_delay} samples of dead time" if model.input_delay else ""
     sd = math.sqrt(float(model.innovation_covariance[0, 0]))
     found = f"order {model.order}{late}, poles {poles}, innovation sd {sd:.3g}"
-    return f"{found}; {_left_open(result)}{result.excitation.sentence}"
+    return f"{found}; {_alternatives_text(result)}{result.excitation.sentence}"
 
 
-def _left_open(result: ClosedLoopIdentification) -> str:
+def _alternatives_text(result: ClosedLoopIdentification) -> str:
     """Return what is said of other orders and dead times that the record leaves open; nothing where there are none."""
     from autotune.identification.closed_loop.loop_plant import PROBABLE
 

@@ -20,7 +20,15 @@ if TYPE_CHECKING:
 
 
 def rig_of(config: Config, dry_run: bool = False) -> Rig:
-    """Return the rig that the configuration describes, or its simulated twin; nothing has been sent to it."""
+    """Return the rig that the configuration describes, or its simulated twin; nothing has been sent to it.
+
+    Parameters
+    ----------
+    config : Config
+        Of the rig.
+    dry_run : bool
+        Whether its simulated twin is meant.
+    """
     from autotune.controller import PIDController
     from drivers import open_rig, twin_of
 
@@ -100,7 +108,15 @@ class ProgressBar:
         self._progress.update(self._task, completed=status.fraction, description=text, left=left)
 
     def work(self, what: str, share: float) -> None:
-        """Show what is being computed and the share done, 0 to 1."""
+        """Show what is being computed and how much of it is done.
+
+        Parameters
+        ----------
+        what : str
+            What is being computed.
+        share : float
+            How much of it is done, 0 to 1.
+        """
         self._progress.update(self._task, completed=share, description=what, left="")
 
     def __enter__(self) -> ProgressBar:

@@ -81,7 +81,7 @@ def _checks(config: Path | None) -> Iterator[Check]:
     yield _python()
     yield from _packages()
     yield _extra()
-    yield _compiled()
+    yield _check_compiled()
     yield from _writing(Path.cwd())
     content, check = _configuration(config)
     if check is not None:
@@ -131,7 +131,7 @@ def _extra() -> Check:
     return Check(subject="live page", found=f"nicegui {metadata.version('nicegui')}")
 
 
-def _compiled() -> Check:
+def _check_compiled() -> Check:
     """Say whether the inner loops are compiled already, and whether they can be kept."""
     import autotune
 

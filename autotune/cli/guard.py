@@ -88,7 +88,7 @@ def without_stdout() -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-def _named(error: BaseException) -> str:
+def _text_of_error(error: BaseException) -> str:
     text = str(error).strip().splitlines()
     return printable(f"{type(error).__name__}: {text[0][:200]}" if text else type(error).__name__)
 
@@ -107,7 +107,7 @@ def _unforeseen(error: Exception, ctx: Any) -> AutotuneError:
     kept = _keep_traceback(error, _place(ctx))
     kind = UnforeseenAtRig if _RIG_IN_COMMAND.get() else Unforeseen
     return kind(
-        f"a defect of the tool: {_named(error)}",
+        f"a defect of the tool: {_text_of_error(error)}",
         where=ctx.command_path,
         remedy=f"the traceback is in {kept}; please report it",
     )

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
-from pydantic import BaseModel
 from rich.console import Console
 
 from autotune.cli import app
 from autotune.cli.init_keys import REGISTER, Table, add_registers, register, set_keys
 from autotune.cli.init_model import EXAMPLE, ModelOfRig, model_of_rig
 from autotune.cli.init_questions import Questions, one_of, pair
+from autotune.cli.init_text import text_of
 from autotune.errors import InputError
 from autotune.outputs import Output
 
@@ -161,11 +160,11 @@ def init(
         twin.place(config)  # refused before anything is asked in vain
     answers: Table = {}
     if simulated and isinstance(twin, str):
-        content = _simulated(twin)
+        content = _simulated_config(twin)
     else:
         given = {"host": host, "device": device, "recording": recording, "y_span": y_span, "u_span": u_span}
         given |= {"endpoint": endpoint, "y_node": y_node, "u_node": u_node, "y_place": y_place, "u_place": u_place}
-        reached = _reached(questions, chosen, given | {"y": y_register, "u": u_register})
+        reached = _ask_rig(questions, chosen, given | {"y": y_register, "u": u_register})
         if registers and not chosen.has_registers:
             raise InputError(f'kind = "{chosen.name}" has no registers', where="--register", remedy="leave it out")
         add_registers(reached.get("registers", {}), registers or ())
@@ -180,14 +179,14 @@ def init(
             "u": questions.ask("--u", u, "command that holds it there, about", float),
         }
         questions.require()
-        played = _played(twin, config, answers)
+        played = _settings_of_twin(twin, config, answers)
         content = _real(reached | (played if simulated else {"twin": played} if played else {}), answers)
     content = {"name": config.stem, **content}
     set_keys(content, keys or ())
     validated(Config, content, str(config))
     place = Output(config)
     written = twin.write(config, answers) if isinstance(twin, ModelOfRig) else None
-    place.text(_text(content, config))
+    place.text(text_of(content, config))
     console = Console(highlight=False, soft_wrap=True)
     console.print(f"wrote {config}" + (f" and {written}" if written else ""), markup=False)
     if simulated:
@@ -210,14 +209,14 @@ def _plant_or_model(answer: str) -> str | ModelOfRig:
         ) from None
 
 
-def _played(twin: Plant | ModelOfRig | None, config: Path, answers: Table) -> Table:
+def _settings_of_twin(twin: Plant | ModelOfRig | None, config: Path, answers: Table) -> Table:
     """Return what a simulated rig, or the twin of a real one, is to play: of a model with the usual sensor."""
     if isinstance(twin, ModelOfRig):
         span = abs(answers["y_range"][1] - answers["y_range"][0])
         return {
             "model": twin.path(config),
-            "noise": _rounded(NOISE * span),
-            "resolution": _rounded(span / CONVERTER),
+            "noise": _round(NOISE * span),
+            "resolution": _round(span / CONVERTER),
         }
     return {} if twin is None else {"plant": twin, **PLANTS[twin].get("rig", {})}
 
@@ -236,7 +235,7 @@ _CUSTOM = {f"{which}_file": f"certificates/{name}" for which, name in
            {"ca": "ca.pem", "cert": "host.pem", "key": "host.key", "server_cert": "server.pem"}.items()}  # fmt: skip
 
 
-def _reached(questions: Questions, kind: Kind, given: Mapping[str, Any]) -> Table:
+def _ask_rig(questions: Questions, kind: Kind, given: Mapping[str, Any]) -> Table:
     """Return the table [rig] of a rig that is there: what the settings of its kind have keys for is asked."""
     keys = kind.settings.model_fields
     rig: Table = {"kind": kind.name} | {key: name for key, name in _CUSTOM.items() if key in keys}
@@ -260,7 +259,7 @@ def _reached(questions: Questions, kind: Kind, given: Mapping[str, Any]) -> Tabl
     return rig
 
 
-def _simulated(plant: Plant) -> Table:
+def _simulated_config(plant: Plant) -> Table:
     known = dict(PLANTS[plant])
     return {"rig": {"kind": "simulated", "plant": plant, **known.pop("rig", {})}, **known}
 
@@ -273,74 +272,19 @@ def _real(rig: Table, answers: Table) -> Table:
     if not room > 0.0:
         raise InputError(f"y = {answers['y']:g} is not within {y_min:g}..{y_max:g}", where="operating_point.y")
     # a quarter of the room leaves the rest to overshoot; rounded to what a person would have written
-    swing = _rounded(0.25 * room)
+    swing = _round(0.25 * room)
     T_s = answers["sample_time_s"]
-    budget_s = max(60.0, _rounded(SWEEP_SAMPLES * T_s))
+    budget_s = max(60.0, _round(SWEEP_SAMPLES * T_s))
     return {
         "rig": rig,
         "signals": {name: answers[name] for name in ("sample_time_s", "u_unit", "y_unit")},
         "limits": {"u_min": u_min, "u_max": u_max, "u_safe": answers["u_safe"],
                    "y_min": y_min, "y_max": y_max, "swing": swing, "time_s": 4.0 * budget_s},
         "operating_point": {"y": answers["y"], "u_guess": answers["u"],
-                            "u_uncertainty": _rounded(0.05 * (u_max - u_min)), "approach": "hold"},
+                            "u_uncertainty": _round(0.05 * (u_max - u_min)), "approach": "hold"},
         "experiment": {"points": 5, "budget_s": budget_s},
     }  # fmt: skip
 
 
-def _rounded(value: float) -> float:
+def _round(value: float) -> float:
     return float(f"{value:.2g}")
-
-
-def _text(content: Table, path: Path) -> str:
-    """Return the file: every key with its description, those left at their defaults as comments."""
-    from autotune.config import Config
-
-    lines = [f"# {path.name}: what autotune run does, and on what. A line that begins with #: is a default."]
-    lines += ["# autotune schema --out config.schema.json lets editors complete the keys.", ""]
-    plain = {name: field for name, field in Config.model_fields.items() if _model(field.annotation, {}) is None}
-    lines += [f"{name} = {_value(content[name])}" for name in plain if name in content]
-    for name, field in Config.model_fields.items():
-        if name in plain:
-            continue
-        model = _model(field.annotation, content.get(name, {}))
-        if model is not None:
-            lines += _section(name, model, content.get(name))
-    return "\n".join(lines) + "\n"
-
-
-def _model(annotation: Any, given: Mapping[str, Any]) -> type[BaseModel] | None:
-    """Return the settings that a key holds: of the kinds of a union the one that was given."""
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        kinds = annotation.model_fields.get("kind")
-        return None if kinds and "kind" in given and given["kind"] not in get_args(kinds.annotation) else annotation
-    models = (_model(part, given) for part in get_args(annotation))
-    return next((model for model in models if model is not None), None)
-
-
-def _section(path: str, model: type[BaseModel], given: Mapping[str, Any] | None) -> list[str]:
-    """Return a table and the tables in it; a table that was not given stays a comment."""
-    given_here = given or {}
-    written, after = [], []
-    for name, field in sorted(model.model_fields.items(), key=lambda named: named[0] != "kind"):
-        inner = None if path.endswith(("registers", "nodes", "rig.signals")) else _model(field.annotation, {})
-        if inner is not None and not isinstance(given_here.get(name), list | tuple):
-            if name in given_here:
-                after += _section(f"{path}.{name}", inner, given_here[name])
-            continue
-        value = given_here.get(name, field.default)
-        shown = "" if value is None or (field.is_required() and name not in given_here) else f" {_value(value)}"
-        mark = "" if name in given_here else "#: "
-        written.append((f"{mark}{name} ={shown}", field.description or "how the rig is reached"))
-    head = f"[{path}]" if given is not None else f"#: [{path}]"
-    width = min(max((len(line) for line, _ in written), default=0), 44)
-    says = " ".join((model.__doc__ or "").replace("``", "").split())
-    return ["", f"# {says}", head, *(f"{line:<{width}}  # {text}".rstrip(" #") for line, text in written), *after]
-
-
-def _value(value: Any) -> str:
-    """Return a value as TOML writes it, on one line."""
-    if isinstance(value, Mapping):
-        return "{ " + ", ".join(f"{key} = {_value(one)}" for key, one in value.items()) + " }"
-    if isinstance(value, tuple | list):
-        return "[" + ", ".join(_value(one) for one in value) + "]"
-    return json.dumps(value, ensure_ascii=False)

@@ -40,6 +40,13 @@ def register(answer: str) -> Table:
 def add_registers(registers: Table, given: Iterable[str]) -> None:
     """Put ``NAME=REGISTER`` into a register map; ``gains.NAME`` is a setting in a maker's form.
 
+    Parameters
+    ----------
+    registers : dict
+        The map as far as it is written; changed in place.
+    given : iterable of str
+        The options, ``NAME=REGISTER``.
+
     Raises
     ------
     InputError
@@ -61,6 +68,13 @@ def add_registers(registers: Table, given: Iterable[str]) -> None:
 
 def set_keys(content: Table, given: Iterable[str]) -> None:
     """Set ``PATH.TO.KEY=VALUE`` in a configuration; what is no TOML value is taken as text.
+
+    Parameters
+    ----------
+    content : dict
+        The configuration as far as it is written; changed in place.
+    given : iterable of str
+        The options, ``PATH.TO.KEY=VALUE``.
 
     Raises
     ------

@@ -47,8 +47,17 @@ class ModelOfRig:
         return self.text if place is None else str(place.path)
 
     def write(self, config: Path, answers: Mapping[str, Any]) -> Path | None:
-        """Write the model file of a transfer function, which holds around the operating point, and return its path."""
-        from autotune.models import Block, Model, Port, write_model
+        """Write the model file of a transfer function, which holds around the operating point, and return its path.
+
+        Parameters
+        ----------
+        config : Path
+            The configuration's file, beside which the model's lies.
+        answers : mapping
+            What the questions gave.
+        """
+        from autotune.model_tables import write_model
+        from autotune.models import Block, Model, Port
 
         place = self.place(config)
         if place is None or self.dynamics is None:

@@ -42,7 +42,7 @@ class Questions:
             if default is None:
                 self._missing.append(flag)
             return default
-        return typer.prompt(question, default=default, value_proc=_checked(convert))
+        return typer.prompt(question, default=default, value_proc=_ask_again_where_refused(convert))
 
     def require(self) -> None:
         """Refuse where an answer is missing.
@@ -57,7 +57,7 @@ class Questions:
             raise InputError(f"{flags}: no answer", where="autotune init", remedy="give them, or call it at a terminal")
 
 
-def _checked(convert: Callable[[str], Any]) -> Callable[[str], Any]:
+def _ask_again_where_refused(convert: Callable[[str], Any]) -> Callable[[str], Any]:
     """Let a question be asked again where its answer is refused."""
 
     def check(answer: str) -> Any:
@@ -70,7 +70,22 @@ def _checked(convert: Callable[[str], Any]) -> Callable[[str], Any]:
 
 
 def one_of(answer: str, known: Collection[str], flag: str) -> str:
-    """Return an answer that is one of the known ones; refuse any other."""
+    """Return an answer that is one of the known ones; refuse any other.
+
+    Parameters
+    ----------
+    answer : str
+        What was given.
+    known : collection of str
+        What may be.
+    flag : str
+        Its option, for the refusal.
+
+    Raises
+    ------
+    InputError
+        Any other answer.
+    """
     if answer not in known:
         raise InputError(f"{answer!r} is none of {', '.join(known)}", where=flag)
     return answer

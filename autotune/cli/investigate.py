@@ -10,7 +10,7 @@ import typer
 
 from autotune.cli import app
 from autotune.cli.recordings import R, T, U, Y, read_all, signal_names
-from autotune.outputs import write_whole
+from autotune.whole_files import write_whole
 
 if TYPE_CHECKING:
     from autotune.pipeline.investigation import Investigation

@@ -78,10 +78,10 @@ def real_time_priority() -> tuple[str, str]:
     policy = os.sched_getscheduler(0)
     if policy in (os.SCHED_FIFO, os.SCHED_RR):
         return f"real-time priority {os.sched_getparam(0).sched_priority}", ""
-    return "no real-time priority", f"chrt --fifo {PRIORITY} autotune run CONFIG.toml ...{_allowed()}"
+    return "no real-time priority", f"chrt --fifo {PRIORITY} autotune run CONFIG.toml ...{_missing_permission()}"
 
 
-def _allowed() -> str:
+def _missing_permission() -> str:
     """Return what has to be done before a program may ask for it; nothing where it may."""
     import resource
 

@@ -24,7 +24,8 @@ OUT = Annotated[Path, typer.Option(help="model file to write", metavar="M.toml")
 
 def _write(model: Model | EquationModel, place: Output) -> None:
     from autotune.equations import write_equations
-    from autotune.models import Model, write_model
+    from autotune.model_tables import write_model
+    from autotune.models import Model
 
     if isinstance(model, Model):
         place.by(lambda part: write_model(model, part))

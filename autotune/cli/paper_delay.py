@@ -83,13 +83,13 @@ def followed_examples() -> tuple[Followed, ...]:
 
     fourth, fifth = DelayTracking(after_s=14.0, rate=0.4), DelayTracking(start_s=3.6, after_s=40.0, rate=0.4)
     return (
-        _followed("Example 1, figure 1", 50.0, drifting, lambda _: 0.0, 1e-3, None),
-        _followed("Example 4, figure 2", 50.0, drifting, lambda _: 0.5, 4e-3, fourth),
-        _followed("Example 5, figure 3", 120.0, lambda _: -1.2, ramp, 4e-4, fifth),
+        _follow("Example 1, figure 1", 50.0, drifting, lambda _: 0.0, 1e-3, None),
+        _follow("Example 4, figure 2", 50.0, drifting, lambda _: 0.5, 4e-3, fourth),
+        _follow("Example 5, figure 3", 120.0, lambda _: -1.2, ramp, 4e-4, fifth),
     )
 
 
-def _followed(
+def _follow(
     title: str,
     duration_s: float,
     a_1: Callable[[float], float],

@@ -11,7 +11,7 @@ from rich.progress import Progress
 from rich.table import Table
 
 from autotune.errors import InputError
-from autotune.outputs import write_whole
+from autotune.whole_files import write_whole
 
 if TYPE_CHECKING:
     from sim.proof import Campaign
@@ -19,14 +19,39 @@ if TYPE_CHECKING:
 
 
 def publish(path: Path, digest: str) -> None:
-    """Write the seal before anything is diagnosed; a continued campaign must have the same one."""
+    """Write the seal before anything is diagnosed; a continued campaign must have the same one.
+
+    Parameters
+    ----------
+    path : Path
+        The seal's file.
+    digest : str
+        Hash of the sealed answers.
+
+    Raises
+    ------
+    InputError
+        The file holds another one.
+    """
     if path.exists() and path.read_text(encoding="utf-8").strip() != digest:
         raise InputError(f"{path}: these answers are not the ones that were sealed; use another --out")
     write_whole(path, digest + "\n")
 
 
 def diagnose_all(console: Console, tasks: Sequence[tuple[Campaign, int]], workers: int, scheduler: str | None) -> None:
-    """Diagnose cases of campaigns; each diagnosis is a program of its own, so a thread is enough to start it."""
+    """Diagnose cases of campaigns; each diagnosis is a program of its own, so a thread is enough to start it.
+
+    Parameters
+    ----------
+    console : Console
+        Shows how far it is.
+    tasks : sequence of (Campaign, int)
+        Cases by campaign and number.
+    workers : int
+        How many at once.
+    scheduler : str or None
+        Address of a Dask scheduler; None starts one here.
+    """
     from autotune.batch.engine import cluster, run_all
 
     with cluster(workers, scheduler, processes=False) as client, Progress(console=console) as progress:
@@ -44,7 +69,15 @@ def _diagnose(task: tuple[Campaign, int]) -> None:
 
 
 def print_confusion(console: Console, marks: Sequence[Mark]) -> None:
-    """Print what was said of what."""
+    """Print what was said of what.
+
+    Parameters
+    ----------
+    console : Console
+        Where.
+    marks : sequence of Mark
+        One for each case.
+    """
     from sim.score import confusion
 
     view = Table("concealed", "cases", "right", "said instead", title="Confusion matrix, by rows")
@@ -54,7 +87,15 @@ def print_confusion(console: Console, marks: Sequence[Mark]) -> None:
 
 
 def print_table(console: Console, rows: Sequence[Row]) -> None:
-    """Print the figures with what is asked of them."""
+    """Print the figures with what is asked of them.
+
+    Parameters
+    ----------
+    console : Console
+        Where.
+    rows : sequence of Row
+        One for each figure.
+    """
     view = Table("figure", "asked", "measured", "95 % interval", "of", "met", title="Proof on concealed cases")
     for row in rows:
         share = row.interval is not None

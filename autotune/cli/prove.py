@@ -19,7 +19,7 @@ from autotune.cli import app
 from autotune.cli.proof_steps import diagnose_all, print_confusion, print_table, publish
 from autotune.cli.prove_recorded import prove_recorded
 from autotune.errors import InputError, require_extra
-from autotune.outputs import write_whole
+from autotune.whole_files import write_whole
 
 if TYPE_CHECKING:
     from sim.proof import Campaign
@@ -137,7 +137,7 @@ def tie_resolved(out: Path, seed: int) -> dict[str, Any]:
         recording left nothing open, ``right_before`` and ``resolved``.
     """
     from autotune.config import load_config
-    from autotune.models import read_model
+    from autotune.model_tables import read_model
     from autotune.pipeline.investigation import Budget, investigate
     from autotune.recording import read_recording
     from drivers.simulated import SimulatedRig

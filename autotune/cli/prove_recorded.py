@@ -14,7 +14,7 @@ from rich.progress import track
 
 from autotune.cli.proof_steps import diagnose_all, print_confusion, print_table, publish
 from autotune.errors import InputError
-from autotune.outputs import write_whole
+from autotune.whole_files import write_whole
 
 if TYPE_CHECKING:
     from sim.recorded.campaign import RecordedCampaign, RecordedMark

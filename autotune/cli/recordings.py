@@ -24,14 +24,33 @@ R: TypeAlias = Annotated[str | None, typer.Option("--r", metavar="COLUMN", help=
 
 
 def signal_names(t: str | None, u: str | None, y: str | None, r: str | None) -> SignalNames:
-    """Return the columns that the options name."""
+    """Return the columns that the options name.
+
+    Parameters
+    ----------
+    t, u, y, r : str or None
+        Time, command, measurement and set-point; None where the file's own names say it.
+    """
     from autotune.files import SignalNames
 
     return SignalNames(t=t or "", u=u or "", y=y or "", r=r or "")
 
 
 def read_all(paths: Iterable[Path], names: SignalNames) -> list[Recording]:
-    """Return the recordings of all files, each uninterrupted stretch one, and say how the files were read."""
+    """Return the recordings of all files, each uninterrupted stretch one, and say how the files were read.
+
+    Parameters
+    ----------
+    paths : iterable of Path
+        The files.
+    names : SignalNames
+        Which column is which.
+
+    Raises
+    ------
+    InputError
+        A file that is no recording, or units that differ.
+    """
     from autotune.equations.recorded_units import require_units_of_each_other
     from autotune.recording import usable
 
@@ -44,6 +63,20 @@ def read_one(path: Path, names: SignalNames, *, moving: bool = True) -> Recordin
     """Return the recording of a file, its longest stretch where it has several, and say how it was read.
 
     A y that does not move is refused, unless ``moving`` is false.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    names : SignalNames
+        Which column is which.
+    moving : bool
+        Whether a y that does not move is refused.
+
+    Raises
+    ------
+    InputError
+        The file is no recording.
     """
     from autotune.recording import usable
 

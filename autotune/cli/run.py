@@ -15,7 +15,8 @@ from autotune.cli.common import OVERWRITE, ProgressBar, new_folder, rig_of, ungu
 from autotune.cli.live import LISTEN, PORT, TOKEN_FILE
 from autotune.cli.recordings import R, T, U, Y, read_all, signal_names
 from autotune.errors import ExperimentStopped, InputError
-from autotune.outputs import OutputFolder, write_json
+from autotune.outputs import OutputFolder
+from autotune.whole_files import write_json
 
 if TYPE_CHECKING:
     from autotune.config import Config
@@ -81,7 +82,7 @@ def run(
                 keep=keep,
             )
         missed = tuning.verification is not None and not tuning.verification.accepted
-        found = _diagnosed(content, tuning, folder, console) if missed or diagnose else None
+        found = _diagnose(content, tuning, folder, console) if missed or diagnose else None
         recordings = [read_recording(folder / part.recording) for part in tuning.experiment.parts]
         page = run_page(content.name, content.signals, recordings, tuning, found, dry_run=dry_run)
         write_page(page, folder / "report.html")
@@ -136,7 +137,7 @@ def _configuration(config: Path | None, out: Path | None, resume: Path | None, d
     return content.model_copy(update={"rig": twin_of(content.rig)}) if dry_run else content
 
 
-def _diagnosed(config: Config, tuning: Tuning, folder: Path, console: Console) -> Diagnosis | None:
+def _diagnose(config: Config, tuning: Tuning, folder: Path, console: Console) -> Diagnosis | None:
     """Return what the fitted plant leaves out, its files written; None where the recordings do not allow it."""
     from autotune.equations.files import write_any
     from autotune.pipeline.folder import RESULT, VERIFICATION, recordings

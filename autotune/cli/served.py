@@ -136,6 +136,15 @@ def _form_of(config: Config, registers: RegisterMap) -> dict[str, Any]:
 def served(config: Config, device: RegisterDevice, *, refuse: Refusal | None = None) -> Iterator[ModbusRig]:
     """Serve a device at the address of the configuration until the context ends.
 
+    Parameters
+    ----------
+    config : Config
+        With a Modbus rig.
+    device : RegisterDevice
+        What answers.
+    refuse : callable, optional
+        Which requests are refused, and how.
+
     Raises
     ------
     InputError
@@ -148,7 +157,7 @@ def served(config: Config, device: RegisterDevice, *, refuse: Refusal | None = N
             # a pseudo-terminal knows no parity
             parity = settings.parity if twin.device else "N"
             transport = RtuTransport(device=end, baud=settings.baud, parity=parity, stop_bits=settings.stop_bits)
-            with _started(ModbusRig(device, transport, unit_id=settings.unit_id, refuse=refuse)) as rig:
+            with _start(ModbusRig(device, transport, unit_id=settings.unit_id, refuse=refuse)) as rig:
                 yield rig
         return
     ca_file = settings.ca_file if isinstance(settings, ModbusTlsSettings) else None
@@ -157,13 +166,22 @@ def served(config: Config, device: RegisterDevice, *, refuse: Refusal | None = N
     transport_tcp = TcpTransport(
         address=twin.listen, port=settings.port, ca_file=ca_file, cert_file=twin.cert_file, key_file=twin.key_file
     )
-    with _started(ModbusRig(device, transport_tcp, unit_id=settings.unit_id, refuse=refuse)) as rig:
+    with _start(ModbusRig(device, transport_tcp, unit_id=settings.unit_id, refuse=refuse)) as rig:
         yield rig
 
 
 @contextmanager
 def served_opcua(config: Config, settings: OpcUaSettings, users: Mapping[str, str] | None = None) -> Iterator[OpcUaRig]:
     """Serve the configuration's twin behind an OPC UA server at its endpoint until the context ends.
+
+    Parameters
+    ----------
+    config : Config
+        With a twin.
+    settings : OpcUaSettings
+        Endpoint and nodes.
+    users : mapping of str to str, optional
+        Passwords by user name; without them anybody may come.
 
     Raises
     ------
@@ -187,13 +205,20 @@ def served_opcua(config: Config, settings: OpcUaSettings, users: Mapping[str, st
     if settings.security_policy != "None":
         trusted = str(Path(str(settings.cert_file)).parent)
         security = Security(cert_file=twin.cert_file, key_file=twin.key_file, trusted=trusted, users=users)
-    with _started(OpcUaRig(device_of(config), nodes, settings.endpoint, security)) as rig:
+    with _start(OpcUaRig(device_of(config), nodes, settings.endpoint, security)) as rig:
         yield rig
 
 
 @contextmanager
 def served_s7(config: Config, settings: S7Settings) -> Iterator[S7Rig]:
     """Serve the configuration's twin as a Siemens CPU at its address until the context ends.
+
+    Parameters
+    ----------
+    config : Config
+        With a twin.
+    settings : S7Settings
+        Address and data blocks.
 
     Raises
     ------
@@ -203,7 +228,7 @@ def served_s7(config: Config, settings: S7Settings) -> Iterator[S7Rig]:
     from sim.s7_rig import S7Rig
 
     twin = _twin(settings)
-    with _started(S7Rig(device_of(config), s7_places(settings), twin.listen, settings.port)) as rig:
+    with _start(S7Rig(device_of(config), s7_places(settings), twin.listen, settings.port)) as rig:
         yield rig
 
 
@@ -220,6 +245,13 @@ def s7_places(settings: S7Settings) -> dict[str, ServedPlace]:
 @contextmanager
 def served_on_line(config: Config, settings: SerialSettings) -> Iterator[SerialRig]:
     """Serve the configuration's twin as a microcontroller on a serial line until the context ends.
+
+    Parameters
+    ----------
+    config : Config
+        With a twin.
+    settings : SerialSettings
+        The line.
 
     Raises
     ------
@@ -253,7 +285,7 @@ def _twin(settings: AnyModbusSettings | OpcUaSettings | S7Settings | SerialSetti
 
 
 @contextmanager
-def _started(rig: _Served) -> Iterator[_Served]:
+def _start(rig: _Served) -> Iterator[_Served]:
     try:
         rig.__enter__()
     except ConnectionError as error:

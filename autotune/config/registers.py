@@ -100,6 +100,11 @@ class RegisterSettings(Section):
     def inwards(self, low: float, high: float) -> tuple[float, float]:
         """Return the lowest and the highest value that the register can hold between two limits.
 
+        Parameters
+        ----------
+        low, high : float
+            The limits, in the value's unit.
+
         Raises
         ------
         ValueError

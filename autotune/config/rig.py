@@ -235,6 +235,3 @@ def rig_kind_of(settings: type[Section]) -> str:
             f"{settings.__name__} has no kind", where="autotune/config/rig.py", remedy='add kind: Literal["NAME"]'
         )
     return str(get_args(kind.annotation)[0])
-
-
-RIG_KINDS = frozenset(rig_kind_of(model) for model in RIG_SETTINGS)

@@ -68,8 +68,20 @@ class Check:
 def on_plants(
     plants: Sequence[TransferFunction], controller: PIDController, specification: Specification, what: str
 ) -> Check:
-    """Return the check on the worst of some plants."""
-    found = [_signed(margins(plant, controller)) for plant in plants]
+    """Return the check on the worst of some plants.
+
+    Parameters
+    ----------
+    plants : sequence of TransferFunction
+        At least one.
+    controller : PIDController
+        What is checked.
+    specification : Specification
+        The margins that were asked for.
+    what : str
+        The plants in words.
+    """
+    found = [_margins_signed_by_stability(margins(plant, controller)) for plant in plants]
     asked = np.array([specification.modulus_margin, specification.phase_margin_rad])
     worst = min(found, key=lambda pair: float(np.min(np.array(pair[:2]) / asked)))
     modulus, phase, stable = worst
@@ -77,7 +89,7 @@ def on_plants(
     return Check(on=what, kept=kept, modulus=modulus, phase_rad=phase, stable=stable)
 
 
-def _signed(m: Margins) -> tuple[float, float, bool]:
+def _margins_signed_by_stability(m: Margins) -> tuple[float, float, bool]:
     return (m.modulus, m.phase_rad, True) if m.stable else (-m.modulus, -abs(m.phase_rad), False)
 
 
@@ -86,6 +98,15 @@ def on_points(points: Sequence[FrequencyPoint], controller: PIDController, speci
 
     A region that only touches the circle says nothing against the controller: what the points say together about the
     plant at their frequencies is narrower than each one's own region, and is what the fit's region stands for.
+
+    Parameters
+    ----------
+    points : sequence of FrequencyPoint
+        At least one, with covariance.
+    controller : PIDController
+        What is checked.
+    specification : Specification
+        The margins that were asked for.
     """
     C = controller.response(np.array([point.omega_rad_s for point in points]))
     farthest = []

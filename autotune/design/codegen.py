@@ -110,6 +110,13 @@ def c_source(law: PILaw, *, name: str = "control", single: bool = False) -> str:
 def structured_text(law: PILaw, *, name: str = "CONTROL_LAW") -> str:
     """Return an IEC 61131-3 function block in Structured Text, standard functions only.
 
+    Parameters
+    ----------
+    law : PILaw
+        Gains, sample time, limits.
+    name : str
+        Of the function block.
+
     Raises
     ------
     DesignError

@@ -41,7 +41,7 @@ def out_of_corner(problem: Problem, start: FloatArray) -> FloatArray:
     """
     enough = float(problem.norms_and_slacks(start[None, :])[0][0]) * (1.0 - _WORTHWHILE)
     for more in (0.0, *_SLIGHTLY_TIGHTER):
-        squared, found = _followed(problem, start, more)
+        squared, found = _search_on_grids(problem, start, more)
         if squared > enough:
             break
         if problem.kept(found):
@@ -49,7 +49,7 @@ def out_of_corner(problem: Problem, start: FloatArray) -> FloatArray:
     return start
 
 
-def _followed(problem: Problem, start: FloatArray, more: float) -> tuple[float, FloatArray]:
+def _search_on_grids(problem: Problem, start: FloatArray, more: float) -> tuple[float, FloatArray]:
     """Return squared norm and gains of the best PI that shrinking grids find whose slacks are at least ``more``."""
     free = start > 0.0
     steps = np.linspace(-1.0, 1.0, _ZOOM_NODES)
@@ -78,6 +78,15 @@ def plainest(
 
     A search in logarithms of the gains comes as near to a PI as it has steps: its T_d of 1e-30 s says nothing, and no
     device holds it.
+
+    Parameters
+    ----------
+    found : sequence of (4,) array
+        Controllers (K, T_I, T_d, T_f) that keep the constraints, times in s.
+    log_norm : callable
+        Logarithm of a (4,) controller's norm.
+    kept : callable
+        Whether a (4,) controller keeps the constraints.
     """
     cut = [p * np.array([1.0, 1.0, 0.0, 0.0]) for p in found]
     plain = [p for p in cut if kept(p)]

@@ -64,6 +64,13 @@ def sampled_plant(plant: TransferFunction, largest_gain: float = 1.0) -> Sampled
 
     The grid covers the plant's features and the crossovers that gains up to ``largest_gain`` give it.
 
+    Parameters
+    ----------
+    plant : TransferFunction
+        H, time in s.
+    largest_gain : float
+        Largest abs(C) that a design may use [u unit/y unit].
+
     Raises
     ------
     DesignError
@@ -109,6 +116,15 @@ def sampled_plant(plant: TransferFunction, largest_gain: float = 1.0) -> Sampled
 
 def on_grid(plant: TransferFunction, omega: FloatArray, sign: float) -> SampledPlant:
     """Return the plant at the given frequencies, which reach a decade beyond all its features.
+
+    Parameters
+    ----------
+    plant : TransferFunction
+        H, time in s.
+    omega : (N,) array
+        Angular frequencies [rad/s], ascending.
+    sign : float
+        1 or -1, the sign that the gain of a stabilising PI has.
 
     Raises
     ------
@@ -164,10 +180,28 @@ def evaluate(
     Tf: float,
     omega_n: float,
 ) -> Figures:
-    """Return the figures of one controller, (K, T_I, T_d, T_f), on a sampled plant.
+    """Return the figures of one controller on a sampled plant.
 
     ``omega_n`` below 0 stands for the highest crossover, which is interpolated: the noise gain must not jump while the
     crossover moves between two frequencies of the grid.
+
+    Parameters
+    ----------
+    omega : (N,) array
+        Angular frequencies [rad/s], ascending.
+    h : (N,) complex array
+        H(j omega), sign taken out.
+    weights : (N,) array
+        Quadrature weights of the squared norm (11).
+    turn : float
+        Argument change of the open loop's denominator along the grid [rad].
+    K : float
+        Gain, sign taken out [u unit/y unit].
+    Ti, Td, Tf : float
+        Times of integral, derivative and filter [s].
+    omega_n : float
+        Lowest frequency of the noise [rad/s]. Below 0 it stands for the highest crossover, which is interpolated: the
+        noise gain must not jump while the crossover moves between two frequencies of the grid.
     """
     h2 = 0.0
     smallest = 1e300
@@ -240,7 +274,28 @@ def evaluate_grid(
     parameters: FloatArray,
     omega_n: float,
 ) -> FloatArray:
-    """Return the figures of :func:`evaluate` for every row (K, Ti, Td, Tf) of ``parameters``, (M, 6)."""
+    """Return the figures of :func:`evaluate` for many controllers.
+
+    Parameters
+    ----------
+    omega : (N,) array
+        Angular frequencies [rad/s], ascending.
+    h : (N,) complex array
+        H(j omega), sign taken out.
+    weights : (N,) array
+        Quadrature weights of the squared norm (11).
+    turn : float
+        Argument change of the open loop's denominator along the grid [rad].
+    parameters : (M, 4) array
+        Rows of K, T_I, T_d, T_f, as :func:`evaluate` takes them.
+    omega_n : float
+        Lowest frequency of the noise [rad/s]; below 0 the crossover.
+
+    Returns
+    -------
+    (M, 6) array
+        The figures of each row.
+    """
     out = np.empty((len(parameters), 6))
     for k in range(len(parameters)):
         K, Ti, Td, Tf = parameters[k]

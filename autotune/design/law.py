@@ -153,7 +153,17 @@ class PILaw:
         return u, LawState(integral=integral + self.tracking_gain * (u - v), y_filtered=y_f, u=u)
 
     def with_gains(self, controller: PIDController, state: LawState, r: float, y: float) -> tuple[PILaw, LawState]:
-        """Return the law with other gains and the state that hands over without a bump in u."""
+        """Return the law with other gains and the state that hands over without a bump in u.
+
+        Parameters
+        ----------
+        controller : PIDController
+            The new gains.
+        state : LawState
+            Of this law, after the last sample.
+        r, y : float
+            Set-point and measurement of the last sample [y unit].
+        """
         law = replace(self, controller=controller)
         return law, law.initial(state.u, r, y)
 

@@ -271,7 +271,15 @@ class SampledLoop:
 
 
 def open_loop(plant: Plant, controller: Controller) -> ContinuousLoop | SampledLoop:
-    """Return the loop of a plant and a controller: continuous, or sampled where the controller is discrete."""
+    """Return the loop of a plant and a controller: continuous, or sampled where the controller is discrete.
+
+    Parameters
+    ----------
+    plant : Plant
+        Continuous, time in s.
+    controller : Controller
+        A PI or PID, a continuous transfer function, or a discrete one behind a hold.
+    """
     H = transfer_function_of(plant)
     match controller:
         case DiscreteController():

@@ -143,7 +143,15 @@ def margins(plant: Plant, controller: Controller, *, noise_frequency_rad_s: floa
 
 
 def controller_gain(loop: OpenLoop, start_rad_s: float) -> float:
-    """Return the largest abs(C) at and above ``start_rad_s``, left side of (16); infinite for an improper C."""
+    """Return the largest abs(C) from a frequency on, left side of (16); infinite for an improper C.
+
+    Parameters
+    ----------
+    loop : OpenLoop
+        Continuous or sampled.
+    start_rad_s : float
+        Lowest frequency that counts [rad/s].
+    """
     omega = np.append(loop.grid[loop.grid > start_rad_s], start_rad_s)
     largest = float(np.max(np.abs(loop.controller_response(omega))))
     if isinstance(loop, ContinuousLoop):
@@ -161,6 +169,20 @@ def refined_minimum(
 
     Of the local minima on the grid those within a tenth of the lowest, eight at most, are searched between their
     neighbours.
+
+    Parameters
+    ----------
+    f : callable
+        From (M,) frequencies [rad/s] to (M,) values.
+    omega : (N,) array
+        Grid [rad/s], ascending.
+    values : (N,) array
+        f on it.
+
+    Returns
+    -------
+    tuple of float
+        The least value, and its frequency [rad/s].
     """
     inner = np.flatnonzero((values[1:-1] <= values[:-2]) & (values[1:-1] <= values[2:])) + 1
     best = int(np.argmin(values))
@@ -179,7 +201,22 @@ def refined_minimum(
 
 
 def modulus_margin(loop: OpenLoop, omega: FloatArray, L: ComplexArray) -> tuple[float, float]:
-    """Return M_m of (12) and the frequency [rad/s] it is at, given L on the loop's grid."""
+    """Return M_m of (12) and the frequency it is at.
+
+    Parameters
+    ----------
+    loop : OpenLoop
+        Continuous or sampled.
+    omega : (N,) array
+        Its grid [rad/s].
+    L : (N,) complex array
+        Its response there.
+
+    Returns
+    -------
+    tuple of float
+        M_m, and its frequency [rad/s]; infinite where only ever higher frequencies come near it.
+    """
     lowest, at = refined_minimum(lambda x: np.abs(1.0 + loop.response(x)), omega, np.abs(1.0 + L))
     if isinstance(loop, ContinuousLoop) and loop.transfer_function.delay_s > 0.0 and loop.gain_at_infinity > 0.0:
         # dead time turns a gain that does not vanish through -180 deg for ever
@@ -209,7 +246,22 @@ def _roots(f: Callable[[FloatArray], FloatArray], omega: FloatArray, values: Flo
 
 
 def phase_and_delay_margin(loop: OpenLoop, omega: FloatArray, L: ComplexArray) -> tuple[float, float, float]:
-    """Return phase margin (13) [rad], delay margin [s] and highest crossover (14) [rad/s], given L on the grid."""
+    """Return phase margin (13), delay margin and highest crossover (14).
+
+    Parameters
+    ----------
+    loop : OpenLoop
+        Continuous or sampled.
+    omega : (N,) array
+        Its grid [rad/s].
+    L : (N,) complex array
+        Its response there.
+
+    Returns
+    -------
+    tuple of float
+        Phase margin [rad], delay margin [s], crossover [rad/s]; pi, infinite and NaN where abs(L) is never 1.
+    """
 
     def f(x: FloatArray) -> FloatArray:
         return np.log(np.abs(loop.response(x)))
@@ -233,7 +285,17 @@ def _gain_margins(loop: OpenLoop, omega: FloatArray, L: ComplexArray) -> tuple[f
 
 
 def noise_amplification(loop: OpenLoop, omega: FloatArray, start: float) -> float:
-    """Return max abs(C/(1 + L)) of (15) at and above ``start`` [rad/s]."""
+    """Return max abs(C/(1 + L)) of (15) from a frequency on.
+
+    Parameters
+    ----------
+    loop : OpenLoop
+        Continuous or sampled.
+    omega : (N,) array
+        Its grid [rad/s].
+    start : float
+        Lowest frequency of the noise [rad/s].
+    """
 
     def f(x: FloatArray) -> FloatArray:
         return -np.abs(loop.controller_response(x) / (1.0 + loop.response(x)))

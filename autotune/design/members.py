@@ -44,7 +44,15 @@ class Members:
         return columns(np.array(rows).reshape(-1, 6))
 
     def slacks(self, controller: PIDController, specification: Specification) -> FloatArray:
-        """Return (S, 3) slacks of modulus, phase and delay margin of one controller on the plants."""
+        """Return (S, 3) slacks of modulus, phase and delay margin of one controller on the plants.
+
+        Parameters
+        ----------
+        controller : PIDController
+            One for all S plants.
+        specification : Specification
+            What was asked for.
+        """
         return np.asarray(specification.slacks(self.figures(controller))[:, [0, 1, 3]])
 
     def chosen(self, which: Sequence[int]) -> Members:
@@ -55,6 +63,13 @@ class Members:
         """Return margins that none of the plants falls below, nor ``m`` itself; norm and crossover are those of ``m``.
 
         The gain margins are found on the grids, between whose frequencies L is taken as straight.
+
+        Parameters
+        ----------
+        m : Margins
+            Of the nominal plant.
+        controller : PIDController
+            The one they belong to.
         """
         if not self.plants:
             return m
@@ -77,7 +92,15 @@ class Members:
 
 
 def members_of(plants: Sequence[TransferFunction], specification: Specification) -> Members:
-    """Return plants with their grids, which reach as far as the specification's largest gain makes them matter."""
+    """Return plants with their grids, which reach as far as the specification's largest gain makes them matter.
+
+    Parameters
+    ----------
+    plants : sequence of TransferFunction
+        S plants.
+    specification : Specification
+        Its largest gain sets how far the grids reach.
+    """
     sampled = tuple(sampled_plant(one, specification.largest_gain) for one in plants)
     return Members(plants=tuple(plants), sampled=sampled)
 
@@ -95,7 +118,15 @@ def _gain_margins(plant: SampledPlant, controller: PIDController) -> tuple[float
 
 
 def crossovers(plant: SampledPlant, controller: PIDController) -> FloatArray:
-    """Return the frequencies [rad/s] at which abs(L) passes 1, between those of the plant's grid in log-log."""
+    """Return the frequencies [rad/s] at which abs(L) passes 1, between those of the plant's grid in log-log.
+
+    Parameters
+    ----------
+    plant : SampledPlant
+        On its grid.
+    controller : PIDController
+        L is their product.
+    """
     gain = np.log(np.maximum(np.abs(plant.h * controller.response(plant.omega)), 1e-300))
     passed = np.flatnonzero(np.sign(gain[:-1]) * np.sign(gain[1:]) < 0.0)
     a, b, x = gain[passed], gain[passed + 1], np.log(plant.omega)

@@ -52,7 +52,7 @@ def disturbance_h2(loop: OpenLoop, relative_tolerance: float = 1e-9) -> float:
     if not loop.is_stable:
         return math.inf
     if isinstance(loop, SampledLoop):
-        return _sampled(loop, relative_tolerance)
+        return _norm_of_sampled(loop, relative_tolerance)
     assert isinstance(loop, ContinuousLoop)
     if order_at_zero(loop.plant) - min(order_at_zero(loop.plant) + order_at_zero(loop.controller), 0) < 1:
         return math.inf
@@ -78,9 +78,23 @@ def order_at_zero(system: TransferFunction) -> int:
 
 
 def integral(f: Callable[[FloatArray], FloatArray], edges: FloatArray, relative_tolerance: float) -> float:
-    """Return the integral over the panels between the edges, each halved until two Gauss rules agree.
+    """Return the integral over log omega between the edges, each panel halved until two Gauss rules agree.
 
     The integration variable is log omega; ``edges`` is (M,), positive and ascending [rad/s].
+
+    Parameters
+    ----------
+    f : callable
+        The integrand over log omega, from frequencies [rad/s] of any shape to values of the same.
+    edges : (M,) array
+        Of the panels [rad/s], positive and ascending.
+    relative_tolerance : float
+        Of the whole integral.
+
+    Raises
+    ------
+    DesignError
+        It does not converge in bounded work.
     """
     a, b = np.log(edges[:-1]), np.log(edges[1:])
     total = 0.0
@@ -113,7 +127,7 @@ def _rule(
     return np.asarray((values @ weights) * half)
 
 
-def _sampled(loop: SampledLoop, relative_tolerance: float) -> float:
+def _norm_of_sampled(loop: SampledLoop, relative_tolerance: float) -> float:
     T_s = loop.controller.sample_time_s
     if abs(np.sum(loop.controller.den)) > 1e-12 * np.sum(np.abs(loop.controller.den)):
         return math.inf

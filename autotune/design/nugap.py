@@ -22,7 +22,18 @@ from autotune.models import TransferFunction
 
 
 def chordal_distance(P1: ComplexArray, P2: ComplexArray) -> FloatArray:
-    """Return abs(P1 - P2)/sqrt((1 + abs(P1)^2)(1 + abs(P2)^2)), the distance on the Riemann sphere, 0 to 1."""
+    """Return abs(P1 - P2)/sqrt((1 + abs(P1)^2)(1 + abs(P2)^2)), the distance on the Riemann sphere, 0 to 1.
+
+    Parameters
+    ----------
+    P1, P2 : (N,) complex array
+        Two responses at the same frequencies.
+
+    Returns
+    -------
+    (N,) array
+        The distances.
+    """
     a1, a2 = np.abs(P1), np.abs(P2)
     # written with reciprocals where the gain is large, so that an integrator does not overflow
     return np.asarray(np.abs(P1 - P2) / (np.hypot(1.0, a1) * np.hypot(1.0, a2)))
@@ -55,7 +66,7 @@ def nu_gap(P1: Plant, P2: Plant, *, scaling: float = 1.0) -> float:
     Vinnicombe 1993; Le & Mendes 2010, equation (10).
     """
     H1, H2 = transfer_function_of(P1), transfer_function_of(P2)
-    if not _winding_condition(_scaled(H1, scaling), _scaled(H2, scaling)):
+    if not _winding_condition(_scale(H1, scaling), _scale(H2, scaling)):
         return 1.0
     omega = _pair_grid(H1, H2, scaling)
 
@@ -67,6 +78,15 @@ def nu_gap(P1: Plant, P2: Plant, *, scaling: float = 1.0) -> float:
 
 def generalized_stability_margin(plant: Plant, controller: Controller, *, scaling: float = 1.0) -> float:
     """Return b(C/k, k P) = min over omega of abs(1 + P C)/sqrt((1 + abs(k P)^2)(1 + abs(C/k)^2)); 0 if unstable.
+
+    Parameters
+    ----------
+    plant : Plant
+        P, continuous.
+    controller : Controller
+        C.
+    scaling : float
+        k [u unit/y unit].
 
     References
     ----------
@@ -92,6 +112,13 @@ def _local_margin(loop: ContinuousLoop | SampledLoop, omega: FloatArray, scaling
 def optimal_stability_margin(plant: Plant, *, scaling: float = 1.0) -> float:
     """Return the largest b(C, k P) that any controller reaches: sqrt(1 - ||[N; M]||_H^2) = 1/sqrt(1 + rho(X Y)).
 
+    Parameters
+    ----------
+    plant : Plant
+        P, continuous, rational and proper.
+    scaling : float
+        k [u unit/y unit].
+
     Raises
     ------
     DesignError
@@ -101,7 +128,7 @@ def optimal_stability_margin(plant: Plant, *, scaling: float = 1.0) -> float:
     ----------
     McFarlane & Glover 1990, with X and Y of the control and filtering Riccati equations.
     """
-    H = _scaled(transfer_function_of(plant), scaling)
+    H = _scale(transfer_function_of(plant), scaling)
     if H.delay_s > 0.0 or not H.is_proper:
         raise DesignError(
             "the optimal stability margin is computed for proper plants without dead time", where="nu-gap"
@@ -126,6 +153,18 @@ def optimal_stability_margin(plant: Plant, *, scaling: float = 1.0) -> float:
 
 def loop_scaling(plant: Plant, controller: Controller) -> float:
     """Return the loop's own scaling k = abs(C) at the highest crossover, so that k P and C/k both have gain 1 there.
+
+    Parameters
+    ----------
+    plant : Plant
+        P, continuous.
+    controller : Controller
+        C.
+
+    Returns
+    -------
+    float
+        k [u unit/y unit].
 
     Raises
     ------
@@ -207,7 +246,7 @@ def validate(rig: Plant, reduced: Plant, controller: Controller, *, scaling: flo
     )
 
 
-def _scaled(system: TransferFunction, k: float) -> TransferFunction:
+def _scale(system: TransferFunction, k: float) -> TransferFunction:
     return TransferFunction(num=tuple(k * b for b in system.num), den=system.den, delay_s=system.delay_s)
 
 
@@ -223,7 +262,7 @@ def _winding_condition(H1: TransferFunction, H2: TransferFunction) -> bool:
     wno(1 + P_1~ P_2) + eta(P_1) - eta_0(P_2) - eta~(P_2) = 0, evaluated as the argument of the polynomial form along
     the axis, which needs no indentation around poles on it.
     """
-    N1, M1 = _mirrored(H1.num), _mirrored(H1.den)
+    N1, M1 = _mirror(H1.num), _mirror(H1.den)
     N2, M2 = np.array(H2.num), np.array(H2.den)
     n1, n2 = len(M1) - 1, len(M2) - 1
     lag = H2.delay_s - H1.delay_s
@@ -242,7 +281,7 @@ def _winding_condition(H1: TransferFunction, H2: TransferFunction) -> bool:
     return turned is not None and round(turned / (2.0 * np.pi)) == 0
 
 
-def _mirrored(coefficients: tuple[float, ...]) -> FloatArray:
+def _mirror(coefficients: tuple[float, ...]) -> FloatArray:
     """Coefficients of p(-s)."""
     values = np.array(coefficients)
     return np.asarray(values * (-1.0) ** np.arange(len(values) - 1, -1, -1))

@@ -90,6 +90,17 @@ def design_on_plants(
 
     Members that miss a constraint become constraints of the next round, until none does.
 
+    Parameters
+    ----------
+    nominal : TransferFunction
+        The plant whose norm is made small.
+    members : Members
+        S plants that the controller keeps the margins on.
+    specification : Specification
+        Constraints (18).
+    kind : {"pi", "pid"}
+        Structure of the controller.
+
     Raises
     ------
     DesignError
@@ -114,6 +125,16 @@ def missed(slack: FloatArray) -> set[int]:
 def worst_of(
     members: Sequence[TransferFunction], controller: PIDController, specification: Specification
 ) -> tuple[TransferFunction, ...]:
-    """Return the members on which one margin or another is smallest with the controller, three at most."""
+    """Return the members on which one margin or another is smallest with the controller, three at most.
+
+    Parameters
+    ----------
+    members : sequence of TransferFunction
+        Plants.
+    controller : PIDController
+        The one they are held against.
+    specification : Specification
+        Says which margins count.
+    """
     slack = members_of(members, specification).slacks(controller, specification)
     return tuple(members[i] for i in sorted({int(i) for i in np.argmin(slack, axis=0)}))

@@ -65,7 +65,7 @@ def design_on_structures(structures: ConsistentStructures, specification: Specif
             remedy=f"{error.remedy}; or {where_to_measure(structures)}",
         ) from None
     require_kept(slack, structures, specification)
-    least, remark = _as_measured(members.least(found.margins, found.controller), members, found.controller, structures)
+    least, remark = _as_seen(members.least(found.margins, found.controller), members, found.controller, structures)
     return replace(
         found,
         margins=least,
@@ -78,7 +78,16 @@ def design_on_structures(structures: ConsistentStructures, specification: Specif
 
 
 def require_kept(slack: FloatArray, structures: ConsistentStructures, specification: Specification) -> None:
-    """Refuse a controller that plants through the points do not keep, given their (S, 3) slacks.
+    """Refuse a controller that plants through the points do not keep.
+
+    Parameters
+    ----------
+    slack : (S, 3) array
+        Slacks of modulus, phase and delay margin on S plants.
+    structures : ConsistentStructures
+        What the points allow; says where to measure.
+    specification : Specification
+        For the message.
 
     Raises
     ------
@@ -95,7 +104,7 @@ def require_kept(slack: FloatArray, structures: ConsistentStructures, specificat
     )
 
 
-def _as_measured(
+def _as_seen(
     margins: Margins, members: Members, controller: PIDController, structures: ConsistentStructures
 ) -> tuple[Margins, str]:
     """Return margins with phase and delay as far as points tell of them, and what is to be said of them.

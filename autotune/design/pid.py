@@ -12,7 +12,8 @@ import numpy as np
 from autotune.arrays import FloatArray
 from autotune.controller import PIDController
 from autotune.design.corners import plainest
-from autotune.design.search import Problem, admissible, polished, separate
+from autotune.design.search import Problem, polished
+from autotune.design.search_starts import admissible, separate
 from autotune.errors import DesignError
 
 _STARTS = 8

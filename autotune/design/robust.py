@@ -155,7 +155,7 @@ def _search_structure(plant: UncertainPlant, specification: Specification, kind:
     figures = columns(evaluate_grid(n.omega, n.h, n.weights, n.turn, grid, _omega_n(specification)))
     promising = np.flatnonzero(np.min(specification.slacks(figures)[:, :2], axis=1) >= -0.05)
     order = promising[np.argsort(np.asarray(figures.squared_norm)[promising])]
-    starts = _first_kept(coarse, specification, grid[order]) or _led(coarse, specification, grid[order])
+    starts = _first_kept(coarse, specification, grid[order]) or _raise_least_slack(coarse, specification, grid[order])
     if not starts:
         raise _unreachable(plant, specification, kind, grid)
     # a simplex is not caught by the kinks of the least slack, which the quadratic programme sometimes is; in four
@@ -187,7 +187,7 @@ def _first_kept(plant: UncertainPlant, specification: Specification, nodes: Floa
     return kept
 
 
-def _led(plant: UncertainPlant, specification: Specification, nodes: FloatArray) -> list[FloatArray]:
+def _raise_least_slack(plant: UncertainPlant, specification: Specification, nodes: FloatArray) -> list[FloatArray]:
     """Return the controller at which the whole set keeps all constraints, from the nodes that miss them least."""
     looked = nodes[:: max(1, len(nodes) // _LOOKED)]
     least = np.array([np.min(_slacks(plant, specification, node)) for node in looked])

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from autotune.arguments import checked
-from autotune.arrays import ComplexArray, FloatArray
+from autotune.arrays import FloatArray
 from autotune.errors import DesignError
 from autotune.models import TransferFunction
 
@@ -123,12 +123,6 @@ def place_poles(plant: TransferFunction, poles: Sequence[complex]) -> RST:
     S = np.concatenate(([1.0], x[:n], [0.0])) * w ** np.arange(n + 2)
     R = x[n:] * w ** np.arange(1, n + 2)
     return RST(R=_floats(R), S=_floats(S), T=(float(R[-1]),))
-
-
-def closed_loop_poles(plant: TransferFunction, controller: RST) -> ComplexArray:
-    """Return the roots of A S + B R [rad/s]."""
-    polynomial = np.polyadd(np.polymul(plant.den, controller.S), np.polymul(plant.num, controller.R))
-    return np.asarray(np.roots(polynomial), dtype=np.complex128)
 
 
 def place_dominant(plant: TransferFunction, dominant_rad_s: float, rest_rad_s: float) -> RST:

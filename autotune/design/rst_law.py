@@ -109,13 +109,36 @@ class RSTLaw:
         return np.asarray(np.real(np.poly(roots)))
 
     def initial(self, u: float, r: float, _y: float) -> RSTState:
-        """Return the state of a loop that has long rested at r under u [u unit]: bumpless where y is at r."""
+        """Return the state of a loop that has long rested at r under u: bumpless where y is at r.
+
+        Parameters
+        ----------
+        u : float
+            Command [u unit].
+        r : float
+            Set-point [y unit].
+        _y : float
+            Measurement [y unit]; not used.
+        """
         past = len(self.controller.S) - 1
         held = min(max(u, self.u_min), self.u_max)
         return RSTState(r=(r,) * past, y=(r,) * past, v=(held,) * past, u=(held,) * past)
 
     def step(self, state: RSTState, r: float, y: float) -> tuple[float, RSTState]:
-        """Return the command for this sample, within the limits, and the state for the next."""
+        """Return the command for this sample, within the limits, and the state for the next.
+
+        Parameters
+        ----------
+        state : RSTState
+            After the sample before.
+        r, y : float
+            Set-point and measurement [y unit].
+
+        Raises
+        ------
+        InputError
+            One of them is not finite.
+        """
         if not (math.isfinite(r) and math.isfinite(y)):
             raise InputError(f"set-point {r} and measurement {y}", where="RST law", remedy="both must be finite")
         R, S, T = self.coefficients

@@ -64,6 +64,23 @@ def relay_ultimate_point(plant: TransferFunction, harmonics: int = 400) -> tuple
 
     The limit cycle of an ideal relay is exact (Tsypkin): y at the switching instants vanishes with all odd harmonics,
     and a is half the peak-to-peak output. The describing function's error is thus in the result, as on a rig.
+
+    Parameters
+    ----------
+    plant : TransferFunction
+        Continuous, time in s.
+    harmonics : int
+        Odd harmonics of the limit cycle that are counted.
+
+    Returns
+    -------
+    tuple of float
+        Ultimate gain [u unit/y unit], and ultimate period [s].
+
+    Raises
+    ------
+    DesignError
+        An ideal relay does not make it oscillate.
     """
     K_u, T_u = ultimate_point(plant)
     sign = math.copysign(1.0, K_u)

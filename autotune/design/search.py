@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import minimize
 
-from autotune.arrays import BoolArray, FloatArray
+from autotune.arrays import FloatArray
 from autotune.controller import PIDController
 from autotune.design.corners import out_of_corner
 from autotune.design.figures import Figures, columns
@@ -28,7 +28,6 @@ from autotune.models import TransferFunction
 _TOLERANCE = 1e-6
 _CORRECTIONS = 6
 _TIGHTER = (1e-4, 1e-3, 0.01, 0.03)
-_ENOUGH = 0.01  # slack with which a controller counts as well inside
 _PI_GAINS = 2
 _MOST_SLACK = 10.0  # what is not asked for has infinite slack, which has no derivative
 
@@ -59,7 +58,15 @@ class Problem:
         return -1.0 if asked is None else asked
 
     def norms_and_slacks(self, grid: FloatArray, thin: int = 1) -> tuple[FloatArray, FloatArray]:
-        """Return (M,) squared norms on the first plant and (M, S, 4) slacks on all plants of the (M, 4) controllers."""
+        """Return (M,) squared norms on the first plant and (M, S, 4) slacks on all plants of the (M, 4) controllers.
+
+        Parameters
+        ----------
+        grid : (M, 4) array
+            Rows of K, T_I, T_d, T_f, sign taken out, times in s.
+        thin : int
+            Every ``thin``-th frequency is looked at.
+        """
         found = []
         for plant in self.sampled:
             s = plant.thinned(thin) if thin > 1 else plant
@@ -68,16 +75,36 @@ class Problem:
         return np.asarray(found[0].squared_norm), slacks
 
     def slacks_of(self, plant: int, figures: Figures) -> FloatArray:
-        """Return (..., 4) slacks of the figures on a plant."""
+        """Return the slacks of the figures on a plant.
+
+        Parameters
+        ----------
+        plant : int
+            Which one; the first alone is held to the noise gain.
+        figures : Figures
+            Each of shape (...).
+
+        Returns
+        -------
+        (..., 4) array
+            Slacks of modulus, phase, noise gain and delay; infinite where nothing is asked.
+        """
         slacks = self.specification.slacks(figures)
         if plant > 0:
             slacks[..., 2] = np.inf
         return slacks
 
     def exact_slacks(self, parameters: FloatArray, coarse: FloatArray) -> FloatArray:
-        """Return (S, 4) slacks refined between the grid's frequencies, given ``coarse``, those on the grid.
+        """Return (S, 4) slacks refined between the grid's frequencies.
 
         Whether a loop is stable is taken from the grid's count: a negative modulus margin.
+
+        Parameters
+        ----------
+        parameters : (4,) array
+            K, T_I, T_d, T_f, sign taken out, times in s.
+        coarse : (S, 4) array
+            Slacks on the grids.
         """
         controller = self.controller(parameters)
         found = [
@@ -119,17 +146,24 @@ def _exact_figures(
 
 
 def polished(problem: Problem, starts: FloatArray) -> PIDController:
-    """Return the best controller reached from the (S, 4) starting values, its constraints corrected to the exact ones.
+    """Return the best controller reached from the starting values, its constraints corrected to the exact ones.
 
     Parameters with value 0 stay 0. Where the corrections do not settle on the feasible side, a little more is asked
     for, and where no search ends there, the best of the starting values that is feasible exactly is returned.
+
+    Parameters
+    ----------
+    problem : Problem
+        Plants and constraints.
+    starts : (S, 4) array
+        Rows of K, T_I, T_d, T_f, sign taken out, times in s; a 0 stays 0.
 
     Raises
     ------
     DesignError
         Not even a starting value keeps the constraints between the frequencies of the grid.
     """
-    best = _corrected(problem, starts)
+    best = _search_corrected(problem, starts)
     if best is not None and np.sum(best > 0.0) == _PI_GAINS:
         best = out_of_corner(problem, best)
     shape = (len(problem.plants), 4)
@@ -149,7 +183,7 @@ def polished(problem: Problem, starts: FloatArray) -> PIDController:
     return problem.controller(best)
 
 
-def _corrected(problem: Problem, starts: FloatArray) -> FloatArray | None:
+def _search_corrected(problem: Problem, starts: FloatArray) -> FloatArray | None:
     """Return the best parameters, the constraints on the grid shifted until they are the exact ones; None if none."""
     offset = np.zeros((len(problem.plants), 4))
     best: tuple[float, FloatArray] | None = None
@@ -172,10 +206,10 @@ def _corrected(problem: Problem, starts: FloatArray) -> FloatArray | None:
 
 
 def _best_of(problem: Problem, starts: FloatArray, offset: FloatArray) -> tuple[float, FloatArray]:
-    return min((local_search(problem, start, offset) for start in starts), key=lambda item: item[0])
+    return min((_local_search(problem, start, offset) for start in starts), key=lambda item: item[0])
 
 
-def local_search(problem: Problem, start: FloatArray, offset: FloatArray) -> tuple[float, FloatArray]:
+def _local_search(problem: Problem, start: FloatArray, offset: FloatArray) -> tuple[float, FloatArray]:
     """Return the norm and the (4,) parameters at a local optimum: sequential quadratic programming in log gains.
 
     ``offset`` (S, 4) is added to what the constraints ask for. The norm is infinite where no feasible point was found.
@@ -253,47 +287,3 @@ def _gradient(f: Callable[[FloatArray], FloatArray], x: FloatArray) -> FloatArra
     step = 1e-6
     columns_ = [(f(x + step * e) - f(x - step * e)) / (2.0 * step) for e in np.eye(len(x))]
     return np.stack(columns_, axis=-1)
-
-
-def admissible(problem: Problem, starts: FloatArray) -> FloatArray:
-    """Return those (K, 4) controllers that a simplex, which raises the least slack, led to where all constraints hold.
-
-    Parameters
-    ----------
-    starts : (S, 4) array
-        Controllers that keep not all constraints, the most promising first; parameters with value 0 stay 0.
-    """
-    found = []
-    for start in starts:
-        free = start > 0.0
-
-        def missed(x: FloatArray, start: FloatArray = start, free: BoolArray = free) -> float:
-            p = start.copy()
-            p[free] = start[free] * np.exp(x)
-            return -min(float(np.min(problem.norms_and_slacks(p[None, :], thin=2)[1])), _ENOUGH)
-
-        size = int(np.sum(free))
-        simplex = 0.4 * (np.vstack((np.zeros(size), np.eye(size))) - 0.5 / size)
-        result = minimize(
-            missed,
-            np.zeros(size),
-            method="Nelder-Mead",
-            options={"initial_simplex": simplex, "xatol": 1e-4, "fatol": 1e-5, "maxfev": 150 * size},
-        )
-        if result.fun <= 0.0:
-            reached = start.copy()
-            reached[free] = start[free] * np.exp(result.x)
-            found.append(reached)
-    return np.array(found).reshape(-1, 4)
-
-
-def separate(nodes: FloatArray, distance: float, most: int) -> FloatArray:
-    """Return the first of the (M, 4) controllers and those after it that are no neighbours: a start for each basin."""
-    kept: list[FloatArray] = []
-    for node in nodes:
-        free = node > 0.0
-        if all(np.max(np.abs(np.log(node[free] / other[free]))) > distance for other in kept):
-            kept.append(node)
-        if len(kept) == most:
-            break
-    return np.array(kept)

@@ -18,7 +18,8 @@ from autotune.design.kernels import SampledPlant, sampled_plant
 from autotune.design.load_error import least_error, load_step
 from autotune.design.loop import Plant, transfer_function_of
 from autotune.design.margins import margins
-from autotune.design.search import Problem, admissible, polished, separate
+from autotune.design.search import Problem, polished
+from autotune.design.search_starts import admissible, separate
 from autotune.design.specification import Design, Kind, Specification
 from autotune.errors import DesignError
 
@@ -95,7 +96,7 @@ def design(
         statement = "no lower bound: four gains are searched locally from several starts"
     if specification.criterion == "iae":
         controller = _least_error(problem, controller)
-    integral = as_integral(problem, controller)
+    integral = _as_integral(problem, controller)
     controller = controller if integral is None else integral
     found = [margins(one, controller, noise_frequency_rad_s=specification.noise_frequency_rad_s) for one in plants]
     slacks = [float(np.min(problem.slacks_of(i, m.figures))) for i, m in enumerate(found)]
@@ -124,7 +125,7 @@ def design(
     )
 
 
-def as_integral(problem: Problem, controller: PIDController) -> PIDController | None:
+def _as_integral(problem: Problem, controller: PIDController) -> PIDController | None:
     """Return an integral controller as a PI that a device can hold; None where the proportional part does something.
 
     On a plant with a resonance or little but dead time the best PI has K = 0. A search in logarithms of the gains comes
@@ -162,12 +163,20 @@ def _least_error(problem: Problem, controller: PIDController) -> PIDController:
 
 
 def weighted(controller: PIDController, specification: Specification) -> PIDController:
-    """Return the controller with the largest set-point weight that keeps the immediate set-point command."""
+    """Return the controller with the largest set-point weight that keeps the immediate set-point command.
+
+    Parameters
+    ----------
+    controller : PIDController
+        Its gain stays.
+    specification : Specification
+        States the largest command that a unit step of the set-point may give.
+    """
     weight = min(1.0, specification.setpoint_command / max(abs(controller.K), 1e-300))
     return replace(controller, setpoint_weight=weight)
 
 
-def gain_range(sampled: SampledPlant, specification: Specification) -> tuple[float, float, float]:
+def _gain_range(sampled: SampledPlant, specification: Specification) -> tuple[float, float, float]:
     """Return the largest gain worth looking at, and the frequency [rad/s] and phase limit that it comes from.
 
     The crossover lies where arg H >= -pi + phi with phi the larger of the phase margin and the angle that the modulus
@@ -189,7 +198,7 @@ def gain_range(sampled: SampledPlant, specification: Specification) -> tuple[flo
 
 
 def _best_pi(problem: Problem) -> PIDController:
-    largest, omega_ref, _ = gain_range(problem.sampled[0], problem.specification)
+    largest, omega_ref, _ = _gain_range(problem.sampled[0], problem.specification)
     K = largest * np.geomspace(1e-4, 1.0, 33)
     Ti = np.geomspace(0.02, 400.0, 36) / omega_ref
     grid = np.array([(k, t, 0.0, 0.0) for k in K for t in Ti])
@@ -214,7 +223,7 @@ def _best_pid(problem: Problem) -> PIDController:
         pi = _best_pi(problem)
     except DesignError as error:
         refused = error
-    largest, omega_ref, _ = gain_range(problem.sampled[0], problem.specification)
+    largest, omega_ref, _ = _gain_range(problem.sampled[0], problem.specification)
     found = best_pid(problem, pi, largest, omega_ref)
     if found is not None:
         return found

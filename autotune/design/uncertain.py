@@ -165,6 +165,19 @@ def guaranteed(
     The modulus margin is negative where the set does not decide: abs(L) is not surely above 1 + itself at the lowest
     frequency and below 1 - itself at the highest. The noise begins at ``omega_n``, or where ``omega_n`` is below 0 at
     the lowest crossover that a plant of the set can have.
+
+    Parameters
+    ----------
+    omega : (N,) array
+        Angular frequencies [rad/s], ascending.
+    supports : (N, D) array
+        Support values of each set of plants, in log gain and phase [rad], over D directions.
+    K : float
+        Gain, sign taken out [u unit/y unit].
+    Ti, Td, Tf : float
+        Times of integral, derivative and filter [s].
+    omega_n : float
+        Lowest frequency of the noise [rad/s]; below 0 the lowest crossover that a plant of the set can have.
     """
     directions = supports.shape[1]
     step = 2.0 * math.pi / directions

@@ -34,6 +34,13 @@ STRUCTURES: dict[str, EffectKind] = {kind.name: kind for kind in ALL if kind.sou
 def kind_of(name: str, where: str = "catalogue") -> EffectKind:
     """Return an effect by its name.
 
+    Parameters
+    ----------
+    name : str
+        PLACE.EFFECT, as in a model file.
+    where : str
+        Names the file in the refusal.
+
     Raises
     ------
     InputError
@@ -63,7 +70,15 @@ def taken_by(names: Iterable[str]) -> set[str]:
 
 
 def unknown(name: str, where: str) -> InputError:
-    """Return the error of an effect that no catalogue has: the name that may be meant, and all that there are."""
+    """Return the error of an effect that no catalogue has: the name that may be meant, and all that there are.
+
+    Parameters
+    ----------
+    name : str
+        What was written.
+    where : str
+        Names the file.
+    """
     names = sorted(KINDS)
     near = get_close_matches(name, names, 1)
     meant = f"did you mean {near[0]!r}? " if near else ""
@@ -72,6 +87,15 @@ def unknown(name: str, where: str) -> InputError:
 
 def require_known(effects: Iterable[Effect], where: str, *, in_chain: bool = True) -> None:
     """Refuse effects that the catalogue does not have, or not for a chain of blocks.
+
+    Parameters
+    ----------
+    effects : iterable of Effect
+        Of a model.
+    where : str
+        Names the file in the refusal.
+    in_chain : bool
+        Whether they act in a chain of blocks.
 
     Raises
     ------

@@ -32,7 +32,15 @@ _BANDS_TRIED = (0.002, 0.6, 75)
 
 
 def limit_starts(low: float, high: float, cuts: tuple[float, ...]) -> list[tuple[float, ...]]:
-    """Return starts for two limits: the upper alone, the lower alone, both; one that does not act lies far outside."""
+    """Return starts for two limits: the upper alone, the lower alone, both; one that does not act lies far outside.
+
+    Parameters
+    ----------
+    low, high : float
+        Range of the signal, in its unit.
+    cuts : tuple of float
+        Shares of the range that a limit cuts off.
+    """
     span = high - low
     far = (low - 10.0 * span, high + 10.0 * span)
     starts: list[tuple[float, ...]] = []
@@ -43,7 +51,17 @@ def limit_starts(low: float, high: float, cuts: tuple[float, ...]) -> list[tuple
 
 
 def converted(u: float, step: float, origin: float) -> float:
-    """Return a converter's level for a command."""
+    """Return a converter's level for a command.
+
+    Parameters
+    ----------
+    u : float
+        Command [u unit].
+    step : float
+        Between two levels [u unit].
+    origin : float
+        One of the levels [u unit].
+    """
     return origin + step * math.floor((u - origin) / step + 0.5)
 
 
@@ -59,13 +77,23 @@ def _levels_around(values: Values, span: float, wide: float, turn: float) -> lis
 
 
 def followed(w: float, width: float, held: float) -> tuple[float, float]:
-    """Return the far side of a play, and where it stays."""
+    """Return the far side of a play, and where it stays.
+
+    Parameters
+    ----------
+    w : float
+        Near side [u unit].
+    width : float
+        Of the play [u unit].
+    held : float
+        Far side before [u unit].
+    """
     half = 0.5 * width
     held = min(max(held, w - half), w + half)
     return held, held
 
 
-def stuck(w: float, band: float, slip: float, held: float) -> tuple[float, float]:
+def _stuck(w: float, band: float, slip: float, held: float) -> tuple[float, float]:
     """Return a sticking valve's position, and where it stays; it jumps to w, or to ``slip`` - ``band`` short of it."""
     if abs(w - held) > band:
         held = w - math.copysign(band - slip, w - held) if slip >= 0.0 else w
@@ -88,13 +116,25 @@ def _bands(scan: Scan) -> list[tuple[float, ...]]:
     return [values for decrease, values in best if decrease > 0.0]
 
 
-def without_zone(w: float, half_width: float) -> float:
+def _without_zone(w: float, half_width: float) -> float:
     """Return what a dead zone lets through."""
     return w - min(max(w, -half_width), half_width)
 
 
 def curved(w: float, second_order: float, third_order: float, slope: float, low: float, high: float) -> float:
-    """Return a command through a curved characteristic, which runs straight on beyond its ends."""
+    """Return a command through a curved characteristic, which runs straight on beyond its ends.
+
+    Parameters
+    ----------
+    w : float
+        Command about the operating point [u unit].
+    second_order, third_order : float
+        Of the curve [1/u unit, 1/u unit^2].
+    slope : float
+        Slope beyond the ends.
+    low, high : float
+        The ends [u unit].
+    """
     c = min(max(w, low), high)
     bent = c + second_order * c * c
     bent += third_order * bent * bent * bent
@@ -102,29 +142,37 @@ def curved(w: float, second_order: float, third_order: float, slope: float, low:
 
 
 def rises(values: Values, w: float) -> bool:
-    """Whether a curved characteristic still rises."""
+    """Whether a curved characteristic still rises.
+
+    Parameters
+    ----------
+    values : mapping of str to float
+        The effect's parameters.
+    w : float
+        Command about the operating point [u unit].
+    """
     bent = w + values["second_order"] * w * w
     return (1.0 + 2.0 * values["second_order"] * w) * (1.0 + 3.0 * values["third_order"] * bent * bent) > 0.0
 
 
-def limited(w: float, offset: float, low: float, high: float) -> float:
+def _limited(w: float, offset: float, low: float, high: float) -> float:
     """Return a command within absolute limits."""
     return min(max(w, low - offset), high - offset)
 
 
-def slewed(w: float, dt: float, rate: float, before: float) -> tuple[float, float]:
+def _slewed(w: float, dt: float, rate: float, before: float) -> tuple[float, float]:
     """Return the mean of a rate-limited command over a sub-step, and its end."""
     reach = rate * dt
     end = before + min(max(w - before, -reach), reach)
     return 0.5 * (before + end), end
 
 
-def drifted(w: float, t: float, rate: float) -> float:
+def _drifted(w: float, t: float, rate: float) -> float:
     """Return a command whose gain drifts."""
     return w * (1.0 + rate * t)
 
 
-def with_lag(blocks: Blocks, values: Values) -> Blocks:
+def _with_lag(blocks: Blocks, values: Values) -> Blocks:
     """Put a lag before the chain."""
     lag = TransferFunction(num=(1.0,), den=(max(values["time_constant"], 1e-12), 1.0))
     return (Block(name="added lag", place="actuator", dynamics=lag), *blocks)
@@ -137,7 +185,7 @@ def _with_time_constant(blocks: Blocks, time_constant: float) -> Blocks:
             gain = block.dynamics.num[-1] / block.dynamics.den[1]
             lag = TransferFunction(num=(gain,), den=(time_constant, 1.0), delay_s=block.dynamics.delay_s)
             return (*blocks[:i], replace(block, dynamics=lag), *blocks[i + 1 :])
-    return with_lag(blocks, {"time_constant": time_constant})
+    return _with_lag(blocks, {"time_constant": time_constant})
 
 
 def _last_commands(u: FloatArray, y: FloatArray, values: Values) -> FloatArray:
@@ -208,7 +256,7 @@ ACTUATOR = (
             # where it is not negative the valve jumps that far instead of all the way
             Quantity(name="slip", unit="{u}", role="shape", sign="real", neutral=-1.0),
         ),
-        lines=(Line(stage="command", does=stuck),),
+        lines=(Line(stage="command", does=_stuck),),
         memory=Memory(name="held", replayed=True),
         search=_bands,
         lasting=True,
@@ -228,7 +276,7 @@ ACTUATOR = (
         words=("dead zone", "small commands do nothing"),
         equation="w = 0 for |u - u0| < half_width, else u - u0 -+ half_width",
         parameters=(Quantity(name="half_width", unit="{u}", role="amplitude"),),
-        lines=(Line(stage="command", does=without_zone),),
+        lines=(Line(stage="command", does=_without_zone),),
         starts=lambda s: [(c * s.w,) for c in (0.01, 0.04, 0.12, 0.3)],
         rough=True,
         odds={"any": 0.15, "level": 0.1, "thermal": 0.05, "valve": 0.1, "damper": 0.0},
@@ -271,7 +319,7 @@ ACTUATOR = (
             Quantity(name="low", unit="{u}", role="limit", sign="real", neutral=-NEVER),
             Quantity(name="high", unit="{u}", role="limit", sign="real", neutral=NEVER),
         ),
-        lines=(Line(stage="command", does=limited),),
+        lines=(Line(stage="command", does=_limited),),
         starts=lambda s: limit_starts(s.w_low, s.w_high, (0.05, 0.15, 0.3)),
         odds={"any": 0.15, "level": 0.3},
         in_equations=InEquations(
@@ -287,7 +335,7 @@ ACTUATOR = (
         words=("rate limit", "the actuator moves no faster than a limit"),
         equation="|dw/dt| <= rate",
         parameters=(Quantity(name="rate", unit="{u}/s", role="threshold"),),
-        lines=(Line(stage="command", does=slewed),),
+        lines=(Line(stage="command", does=_slewed),),
         memory=Memory(name="before"),
         sub_steps=4,
         starts=lambda s: [(s.w / (c * s.lag_s),) for c in (0.03, 0.06, 0.1, 0.16, 0.25, 0.4, 0.6, 1.0, 1.5)],
@@ -306,7 +354,7 @@ ACTUATOR = (
         words=("drifting gain", "the actuator's gain drifts with time"),
         equation="w = (u - u0) (1 + rate t)",
         parameters=(Quantity(name="rate", unit="1/s", role="amplitude", sign="real"),),
-        lines=(Line(stage="command", does=drifted),),
+        lines=(Line(stage="command", does=_drifted),),
         starts=lambda s: [(0.01 / s.duration_s,)],
         places=("actuator", "plant"),
         at_a_time=True,
@@ -323,7 +371,7 @@ ACTUATOR = (
         words=("a lag", "the command passes a lag that the model does not have"),
         equation="time_constant dw/dt = u - w",
         parameters=(Quantity(name="time_constant", unit="s", role="amplitude"),),
-        linear=LinearPart(blocks=with_lag, states=1, at="front", start=_last_commands),
+        linear=LinearPart(blocks=_with_lag, states=1, at="front", start=_last_commands),
         starts=lambda s: [(c * s.lag_s,) for c in (0.05, 0.25)],
         same=("sensor.lag",),
         places=("actuator", "sensor", "plant"),

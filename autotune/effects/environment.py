@@ -31,11 +31,25 @@ _FASTEST_SAMPLED, _FASTEST_LAGGED = 0.2, 10.0
 
 
 def stepped(t: float, number: float, amplitude: float, time: float, end: float, recording: float) -> float:
-    """Return a load that stands from a time on, in one recording, or in all (-1)."""
+    """Return a load that stands for a time, in one recording or in all.
+
+    Parameters
+    ----------
+    t : float
+        Time in the recording [s].
+    number : float
+        Of the recording.
+    amplitude : float
+        Of the load, as a force at the plant's input.
+    time, end : float
+        From when until when it stands [s].
+    recording : float
+        Number of the one that has it, or -1.
+    """
     return amplitude if (recording < 0.0 or number == recording) and time <= t < end else 0.0
 
 
-def regained(w: float, t: float, number: float, change: float, time: float, end: float, recording: float) -> float:
+def _regained(w: float, t: float, number: float, change: float, time: float, end: float, recording: float) -> float:
     """Return a command whose gain is another one from a time on."""
     return w + stepped(t, number, change, time, end, recording) * w
 
@@ -50,18 +64,54 @@ def opened(
     end: float,
     recording: float,
 ) -> float:
-    """Return what a loss that is larger from a time on takes, as a force at the plant's input."""
+    """Return what a loss that is larger from a time on takes, as a force at the plant's input.
+
+    Parameters
+    ----------
+    x : float
+        Position or level about the operating point [y unit].
+    gain : float
+        From force to level.
+    t : float
+        Time in the recording [s].
+    number : float
+        Of the recording.
+    change : float
+        What the loss grows by.
+    time, end : float
+        From when until when it is larger [s].
+    recording : float
+        Number of the one that has it, or -1.
+    """
     return -(stepped(t, number, change, time, end, recording) * x / gain)
 
 
 def swinging(t: float, in_phase: float, quadrature: float, frequency: float) -> float:
-    """Return a sinusoidal load."""
+    """Return a sinusoidal load.
+
+    Parameters
+    ----------
+    t : float
+        Time in the recording [s].
+    in_phase, quadrature : float
+        Amplitudes of sine and cosine, as forces at the plant's input.
+    frequency : float
+        In Hz.
+    """
     angle = 2.0 * math.pi * frequency * t
     return in_phase * math.sin(angle) + quadrature * math.cos(angle)
 
 
 def growing(t: float, rate: float) -> float:
-    """Return a load that drifts."""
+    """Return a load that drifts.
+
+    Parameters
+    ----------
+    t : float
+        Time in the recording [s].
+    rate : float
+        Growth in a second, as a force at the plant's input.
+    """
     return rate * t
 
 
@@ -248,7 +298,7 @@ ENVIRONMENT = (
         words=("a switched gain", "from a time on a command does more, or less, than before"),
         equation="w = (u - u0) (1 + change) from the time on: a pump, a voltage, another mode of working",
         parameters=_step_of("change", ""),
-        lines=(Line(stage="command", does=regained),),
+        lines=(Line(stage="command", does=_regained),),
         sought="rig",
         search=_switch_times,
         acts_in=_acts_in,

@@ -48,40 +48,60 @@ LEAST_WIDTH = 1.0 / 300.0
 
 
 def dry(v: float, level: float) -> float:
-    """Return the level of a friction that does not depend on speed."""
+    """Return the level of a friction that does not depend on speed.
+
+    Parameters
+    ----------
+    v : float
+        Speed [y unit/s]; not used.
+    level : float
+        Of the friction, as a force at the plant's input.
+    """
     return level
 
 
-def yielded(z: float, through: float, level: float, transition: float) -> float:
+def _yielded(z: float, through: float, level: float, transition: float) -> float:
     """Return the force of a damper that yields: dry friction over the speed of a plant that is a law."""
     if transition > 0.0:
         return z + level * math.tanh(through / transition)
     return z + (math.copysign(level, through) if through != 0.0 else 0.0)
 
 
-def dropping(v: float, level: float, breakaway: float, stribeck_speed: float) -> float:
+def _dropping(v: float, level: float, breakaway: float, stribeck_speed: float) -> float:
     """Return the level of a friction that falls from breakaway as the speed grows."""
     ratio = v / stribeck_speed
     return level + (breakaway - level) * math.exp(-ratio * ratio)
 
 
-def dragged(v: float, gain: float, coefficient: float) -> float:
+def _dragged(v: float, gain: float, coefficient: float) -> float:
     """Return a drag as a force at the plant's input."""
     return -(coefficient * v * abs(v) / gain)
 
 
-def hardened(x: float, coefficient: float, low: float, high: float) -> float:
+def _hardened(x: float, coefficient: float, low: float, high: float) -> float:
     """Return the force of a spring that grows with the cube of the travel."""
     c = min(max(x, low), high)
     return -(coefficient * c * c * c)
 
 
 def weighed(w: float, x: float, slope: float, low: float, high: float) -> float:
-    """Return what a gain over position adds to the plant's input."""
+    """Return what a gain over position adds to the plant's input.
+
+    Parameters
+    ----------
+    w : float
+        Plant input.
+    x : float
+        Position about the operating point [y unit].
+    slope : float
+        Of the gain over position, as a share [1/y unit].
+    low, high : float
+        Where it ends [y unit].
+    """
     return slope * min(max(x, low), high) * w
 
 
-def cogging(
+def _cogging(
     x: float,
     y_offset: float,
     gain: float,
@@ -101,27 +121,47 @@ def cogging(
 
 
 def rising(x: float, gain: float, coefficient: float) -> float:
-    """Return what a loss that grows with the square of the difference adds to the linear one."""
+    """Return what a loss that grows with the square of the difference adds to the linear one.
+
+    Parameters
+    ----------
+    x : float
+        Level about the operating point [y unit].
+    gain : float
+        From force to level.
+    coefficient : float
+        Of the square [1/y unit].
+    """
     return -(coefficient * x * abs(x) / gain)
 
 
-def held_back(turned: float, amplitude: float) -> float:
+def _held_back(turned: float, amplitude: float) -> float:
     """Return the force of a hysteresis."""
     return -(amplitude * turned)
 
 
 def turn(dx: float, width: float, turned: float) -> float:
-    """Return how far a hysteresis has turned after a travel."""
+    """Return how far a hysteresis has turned after a travel.
+
+    Parameters
+    ----------
+    dx : float
+        Travel [y unit].
+    width : float
+        Travel over which it turns [y unit].
+    turned : float
+        How far it had turned, -1 to 1.
+    """
     travel = dx / width
     return min(max(turned + travel - abs(travel) * turned, -1.0), 1.0)
 
 
-def radiated(x: float, gain: float, kelvin: float, coefficient: float) -> float:
+def _radiated(x: float, gain: float, kelvin: float, coefficient: float) -> float:
     """Return what the fourth power adds to the linear loss that the plant's own lag stands for."""
     return -(coefficient * ((kelvin + x) ** 4 - kelvin**4 - 4.0 * kelvin**3 * x) / gain)
 
 
-def leaked(x: float, gain: float, rate: float, low: float, high: float) -> float:
+def _leaked(x: float, gain: float, rate: float, low: float, high: float) -> float:
     """Return a leak as a force at the plant's input."""
     return -(rate * min(max(x, low), high) / gain)
 
@@ -132,11 +172,21 @@ def _excess(x: float, level: float) -> float:
 
 
 def outflow(level: float, gain: float, operating_level: float) -> float:
-    """Return what the first level's outflow lacks, as a force at the plant's input."""
+    """Return what the first level's outflow lacks, as a force at the plant's input.
+
+    Parameters
+    ----------
+    level : float
+        First level about the operating point [y unit].
+    gain : float
+        From force to level.
+    operating_level : float
+        Level at the operating point [y unit].
+    """
     return _excess(level, operating_level) / gain
 
 
-def lower_outflow(x: float, level: float, gain_last: float, operating_level: float, operating_level_2: float) -> float:
+def _lower_outflow(x: float, level: float, gain_last: float, operating_level: float, operating_level_2: float) -> float:
     """Return the same for a lower tank: it gets the upper one's true outflow and gives a square-root one itself."""
     if operating_level_2 <= 0.0:
         return 0.0
@@ -144,7 +194,17 @@ def lower_outflow(x: float, level: float, gain_last: float, operating_level: flo
 
 
 def stopped(x: float, v: float, y_offset: float, low: float, high: float) -> tuple[float, float]:
-    """Hold the position inside hard stops; an impact on a stop is inelastic."""
+    """Hold the position inside hard stops; an impact on a stop is inelastic.
+
+    Parameters
+    ----------
+    x, v : float
+        Position [y unit] and speed [y unit/s] after a sub-step.
+    y_offset : float
+        Reading at position 0 [y unit].
+    low, high : float
+        The stops, as readings [y unit].
+    """
     if x > high - y_offset:
         x = high - y_offset
         v = min(v, 0.0)
@@ -287,7 +347,7 @@ PLANT = (
             # of a damper, whose plant is a law: speed over which its force turns round
             Quantity(name="transition", unit="{f}", role="shape", neutral=0.0),
         ),
-        lines=(Line(stage="friction", does=dry), Line(stage="sensor", does=yielded)),
+        lines=(Line(stage="friction", does=dry), Line(stage="sensor", does=_yielded)),
         sub_steps=2,
         needs=RUBBING,
         suits=RUBBING,
@@ -313,7 +373,7 @@ PLANT = (
             Quantity(name="breakaway", unit="{f}", role="amplitude"),
             Quantity(name="stribeck_speed", unit="{v}", role="shape", nonzero=True),
         ),
-        lines=(Line(stage="friction", does=dropping),),
+        lines=(Line(stage="friction", does=_dropping),),
         sub_steps=2,
         needs=MECHANICAL,
         suits=MECHANICAL,
@@ -355,7 +415,7 @@ PLANT = (
         words=("drag", "drag grows with the square of the speed"),
         equation="tau dv/dt = -v - coefficient v |v| + gain w",
         parameters=(Quantity(name="coefficient", unit="1/({v})", role="amplitude"),),
-        lines=(Line(stage="force", does=dragged),),
+        lines=(Line(stage="force", does=_dragged),),
         needs=MECHANICAL,
         suits=MECHANICAL,
         starts=lambda s: [(0.05 / s.v,), (0.5 / s.v,)],
@@ -373,7 +433,7 @@ PLANT = (
         words=("curved spring", "the spring's stiffness changes with the travel"),
         equation="force = -coefficient x^3",
         parameters=(Quantity(name="coefficient", unit="{f}/{y}^3", role="amplitude", sign="real"), *ends("{y}")),
-        lines=(Line(stage="force", does=hardened),),
+        lines=(Line(stage="force", does=_hardened),),
         goes_on=lambda values, x: values["coefficient"] * values["gain"] > 0.0,
         needs=TRAVEL,
         suits=TRAVEL,
@@ -446,7 +506,7 @@ PLANT = (
             # of a lower tank, where there are two one above the other
             Quantity(name="operating_level_2", unit="{y}", role="shape", neutral=0.0, nonzero=True),
         ),
-        lines=(Line(stage="force", does=outflow), Line(stage="outflow", does=lower_outflow)),
+        lines=(Line(stage="force", does=outflow), Line(stage="outflow", does=_lower_outflow)),
         suits=LEVEL,
         starts=lambda s: [(c * s.x,) * (2 if s.levels == 2 else 1) for c in (1.5, 6.0)],
         odds={"level": 1.0},
@@ -491,7 +551,7 @@ PLANT = (
             Quantity(name="amplitude", unit="{f}", role="amplitude"),
             Quantity(name="width", unit="{y}", role="shape", nonzero=True),
         ),
-        lines=(Line(stage="force", does=held_back), Line(stage="travel", does=turn)),
+        lines=(Line(stage="force", does=_held_back), Line(stage="travel", does=turn)),
         memory=Memory(name="turned", start="zero"),
         starts=lambda s: [(0.05 * s.f, c * s.x) for c in (0.05, 0.3)],
         rough=True,
@@ -519,7 +579,7 @@ PLANT = (
         words=("radiation", "heat is lost by radiation, with the fourth power of the temperature"),
         equation="tau dx/dt = -x - coefficient (T^4 - T0^4 - 4 T0^3 x) + gain w, T = T0 + x absolute",
         parameters=(Quantity(name="coefficient", unit="1/K^3", role="amplitude"),),
-        lines=(Line(stage="force", does=radiated),),
+        lines=(Line(stage="force", does=_radiated),),
         suits=LEVEL,
         possible=_kelvin,
         starts=lambda s: [(c / (s.x_offset + _ICE) ** 3,) for c in (0.02, 0.3)],
@@ -559,7 +619,7 @@ PLANT = (
         words=("leak", "the plant loses what it has stored"),
         equation="force = -rate x / gain: the plant loses what it has stored",
         parameters=(Quantity(name="rate", unit="{v}/({y})", role="amplitude", sign="real"), *ends("{y}")),
-        lines=(Line(stage="force", does=leaked),),
+        lines=(Line(stage="force", does=_leaked),),
         goes_on=lambda values, x: values["rate"] > 0.0,
         suits=INTEGRATING,
         starts=lambda s: [(0.02 * abs(s.f * s.gain) / s.x,)],
@@ -583,7 +643,7 @@ PLANT = (
             Quantity(name="gravity", unit="", role="mark", neutral=0.0),
             *ends("{y}"),  # of gravity: unwound, an arm would turn on and on where nobody has seen it
         ),
-        lines=(Line(stage="force", does=cogging),),
+        lines=(Line(stage="force", does=_cogging),),
         goes_on=lambda values, x: True,
         needs=TRAVEL,
         suits=TRAVEL,

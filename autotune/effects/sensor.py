@@ -15,29 +15,39 @@ _LJUNG = "Ljung, System Identification, 2nd ed., sec. 5.1"
 
 
 def curved(z: float, second_order: float, third_order: float, low: float, high: float) -> float:
-    """Return a reading through a curved characteristic, which runs straight on beyond its ends."""
+    """Return a reading through a curved characteristic, which runs straight on beyond its ends.
+
+    Parameters
+    ----------
+    z : float
+        Reading about the operating point [y unit].
+    second_order, third_order : float
+        Of the curve [1/y unit, 1/y unit^2].
+    low, high : float
+        Where it runs straight on [y unit].
+    """
     c = min(max(z, low), high)
     bent = c + second_order * c * c
     bent += third_order * bent * bent * bent
     return z + (bent - c)
 
 
-def drifted(z: float, t: float, rate: float) -> float:
+def _drifted(z: float, t: float, rate: float) -> float:
     """Return a reading that drifts."""
     return z + rate * t
 
 
-def folded(y: float, fold: float) -> float:
+def _folded(y: float, fold: float) -> float:
     """Return a reading without its sign."""
     return fold + abs(y - fold)
 
 
-def limited(y: float, low: float, high: float) -> float:
+def _limited(y: float, low: float, high: float) -> float:
     """Return a reading within the sensor's range."""
     return min(max(y, low), high)
 
 
-def rounded(y: float, step: float) -> float:
+def _rounded(y: float, step: float) -> float:
     """Return a converter's level for a reading."""
     return step * math.floor(y / step + 0.5)
 
@@ -103,7 +113,7 @@ SENSOR = (
         words=("drift", "the reading drifts with time"),
         equation="y = z + rate t",
         parameters=(Quantity(name="rate", unit="{y}/s", role="amplitude", sign="real"),),
-        lines=(Line(stage="sensor", does=drifted),),
+        lines=(Line(stage="sensor", does=_drifted),),
         starts=lambda s: [(0.01 * s.y / s.duration_s,)],
         same=("environment.drifting_load",),
         at_a_time=True,
@@ -120,7 +130,7 @@ SENSOR = (
         words=("no sign", "the sensor cannot tell the sign"),
         equation="y = fold + |z - fold|, fold = 0 for a sensor that cannot tell the sign",
         parameters=(Quantity(name="fold", unit="{y}", role="threshold", sign="real"),),
-        lines=(Line(stage="reading", does=folded),),
+        lines=(Line(stage="reading", does=_folded),),
         starts=lambda s: [(s.y_low + c * (s.y_high - s.y_low),) for c in (0.005, 0.03, 0.1)],
         in_equations=InEquations(acts="reading", text="fold + abs(value - fold)", defaults={"fold": 0.0}),
         reference="a sensor that cannot tell the sign, as an encoder without direction",
@@ -133,7 +143,7 @@ SENSOR = (
             Quantity(name="low", unit="{y}", role="limit", sign="real", neutral=-NEVER),
             Quantity(name="high", unit="{y}", role="limit", sign="real", neutral=NEVER),
         ),
-        lines=(Line(stage="reading", does=limited),),
+        lines=(Line(stage="reading", does=_limited),),
         starts=lambda s: limit_starts(s.y_low, s.y_high, (0.02, 0.1)),
         flattens=True,
         odds={"any": 0.03, "lifted": 0.01},
@@ -145,7 +155,7 @@ SENSOR = (
         words=("steps", "the reading comes in steps"),
         equation="y = step round(z / step)",
         parameters=(Quantity(name="step", unit="{y}", role="threshold", nonzero=True),),
-        lines=(Line(stage="reading", does=rounded),),
+        lines=(Line(stage="reading", does=_rounded),),
         sought="samples",
         steps=True,
         # a reading that was rounded is off by less where it stands still: that is no jitter

@@ -12,7 +12,7 @@ from autotune.errors import InputError
 _LJUNG = "Ljung, System Identification, 2nd ed., sec. 5.1"
 
 
-def stretched(elapsed: float, error: float) -> float:
+def _stretched(elapsed: float, error: float) -> float:
     """Return when a command acts whose stamp was taken by a clock of another rate."""
     return elapsed * (1.0 + error)
 
@@ -46,7 +46,7 @@ TIMING = (
         words=("clock error", "the clock of the stamps runs at another rate"),
         equation="the command at stamp t acts at t (1 + error)",
         parameters=(Quantity(name="error", unit="", role="amplitude", sign="real"),),
-        lines=(Line(stage="clock", does=stretched),),
+        lines=(Line(stage="clock", does=_stretched),),
         starts=lambda s: [(0.2 * s.dt_s / s.duration_s,)],
         reference=_LJUNG,
     ),

@@ -75,6 +75,22 @@ class BlackBox:
 def driven(box: BlackBox, extensions: Sequence[Extension], delays: FloatArray, drive: Drive) -> Drive:
     """Return the inputs that reach a closed model behind effects on its inputs.
 
+    Parameters
+    ----------
+    box : BlackBox
+        The closed model.
+    extensions : sequence of Extension
+        Effects on its inputs.
+    delays : (m,) array
+        Dead time of each input [s].
+    drive : Drive
+        N rows of m inputs.
+
+    Returns
+    -------
+    Drive
+        The same rows, with what arrives.
+
     Notes
     -----
     A row's input is the mean of what arrives until the next row: exact for what acts at once, and to the second order
@@ -143,7 +159,22 @@ def from_function(
 
 
 def read_out(y: FloatArray, drive: Drive, effects: Sequence[Effect]) -> FloatArray:
-    """Return readings behind effects of the sensor, the signal straight between rows."""
+    """Return readings behind effects of the sensor, the signal straight between rows.
+
+    Parameters
+    ----------
+    y : (N,) array
+        What the model gives [y unit].
+    drive : Drive
+        Its rows.
+    effects : sequence of Effect
+        Of the sensor.
+
+    Returns
+    -------
+    (N,) array
+        Readings [y unit].
+    """
     if not effects:
         return y
     shell = EquationModel(name="sensor", inputs=(InputColumn(column="z", hold="linear"),), output=Name("z"), states=())
@@ -154,6 +185,18 @@ def read_out(y: FloatArray, drive: Drive, effects: Sequence[Effect]) -> FloatArr
 
 def run_closed(box: BlackBox, recording: Recording) -> FloatArray:
     """Return the readings of a closed model with its effects over a recording, from the model's own start.
+
+    Parameters
+    ----------
+    box : BlackBox
+        The closed model.
+    recording : Recording
+        N rows, with its input columns.
+
+    Returns
+    -------
+    (N,) array
+        Readings [y unit].
 
     Raises
     ------

@@ -10,7 +10,8 @@ from typing import Any
 from autotune.equations.expressions import Call, Expression, Name, Number
 from autotune.equations.model import EquationModel, InputColumn, ModelParameter, State, StateKind
 from autotune.errors import InputError
-from autotune.models import Block, Model, TransferFunction, model_of
+from autotune.model_tables import model_of
+from autotune.models import Block, Model, TransferFunction
 
 
 def from_chain(model: Model, column: str = "u") -> EquationModel:
@@ -58,7 +59,7 @@ def chain_with_inputs(content: Mapping[str, Any], where: str) -> EquationModel:
     Raises
     ------
     InputError
-        As :func:`autotune.models.read_model`, and an input that does not say what it does.
+        As :func:`autotune.model_tables.read_model`, and an input that does not say what it does.
     """
     inputs = content.get("input")
     if not isinstance(inputs, list) or not inputs or not all(isinstance(one, dict) for one in inputs):

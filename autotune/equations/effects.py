@@ -96,7 +96,7 @@ def apply(model: EquationModel, effects: Sequence[Effect] | None = None) -> Appl
             case "nothing":
                 pass
             case _:
-                extensions.append(extension_of(model, effect, number))
+                extensions.append(_extension_of(model, effect, number))
     if np.any(delays < 0.0):
         raise InputError("the dead time is negative", where=model.name, remedy="check inputs and effects")
 
@@ -156,7 +156,7 @@ def compile_with(
     return compile_model(model, (*apply(model, effects).extensions, *further), signals, held)
 
 
-def extension_of(model: EquationModel, effect: Effect, number: int = 0) -> Extension:
+def _extension_of(model: EquationModel, effect: Effect, number: int = 0) -> Extension:
     """Return an effect in the model's language; its parameters are named ``EFFECT_NUMBER_KEY``.
 
     Raises
@@ -229,6 +229,13 @@ def at_state(model: EquationModel, state: str, tree: Expression) -> dict[str, Ex
 def form_of(effect: Effect, model: EquationModel) -> InEquations:
     """Return how an effect acts in a model of equations.
 
+    Parameters
+    ----------
+    effect : Effect
+        Of a model or a hypothesis.
+    model : EquationModel
+        Names itself in the refusal.
+
     Raises
     ------
     InputError
@@ -245,7 +252,15 @@ def form_of(effect: Effect, model: EquationModel) -> InEquations:
 
 
 def at_reading(model: EquationModel, effects: Sequence[Effect]) -> list[Effect]:
-    """Return those of the effects that act on the reading."""
+    """Return those of the effects that act on the reading.
+
+    Parameters
+    ----------
+    model : EquationModel
+        Names itself in refusals.
+    effects : sequence of Effect
+        Those to choose from.
+    """
     acts = ((e, form_of(e, model).acts) for e in effects)
     return [e for e, how in acts if how == "reading" or (how == "anywhere" and not where_of(e))]
 
@@ -256,7 +271,15 @@ def where_of(effect: Effect) -> str:
 
 
 def prefix_of(effect: Effect, number: int) -> str:
-    """Return what the names of an effect's parameters and states begin with."""
+    """Return what the names of an effect's parameters and states begin with.
+
+    Parameters
+    ----------
+    effect : Effect
+        PLACE.EFFECT.
+    number : int
+        Its place among the model's effects.
+    """
     return f"{effect.name.split('.')[1]}_{number}_"
 
 
@@ -266,12 +289,28 @@ def _key(effect: Effect) -> str:
 
 
 def text_of(form: InEquations, effect: Effect) -> str:
-    """Return what an effect adds, or puts in the place of ``value``, with the numbers that it has."""
+    """Return what an effect adds, or puts in the place of ``value``, with the numbers that it has.
+
+    Parameters
+    ----------
+    form : InEquations
+        How the effect acts.
+    effect : Effect
+        With its parameters.
+    """
     return form.text if not form.at_once or form.remembers(effect.parameters) else form.at_once
 
 
 def local_names(model: EquationModel, effect: Effect) -> dict[str, Expression | None]:
-    """Return what names in an effect's text stand for that are no parameters of it; nothing for what is not there."""
+    """Return what names in an effect's text stand for that are no parameters of it; nothing for what is not there.
+
+    Parameters
+    ----------
+    model : EquationModel
+        Where it acts.
+    effect : Effect
+        Says at which state, port or column.
+    """
     V, X = _speed_and_position(model, effect)
     return {"V": V, "X": X, "column": Name(effect.column) if effect.column in model.columns else None}
 
@@ -296,7 +335,15 @@ def _speed_and_position(model: EquationModel, effect: Effect) -> tuple[Expressio
 
 
 def position_under(model: EquationModel, across: Expression) -> Expression | None:
-    """Return the difference of positions whose speeds a port lies across, where every name in it is a speed."""
+    """Return the difference of positions whose speeds a port lies across, where every name in it is a speed.
+
+    Parameters
+    ----------
+    model : EquationModel
+        Says of which position a speed is the derivative.
+    across : Expression
+        The difference of speeds.
+    """
     of = {one.name: one.of for one in model.states if one.of}
     known = {one.name for one in model.states}
     lost: list[str] = []
@@ -331,7 +378,15 @@ def _value(effect: Effect, key: str, model: EquationModel) -> float:
 
 
 def with_values(effects: Sequence[Effect], values: Mapping[str, tuple[float, float]]) -> tuple[Effect, ...]:
-    """Return effects with fitted values: ``values`` maps ``EFFECT_NUMBER_KEY`` to (value, standard deviation)."""
+    """Return effects with fitted values.
+
+    Parameters
+    ----------
+    effects : sequence of Effect
+        In the model's order.
+    values : mapping of str to (float, float)
+        Value and standard deviation by ``EFFECT_NUMBER_KEY``, in the parameter's unit.
+    """
     found = []
     for number, effect in enumerate(effects):
         prefix, parameters = prefix_of(effect, number), {}
@@ -349,7 +404,15 @@ def where_told(effect: Effect) -> str:
 
 
 def equation_of(model: EquationModel, effect: Effect) -> str:
-    """Return an effect's equation for a reader, with the names of its states and parameters."""
+    """Return an effect's equation for a reader, with the names of its states and parameters.
+
+    Parameters
+    ----------
+    model : EquationModel
+        Where it acts.
+    effect : Effect
+        Of the catalogue.
+    """
     form, column = form_of(effect, model), effect.input or model.columns[0]
     if form.acts == "delay":
         return f"{column}(t - {_key(effect)})"

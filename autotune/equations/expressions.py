@@ -252,7 +252,15 @@ def names_in(tree: Expression) -> set[str]:
 
 
 def substituted(tree: Expression, replace: Callable[[str], Expression | None]) -> Expression:
-    """Return an expression with names replaced by expressions; ``None`` leaves a name as it is."""
+    """Return an expression with names replaced by expressions.
+
+    Parameters
+    ----------
+    tree : Expression
+        The expression; stays as it is.
+    replace : callable
+        From a name to what takes its place; None leaves it.
+    """
     match tree:
         case Name(name):
             new = replace(name)

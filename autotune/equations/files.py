@@ -19,7 +19,8 @@ from autotune.equations.forecast import forecast
 from autotune.equations.model import EquationModel
 from autotune.equations.read import content_of, equations_of, write_equations
 from autotune.errors import InputError
-from autotune.models import Model, read_model, write_model
+from autotune.model_tables import read_model, write_model
+from autotune.models import Model
 from autotune.recording import Recording
 from autotune.text_files import read_toml
 
@@ -83,6 +84,20 @@ def write_any(model: AnyModel, path: Path, base: Path | None = None) -> None:
 
 def forecast_any(model: EquationModel | BlackBox, recording: Recording, horizon_s: float | None = None) -> FloatArray:
     """Simulate equations or a closed model with a recording's inputs, see :func:`autotune.equations.forecast.forecast`.
+
+    Parameters
+    ----------
+    model : EquationModel or BlackBox
+        The model.
+    recording : Recording
+        N rows; its columns drive the model.
+    horizon_s : float, optional
+        Length of the windows [s] before which the state is estimated anew; one free run when absent.
+
+    Returns
+    -------
+    (N,) array
+        y [y unit].
 
     Raises
     ------

@@ -70,6 +70,18 @@ def window_rows(t: FloatArray, horizon_s: float | None) -> tuple[IntArray, IntAr
     """Return the first rows of windows of about a length, and the rows before which they end; one window without it.
 
     All are as long as one another: in a longer one an unstable plant would run away.
+
+    Parameters
+    ----------
+    t : (N,) array
+        Time stamps [s].
+    horizon_s : float or None
+        The length [s].
+
+    Returns
+    -------
+    tuple of (W,) array of int
+        First rows, and stop rows.
     """
     if horizon_s is None:
         return np.zeros(1, dtype=np.int64), np.array([t.size], dtype=np.int64)
@@ -87,6 +99,21 @@ def data_of(
     """Return a recording prepared for a fit, on given windows or on ones of a length.
 
     What an earlier fit knows of states, on its own windows, is taken over.
+
+    Parameters
+    ----------
+    compiled : Compiled
+        The model.
+    recording : Recording
+        N rows.
+    parameters : (P,) array
+        Values that the start states are estimated with.
+    length_s : float or None
+        Length of the windows [s]; one window when None.
+    windows : Windows or None
+        The windows, where they are known.
+    known : Windows, optional
+        Of an earlier fit.
 
     Raises
     ------

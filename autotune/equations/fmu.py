@@ -29,7 +29,7 @@ from autotune.equations.black_box import BlackBox
 from autotune.equations.read import input_of, parameter_of
 from autotune.equations.simulate import Drive
 from autotune.errors import InputError
-from autotune.models import effect_of
+from autotune.model_tables import effect_of
 
 _KEYS = {"name", "fmu", "input", "output", "parameters", "effect"}
 
@@ -71,6 +71,13 @@ def _description(path: Path) -> Any:
 
 def fmu_of(content: Mapping[str, Any], where: str) -> BlackBox:
     """Return the model that a file's content states; the FMU's path counts from the file's folder.
+
+    Parameters
+    ----------
+    content : mapping
+        The decoded TOML.
+    where : str
+        Its file, for messages and for the FMU's path.
 
     Raises
     ------

@@ -18,6 +18,15 @@ from autotune.models import Block, Model, Port, TransferFunction
 def from_coefficients(num: Any, den: Any, delay_s: float = 0.0, name: str = "plant") -> Model:
     """Return a chain of one block from coefficients in descending powers of s.
 
+    Parameters
+    ----------
+    num, den : sequence of float
+        Descending powers of s [rad/s].
+    delay_s : float
+        Dead time [s].
+    name : str
+        Of the model.
+
     Raises
     ------
     InputError
@@ -34,6 +43,15 @@ def from_coefficients(num: Any, den: Any, delay_s: float = 0.0, name: str = "pla
 
 def from_matlab(num: str, den: str, delay_s: float = 0.0, name: str = "plant") -> Model:
     """Return a chain of one block from vectors as MATLAB prints them: ``"[1 2]"``, ``"1, 3.5, 0"``.
+
+    Parameters
+    ----------
+    num, den : str
+        Descending powers of s [rad/s].
+    delay_s : float
+        Dead time [s].
+    name : str
+        Of the model.
 
     Raises
     ------
@@ -93,10 +111,10 @@ def from_control(system: Any, name: str = "") -> Model | EquationModel:
         return from_coefficients(tf.num[0][0], tf.den[0][0], name=name)
     import control
 
-    return from_state_space(control.ss(system), name)
+    return _from_state_space(control.ss(system), name)
 
 
-def from_state_space(system: Any, name: str) -> EquationModel:
+def _from_state_space(system: Any, name: str) -> EquationModel:
     """Return a state space with several inputs as equations; entries that are neither 0 nor 1 become parameters."""
     labels = [label if label.isidentifier() else f"x{i + 1}" for i, label in enumerate(system.state_labels)]
     columns = [label if label.isidentifier() else f"u{i + 1}" for i, label in enumerate(system.input_labels)]

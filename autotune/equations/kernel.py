@@ -203,6 +203,35 @@ def run(
     ``most`` bounds the steps between two rows on average, all but ``spare`` of a window's. ``out`` is (q, N);
     ``ends`` (W, n) receives the state at each window's stop row (or at the last row); ``status`` (W, 3) the reason and
     the time of the end, and the steps taken.
+
+    Parameters
+    ----------
+    p : Tape
+        The program, n states, m inputs, q outputs.
+    template : array
+        Registers with the program's constants.
+    parameters : (P,) array
+        In their own units.
+    times : (N,) array
+        Stamps of the rows [s].
+    columns : (N, m) array
+        The inputs at the rows.
+    delays : (m,) array
+        Dead time of each input [s].
+    starts, stops : (W,) array of int
+        First row of every window, and the row before which it ends.
+    x0 : (W, n) array
+        Start states.
+    tolerance : float
+        Relative error of a step.
+    most, spare : float
+        Most steps between two rows on average, all but the spare ones of a window.
+    out : (q, N) array
+        Receives the outputs.
+    ends : (W, n) array
+        Receives the state at each window's stop row, or at the last row.
+    status : (W, 3) array
+        Receives the reason and the time of the end, and the steps taken.
     """
     w = new_work(p, template, parameters)
     x, at = np.zeros(p.n), np.zeros(p.linear.size, dtype=np.int64)
@@ -217,7 +246,28 @@ def run(
 def look(
     p: Tape, template: FloatArray, parameters: FloatArray, states: FloatArray, inputs: FloatArray, t: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Return derivatives (P, n) and outputs (P, q) at P points of states (P, n) and inputs (P, m) at time t."""
+    """Return derivatives and outputs at points of states and inputs.
+
+    Parameters
+    ----------
+    p : Tape
+        The program, n states, m inputs, q outputs.
+    template : array
+        Registers with the program's constants.
+    parameters : (P,) array
+        In their own units.
+    states : (K, n) array
+        At K points.
+    inputs : (K, m) array
+        At the same.
+    t : float
+        Time [s].
+
+    Returns
+    -------
+    tuple of array
+        Derivatives, (K, n), and outputs, (K, q).
+    """
     w = new_work(p, template, parameters)
     points = states.shape[0]
     found, y, x = np.zeros((points, p.n)), np.zeros((points, p.outputs.size)), np.zeros(p.n)

@@ -91,13 +91,21 @@ def growth_rate(model: EquationModel, recordings: Sequence[Recording]) -> float:
     recordings : sequence of Recording
         Their medians are the operating point; where nothing rests under these inputs the rate is not known, and 0.
     """
-    linear = at_recordings(model, recordings)
+    linear = _at_recordings(model, recordings)
     return 0.0 if linear is None else max(float(np.max(np.linalg.eigvals(linear.A).real, initial=0.0)), 0.0)
 
 
 def settles(model: EquationModel, recordings: Sequence[Recording]) -> bool:
-    """Whether a deviation from where recordings are dies out, as far as a rest is known there."""
-    linear = at_recordings(model, recordings)
+    """Whether a deviation from where recordings are dies out, as far as a rest is known there.
+
+    Parameters
+    ----------
+    model : EquationModel
+        The model.
+    recordings : sequence of Recording
+        Say where it rests.
+    """
+    linear = _at_recordings(model, recordings)
     return linear is not None and bool(np.all(np.linalg.eigvals(linear.A).real < 0.0))
 
 
@@ -119,7 +127,7 @@ def linearise_at(model: EquationModel, states: FloatArray, inputs: FloatArray) -
     return Linear(A=A, B=B, C=C, D=D, states=states, inputs=inputs, y=y, delays_s=applied.delays)
 
 
-def at_recordings(model: EquationModel, recordings: Sequence[Recording]) -> Linear | None:
+def _at_recordings(model: EquationModel, recordings: Sequence[Recording]) -> Linear | None:
     """Return a model linearised at the medians of recordings; nothing where nothing rests there."""
     inputs = np.array([float(np.median(np.concatenate([r[name] for r in recordings]))) for name in model.columns])
     y = float(np.nanmedian(np.concatenate([r.y for r in recordings])))
@@ -145,7 +153,15 @@ def _differences(
 
 
 def transfer_function(linear: Linear, column: int = 0) -> TransferFunction:
-    """Return the transfer function from one input to y, with its dead time."""
+    """Return the transfer function from one input to y, with its dead time.
+
+    Parameters
+    ----------
+    linear : Linear
+        The linearisation.
+    column : int
+        Place of the input.
+    """
     from scipy.signal import ss2tf
 
     num, den = ss2tf(linear.A, linear.B[:, [column]], linear.C, linear.D[:, [column]])
@@ -154,7 +170,15 @@ def transfer_function(linear: Linear, column: int = 0) -> TransferFunction:
 
 
 def as_chain(model: EquationModel, linear: Linear) -> Model:
-    """Return the linearisation from the command as a chain of one block, offsets at the operating point."""
+    """Return the linearisation from the command as a chain of one block, offsets at the operating point.
+
+    Parameters
+    ----------
+    model : EquationModel
+        Names and units.
+    linear : Linear
+        Its linearisation.
+    """
     block = Block(name="linearisation", place="plant", dynamics=transfer_function(linear))
     return Model(
         name=f"{model.name}, linearised",
@@ -162,13 +186,3 @@ def as_chain(model: EquationModel, linear: Linear) -> Model:
         output=Port(unit=model.output_unit, offset=linear.y),
         blocks=(block,),
     )
-
-
-def as_control(model: EquationModel, linear: Linear) -> object:
-    """Return the linearisation as python-control's ``StateSpace``, signals named; dead times are left out."""
-    import control
-
-    return control.StateSpace(
-        linear.A, linear.B, linear.C, linear.D, states=list(compile_model(model, apply(model).extensions).states),
-        inputs=list(model.columns), outputs=["y"],
-    )  # fmt: skip

@@ -59,6 +59,15 @@ class Translator:
         """Return the machine code of a tape that is about to be run over some rows; nothing where it is run seldom.
 
         The caller keeps what is returned until its run has ended: what is forgotten here is freed with its last use.
+
+        Parameters
+        ----------
+        code : (K, 5) array of int
+            The tape.
+        first, last : int
+            Its operations that are run.
+        rows : int
+            Over how many rows.
         """
         key = np.array([first, last]).tobytes() + code[first:last].tobytes()
         with self._lock:
@@ -79,7 +88,19 @@ class Translator:
 
 @intrinsic
 def call(typing: Any, address: Any, r: Any, extended: Any) -> Any:
-    """Run machine code at an address on registers."""
+    """Run machine code at an address on registers.
+
+    Parameters
+    ----------
+    typing : object
+        Of numba's compiler.
+    address : int64
+        Of the machine code.
+    r : array
+        The registers.
+    extended : bool
+        As of :func:`autotune.equations.tape_ops.evaluate`.
+    """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         function = builder.inttoptr(arguments[0], _TYPE.as_pointer())

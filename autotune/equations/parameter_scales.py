@@ -16,7 +16,20 @@ LAST_SHARE = 0.02
 
 
 def values_of(compiled: Compiled, z: FloatArray) -> FloatArray:
-    """Return the parameters at distances z from their nominal values, in prior standard deviations."""
+    """Return the parameters at distances z from their nominal values, in prior standard deviations.
+
+    Parameters
+    ----------
+    compiled : Compiled
+        P parameters.
+    z : (P,) array
+        The distances.
+
+    Returns
+    -------
+    (P,) array
+        Values in their own units.
+    """
     value, spread = compiled.parameter_vector, np.array([p.spread for p in compiled.parameters])
     scaled = value * _factors(spread * z)[0]
     least = np.array([p.least for p in compiled.parameters])
@@ -26,7 +39,20 @@ def values_of(compiled: Compiled, z: FloatArray) -> FloatArray:
 
 
 def slopes_of(compiled: Compiled, z: FloatArray) -> FloatArray:
-    """Return how fast the parameters change with their distances z, (P,)."""
+    """Return how fast the parameters change with their distances z.
+
+    Parameters
+    ----------
+    compiled : Compiled
+        P parameters.
+    z : (P,) array
+        The distances.
+
+    Returns
+    -------
+    (P,) array
+        Derivatives, in the parameters' units.
+    """
     value, spread = compiled.parameter_vector, np.array([p.spread for p in compiled.parameters])
     return np.asarray(np.where(linear(compiled), spread, value * spread * _factors(spread * z)[1]))
 

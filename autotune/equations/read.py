@@ -23,7 +23,8 @@ from autotune.equations.model import (
 )
 from autotune.equations.units import check_units
 from autotune.errors import InputError
-from autotune.models import Hold, effect_of, effect_table
+from autotune.model_tables import effect_of, effect_table
+from autotune.models import Hold
 from autotune.text_files import read_toml
 
 _TOP = {"name", "input", "output", "state", "parameters", "define", "port", "horizon_s", "effect"}
@@ -51,7 +52,20 @@ def read_equations(path: str | os.PathLike[str]) -> EquationModel:
 
 
 def equations_of(content: Mapping[str, Any], where: str) -> EquationModel:
-    """Return the model that a TOML content states; ``where`` names it in messages."""
+    """Return the model that a TOML content states.
+
+    Parameters
+    ----------
+    content : mapping
+        The decoded TOML.
+    where : str
+        Names it in messages.
+
+    Raises
+    ------
+    InputError
+        A key that is not known, or a value that no model has; names it.
+    """
     _known(content, _TOP, where)
     states = _tables(content, "state", where)
     if not states:
@@ -148,7 +162,20 @@ def _positive(value: Any, key: str, where: str) -> float:
 
 
 def input_of(table: Mapping[str, Any], where: str) -> InputColumn:
-    """Return the input that an ``[[input]]`` table states."""
+    """Return the input that an ``[[input]]`` table states.
+
+    Parameters
+    ----------
+    table : mapping
+        The decoded TOML.
+    where : str
+        Names it in messages.
+
+    Raises
+    ------
+    InputError
+        A key that is not known, or a value that no input has; names it.
+    """
     _known(table, {"column", "unit", "hold", "kind", "delay", "offset"}, where)
     delay = _real(table.get("delay", 0.0), "delay", where)
     if delay < 0.0:
@@ -176,7 +203,22 @@ def _state(table: Mapping[str, Any], where: str) -> State:
 
 
 def parameter_of(name: str, given: Any, where: str) -> ModelParameter:
-    """Return the parameter that a ``[parameters.NAME]`` table, or a number alone, states."""
+    """Return the parameter that a ``[parameters.NAME]`` table, or a number alone, states.
+
+    Parameters
+    ----------
+    name : str
+        Of the parameter.
+    given : object
+        The table, or the number.
+    where : str
+        Names the file in messages.
+
+    Raises
+    ------
+    InputError
+        A key that is not known, or a value that no parameter has; names it.
+    """
     where = f"{where} [parameters.{name}]"
     table = given if isinstance(given, dict) else {"value": given}
     _known(table, {"value", "unit", "spread", "fixed", "sd"}, where)
@@ -224,7 +266,15 @@ def write_equations(
 
 
 def content_of(model: EquationModel, equations: Mapping[str, str] | None = None) -> dict[str, Any]:
-    """Return the TOML content of a model."""
+    """Return the TOML content of a model.
+
+    Parameters
+    ----------
+    model : EquationModel
+        What is written.
+    equations : mapping of str to str, optional
+        For the reader, the equation of an effect by its name.
+    """
     content: dict[str, Any] = {"name": model.name}
     if model.horizon_s is not None:
         content["horizon_s"] = model.horizon_s

@@ -12,7 +12,22 @@ from autotune.arrays import FloatArray
 
 @njit(cache=True)
 def backlash(t: FloatArray, u: FloatArray, width: float) -> FloatArray:
-    """Return what follows u with a play of a width."""
+    """Return what follows u with a play of a width.
+
+    Parameters
+    ----------
+    t : (N,) array
+        Time stamps [s]; not used.
+    u : (N,) array
+        Command.
+    width : float
+        Of the play [u unit].
+
+    Returns
+    -------
+    (N,) array
+        The far side.
+    """
     w = np.empty_like(u)
     now = u[0]
     for k in range(u.size):
@@ -23,7 +38,22 @@ def backlash(t: FloatArray, u: FloatArray, width: float) -> FloatArray:
 
 @njit(cache=True)
 def stiction(t: FloatArray, u: FloatArray, band: float) -> FloatArray:
-    """Return what stays until u is further away than a band, and then jumps to u."""
+    """Return what stays until u is further away than a band, and then jumps to u.
+
+    Parameters
+    ----------
+    t : (N,) array
+        Time stamps [s]; not used.
+    u : (N,) array
+        Command.
+    band : float
+        The band [u unit].
+
+    Returns
+    -------
+    (N,) array
+        The position.
+    """
     w = np.empty_like(u)
     now = u[0]
     for k in range(u.size):
@@ -58,7 +88,20 @@ def lagged(t: FloatArray, u: FloatArray, time_constant_s: float, straight: bool)
 
 
 def quantised(values: FloatArray, step: float) -> FloatArray:
-    """Return values on a converter's steps; a step of 0 leaves them."""
+    """Return values on a converter's steps; a step of 0 leaves them.
+
+    Parameters
+    ----------
+    values : (N,) array
+        Values.
+    step : float
+        In their unit.
+
+    Returns
+    -------
+    (N,) array
+        The levels.
+    """
     return step * np.floor(values / step + 0.5) if step > 0.0 else values
 
 

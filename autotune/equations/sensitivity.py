@@ -60,7 +60,15 @@ def _pool() -> ThreadPoolExecutor:
 
 
 def side_by_side(one: Callable[[_A], _B], found: Iterable[_A]) -> Iterator[_B]:
-    """Return what a function that simulates makes of each of its arguments, in order, several at a time."""
+    """Return what a function that simulates makes of each of its arguments, in order, several at a time.
+
+    Parameters
+    ----------
+    one : callable
+        Simulates one argument.
+    found : iterable
+        The arguments.
+    """
     return _pool().map(one, found)
 
 

@@ -204,6 +204,18 @@ def _lags(
 def drive_of(model: EquationModel, recording: Recording) -> Drive:
     """Return what a recording drives a model with.
 
+    Parameters
+    ----------
+    model : EquationModel
+        Names its m columns.
+    recording : Recording
+        N rows.
+
+    Returns
+    -------
+    Drive
+        Stamps, (N,), and inputs, (N, m).
+
     Raises
     ------
     InputError
@@ -334,6 +346,15 @@ def derivatives(
 
 def require_complete(run: Run, compiled: Compiled, where: str) -> Run:
     """Return a run that reached its end.
+
+    Parameters
+    ----------
+    run : Run
+        The run, of one window or several.
+    compiled : Compiled
+        The model, for the message.
+    where : str
+        The recording, for the message.
 
     Raises
     ------

@@ -75,7 +75,24 @@ def rest_state(compiled: Compiled, parameters: FloatArray, inputs: FloatArray, y
 
 
 def state_scales(compiled: Compiled, parameters: FloatArray, drive: Drive, start: FloatArray) -> FloatArray:
-    """Return how large each state typically is, (n,): what a change of it is measured by."""
+    """Return how large each state typically is: what a change of it is measured by.
+
+    Parameters
+    ----------
+    compiled : Compiled
+        n states.
+    parameters : (P,) array
+        In their own units.
+    drive : Drive
+        The recording's inputs.
+    start : (n,) array
+        State at the first row.
+
+    Returns
+    -------
+    (n,) array
+        Sizes, in the states' units.
+    """
     probe = np.linspace(0, drive.t.size - 1, min(drive.t.size, 400)).astype(np.int64)[:-1]
     states = np.repeat(start[None, :], probe.size, axis=0)
     run = simulate(compiled, parameters, drive, states, starts=probe, stops=probe + 1)

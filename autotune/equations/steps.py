@@ -120,7 +120,23 @@ def _jacobian(p: Tape, w: Work, x: FloatArray, t: float, h: float) -> None:
 
 @in_place(inline="always")
 def trial(p: Tape, w: Work, x: FloatArray, t: float, h: float, tolerance: float, new_point: bool) -> float:
-    """Try a step into y and return its error in units of what is allowed."""
+    """Try a step into y and return its error in units of what is allowed.
+
+    Parameters
+    ----------
+    p : Tape
+        The program.
+    w : Work
+        What is written on.
+    x : (n,) array
+        State before the step.
+    t, h : float
+        Time and length of the step [s].
+    tolerance : float
+        Relative error that is allowed.
+    new_point : bool
+        Whether nothing was tried from this state yet.
+    """
     if w.memory[IS_STIFF] > 0.0:
         if new_point:
             _jacobian(p, w, x, t, h)
@@ -135,7 +151,17 @@ def trial(p: Tape, w: Work, x: FloatArray, t: float, h: float, tolerance: float,
 
 @in_place(inline="always")
 def next_step(w: Work, error: float, h: float) -> None:
-    """Remember the step that the error allows; one that was cut short leaves a longer one as it was."""
+    """Remember the step that the error allows; one that was cut short leaves a longer one as it was.
+
+    Parameters
+    ----------
+    w : Work
+        Its memory keeps the step.
+    error : float
+        Of the step that was tried, in units of what is allowed.
+    h : float
+        Its length [s].
+    """
     power = -1.0 / 3.0 if w.memory[IS_STIFF] > 0.0 else -0.2
     if not np.isfinite(error):
         w.memory[STEP] = 0.25 * h

@@ -50,7 +50,21 @@ def _speeds_of_switches(p: Tape, w: Work) -> None:
 
 @in_place(inline="always")
 def field(p: Tape, w: Work, x: FloatArray, t: float, row: int) -> None:
-    """Evaluate the derivatives into a row of K; modes of sliding switches keep the state on the surface."""
+    """Evaluate the derivatives into a row of K; modes of sliding switches keep the state on the surface.
+
+    Parameters
+    ----------
+    p : Tape
+        The program.
+    w : Work
+        What is written on.
+    x : (n,) array
+        State.
+    t : float
+        Time [s].
+    row : int
+        Of K.
+    """
     r, base, ramp, n = w.r, w.base, w.ramp, p.n
     begun = t - w.since[0]
     r[0] = t
@@ -71,7 +85,19 @@ def field(p: Tape, w: Work, x: FloatArray, t: float, row: int) -> None:
 
 @in_place
 def field_in_row(p: Tape, w: Work, x: FloatArray, t: float) -> None:
-    """Do as :func:`field`, into the row that the memory names: a call, where time does not count."""
+    """Do as :func:`field`, into the row that the memory names: a call, where time does not count.
+
+    Parameters
+    ----------
+    p : Tape
+        The program.
+    w : Work
+        What is written on.
+    x : (n,) array
+        State.
+    t : float
+        Time [s].
+    """
     field(p, w, x, t, int(w.memory[ROW]))
 
 
@@ -110,7 +136,19 @@ def _slide(p: Tape, w: Work, count: int) -> None:
 
 @in_place
 def settle(p: Tape, w: Work, x: FloatArray, t: float) -> None:
-    """Set every switch's mode for the state and inputs of now, one side or sliding, and the field in K[0]."""
+    """Set every switch's mode for the state and inputs of now, one side or sliding, and the field in K[0].
+
+    Parameters
+    ----------
+    p : Tape
+        The program.
+    w : Work
+        What is written on.
+    x : (n,) array
+        State.
+    t : float
+        Time [s].
+    """
     for _ in range(3):
         changed = False
         for k in range(p.switches.size):
@@ -164,7 +202,15 @@ def _choose(p: Tape, w: Work, x: FloatArray, t: float, k: int, before: float, g:
 
 @in_place
 def crossing(p: Tape, w: Work) -> bool:
-    """Return whether a mode no longer fits the registers of now, and mark which."""
+    """Return whether a mode no longer fits the registers of now, and mark which.
+
+    Parameters
+    ----------
+    p : Tape
+        The program.
+    w : Work
+        Holds the registers; the marks are written there.
+    """
     found = False
     for k in range(p.switches.size):
         mode = w.r[p.modes[k]]
@@ -182,7 +228,19 @@ def crossing(p: Tape, w: Work) -> bool:
 
 @in_place
 def begin_locating(p: Tape, w: Work, x: FloatArray, t: float) -> None:
-    """Remember how far modes are over their edges where a step ends beyond a crossing, and where it began."""
+    """Remember how far modes are over their edges where a step ends beyond a crossing, and where it began.
+
+    Parameters
+    ----------
+    p : Tape
+        The program.
+    w : Work
+        What is written on.
+    x : (n,) array
+        State before the step.
+    t : float
+        Time before it [s].
+    """
     copy(w.over, w.beyond)
     w.memory[ROW] = 5.0
     field_in_row(p, w, x, t)
@@ -196,6 +254,20 @@ def located(w: Work, low: float, high: float, close: float, side: int, halve: bo
 
     ``side`` says whether the last one tried lay beyond (1) or before (-1): the next is put a little to the other side
     of the estimate, so that the bracket closes from both ends.
+
+    Parameters
+    ----------
+    w : Work
+        Knows how far modes are over their edges at both.
+    low, high : float
+        Steps before and beyond the crossing [s].
+    close : float
+        How closely a crossing is located [s].
+    side : int
+        Whether the last one tried lay beyond (1) or before (-1): the next is put a little to the other side of the
+        estimate, so that the bracket closes from both ends.
+    halve : bool
+        Whether the next one is half way.
     """
     found = 2.0 * high
     for k in range(w.over.size):

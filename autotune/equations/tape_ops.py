@@ -36,10 +36,22 @@ from autotune.equations.opcodes import (
 
 @in_place
 def evaluate(code: IntArray, first: int, last: int, r: FloatArray, extended: bool) -> None:
-    """Run operations ``first`` to ``last`` on the registers.
+    """Run operations on the registers; what is undefined becomes NaN.
 
     What is undefined becomes NaN; ``extended``, roots and logarithms go on beyond their domain, so that a step over
     the crossing of ``sqrt(max(h, 0))``, whose mode is held, can be tried and cut there.
+
+    Parameters
+    ----------
+    code : (K, 5) array of int
+        Operations.
+    first, last : int
+        The first, and the one after the last.
+    r : array
+        The registers, changed in place.
+    extended : bool
+        Whether roots and logarithms go on beyond their domain, so that a step over the crossing of ``sqrt(max(h,
+        0))``, whose mode is held, can be tried and cut there.
     """
     for k in range(first, last):
         o = code[k, 0]
@@ -104,7 +116,19 @@ def evaluate(code: IntArray, first: int, last: int, r: FloatArray, extended: boo
 
 @in_place
 def tangents(code: IntArray, first: int, last: int, r: FloatArray, d: FloatArray) -> None:
-    """Carry a direction ``d`` of the registers through operations whose values are in ``r``; modes stay fixed."""
+    """Carry a direction of the registers through operations whose values they hold; modes stay fixed.
+
+    Parameters
+    ----------
+    code : (K, 5) array of int
+        Operations.
+    first, last : int
+        The first, and the one after the last.
+    r : array
+        The registers.
+    d : array
+        The direction, of r's length, changed in place.
+    """
     for k in range(first, last):
         o = code[k, 0]
         i, j = code[k, 2], code[k, 3]
@@ -163,7 +187,17 @@ def tangents(code: IntArray, first: int, last: int, r: FloatArray, d: FloatArray
 
 @in_place
 def solve(A: FloatArray, b: FloatArray, n: int) -> None:
-    """Solve the leading n by n system in place by elimination with row pivots; b becomes the solution."""
+    """Solve the leading n by n system in place by elimination with row pivots.
+
+    Parameters
+    ----------
+    A : (n or more, n or more) array
+        The matrix, changed in place.
+    b : (n or more,) array
+        Right-hand side; becomes the solution.
+    n : int
+        Size of the system.
+    """
     for i in range(n):
         p = i
         for row in range(i + 1, n):

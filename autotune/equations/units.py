@@ -37,7 +37,7 @@ class Unit:
 _ONE = Unit(powers=(), factor=1.0)
 
 
-def parse_unit(text: str, where: str) -> Unit:
+def _parse_unit(text: str, where: str) -> Unit:
     """Return what a unit's text means.
 
     Raises
@@ -96,7 +96,7 @@ def check_units(model: EquationModel) -> None:
         return
     known: dict[str, Unit | None] = {"pi": _ONE, "t": _parsed("s")}
     for name, text in given.items():
-        known[name] = parse_unit(text, f"{model.name}: {name}") if text else None
+        known[name] = _parse_unit(text, f"{model.name}: {name}") if text else None
     for name, tree in model.defines:
         known[name] = _Walk(known, f"{model.name}: [define] {name}").unit(tree)
     second = _parsed("s")
@@ -109,7 +109,7 @@ def check_units(model: EquationModel) -> None:
         if port.across is not None:
             _Walk(known, f"{model.name}: across of port {port.name}").unit(port.across)
     where = f"{model.name}: [output] value"
-    wanted = parse_unit(model.output_unit, where) if model.output_unit else None
+    wanted = _parse_unit(model.output_unit, where) if model.output_unit else None
     _compare(_Walk(known, where).unit(model.output), wanted, where)
 
 
@@ -117,7 +117,7 @@ def _check_effects(model: EquationModel) -> None:
     """Refuse a unit of an effect's parameter that is not known; what it should be, the effect's equation says."""
     for effect in model.effects:
         for key, one in effect.parameters.items():
-            parse_unit(one.unit, f"{model.name}: {effect.name} {key}")
+            _parse_unit(one.unit, f"{model.name}: {effect.name} {key}")
 
 
 def _compare(found: Unit | None, wanted: Unit | None, where: str) -> None:

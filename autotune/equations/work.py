@@ -69,7 +69,17 @@ class Work(NamedTuple):
 
 @njit(**COMPILED)
 def new_work(p: Tape, template: FloatArray, parameters: FloatArray) -> Work:
-    """Return room for an integration, with everything that depends on parameters alone computed."""
+    """Return room for an integration, with everything that depends on parameters alone computed.
+
+    Parameters
+    ----------
+    p : Tape
+        The program.
+    template : array
+        Registers with the program's constants.
+    parameters : (P,) array
+        In their own units.
+    """
     n, m, s = p.n, p.linear.size, p.switches.size
     r = template.copy()
     for i in range(parameters.size):
@@ -85,7 +95,21 @@ def new_work(p: Tape, template: FloatArray, parameters: FloatArray) -> Work:
 
 @in_place
 def begin(p: Tape, w: Work, x0: FloatArray, number: int, x: FloatArray) -> None:
-    """Bring the state to a row of ``x0``, with nothing known yet of steps and switches."""
+    """Bring the state to a row of ``x0``, with nothing known yet of steps and switches.
+
+    Parameters
+    ----------
+    p : Tape
+        The program, n states.
+    w : Work
+        What is written on.
+    x0 : (W, n) array
+        Start states.
+    number : int
+        Row of them.
+    x : (n,) array
+        The state, changed in place.
+    """
     for i in range(p.n):
         x[i] = x0[number, i]
         w.seen[i] = abs(x[i])
@@ -98,7 +122,13 @@ def begin(p: Tape, w: Work, x0: FloatArray, number: int, x: FloatArray) -> None:
 
 @in_place
 def copy(a: FloatArray, b: FloatArray) -> None:
-    """Write one array's values into another."""
+    """Write one array's values into another.
+
+    Parameters
+    ----------
+    a, b : array
+        From, and to; of one length.
+    """
     for i in range(a.size):
         b[i] = a[i]
 

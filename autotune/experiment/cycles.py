@@ -39,10 +39,10 @@ def measured(cycle: Cycle, rows: Rows, sample_time_s: float, known: Sequence[Fre
     IdentificationError
         No response above the noise, or too few samples per period.
     """
-    return _segment(cycle, _windowed(cycle, rows, sample_time_s).estimate(known), sample_time_s)
+    return _segment(cycle, _window(cycle, rows, sample_time_s).estimate(known), sample_time_s)
 
 
-def _windowed(cycle: Cycle, rows: Rows, sample_time_s: float) -> Windowed:
+def _window(cycle: Cycle, rows: Rows, sample_time_s: float) -> Windowed:
     window = WholePeriods(start_s=cycle.start_s, end_s=cycle.end_s, periods=cycle.periods)
     return Windowed(rows=rows, window=window, sample_time_s=sample_time_s)
 
@@ -79,7 +79,7 @@ def refined(segments: Sequence[Segment], rows: Callable[[int], Rows], sample_tim
     sample_time_s : float
         Control period [s].
     """
-    found = windowed_cycles([_windowed(one, rows(one.part), sample_time_s) for one in segments])
+    found = windowed_cycles([_window(one, rows(one.part), sample_time_s) for one in segments])
     return tuple(_segment(one, cycle, sample_time_s) for one, cycle in zip(segments, found, strict=True))
 
 
@@ -144,7 +144,7 @@ def read_earlier(paths: Sequence[Path], sample_time_s: float) -> Earlier:
             if "two rows" in error.remedy:  # killed before its second row
                 continue
             raise
-        cycles = _finished(recording, len(recordings))
+        cycles = _read_finished(recording, len(recordings))
         for cycle in cycles:
             known = [one.point for one in segments]
             segments.append(measured(cycle, (recording.t, recording.u, recording.y), sample_time_s, known))
@@ -176,7 +176,7 @@ def _why(recording: Recording) -> str:
     return str(ended["reason"]) if "exit_status" in ended else "killed: nothing was written at the end"
 
 
-def _finished(recording: Recording, part: int) -> list[Cycle]:
+def _read_finished(recording: Recording, part: int) -> list[Cycle]:
     tables = recording.metadata.get("relay", [])
     try:
         cycles = [Cycle.from_table(table, part) for table in tables]

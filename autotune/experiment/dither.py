@@ -67,7 +67,7 @@ class DitherExperiment:
     duration_s: float
 
 
-def present_controller(rig: Rig, config: Config) -> PIDController:
+def _present_controller(rig: Rig, config: Config) -> PIDController:
     """Return the gains the loop has now: the configuration's, else those the open rig holds.
 
     Raises
@@ -85,7 +85,24 @@ def present_controller(rig: Rig, config: Config) -> PIDController:
 
 
 def random_dwells(rows: int, longest: int, seed: int, shortest: int = 1) -> FloatArray:
-    """Return a random binary signal (rows,) of +-1, dwell times log-uniform from shortest to longest [samples]."""
+    """Return a random binary signal of +-1, dwell times log-uniform from shortest to longest.
+
+    Parameters
+    ----------
+    rows : int
+        Length of the signal.
+    longest : int
+        Longest dwell [samples].
+    seed : int
+        Of the draws.
+    shortest : int
+        Shortest dwell [samples].
+
+    Returns
+    -------
+    (rows,) array
+        The signal.
+    """
     rng = np.random.default_rng(seed)
     signal = np.empty(rows)
     at, sign = 0, 1.0
@@ -147,7 +164,7 @@ def run_dither(
     limits, centre = config.limits, config.operating_point.y
     writer = RecordingWriter(recording, ("t", "u", "y", "r", "dither"), recording_metadata(config))
     with ControlLoop(rig=rig, envelope=envelope_of(config), writer=writer, extra=("r", "dither")) as loop:
-        controller = present_controller(rig, config)
+        controller = _present_controller(rig, config)
         u_hold = _bring_to_operating_point(loop, config)
         room = min(limits.u_max - u_hold, u_hold - limits.u_min)
         if amplitude is not None and not 0.0 < amplitude < 0.9 * room:

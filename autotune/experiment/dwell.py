@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from autotune.arrays import FloatArray
-from autotune.experiment.plan import LocalModel
+from autotune.experiment.local_model import LocalModel
 
 #: time constant, in 1/omega of the band's middle, below which a lag could not be told from a dead time
 _LEAST = 0.05

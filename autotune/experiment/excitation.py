@@ -17,9 +17,10 @@ from autotune.arrays import FloatArray
 from autotune.config import Config
 from autotune.controller import PIDController
 from autotune.design.law import LawState, PILaw
-from autotune.experiment.approach import approach, find_midpoint, preflight
+from autotune.experiment.approach import approach, find_midpoint
 from autotune.experiment.limits import Watch
 from autotune.experiment.loop import ControlLoop, Tick
+from autotune.experiment.preflight import preflight
 from autotune.experiment.result import State, Status
 from autotune.experiment.rig import Rig
 from autotune.experiment.run import OnStatus, envelope_of, recording_metadata, wait_for_rest

@@ -193,7 +193,13 @@ class Expectation:
 def expectation(
     test: StepTest, law: PILaw, fit: PlantFit, noise_sd: float, *, u_rest: float, seed: int = 0
 ) -> Expectation:
-    """Predict a test, and say which error is explained; parameters as of :func:`judge`."""
+    """Predict a test, and say which error is explained.
+
+    Parameters
+    ----------
+    test, law, fit, noise_sd, u_rest, seed : as of judge
+        What is asked, what runs, and what is known of the plant.
+    """
     rng = np.random.default_rng(seed)
     draws, thin = fit.draws(DRAWS, rng), max(1, round(test.sample_time_s / law.sample_time_s))
     prediction = predict(
@@ -311,7 +317,20 @@ def _over(drawn: Sequence[StepFigures], statistic: Callable[[list[float]], Any])
 
 
 def smoothed(y: FloatArray, test: StepTest) -> FloatArray:
-    """Return the centred moving average over the test's smoothing, step by step so that a step stays a step."""
+    """Return the centred moving average over the test's smoothing, step by step so that a step stays a step.
+
+    Parameters
+    ----------
+    y : (N,) array
+        Measured or predicted [y unit].
+    test : StepTest
+        States the smoothing and the row of the step.
+
+    Returns
+    -------
+    (N,) array
+        The average [y unit].
+    """
     split = test.disturbed_from
     parts = (y[:split], y[split:])
     return np.concatenate([uniform_filter1d(part, test.smoothing, mode="nearest") for part in parts])

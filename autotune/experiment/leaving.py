@@ -117,7 +117,15 @@ def verdict_on(error: BaseException | None) -> AutotuneError | None:
 
 
 def say(error: BaseException, note: str) -> None:
-    """Have the error's one line say how the rig was left."""
+    """Have the error's one line say how the rig was left.
+
+    Parameters
+    ----------
+    error : BaseException
+        The error, changed in place.
+    note : str
+        How the rig was left; nothing is changed where it is empty.
+    """
     if not note:
         return
     if isinstance(error, AutotuneError):

@@ -55,7 +55,7 @@ def run_limit_cycle(
         if len(foreign) > disturbed:  # its command was not this cycle's: anew, when it has died away for a period
             disturbed, skip, start = len(foreign), len(oscillation.edges) + 1, -1
         edges = oscillation.slots[skip:]
-        if switched and len(edges) > 2 and _rebalanced(oscillation):
+        if switched and len(edges) > 2 and _rebalance(oscillation):
             skip, start = len(oscillation.edges) - 1, -1
             continue
         if start < 0 and edges:
@@ -76,7 +76,7 @@ def run_limit_cycle(
         return WholePeriods(start_s=float(t[0]), end_s=float(t[0] + periods * period * slot_s), periods=periods)
 
 
-def _rebalanced(oscillation: Oscillation) -> bool:
+def _rebalance(oscillation: Oscillation) -> bool:
     """Correct the mid-point where the last period was lopsided, and say whether it was."""
     settings = oscillation.settings
     mean = mean_command(oscillation.loop, oscillation.edges)

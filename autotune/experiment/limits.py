@@ -47,7 +47,15 @@ class Patience:
     samples: float = math.inf
 
     def is_over(self, seconds: float, samples: float, times: float = 1.0) -> bool:
-        """Return whether so much is more than that, or than several times that."""
+        """Return whether something bad has lasted longer than is ridden through.
+
+        Parameters
+        ----------
+        seconds, samples : float
+            How long it lasts [s], and over how many samples.
+        times : float
+            Factor on both limits.
+        """
         return samples > times * self.samples or seconds > times * self.seconds
 
 
@@ -107,6 +115,11 @@ class Envelope:
 
     def check_command(self, u: float, u_previous: float) -> None:
         """Let a command pass, or stop the experiment.
+
+        Parameters
+        ----------
+        u, u_previous : float
+            The command, and the one that it follows [u unit].
 
         Raises
         ------

@@ -49,7 +49,15 @@ def jumped(loop: ControlLoop) -> bool:
 
 
 def mean_command(loop: ControlLoop, edges: Sequence[int]) -> float:
-    """Return the mean command of the last whole period, every command weighted by the time it was held [u unit]."""
+    """Return the mean command [u unit] of the last whole period, every command weighted by the time it was held.
+
+    Parameters
+    ----------
+    loop : ControlLoop
+        Holds the rows.
+    edges : sequence of int
+        Rows at which the command switched, three at least.
+    """
     t, u, _ = loop.history(edges[-3])
     rows = edges[-1] - edges[-3]
     return float(np.average(u[:rows], weights=np.diff(t[: rows + 1])))
@@ -125,6 +133,19 @@ class Oscillation:
 
         It turns y ``turning_s`` [s] after a switch; ``foreseen`` says that by the measured points it keeps within the
         swing.
+
+        Parameters
+        ----------
+        settings : RelaySettings
+            The next setting.
+        patience_s : float
+            Longest time without a switch [s].
+        nudge_s : float
+            Time without a switch after which the relay is nudged [s].
+        turning_s : float
+            How soon after a switch y turns [s].
+        foreseen : bool
+            Whether y keeps within the swing by the measured points.
         """
         self._turning_s, self._foreseen = turning_s, foreseen
         self.settings = settings

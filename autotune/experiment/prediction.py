@@ -145,12 +145,12 @@ def _respond(
     # an infinite T_I gives no integral
     terms = (c.K, c.setpoint_weight, c.K * T_s / c.Ti_s, T_s / (c.Tf_s + T_s), c.K * c.Td_s / T_s, law.tracking_gain)
     low, high = law.u_min - u_rest - disturbance, law.u_max - u_rest - disturbance
-    y, u = _stepped(num, den, terms, low, high, law.u_rate * T_s, setpoint, disturbance, noise)
+    y, u = _step_loop(num, den, terms, low, high, law.u_rate * T_s, setpoint, disturbance, noise)
     return y, u
 
 
 @njit(cache=True)
-def _stepped(
+def _step_loop(
     num: FloatArray,
     den: FloatArray,
     terms: tuple[float, float, float, float, float, float],

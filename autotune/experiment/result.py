@@ -97,7 +97,20 @@ class Cycle:
 
     @classmethod
     def from_table(cls, table: Mapping[str, Any], part: int) -> Cycle:
-        """Return the cycle that :meth:`to_table` wrote; KeyError where one of its keys is missing."""
+        """Return the cycle that :meth:`to_table` wrote.
+
+        Parameters
+        ----------
+        table : mapping
+            From the recording's sidecar.
+        part : int
+            Which recording of the run it is in.
+
+        Raises
+        ------
+        KeyError
+            One of its keys is missing.
+        """
         return cls(
             part=part,
             settings=RelaySettings(**{field.name: table[field.name] for field in fields(RelaySettings)}),

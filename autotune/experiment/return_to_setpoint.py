@@ -6,9 +6,9 @@ import math
 from dataclasses import replace
 from statistics import median
 
-from autotune.experiment.approach import Known
 from autotune.experiment.loop import ControlLoop
 from autotune.experiment.oscillation import Oscillation
+from autotune.experiment.preflight import Known
 from autotune.experiment.rig import HandsBack, Rig
 
 #: distance from the set-point, as a part of limits.swing, that counts as there; noise is added
@@ -43,7 +43,15 @@ def setpoint_before(rig: Rig, operating_y: float, swing: float) -> float:
 
 
 def is_near(loop: ControlLoop, setpoint: float) -> bool:
-    """Return whether y is at a set-point, to within the noise and a small part of the swing."""
+    """Return whether y is at a set-point, to within the noise and a small part of the swing.
+
+    Parameters
+    ----------
+    loop : ControlLoop
+        Monitors y.
+    setpoint : float
+        Where y should be [y unit].
+    """
     tolerance = NEAR * loop.envelope.settings.swing + loop.monitor.noise / math.sqrt(len(loop.monitor.recent) or 1)
     return abs(median(loop.monitor.recent) - setpoint) <= tolerance
 

@@ -188,7 +188,19 @@ class RunsRelay(Rig, Protocol):
     def start_relay(
         self, settings: RelaySettings, *, row_s: float, time_s: float, y_range: tuple[float, float]
     ) -> Reading:
-        """Run the relay, its delay in ticks, or change the setting of one that runs; return the last sample before."""
+        """Run the relay, or change the setting of one that runs; return the last sample before.
+
+        Parameters
+        ----------
+        settings : RelaySettings
+            The relay, its delay in ticks.
+        row_s : float
+            Time between two rows [s].
+        time_s : float
+            How long it may run before the device ends it [s].
+        y_range : (float, float)
+            Lowest and highest y; beyond them the device ends it [y unit].
+        """
         ...
 
     def row(self) -> Row:
@@ -210,7 +222,23 @@ class RunsLaws(RunsRelay, Exchanges, Protocol):
         time_s: float,
         y_range: tuple[float, float],
     ) -> Reading:
-        """Run the PI on gains that are not kept, or change what is asked of it; return the last sample before."""
+        """Run the PI on gains that are not kept, or change what is asked of it; return the last sample before.
+
+        Parameters
+        ----------
+        controller : PIDController
+            The gains.
+        setpoint : float
+            Set-point [y unit].
+        load : float
+            Added to its output [u unit].
+        row_s : float
+            Time between two rows [s].
+        time_s : float
+            How long it may run before the device ends it [s].
+        y_range : (float, float)
+            Lowest and highest y; beyond them the device ends it [y unit].
+        """
         ...
 
 
@@ -260,9 +288,16 @@ class RunsOwnController(HoldsGains, Protocol):
         ...
 
     def ask_controller(self, setpoint: float, load: float) -> tuple[float, float]:
-        """Change set-point [y unit] and what is added to its output [u unit]; return both as the device holds them.
+        """Change what the rig's own controller is asked for; return both as the device holds them.
 
         Raises LinkError where somebody else has changed what it was asked for before.
+
+        Parameters
+        ----------
+        setpoint : float
+            Set-point [y unit].
+        load : float
+            Added to its output [u unit].
         """
         ...
 

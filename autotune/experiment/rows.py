@@ -33,7 +33,17 @@ class RecentRows:
         self.unusable = 0
 
     def append(self, t_s: float, u: float, y: float) -> None:
-        """Put a row; ``y`` is NaN where the sample was unusable."""
+        """Put a row.
+
+        Parameters
+        ----------
+        t_s : float
+            Stamp [s].
+        u : float
+            Command [u unit].
+        y : float
+            Measurement [y unit], NaN where the sample was unusable.
+        """
         self.unusable += math.isnan(y)
         for column, value in zip(self._columns, (t_s, u, y), strict=True):
             column.append(as_written(value))

@@ -12,11 +12,12 @@ import numpy as np
 
 from autotune.config import Config
 from autotune.errors import AutotuneError, ExperimentStopped
-from autotune.experiment.approach import Known, approach, find_midpoint, preflight
+from autotune.experiment.approach import approach, find_midpoint
 from autotune.experiment.cycles import Earlier, refined
 from autotune.experiment.device import DeviceOscillation
 from autotune.experiment.limits import Envelope, Watch
 from autotune.experiment.loop import ControlLoop, Timing
+from autotune.experiment.preflight import Known, preflight
 from autotune.experiment.relay import RelaySettings
 from autotune.experiment.result import ExperimentResult, Part, Segment, State, Status
 from autotune.experiment.return_to_setpoint import return_by_relay, setpoint_before
@@ -100,7 +101,7 @@ def run_experiment(
     extra = further_columns(rig)
     writer = RecordingWriter(recording, ("t", "u", "y", *extra), recording_metadata(config))
     with ControlLoop(rig=rig, envelope=envelope_of(config), writer=writer, extra=extra) as loop:
-        swept = experiment_on(loop, config, earlier=earlier, on_status=on_status)
+        swept = _experiment_on(loop, config, earlier=earlier, on_status=on_status)
     sitting = len(earlier.recordings)
 
     def rows(number: int) -> Rows:
@@ -132,7 +133,7 @@ class Swept:
     part: Part
 
 
-def experiment_on(
+def _experiment_on(
     loop: ControlLoop, config: Config, *, earlier: Earlier | None = None, on_status: OnStatus | None = None
 ) -> Swept:
     """Go through the states on an open loop; the plant is left at rest, under the command that holds it.
@@ -274,13 +275,13 @@ def _result(
         sweep_time_s=sum(part.sweep_time_s for part in parts),
         parts=parts,
         reason="completed",
-        warnings=(*sweep_warnings(segments, config.experiment, known.link_rad_s, together), *_missed(timing)),
+        warnings=(*sweep_warnings(segments, config.experiment, known.link_rad_s, together), *_missed_text(timing)),
         together=together,
         by_itself=reason_noted(noted),
     )
 
 
-def _missed(timing: Timing) -> tuple[str, ...]:
+def _missed_text(timing: Timing) -> tuple[str, ...]:
     """Return what the reader should know of samples that were missed."""
     if timing.missed_share <= NOTABLE_SHARE:
         return ()

@@ -192,7 +192,7 @@ def identify_running_law(
         K=shown.P,
         Ti_s=_over(shown.P, shown.I),
         Td_s=_over(shown.D, shown.P) if shown.D else 0.0,
-        renewed_s=_renewed_s(record),
+        renewed_s=_output_period_s(record),
         noise=noise,
         sample_time_s=record.sample_time_s,
     )
@@ -363,7 +363,7 @@ def _estimate(record: LawRecord, given: PIDController) -> _Estimate | None:
     return min(found, key=lambda pair: pair[0])[1]
 
 
-def _renewed_s(record: LawRecord) -> float:
+def _output_period_s(record: LawRecord) -> float:
     """Return the time between two changes of the output where it changes fastest [s]."""
     changes = np.flatnonzero(np.diff(record.u) != 0.0)
     if changes.size < 5:

@@ -8,24 +8,15 @@ from dataclasses import replace
 
 from autotune.config.procedure import ExperimentSettings, OperatingPointSettings
 from autotune.errors import ExperimentStopped, IdentificationError
-from autotune.experiment.approach import Known
 from autotune.experiment.cycles import Earlier, measured
 from autotune.experiment.dwell import Dwell, further_periods
 from autotune.experiment.limit_cycle_run import LEAST_PERIODS, run_limit_cycle
 from autotune.experiment.limits import Envelope
+from autotune.experiment.local_model import LocalModel, lag_beyond_integrator
 from autotune.experiment.loop import ControlLoop
 from autotune.experiment.oscillation import Oscillation
-from autotune.experiment.plan import (
-    Choice,
-    Goal,
-    LocalModel,
-    allot,
-    choose,
-    lag_beyond_integrator,
-    phase_targets,
-    time_s,
-    within_reach,
-)
+from autotune.experiment.plan import Choice, Goal, allot, choose, phase_targets, time_s, within_reach
+from autotune.experiment.preflight import Known
 from autotune.experiment.relay import RelaySettings
 from autotune.experiment.result import Cycle, Segment, State
 from autotune.experiment.sweep_warnings import relative_sd, sweep_warnings
@@ -276,13 +267,21 @@ def _by_themselves(run: _Sweep, first: Sequence[float], others: Sequence[float],
 
 
 def missing_phases(wanted: ExperimentSettings, earlier: Earlier) -> tuple[float, ...]:
-    """Return the phases of the positive-gain plant that are still to be measured, in their order [rad]."""
+    """Return the phases of the positive-gain plant that are still to be measured, in their order [rad].
+
+    Parameters
+    ----------
+    wanted : ExperimentSettings
+        What is asked of the sweep.
+    earlier : Earlier
+        What was measured of it.
+    """
     if is_together(earlier):
         return ()
     return _missing(_ends_deg(wanted, earlier), wanted, earlier)
 
 
-def phases_between(ends_deg: Sequence[float], wanted: ExperimentSettings, segments: Sequence[Segment]) -> list[float]:
+def _phases_between(ends_deg: Sequence[float], wanted: ExperimentSettings, segments: Sequence[Segment]) -> list[float]:
     """Return the wanted phases of a range [deg] that no limit cycle aimed at [rad]."""
     return [phase for phase in phase_targets(ends_deg[0], ends_deg[1], wanted.points) if not _is_aimed(phase, segments)]
 
@@ -299,7 +298,7 @@ def _ends_deg(wanted: ExperimentSettings, earlier: Earlier) -> tuple[float, floa
 
 
 def _missing(ends_deg: tuple[float, float], wanted: ExperimentSettings, earlier: Earlier) -> tuple[float, ...]:
-    return tuple(phases_between(ends_deg, wanted, earlier.segments))
+    return tuple(_phases_between(ends_deg, wanted, earlier.segments))
 
 
 def _goal(envelope: Envelope, amplitude: float | None, known: Known) -> Goal:

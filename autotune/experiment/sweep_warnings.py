@@ -22,7 +22,19 @@ def sweep_warnings(
     link_rad_s: float,
     together: SweepEstimate | None = None,
 ) -> tuple[str, ...]:
-    """Return what the reader should know of points not as good as was wanted, or beyond what the link supports."""
+    """Return what the reader should know of points not as good as was wanted, or beyond what the link supports.
+
+    Parameters
+    ----------
+    segments : sequence of Segment
+        The sweep's limit cycles.
+    experiment : ExperimentSettings
+        What was wanted.
+    link_rad_s : float
+        Highest frequency that the link supports [rad/s].
+    together : SweepEstimate, optional
+        The points from all rows, where they are the result.
+    """
     wanted = experiment.gain_sd
     points = [one.point for one in segments] if together is None else together.points
     sds = [relative_sd(one) for one in segments] if together is None else [together.worst_sd]

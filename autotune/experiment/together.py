@@ -67,6 +67,13 @@ def estimate_beside(
 ) -> SweepEstimate | str:
     """Return the estimate, or why there is none; where the rig's clock goes on, the relay does meanwhile.
 
+    Parameters
+    ----------
+    oscillation : Oscillation
+        What runs meanwhile, and holds the rows.
+    segments, phases_rad, first_move_s : as of estimate_together
+        The sweep so far.
+
     Raises
     ------
     ExperimentStopped, LinkError

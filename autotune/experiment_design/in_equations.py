@@ -43,7 +43,7 @@ def planned_in_equations(found: Diagnosis) -> NextExperiment | None:
     if not isinstance(given, EquationModel) or given.horizon_s is not None:
         return None
     # with the further columns that a hypothesis may be driven by
-    return _planned(found, found.search.found.retuned.fitted.compiled.model)
+    return _plan(found, found.search.found.retuned.fitted.compiled.model)
 
 
 def _open(found: Diagnosis) -> dict[str, tuple[Outcome, float]]:
@@ -58,7 +58,7 @@ def _open(found: Diagnosis) -> dict[str, tuple[Outcome, float]]:
     return {c.name: (best[c.name], c.probability) for c in alive[: limits.most_open]}
 
 
-def _planned(found: Diagnosis, model: EquationModel) -> NextExperiment | None:
+def _plan(found: Diagnosis, model: EquationModel) -> NextExperiment | None:
     """Return the excitation under which the open hypotheses differ most; nothing where there are not two of them."""
     alive = _open(found)
     if len(alive) < 2:
@@ -66,7 +66,7 @@ def _planned(found: Diagnosis, model: EquationModel) -> NextExperiment | None:
     noise, most = max(found.search.found.noise.total_sd, 1e-300), 0.0
     best: Excitation | None = None
     for excitation, drive in _excitations(found, model):
-        runs = [(_simulated(model, one, drive), p) for one, p in alive.values()]
+        runs = [(_simulate(model, one, drive), p) for one, p in alive.values()]
         told = weight = 0.0
         for (a, p), (b, q) in itertools.combinations(runs, 2):
             if np.all(np.isfinite(a)) and np.all(np.isfinite(b)):
@@ -102,7 +102,7 @@ def _excitations(found: Diagnosis, model: EquationModel) -> list[tuple[Excitatio
     return drives
 
 
-def _simulated(model: EquationModel, one: Outcome, drive: Drive) -> FloatArray:
+def _simulate(model: EquationModel, one: Outcome, drive: Drive) -> FloatArray:
     """Return the readings of a hypothesis that begins at rest."""
     compiled, p = one.fitted.compiled, one.fitted.parameters
     applied = apply(model, one.effects)

@@ -39,7 +39,7 @@ def next_experiment(found: Diagnosis) -> NextExperiment | None:
     """
     of_equations = isinstance(found.search, EquationSearch)
     if found.verdict in ("none", "parameters"):
-        return None if of_equations or decided(found) else _planned(found)
+        return None if of_equations or decided(found) else _plan(found)
     if not found.places:
         return None
     for effect in found.effects:
@@ -47,13 +47,13 @@ def next_experiment(found: Diagnosis) -> NextExperiment | None:
             return _extra_signal(effect)
     if found.verdict == "effect" and not of_equations and len(open_hypotheses(found)) < 2:
         return None
-    planned = _planned(found)
+    planned = _plan(found)
     if planned is None and found.verdict == "unexplained" and is_driven(found) and not of_equations:
         return _larger_swing(found)
     return planned
 
 
-def _planned(found: Diagnosis) -> NextExperiment | None:
+def _plan(found: Diagnosis) -> NextExperiment | None:
     """Return the experiment that separates the hypotheses alive best; nothing where none does."""
     if isinstance(found.search, EquationSearch):
         return planned_in_equations(found) if is_driven(found) else None

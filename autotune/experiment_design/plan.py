@@ -98,7 +98,7 @@ def _within_swing(
         planned = planned_recording(found.search.retuned.fit.sim, conditions, smaller)
         if planned is None:
             continue
-        plan, y = _told(found, hypotheses, smaller, planned)
+        plan, y = _rate_excitation(found, hypotheses, smaller, planned)
         if np.max(np.abs(y - conditions.y), initial=0.0) <= conditions.limits.swing:
             return [plan]
     return []
@@ -106,6 +106,17 @@ def _within_swing(
 
 def excitations(sim: Simulator, conditions: Conditions, duration_s: float, seed: int = 0) -> list[Excitation]:
     """Return every excitation that may be run, as large as the limits allow by the linear prediction.
+
+    Parameters
+    ----------
+    sim : Simulator
+        The nominal model, whose linear response sets the sizes.
+    conditions : Conditions
+        Present law, sample time and limits.
+    duration_s : float
+        Length of each experiment [s].
+    seed : int
+        Of what is random in them.
 
     Raises
     ------
@@ -210,7 +221,7 @@ def _rest(sim: Simulator, y: float) -> tuple[FloatArray, float]:
     return rest[: chain.order], float(rest[chain.order])
 
 
-def _told(
+def _rate_excitation(
     found: Diagnosis, hypotheses: dict[str, tuple[Hypothesis, float]], one: Excitation, planned: Recording
 ) -> tuple[Plan, FloatArray]:
     """Return an excitation with its expected discrimination, and all readings that the hypotheses predict."""
@@ -260,7 +271,24 @@ def _least_chi2(result: Fit, data: Data) -> float:
 
 
 def general(sim: Simulator, conditions: Conditions, duration_s: float, seed: int = 0) -> Excitation:
-    """Return the experiment to begin with while there is no hypothesis: random steps over many levels and dwells."""
+    """Return the experiment to begin with while there is no hypothesis: random steps over many levels and dwells.
+
+    Parameters
+    ----------
+    sim : Simulator
+        The nominal model, whose linear response sets the sizes.
+    conditions : Conditions
+        Present law, sample time and limits.
+    duration_s : float
+        Length of the experiment [s].
+    seed : int
+        Of its levels and dwells.
+
+    Raises
+    ------
+    InputError
+        Nothing fits into the limits.
+    """
     choices: Sequence[Excitation] = excitations(sim, conditions, duration_s, seed)
     steps = [one for one in choices if one.kind == "random steps"]
     if not steps:

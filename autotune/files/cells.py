@@ -74,7 +74,20 @@ def _number(cell: str) -> float:
 
 
 def good_samples(cells: Cells, good: Iterable[str] = GOOD) -> BoolArray:
-    """Return which flags are good; an empty one says nothing against its sample."""
+    """Return which flags are good; an empty one says nothing against its sample.
+
+    Parameters
+    ----------
+    cells : sequence of str, or (N,) array
+        A column of flags.
+    good : iterable of str
+        Flags of good samples, in whatever case.
+
+    Returns
+    -------
+    (N,) array of bool
+        Which are good.
+    """
     words = {word.lower() for word in good}
     if isinstance(cells, np.ndarray):
         codes = [float(word) for word in words if NUMBER.fullmatch(word)]
@@ -92,6 +105,19 @@ def are_flags(cells: Cells) -> bool:
 
 
 def held(values: FloatArray, missing: BoolArray) -> FloatArray:
-    """Return the values with each missing one as the one before it; those at the beginning stay as they are."""
+    """Return the values with each missing one as the one before it; those at the beginning stay as they are.
+
+    Parameters
+    ----------
+    values : (N,) array
+        A column.
+    missing : (N,) array of bool
+        Which of them are not known.
+
+    Returns
+    -------
+    (N,) array
+        The column, filled.
+    """
     before = np.maximum.accumulate(np.where(missing, 0, np.arange(values.size)))
     return np.asarray(values[before])

@@ -80,7 +80,7 @@ def read_header(rows: Sequence[Sequence[str]], header_at: int | None = None) -> 
         if _is_data(row):
             break
         above.insert(0, [*row, *[""] * (width - len(row))][:width])
-    return _named(above, first, width)
+    return _name_columns(above, first, width)
 
 
 def _is_data(row: Sequence[str]) -> bool:
@@ -93,14 +93,14 @@ def _is_data(row: Sequence[str]) -> bool:
     return 2 * (values + stamps) >= len(filled) and (values > 0 or stamps > 0)
 
 
-def _named(above: Sequence[Sequence[str]], first: int, width: int) -> Header:
+def _name_columns(above: Sequence[Sequence[str]], first: int, width: int) -> Header:
     kinds = [_kind(row) for row in above]
     texts = [row for row, kind in zip(above, kinds, strict=True) if kind == "names"]
     if not texts and above:  # one row whose names look like units, such as t,u,y
         texts, kinds = [above[0]], ["names", *kinds[1:]]
     chosen = next((row for row in texts if len(set(filter(None, row))) == sum(map(bool, row)) >= width - 1), None)
     if chosen is None and texts:  # groups above names: both together tell the columns apart
-        chosen = [".".join(filter(None, dict.fromkeys(cells))) for cells in zip(*map(_filled, texts), strict=True)]
+        chosen = [".".join(filter(None, dict.fromkeys(cells))) for cells in zip(*map(_fill_groups, texts), strict=True)]
     names = _unique([name or str(i) for i, name in enumerate(chosen or [""] * width, start=1)])
     units = {name: unit for name in names if (unit := bare_and_unit(name)[1])}
     for row, kind in zip(above, kinds, strict=True):
@@ -111,7 +111,7 @@ def _named(above: Sequence[Sequence[str]], first: int, width: int) -> Header:
     return Header(first_row=first, names=tuple(names), units=units, labels=labels, rows=len(above))
 
 
-def _filled(row: Sequence[str]) -> list[str]:
+def _fill_groups(row: Sequence[str]) -> list[str]:
     """Return a row of groups with each empty cell as the one before it, as merged cells are written."""
     filled: list[str] = []
     for cell in row:

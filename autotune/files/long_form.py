@@ -32,7 +32,7 @@ _LOOKED_AT = 300
 
 def one_column_per_tag(table: Table) -> Table:
     """Return the table as it is, or, where each row is one sample of one tag, with a column for each tag."""
-    tag, value, stamp = (_named(table, words) for words in (_TAG, _VALUE, _STAMP))
+    tag, value, stamp = (_find_column(table, words) for words in (_TAG, _VALUE, _STAMP))
     if not (tag and value and stamp) or len({tag, value, stamp}) < 3:
         return table
     tags = table.sample[tag]
@@ -55,7 +55,7 @@ def one_column_per_tag(table: Table) -> Table:
     )
 
 
-def _named(table: Table, words: set[str]) -> str:
+def _find_column(table: Table, words: set[str]) -> str:
     return next((name for name in table.names if table.bare(name).lower() in words), "")
 
 

@@ -23,26 +23,26 @@ _TIME = vocabulary(
 )
 
 
-def _valued(terms: str, usual: str, often: str) -> dict[str, int]:
+def _weigh_terms(terms: str, usual: str, often: str) -> dict[str, int]:
     """Return what a word says of a signal: 3 the term of the field, 2 a usual name, 1 a quantity that it often is."""
     return {word: value for value, words in ((1, often), (2, usual), (3, terms)) for word in words.split()}
 
 
 _WORDS: Mapping[str, Mapping[str, int]] = {
-    "u": _valued(
+    "u": _weigh_terms(
         "u uk op command cmd controlleroutput stellgroesse stellgrosse stellwert stellgrad",
         "stellsignal stell manipulated mv lmn co cv out out1 input eingang actuator commande ctrl control drive demand"
         " controllerout controlsignal",
         "valve ventil pwm heater heizung heat power leistung pump pumpe duty voltage spannung fan motor current torque"
         " throttle dac output",
     ),
-    "y": _valued(
+    "y": _weigh_terms(
         "y yk pv processvalue processvariable istwert regelgroesse regelgrosse mesure sensor",
         "measurement measured meas messwert actual act ist output ausgang feedback response mess",
         "temperature temperatur temp level fuellstand fullstand flow durchfluss pressure druck speed drehzahl position"
         " pos height angle winkel velocity concentration ph humidity feuchte niveau thermocouple encoder rpm adc",
     ),
-    "r": _valued(
+    "r": _weigh_terms(
         "r rk sp setpoint sollwert reference consigne fuehrungsgroesse fuhrungsgrosse",
         "soll ref target setp setvalue sv w desired",
         "",
@@ -293,7 +293,15 @@ def _held_share(table: Table, name: str) -> float:
 
 
 def confirmed(roles: Roles, answers: Mapping[str, str]) -> Roles:
-    """Return the roles with what somebody answered."""
+    """Return the roles with what somebody answered.
+
+    Parameters
+    ----------
+    roles : Roles
+        As they were found out.
+    answers : mapping of str to str
+        Columns by signal: t, u, y or r.
+    """
     names = replace(roles.names, **dict(answers))
     time = (answers["t"],) if "t" in answers else roles.time
     taken = {*time, names.u, names.y, names.r}

@@ -278,7 +278,17 @@ def _past_midnight(values: FloatArray) -> FloatArray:
 
 
 def is_milliseconds(cells: Cells, name: str, decimal: str) -> bool:
-    """Return whether a column holds the milliseconds of a clock that stands in another column."""
+    """Return whether a column holds the milliseconds of a clock that stands in another column.
+
+    Parameters
+    ----------
+    cells : sequence of str, or (N,) array
+        The column.
+    name : str
+        Its heading.
+    decimal : str
+        Its decimal mark.
+    """
     word = re.sub(r"[^a-z]", "", name.lower())
     if word not in ("ms", "msec", "millis", "millisec", "milliseconds", "millisecond", "millisekunden", "timems"):
         return False

@@ -64,6 +64,13 @@ def _room(t: FloatArray, first: IntArray, counts: IntArray) -> FloatArray:
 def on_change(t: FloatArray, u: FloatArray, y: FloatArray) -> bool:
     """Return whether rows came when something had changed, not by the clock.
 
+    Parameters
+    ----------
+    t : (N,) array
+        Stamps [s].
+    u, y : (N,) array
+        NaN where a row has none.
+
     Notes
     -----
     Two signs: rows with u hardly ever have y and the other way round; or the steps between rows vary by a factor of
@@ -150,6 +157,18 @@ def stretches(t: FloatArray, good: BoolArray, longest_gap_s: float | None, notes
 
 def stretch(columns: Mapping[str, FloatArray], at: IntArray) -> dict[str, FloatArray]:
     """Return the rows from the first to the last good one.
+
+    Parameters
+    ----------
+    columns : mapping of str to (N,) array
+        t, u and y, and perhaps r and others; NaN where a row has none.
+    at : (M,) array of int
+        The good rows, ascending.
+
+    Returns
+    -------
+    dict of str to array
+        The same columns.
 
     Notes
     -----

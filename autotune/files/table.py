@@ -124,6 +124,14 @@ def bare_and_unit(name: str) -> tuple[str, str]:
 
 
 def listed(names: Iterable[str], most: int = 8) -> str:
-    """Return names for a message, the first few of many."""
+    """Return names for a message, the first few of many.
+
+    Parameters
+    ----------
+    names : iterable of str
+        What is listed.
+    most : int
+        How many are written out.
+    """
     names = list(names)
     return ", ".join(names[:most]) + (f", ... ({len(names)} in all)" if len(names) > most else "")

@@ -64,7 +64,15 @@ class Layout:
 
 
 def beginning(path: Path, form: FileForm) -> tuple[Layout, str]:
-    """Return layout and encoding of a text file too long to be read whole, from its first megabyte."""
+    """Return layout and encoding of a text file too long to be read whole, from its first megabyte.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    form : FileForm
+        What was said of it.
+    """
     text, encoding = decode(path, form.encoding, _BEGINNING_BYTES)
     return _layout(path, text.splitlines()[:-1] or text.splitlines(), form), encoding
 
@@ -75,7 +83,7 @@ def _layout(path: Path, lines: Sequence[str], form: FileForm) -> Layout:
     tried = [form.delimiter] if form.delimiter else list(_DELIMITERS)
     best: tuple[float, str, Header] | None = None
     for delimiter in tried:
-        rows = [_stripped(row) for row in split([line for _, line in body], delimiter)]
+        rows = [_strip(row) for row in split([line for _, line in body], delimiter)]
         found = read_header(rows, form.skip_rows)
         fit = 0.0 if found is None else _consistency(rows[found.first_row :])
         if found is not None and len(found.names) > 1 and (best is None or fit > best[0] + 0.05):
@@ -93,7 +101,22 @@ def _layout(path: Path, lines: Sequence[str], form: FileForm) -> Layout:
 
 
 def decode(path: Path, encoding: str | None = None, most: int = -1) -> tuple[str, str]:
-    """Return a file's text and its encoding: what its first bytes say, UTF-8, or else that of Windows."""
+    """Return a file's text and its encoding: what its first bytes say, UTF-8, or else that of Windows.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    encoding : str, optional
+        Its encoding, where that is known.
+    most : int
+        Longest part that is read [bytes], cut to whole lines; all where negative.
+
+    Raises
+    ------
+    InputError
+        It cannot be read, or there is no such encoding.
+    """
     try:
         with path.open("rb") as file:
             content = file.read(most)
@@ -116,7 +139,15 @@ def decode(path: Path, encoding: str | None = None, most: int = -1) -> tuple[str
 
 
 def split(lines: Iterable[str], delimiter: str) -> Iterator[list[str]]:
-    """Yield the cells of each line."""
+    """Yield the cells of each line.
+
+    Parameters
+    ----------
+    lines : iterable of str
+        Lines of a file.
+    delimiter : str
+        Between its cells; a blank stands for any white space.
+    """
     if delimiter == " ":
         return (line.split() for line in lines)
     return _cells_of(lines, delimiter)
@@ -131,7 +162,7 @@ def _cells_of(lines: Iterable[str], delimiter: str) -> Iterator[list[str]]:
         ) from None
 
 
-def _stripped(row: Sequence[str]) -> list[str]:
+def _strip(row: Sequence[str]) -> list[str]:
     return [cell.strip().strip('"').strip() for cell in row]
 
 
@@ -154,7 +185,7 @@ def _with_commented_names(
     if header.rows or at == 0 or not lines[at - 1].lstrip().startswith(_COMMENT):
         return header
     above = lines[at - 1].lstrip().lstrip("#%/ ")
-    rows = [_stripped(row) for row in split([above, *[line for _, line in body[header.first_row :]]], delimiter)]
+    rows = [_strip(row) for row in split([above, *[line for _, line in body[header.first_row :]]], delimiter)]
     found = read_header(rows)
     if found is None or found.rows != 1 or len(found.names) != len(header.names):
         return header
@@ -162,7 +193,19 @@ def _with_commented_names(
 
 
 def table_of(path: Path, layout: Layout, encoding: str, form: FileForm) -> Table:
-    """Return the lines of a layout as a table."""
+    """Return the lines of a layout as a table.
+
+    Parameters
+    ----------
+    path : Path
+        The file, for messages.
+    layout : Layout
+        Its lines, delimiter and header.
+    encoding : str
+        How it was decoded, for the notes.
+    form : FileForm
+        What was said of it.
+    """
     lines, delimiter, header = layout.lines, layout.delimiter, layout.header
     names = header.names
 

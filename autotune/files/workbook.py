@@ -32,6 +32,13 @@ _REFERENCE = re.compile(rb'<c [^>]{0,80}?r="([A-Z]+)(\d+)"')
 def open_table(path: Path, form: FileForm | None = None) -> Table:
     """Open a file of any kind as a table; its kind follows from the ending of its name.
 
+    Parameters
+    ----------
+    path : Path
+        The file.
+    form : FileForm, optional
+        What is known of how it is written.
+
     Raises
     ------
     InputError

@@ -21,229 +21,50 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
-from itertools import product
-from typing import Literal, TypeAlias
+from functools import lru_cache
 
 import numpy as np
-from scipy.stats import chi2
 
-from autotune.arrays import BoolArray, ComplexArray, FloatArray
+from autotune.arrays import BoolArray, FloatArray
+from autotune.identification.structure_evidence import (
+    FURTHER,
+    STRUCTURES,
+    Evidence,
+    Structure,
+    are_admitted,
+    bounds,
+    evidence_of,
+    responses,
+)
 from autotune.models import TransferFunction
 from autotune.points import FrequencyPoint
 
-First: TypeAlias = Literal["none", "integrator", "lag", "unstable", "pair"]
-Second: TypeAlias = Literal["none", "lag", "pair"]
-Zero: TypeAlias = Literal["none", "real", "pair"]
-
-#: what a structure of low order need not represent, as a share of the gain
-_RESOLUTION = 1e-3
 #: structures with so many more parameters than the smallest that fits are members too
 _MORE = 2
-#: damping above which a pair of roots may lie anywhere
-_AUDIBLE = 0.4
-#: where a lightly damped pair may lie, times the lowest and the highest frequency
-_BELOW, _ABOVE = 0.5, 1.3
-#: how far a second pair may lie, times the highest frequency, and its least damping
-_FURTHER, _DAMPED = 3.0, 0.1
 _WALKERS, _STEPS, _KEPT = 48, 400, 64
 _STARTS, _ROUNDS = 12, 60
 
 
-@dataclass(frozen=True, kw_only=True)
-class Structure:
-    """Which factors a plant has.
-
-    Attributes
-    ----------
-    first : {"none", "integrator", "lag", "unstable", "pair"}
-        Pole at 0, in the left or in the right half plane; or a pair beside the one of ``second``.
-    second : {"none", "lag", "pair"}
-        Further poles.
-    zero : {"none", "real", "pair"}
-        Numerator.
-    """
-
-    first: First
-    second: Second
-    zero: Zero
-
-    @cached_property
-    def names(self) -> tuple[str, ...]:
-        """Names of the parameters in their order; all but L and a are logarithms."""
-        found = ["b", "L"]
-        found += {"lag": ["T"], "unstable": ["T"], "pair": ["w1", "z1"]}.get(self.first, [])
-        found += {"none": [], "lag": ["T2"], "pair": ["w0", "z0"]}[self.second]
-        return tuple(found + {"none": [], "real": ["a"], "pair": ["wz", "zz"]}[self.zero])
-
-    @property
-    def is_member(self) -> bool:
-        """Whether the structure is strictly proper, and none that another one is already."""
-        if self.first == "pair":
-            return self.second == "pair"
-        poles = (self.first != "none") + {"none": 0, "lag": 1, "pair": 2}[self.second]
-        zeros = {"none": 0, "real": 1, "pair": 2}[self.zero]
-        return poles > zeros and not (self.first == "none" and self.second == "lag")
-
-
-STRUCTURES = tuple(
-    sorted(
-        (
-            structure
-            for first, second, zero in product(
-                ("none", "integrator", "lag", "unstable", "pair"), ("none", "lag", "pair"), ("none", "real", "pair")
-            )
-            if (structure := Structure(first=first, second=second, zero=zero)).is_member  # type: ignore[arg-type]
-        ),
-        key=lambda structure: len(structure.names),
-    )
-)
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Evidence:
-    """Points, whitened, in units of their middle frequency.
-
-    Attributes
-    ----------
-    omega : (N,) array
-        Frequencies over ``omega_0``.
-    measured : (N,) complex array
-        Gains, sign taken out.
-    whitener : (N, 2, 2) array
-        W with W cov W^T = I.
-    omega_0 : float
-        Unit of frequency [rad/s].
-    sign : float
-        Of the gain that a stabilising PI has: the lowest point's phase lies between -180 and 0 degrees without it.
-    most : float
-        Largest weighted squared distance of a member from the points.
-    """
-
-    omega: FloatArray
-    measured: ComplexArray
-    whitener: FloatArray
-    omega_0: float
-    sign: float
-    most: float
-
-    def residuals(self, response: ComplexArray) -> FloatArray:
-        """Return (..., 2 N) whitened residuals of (..., N) responses."""
-        error = response - self.measured
-        parts = np.stack([error.real, error.imag], axis=-1)
-        return np.asarray(np.einsum("nij,...nj->...ni", self.whitener, parts)).reshape(*error.shape[:-1], -1)
-
-
-def evidence_of(points: Sequence[FrequencyPoint], probability: float) -> Evidence:
-    """Return the points whitened, with the distance that holds the plant with ``probability``."""
-    ordered = sorted(points, key=lambda point: point.omega_rad_s)
-    omega = np.array([point.omega_rad_s for point in ordered])
-    omega_0 = float(np.exp(np.mean(np.log(omega))))
-    sign = -1.0 if ordered[0].phase_rad > 0.0 else 1.0
-    floors = [np.array(point.covariance) + (_RESOLUTION * point.gain) ** 2 * np.eye(2) for point in ordered]
-    return Evidence(
-        omega=omega / omega_0,
-        measured=np.array([sign * point.response for point in ordered], dtype=np.complex128),
-        sign=sign,
-        whitener=np.array([np.linalg.inv(np.linalg.cholesky(covariance)) for covariance in floors]),
-        omega_0=omega_0,
-        most=float(chi2.ppf(probability, 2 * len(ordered))),
-    )
-
-
-def _responses(structure: Structure, x: FloatArray, omega: FloatArray) -> ComplexArray:
-    """Return (M, N) responses of (M, P) parameters, frequencies in units of omega_0."""
-    s = 1j * omega[None, :]
-    p = {name: x[:, i, None] for i, name in enumerate(structure.names)}
-    H = np.exp(p["b"] - s * p["L"])
-    if structure.first == "integrator":
-        H = H / s
-    elif structure.first == "lag":
-        H = H / (1.0 + s * np.exp(p["T"]))
-    elif structure.first == "unstable":
-        H = H / (s * np.exp(p["T"]) - 1.0)
-    elif structure.first == "pair":
-        w = s / np.exp(p["w1"])
-        H = H / (1.0 + 2.0 * np.exp(p["z1"]) * w + w * w)
-    if structure.second == "lag":
-        H = H / (1.0 + s * np.exp(p["T2"]))
-    elif structure.second == "pair":
-        w = s / np.exp(p["w0"])
-        H = H / (1.0 + 2.0 * np.exp(p["z0"]) * w + w * w)
-    if structure.zero == "real":
-        H = H * (1.0 + s * np.sinh(p["a"]))
-    elif structure.zero == "pair":
-        w = s / np.exp(p["wz"])
-        H = H * (1.0 + 2.0 * np.exp(p["zz"]) * w + w * w)
-    return np.asarray(H)
-
-
-def _bounds(structure: Structure, evidence: Evidence) -> tuple[FloatArray, FloatArray]:
-    first, last = evidence.omega[0], evidence.omega[-1]
-    size = float(np.log(np.max(np.abs(evidence.measured))))
-    ranges = {
-        "b": (size - 16.0, size + 16.0),
-        "L": (0.0, 2.0 * math.pi / first),
-        "T": (math.log(0.03 / last), math.log(100.0 / first)),
-        "T2": (math.log(0.03 / last), math.log(30.0 / first)),
-        "w0": (math.log(0.1 * first), math.log(10.0 * last)),
-        "z0": (math.log(2e-3), math.log(3.0)),
-        "w1": (math.log(0.1 * first), math.log(_FURTHER * last)),
-        "z1": (math.log(_DAMPED), math.log(3.0)),
-        "a": (0.0 if structure.first == "unstable" else -math.asinh(10.0 / first), math.asinh(10.0 / first)),
-        "wz": (math.log(0.1 * first), math.log(10.0 * last)),
-        "zz": (math.log(2e-3), math.log(3.0)),
-    }
-    limits = np.array([ranges[name] for name in structure.names])
-    return limits[:, 0], limits[:, 1]
-
-
-def _admitted(structure: Structure, x: FloatArray, evidence: Evidence) -> BoolArray:
-    """Return whether (M, P) parameters are of the class: where a lightly damped pair is, and the phase's turn."""
-    first, last = evidence.omega[0], evidence.omega[-1]
-    p = {name: x[:, i] for i, name in enumerate(structure.names)}
-    inside = np.ones(len(x), dtype=bool)
-    phase = -first * p["L"]  # at the first point, counted from frequency 0
-    for frequency, damping, turn in (("w0", "z0", -1.0), ("wz", "zz", 1.0)):
-        if frequency in p:
-            w = np.exp(p[frequency])
-            inside &= ((w >= _BELOW * first) & (w <= _ABOVE * last)) | (p[damping] >= math.log(_AUDIBLE))
-            phase = phase + turn * np.arctan2(2.0 * np.exp(p[damping]) * first / w, 1.0 - (first / w) ** 2)
-    if structure.first == "pair":
-        w = np.exp(p["w1"])
-        phase = phase - np.arctan2(2.0 * np.exp(p["z1"]) * first / w, 1.0 - (first / w) ** 2)
-    elif structure.first == "integrator":
-        phase = phase - 0.5 * np.pi
-    elif structure.first != "none":
-        phase = phase - np.arctan(first * np.exp(p["T"])) * (1.0 if structure.first == "lag" else -1.0)
-        phase = phase - (np.pi if structure.first == "unstable" else 0.0)
-    if "T2" in p:
-        phase = phase - np.arctan(first * np.exp(p["T2"]))
-    if "a" in p:
-        phase = phase + np.arctan(first * np.sinh(p["a"]))
-    return np.asarray(inside & (phase > -np.pi) & (phase <= 0.5 * np.pi))
-
-
 def _starts(structure: Structure, evidence: Evidence, rng: np.random.Generator) -> tuple[FloatArray, ...]:
     """Return (K, P) starting values all over the bounds, and the bounds."""
-    lower, upper = _bounds(structure, evidence)
+    lower, upper = bounds(structure, evidence)
     x = lower + (upper - lower) * rng.uniform(0.25, 0.75, (_STARTS, len(lower)))
     for i, name in enumerate(structure.names):
         if name == "w1":
-            x[:, i] = np.log(evidence.omega[-1] * rng.uniform(0.8, _FURTHER, _STARTS))
+            x[:, i] = np.log(evidence.omega[-1] * rng.uniform(0.8, FURTHER, _STARTS))
         elif name in ("w0", "wz"):
             x[:, i] = np.log(rng.choice(evidence.omega, _STARTS))
         elif name in ("z0", "z1", "zz"):
             x[:, i] = np.log(10.0 ** rng.uniform(-1.7, 0.0, _STARTS))
         elif name == "L":
             x[:, i] = rng.choice([0.01, 0.1, 0.5], _STARTS) / evidence.omega[-1]
-    gain = np.abs(evidence.measured / _responses(structure, x, evidence.omega))
+    gain = np.abs(evidence.measured / responses(structure, x, evidence.omega))
     x[:, 0] += np.mean(np.log(gain), axis=1)
     margin = 1e-6 * (upper - lower)
     return np.clip(x, lower + margin, upper - margin), lower, upper
 
 
-def _fitted(structure: Structure, evidence: Evidence, rng: np.random.Generator) -> FloatArray:
+def _fit(structure: Structure, evidence: Evidence, rng: np.random.Generator) -> FloatArray:
     """Return the (K, P) parameters within the region that least squares ends at from several starts.
 
     Levenberg and Marquardt's method, for all starts at once; what would leave the bounds stays on them.
@@ -254,7 +75,7 @@ def _fitted(structure: Structure, evidence: Evidence, rng: np.random.Generator) 
     step = 1e-6
 
     def residuals(values: FloatArray) -> FloatArray:
-        return evidence.residuals(_responses(structure, values, evidence.omega))
+        return evidence.residuals(responses(structure, values, evidence.omega))
 
     r = residuals(x)
     cost = np.sum(r**2, axis=1)
@@ -273,17 +94,17 @@ def _fitted(structure: Structure, evidence: Evidence, rng: np.random.Generator) 
         x, r = np.where(better[:, None], tried, x), np.where(better[:, None], there, r)
         cost = np.where(better, size, cost)
         damping = np.clip(np.where(better, damping * 0.3, damping * 5.0), 1e-12, 1e8)
-    inside = (cost <= evidence.most) & _admitted(structure, x, evidence)
+    inside = (cost <= evidence.most) & are_admitted(structure, x, evidence)
     return np.asarray(x[inside])
 
 
-def _sampled(structure: Structure, evidence: Evidence, fitted: FloatArray, rng: np.random.Generator) -> FloatArray:
+def _sample(structure: Structure, evidence: Evidence, fitted: FloatArray, rng: np.random.Generator) -> FloatArray:
     """Return (M, P) parameters spread over the region: the stretch move of Goodman & Weare (2010), flat inside."""
-    lower, upper = _bounds(structure, evidence)
+    lower, upper = bounds(structure, evidence)
 
     def inside(x: FloatArray) -> BoolArray:
-        within = np.all((x >= lower) & (x <= upper), axis=1) & _admitted(structure, x, evidence)
-        residuals = evidence.residuals(_responses(structure, x, evidence.omega))
+        within = np.all((x >= lower) & (x <= upper), axis=1) & are_admitted(structure, x, evidence)
+        residuals = evidence.residuals(responses(structure, x, evidence.omega))
         return np.asarray(within & (np.sum(residuals**2, axis=1) <= evidence.most))
 
     walkers = fitted[rng.integers(len(fitted), size=_WALKERS)]
@@ -379,14 +200,14 @@ def _consistent(points: tuple[FrequencyPoint, ...], probability: float) -> Consi
         size = len(structure.names)
         if size > min(least + _MORE, 2 * len(points) - 1):
             continue
-        fitted = _fitted(structure, evidence, rng)
+        fitted = _fit(structure, evidence, rng)
         if not len(fitted):
             continue
         least = min(least, size)
-        sample = _sampled(structure, evidence, fitted, rng)
+        sample = _sample(structure, evidence, fitted, rng)
         plants += [_built(structure, x, evidence) for x in sample[rng.permutation(len(sample))[:_KEPT]]]
         structures.append(structure)
-        sizes = np.sum(evidence.residuals(_responses(structure, fitted, evidence.omega)) ** 2, axis=1)
+        sizes = np.sum(evidence.residuals(responses(structure, fitted, evidence.omega)) ** 2, axis=1)
         criterion = float(np.min(sizes)) + size * math.log(2 * len(points))
         if nominal is None or criterion < nominal[0]:
             nominal = (criterion, _built(structure, fitted[int(np.argmin(sizes))], evidence))

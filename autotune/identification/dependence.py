@@ -76,7 +76,7 @@ def recorded_dependence(recording: Recording) -> Dependence:
     """Return how likely chance alone relates y so closely to u, or to a set-point that moves and acts by way of u."""
     found = dependence(recording.u, recording.y, first_lag=0 if recording.metadata.get("hold") == "linear" else 1)
     r = recording.extra.get("r")
-    if found.answers or r is None or np.ptp(_bridged(r)) == 0.0:
+    if found.answers or r is None or np.ptp(_bridge(r)) == 0.0:
         return found
     by_setpoint = dependence(r, recording.y, fed_back=False)
     return replace(by_setpoint, backward=found.backward, same_row=found.same_row, sign=found.sign)
@@ -85,7 +85,7 @@ def recorded_dependence(recording: Recording) -> Dependence:
 def is_fed_back(recording: Recording) -> bool:
     """Return whether a controller makes u of y: a set-point moves, or u follows y within its row."""
     r = recording.extra.get("r")
-    if r is not None and np.ptp(_bridged(r)) > 0.0:
+    if r is not None and np.ptp(_bridge(r)) > 0.0:
         return True
     return abs(dependence(recording.u, recording.y).same_row) > _SAME_ROW
 
@@ -97,7 +97,7 @@ def latest_answer_s(recording: Recording) -> float | None:
     of the other sign, dead for several periods of the loop, fits about as well as the true one: it is 1/C, delayed.
     """
     r = recording.extra.get("r")
-    if r is not None and np.ptp(_bridged(r)) > 0.0:
+    if r is not None and np.ptp(_bridge(r)) > 0.0:
         return None
     found = dependence(recording.u, recording.y)
     if abs(found.same_row) <= _SAME_ROW or not found.answers:
@@ -122,7 +122,7 @@ def require_order(recordings: Sequence[Recording]) -> None:
     -----
     Weaker than :func:`require_answer`: a loop that nothing but its own noise drives passes.
     """
-    moving = [recording for recording in recordings if not _is_constant(_bridged(recording.u))]
+    moving = [recording for recording in recordings if not _is_constant(_bridge(recording.u))]
     found = [recorded_dependence(recording) for recording in moving]
     answers = any(one.answers for one in found) or any(map(_answers_a_test, moving, found))
     if found and not answers and _seem_swapped(found):
@@ -156,7 +156,7 @@ def require_answer(recordings: Sequence[Recording]) -> None:
         u never changes, y is a copy of u, the two are swapped, u does nothing but follow y, or y does not answer u
         beyond chance (1 in 1,000).
     """
-    moving = [recording for recording in recordings if not _is_constant(_bridged(recording.u))]
+    moving = [recording for recording in recordings if not _is_constant(_bridge(recording.u))]
     if not moving:
         raise IdentificationError(
             "u is constant: the command never changes",
@@ -189,7 +189,7 @@ def _answers_a_test(recording: Recording, found: Dependence) -> bool:
     """Return whether y answers a few steps or ramps as a plant does, beyond what any colour of noise explains."""
     from autotune.identification.plant_evidence import NEEDED, explained_by_plant, is_simple_test
 
-    if abs(found.same_row) > _SAME_ROW or not is_simple_test(_bridged(recording.u)):
+    if abs(found.same_row) > _SAME_ROW or not is_simple_test(_bridge(recording.u)):
         return False
     return explained_by_plant(recording) > NEEDED
 
@@ -199,7 +199,7 @@ def _is_constant(values: FloatArray) -> bool:
 
 
 def _require_two_signals(recording: Recording) -> None:
-    u, y = _bridged(recording.u), _bridged(recording.y)
+    u, y = _bridge(recording.u), _bridge(recording.y)
     v, w = u - u.mean(), y - y.mean()
     apart = w - (float(v @ w) / float(v @ v)) * v
     if not _is_constant(y) and float(np.linalg.norm(apart)) <= _COPY * float(np.linalg.norm(w)):
@@ -237,7 +237,7 @@ def dependence(u: FloatArray, y: FloatArray, *, first_lag: int = 1, fed_back: bo
     ----------
     Haugh, Checking the independence of two covariance-stationary time series, JASA 71, 1976.
     """
-    u, y, first, every = _thinned(_bridged(u), _bridged(y), first_lag)
+    u, y, first, every = _thin(_bridge(u), _bridge(y), first_lag)
     if min(u.size, y.size) < _LEAST_ROWS or np.ptp(u) == 0.0 or np.ptp(y) == 0.0:
         return Dependence(forward=1.0, backward=1.0, same_row=0.0, lag=0, sign=1, within=0)
     e_u, e_y = _innovations(u, _COMMAND), _innovations(y, _ROUNDING)
@@ -250,7 +250,7 @@ def dependence(u: FloatArray, y: FloatArray, *, first_lag: int = 1, fed_back: bo
     )
 
 
-def _bridged(values: FloatArray) -> FloatArray:
+def _bridge(values: FloatArray) -> FloatArray:
     known = np.isfinite(values)
     if known.all() or not known.any():
         return np.where(known, values, 0.0)
@@ -279,7 +279,7 @@ def _past(x: FloatArray, order: int) -> FloatArray:
     return np.column_stack([x[order - k : x.size - k] for k in range(1, order + 1)])
 
 
-def _thinned(u: FloatArray, y: FloatArray, first_lag: int) -> tuple[FloatArray, FloatArray, int, int]:
+def _thin(u: FloatArray, y: FloatArray, first_lag: int) -> tuple[FloatArray, FloatArray, int, int]:
     """Return at most so many rows, the first lag, and how many each is the mean of: a row of u is before y's next."""
     every = -(-u.size // (_MOST_ROWS if first_lag else _MOST_SMOOTH_ROWS))
     if every <= 1:

@@ -56,7 +56,7 @@ class Envelope:
         )
 
 
-def positive_phase(response: ComplexArray, sign: int) -> FloatArray:
+def _positive_phase(response: ComplexArray, sign: int) -> FloatArray:
     """Return the phase of the positive-gain plant in (-3 pi/2, pi/2] [rad]."""
     phase = np.angle(sign * response)
     return np.asarray(np.where(phase > 0.5 * math.pi, phase - 2.0 * math.pi, phase), dtype=np.float64)
@@ -76,7 +76,7 @@ def envelope_of_points(points: Sequence[FrequencyPoint], sign: int, probability:
     """
     omega = np.array([point.omega_rad_s for point in points])
     H = np.array([point.response for point in points])
-    phase = positive_phase(H, sign)
+    phase = _positive_phase(H, sign)
     gain_radius, phase_radius = np.zeros(omega.size), np.zeros(omega.size)
     if probability > 0.0:
         quantile = math.sqrt(-2.0 * math.log(1.0 - probability))
@@ -128,7 +128,17 @@ def envelope_of_fit(fit: PlantFit, omega_rad_s: FloatArray, probability: float) 
 
 
 def envelope_of_transfer_function(plant: TransferFunction, sign: int, omega_rad_s: FloatArray) -> Envelope:
-    """Return the plant itself as its own bounds, phase unwrapped from low frequency."""
+    """Return the plant itself as its own bounds, phase unwrapped from low frequency.
+
+    Parameters
+    ----------
+    plant : TransferFunction
+        Exact.
+    sign : int
+        1 or -1, of the plant's gain at low frequency.
+    omega_rad_s : (N,) array
+        Angular frequencies [rad/s], ascending.
+    """
     H = sign * plant.response(omega_rad_s)
     phase = np.unwrap(np.angle(H))
     return Envelope(omega_rad_s=omega_rad_s, gain=np.abs(H), phase_rad=phase, phase_high_rad=phase)
@@ -152,7 +162,7 @@ def require_class_one(points: Sequence[FrequencyPoint], sign: int, *, sigmas: fl
         Gain or phase rises with frequency, or the phase starts below -135 degrees.
     """
     H = np.array([point.response for point in points])
-    gain, phase = np.log(np.abs(H)), positive_phase(H, sign)
+    gain, phase = np.log(np.abs(H)), _positive_phase(H, sign)
     sd = np.array([polar_sd(point) for point in points])
     for i in range(len(points)):
         for j in range(i + 1, len(points)):

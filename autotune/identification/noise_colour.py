@@ -96,7 +96,7 @@ def whitening_filter(residual: FloatArray, max_order: int = MAX_AR) -> FloatArra
     """
     N = residual.size
     max_order = min(max_order, N // 20)
-    r = autocovariances(residual, max_order)
+    r = _autocovariances(residual, max_order)
     best, filter_best = N * np.log(r[0]), WHITE
     for order in range(1, max_order + 1):
         c = -solve_toeplitz(r[:order], r[1 : order + 1])
@@ -110,7 +110,7 @@ def whitening_filter(residual: FloatArray, max_order: int = MAX_AR) -> FloatArra
 
 
 @njit(cache=True)
-def autocovariances(values: FloatArray, lags: int) -> FloatArray:
+def _autocovariances(values: FloatArray, lags: int) -> FloatArray:
     """Return the sums of products at lags 0..lags, divided by the number of rows, shape (lags + 1,)."""
     result = np.zeros(lags + 1)
     for lag in range(lags + 1):

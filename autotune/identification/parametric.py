@@ -87,7 +87,15 @@ class PlantFit:
         return float(chi2.sf(self.chi_square, self.degrees_of_freedom)) if self.degrees_of_freedom else 1.0
 
     def draws(self, count: int, rng: np.random.Generator) -> tuple[TransferFunction, ...]:
-        """Return plants drawn from the parameters' normal distribution, cut at the bounds of the search."""
+        """Return plants drawn from the parameters' normal distribution, cut at the bounds of the search.
+
+        Parameters
+        ----------
+        count : int
+            How many.
+        rng : numpy.random.Generator
+            Source of the draws.
+        """
         samples = rng.multivariate_normal(self.parameters, self.covariance, count, method="eigh")
         return tuple(self.build(self._within(sample)) for sample in samples)
 

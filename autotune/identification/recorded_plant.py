@@ -111,7 +111,7 @@ def fit_recordings(recordings: Sequence[Recording], progress: Progress = quiet) 
     if not any(is_fed_back(one) for one in recordings):
         found += [zero for one in found if one.structure.order == 2 and (zero := _zero(recordings, one)) is not None]
     rows = [min(one.models[i].rows for one in found) for i in range(len(recordings))]
-    return not_excluded([_with_zero(recordings, one, rows) if one.tau_s else _joined(one, rows) for one in found])
+    return not_excluded([_with_zero(recordings, one, rows) if one.tau_s else _join(one, rows) for one in found])
 
 
 def plant_fit(models: Sequence[tuple[DelayModel, bool]]) -> PlantFit:
@@ -121,7 +121,7 @@ def plant_fit(models: Sequence[tuple[DelayModel, bool]]) -> PlantFit:
         for model, integrator in models
     ]
     rows = [min(model.rows for model, _ in models)]
-    return not_excluded([_joined(one, rows) for one in found])
+    return not_excluded([_join(one, rows) for one in found])
 
 
 def _leading(recording: Recording, tau_s: float) -> Recording:
@@ -176,14 +176,14 @@ def _zero(recordings: Sequence[Recording], without: _Fitted) -> _Fitted | None:
 def _with_zero(recordings: Sequence[Recording], found: _Fitted, rows: Sequence[int]) -> PlantFit:
     """Return the fit with tau among its parameters; its variance is the curvature of what is left beside it."""
     unit = _largest_term(max(found.models, key=lambda model: model.rows))
-    middle = _joined(found, rows, unit)
+    middle = _join(found, rows, unit)
     way = 0.1 * found.tau_s
     slope, variance = np.zeros(middle.parameters.size), (0.5 * found.tau_s) ** 2
     for _ in range(2):
         beside = [_at_zero(recordings, found, found.tau_s + step) for step in (-way, way)]
         if beside[0] is None or beside[1] is None:
             break
-        low, high = (_joined(one, rows, unit) for one in beside if one is not None)
+        low, high = (_join(one, rows, unit) for one in beside if one is not None)
         curvature = (low.criterion + high.criterion - 2.0 * middle.criterion) / way**2
         slope = (high.parameters - low.parameters) / (2.0 * way)
         variance = min(2.0 / curvature if curvature > 0.0 else math.inf, (0.5 * found.tau_s) ** 2)
@@ -208,7 +208,7 @@ def _with_zero(recordings: Sequence[Recording], found: _Fitted, rows: Sequence[i
     )
 
 
-def _joined(found: _Fitted, common: Sequence[int], unit: int | None = None) -> PlantFit:
+def _join(found: _Fitted, common: Sequence[int], unit: int | None = None) -> PlantFit:
     """Return the fit of one structure to all recordings: information adds, and so do the criteria."""
     structure, models, n = found.structure, found.models, found.structure.order
     unit = _largest_term(max(models, key=lambda model: model.rows)) if unit is None else unit

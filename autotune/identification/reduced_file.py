@@ -9,10 +9,11 @@ import tomli_w
 
 from autotune.errors import InputError
 from autotune.identification.reduction import ReducedModel
-from autotune.models import Block, Model, Port, TransferFunction, model_content, model_of
-from autotune.outputs import write_whole
+from autotune.model_tables import model_content, model_of
+from autotune.models import Block, Model, Port, TransferFunction
 from autotune.points import points_from_json, points_to_json
 from autotune.text_files import read_toml
+from autotune.whole_files import write_whole
 
 _CHANGED = "its block is no longer the reduced model that [reduced] tells of"
 #: relative change of a coefficient that is rounding of the text

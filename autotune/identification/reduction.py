@@ -214,7 +214,7 @@ def reduce_points(
     if conditions == "regions":
         _require_135(ordered, fit)
     gain = abs(fit.plant.num[0]) if chosen == "self-regulating" else None
-    envelope, (G_r, omega_0r, omega_d), more = _reduced(ordered, fit, conditions, gain)
+    envelope, (G_r, omega_0r, omega_d), more = _reduce(ordered, fit, conditions, gain)
     warnings = (*warnings, *more)
     if fit.p_value < _CONTRADICTED:
         warnings = (
@@ -235,18 +235,18 @@ def reduce_points(
     )
 
 
-def _known(points: Sequence[FrequencyPoint], fit: PlantFit, conditions: Conditions) -> Envelope:
+def _bounds_of(points: Sequence[FrequencyPoint], fit: PlantFit, conditions: Conditions) -> Envelope:
     if conditions == "estimates":
         return envelope_of_points(points, fit.sign, 0.0)
     grid = np.geomspace(1e-3 * points[0].omega_rad_s, 3.0 * points[-1].omega_rad_s, 400)
     return envelope_of_fit(fit, grid, _PROBABILITY)
 
 
-def _reduced(
+def _reduce(
     points: Sequence[FrequencyPoint], fit: PlantFit, conditions: Conditions, gain: float | None
 ) -> tuple[Envelope, tuple[float, float | None, float], tuple[str, ...]]:
     """Return the bounds used, (|G_r|, omega_0r, omega_d), and what to warn of."""
-    known = _known(points, fit, conditions)
+    known = _bounds_of(points, fit, conditions)
     if conditions == "estimates":
         return known, _by_conditions(known, gain), ()
     # the structure chosen for the fit is itself uncertain: each point's own region stands beside the band

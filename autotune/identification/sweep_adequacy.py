@@ -26,7 +26,20 @@ _INDEPENDENT = 1e-11
 
 
 def own_columns(t: FloatArray, windows: Sequence[WholePeriods]) -> tuple[FloatArray, FloatArray]:
-    """Return columns of each cycle's own, and of the rows before the first, and which test each column is of."""
+    """Return columns of each cycle's own, and of the rows before the first, and which test each column is of.
+
+    Parameters
+    ----------
+    t : (N,) array
+        Time stamps [s].
+    windows : sequence of WholePeriods
+        The sweep's limit cycles.
+
+    Returns
+    -------
+    tuple of array
+        The (N, K) columns, and (K,) places in :data:`TESTS`.
+    """
     columns, kinds = [], []
     for window in windows:
         inside = (t >= window.start_s - 1e-9) & (t < window.end_s - 1e-9)
@@ -55,7 +68,22 @@ def _sensitivities(data: DelayData, found: Fitted) -> FloatArray:
 
 
 def colour_beside(data: DelayData, found: Fitted, columns: FloatArray) -> FloatArray:
-    """Return the filter that whitens what is left beside the cycles' own columns: a wrong model is no noise."""
+    """Return the filter that whitens what is left beside the cycles' own columns: a wrong model is no noise.
+
+    Parameters
+    ----------
+    data : DelayData
+        N rows.
+    found : Fitted
+        The model.
+    columns : (N, K) array
+        As of :func:`own_columns`.
+
+    Returns
+    -------
+    (p,) array
+        Coefficients of the filter.
+    """
     every, residual = np.column_stack([_sensitivities(data, found), columns]), residuals(data, found.point)
     solution, _, _ = _least_squares(every.T @ every, every.T @ residual)
     return whitening_filter(residual - every @ solution)
@@ -64,7 +92,19 @@ def colour_beside(data: DelayData, found: Fitted, columns: FloatArray) -> FloatA
 def judge_equation(
     data: DelayData, found: Fitted, columns: FloatArray, kinds: FloatArray, whitening: FloatArray
 ) -> tuple[tuple[float, float, float], float]:
-    """Return the probabilities of the three tests, and the variance ratio of the fundamentals, 1 at least."""
+    """Return the probabilities of the three tests, and the variance ratio of the fundamentals, 1 at least.
+
+    Parameters
+    ----------
+    data : DelayData
+        N rows.
+    found : Fitted
+        The model.
+    columns, kinds : (N, K), (K,) arrays
+        As of :func:`own_columns`.
+    whitening : (p,) array
+        Coefficients of the filter that makes the noise white.
+    """
     residual = residuals(data, found.point)
     rows = np.column_stack([_sensitivities(data, found), columns, residual])
     white = lfilter([1.0, *whitening], [1.0], rows, axis=0)[whitening.size :]

@@ -13,7 +13,8 @@ from autotune.arrays import ComplexArray, FloatArray
 from autotune.errors import AutotuneError, IdentificationError
 from autotune.identification.delay.data import DelayData
 from autotune.identification.delay.model import DelayModel
-from autotune.identification.delay.output_error import Point, Structure, finish, minimise, solve_linear
+from autotune.identification.delay.output_error import Point, Structure, minimise, solve_linear
+from autotune.identification.delay.output_error_model import finish
 from autotune.identification.parametric import fit_structures
 from autotune.points import FrequencyPoint
 
@@ -51,7 +52,17 @@ class Fitted:
 
 
 def starts_of(points: Sequence[FrequencyPoint], data: DelayData, largest: float) -> list[tuple[Structure, Point]]:
-    """Return a start for each structure: lags and dead time through the cycles' own points."""
+    """Return a start for each structure: lags and dead time through the cycles' own points.
+
+    Parameters
+    ----------
+    points : sequence of FrequencyPoint
+        Of the sweep's cycles.
+    data : DelayData
+        Its rows.
+    largest : float
+        Longest delay [s].
+    """
     fits = fit_structures(points)
     slowest = min(point.omega_rad_s for point in points)
     found: list[tuple[Structure, Point]] = []
@@ -71,7 +82,24 @@ def starts_of(points: Sequence[FrequencyPoint], data: DelayData, largest: float)
 def fit_all(
     data: DelayData, starts: Sequence[tuple[Structure, Point]], largest: float, whitening: FloatArray
 ) -> list[Fitted]:
-    """Return every structure at its minimum that the rows determine."""
+    """Return every structure at its minimum that the rows determine.
+
+    Parameters
+    ----------
+    data : DelayData
+        The sweep's rows.
+    starts : sequence of (Structure, Point)
+        Where each begins.
+    largest : float
+        Longest delay [s].
+    whitening : (p,) array
+        Coefficients of the filter that makes the noise white.
+
+    Raises
+    ------
+    IdentificationError
+        The rows determine none.
+    """
     found: list[Fitted] = []
     for structure, start in starts:
         at = solve_linear(data, structure, start.a, start.h, whitening)

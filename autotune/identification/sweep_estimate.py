@@ -123,7 +123,7 @@ def estimate_sweep(
     p_values, excess = judge_equation(data, best, columns, kinds, whitening)
     omega = _frequencies(best, omega_rad_s, phases_rad)
     # what the cycles' own fundamentals depart by beyond noise is bias that was not large enough to be refused
-    response, covariance = _averaged(found, omega)
+    response, covariance = _average(found, omega)
     points = tuple(
         FrequencyPoint(
             omega_rad_s=float(omega[i]),
@@ -151,7 +151,7 @@ def _frequencies(best: Fitted, visited: Sequence[float], phases_rad: Sequence[fl
     return np.unique([*visited, *further])
 
 
-def _averaged(found: Sequence[Fitted], omega_rad_s: FloatArray) -> tuple[ComplexArray, FloatArray]:
+def _average(found: Sequence[Fitted], omega_rad_s: FloatArray) -> tuple[ComplexArray, FloatArray]:
     """Return the mean response over the structures (W,), and its covariance with what they differ by (2W, 2W)."""
     criteria = np.array([one.criterion for one in found])
     weights = np.exp(-0.5 * (criteria - criteria.min()))

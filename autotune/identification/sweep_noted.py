@@ -36,7 +36,15 @@ def note_of(found: SweepEstimate | None, why: str, cycles: int, phases_rad: Sequ
 
 
 def is_noted(metadata: Mapping[str, Any], cycles: int) -> bool:
-    """Return whether a recording's sidecar says that its rows gave the points, and no cycle of theirs was lost."""
+    """Return whether a recording's sidecar says that its rows gave the points, and no cycle of theirs was lost.
+
+    Parameters
+    ----------
+    metadata : mapping
+        Of the recording's sidecar.
+    cycles : int
+        How many limit cycles are noted with it.
+    """
     noted = metadata.get(NOTED)
     return isinstance(noted, dict) and noted.get("used") is True and noted.get("cycles") == cycles
 

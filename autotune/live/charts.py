@@ -66,7 +66,15 @@ class Pictures:
 
 
 def strip_options(story: Story, span_s: float) -> Options:
-    """Return y with its limits and the set-point over u with its limits, for the last ``span_s`` [s]."""
+    """Return y with its limits and the set-point over u with its limits, for the last seconds of a run.
+
+    Parameters
+    ----------
+    story : Story
+        The run as read so far.
+    span_s : float
+        How far back the chart reaches [s].
+    """
     now_s = story.now_s
     t, u, y, r = story.rows.since(now_s - span_s)
     u_unit, y_unit = story.units
@@ -91,7 +99,7 @@ def strip_options(story: Story, span_s: float) -> Options:
         grids=[{"top": 34, "height": "54%"}, {"top": "67%", "bottom": 30}],
         x_axes=[seconds | {"gridIndex": 0, "name": "", ":axisLabel": "({show: false})"}, seconds],
         y_axes=[
-            _axis(f"y [{y_unit}]", *_padded(float(shown.min()), float(shown.max()))),
+            _axis(f"y [{y_unit}]", *_pad(float(shown.min()), float(shown.max()))),
             _axis(f"u [{u_unit}]", *u_range, grid=1) | {"splitNumber": 3},
         ],
         series=[y_line, _line("set-point", t, r, GREY, dash="dashed", width=1.2), u_line],
@@ -287,7 +295,7 @@ def _near(limits: list[float], low: float, high: float) -> list[float]:
     return [limit for limit in limits if low - (high - low) <= limit <= high + (high - low)]
 
 
-def _padded(low: float, high: float) -> tuple[float, float]:
+def _pad(low: float, high: float) -> tuple[float, float]:
     room = 0.06 * (high - low)
     return low - room, high + room
 

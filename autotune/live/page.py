@@ -359,7 +359,17 @@ def _gain_rows(story: Story) -> list[tuple[str, str, str]]:
 
 
 def build(story: Story, controls: Controls, screens: set[Screen]) -> Callable[[Client], None]:
-    """Return the function that builds a page for a browser that asks for one."""
+    """Return the function that builds a page for a browser that asks for one.
+
+    Parameters
+    ----------
+    story : Story
+        The run that the pages show.
+    controls : Controls
+        What their buttons do.
+    screens : set of Screen
+        The open pages; each adds itself, and leaves when its browser does.
+    """
     pictures = Pictures(story)
 
     def page(client: Client) -> None:

@@ -164,7 +164,14 @@ def token_for(given: str | None) -> str:
 
 
 def listening(host: str, port: int) -> socket.socket:
-    """Return a socket that listens; port 0 takes a free one.
+    """Return a socket that listens on this machine alone.
+
+    Parameters
+    ----------
+    host : str
+        An address of this machine.
+    port : int
+        TCP port; 0 takes a free one.
 
     Raises
     ------

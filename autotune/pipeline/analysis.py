@@ -94,7 +94,19 @@ class Analysis:
 def specification(
     settings: DesignSettings, plant: PlantFit, facts: LoopFacts, highest_rad_s: float
 ) -> tuple[Specification, str]:
-    """Return the constraints that the configuration asks for, and where the noise gain comes from."""
+    """Return the constraints that the configuration asks for, and where the noise gain comes from.
+
+    Parameters
+    ----------
+    settings : DesignSettings
+        What the configuration asks for.
+    plant : PlantFit
+        The fitted plant.
+    facts : LoopFacts
+        What is known of the loop besides.
+    highest_rad_s : float
+        Highest measured frequency [rad/s].
+    """
     modulus, phase_rad = settings.margins
     noise_gain, words = settings.noise_gain, "asked for"
     if noise_gain is None:
@@ -153,7 +165,7 @@ def analyse(
     usable = _as_independent(usable, fit)
     facts = facts or LoopFacts()
     asked, noise_source = specification(settings, fit, facts, _highest(usable, fit, facts))
-    reduced = _reduced(usable, fit)
+    reduced = _reduce(usable, fit)
     bases = _bases(usable, fit, lambda: reduced, asked, settings.kind)
     progress("designing", 0.0)
     source, found, looked = _first_kept(bases, settings.source, usable, fit)
@@ -206,7 +218,7 @@ def on_measured(
     IdentificationError, DesignError
         On no basis is there a controller that keeps its margins on all of it; the reason is that of the first.
     """
-    return _first_kept(_bases(points, fit, lambda: _reduced(points, fit), asked, kind), "auto", points, fit)
+    return _first_kept(_bases(points, fit, lambda: _reduce(points, fit), asked, kind), "auto", points, fit)
 
 
 def on_reduced_model(
@@ -350,7 +362,15 @@ def _on_structures(
 
 
 def looked_at(analysis: Analysis, controller: PIDController) -> tuple[Check, ...]:
-    """Return the checks of another controller than the designed one, as of gains that a rig rounds."""
+    """Return the checks of another controller than the designed one, as of gains that a rig rounds.
+
+    Parameters
+    ----------
+    analysis : Analysis
+        With points, fit and specification.
+    controller : PIDController
+        The one that is checked.
+    """
     asked = analysis.design.specification
     usable = _as_independent(of_use(analysis.points), analysis.fit)
     return _checks(analysis.source, usable, analysis.fit, controller, asked)
@@ -406,7 +426,7 @@ def _as_independent(points: Sequence[FrequencyPoint], fit: PlantFit) -> list[Fre
     return [replace(one, covariance=as_pairs(fit.shared_errors * np.array(one.covariance))) for one in points]
 
 
-def _reduced(points: Sequence[FrequencyPoint], fit: PlantFit) -> ReducedModel | AutotuneError:
+def _reduce(points: Sequence[FrequencyPoint], fit: PlantFit) -> ReducedModel | AutotuneError:
     """Return the reduced model of the points, or why there is none."""
     try:
         return reduce_points(points, fit=fit if fit.source == "points" else None)

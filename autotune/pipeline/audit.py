@@ -95,6 +95,17 @@ class AuditLog:
 def audit_log(config: Config, folder: Path, command: str, approval: Mapping[str, str] | None = None) -> AuditLog:
     """Return the log that the configuration names; by default ``audit.jsonl`` in the folder of the journal.
 
+    Parameters
+    ----------
+    config : Config
+        Names the log and the rig; its hash is in every line.
+    folder : Path
+        The journal's.
+    command : str
+        What hands over, "run" or "deploy".
+    approval : mapping of str to str, optional
+        Name and reason of the second person who approved it.
+
     Raises
     ------
     InputError

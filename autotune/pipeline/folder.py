@@ -13,9 +13,9 @@ import tomli_w
 from autotune.config import Config, load_config
 from autotune.errors import InputError
 from autotune.experiment.cycles import Earlier, read_earlier
-from autotune.outputs import write_whole
 from autotune.points import FrequencyPoint, read_points
 from autotune.text_files import read_json
+from autotune.whole_files import write_whole
 
 RECORDING, VERIFICATION, RESULT, JOURNAL = "recording.csv", "verification.csv", "result.json", "journal.jsonl"
 PROGRESS, CONFIG, REPORT, CONTROLLER = "progress.jsonl", "config.toml", "report.html", "controller.toml"
@@ -41,14 +41,30 @@ def numbered(path: Path) -> Iterator[Path]:
 
 
 def next_free(path: Path, *suffixes: str) -> Path:
-    """Return the first of the numbered names that no file has, nor one beside it with one of the suffixes."""
+    """Return the first of the numbered names that no file has, nor one beside it with one of the suffixes.
+
+    Parameters
+    ----------
+    path : Path
+        The first name.
+    *suffixes : str
+        Endings of the files beside it.
+    """
     return next(
         each for each in numbered(path) if not any(one.exists() for one in (each, *map(each.with_suffix, suffixes)))
     )
 
 
 def recordings(folder: Path, name: str = RECORDING) -> tuple[Path, ...]:
-    """Return the recordings of this name in the folder, by default the sweep's, the oldest first."""
+    """Return the recordings of this name in the folder, by default the sweep's, the oldest first.
+
+    Parameters
+    ----------
+    folder : Path
+        Of a run.
+    name : str
+        Of the first of them.
+    """
     return tuple(takewhile(Path.exists, numbered(folder / name)))
 
 
@@ -57,6 +73,13 @@ def store_config(config: Config, folder: Path) -> None:
 
     One that says the same is left as it is, with the comments of whoever wrote it; one that differs where a resumed
     run may differ is kept under the next free name.
+
+    Parameters
+    ----------
+    config : Config
+        As it was checked.
+    folder : Path
+        Of the run.
     """
     place = folder / CONFIG
     if place.is_file():
@@ -68,6 +91,13 @@ def store_config(config: Config, folder: Path) -> None:
 
 def may_store(config: Config, folder: Path) -> None:
     """Refuse a folder for a new run that holds a configuration other than this one.
+
+    Parameters
+    ----------
+    config : Config
+        As it was checked.
+    folder : Path
+        Of the run.
 
     Raises
     ------
@@ -168,7 +198,13 @@ def _is_complete(result: Path) -> bool:
 
 
 def differences(stored: Config, given: Config) -> tuple[str, ...]:
-    """Return the keys that the measured points depend on and that differ, each with both values."""
+    """Return the keys that the measured points depend on and that differ, each with both values.
+
+    Parameters
+    ----------
+    stored, given : Config
+        That of the run so far, and that of the one that goes on.
+    """
     was, now = (_flat(config.model_dump(mode="json", include=set(EXPERIMENT_SECTIONS))) for config in (stored, given))
     keys = [*was, *(key for key in now if key not in was)]
     return tuple(

@@ -50,7 +50,7 @@ def held_by(
     if not isinstance(rig, RoundsGains):
         return controller
     held = rig.holdable(controller)
-    reason = _moved(controller, held) or (_lost(controller, held, settings, fit) if fit is not None else "")
+    reason = _moved_gain(controller, held) or (_lost_margin(controller, held, settings, fit) if fit is not None else "")
     if reason:
         raise InputError(
             f"the rig's registers are too coarse for K = {controller.K:.4g}, T_I = {controller.Ti_s:.4g} s: {reason}",
@@ -61,7 +61,15 @@ def held_by(
 
 
 def on_registers(analysis: Analysis, held: PIDController) -> Analysis:
-    """Return the analysis with the gains as the rig holds them, and their margins in place of the exact gains'."""
+    """Return the analysis with the gains as the rig holds them, and their margins in place of the exact gains'.
+
+    Parameters
+    ----------
+    analysis : Analysis
+        With the exact gains.
+    held : PIDController
+        The gains as the registers hold them.
+    """
     if held == analysis.controller:
         return analysis
     plant = analysis.fit.plant
@@ -84,7 +92,7 @@ def on_registers(analysis: Analysis, held: PIDController) -> Analysis:
     )
 
 
-def _moved(exact: PIDController, held: PIDController) -> str:
+def _moved_gain(exact: PIDController, held: PIDController) -> str:
     """Return which gain rounding moves too far, and how far."""
     moved = []
     for name in ("K", "Ti_s", "Td_s", "Tf_s"):
@@ -94,7 +102,7 @@ def _moved(exact: PIDController, held: PIDController) -> str:
     return ", ".join(moved)
 
 
-def _lost(exact: PIDController, held: PIDController, settings: DesignSettings, fit: PlantFit) -> str:
+def _lost_margin(exact: PIDController, held: PIDController, settings: DesignSettings, fit: PlantFit) -> str:
     """Return which margin rounding takes away."""
     if held == exact:
         return ""

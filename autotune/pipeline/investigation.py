@@ -203,7 +203,7 @@ def investigate(
         What ended a round; the rig is safe, and what was known before has been kept.
     """
     budget.of(config)
-    found = _diagnosed(model, recordings, without, told.report) if recordings else None
+    found = _diagnose(model, recordings, without, told.report) if recordings else None
     before = () if found is None else _probabilities(found)
     known = Investigation(diagnosis=found, recordings=tuple(recordings), before=before, rounds=(), ended="")
     while True:
@@ -268,14 +268,14 @@ def _round(
     path = out / f"recording_{number}.csv"
     write_recording(seen, path)
     recordings = (*known.recordings, replace(seen, name=str(path)))
-    found = _diagnosed(model, recordings, without, told.report)
+    found = _diagnose(model, recordings, without, told.report)
     one = Round(
         number=number, recording=path.name, plan=plan, verdict=found.verdict, candidates=_probabilities(found)
     )  # fmt: skip
     return replace(known, diagnosis=found, recordings=recordings, rounds=(*known.rounds, one))
 
 
-def _diagnosed(model: Model, recordings: Sequence[Recording], without: Sequence[str], report: Progress) -> Diagnosis:
+def _diagnose(model: Model, recordings: Sequence[Recording], without: Sequence[str], report: Progress) -> Diagnosis:
     return with_next_experiment(diagnose(model, recordings, None, without, report))
 
 

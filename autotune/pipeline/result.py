@@ -13,11 +13,11 @@ from autotune.diagnosis.result import Diagnosis
 from autotune.experiment.judgement import Verification
 from autotune.experiment.result import ExperimentResult
 from autotune.experiment.running_law import RunningLaw
-from autotune.outputs import write_whole
 from autotune.pipeline.analysis import Analysis
 from autotune.pipeline.folder import CONTROLLER
 from autotune.points import points_to_json
 from autotune.run_log import jsonable
+from autotune.whole_files import write_whole
 
 
 def write_result(
@@ -28,7 +28,21 @@ def write_result(
     *,
     reason: str,
 ) -> None:
-    """Write ``result.json``, every part that was reached, the others null, and beside it the file of the controller."""
+    """Write ``result.json``, every part that was reached, the others null, and beside it the file of the controller.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    experiment : ExperimentResult or None
+        The points.
+    analysis : Analysis or None
+        Model, controller and margins.
+    verification : Verification or None
+        The loop under test.
+    reason : str
+        Why the run ended as it did.
+    """
     content: dict[str, Any] = {
         "points": points_to_json(experiment.points) if experiment else [],
         "reduced_model": None,
@@ -47,7 +61,15 @@ def write_result(
 
 
 def append_diagnosis(path: Path, found: Diagnosis) -> None:
-    """Add to a ``result.json`` what a diagnosis of the run's recordings found."""
+    """Add to a ``result.json`` what a diagnosis of the run's recordings found.
+
+    Parameters
+    ----------
+    path : Path
+        The file, which is there.
+    found : Diagnosis
+        What is added.
+    """
     said = found.as_json()
     content = json.loads(path.read_text(encoding="utf-8"))
     content["diagnosis"] = {key: said[key] for key in ("verdict", "effects", "places", "next_experiment")}
@@ -55,7 +77,15 @@ def append_diagnosis(path: Path, found: Diagnosis) -> None:
 
 
 def write_json(content: dict[str, Any], path: Path) -> None:
-    """Write a result file; what JSON has no number for becomes null."""
+    """Write a result file; what JSON has no number for becomes null.
+
+    Parameters
+    ----------
+    content : dict
+        What is written.
+    path : Path
+        Replaced where it exists.
+    """
     write_whole(path, json.dumps(jsonable(content), indent=2, allow_nan=False) + "\n")
 
 

@@ -33,19 +33,19 @@ def require_sensible(config: Config, old: PIDController, new: PIDController, fit
     gains = f"K = {new.K:.4g}, T_I = {new.Ti_s:.4g} s"
     odd = beyond_ranges(new.K, new.Ti_s, config.limits, config.signals.sample_time_s)
     if odd is not None:
-        raise _refused(odd, "check the units of the gains, limits.u_min to u_max and limits.y_min to y_max")
+        raise _refusal(odd, "check the units of the gains, limits.u_min to u_max and limits.y_min to y_max")
     if fit is not None:
         require_predictable(fit, new)
         return
     known = config.operating_point.plant_sign
     if known and known * new.K < 0.0:
-        raise _refused(f"{gains} have the wrong sign: operating_point.plant_sign = {known}", "correct one of the two")
+        raise _refusal(f"{gains} have the wrong sign: operating_point.plant_sign = {known}", "correct one of the two")
     if not known and old.K * new.K < 0.0:
-        raise _refused(
+        raise _refusal(
             f"{gains} have the other sign than the K = {old.K:.4g} that the rig holds: one of the two runs away",
             "give --run DIR or --points P.json, which say what sign the plant has, or operating_point.plant_sign",
         )
 
 
-def _refused(what: str, remedy: str) -> InputError:
+def _refusal(what: str, remedy: str) -> InputError:
     return InputError(what, where="gains", remedy=f"nothing was written; {remedy}")

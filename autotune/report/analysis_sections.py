@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,23 +13,15 @@ from autotune.config.procedure import SignalSettings
 from autotune.controller import PIDController
 from autotune.design.margins import margins
 from autotune.design.nugap import Validation
-from autotune.design.specification import Design
 from autotune.experiment.result import ExperimentResult
 from autotune.identification.parametric import PlantFit
 from autotune.pipeline import Analysis
-from autotune.points import FrequencyPoint
-from autotune.report.figures import (
-    Curve,
-    bode_figure,
-    frequencies,
-    gain_phase,
-    nichols_figure,
-    nyquist_figure,
-    ratio_title,
-    sensitivity_figure,
-)
+from autotune.report.analysis_words import based_on, with_units
+from autotune.report.figures import Curve, ratio_title
+from autotune.report.loop_diagrams import nichols_figure, nyquist_figure, sensitivity_figure
 from autotune.report.maker_forms import maker_table
-from autotune.report.page import BLUE, GREEN, GREY, ORANGE, PURPLE, RED, Figure, Section, Table
+from autotune.report.page import BLUE, GREEN, Figure, Section, Table
+from autotune.report.points_section import frequency_grid, is_of_rows, points_section
 
 #: a modulus margin that is less by this share cannot be seen in the figure
 _DRAWN = 0.01
@@ -63,133 +54,27 @@ def analysis_sections(
         The relay experiment the points came from, for the first-harmonic formulas.
     """
     return (
-        _points_section(analysis, signals, experiment),
+        points_section(analysis, signals, experiment),
         _model_section(analysis, signals),
         _loop_section(analysis, signals),
     )
 
 
-def _grid(analysis: Analysis, decades: float) -> FloatArray:
-    """Return the frequencies of a figure [rad/s]: around the points, or around the crossover for a fit in time."""
-    if analysis.points and analysis.fit.source == "points":
-        return frequencies(analysis.points, decades)
-    crossover = analysis.margins.crossover_rad_s
-    return np.geomspace(crossover * 10 ** (-decades - 1.0), crossover * 10 ** (decades + 0.3), 400, dtype=np.float64)
-
-
-def _points_section(analysis: Analysis, signals: SignalSettings, experiment: ExperimentResult | None) -> Section:
-    sign = analysis.fit.sign
-    omega = _grid(analysis, 0.7)
-    estimates = _by_source(analysis.points)
-    compared = _described_table(analysis.points, sign, experiment) if experiment else None
-    gain_unit = f"{signals.y_unit}/{signals.u_unit}" if signals.u_unit and signals.y_unit else ""
-    curves = (
-        Curve(name="fitted plant", system=analysis.fit.plant, colour=GREY, dash="dot"),
-        *([] if analysis.reduced is None else [Curve(name="reduced model", system=analysis.reduced, colour=GREEN)]),
-    )
-    return Section(
-        title="Bode points",
-        text=(
-            "Each point is the ratio of the recorded measurement's Fourier coefficient to that of the recorded,"
-            " held command over whole periods; its region counts the noise that was found beside the oscillation."
-            if all(point.source in _RELAY_SOURCES for point in analysis.points)
-            else "All points are of the differential equation with dead time that was fitted to all rows of the sweep,"
-            " averaged over its orders: their errors go together. Each region counts the noise, and what the orders"
-            " differ by."
-            if _is_of_rows(analysis)
-            else "Colours tell the estimates apart: relay points come from whole periods of a limit cycle,"
-            " closed-loop points from a model of the loop under control, others from a band of frequencies. Each"
-            " region counts the noise of its own experiment."
-            if len({point.source in _RELAY_SOURCES for point in analysis.points}) > 1
-            else "Each point is estimated over a band of frequencies, leakage and drift removed; its region counts"
-            " the noise in that band.",
-        ),
-        tables=(_points_table(analysis.points, sign, gain_unit),),
-        figures=(
-            Figure(
-                figure=bode_figure(estimates, curves, omega, sign, gain_unit),
-                caption=("Gain and phase, the phase for the positive gain." if sign < 0 else "Gain and phase.")
-                + (
-                    " The reduced model lies above the gain and below the phase of the points: margins that a"
-                    " controller keeps on it hold for the plant."
-                    if analysis.reduced is not None
-                    else ""
-                ),
-                height_px=560,
-            ),
-        ),
-        details=(
-            "The first-harmonic formulas trust the delay that was asked for and the relay's ideal wave; their error"
-            " against the recorded signals:",
-        )
-        if compared
-        else (),
-        detail_tables=(compared,) if compared else (),
-    )
-
-
-_RELAY_SOURCES = ("relay", "harmonic")
-_SOURCE_COLOURS = {"relay": BLUE, "harmonic": BLUE, "closed loop": ORANGE, "local polynomial": RED, "spectral": PURPLE}
-
-
-def _by_source(points: Sequence[FrequencyPoint]) -> list[tuple[str, Sequence[FrequencyPoint], str]]:
-    """Return the points in groups of one source and colour, a relay's harmonics with it."""
-    groups: dict[str, list[FrequencyPoint]] = {}
-    for point in points:
-        groups.setdefault("relay" if point.source in _RELAY_SOURCES else point.source, []).append(point)
-    if len(groups) == 1:
-        return [("measured, 95 %", points, BLUE)]
-    return [(f"{name}, 95 %", group, _SOURCE_COLOURS.get(name, GREY)) for name, group in groups.items()]
-
-
-def _points_table(points: Sequence[FrequencyPoint], sign: int, gain_unit: str) -> Table:
-    _, phases = gain_phase(np.array([sign * point.response for point in points], dtype=np.complex128))
-    rows = []
-    for point, phase in zip(points, phases, strict=True):
-        sd = math.sqrt(np.trace(np.array(point.covariance)) / 2.0) / point.gain
-        cells = (f"{point.omega_rad_s:.4g}", f"{point.gain:.5g}", f"{phase:.2f}")
-        rows.append((*cells, f"{100 * 1.96 * sd:.2g} %", f"{math.degrees(1.96 * sd):.2g}", point.source))
-    gain = f"gain [{gain_unit}]" if gain_unit else "gain"
-    header = ("ω [rad/s]", gain, "phase [deg]", "gain ±95 %", "phase ±95 % [deg]", "kind")
-    return Table(header=header, rows=tuple(rows))
-
-
-def _described_table(points: Sequence[FrequencyPoint], sign: int, experiment: ExperimentResult) -> Table | None:
-    """Return the error of the describing function's estimates, where the experiment was a relay's."""
-    described = {segment.point.omega_rad_s: segment.describing for segment in experiment.segments}
-    rows = []
-    for point in points:
-        found = described.get(point.omega_rad_s)
-        if found is not None:
-            turned = _wrapped(found.phase_rad - float(np.angle(sign * point.response)))
-            gain = f"{100 * (found.gain / point.gain - 1):+.0f} %"
-            rows.append((f"{point.omega_rad_s:.4g}", gain, f"{math.degrees(turned):+.1f}"))
-    return Table(header=("ω [rad/s]", "gain error", "phase error [deg]"), rows=tuple(rows)) if rows else None
-
-
-def _wrapped(angle_rad: float) -> float:
-    return (angle_rad + math.pi) % (2 * math.pi) - math.pi
-
-
-def _fitted_to(analysis: Analysis) -> str:
+def _source_text(analysis: Analysis) -> str:
     if analysis.fit.source == "recording":
         return "through the recording"
-    return "to all rows of the sweep" if _is_of_rows(analysis) else "through the points"
-
-
-def _is_of_rows(analysis: Analysis) -> bool:
-    return bool(analysis.points) and all(point.source == "sweep" for point in analysis.points)
+    return "to all rows of the sweep" if is_of_rows(analysis) else "through the points"
 
 
 def _model_section(analysis: Analysis, signals: SignalSettings) -> Section:
     reduced, fit = analysis.reduced, analysis.fit
     fitted = (
-        f"A transfer function was fitted {_fitted_to(analysis)}:"
+        f"A transfer function was fitted {_source_text(analysis)}:"
         f" {_transfer_text(fit, signals)}."
         # of a recording the noise is estimated from the same residual: its chi-square would say nothing
         + (
             f" Chi-square {fit.chi_square:.1f} with {fit.degrees_of_freedom} degrees of freedom."
-            if fit.source == "points" and not _is_of_rows(analysis)
+            if fit.source == "points" and not is_of_rows(analysis)
             else ""
         )
         + (f" {len(fit.others)} other structure(s) are not excluded by the data." if fit.others else "")
@@ -252,28 +137,12 @@ def _transfer_text(fit: PlantFit, signals: SignalSettings) -> str:
     )
     gain = plant.num[-1] / plant.den[-1 - plant.integrators]
     kind = "integrator" if plant.integrators else "no integrator"
-    size = _with_unit(gain, signals.y_unit, f"{signals.u_unit} s" if plant.integrators else signals.u_unit)
+    size = with_units(gain, signals.y_unit, f"{signals.u_unit} s" if plant.integrators else signals.u_unit)
     return f"gain {size}, {kind}, lags {lags or 'none'}, dead time {plant.delay_s:.3g} s"
 
 
 def _loop_section(analysis: Analysis, signals: SignalSettings) -> Section:
     controller, spec = analysis.controller, analysis.design.specification
-    omega = _grid(analysis, 1.3)
-    loops = (
-        Curve(name="fitted plant", system=_Loop(plant=analysis.fit.plant, controller=controller), colour=BLUE),
-        *(
-            []
-            if analysis.reduced is None
-            else [
-                Curve(
-                    name="reduced model" if (_reduced_modulus(analysis) or 0.0) > 0.0 else "reduced model (unstable)",
-                    system=_Loop(plant=analysis.reduced, controller=controller),
-                    colour=GREEN,
-                    dash="dash",
-                )
-            ]
-        ),
-    )
     design, m, d = analysis.design, analysis.margins, analysis.design.margins
     binding, u, y = ", ".join(design.binding) or "none", signals.u_unit, signals.y_unit
     rows = (
@@ -306,20 +175,41 @@ def _loop_section(analysis: Analysis, signals: SignalSettings) -> Section:
         ),
         details=(_certificate(analysis),),
         detail_tables=(_price_table(analysis, signals),),
-        figures=(
-            Figure(
-                figure=nyquist_figure(loops, analysis.points, controller, omega, spec.modulus_margin),
-                caption=f"Nyquist: {_outside(analysis)}; ellipses are the points' 95 % regions times C.",
-                square=True,
-            ),
-            Figure(
-                figure=nichols_figure(loops, omega, spec.modulus_margin, spec.phase_margin_rad),
-                caption="Black-Nichols: the required phase margin as a bar, the modulus margin as a closed curve.",
-            ),
-            Figure(
-                figure=sensitivity_figure(loops, omega, spec.modulus_margin),
-                caption="Sensitivity: its peak is the inverse of the modulus margin.",
-            ),
+        figures=_loop_figures(analysis),
+    )
+
+
+def _loop_figures(analysis: Analysis) -> tuple[Figure, ...]:
+    controller, spec = analysis.controller, analysis.design.specification
+    omega = frequency_grid(analysis, 1.3)
+    loops = (
+        Curve(name="fitted plant", system=_Loop(plant=analysis.fit.plant, controller=controller), colour=BLUE),
+        *(
+            []
+            if analysis.reduced is None
+            else [
+                Curve(
+                    name="reduced model" if (_reduced_modulus(analysis) or 0.0) > 0.0 else "reduced model (unstable)",
+                    system=_Loop(plant=analysis.reduced, controller=controller),
+                    colour=GREEN,
+                    dash="dash",
+                )
+            ]
+        ),
+    )
+    return (
+        Figure(
+            figure=nyquist_figure(loops, analysis.points, controller, omega, spec.modulus_margin),
+            caption=f"Nyquist: {_outside(analysis)}; ellipses are the points' 95 % regions times C.",
+            square=True,
+        ),
+        Figure(
+            figure=nichols_figure(loops, omega, spec.modulus_margin, spec.phase_margin_rad),
+            caption="Black-Nichols: the required phase margin as a bar, the modulus margin as a closed curve.",
+        ),
+        Figure(
+            figure=sensitivity_figure(loops, omega, spec.modulus_margin),
+            caption="Sensitivity: its peak is the inverse of the modulus margin.",
         ),
     )
 
@@ -393,45 +283,3 @@ def _price_table(analysis: Analysis, signals: SignalSettings) -> Table:
 def _certificate(analysis: Analysis) -> str:
     text = analysis.design.certificate
     return f"Certificate: {text}."
-
-
-def gains_text(controller: PIDController, signals: SignalSettings) -> str:
-    """Return a controller's gains in words, with units."""
-    if controller.K == 0.0:
-        return "no controller (K = 0)"
-    unit = f" {signals.u_unit}/{signals.y_unit}" if signals.u_unit and signals.y_unit else ""
-    derivative = f", T_d = {controller.Td_s:.4g} s, T_f = {controller.Tf_s:.3g} s" if controller.kind == "pid" else ""
-    return f"{controller.kind.upper()} with K = {controller.K:.4g}{unit}, T_I = {controller.Ti_s:.4g} s{derivative}"
-
-
-def designed_text(design: Design, signals: SignalSettings) -> str:
-    """Return the gains of a design in words; an integral controller as what it is, and as the PI that acts like it."""
-    c, words = design.controller, gains_text(design.controller, signals)
-    if not design.is_integral:
-        return words
-    unit = f" {signals.u_unit}/({signals.y_unit} s)" if signals.u_unit and signals.y_unit else " per s"
-    return f"I controller with K_I = {c.K / c.Ti_s:.4g}{unit} (where only a PI is at hand: {words})"
-
-
-def based_on(analysis: Analysis) -> str:
-    """Return in words what the controller was designed on."""
-    count = f"{len(analysis.points)} points"
-    if analysis.source == "points":
-        return f"designed on {count}"
-    if analysis.source == "fitted plant":
-        return "designed on the plant fitted to the " + ("recording" if analysis.fit.source == "recording" else count)
-    return f"designed on the reduced model of {count}"
-
-
-def margins_sentence(analysis: Analysis, signals: SignalSettings) -> str:
-    """Return the margins on the fitted plant in a sentence."""
-    m = analysis.margins
-    h2 = _with_unit(m.h2, f"{signals.y_unit} √s", signals.u_unit) if signals.y_unit else f"{m.h2:.4g}"
-    return (
-        f"On the fitted plant: modulus margin {m.modulus:.3f}, phase margin {math.degrees(m.phase_rad):.1f} deg,"
-        f" delay margin {m.delay_s:.3g} s, crossover {m.crossover_rad_s:.3g} rad/s, H2 norm under load {h2}."
-    )
-
-
-def _with_unit(value: float, over: str, under: str) -> str:
-    return ratio_title(f"{value:.4g}", over, under).translate({ord("["): None, ord("]"): None})

@@ -59,7 +59,7 @@ def chain_diagram(
     links = _links(model, named, possible, throughout)
     lit = [f"{link.label}: {', '.join(link.missing) or 'possible'}" for link in links if link.missing or link.may_be]
     says = " to ".join(link.label for link in links) + ("; missing at " + "; ".join(lit) if lit else "; nothing is lit")
-    wide, narrow = _drawn(links, upright=False), _drawn(links, upright=True)
+    wide, narrow = _draw(links, upright=False), _draw(links, upright=True)
     return (
         f'<div class="chain lying" role="img" aria-label="{html.escape(says)}">{wide}</div>'
         f'<div class="chain upright" aria-hidden="true">{narrow}</div>'
@@ -74,11 +74,11 @@ def _links(model: Model, named: Mapping[str, Sequence[str]], possible: Sequence[
     for place in ("controller", "timing", "actuator"):
         if (place in left or (place in possible and place != "controller")) and place not in places:
             at = 0 if place == "controller" else len(links)
-            links.insert(at, _added(place, left.pop(place, ()), place in possible))
+            links.insert(at, _link_of_addition(place, left.pop(place, ()), place in possible))
     for i, block in enumerate(model.blocks):
         first = block.place not in places[:i]
         if first and block.place == "plant" and ("environment" in left or "environment" in possible):
-            links.append(_added("environment", left.pop("environment", ()), "environment" in possible))
+            links.append(_link_of_addition("environment", left.pop("environment", ()), "environment" in possible))
         words = tuple(named.get(block.place, ())) if first or throughout else ()
         left.pop(block.place, None)
         below = " ".join(filter(None, (block.output if block.output != block.name else "", block.unit)))
@@ -86,11 +86,11 @@ def _links(model: Model, named: Mapping[str, Sequence[str]], possible: Sequence[
         links.append(Link(label=block.name, below=below or block.place, place=block.place, missing=words, may_be=same))
     for place in ("plant", "sensor", "environment"):
         if place in left or (place in possible and place not in places and place == "sensor"):
-            links.append(_added(place, left.pop(place, ()), place in possible))
-    return _shortened([*links, Link(label="reading y", below=model.output.unit, place="reading")])
+            links.append(_link_of_addition(place, left.pop(place, ()), place in possible))
+    return _shorten([*links, Link(label="reading y", below=model.output.unit, place="reading")])
 
 
-def _shortened(links: list[Link]) -> list[Link]:
+def _shorten(links: list[Link]) -> list[Link]:
     """Return at most so many boxes, what is lit and both ends among them; the others give way from the back."""
     plain = [i for i, one in enumerate(links[1:-1], 1) if not (one.missing or one.may_be)]
     surplus = max(len(links) - _MOST - 2, 0)
@@ -98,14 +98,14 @@ def _shortened(links: list[Link]) -> list[Link]:
     return [one for i, one in enumerate(links) if i not in left_out]
 
 
-def _added(place: str, words: Sequence[str], possible: bool) -> Link:
+def _link_of_addition(place: str, words: Sequence[str], possible: bool) -> Link:
     return Link(
         label={"environment": "load on the plant", "timing": "time stamps"}.get(place, place), place=place,
         is_added=True, missing=tuple(words), may_be=possible and not words,
     )  # fmt: skip
 
 
-def _wrapped(text: str, letters: int = _WRAP, lines: int = 2) -> list[str]:
+def _wrap(text: str, letters: int = _WRAP, lines: int = 2) -> list[str]:
     """Return a text in lines of some letters; what does not fit ends with an ellipsis."""
     rows = [""]
     for word in text.split():
@@ -118,7 +118,7 @@ def _wrapped(text: str, letters: int = _WRAP, lines: int = 2) -> list[str]:
     return [row if len(row) <= letters + 3 else row[: letters + 1] + "…" for row in kept]
 
 
-def _drawn(links: Sequence[Link], *, upright: bool) -> str:
+def _draw(links: Sequence[Link], *, upright: bool) -> str:
     boxes, x, y = [], 4.0, 4.0
     widths = [_width(link) for link in links]
     widest = max(widths)
@@ -145,7 +145,7 @@ def _drawn(links: Sequence[Link], *, upright: bool) -> str:
 
 def _note_lines(link: Link, letters: int) -> list[str]:
     words = link.missing or (("possibly here",) if link.may_be else ())
-    return [line for word in words for line in _wrapped(word, letters)]
+    return [line for word in words for line in _wrap(word, letters)]
 
 
 def _notes(link: Link) -> int:
@@ -153,7 +153,7 @@ def _notes(link: Link) -> int:
 
 
 def _width(link: Link) -> float:
-    texts = [*_wrapped(link.label), *_wrapped(link.below, lines=1), *_note_lines(link, _WRAP)]
+    texts = [*_wrap(link.label), *_wrap(link.below, lines=1), *_note_lines(link, _WRAP)]
     return max(78.0, 20.0 + _LETTER * max(len(text) for text in texts))
 
 
@@ -178,7 +178,7 @@ def _box(link: Link, x: float, y: float, width: float, *, beside: bool) -> str:
         f'<rect x="{x:.0f}" y="{y:.0f}" width="{width:.0f}" height="{_HEIGHT}" rx="{22 if is_end else 6}" '
         f'class="{kind}"/>'
     ]
-    label, below = _wrapped(link.label), _wrapped(link.below, lines=1) if link.below else []
+    label, below = _wrap(link.label), _wrap(link.below, lines=1) if link.below else []
     top = y + _HEIGHT / 2 - _LINE * (len(label) + len(below) - 1) / 2 + 5
     for k, line in enumerate([*label, *below]):
         size = ' class="small-print"' if k >= len(label) else ""

@@ -22,12 +22,12 @@ _DIGITS = 7
 
 def Scatter(**settings: Any) -> Trace:  # noqa: N802 - plotly's own name
     """Return a trace of points or lines; the settings are plotly's, ``line_shape`` for ``line: {shape}``."""
-    return {"type": "scatter", **_nested(settings)}
+    return {"type": "scatter", **_nest(settings)}
 
 
 def Bar(**settings: Any) -> Trace:  # noqa: N802 - plotly's own name
     """Return a trace of bars."""
-    return {"type": "bar", **_nested(settings)}
+    return {"type": "bar", **_nest(settings)}
 
 
 def make_subplots(
@@ -40,7 +40,21 @@ def make_subplots(
     row_heights: Sequence[float] | None = None,
     subplot_titles: Sequence[str] = (),
 ) -> Chart:
-    """Return a chart with a grid of axes, rows from the top; with shared x axes a column is zoomed together."""
+    """Return a chart with a grid of axes, rows from the top.
+
+    Parameters
+    ----------
+    rows, cols : int
+        Grid of axes.
+    shared_xaxes : bool
+        Whether the x axes of a column are zoomed together.
+    vertical_spacing, horizontal_spacing : float
+        Between rows and columns, as shares of the chart.
+    row_heights : sequence of float, optional
+        Relative heights from the top; equal when absent.
+    subplot_titles : sequence of str
+        Row by row.
+    """
     chart = Chart(rows=rows, cols=cols)
     heights = np.array(row_heights if row_heights is not None else np.ones(rows), dtype=np.float64)
     heights *= (1.0 - vertical_spacing * (rows - 1)) / heights.sum()
@@ -82,48 +96,112 @@ class Chart:
         self.layout: dict[str, Any] = {"xaxis": {}, "yaxis": {}, "shapes": [], "annotations": []}
 
     def add_trace(self, trace: Trace, row: int = 1, col: int = 1) -> None:
-        """Add a trace to the axes in a row and a column, counted from 1."""
+        """Add a trace to the axes in a row and a column.
+
+        Parameters
+        ----------
+        trace : Trace
+            From :func:`Scatter` and its like.
+        row, col : int
+            Counted from 1.
+        """
         name = self._name(row, col)
         self.data.append({**trace, "xaxis": f"x{name}", "yaxis": f"y{name}"})
 
     def add_scatter(self, *, row: int = 1, col: int = 1, **settings: Any) -> None:
-        """Add a trace of points or lines."""
+        """Add a trace of points or lines.
+
+        Parameters
+        ----------
+        row, col : int
+            Counted from 1.
+        **settings : object
+            Of plotly's scatter.
+        """
         self.add_trace(Scatter(**settings), row, col)
 
     def update_layout(self, **settings: Any) -> None:
         """Set what holds for the whole chart."""
-        self.layout |= _nested(settings)
+        self.layout |= _nest(settings)
 
     def update_xaxes(self, row: int | None = None, col: int | None = None, **settings: Any) -> None:
-        """Set horizontal axes: all, or those of a row or a column."""
+        """Set horizontal axes: all, or those of a row or a column.
+
+        Parameters
+        ----------
+        row, col : int, optional
+            Counted from 1; all where absent.
+        **settings : object
+            Of plotly's x axis.
+        """
         self._update("xaxis", row, col, settings)
 
     def update_yaxes(self, row: int | None = None, col: int | None = None, **settings: Any) -> None:
-        """Set vertical axes: all, or those of a row or a column."""
+        """Set vertical axes: all, or those of a row or a column.
+
+        Parameters
+        ----------
+        row, col : int, optional
+            Counted from 1; all where absent.
+        **settings : object
+            Of plotly's y axis.
+        """
         self._update("yaxis", row, col, settings)
 
     def add_vline(self, x: float, **settings: Any) -> None:
-        """Draw a line over the whole height at an x of the first axis."""
+        """Draw a line over the whole height at an x of the first axis.
+
+        Parameters
+        ----------
+        x : float
+            Place on the axis.
+        **settings : object
+            Of plotly's shape.
+        """
         self.add_shape(type="line", x0=x, x1=x, y0=0, y1=1, yref="paper", **settings)
 
     def add_hline(self, y: float, **settings: Any) -> None:
-        """Draw a line over the whole width at a y of the first axis."""
+        """Draw a line over the whole width at a y of the first axis.
+
+        Parameters
+        ----------
+        y : float
+            Place on the axis.
+        **settings : object
+            Of plotly's shape.
+        """
         self.add_shape(type="line", y0=y, y1=y, x0=0, x1=1, xref="paper", **settings)
 
     def add_vrect(self, x0: float, x1: float, **settings: Any) -> None:
-        """Shade what lies between two x of the first axis."""
+        """Shade what lies between two x of the first axis.
+
+        Parameters
+        ----------
+        x0, x1 : float
+            Places on the axis.
+        **settings : object
+            Of plotly's shape.
+        """
         self.add_shape(type="rect", x0=x0, x1=x1, y0=0, y1=1, yref="paper", **settings)
 
     def add_shape(self, **settings: Any) -> None:
         """Draw a shape."""
-        self.layout["shapes"].append(_nested(settings))
+        self.layout["shapes"].append(_nest(settings))
 
     def add_annotation(self, *, row: int | None = None, col: int | None = None, **settings: Any) -> None:
-        """Write a text at a place."""
+        """Write a text at a place.
+
+        Parameters
+        ----------
+        row, col : int, optional
+            Axes that x and y are of, counted from 1; the first where absent.
+        **settings : object
+            Of plotly's annotation.
+        """
         if row is not None or col is not None:
             name = self._name(row or 1, col or 1)
             settings = {"xref": f"x{name}", "yref": f"y{name}", **settings}
-        self.layout["annotations"].append(_nested(settings))
+        self.layout["annotations"].append(_nest(settings))
 
     def to_json(self) -> str:
         """Return traces and layout as JSON, numbers to seven digits, no number as null."""
@@ -136,10 +214,10 @@ class Chart:
         for i in range(self.rows * self.cols):
             if row in (None, i // self.cols + 1) and col in (None, i % self.cols + 1):
                 own = self.layout.setdefault(f"{axis}{_suffix(i)}", {})
-                own |= _nested(settings)
+                own |= _nest(settings)
 
 
-def _nested(settings: Mapping[str, Any]) -> dict[str, Any]:
+def _nest(settings: Mapping[str, Any]) -> dict[str, Any]:
     """Return the settings with ``line_shape`` and the like inside their group, and a title as plotly.js wants it."""
     nested: dict[str, Any] = {}
     for key, value in settings.items():

@@ -75,7 +75,7 @@ def write_diagnosis_page(
 
 def _sections(known: _Evidence, controller: Controller | None) -> tuple[Section, ...]:
     found = known.found
-    described = () if found.description is None else (_described(found.description, found),)
+    described = () if found.description is None else (_description_section(found.description, found),)
     traces = Section(title="Simulation against recording", figures=trace_figures(found, known.names))
     return (
         _before_and_after(known),
@@ -83,7 +83,7 @@ def _sections(known: _Evidence, controller: Controller | None) -> tuple[Section,
         *described,
         _when(known),
         _against(known),
-        *_determined(found),
+        *_determined_sections(found),
         *screen_sections(found, controller, known.names),
         traces,
         *_equations(found),
@@ -136,7 +136,7 @@ def _numbers(found: Diagnosis) -> Table:
     )  # fmt: skip
 
 
-def _determined(found: Diagnosis) -> tuple[Section, ...]:
+def _determined_sections(found: Diagnosis) -> tuple[Section, ...]:
     """Show which combinations of numbers the recordings determine."""
     rows = tuple(
         (", ".join(one.parameters), f"{100.0 * one.narrowed:.3g} %", ", ".join(f"{c:+.2g}" for c in one.changes))
@@ -171,7 +171,7 @@ def _missing(known: _Evidence) -> tuple[Section, ...]:
     figures = tuple(law_figure(law) for law in known.laws)
     if not rows and not figures and not found.extended_model.effects:
         return ()
-    without = [name for name in _added(found) if name not in {law.effect for law in known.laws}]
+    without = [name for name in _added_effects(found) if name not in {law.effect for law in known.laws}]
     text = [] if rows else ["No effect is named."]
     text += [line for line in (in_the_model(found),) if line]
     text += [f"{sentence(clause(name))} That is no law over one signal: the free run shows what it does."
@@ -193,7 +193,7 @@ def _missing(known: _Evidence) -> tuple[Section, ...]:
     )
 
 
-def _added(found: Diagnosis) -> tuple[str, ...]:
+def _added_effects(found: Diagnosis) -> tuple[str, ...]:
     """Return the effects that the extended model has beyond those that samples alone show."""
     return tuple(e.name for e in found.extended_model.effects)
 
@@ -211,7 +211,7 @@ def _effect_rows(effect: FoundEffect) -> list[tuple[str, ...]]:
     return rows or [(*known, "", "", effect.equation)]
 
 
-def _described(description: Description, found: Diagnosis) -> Section:
+def _description_section(description: Description, found: Diagnosis) -> Section:
     """Show what no effect of the catalogue explains, as an equation and as a curve."""
     terms = Table(
         header=("term", "value (95 %)", "unit of the whole"),

@@ -23,12 +23,12 @@ def verdict_of(found: Diagnosis) -> str:
     """Return the verdict in a sentence, effects in words with their names in brackets."""
     if found.verdict != "effect" or not found.effects:
         return found.sentences[0]
-    said = joined([f"{clause(e.name)} ({_called(e)}, probability {e.probability:.2f})" for e in found.effects])
+    said = joined([f"{clause(e.name)} ({_name_of(e)}, probability {e.probability:.2f})" for e in found.effects])
     rest = "" if found.is_clean else " Something smaller is missing as well: what is left is not noise."
     return f"The model leaves physics out: {said}.{rest}"
 
 
-def _called(effect: FoundEffect) -> str:
+def _name_of(effect: FoundEffect) -> str:
     return f"{effect.name} at {effect.at}" if effect.at else effect.name
 
 
@@ -46,11 +46,19 @@ def places_of(found: Diagnosis) -> tuple[dict[str, list[str]], tuple[str, ...]]:
 
 
 def answers(found: Diagnosis, run: UnseenRun | None) -> tuple[tuple[str, str], ...]:
-    """Return what was found, how sure that is, and what to do."""
-    return (("What was found", _found(found)), ("How sure", _sure(found, run)), ("What to do", _to_do(found)))
+    """Return what was found, how sure that is, and what to do.
+
+    Parameters
+    ----------
+    found : Diagnosis
+        The result.
+    run : UnseenRun or None
+        A free run through what was not fitted.
+    """
+    return (("What was found", _finding_text(found)), ("How sure", _sure(found, run)), ("What to do", _to_do(found)))
 
 
-def _found(found: Diagnosis) -> str:
+def _finding_text(found: Diagnosis) -> str:
     if found.verdict == "unexplained" and not found.places:
         return found.sentences[0]
     if not found.effects:
@@ -157,7 +165,17 @@ def in_the_model(found: Diagnosis) -> str:
 
 
 def objections(found: Diagnosis, run: UnseenRun | None, laws: Sequence[MissingLaw]) -> tuple[str, ...]:
-    """Return what a sceptic would hold against the finding: rivals, what was not excited, what is left."""
+    """Return what a sceptic would hold against the finding: rivals, what was not excited, what remains unexplained.
+
+    Parameters
+    ----------
+    found : Diagnosis
+        The result.
+    run : UnseenRun or None
+        A free run through what was not fitted.
+    laws : sequence of MissingLaw
+        What is missing over the signals it goes with.
+    """
     said = [*_rivals(found), *_unseen(run), *_bins(laws)]
     said += _ranges(found)
     for effect in found.effects:

@@ -31,7 +31,15 @@ def sentence(text: str) -> str:
 
 
 def number(value: float, digits: int = 4) -> str:
-    """Return a number to some digits, without an exponent where a person reads it more easily so."""
+    """Return a number, without an exponent where a person reads it more easily so.
+
+    Parameters
+    ----------
+    value : float
+        The number.
+    digits : int
+        Significant ones.
+    """
     if not math.isfinite(value) or value == 0.0 or not 1e-4 <= abs(value) < 1e6:
         return f"{value:.{digits}g}"
     decimals = max(digits - 1 - math.floor(math.log10(abs(value))), 0)
@@ -46,7 +54,15 @@ def unit_of(unit: str) -> str:
 
 
 def with_spread(p: Parameter, digits: int = 4) -> str:
-    """Return a parameter with its 95 % interval, where that is known, and its unit."""
+    """Return a parameter with its 95 % interval, where that is known, and its unit.
+
+    Parameters
+    ----------
+    p : Parameter
+        Value, standard deviation and unit.
+    digits : int
+        Significant ones of the value.
+    """
     spread = f" ± {number(1.96 * p.sd, 2)}" if math.isfinite(p.sd) else ""
     return f"{number(p.value, digits)}{spread}{unit_of(p.unit)}"
 

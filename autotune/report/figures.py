@@ -1,4 +1,4 @@
-"""Figures that several pages share: recordings, Bode diagram with regions, Nyquist, Nichols, sensitivity, steps."""
+"""Figures that several pages share: recordings, Bode diagram with regions, titles of axes."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from autotune.points import FrequencyPoint
 from autotune.recording import Recording
 from autotune.report import chart as go
 from autotune.report.chart import make_subplots
-from autotune.report.page import BLUE, GREY, ORANGE, RED, add_line, thinned
+from autotune.report.page import BLUE, GREY, ORANGE, add_line, thinned
 
 
 class Responds(Protocol):
@@ -66,7 +66,22 @@ def recording_figure(
 
 
 def frequencies(points: Sequence[FrequencyPoint], decades: float = 0.7, count: int = 400) -> FloatArray:
-    """Return a logarithmic grid that covers the points and some decades beyond them [rad/s]."""
+    """Return a logarithmic grid that covers the points and some decades beyond them.
+
+    Parameters
+    ----------
+    points : sequence of FrequencyPoint
+        At least one.
+    decades : float
+        How far it goes on, both ways.
+    count : int
+        Frequencies.
+
+    Returns
+    -------
+    (count,) array
+        Angular frequencies [rad/s].
+    """
     omega = [point.omega_rad_s for point in points]
     return np.geomspace(min(omega) * 10**-decades, max(omega) * 10**decades, count, dtype=np.float64)
 
@@ -161,100 +176,6 @@ def phase_axis(measured: Sequence[FloatArray], drawn: Sequence[FloatArray]) -> t
     return float(step * np.floor(bottom / step + 1e-6)), float(step * np.ceil(top / step - 1e-6)), step
 
 
-def nyquist_figure(
-    loops: Sequence[Curve],
-    points: Sequence[FrequencyPoint],
-    controller: Responds,
-    omega: FloatArray,
-    modulus_margin: float,
-) -> go.Chart:
-    """Draw loops L = H C with the circle of the modulus margin, and the measured points times C with their regions.
-
-    Parameters
-    ----------
-    loops : sequence of Curve
-        Open loops.
-    points : sequence of FrequencyPoint
-        Of the plant; they are multiplied by the controller.
-    controller : Responds
-        C.
-    omega : (N,) array
-        Grid [rad/s].
-    modulus_margin : float
-        Radius of the circle around -1 that the loops must not enter.
-    """
-    figure = go.Chart()
-    angle = np.linspace(0, 2 * np.pi, 181)
-    circle = -1 + modulus_margin * np.exp(1j * angle)
-    add_line(figure, circle.real, circle.imag, f"modulus margin {modulus_margin:g}", RED, dash="dot")
-    add_line(figure, np.cos(angle), np.sin(angle), "gain 1", GREY, dash="dot", width=1.0)
-    for curve in loops:
-        response = curve.system.response(omega)
-        near = np.abs(response) < 6.0
-        add_line(figure, response.real[near], response.imag[near], curve.name, curve.colour, dash=curve.dash)
-    for i, point in enumerate(points):
-        C = complex(controller.response(np.array([point.omega_rad_s]))[0])
-        edge = region(point, C)
-        add_line(figure, edge.real, edge.imag, "95 % regions of the points", BLUE, width=1.0, showlegend=i == 0)
-        figure.add_trace(
-            go.Scatter(
-                x=[(C * point.response).real],
-                y=[(C * point.response).imag],
-                mode="markers",
-                marker={"color": BLUE, "size": 6},
-                showlegend=False,
-                name="point",
-            )
-        )
-    figure.add_trace(
-        go.Scatter(x=[-1], y=[0], mode="markers", marker={"symbol": "cross", "color": RED, "size": 10}, name="-1")
-    )
-    figure.update_xaxes(title="real part of L", range=[-2.4, 1.2], dtick=0.5, constrain="domain")
-    figure.update_yaxes(
-        title="imaginary part of L", range=[-2.4, 1.2], dtick=0.5, scaleanchor="x", scaleratio=1, constrain="domain"
-    )
-    return figure
-
-
-def nichols_figure(
-    loops: Sequence[Curve], omega: FloatArray, modulus_margin: float, phase_margin_rad: float
-) -> go.Chart:
-    """Draw loops in the Black-Nichols plane: gain in dB over phase, with the required margins."""
-    figure = go.Chart()
-    circle = -1 + modulus_margin * np.exp(1j * np.linspace(0, 2 * np.pi, 181))
-    phase_deg = np.degrees(np.angle(circle)) % 360 - 360
-    add_line(figure, phase_deg, 20 * np.log10(np.abs(circle)), f"modulus margin {modulus_margin:g}", RED, dash="dot")
-    for curve in loops:
-        gain, phase = gain_phase(curve.system.response(omega))
-        add_line(figure, phase, 20 * np.log10(gain), curve.name, curve.colour, dash=curve.dash)
-    margin_deg = float(np.degrees(phase_margin_rad))
-    figure.add_trace(
-        go.Scatter(
-            x=[-180, -180 + margin_deg],
-            y=[0, 0],
-            mode="lines+markers",
-            line={"color": RED, "width": 3},
-            name=f"phase margin {margin_deg:.0f} deg",
-        )
-    )
-    figure.update_xaxes(title="phase of L [deg]", range=[-275, -80], dtick=45)
-    figure.update_yaxes(title="gain of L [dB]", range=[-33, 33], dtick=10)
-    return figure
-
-
-def sensitivity_figure(loops: Sequence[Curve], omega: FloatArray, modulus_margin: float) -> go.Chart:
-    """Draw abs(S) in dB with the bound that the modulus margin sets, the inverse of it."""
-    figure = go.Chart()
-    for curve in loops:
-        S = 1.0 / (1.0 + curve.system.response(omega))
-        add_line(figure, omega, 20 * np.log10(np.abs(S)), curve.name, curve.colour, dash=curve.dash)
-    bound = np.full(2, -20 * np.log10(modulus_margin))
-    add_line(figure, omega[[0, -1]], bound, f"bound of modulus margin {modulus_margin:g}", RED, dash="dot")
-    figure.update_xaxes(title="angular frequency [rad/s]", type="log")
-    figure.update_yaxes(title="sensitivity |S| [dB]")
-    return figure
-
-
 def usual_range(values: FloatArray) -> list[float]:
     """Return a range that shows the middle 90 % of the values, (N,): an approach from rest would hide a small relay."""
     low, high = np.quantile(values, [0.05, 0.95])
@@ -263,12 +184,30 @@ def usual_range(values: FloatArray) -> list[float]:
 
 
 def axis_title(name: str, unit: str) -> str:
-    """Return the title of an axis."""
+    """Return the title of an axis.
+
+    Parameters
+    ----------
+    name : str
+        Of the signal.
+    unit : str
+        Its unit; may be empty.
+    """
     return f"{name} [{unit or 'unit not given'}]"
 
 
 def ratio_title(name: str, over: str, under: str, and_under: str = "") -> str:
-    """Return a name with the unit of a ratio, where both of its units are given."""
+    """Return a name with the unit of a ratio, where both of its units are given.
+
+    Parameters
+    ----------
+    name : str
+        Of the ratio.
+    over, under : str
+        Units of its two parts; may be empty.
+    and_under : str
+        A further unit under the line.
+    """
     if not (over and under):
         return name
     below = f"{under} {and_under}".strip()
@@ -295,7 +234,20 @@ def gain_phase_bars(point: FrequencyPoint) -> tuple[float, float]:
 
 
 def region(point: FrequencyPoint, factor: complex) -> ComplexArray:
-    """Return the edge of the point's 95 % region times a complex factor."""
+    """Return the edge of the point's 95 % region times a complex factor.
+
+    Parameters
+    ----------
+    point : FrequencyPoint
+        With covariance.
+    factor : complex
+        What it is multiplied by, as by a controller's response.
+
+    Returns
+    -------
+    (49,) complex array
+        The closed edge.
+    """
     radii, directions = point.region_radii(0.95)
     angle = np.linspace(0, 2 * np.pi, 49)
     edge = directions @ (radii[:, np.newaxis] * np.array([np.cos(angle), np.sin(angle)]))

@@ -26,13 +26,13 @@ def write_investigation_page(known: Investigation, found: Diagnosis, path: str |
 
 
 def _rounds(known: Investigation) -> Section:
-    rows = [("0", "given recordings", "-", "-", _named(known.before))] if known.before else []
+    rows = [("0", "given recordings", "-", "-", _list_candidates(known.before))] if known.before else []
     for one in known.rounds:
         excitation = one.plan.excitation
         asked = " against ".join(one.plan.between) or "what there is at all"
         done = f"{excitation.kind} on the {excitation.on}, {excitation.amplitude:.3g}, {excitation.duration_s:.4g} s"
         expected = f"{one.plan.discrimination:.0f}" if one.plan.between else "-"
-        rows.append((str(one.number), done, asked, expected, _named(one.candidates)))
+        rows.append((str(one.number), done, asked, expected, _list_candidates(one.candidates)))
     table = Table(
         header=("round", "experiment", "to tell", "expected chi-square", "probabilities after it"), rows=tuple(rows),
         caption="Expected chi-square: of one hypothesis where another is true, mean over the pairs.",
@@ -41,5 +41,5 @@ def _rounds(known: Investigation) -> Section:
     return Section(title="How it was learnt", text=(text,), tables=(table,) if rows else ())
 
 
-def _named(candidates: tuple[tuple[str, float], ...], most: int = 3) -> str:
+def _list_candidates(candidates: tuple[tuple[str, float], ...], most: int = 3) -> str:
     return ", ".join(f"{name} {p:.2f}" for name, p in candidates[:most])

@@ -34,13 +34,21 @@ def file_names(recordings: Sequence[Recording]) -> tuple[str, ...]:
     return tuple(f"{name} ({i})" for i, name in enumerate(names))
 
 
-def with_unit(name: str, unit: str) -> str:
+def _with_unit(name: str, unit: str) -> str:
     """Return an axis's title."""
     return f"{name} [{unit}]" if unit else f"{name} [-]"
 
 
 def free_run_figure(run: UnseenRun, name: str) -> Figure:
-    """Draw a free run of all models through a stretch, the residual below."""
+    """Draw a free run of all models through a stretch, the residual below.
+
+    Parameters
+    ----------
+    run : UnseenRun
+        The stretch, and each model's run through it.
+    name : str
+        Of its recording.
+    """
     figure = make_subplots(rows=2, cols=1, shared_xaxes=True, vertical_spacing=0.05, row_heights=[0.66, 0.34])
     add_line(figure, *thinned(run.t, run.y), "measured", GREY, width=2.4, row=1, col=1)
     shown: list[FloatArray] = []
@@ -55,18 +63,18 @@ def free_run_figure(run: UnseenRun, name: str) -> Figure:
     low, high = float(np.nanmin(run.y)), float(np.nanmax(run.y))
     span = (high - low) or 1.0
     figure.update_yaxes(
-        title=with_unit("y", run.unit), range=[low - _MARGIN * span, high + _MARGIN * span], row=1, col=1
+        title=_with_unit("y", run.unit), range=[low - _MARGIN * span, high + _MARGIN * span], row=1, col=1
     )
     widest = 1.15 * max((float(np.nanquantile(np.abs(e), 0.995)) for e in shown), default=span)
     widest = min(widest, span) or span
-    figure.update_yaxes(title=with_unit("residual", run.unit), range=[-widest, widest], row=2, col=1)
+    figure.update_yaxes(title=_with_unit("residual", run.unit), range=[-widest, widest], row=2, col=1)
     figure.update_xaxes(title="t [s]", row=2, col=1)
     for a, b in zip(run.starts_s, run.heads_s, strict=True):
         figure.add_vrect(a, b, fillcolor="rgba(128,128,128,0.16)", line={"width": 0}, layer="below")
-    return Figure(figure=figure, caption=_said_of(run, name), height_px=460)
+    return Figure(figure=figure, caption=_caption_of_run(run, name), height_px=460)
 
 
-def _said_of(run: UnseenRun, name: str) -> str:
+def _caption_of_run(run: UnseenRun, name: str) -> str:
     errors = ", ".join(
         f"{model} {100 * e:.3g} %" if math.isfinite(e) else f"{model} runs away" for model, e in run.errors.items()
     )
@@ -82,7 +90,7 @@ def _said_of(run: UnseenRun, name: str) -> str:
 def law_figure(law: MissingLaw) -> Figure:
     """Draw a law over its signal with its 95 % band, and the bins of the data with their bars."""
     value = law.value if law.is_whole else f"added {law.value}"
-    figure = lines_figure(with_unit(law.signal, law.unit), with_unit(value, law.value_unit))
+    figure = lines_figure(_with_unit(law.signal, law.unit), _with_unit(value, law.value_unit))
     ends = np.array([min(b.x.min() for b in law.branches), max(b.x.max() for b in law.branches)])
     add_line(figure, ends, ends if law.is_whole else np.zeros(2), "without it", ORANGE, dash="dash")
     for branch in law.branches:
@@ -98,10 +106,10 @@ def law_figure(law: MissingLaw) -> Figure:
                     error_y={"type": "data", "array": 1.96 * branch.error, "color": GREY, "thickness": 1.2, "width": 3},
                 )
             )  # fmt: skip
-    return Figure(figure=figure, caption=_said_of_law(law), height_px=360)
+    return Figure(figure=figure, caption=_caption_of_law(law), height_px=360)
 
 
-def _said_of_law(law: MissingLaw) -> str:
+def _caption_of_law(law: MissingLaw) -> str:
     bins = sum(b.at.size for b in law.branches)
     near = sum(int(np.sum(np.abs(b.found - _at(b)) < 1.96 * _both(b))) for b in law.branches)
     told = sum(int(np.sum(np.abs(b.found - (b.at if law.is_whole else 0.0)) > 1.96 * b.error)) for b in law.branches)
@@ -135,8 +143,18 @@ def _add_band(figure: go.Chart, branch: Branch, colour: str) -> None:
 
 
 def acting_figure(law: MissingLaw, recordings: Sequence[Recording], names: Sequence[str]) -> Figure:
-    """Draw what an effect adds along the recordings, one after the other."""
-    figure = lines_figure("t, one recording after the other [s]", with_unit("added", law.value_unit))
+    """Draw what an effect adds along the recordings, one after the other.
+
+    Parameters
+    ----------
+    law : MissingLaw
+        What the effect adds, row by row.
+    recordings : sequence of Recording
+        Those it was found on.
+    names : sequence of str
+        One for each.
+    """
+    figure = lines_figure("t, one recording after the other [s]", _with_unit("added", law.value_unit))
     at, marks = 0.0, []
     for r, rows, added, name in zip(recordings, law.rows, law.acts, names, strict=True):
         # where windows begin, a speed may be far off for a row or two

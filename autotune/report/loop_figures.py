@@ -25,7 +25,7 @@ _VARIANCE = 0.1023
 Models = Mapping[str, Sequence[InnovationModel]]
 
 
-def poles_figure(models: Models, truth: InnovationModel) -> Any:
+def _poles_figure(models: Models, truth: InnovationModel) -> Any:
     """Draw the poles of each method's models in the upper half of the z plane, the true ones on top."""
     figure = make_subplots(rows=1, cols=len(models))
     circle = np.exp(1j * np.linspace(0.0, np.pi, 400))
@@ -53,7 +53,7 @@ def _marks(
     figure.add_trace(trace, **at)
 
 
-def noise_figure(models: Models, truth: InnovationModel) -> Any:
+def _noise_figure(models: Models, truth: InnovationModel) -> Any:
     """Draw sigma times the magnitude of H for each method's models, the true one on top."""
     figure = make_subplots(rows=1, cols=len(models), shared_xaxes=False)
     for col, (title, found) in enumerate(models.items(), start=1):
@@ -113,10 +113,10 @@ def loop_page(models: Models, truth: InnovationModel, count: int, bound: FloatAr
     """
 
     def poles(title: str, caption: str, *names: str) -> Section:
-        figure = poles_figure({name: models[name] for name in names}, truth)
+        figure = _poles_figure({name: models[name] for name in names}, truth)
         return Section(title=title, figures=(Figure(figure=figure, caption=caption, height_px=460),))
 
-    noise = noise_figure({name: models[name] for name in ("this paper", "default")}, truth)
+    noise = _noise_figure({name: models[name] for name in ("this paper", "default")}, truth)
     caption = "Standard deviation of the innovations times the noise model's magnitude."
     return Page(
         title="Closed-loop subspace identification, the example of 2011",

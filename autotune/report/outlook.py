@@ -94,8 +94,8 @@ def outlook_section(
                 f"Predicted, not measured: a step of the set-point by {_amount(1.0, signals.y_unit)}, then one of the"
                 f" load by {_amount(load, signals.u_unit)}. The band holds 95 % of {DRAWS} plants drawn from what the"
                 " data leave open.",
-                *_gained(designed, before),
-                *_weighted(designed, fit.plant, times, load),
+                *_gain_text(designed, before),
+                *_weight_text(designed, fit.plant, times, load),
             ),
             tables=(
                 Table(
@@ -154,7 +154,7 @@ def _member(
     return Member(name=name, controller=controller, kept=margins(plant, controller), worst=worst, prediction=found)
 
 
-def _gained(designed: Member, before: Member | None) -> tuple[str, ...]:
+def _gain_text(designed: Member, before: Member | None) -> tuple[str, ...]:
     """Return by how much a load's error is smaller than with today's gains, where these hold the plant."""
     if before is None or not before.kept.stable:
         return ()
@@ -163,7 +163,7 @@ def _gained(designed: Member, before: Member | None) -> tuple[str, ...]:
     return (f"The integral of the error that a load leaves is {times} than with today's gains.",)
 
 
-def _weighted(designed: Member, plant: TransferFunction, t: FloatArray, load: float) -> tuple[str, ...]:
+def _weight_text(designed: Member, plant: TransferFunction, t: FloatArray, load: float) -> tuple[str, ...]:
     """Return a set-point weight under which the set-point's step overshoots less, where it overshoots much."""
     if _overshoot(designed.prediction) <= OVERSHOOT or designed.controller.setpoint_weight != 1.0:
         return ()
@@ -304,18 +304,26 @@ def _run(plant: TransferFunction, recording: Recording) -> tuple[FloatArray, flo
 
 
 def numbers_table(fit: PlantFit, signals: SignalSettings) -> Table:
-    """Return the plant's gain, lags and dead time with the ends of their 95 % intervals."""
+    """Return the plant's gain, lags and dead time with the ends of their 95 % intervals.
+
+    Parameters
+    ----------
+    fit : PlantFit
+        The fitted plant, with the region of its numbers.
+    signals : SignalSettings
+        Names the units.
+    """
     drawn = [_numbers(plant) for plant in fit.draws(DRAWS * 5, np.random.default_rng(0))]
     rows = []
     for i, (name, value) in enumerate(_numbers(fit.plant)):
         values = [one[i][1] for one in drawn if len(one) > i and one[i][0] == name]
         told = len(values) > 0.9 * len(drawn) and fit.covariance.any()
         low, high = np.quantile(values, [0.025, 0.975]) if told else (math.nan, math.nan)
-        rows.append((_titled(name, signals), f"{value:.4g}", f"{low:.4g} to {high:.4g}" if told else "not told"))
+        rows.append((_title(name, signals), f"{value:.4g}", f"{low:.4g} to {high:.4g}" if told else "not told"))
     return Table(header=("fitted plant", "value", "95 %"), rows=tuple(rows))
 
 
-def _titled(name: str, signals: SignalSettings) -> str:
+def _title(name: str, signals: SignalSettings) -> str:
     if name.startswith("gain"):
         return ratio_title(name, signals.y_unit, f"{signals.u_unit} s" if "integrator" in name else signals.u_unit)
     return name

@@ -16,15 +16,15 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 
 from autotune.arrays import FloatArray
-from autotune.outputs import write_whole
 from autotune.report.chart import Chart, Scatter
+from autotune.report.page_shell import CHARTS, SHELL, TABLES
 from autotune.text_files import shown
+from autotune.whole_files import write_whole
 
 Tone: TypeAlias = Literal["good", "warn", "bad"]
 
 #: Colours told apart in print and by colour-blind readers (Okabe & Ito), legible on white and on black.
 BLUE, ORANGE, GREEN, RED, GREY, PURPLE = "#3b82c4", "#d98200", "#0d9a72", "#d1495b", "#8a8a8a", "#a467b0"
-
 
 #: Rows of a table from which on it can be sorted and filtered.
 _MANY = 12
@@ -136,7 +136,15 @@ def thinned(t: FloatArray, y: FloatArray, points: int = 3000) -> tuple[FloatArra
 
 
 def lines_figure(x_title: str, y_title: str, *, log_x: bool = False, log_y: bool = False) -> Chart:
-    """Return an empty chart with titled axes, for traces to be added."""
+    """Return an empty chart with titled axes, for traces to be added.
+
+    Parameters
+    ----------
+    x_title, y_title : str
+        With units.
+    log_x, log_y : bool
+        Whether the axis is logarithmic.
+    """
     figure = Chart()
     figure.update_xaxes(title=x_title, type="log" if log_x else "linear")
     figure.update_yaxes(title=y_title, type="log" if log_y else "linear")
@@ -154,7 +162,25 @@ def add_line(
     width: float = 1.6,
     **place: Any,
 ) -> None:
-    """Add a curve; ``place`` takes plotly's ``row`` and ``col`` and trace settings such as ``showlegend``."""
+    """Add a curve.
+
+    Parameters
+    ----------
+    figure : Chart
+        The chart, changed in place.
+    x, y : (N,) array
+        The curve, in the axes' units; NaN interrupts it.
+    name : str
+        In the legend.
+    colour : str
+        As of CSS.
+    dash : str
+        As of plotly.
+    width : float
+        Of the line [px].
+    **place : object
+        ``row`` and ``col``, and settings of plotly's scatter such as ``showlegend``.
+    """
     at = {key: place.pop(key) for key in ("row", "col") if key in place}
     trace = Scatter(x=x, y=y, name=name, mode="lines", line={"color": colour, "dash": dash, "width": width}, **place)
     figure.add_trace(trace, **at)
@@ -183,11 +209,11 @@ def write_page(page: Page, path: str | os.PathLike[str]) -> None:
     for i, section in enumerate(page.sections):
         body.append(_section(section, i))
     drawn = any(section.figures for section in page.sections)
-    charts = _CHARTS.replace("@PLOTLY@", _plotly()) if drawn else ""
-    tables = _TABLES if any("class=many" in part for part in body) else ""
+    charts = CHARTS.replace("@PLOTLY@", _plotly()) if drawn else ""
+    tables = TABLES if any("class=many" in part for part in body) else ""
     parts = {"TITLE": _text(page.title), "BODY": "\n".join(body), "CHARTS": tables + charts}
     # in one pass: what a part says is never looked at for the name of another
-    write_whole(path, re.sub("@(TITLE|BODY|CHARTS)@", lambda found: parts[found[1]], _SHELL))
+    write_whole(path, re.sub("@(TITLE|BODY|CHARTS)@", lambda found: parts[found[1]], SHELL))
 
 
 @functools.cache
@@ -301,121 +327,3 @@ def _swatch(trace: Mapping[str, Any]) -> str:
     colour = line.get("color", GREY)
     stroke = f'stroke="{colour}" stroke-width="2.4" stroke-dasharray="{dash}"'
     return f'<svg viewBox="0 0 26 10"><path d="M0 5H26" {stroke}/></svg>'
-
-
-_SHELL = """<!doctype html>
-<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
-<title>@TITLE@</title>
-<style>
-:root { color-scheme: light dark; --ink: #1c1f23; --paper: #fff; --faint: #667; --line: #d5d8de; --card: #f6f7f9; }
-@media (prefers-color-scheme: dark) {
-  :root { --ink: #e4e6ea; --paper: #15171a; --faint: #9aa1ad; --line: #363b43; --card: #1e2126; } }
-* { box-sizing: border-box; }
-body { margin: 0 auto; max-width: 1180px; padding: 1.2rem clamp(0.7rem, 3vw, 2.2rem) 4rem; color: var(--ink);
-  background: var(--paper); font: 16px/1.55 system-ui, "Segoe UI", Roboto, "Helvetica Neue", Arial, sans-serif; }
-h1 { font-size: 1.65rem; line-height: 1.25; margin: 0.6rem 0 0.8rem; }
-h2 { font-size: 1.2rem; margin: 2.4rem 0 0.5rem; padding-top: 0.5rem; border-top: 1px solid var(--line); }
-p { max-width: 78ch; margin: 0.5rem 0; }
-.verdict { font-size: 1.1rem; font-weight: 600; padding: 0.7rem 1rem; border-left: 6px solid; background: var(--card); }
-.good { border-color: #0d9a72; } .warn { border-color: #d98200; } .bad { border-color: #d1495b; }
-nav { display: flex; flex-wrap: wrap; gap: 0.3rem 1rem; margin: 1rem 0; font-size: 0.93rem; }
-a { color: inherit; }
-.wide { overflow-x: auto; margin: 0.8rem 0; }
-table { border-collapse: collapse; font-variant-numeric: tabular-nums; font-size: 0.93rem; }
-.caption { color: var(--faint); font-size: 0.93rem; margin-top: 1.2rem; }
-th, td { text-align: left; padding: 0.3rem 0.9rem 0.3rem 0; border-bottom: 1px solid var(--line); vertical-align: top; }
-th { font-weight: 600; } th button { all: unset; cursor: pointer; }
-th button:focus-visible { outline: 2px solid var(--faint); }
-th[aria-sort="ascending"] button::after { content: " \\2191"; }
-th[aria-sort="descending"] button::after { content: " \\2193"; }
-.sought { font: inherit; padding: 0.25rem 0.6rem; margin-top: 0.6rem; width: min(100%, 22rem); }
-@media print { .sought { display: none; } }
-.answers { display: grid; gap: 0.8rem; margin: 1rem 0; }
-.answers { grid-template-columns: repeat(auto-fit, minmax(min(17rem, 100%), 1fr)); }
-.answers div { background: var(--card); padding: 0.6rem 0.9rem; border-radius: 6px; }
-.answers dt { color: var(--faint); font-size: 0.86rem; } .answers dd { margin: 0.15rem 0 0; overflow-wrap: anywhere; }
-.square { width: min(100%, 560px); aspect-ratio: 1; } .small { width: 100px; height: 28px; }
-.chain { margin: 1.1rem 0; } .chain svg { width: 100%; height: auto; display: block; } .upright { display: none; }
-.chain rect { fill: var(--card); stroke: var(--line); stroke-width: 1.5; } .chain text { fill: var(--ink); }
-.chain rect.lit { fill: #d9820033; stroke: #d98200; stroke-width: 3; } .chain rect.may { stroke: #d98200; }
-.chain rect.added { stroke-dasharray: 6 4; } .chain .small-print { fill: var(--faint); font-size: 12px; }
-.chain .note { font-weight: 600; } .wire { stroke: var(--faint); stroke-width: 1.5; } .tip { fill: var(--faint); }
-details { margin: 0.8rem 0; } summary { cursor: pointer; color: var(--faint); font-size: 0.93rem; }
-.legend { display: flex; flex-wrap: wrap; gap: 0.1rem 0.4rem; }
-.legend button { all: unset; cursor: pointer; font-size: 0.86rem; padding: 0.1rem 0.4rem; border-radius: 4px; }
-.legend button:focus-visible { outline: 2px solid var(--faint); } .legend button[aria-pressed="false"] { opacity: 0.4; }
-.legend svg { width: 26px; height: 10px; margin-right: 0.4rem; fill: none; }
-figure { margin: 1.1rem 0 1.6rem; } figcaption { color: var(--faint); font-size: 0.9rem; max-width: 84ch; }
-@media (max-width: 760px) { .lying { display: none; } .upright { display: block; } }
-@media (max-width: 520px) { body { font-size: 15px; } h1 { font-size: 1.35rem; } table { font-size: 0.85rem; }
-  td, th { padding-right: 0.45rem; } }
-</style>
-</head>
-<body><main>
-@BODY@
-</main>
-@CHARTS@</body></html>
-"""
-
-_TABLES = """<script>
-const value = (row, at) => row.cells[at].textContent.trim();
-for (const table of document.querySelectorAll("table.many")) {
-  const body = table.tBodies[0], heads = [...table.tHead.rows[0].cells];
-  heads.forEach((head, at) => head.firstChild.addEventListener("click", () => {
-    const up = head.getAttribute("aria-sort") !== "ascending";
-    heads.forEach(one => one.removeAttribute("aria-sort"));
-    head.setAttribute("aria-sort", up ? "ascending" : "descending");
-    const rows = [...body.rows].map(row => [value(row, at), parseFloat(value(row, at)), row]);
-    const order = ([a, x], [b, y]) => isNaN(x) || isNaN(y) ? isNaN(x) - isNaN(y) || a.localeCompare(b) : x - y;
-    rows.sort((a, b) => up ? order(a, b) : order(b, a));
-    body.append(...rows.map(([, , row]) => row));
-  }));
-  table.parentElement.previousElementSibling.addEventListener("input", event => {
-    const words = event.target.value.toLowerCase().split(/\\s+/);
-    for (const row of body.rows) row.hidden = !words.every(word => row.textContent.toLowerCase().includes(word));
-  });
-}
-</script>
-"""
-
-_CHARTS = """<noscript><p>The charts need JavaScript, all of which is in this file; no request is sent.</p></noscript>
-<script type="text/plain" id="plotly">@PLOTLY@</script>
-<script>
-const own = id => JSON.parse(document.querySelector(`[data-chart="${id}"]`).textContent);
-const ink = () => ({"font.color": getComputedStyle(document.body).color, "font.family": "inherit"});
-async function unpacked(id) {
-  const bytes = Uint8Array.from(atob(document.getElementById(id).textContent), one => one.charCodeAt(0));
-  return new Response(new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"))).text();
-}
-function narrow(layout, width) {
-  if (width > 520) return;
-  for (const key of Object.keys(layout).filter(key => /^[xy]axis/.test(key))) {
-    const axis = layout[key], part = axis.domain ? axis.domain[1] - axis.domain[0] : 1;
-    if (key[0] === "x" && axis.dtick === undefined) axis.nticks = Math.max(2, Math.floor(6 * part));
-    if (axis.title) axis.title.font = {size: 11};
-  }
-  layout.font.size = 11;
-}
-function draw(div) {
-  const {data, layout} = own(div.id);
-  layout.font = {size: 13, color: getComputedStyle(document.body).color};
-  narrow(layout, div.clientWidth);
-  return Plotly.newPlot(div, data, layout, {responsive: true, displaylogo: false, displayModeBar: false});
-}
-async function drawAll() {
-  const script = document.createElement("script");
-  script.textContent = await unpacked("plotly");
-  document.head.append(script);
-  for (const div of document.querySelectorAll(".chart")) await draw(div);
-  document.body.dataset.drawn = "yes";
-}
-drawAll();
-matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () =>
-  document.querySelectorAll(".chart").forEach(div => Plotly.relayout(div, ink())));
-document.querySelectorAll(".legend button").forEach(button => button.addEventListener("click", () => {
-  const shown = button.getAttribute("aria-pressed") !== "true";
-  button.setAttribute("aria-pressed", shown);
-  Plotly.restyle(button.dataset.of, {visible: shown}, button.dataset.traces.split(",").map(Number));
-}));
-</script>
-"""

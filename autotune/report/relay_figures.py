@@ -18,7 +18,8 @@ from autotune.identification.reduction import ReducedModel
 from autotune.models import TransferFunction
 from autotune.points import FrequencyPoint
 from autotune.report.chart import make_subplots
-from autotune.report.figures import Curve, bode_figure, nichols_figure, sensitivity_figure
+from autotune.report.figures import Curve, bode_figure
+from autotune.report.loop_diagrams import nichols_figure, sensitivity_figure
 from autotune.report.page import BLUE, GREEN, ORANGE, PURPLE, RED, Figure, Page, Section, add_line
 from autotune.report.relay_tables import PAPER_PI, Law, bandwidth_words, feedback, printed_tables, tables
 
@@ -144,10 +145,10 @@ def step_responses(
     """
     law = _rational(controller)
     fine = 2.0 * half_s / _STEPS / _SUBSTEPS
-    b, a = _sampled(plant, fine, "zoh")
-    d, c = _sampled(law, fine, "bilinear")
+    b, a = _sample(plant, fine, "zoh")
+    d, c = _sample(law, fine, "bilinear")
     of_setpoint = TransferFunction(num=controller.T, den=controller.S) if isinstance(controller, RST) else law
-    wanted = np.cumsum(_sampled(of_setpoint, fine, "bilinear")[0])  # T of a set-point that is 1 from the first row on
+    wanted = np.cumsum(_sample(of_setpoint, fine, "bilinear")[0])  # T of a set-point that is 1 from the first row on
     b = np.concatenate([np.zeros(round(plant.delay_s / fine)), b])
     y, u, count = np.zeros(_STEPS * _SUBSTEPS + 1), np.zeros(_STEPS * _SUBSTEPS + 1), _STEPS * _SUBSTEPS + 1
     at_plant, at_input = np.zeros(count), 0.0
@@ -166,7 +167,7 @@ def half_of_largest(u: FloatArray) -> float:
     return float(0.5 * u[int(np.argmax(np.abs(u)))])
 
 
-def _sampled(
+def _sample(
     system: TransferFunction, step_s: float, method: Literal["zoh", "bilinear"]
 ) -> tuple[FloatArray, FloatArray]:
     """Return numerator and denominator in ascending powers of the delay operator, dead time left out."""

@@ -45,7 +45,17 @@ def feedback(law: Law) -> Controller:
 
 
 def crossing(plant: TransferFunction, level: float, omega: FloatArray) -> float:
-    """Return the highest frequency at which abs(H) falls through a level [rad/s]; NaN where the grid shows none."""
+    """Return the highest frequency at which abs(H) falls through a level [rad/s]; NaN where the grid shows none.
+
+    Parameters
+    ----------
+    plant : TransferFunction
+        H, time in s.
+    level : float
+        The gain [y unit/u unit].
+    omega : (N,) array
+        Angular frequencies [rad/s], ascending.
+    """
     gain = np.abs(plant.response(omega)) / level
     above = np.flatnonzero(gain >= 1.0)
     if above.size == 0 or above[-1] == omega.size - 1:
@@ -101,7 +111,17 @@ def asymptotic_bandwidth(plant: TransferFunction, noise_gain: float, omega: Floa
 
 
 def bandwidth_words(plant: TransferFunction, noise_gain: float, omega: FloatArray) -> str:
-    """Return (26) and the limit on the plant itself in a sentence; empty where there is neither."""
+    """Return (26) and the limit on the plant itself in a sentence; empty where there is neither.
+
+    Parameters
+    ----------
+    plant : TransferFunction
+        H, time in s.
+    noise_gain : float
+        N_max [u unit/y unit].
+    omega : (N,) array
+        Angular frequencies [rad/s], ascending.
+    """
     line, limit = asymptotic_bandwidth(plant, noise_gain, omega), bandwidth_limit(plant, noise_gain, omega)
     words = (
         []
@@ -140,7 +160,7 @@ def tables(
     second = Table(
         caption=f"Margins on {plant_name}.",
         header=("", *columns),
-        rows=tuple((name, *(_shown(column[i]) for column in columns.values())) for i, name in enumerate(_ROWS_2)),
+        rows=tuple((name, *(_as_text(column[i]) for column in columns.values())) for i, name in enumerate(_ROWS_2)),
     )
     return (
         Section(title="Table I: the reduced model", tables=(first,)),
@@ -224,7 +244,7 @@ def _printed_2(of_paper: Mapping[str, Margins], rebuilt: RST, own: Mapping[str, 
         columns[f"{name}, printed"] = (*p[:5], None, *p[5:])
         columns[f"{name}, recomputed"] = _row_2(law, of_paper[name])
     columns |= {f"{name}, own": values for name, values in own.items()}
-    rows = tuple((name, *(_shown(column[i]) for column in columns.values())) for i, name in enumerate(_ROWS_2))
+    rows = tuple((name, *(_as_text(column[i]) for column in columns.values())) for i, name in enumerate(_ROWS_2))
     norm, of_pi = of_paper["RST"].h2, of_paper["PI"].h2
     return Section(
         title="Table II: the controllers",
@@ -265,7 +285,7 @@ def _printed_text(
             Table(
                 header=("[rad/s]", "printed", "recomputed", "own"),
                 rows=tuple(
-                    (name, f"{printed:g}", _shown(again), _shown(mine))
+                    (name, f"{printed:g}", _as_text(again), _as_text(mine))
                     for printed, (name, again, mine) in zip(PRINTED_TEXT, values, strict=True)
                 ),
             ),
@@ -283,5 +303,5 @@ def _row_2(law: Law, m: Margins) -> tuple[float | None, ...]:
     return (K, Ti, m.modulus, *rest)
 
 
-def _shown(value: float | None) -> str:
+def _as_text(value: float | None) -> str:
     return "" if value is None or math.isnan(value) else f"{value:.4g}"

@@ -2,30 +2,24 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import Literal
-
-import numpy as np
 
 from autotune.config.procedure import SignalSettings
 from autotune.controller import PIDController
 from autotune.diagnosis.result import Diagnosis
-from autotune.experiment.judgement import Verification, smoothed
+from autotune.experiment.judgement import Verification
 from autotune.experiment.leaving import sentence
-from autotune.experiment.result import ExperimentResult, Segment
-from autotune.experiment.step_test import StepTest
-from autotune.experiment.sweep_warnings import relative_sd
-from autotune.identification.sweep_adequacy import TESTS
-from autotune.identification.sweep_estimate import LEVEL
 from autotune.pipeline import Analysis, Tuning
 from autotune.pipeline.deployment import Deployment
 from autotune.recording import Recording
-from autotune.report.analysis_sections import analysis_sections, based_on, designed_text, gains_text, margins_sentence
-from autotune.report.chart import Chart, make_subplots
-from autotune.report.figures import axis_title, ratio_title, recording_figure
+from autotune.report.analysis_sections import analysis_sections
+from autotune.report.analysis_words import based_on, designed_text, gains_text, margins_sentence
+from autotune.report.experiment_section import experiment_section
+from autotune.report.figures import ratio_title, recording_figure
 from autotune.report.outlook import model_figures, numbers_table, outlook_section
-from autotune.report.page import BLUE, GREEN, GREY, ORANGE, PURPLE, RED, Figure, Page, Section, Table, add_line, thinned
+from autotune.report.page import Figure, Page, Section, Table
+from autotune.report.verification_section import verification_section
 
 
 def run_page(
@@ -55,13 +49,13 @@ def run_page(
         Whether the rig's simulated twin took its place.
     """
     experiment, verification = tuning.experiment, tuning.verification
-    sections = [] if verification is None else [_verification_section(verification, signals)]
+    sections = [] if verification is None else [verification_section(verification, signals)]
     if diagnosis is not None:
         sections.append(_diagnosis_section(diagnosis))
     if verification is None:
         sections += outlook_section(tuning.analysis, signals, tuning.old_controller)
     sections += reversed(analysis_sections(tuning.analysis, signals, experiment))
-    sections.append(_experiment_section(recordings, experiment, signals))
+    sections.append(experiment_section(recordings, experiment, signals))
     sections += _warnings_sections((*experiment.warnings, *tuning.analysis.warnings))
     verdict, good = _verdict(tuning, signals, dry_run)
     return Page(
@@ -190,7 +184,7 @@ def deployment_page(name: str, signals: SignalSettings, done: Deployment) -> Pag
         answers=(("What to do", _next_step(verification)),),
         sections=(
             Section(title="Gains", tables=(gains,)),
-            *((_verification_section(verification, signals),) if verification is not None else ()),
+            *((verification_section(verification, signals),) if verification is not None else ()),
         ),
     )
 
@@ -217,7 +211,7 @@ def verification_page(
         verdict=f"{said}: {gains_text(controller, signals)}; {verification.reason}; {verification.whose}.",
         tone=_tone(verification),
         answers=(("What to do", _next_step(verification)),),
-        sections=(_verification_section(verification, signals),),
+        sections=(verification_section(verification, signals),),
     )
 
 
@@ -277,148 +271,6 @@ def _answers(tuning: Tuning, signals: SignalSettings, diagnosis: Diagnosis | Non
     return ("Found", found), ("How sure", sure), ("What to do", todo)
 
 
-def _experiment_section(
-    recordings: Sequence[Recording], experiment: ExperimentResult, signals: SignalSettings
-) -> Section:
-    timing, parts = experiment.timing, experiment.parts
-    figures = []
-    for number, (recording, part) in enumerate(zip(recordings, parts, strict=True)):
-        marks = [(s.start_s, f"{i + 1}") for i, s in enumerate(experiment.segments) if s.part == number]
-        which = "The whole recording." if len(parts) == 1 else f"Sitting {number + 1}, {part.recording}."
-        figures.append(
-            Figure(
-                figure=recording_figure(recording, signals.u_unit, signals.y_unit, marks=marks),
-                caption=f"{which} Numbers mark where each limit cycle's evaluation begins.",
-                height_px=460,
-            )
-        )
-    sittings = Table(
-        header=("sitting", "recording", "points", "on the rig [s]", "ended"),
-        rows=tuple(
-            (f"{i}", part.recording, f"{part.points}", f"{part.rig_time_s:.1f}", part.ended)
-            for i, part in enumerate(parts, start=1)
-        ),
-    )
-    return Section(
-        title="The experiment",
-        text=(
-            f"The command that holds the operating point is {experiment.u_rest:.4g} ± {1.96 * experiment.u_rest_sd:.2g}"
-            f" {signals.u_unit}; the measurement's noise has a standard deviation of {experiment.noise_sd:.3g}"
-            f" {signals.y_unit}.",
-            *_together_text(experiment),
-            f"It ended because: {experiment.reason}; {sentence(experiment.output)}.",
-            f"Link latency {_milliseconds(timing.latency_s)}, lateness of the loop {_milliseconds(timing.lateness_s)},"
-            f"{_decision(timing.decision_s)}"
-            f" (median, 99 %, worst); {timing.missed} sample(s) missed, {timing.unusable} unusable.",
-        ),
-        tables=(*((sittings,) if len(parts) > 1 else ()), _dwell_table(experiment)),
-        figures=(
-            *figures,
-            Figure(
-                figure=_cycles_figure(recordings, experiment.segments, signals),
-                caption="Two periods of every limit cycle that a point was made from: y around its mean, over u.",
-                height_px=420,
-            ),
-        ),
-    )
-
-
-def _together_text(experiment: ExperimentResult) -> tuple[str, ...]:
-    """Say whether the points are of all rows together, and what the rows said of it."""
-    found = experiment.together
-    if found is None:
-        return (f"Each point is of a limit cycle of its own: {experiment.by_itself}.",) if experiment.by_itself else ()
-    tests = ", ".join(f"{what} {p:.2g}" for what, p in zip(TESTS, found.p_values, strict=True))
-    return (
-        f"The points are estimated together from all rows between {found.start_s:.4g} and {found.end_s:.4g} s. What the"
-        f" fitted equation leaves shows nothing else: the probabilities of as much by noise alone are {tests}; below"
-        f" {LEVEL / len(TESTS):.2g} each point would have been measured by itself.",
-    )
-
-
-def _dwell_table(experiment: ExperimentResult) -> Table:
-    """Return where the sweep's time went."""
-    rows = []
-    for i, one in enumerate(experiment.segments, start=1):
-        dwell = f"{one.end_s - one.start_s:.1f}"
-        cells = (f"{i}", f"{math.degrees(one.phase_rad):.0f}", f"{one.point.omega_rad_s:.3g}", f"{one.periods}", dwell)
-        rows.append((*cells, f"{100 * relative_sd(one):.2g} %"))
-    header = ("cycle", "aimed at [deg]", "ω [rad/s]", "periods", "dwell [s]", "its own rows know its point to")
-    return Table(header=header, rows=tuple(rows))
-
-
-def _decision(values: tuple[float, float, float]) -> str:
-    """Return the time from a reading to its command, where the host computes it."""
-    return f" from a reading to its command {_milliseconds(values)}" if math.isfinite(values[0]) else ""
-
-
-def _milliseconds(values: tuple[float, float, float]) -> str:
-    return " / ".join(f"{1e3 * value:.2g}" for value in values) + " ms"
-
-
-_CYCLE_COLOURS = (BLUE, ORANGE, GREEN, RED, PURPLE, GREY)
-
-
-def _cycles_figure(recordings: Sequence[Recording], segments: Sequence[Segment], signals: SignalSettings) -> Chart:
-    figure = make_subplots(rows=2, shared_xaxes=True, vertical_spacing=0.06, row_heights=[0.6, 0.4])
-    for i, segment in enumerate(sorted(segments, key=lambda segment: segment.point.omega_rad_s)):
-        period = 2 * math.pi / segment.point.omega_rad_s
-        part = recordings[segment.part].between(max(segment.start_s, segment.end_s - 2 * period), segment.end_s)
-        t = (part.t - part.t[0]) / period
-        name, colour = f"{segment.point.omega_rad_s:.3g} rad/s", _CYCLE_COLOURS[i % len(_CYCLE_COLOURS)]
-        y = part.y - np.nanmean(part.y)
-        add_line(figure, *thinned(t, y, 600), name, colour, width=1.2, row=1, col=1)
-        add_line(figure, *thinned(t, part.u, 600), name, colour, width=1.2, row=2, col=1, line_shape="hv")
-    figure.update_xaxes(title="periods", row=2, col=1)
-    figure.update_yaxes(title=axis_title("y - mean", signals.y_unit), row=1, col=1)
-    figure.update_yaxes(title=axis_title("u", signals.u_unit), row=2, col=1)
-    return figure
-
-
-def _verification_section(verification: Verification, signals: SignalSettings) -> Section:
-    measured, predicted, sd = verification.measured, verification.predicted, verification.predicted_sd
-    unit = signals.y_unit
-    rows = (
-        ("overshoot [%]", 100 * measured.overshoot, 100 * predicted.overshoot, 100 * sd.overshoot),
-        ("rise to 90 % [s]", measured.rise_s, predicted.rise_s, sd.rise_s),
-        (f"peak under load [{unit}]", measured.peak, predicted.peak, sd.peak),
-        (
-            ratio_title("H2 over the load step", f"{unit} √s" if unit else "", signals.u_unit),
-            measured.h2,
-            predicted.h2,
-            sd.h2,
-        ),
-    )
-    return Section(
-        title="Verification on the rig",
-        text=(
-            _asked(verification.test, signals),
-            _sentence(f"{verification.whose}: {verification.reason}"),
-            *((_sentence(law.sentence),) if (law := verification.running_law) is not None else ()),
-        ),
-        tables=(
-            Table(
-                header=("", "measured", "predicted", "predicted scatter (sd)"),
-                rows=tuple(
-                    (name, *(f"{value:.3g}" if math.isfinite(value) else "-" for value in values))
-                    for name, *values in rows
-                    if any(map(math.isfinite, values))
-                ),
-                caption="Of the smoothed responses; what is left of the noise is in the scatter.",
-            ),
-        ),
-        figures=(
-            Figure(
-                figure=_step_figure(verification, signals),
-                caption="Measured loop and the band that holds 95 % of what plant uncertainty and noise predict:"
-                f" set-point step on the left half, {'load step' if _has_load(verification.test) else 'and back'}"
-                " on the right.",
-                height_px=500,
-            ),
-        ),
-    )
-
-
 def _diagnosis_section(found: Diagnosis) -> Section:
     following = found.next_experiment
     text = [*found.sentences]
@@ -443,46 +295,6 @@ def _diagnosis_section(found: Diagnosis) -> Section:
         links=(("The whole diagnosis, with its pictures", "diagnosis/report.html"),),
         tables=(effects,) if found.effects else (),
     )
-
-
-def _sentence(text: str) -> str:
-    return f"{text[0].upper()}{text[1:]}."
-
-
-def _asked(test: StepTest, signals: SignalSettings) -> str:
-    step = f"Set-point step of {test.setpoint[0]:.3g} {signals.y_unit}"
-    if not _has_load(test):
-        return f"{step}, then back; no load was tried, as none is mapped in [rig]."
-    return f"{step}, then a load of {test.disturbance[-1]:.3g} {signals.u_unit} added to the command."
-
-
-def _has_load(test: StepTest) -> bool:
-    return float(test.disturbance[-1]) != 0.0
-
-
-def _step_figure(verification: Verification, signals: SignalSettings) -> Chart:
-    test, prediction = verification.test, verification.prediction
-    figure = make_subplots(rows=2, cols=1, shared_xaxes=True, vertical_spacing=0.06, row_heights=[0.65, 0.35])
-    edge = slice(None, None, max(1, test.t.size // 600))
-    add_line(figure, test.t[edge], prediction.low[edge], "low", GREEN, width=0.4, row=1, col=1, showlegend=False)
-    add_line(
-        figure, test.t[edge], prediction.high[edge], "95 % band", GREEN, width=0.4, row=1, col=1,
-        fill="tonexty", fillcolor="rgba(13,154,114,0.18)",
-    )  # fmt: skip
-    add_line(figure, *thinned(test.t, verification.y), "measured", "rgba(59,130,196,0.45)", width=0.8, row=1, col=1)
-    usable = np.isfinite(verification.y)
-    filled = np.interp(test.t, test.t[usable], verification.y[usable])
-    add_line(figure, *thinned(test.t, smoothed(filled, test)), "measured, smoothed", BLUE, row=1, col=1)
-    add_line(figure, *thinned(test.t, prediction.y), "predicted", RED, row=1, col=1)
-    add_line(figure, test.t[edge], test.setpoint[edge], "set-point", GREY, dash="dash", row=1, col=1)
-    early = slice(0, max(test.disturbed_from // 10, 1))
-    rest = float(np.median(verification.u[early] - prediction.u[early]))  # the command that holds the operating point
-    add_line(figure, *thinned(test.t, verification.u - rest), "u of the law", ORANGE, width=1.0, row=2, col=1)
-    add_line(figure, *thinned(test.t, prediction.u), "predicted u", RED, row=2, col=1, showlegend=False)
-    figure.update_yaxes(title=axis_title("y - operating point", signals.y_unit), row=1, col=1)
-    figure.update_yaxes(title=axis_title("Δu", signals.u_unit), row=2, col=1)
-    figure.update_xaxes(title="time [s]", row=2, col=1)
-    return figure
 
 
 def _warnings_sections(warnings: Sequence[str]) -> tuple[Section, ...]:

@@ -186,7 +186,7 @@ def _signals(found: Diagnosis) -> Section:
     best = max(curves, key=lambda name: curves[name].explained)
     figures, rows = [], []
     for name, means in sorted(curves.items(), key=lambda pair: -pair[1].explained):
-        figure = lines_figure(_titled(name, found), f"residual [{found.search.units[1]}]")
+        figure = lines_figure(_title(name, found), f"residual [{found.search.units[1]}]")
         _add_means(figure, means, "retuned", ORANGE, search.data.noise.total_sd)
         share = "-"
         if name in after:
@@ -202,7 +202,7 @@ def _signals(found: Diagnosis) -> Section:
     return Section(title="Residual against every signal", text=(text,), tables=(table,), figures=tuple(figures))
 
 
-def _titled(name: str, found: Diagnosis) -> str:
+def _title(name: str, found: Diagnosis) -> str:
     """Return the title of a signal's axis, with its unit."""
     blocks, (u, y) = found.search.retuned.fit.model.blocks, found.search.units
     at_plant = next((b.unit for b in blocks if b.place == "actuator" and b.unit), u)
@@ -228,15 +228,31 @@ def _band(figure: go.Chart, x: FloatArray, y: FloatArray, half: FloatArray, colo
 
 
 def curve_figure(curve: Curve, found: Diagnosis) -> go.Chart:
-    """Return the picture of a description's free curve with its 95 % band."""
-    figure = lines_figure(_titled(curve.signal, found), f"missing [{curve.unit or '-'}]")
+    """Return the picture of a description's free curve with its 95 % band.
+
+    Parameters
+    ----------
+    curve : Curve
+        The curve with its standard deviation.
+    found : Diagnosis
+        Names the units.
+    """
+    figure = lines_figure(_title(curve.signal, found), f"missing [{curve.unit or '-'}]")
     _band(figure, curve.x, curve.value, 1.96 * curve.sd, GREEN)
     add_line(figure, curve.x, curve.value, "free curve", GREEN)
     return figure
 
 
 def trace_figures(found: Diagnosis, names: Sequence[str]) -> tuple[Figure, ...]:
-    """Return every recording with the retuned and the extended simulation, window by window."""
+    """Return every recording with the retuned and the extended simulation, window by window.
+
+    Parameters
+    ----------
+    found : Diagnosis
+        With its simulations.
+    names : sequence of str
+        One for each recording.
+    """
     figures, search = [], found.search
     for i, (r, name, count) in enumerate(zip(search.recordings, names, search.runs(), strict=True)):
         figure = lines_figure("t [s]", f"y [{search.units[1]}]")

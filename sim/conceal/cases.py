@@ -25,7 +25,7 @@ NUISANCE = ["actuator.offset", "environment.step_load"]
 ACTS_AT_TIMES = ("plant.hard_stop", "actuator.saturation")
 
 
-def retuned_ratio(d: Draw, sizes: tuple[float, ...], scale: Scale) -> tuple[float, Chain]:
+def _retuned_ratio(d: Draw, sizes: tuple[float, ...], scale: Scale) -> tuple[float, Chain]:
     """Rms residual of the retuned structure over the noise, and that structure."""
     physics, made = sized_effects(d, sizes, scale)
     records = [record(d, which, physics, made) for which in (0, 1)]
@@ -34,13 +34,13 @@ def retuned_ratio(d: Draw, sizes: tuple[float, ...], scale: Scale) -> tuple[floa
     return rms / d.rig.noise_sd, chain
 
 
-def search_size(d: Draw, scale: Scale, low: float, high: float) -> float:
+def _search_size(d: Draw, scale: Scale, low: float, high: float) -> float:
     """Size of a single effect at which the retuned rms residual lies in the band."""
     target = float(np.exp(d.stream(5).uniform(np.log(low), np.log(high))))
     size, below, above = 1.0, 0.0, np.inf
     for _ in range(12):
         try:
-            ratio = retuned_ratio(d, (size,), scale)[0]
+            ratio = _retuned_ratio(d, (size,), scale)[0]
         except RejectedError:
             ratio = np.inf
         if low <= ratio <= high and (abs(ratio - target) < 0.3 * (target - 1.0)):
@@ -55,19 +55,19 @@ def search_size(d: Draw, scale: Scale, low: float, high: float) -> float:
     raise RejectedError("no size of the effect has the strength")
 
 
-def sizes_for(d: Draw, scale: Scale) -> tuple[float, ...]:
+def _sizes_for(d: Draw, scale: Scale) -> tuple[float, ...]:
     """Sizes of the case's effects: by strength for one, each plainly visible alone for two."""
     if not d.effects:
         return ()
     if d.effects[0].name == "controller.law":
         return (LAW_SIZES[d.strength or "medium"],)
     if len(d.effects) == 1:
-        return (search_size(d, scale, *STRENGTHS[d.strength or "medium"]),)
+        return (_search_size(d, scale, *STRENGTHS[d.strength or "medium"]),)
     alone = [replace(d, effects=(effect,)) for effect in d.effects]
-    return tuple(search_size(one, scale, 1.12, 1.5) for one in alone)
+    return tuple(_search_size(one, scale, 1.12, 1.5) for one in alone)
 
 
-def windows_of(d: Draw, records: list[Record]) -> dict[str, list[list[float]]]:
+def _windows_of(d: Draw, records: list[Record]) -> dict[str, list[list[float]]]:
     """List the times at which an effect that acts only at times does act."""
     names = {e.name for e in d.effects}
     out: dict[str, list[list[float]]] = {}
@@ -83,7 +83,7 @@ def windows_of(d: Draw, records: list[Record]) -> dict[str, list[list[float]]]:
     return out
 
 
-def unseen_errors(d: Draw, r: Record, physics: Physics, retuned: Chain) -> dict[str, float]:
+def _unseen_errors(d: Draw, r: Record, physics: Physics, retuned: Chain) -> dict[str, float]:
     """Forecast errors of the unseen recording over its standard deviation."""
     H = round(d.rig.horizon / d.rig.Ts)
     sd = float(np.std(r.y[2 * H :]))
@@ -107,7 +107,7 @@ def make(seed: int) -> tuple[Draw, list[Record], dict[str, Any]]:
         d = draw(seed, attempt)
         try:
             scale = scale_of(d)
-            sizes = sizes_for(d, scale)
+            sizes = _sizes_for(d, scale)
             physics, made = sized_effects(d, sizes, scale)
             records = [record(d, which, physics, made) for which in (0, 1, 2)]
             return d, records, _answer(d, records, physics, made)
@@ -124,7 +124,7 @@ def _answer(d: Draw, records: list[Record], physics: Physics, made: tuple[Sized,
     nominal_ratio = float(np.sqrt(np.mean(nominal**2))) / d.rig.noise_sd
     if d.kind == "parameters" and nominal_ratio < 1.15:
         raise RejectedError("the numbers are wrong by less than shows")
-    errors = unseen_errors(d, records[2], physics, retuned)
+    errors = _unseen_errors(d, records[2], physics, retuned)
     clean = d.kind in ("exact", "coloured", "parameters")
     verdict = {"exact": "none", "coloured": "none", "parameters": "parameters", "outside": "unexplained"}
     places = {p for e in d.effects for p in (e.places if e.outside else (e.name.split(".")[0], *e.places))}
@@ -148,7 +148,7 @@ def _answer(d: Draw, records: list[Record], physics: Physics, made: tuple[Sized,
         "Ts": d.rig.Ts,
         "rows": d.rig.rows,
         "horizon": d.rig.horizon,
-        "windows": windows_of(d, records),
+        "windows": _windows_of(d, records),
         "truth_parameters": {
             **{name: getattr(physics, name) for name in ("K", "tau_actuator", "tau_plant", "tau_sensor", "delay")},
             "u_offset": physics.u_offset,
@@ -162,7 +162,17 @@ def _answer(d: Draw, records: list[Record], physics: Physics, made: tuple[Sized,
 
 
 def write(seed: int, folder: Path, answer_file: Path) -> dict[str, Any]:
-    """Write the case of one seed: model, recordings and sidecars to ``folder``, the answer to ``answer_file``."""
+    """Write the case of one seed, and its answer.
+
+    Parameters
+    ----------
+    seed : int
+        Of the case.
+    folder : Path
+        For what the tool is given.
+    answer_file : Path
+        For the answer, elsewhere.
+    """
     d, records, answer = make(seed)
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "model.toml").write_text(model_file(d.rig), encoding="utf-8")

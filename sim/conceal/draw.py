@@ -44,7 +44,15 @@ class Draw:
 
 
 def draw(seed: int, attempt: int) -> Draw:
-    """Draw kind, strength, rig, effects and excitations of one case."""
+    """Draw kind, strength, rig, effects and excitations of one case.
+
+    Parameters
+    ----------
+    seed : int
+        Of the case.
+    attempt : int
+        How many draws of it were rejected.
+    """
     rng = np.random.default_rng([seed, attempt, 0])
     # kind, strength, rig and effects stay for a few rejected draws, so that effects hard to place are not crowded out
     fixed = np.random.default_rng([seed, attempt // SAME_EFFECTS, 99])

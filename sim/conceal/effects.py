@@ -32,7 +32,15 @@ class Effect:
         return self.name.startswith("x.")
 
     def answer(self, sized: Sized, rig: str) -> dict[str, Any]:
-        """Entry of ``effects`` in the answer file."""
+        """Entry of ``effects`` in the answer file.
+
+        Parameters
+        ----------
+        sized : Sized
+            The effect at its size.
+        rig : str
+            Family of the rig.
+        """
         accept = [] if self.outside else sorted({self.name, *self.accept})
         if rig != PROCESS and self.name != "sensor.drift":  # a drifting sensor looks like a drifting load on a lag only
             accept = [name for name in accept if name != "sensor.drift"]

@@ -36,14 +36,50 @@ def six(value: float) -> float:
 
 
 def multisine(rng: np.random.Generator, t: Floats, lines: int, low: float, high: float, rms: float) -> Floats:
-    """Sinusoids of equal amplitude and random phase at frequencies spread evenly on a logarithmic scale."""
+    """Return sinusoids of equal amplitude and random phase at frequencies drawn evenly on a logarithmic scale.
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+        Source of frequencies and phases.
+    t : (N,) array
+        Time stamps [s].
+    lines : int
+        How many sinusoids.
+    low, high : float
+        Range of their frequencies [Hz].
+    rms : float
+        Of the sum.
+
+    Returns
+    -------
+    (N,) array
+        The signal.
+    """
     hertz = np.exp(rng.uniform(np.log(low), np.log(high), lines))
     phase = rng.uniform(0.0, 2.0 * np.pi, lines)
     return np.asarray(rms * np.sqrt(2.0 / lines) * np.sin(2.0 * np.pi * np.outer(t, hertz) + phase).sum(axis=1))
 
 
 def staircase(rng: np.random.Generator, t: Floats, shortest: float, longest: float, low: float, high: float) -> Floats:
-    """Piecewise constant signal: random levels held for random times."""
+    """Piecewise constant signal: random levels held for random times.
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+        Source of levels and times.
+    t : (N,) array
+        Time stamps [s].
+    shortest, longest : float
+        Range of the times [s].
+    low, high : float
+        Range of the levels.
+
+    Returns
+    -------
+    (N,) array
+        The signal.
+    """
     values = np.empty(len(t))
     begin = t[0]
     while begin <= t[-1]:
@@ -54,7 +90,19 @@ def staircase(rng: np.random.Generator, t: Floats, shortest: float, longest: flo
 
 
 def ball(rng: np.random.Generator, name: str, t: Floats, Ts: float) -> Excitation:
-    """Ball in a tube: the paper's PI with a dither on the command, or a relay."""
+    """Ball in a tube: the paper's PI with a dither on the command, or a relay.
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+        Source of what is random.
+    name : str
+        Which excitation.
+    t : (N,) array
+        Time stamps [s].
+    Ts : float
+        Sample time [s].
+    """
     r = np.full(len(t), 5.0)
     bias = 5.0 + rng.normal(0.0, 0.01)
     if name == "relay":
@@ -78,7 +126,21 @@ def ball(rng: np.random.Generator, name: str, t: Floats, Ts: float) -> Excitatio
 
 
 def servo(rng: np.random.Generator, name: str, t: Floats, Ts: float, K: float) -> Excitation:
-    """Position servo: P or PD on a square or random set-point, strong dither, or a relay."""
+    """Position servo: P or PD on a square or random set-point, strong dither, or a relay.
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+        Source of what is random.
+    name : str
+        Which excitation.
+    t : (N,) array
+        Time stamps [s].
+    Ts : float
+        Sample time [s].
+    K : float
+        The chain's gain.
+    """
     scale = 8.0 * K / 20.0  # a position the drive reaches in comfort, rad or mm
     r = np.zeros(len(t))
     if name == "relay":
@@ -111,7 +173,23 @@ def _two(rng: np.random.Generator) -> tuple[float, float]:
 
 
 def process(rng: np.random.Generator, name: str, t: Floats, Ts: float, K: float, u0: float, y0: float) -> Excitation:
-    """Level or thermal process: open-loop steps, a relay, or a PI with steps in set-point and dither."""
+    """Level or thermal process: open-loop steps, a relay, or a PI with steps in set-point and dither.
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+        Source of what is random.
+    name : str
+        Which excitation.
+    t : (N,) array
+        Time stamps [s].
+    Ts : float
+        Sample time [s].
+    K : float
+        The chain's gain.
+    u0, y0 : float
+        The operating point.
+    """
     r = np.full(len(t), y0)
     open_loop = {"kind": "open loop"}
     if name == "prbs":

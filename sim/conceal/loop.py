@@ -39,7 +39,17 @@ class Sampling(NamedTuple):
 
 @njit(cache=True)
 def interpolated(values: Floats, k: int, back: float) -> float:
-    """Sequence at ``back`` rows before row k, linear between rows."""
+    """Return a sequence some rows before row k, linear between rows.
+
+    Parameters
+    ----------
+    values : (N,) array
+        The sequence, known up to row k.
+    k : int
+        The row of now.
+    back : float
+        How many rows before it.
+    """
     position = max(k - back, 0.0)
     i = int(position)
     if i >= k:
@@ -49,7 +59,23 @@ def interpolated(values: Floats, k: int, back: float) -> float:
 
 @njit(cache=True)
 def measure(k: int, clean: Floats, command: float, sampling: Sampling, last: float, p: Physics) -> float:
-    """Row k as the sensor's electronics give it."""
+    """Return row k as the sensor's electronics give it.
+
+    Parameters
+    ----------
+    k : int
+        The row.
+    clean : (N,) array
+        The chain's output about its offset, known up to row k.
+    command : float
+        Of now.
+    sampling : Sampling
+        Stamps and errors of every row.
+    last : float
+        The reading before.
+    p : Physics
+        Truth of the rig.
+    """
     t = sampling.t[k]
     back = p.clock_error * max(t, 0.0) / sampling.Ts
     y = interpolated(clean, k, back)
@@ -72,7 +98,27 @@ def measure(k: int, clean: Floats, command: float, sampling: Sampling, last: flo
 def control(
     k: int, r: float, y: float, dither: float, memory: Floats, side: Floats, law: Law, Ts: float, sign: float
 ) -> float:
-    """One row of the control law; ``memory`` = (integral, last y, filtered slope), ``side`` the relay's past."""
+    """Return the command of one row of the control law.
+
+    Parameters
+    ----------
+    k : int
+        The row.
+    r, y : float
+        Set-point and reading.
+    dither : float
+        Added to the command.
+    memory : (3,) array
+        Integral, last y, filtered slope; changed in place.
+    side : (N,) array
+        The relay's past; changed in place.
+    law : Law
+        The control law.
+    Ts : float
+        Sample time [s].
+    sign : float
+        Of the plant's gain.
+    """
     if law.kind == OPEN_LOOP:
         return dither
     error = r - y

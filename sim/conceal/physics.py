@@ -101,7 +101,17 @@ class Physics(NamedTuple):
 
 @njit(cache=True)
 def command_static(du: float, before: float, p: Physics) -> float:
-    """Apply the actuator's static and memory effects to one new command; it put out ``before`` until now."""
+    """Return what an actuator's static and memory effects make of one new command.
+
+    Parameters
+    ----------
+    du : float
+        The command about its offset.
+    before : float
+        What the actuator put out until now.
+    p : Physics
+        Truth of the rig.
+    """
     e = du + p.command_offset + p.command_second_order * du * du
     if p.command_quantum > 0.0:
         e = p.quantum_origin + p.command_quantum * np.round((e - p.quantum_origin) / p.command_quantum)
@@ -117,7 +127,15 @@ def command_static(du: float, before: float, p: Physics) -> float:
 
 @njit(cache=True)
 def load(t: float, p: Physics) -> float:
-    """Load on the plant in units of the command."""
+    """Load on the plant in units of the command.
+
+    Parameters
+    ----------
+    t : float
+        Time since the first row [s].
+    p : Physics
+        Truth of the rig.
+    """
     w = p.load_rate * max(t, 0.0)
     if p.load_start <= t < p.load_end:
         w += p.load_step
@@ -128,7 +146,17 @@ def load(t: float, p: Physics) -> float:
 
 @njit(cache=True)
 def drive(t: float, s: Floats, p: Physics) -> float:
-    """Everything that pushes the plant except its own damping and dry friction, in units of K times the command."""
+    """Everything that pushes the plant except its own damping and dry friction, in units of K times the command.
+
+    Parameters
+    ----------
+    t : float
+        Time since the first row [s].
+    s : (10,) array
+        State.
+    p : Physics
+        Truth of the rig.
+    """
     x = s[POSITION]
     gain = 1.0 + p.gain_rate * max(t, 0.0) + p.gain_slope * x
     if p.switching_gain != 0.0 and np.floor(t / p.switching_period) % 2 == 1:
@@ -145,7 +173,15 @@ def drive(t: float, s: Floats, p: Physics) -> float:
 
 @njit(cache=True)
 def loss(v: float, p: Physics) -> float:
-    """Damping of an integrating rig's speed, or outflow and heat loss of a process."""
+    """Damping of an integrating rig's speed, or outflow and heat loss of a process.
+
+    Parameters
+    ----------
+    v : float
+        Speed, or level about the operating point.
+    p : Physics
+        Truth of the rig.
+    """
     if p.head > 0.0:  # square-root outflow with the head at the operating point, same slope there
         return float(2.0 * p.head * (np.sqrt(max(1.0 + v / p.head, 0.0)) - 1.0))
     r = v + p.drag * abs(v) * v
@@ -157,7 +193,25 @@ def loss(v: float, p: Physics) -> float:
 
 @njit(cache=True)
 def derivative(t: float, s: Floats, e: float, direction: float, mode: int, p: Physics, out: Floats) -> None:
-    """Time derivative of the chain's state into ``out``; ``direction`` is the sign dry friction opposes."""
+    """Write the time derivative of the chain's state.
+
+    Parameters
+    ----------
+    t : float
+        Time since the first row [s].
+    s : (10,) array
+        State.
+    e : float
+        What the actuator is asked for.
+    direction : float
+        Sign that dry friction opposes.
+    mode : int
+        Free, stuck or stopped.
+    p : Physics
+        Truth of the rig.
+    out : (10,) array
+        Takes the derivative.
+    """
     out[:] = 0.0
     w = e
     if p.extra_lag > 0.0:
@@ -195,7 +249,15 @@ def derivative(t: float, s: Floats, e: float, direction: float, mode: int, p: Ph
 
 @njit(cache=True)
 def chain_output(s: Floats, p: Physics) -> float:
-    """Give what reaches the sensor's electronics, about the output offset."""
+    """Give what reaches the sensor's electronics, about the output offset.
+
+    Parameters
+    ----------
+    s : (10,) array
+        State.
+    p : Physics
+        Truth of the rig.
+    """
     if p.extra_sensor_lag > 0.0:
         return float(s[EXTRA_SENSOR])
     if p.tau_sensor > 0.0:
@@ -209,20 +271,20 @@ def chain_output(s: Floats, p: Physics) -> float:
 
 
 @njit(cache=True)
-def rk4(t: float, h: float, s: Floats, ramp: Floats, direction: float, mode: int, p: Physics, work: Floats) -> Floats:
+def _rk4(t: float, h: float, s: Floats, ramp: Floats, direction: float, mode: int, p: Physics, work: Floats) -> Floats:
     """One classical Runge-Kutta step; ``ramp`` = (value at start, target, start time) of the command."""
     k1, k2, k3, k4 = work[0], work[1], work[2], work[3]
-    derivative(t, s, command_at(t, ramp, p), direction, mode, p, k1)
-    e = command_at(t + 0.5 * h, ramp, p)
+    derivative(t, s, _command_at(t, ramp, p), direction, mode, p, k1)
+    e = _command_at(t + 0.5 * h, ramp, p)
     derivative(t + 0.5 * h, s + 0.5 * h * k1, e, direction, mode, p, k2)
     derivative(t + 0.5 * h, s + 0.5 * h * k2, e, direction, mode, p, k3)
-    derivative(t + h, s + h * k3, command_at(t + h, ramp, p), direction, mode, p, k4)
+    derivative(t + h, s + h * k3, _command_at(t + h, ramp, p), direction, mode, p, k4)
     out: Floats = s + h / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
     return out
 
 
 @njit(cache=True)
-def command_at(t: float, ramp: Floats, p: Physics) -> float:
+def _command_at(t: float, ramp: Floats, p: Physics) -> float:
     """Command after the rate limit: from the value it had towards the target, never faster than the limit."""
     if p.rate_limit == np.inf:
         return float(ramp[1])
@@ -232,7 +294,19 @@ def command_at(t: float, ramp: Floats, p: Physics) -> float:
 
 @njit(cache=True)
 def crossing(s: Floats, direction: float, mode: int, p: Physics) -> float:
-    """Event function: positive while the present mode lasts."""
+    """Event function: positive while the present mode lasts.
+
+    Parameters
+    ----------
+    s : (10,) array
+        State.
+    direction : float
+        Sign that dry friction opposes.
+    mode : int
+        Free, stuck or stopped.
+    p : Physics
+        Truth of the rig.
+    """
     moves = s[POSITION] if p.integrating > 0.0 else s[SPEED]
     to_stop = p.stop_sign * (p.stop - moves) if p.stop != np.inf else np.inf
     if mode == FREE and p.breakaway > 0.0:
@@ -241,7 +315,7 @@ def crossing(s: Floats, direction: float, mode: int, p: Physics) -> float:
 
 
 @njit(cache=True)
-def leaves(t: float, s: Floats, mode: int, p: Physics) -> bool:
+def _leaves(t: float, s: Floats, mode: int, p: Physics) -> bool:
     """Whether a stuck or stopped body starts to move."""
     d = drive(t, s, p)
     if mode == STUCK:
@@ -253,9 +327,23 @@ def leaves(t: float, s: Floats, mode: int, p: Physics) -> bool:
 
 @njit(cache=True)
 def settle(t: float, s: Floats, direction: float, mode: int, p: Physics) -> tuple[float, int]:
-    """Mode and direction just after an event; the state is put exactly on the event."""
+    """Mode and direction just after an event; the state is put exactly on the event.
+
+    Parameters
+    ----------
+    t : float
+        Time since the first row [s].
+    s : (10,) array
+        State, changed in place.
+    direction : float
+        Sign that dry friction opposed before.
+    mode : int
+        The mode before.
+    p : Physics
+        Truth of the rig.
+    """
     if mode != FREE:
-        if not leaves(t, s, mode, p):
+        if not _leaves(t, s, mode, p):
             return direction, mode
         return float(np.sign(drive(t, s, p))), FREE
     body = POSITION if p.integrating > 0.0 else SPEED
@@ -266,7 +354,7 @@ def settle(t: float, s: Floats, direction: float, mode: int, p: Physics) -> tupl
         return direction, STOPPED
     if p.breakaway > 0.0 and direction * s[SPEED] <= 1e-12:
         s[SPEED] = 0.0
-        if leaves(t, s, STUCK, p):
+        if _leaves(t, s, STUCK, p):
             return float(np.sign(drive(t, s, p))), FREE
         return direction, STUCK
     return direction, FREE
@@ -276,21 +364,41 @@ def settle(t: float, s: Floats, direction: float, mode: int, p: Physics) -> tupl
 def advance(
     t: float, end: float, h: float, s: Floats, ramp: Floats, direction: float, mode: int, p: Physics, work: Floats
 ) -> tuple[float, int]:
-    """Integrate the state in place from t to end in steps of at most h, locating every event on the way."""
+    """Integrate the state in place from t to end in steps of at most h, locating every event on the way.
+
+    Parameters
+    ----------
+    t, end : float
+        From when until when [s].
+    h : float
+        Longest step [s].
+    s : (10,) array
+        State, changed in place.
+    ramp : (3,) array
+        Value at the start, target, and start time of the command.
+    direction : float
+        Sign that dry friction opposes.
+    mode : int
+        Free, stuck or stopped.
+    p : Physics
+        Truth of the rig.
+    work : (4, 10) array
+        Room to work in.
+    """
     while end - t > 1e-12 * (1.0 + abs(end)):
         step = min(h, end - t)
         if mode != FREE:
             direction, mode = settle(t, s, direction, mode, p)
-        after = rk4(t, step, s, ramp, direction, mode, p, work)
+        after = _rk4(t, step, s, ramp, direction, mode, p, work)
         if mode == FREE and crossing(after, direction, mode, p) < 0.0:
             low, high = 0.0, step
             for _ in range(BISECTIONS):
                 middle = 0.5 * (low + high)
-                if crossing(rk4(t, middle, s, ramp, direction, mode, p, work), direction, mode, p) < 0.0:
+                if crossing(_rk4(t, middle, s, ramp, direction, mode, p, work), direction, mode, p) < 0.0:
                     high = middle
                 else:
                     low = middle
-            s[:] = rk4(t, high, s, ramp, direction, mode, p, work)
+            s[:] = _rk4(t, high, s, ramp, direction, mode, p, work)
             t += high
             direction, mode = settle(t, s, direction, mode, p)
             continue

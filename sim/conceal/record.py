@@ -30,7 +30,19 @@ class Record:
 
 
 def record(d: Draw, which: int, physics: Physics, sized: tuple[Sized, ...]) -> Record:
-    """Simulate one recording with the effects at the given sizes."""
+    """Simulate one recording with the effects at the given sizes.
+
+    Parameters
+    ----------
+    d : Draw
+        The case.
+    which : int
+        Place of the recording.
+    physics : Physics
+        Truth with the effects in it.
+    sized : tuple of Sized
+        What the effects do to rows and law.
+    """
     rng = d.stream(10 + which)
     rig, ex = d.rig, d.excitations[which]
     N = rig.rows + rig.burn_in
@@ -86,7 +98,17 @@ def scale_of(d: Draw) -> Scale:
 
 
 def sized_effects(d: Draw, sizes: tuple[float, ...], scale: Scale) -> tuple[Physics, tuple[Sized, ...]]:
-    """Physics with the effects in it at the given sizes."""
+    """Physics with the effects in it at the given sizes.
+
+    Parameters
+    ----------
+    d : Draw
+        The case.
+    sizes : tuple of float
+        One for each of its effects.
+    scale : Scale
+        What they are measured in.
+    """
     physics, made = d.physics, []
     for i, (effect, size) in enumerate(zip(d.effects, sizes, strict=True)):
         sized = effect.make(size, physics, scale, d.stream(20 + i))

@@ -40,7 +40,15 @@ class Steps:
 
 
 def discretise(chain: Chain, Ts: float) -> Steps:
-    """Exact step of the chain over one sample time with the command's switch inside it."""
+    """Return the exact step of the chain over one sample time with the command's switch inside it.
+
+    Parameters
+    ----------
+    chain : Chain
+        The nominal form.
+    Ts : float
+        Sample time [s].
+    """
     lags = [(chain.tau_actuator, 1.0), (chain.tau_plant, chain.K)]
     if chain.integrating:
         lags.append((np.inf, 1.0))
@@ -109,7 +117,7 @@ def _free_runs(A: Floats, b0: Floats, b1: Floats, u: Floats, rows: int, begin: i
     return out
 
 
-def observability(steps: Steps, length: int) -> Floats:
+def _observability(steps: Steps, length: int) -> Floats:
     """Rows c A^k, shape (length, n)."""
     out: Floats = _powers(steps.A, steps.c, length)
     return out
@@ -131,17 +139,29 @@ def _powers(A: Floats, c: Floats, length: int) -> Floats:
 
 
 def residuals(chain: Chain, u: Floats, y: Floats, Ts: float, window: int) -> Floats:
-    """Residuals of free runs over whole windows, each window's starting state fitted."""
+    """Residuals of free runs over whole windows, each window's starting state fitted.
+
+    Parameters
+    ----------
+    chain : Chain
+        The nominal form.
+    u, y : (N,) array
+        Command and reading.
+    Ts : float
+        Sample time [s].
+    window : int
+        Rows of a window.
+    """
     steps = discretise(chain, Ts)
     count = len(y) // window
     runs = _free_runs(steps.A, steps.b_before, steps.b_after, u - chain.u_offset, steps.rows, 0, count, window)
     e = y[: count * window].reshape(count, window) - chain.y_offset - runs
-    q, _ = np.linalg.qr(observability(steps, window))
+    q, _ = np.linalg.qr(_observability(steps, window))
     out: Floats = (e - (e @ q) @ q.T).ravel()
     return out
 
 
-def degrees_lost(chain: Chain, window: int) -> float:
+def _degrees_lost(chain: Chain, window: int) -> float:
     """Factor that makes the rms residual of white noise its standard deviation."""
     n = 2 + int(chain.integrating) + int(chain.tau_sensor > 0.0)
     return float(np.sqrt(window / (window - n)))
@@ -162,6 +182,19 @@ def retune(
     """Refit gain, lags, delay (each within a factor of two) and one offset by damped, projected Gauss-Newton.
 
     Returns the refitted chain and its rms residual.
+
+    Parameters
+    ----------
+    nominal : Chain
+        Where it begins.
+    records : list of ((N,) array, (N,) array)
+        u and y of each recording.
+    Ts : float
+        Sample time [s].
+    window : int
+        Rows of a window.
+    tolerance : float
+        Relative decrease of the sum of squares below which it ends.
     """
     count = 4 if nominal.integrating else 5
     bound = np.full(5, np.log(2.0))
@@ -198,13 +231,25 @@ def retune(
         if gain < tolerance:
             break
     chain = _moved(nominal, at)
-    return chain, float(np.sqrt(np.mean(e**2)) * degrees_lost(nominal, window))
+    return chain, float(np.sqrt(np.mean(e**2)) * _degrees_lost(nominal, window))
 
 
 def forecast_error(chain: Chain, u: Floats, y: Floats, Ts: float, horizon: int) -> Floats:
-    """Errors of forecasts over one horizon each, started from the state fitted to the two horizons before."""
+    """Errors of forecasts over one horizon each, started from the state fitted to the two horizons before.
+
+    Parameters
+    ----------
+    chain : Chain
+        The nominal form.
+    u, y : (N,) array
+        Command and reading.
+    Ts : float
+        Sample time [s].
+    horizon : int
+        Rows of a forecast.
+    """
     steps = discretise(chain, Ts)
-    rows = observability(steps, 3 * horizon)
+    rows = _observability(steps, 3 * horizon)
     fit = np.linalg.pinv(rows[: 2 * horizon])
     errors = []
     du = u - chain.u_offset

@@ -33,65 +33,85 @@ class NominalRig:
 
 
 def nominal_rig(rng: np.random.Generator, rig: str, variant: str) -> NominalRig:
-    """Draw a nominal rig of one family."""
+    """Draw a nominal rig of one family.
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+        Source of its numbers.
+    rig : str
+        The family.
+    variant : str
+        Of a servo "mm" or "rad", of a process "thermal" or "level".
+    """
     if rig == BALL:
-        Ts = float(rng.choice([0.01, 0.02]))
-        chain = Chain(
-            integrating=True,
-            K=-65.5,
-            tau_actuator=0.016668,
-            tau_plant=0.36359,
-            tau_sensor=0.003333,
-            delay=0.0,
-            u_offset=5.0,
-            y_offset=5.0,
-        )
-        rows = int(rng.integers(4200, 5600)) if Ts == 0.01 else 3000
-        return NominalRig(
-            rig=rig,
-            variant="",
-            name="ball in tube",
-            blocks=("turbine", "ball speed", "ball height", "height sensor"),
-            output="height",
-            unit_u="V",
-            unit_y="V",
-            chain=chain,
-            Ts=Ts,
-            rows=rows,
-            burn_in=round(8.0 / Ts),
-            substeps=round(Ts / 0.001),
-            horizon=2.0,
-            noise_sd=float(rng.uniform(0.02, 0.06)),
-        )
-    if rig == SERVO:
-        in_mm = variant == "mm"
-        K = round(float(rng.uniform(45.0, 56.0)), 1) if in_mm else round(float(rng.uniform(4.2, 5.2)), 2)
-        chain = Chain(
-            integrating=True,
-            K=K,
-            tau_actuator=0.01,
-            tau_plant=round(float(rng.uniform(0.18, 0.25)), 3),
-            tau_sensor=0.0,
-            delay=0.0,
-            u_offset=0.0,
-            y_offset=0.0,
-        )
-        return NominalRig(
-            rig=rig,
-            variant=variant,
-            name="position servo",
-            blocks=("motor drive", "mass with friction", "position", "encoder"),
-            output="position",
-            unit_u="V",
-            unit_y="mm" if in_mm else "rad",
-            chain=chain,
-            Ts=0.005,
-            rows=int(rng.integers(7300, 7900)),
-            burn_in=800,
-            substeps=5,
-            horizon=1.0,
-            noise_sd=float(rng.uniform(0.0024, 0.005)) * K,
-        )
+        return _ball(rng)
+    return _servo(rng, variant) if rig == SERVO else _process(rng, variant)
+
+
+def _ball(rng: np.random.Generator) -> NominalRig:
+    Ts = float(rng.choice([0.01, 0.02]))
+    chain = Chain(
+        integrating=True,
+        K=-65.5,
+        tau_actuator=0.016668,
+        tau_plant=0.36359,
+        tau_sensor=0.003333,
+        delay=0.0,
+        u_offset=5.0,
+        y_offset=5.0,
+    )
+    rows = int(rng.integers(4200, 5600)) if Ts == 0.01 else 3000
+    return NominalRig(
+        rig=BALL,
+        variant="",
+        name="ball in tube",
+        blocks=("turbine", "ball speed", "ball height", "height sensor"),
+        output="height",
+        unit_u="V",
+        unit_y="V",
+        chain=chain,
+        Ts=Ts,
+        rows=rows,
+        burn_in=round(8.0 / Ts),
+        substeps=round(Ts / 0.001),
+        horizon=2.0,
+        noise_sd=float(rng.uniform(0.02, 0.06)),
+    )
+
+
+def _servo(rng: np.random.Generator, variant: str) -> NominalRig:
+    in_mm = variant == "mm"
+    K = round(float(rng.uniform(45.0, 56.0)), 1) if in_mm else round(float(rng.uniform(4.2, 5.2)), 2)
+    chain = Chain(
+        integrating=True,
+        K=K,
+        tau_actuator=0.01,
+        tau_plant=round(float(rng.uniform(0.18, 0.25)), 3),
+        tau_sensor=0.0,
+        delay=0.0,
+        u_offset=0.0,
+        y_offset=0.0,
+    )
+    return NominalRig(
+        rig=SERVO,
+        variant=variant,
+        name="position servo",
+        blocks=("motor drive", "mass with friction", "position", "encoder"),
+        output="position",
+        unit_u="V",
+        unit_y="mm" if in_mm else "rad",
+        chain=chain,
+        Ts=0.005,
+        rows=int(rng.integers(7300, 7900)),
+        burn_in=800,
+        substeps=5,
+        horizon=1.0,
+        noise_sd=float(rng.uniform(0.0024, 0.005)) * K,
+    )
+
+
+def _process(rng: np.random.Generator, variant: str) -> NominalRig:
     thermal = variant == "thermal"
     chain = Chain(
         integrating=False,
@@ -123,7 +143,19 @@ def nominal_rig(rng: np.random.Generator, rig: str, variant: str) -> NominalRig:
 
 
 def truth(rng: np.random.Generator, rig: NominalRig, exact: bool, offset: bool) -> Physics:
-    """Draw the rig as it is: every number within 20 % of its nominal value, the operating point shifted where asked."""
+    """Draw the rig as it is: every number within 20 % of its nominal value, the operating point shifted where asked.
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+        Source of the numbers.
+    rig : NominalRig
+        As it is believed to be.
+    exact : bool
+        Whether every number is the nominal one.
+    offset : bool
+        Whether the operating point is shifted.
+    """
     chain = rig.chain
     factors = np.ones(5) if exact else rng.uniform(0.8, 1.2, 5)
     shift = {BALL: 0.03, SERVO: 0.07, PROCESS: 0.0}[rig.rig] * float(rng.uniform(-1.0, 1.0)) if offset else 0.0

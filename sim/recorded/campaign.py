@@ -144,7 +144,7 @@ def _marked(campaign: Campaign, seed: int, before: Json, reached: float) -> Reco
         errors = answer["nrmse_unseen"]
         errors["noise"] = min(errors["noise"], reached / errors["spread"])
     said = {**said, "places": []}  # places of new names only
-    if new_names(said, before):  # what samples show is named beside something unexplained, too
+    if _new_names(said, before):  # what samples show is named beside something unexplained, too
         said = {**said, "verdict": "effect"}
     elif answer["kind"] == "clean" and not raises_alarm(said, before):
         said = {**said, "verdict": "parameters", "effects": []}
@@ -156,18 +156,34 @@ def _marked(campaign: Campaign, seed: int, before: Json, reached: float) -> Reco
 
 
 def raises_alarm(said: Json, before: Json) -> bool:
-    """Whether something is said of a changed recording that was not said of the recording as it is."""
+    """Whether something is said of a changed recording that was not said of the recording as it is.
+
+    Parameters
+    ----------
+    said : mapping
+        Of the changed recording.
+    before : mapping
+        Of the recording as it is.
+    """
     worse = said["verdict"] in ALARMS and before["verdict"] not in (*ALARMS, "effect")
-    return bool(new_names(said, before)) or worse or (said["verdict"] == "failed" != before["verdict"])
+    return bool(_new_names(said, before)) or worse or (said["verdict"] == "failed" != before["verdict"])
 
 
-def new_names(said: Json, before: Json) -> set[str]:
+def _new_names(said: Json, before: Json) -> set[str]:
     """Names of effects that were not said of the recording as it is."""
     return {str(e["name"]) for e in said["effects"]} - {str(e["name"]) for e in before["effects"]}
 
 
 def as_json(campaign: RecordedCampaign, marks: Sequence[RecordedMark]) -> Json:
-    """Return marks, what was said of the recordings as they are, and what was passed over, for ``proof.json``."""
+    """Return marks, what was said of the recordings as they are, and what was passed over, for ``proof.json``.
+
+    Parameters
+    ----------
+    campaign : RecordedCampaign
+        Its folder and rigs.
+    marks : sequence of RecordedMark
+        One for each case.
+    """
     plain = campaign.as_recorded
     return {
         "marks": [{**asdict(m.mark), "before": m.before, "not_counted": m.not_counted} for m in marks],

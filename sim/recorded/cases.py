@@ -82,7 +82,22 @@ def _pairs(records: Sequence[Record]) -> list[tuple[Floats, Floats]]:
 
 
 def changed(ready: Ready, put: Put, seed: int) -> tuple[list[Record], list[Record]]:
-    """Return the recordings that the tool is given and those kept back, with the effect in them."""
+    """Return the recordings that the tool is given and those kept back, with the effect in them.
+
+    Parameters
+    ----------
+    ready : Ready
+        The rig.
+    put : Put
+        The effect at one size.
+    seed : int
+        Of what is random in it.
+
+    Raises
+    ------
+    RefusedError
+        The command would go too far.
+    """
     count = len(ready.rig.given)
     made = [put.apply(r, np.random.default_rng([seed, 10 + i])) for i, r in enumerate(ready.rig.every)]
     if max(float(np.ptp(r.u)) for r in made) > MOST_SPAN * ready.scale.u_span:
@@ -91,14 +106,24 @@ def changed(ready: Ready, put: Put, seed: int) -> tuple[list[Record], list[Recor
 
 
 def ratio(ready: Ready, put: Put, seed: int) -> tuple[float, Floats]:
-    """Residual of the chain refitted to what is changed, over that of the recordings as they are; and its numbers."""
+    """Residual of the chain refitted to what is changed, over that of the recordings as they are; and its numbers.
+
+    Parameters
+    ----------
+    ready : Ready
+        The rig.
+    put : Put
+        The effect at one size.
+    seed : int
+        Of what is random in it.
+    """
     rig = ready.rig
     given, _ = changed(ready, put, seed)
     numbers, rms = linear.retune(rig.chain, _pairs(given), rig.Ts, ready.window, ready.numbers)
     return rms / ready.noise, numbers
 
 
-def search_size(ready: Ready, effect: Effect, strength: str, seed: int) -> Put:
+def _search_size(ready: Ready, effect: Effect, strength: str, seed: int) -> Put:
     """Return the effect at a size at which the residual has grown as the strength says.
 
     Raises
@@ -143,7 +168,15 @@ class Made:
 
 
 def make(seed: int, rigs: Sequence[Ready]) -> Made:
-    """Make the case of a seed among the rigs of a campaign."""
+    """Make the case of a seed among the rigs of a campaign.
+
+    Parameters
+    ----------
+    seed : int
+        Of the case.
+    rigs : sequence of Ready
+        Those of the campaign.
+    """
     ready, turn = rigs[seed % len(rigs)], seed // len(rigs)
     rng = np.random.default_rng([seed, 0])
     place = (STRIDE * (seed % len(rigs)) + turn) % (len(EFFECTS) + NUMBERS)
@@ -156,7 +189,7 @@ def make(seed: int, rigs: Sequence[Ready]) -> Made:
             continue
         for strength in (str(one) for one in rng.permutation(list(STRENGTHS))):
             try:
-                put = search_size(ready, effect, strength, seed)
+                put = _search_size(ready, effect, strength, seed)
                 return _made(ready, effect, strength, put, seed, passed_over)
             except RefusedError as why:
                 passed_over.append(f"{effect.name}, {strength}: {why}")
@@ -201,7 +234,15 @@ def _numbers_only(ready: Ready, place: int, rng: np.random.Generator) -> Put:
 
 
 def answer(made: Made, seed: int) -> dict[str, Any]:
-    """Return the sealed answer of a case, in the form of :mod:`sim.conceal.cases`."""
+    """Return the sealed answer of a case, in the form of :mod:`sim.conceal.cases`.
+
+    Parameters
+    ----------
+    made : Made
+        The case.
+    seed : int
+        Its seed.
+    """
     rig, effect = made.ready.rig, made.effect
     errors = _unseen_errors(made)
     values = {name: {"value": value, "unit": unit} for name, (value, unit) in made.put.parameters.items()}
@@ -260,6 +301,15 @@ def write(folder: Path, rig: Rig, given: Sequence[Record], kept_back: Sequence[R
     """Write a case as the tool is given it: model.toml, rec1.csv, rec2.csv, .., and unseen.csv where one is kept back.
 
     Sidecars stay out: the control law that they may state is not the one that gives a changed command.
+
+    Parameters
+    ----------
+    folder : Path
+        For what the tool is given.
+    rig : Rig
+        Has the model.
+    given, kept_back : sequence of Record
+        What the tool is given, and what it is marked against.
     """
     folder.mkdir(parents=True, exist_ok=True)
     shutil.copy(rig.folder / "model.toml", folder / "model.toml")
@@ -276,7 +326,19 @@ def _write(path: Path, r: Record) -> None:
 
 
 def conceal(seed: int, rigs: Sequence[Ready], folder: Path, answer_file: Path) -> None:
-    """Make the case of a seed and write it to ``folder``, the answer to ``answer_file``."""
+    """Make the case of a seed and write it, and its answer.
+
+    Parameters
+    ----------
+    seed : int
+        Of the case.
+    rigs : sequence of Ready
+        Those of the campaign.
+    folder : Path
+        For what the tool is given.
+    answer_file : Path
+        For the answer, elsewhere.
+    """
     made = make(seed, rigs)
     write(folder, made.ready.rig, made.given, made.kept_back)
     answer_file.parent.mkdir(parents=True, exist_ok=True)
@@ -284,7 +346,17 @@ def conceal(seed: int, rigs: Sequence[Ready], folder: Path, answer_file: Path) -
 
 
 def keep_as_recorded(ready: Ready, folder: Path, answer_file: Path) -> None:
-    """Write a rig's recordings as they are, as a case; its answer says what is needed to mark against it."""
+    """Write a rig's recordings as they are, as a case; its answer says what is needed to mark against it.
+
+    Parameters
+    ----------
+    ready : Ready
+        The rig.
+    folder : Path
+        For its recordings.
+    answer_file : Path
+        For the answer, elsewhere.
+    """
     rig = ready.rig
     write(folder, rig, rig.given, rig.kept_back)
     spread = _spread(rig, rig.kept_back[longest(rig.kept_back)]) if rig.kept_back else None

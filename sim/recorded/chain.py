@@ -63,11 +63,6 @@ class Chain:
         rates = rates[rates > 1e-9]
         return float(1.0 / np.min(rates)) if len(rates) else 0.0
 
-    @property
-    def passes_constants(self) -> bool:
-        """Whether a constant command reaches the output."""
-        return all(b.num[-1] != 0.0 for b in self.blocks)
-
 
 @dataclass(frozen=True, kw_only=True)
 class Steps:
@@ -98,7 +93,15 @@ def state_space(blocks: Sequence[Block]) -> tuple[Floats, Floats, Floats, float]
 
 
 def discretise(chain: Chain, Ts: float) -> Steps:
-    """Exact step of the chain over one sample time ``Ts`` [s] with the command's switch inside it."""
+    """Return the exact step of the chain over one sample time with the command's switch inside it.
+
+    Parameters
+    ----------
+    chain : Chain
+        Blocks in a row.
+    Ts : float
+        Sample time [s].
+    """
     A, b, c, d = state_space(chain.blocks)
     n = len(b)
     delay = sum(block.delay for block in chain.blocks)
@@ -141,14 +144,44 @@ def _runs(
 
 
 def free_runs(steps: Steps, u: Floats, begin: int, count: int, length: int) -> Floats:
-    """Return ``count`` free runs of ``length`` rows from zero state, shape (count, length), for commands about zero."""
+    """Return free runs from zero state, one after the other.
+
+    Parameters
+    ----------
+    steps : Steps
+        The chain's, n states.
+    u : (N,) array
+        Command about zero.
+    begin : int
+        First row.
+    count, length : int
+        Runs, and rows of each.
+
+    Returns
+    -------
+    (count, length) array
+        Outputs about their offset.
+    """
     out = np.zeros((count, length))
     _runs(steps.A, steps.before, steps.after, steps.c, steps.d, u, steps.rows, begin, out)
     return out
 
 
 def start_states(steps: Steps, length: int) -> Floats:
-    """Return what each state at a window's start adds to its readings, scaled, shape (length, n)."""
+    """Return what each state at a window's start adds to its readings, scaled.
+
+    Parameters
+    ----------
+    steps : Steps
+        The chain's, n states.
+    length : int
+        Rows of a window.
+
+    Returns
+    -------
+    (length, n) array
+        The contributions.
+    """
     rows = np.empty((length, len(steps.c)))
     row = steps.c.copy()
     for k in range(length):
@@ -159,7 +192,19 @@ def start_states(steps: Steps, length: int) -> Floats:
 
 
 def residuals(chain: Chain, u: Floats, y: Floats, Ts: float, window: int) -> Floats:
-    """Residuals of free runs over whole windows of ``window`` rows, each window's starting state fitted."""
+    """Return residuals of free runs over whole windows, each window's starting state fitted.
+
+    Parameters
+    ----------
+    chain : Chain
+        Blocks in a row.
+    u, y : (N,) array
+        Command and reading.
+    Ts : float
+        Sample time [s].
+    window : int
+        Rows of a window.
+    """
     steps = discretise(chain, Ts)
     count = len(y) // window
     e = y[: count * window].reshape(count, window) - chain.y_offset
@@ -180,7 +225,15 @@ def _free(block: Block) -> np.ndarray:
 
 
 def moved(chain: Chain, at: Floats) -> Chain:
-    """Return the chain with its numbers moved: logarithms of factors, then one offset as it is added."""
+    """Return the chain with its numbers moved.
+
+    Parameters
+    ----------
+    chain : Chain
+        Where it begins.
+    at : (P,) array
+        Logarithms of factors, then one offset as it is added.
+    """
     values, blocks = iter(at), []
     gain = math.exp(next(values))
     for block in chain.blocks:
@@ -239,7 +292,19 @@ def retune(
 
 
 def forecast_error(chain: Chain, u: Floats, y: Floats, Ts: float, horizon: int) -> Floats:
-    """Errors of forecasts over ``horizon`` rows, each from the state fitted to the two horizons before it."""
+    """Return errors of forecasts, each from the state fitted to the two horizons before it.
+
+    Parameters
+    ----------
+    chain : Chain
+        Blocks in a row.
+    u, y : (N,) array
+        Command and reading.
+    Ts : float
+        Sample time [s].
+    horizon : int
+        Rows of a forecast.
+    """
     steps = discretise(chain, Ts)
     rows = start_states(steps, 3 * horizon)
     fit = np.linalg.pinv(rows[: 2 * horizon], rcond=RANK)
@@ -253,7 +318,17 @@ def forecast_error(chain: Chain, u: Floats, y: Floats, Ts: float, horizon: int) 
 
 
 def horizon_rows(chain: Chain, Ts: float, shortest: int, shortest_kept_back: int) -> int:
-    """Rows of a forecast: a few time constants, and a share of the shortest recording at most."""
+    """Return the rows of a forecast: a few time constants, and a share of the shortest recording at most.
+
+    Parameters
+    ----------
+    chain : Chain
+        Has the time constants.
+    Ts : float
+        Sample time [s].
+    shortest, shortest_kept_back : int
+        Rows of the shortest recording of each kind.
+    """
     wanted = TIME_CONSTANTS * chain.slowest_s / Ts if chain.slowest_s > 0.0 else math.inf
     most = min(SHARE * shortest, 2.0 * SHARE * shortest_kept_back)
     return max(LEAST_ROWS, int(min(wanted, most)))

@@ -126,6 +126,11 @@ def require_no_converter(before: Sequence[Record], after: Sequence[Record]) -> N
 
     A command of few levels says no more: every effect that moves it by less than half their distance would be one.
 
+    Parameters
+    ----------
+    before, after : sequence of Record
+        The recordings as they are, and changed.
+
     Raises
     ------
     RefusedError

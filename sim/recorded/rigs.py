@@ -112,6 +112,13 @@ def find(folder: Path) -> tuple[list[Rig], dict[str, str]]:
 def read(folder: Path, name: str) -> Rig:
     """Read one rig.
 
+    Parameters
+    ----------
+    folder : Path
+        With its model and recordings.
+    name : str
+        Of the rig.
+
     Raises
     ------
     RefusedError

@@ -100,7 +100,24 @@ class Plant:
 
 
 def steps(rng: np.random.Generator, rows: int, shortest: int, longest: int, low: float, high: float) -> Floats:
-    """Return a staircase of levels drawn evenly, each held for a number of rows drawn evenly."""
+    """Return a staircase of levels drawn evenly, each held for a number of rows drawn evenly.
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+        Source of levels and times.
+    rows : int
+        Length of the signal.
+    shortest, longest : int
+        Rows that a level is held for.
+    low, high : float
+        Range of the levels.
+
+    Returns
+    -------
+    (rows,) array
+        The signal.
+    """
     found: list[float] = []
     while len(found) < rows:
         found += [float(rng.uniform(low, high))] * int(rng.integers(shortest, longest + 1))
@@ -108,7 +125,24 @@ def steps(rng: np.random.Generator, rows: int, shortest: int, longest: int, low:
 
 
 def wave(rng: np.random.Generator, rows: int, slowest: float, middle: float, size: float) -> Floats:
-    """Return a smooth measured input about a middle: five sines of some rows' period and longer."""
+    """Return a smooth measured input about a middle: five sines.
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+        Source of the phases.
+    rows : int
+        Length of the signal.
+    slowest : float
+        Period of the slowest sine, in rows.
+    middle, size : float
+        Its middle, and the root of the summed squares of the amplitudes.
+
+    Returns
+    -------
+    (rows,) array
+        The signal.
+    """
     k, found = np.arange(rows), np.full(rows, middle)
     for harmonic in range(1, 6):
         found += size / np.sqrt(5.0) * np.sin(2.0 * np.pi * harmonic * k / slowest + rng.uniform(0.0, 6.28))

@@ -41,13 +41,33 @@ class Made:
 
 
 def truth(plant: Plant, rng: np.random.Generator, spread: float = 0.08) -> Numbers:
-    """Return the true numbers: those that may be retuned lie about the nominal ones."""
+    """Return the true numbers: those that may be retuned lie about the nominal ones.
+
+    Parameters
+    ----------
+    plant : Plant
+        Has the nominal numbers.
+    rng : numpy.random.Generator
+        Source of the true ones.
+    spread : float
+        Standard deviation of their logarithms.
+    """
     free = plant.retuned
     return {n: v * float(np.exp(spread * rng.normal())) if n in free else v for n, v in plant.nominal.items()}
 
 
 def scale_of(plant: Plant, made: Made, where: str) -> Scale:
-    """Return how a clean recording moves at a place."""
+    """Return how a clean recording moves at a place.
+
+    Parameters
+    ----------
+    plant : Plant
+        Has the places.
+    made : Made
+        A clean recording with its states.
+    where : str
+        Name of the place.
+    """
     place = next((one for one in plant.places if one.name == where), None)
     speed = np.array([place.speed(x) if place else 0.0 for x in made.states.tolist()])
     position = np.array([place.position(x) if place else 0.0 for x in made.states.tolist()])

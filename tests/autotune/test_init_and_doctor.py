@@ -21,7 +21,7 @@ from autotune.config.registers import RegisterMap
 from autotune.config.rig import ModbusTcpSettings, SerialSettings, SimulatedRigSettings
 from autotune.equations.transfer_text import parse_transfer_function
 from autotune.errors import InputError
-from autotune.models import read_model
+from autotune.model_tables import read_model
 from drivers.kinds import KINDS
 from tests.benchmarks.twins import PLANTS, REACHED, TextbookPlant, run_twin
 

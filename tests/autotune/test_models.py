@@ -9,16 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from autotune.errors import InputError
-from autotune.models import (
-    Block,
-    Effect,
-    Model,
-    Parameter,
-    Port,
-    TransferFunction,
-    read_model,
-    write_model,
-)
+from autotune.model_tables import read_model, write_model
+from autotune.models import Block, Effect, Model, Parameter, Port, TransferFunction
 
 #: Le & Mendes 2010, equation (23)
 BALL = TransferFunction(num=(-65.5,), den=(2.02e-5, 0.007328, 0.3836, 1.0, 0.0))

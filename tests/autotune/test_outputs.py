@@ -13,10 +13,13 @@ from types import FrameType
 
 import pytest
 
-from autotune import outputs
+from autotune import outputs, whole_files
 from autotune.errors import InputError
-from autotune.outputs import Output, OutputFolder, append_whole, claim, write_json, write_whole
+from autotune.outputs import Output, OutputFolder, claim
 from autotune.recording import RecordingWriter, read_recording
+from autotune.whole_files import append_whole, write_json, write_whole
+
+WRITING = (outputs.__file__, whole_files.__file__)
 
 
 def test_nothing_that_exists_is_overwritten_unless_it_is_asked_for(tmp_path: Path) -> None:
@@ -222,7 +225,7 @@ def test_an_interrupt_at_any_call_leaves_a_whole_file_or_none(tmp_path: Path, wa
         calls = itertools.count()
 
         def heard(frame: FrameType, event: str, _: object) -> None:
-            if event != "return" and frame.f_code.co_filename == outputs.__file__ and next(calls) == number:
+            if event != "return" and frame.f_code.co_filename in WRITING and next(calls) == number:
                 signal.raise_signal(signal.SIGINT)
 
         sys.setprofile(heard)

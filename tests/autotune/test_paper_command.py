@@ -13,7 +13,8 @@ from typer.testing import CliRunner
 import autotune as at
 from autotune.cli import app
 from autotune.controller import PIDController, write_controller
-from autotune.models import Block, Model, Port, write_model
+from autotune.model_tables import write_model
+from autotune.models import Block, Model, Port
 from autotune.points import points_to_json
 from autotune.report.page import Section
 from autotune.report.relay_figures import step_responses

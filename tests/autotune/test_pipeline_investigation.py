@@ -21,7 +21,8 @@ from autotune.experiment_design import with_next_experiment
 from autotune.experiment_design.conditions import as_recorded, conditions_of
 from autotune.experiment_design.open_hypotheses import open_hypotheses
 from autotune.experiment_design.plan import excitations, planned_recording
-from autotune.models import Block, Model, Port, TransferFunction, read_model, write_model
+from autotune.model_tables import read_model, write_model
+from autotune.models import Block, Model, Port, TransferFunction
 from autotune.pipeline.investigation import Budget, Investigation, Listeners, investigate
 from autotune.recording import Recording, read_recording, write_recording
 from drivers.simulated import SimulatedRig

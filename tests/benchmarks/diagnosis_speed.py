@@ -25,7 +25,8 @@ from rich.table import Table
 
 from autotune.diagnosis.diagnose import diagnose
 from autotune.diagnosis.simulation.assembly import assemble
-from autotune.models import Block, Model, Port, TransferFunction, write_model
+from autotune.model_tables import write_model
+from autotune.models import Block, Model, Port, TransferFunction
 from autotune.recording import Recording
 from tests.autotune.diagnosis.servo_rigs import servo_model, servo_recording
 
@@ -36,7 +37,7 @@ BESIDE = os.environ.get("DIAGNOSIS_BESIDE", "")
 ONCE = """
 import sys, time
 from autotune.diagnosis.diagnose import diagnose
-from autotune.models import read_model
+from autotune.model_tables import read_model
 from autotune.recording import read_recording
 model, *paths = sys.argv[1:]
 recordings = [read_recording(path) for path in paths]

@@ -39,7 +39,8 @@ from autotune.models import TransferFunction
 from autotune.points import FrequencyPoint
 from autotune.recording import RecordingWriter
 from autotune.report.chart import make_subplots
-from autotune.report.figures import Curve, nichols_figure, sensitivity_figure
+from autotune.report.figures import Curve
+from autotune.report.loop_diagrams import nichols_figure, sensitivity_figure
 from autotune.report.page import BLUE, GREEN, GREY, ORANGE, PURPLE, Figure, Page, Section, Table, add_line, write_page
 from drivers.simulated import SimulatedRig
 from sim.ball import linear_ball, make_ball

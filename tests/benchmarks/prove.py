@@ -23,7 +23,7 @@ from scipy.signal import lfilter, savgol_filter
 from autotune.batch.engine import cluster, run_all
 from autotune.diagnosis.selection.hypothesis import hypothesis, penalised
 from autotune.diagnosis.selection.search import search
-from autotune.models import read_model
+from autotune.model_tables import read_model
 from autotune.recording import read_recording
 from sim.proof import Campaign, conceal, diagnose, forecast_nrmse, mark_all, seal
 from sim.score import confusion, table, wilson

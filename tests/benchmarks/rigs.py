@@ -23,7 +23,8 @@ from typing import Any
 import numpy as np
 
 from autotune.diagnosis import diagnose
-from autotune.models import Model, TransferFunction, read_model
+from autotune.model_tables import read_model
+from autotune.models import Model, TransferFunction
 from autotune.recording import Recording, read_recording
 from tests.conftest import SHARED
 

@@ -29,7 +29,8 @@ from autotune.diagnosis.selection.search import search
 from autotune.diagnosis.simulation.forecast import forecast
 from autotune.diagnosis.thresholds import IN_USE
 from autotune.errors import AutotuneError
-from autotune.models import Model, read_model
+from autotune.model_tables import read_model
+from autotune.models import Model
 from autotune.recording import read_recording
 from sim.score import wilson
 from tests.benchmarks._rival_cases import Case, concealed, real

@@ -17,7 +17,7 @@ from autotune.cli.served import device_of
 from autotune.config import load_config
 from autotune.config.rig import SimulatedRigSettings
 from autotune.errors import InputError
-from autotune.models import read_model
+from autotune.model_tables import read_model
 from drivers.model_plant import ModelPlant, model_plant
 from sim.plant import Plant
 

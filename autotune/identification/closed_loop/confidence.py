@@ -60,7 +60,20 @@ def response_covariance(estimate: PredictionErrorEstimate, omega_rad_s: FloatArr
 
 
 def response_gradient(estimate: PredictionErrorEstimate, omega_rad_s: FloatArray) -> ComplexArray:
-    """Return the sensitivity of every entry of G(exp(j omega Ts)) to the parameters, shape (W, n_y, n_u, P)."""
+    """Return the sensitivity of every entry of G(exp(j omega Ts)) to the parameters.
+
+    Parameters
+    ----------
+    estimate : PredictionErrorEstimate
+        Polished model, with the derivatives of its matrices by P parameters.
+    omega_rad_s : (W,) array
+        Angular frequencies [rad/s].
+
+    Returns
+    -------
+    (W, n_y, n_u, P) complex array
+        Derivatives, in output unit per input unit and unit of the parameter.
+    """
     model = estimate.model
     resolvent = _resolvent(estimate, omega_rad_s)
     right, left = resolvent @ model.B, model.C @ resolvent
@@ -188,7 +201,22 @@ class Whiteness:
 def residuals(
     estimate: PredictionErrorEstimate, u: FloatArray, y: FloatArray, starts: tuple[int, ...] = (0,)
 ) -> FloatArray:
-    """Return the one-step prediction errors of the polished model on the data it came from, shape (rows, n_y)."""
+    """Return the one-step prediction errors of the polished model on the data it came from.
+
+    Parameters
+    ----------
+    estimate : PredictionErrorEstimate
+        Polished model, with its initial states.
+    u, y : (N, n_u), (N, n_y) arrays
+        The data it came from, in its units.
+    starts : tuple of int
+        First row of each stretch.
+
+    Returns
+    -------
+    (rows, n_y) array
+        Errors [output unit]; rows that a dead time takes are missing.
+    """
     model, states = estimate.model, estimate.initial_states
     predictor = Predictor.of(model, estimate.offset_x, estimate.offset_y, states[0])
     series = Series(u=np.ascontiguousarray(u), y=np.ascontiguousarray(y), starts=starts).delayed(model.input_delay)
@@ -196,7 +224,15 @@ def residuals(
 
 
 def whiteness(estimate: PredictionErrorEstimate, errors: FloatArray) -> Whiteness:
-    """Return the Ljung-Box test of the residuals' autocorrelation, each output for itself, the worst one counted."""
+    """Return the Ljung-Box test of the residuals' autocorrelation, each output for itself, the worst one counted.
+
+    Parameters
+    ----------
+    estimate : PredictionErrorEstimate
+        Its order is taken off the degrees of freedom.
+    errors : (rows, n_y) array
+        Its one-step prediction errors.
+    """
     rows, n_y = errors.shape
     n = estimate.model.order
     lags = min(max(30, 4 * n), rows // 4)

@@ -103,9 +103,9 @@ def check_law(
     """
     own = u - (np.zeros_like(u) if added is None else added)
     reference = np.zeros_like(u) if r is None else r
-    rows, step = _unsaturated(u), _resolution(u)
+    rows, step = _rows_within_extremes(u), _resolution(u)
     checks = []
-    for law in discrete_laws(controller, sample_time_s):
+    for law in _discrete_laws(controller, sample_time_s):
         for late in (0, 1):  # computed from this row's measurement, or from the one before
             num = (0.0,) * late + law.num
             named = DiscreteController(num=num, den=law.den, sample_time_s=sample_time_s)
@@ -115,7 +115,7 @@ def check_law(
     return min(checks, key=lambda check: check.unexplained)
 
 
-def discrete_laws(controller: Controller, sample_time_s: float) -> tuple[DiscreteController, ...]:
+def _discrete_laws(controller: Controller, sample_time_s: float) -> tuple[DiscreteController, ...]:
     """Return the discrete laws that a controller file can mean at a sample time.
 
     Raises
@@ -145,13 +145,13 @@ def discrete_laws(controller: Controller, sample_time_s: float) -> tuple[Discret
         )
     laws = []
     for method in _METHODS:
-        num, den = _discretised(continuous, sample_time_s, method)
+        num, den = _discretise(continuous, sample_time_s, method)
         law = DiscreteController(num=tuple(num / den[0]), den=tuple(den / den[0]), sample_time_s=sample_time_s)
         laws.append(law)
     return tuple(laws)
 
 
-def _discretised(law: TransferFunction, sample_time_s: float, method: Method) -> tuple[FloatArray, FloatArray]:
+def _discretise(law: TransferFunction, sample_time_s: float, method: Method) -> tuple[FloatArray, FloatArray]:
     num, den = np.array(law.num, dtype=np.float64), np.array(law.den, dtype=np.float64)
     result = cont2discrete((num, den), sample_time_s, method=method)
     return np.asarray(np.real(result[0]), dtype=np.float64).ravel(), np.asarray(np.real(result[1]), dtype=np.float64)
@@ -182,7 +182,7 @@ def _check(
     )
 
 
-def _unsaturated(u: FloatArray) -> FloatArray:
+def _rows_within_extremes(u: FloatArray) -> FloatArray:
     """Return 1.0 for rows inside the extremes of u, or for all rows where the extremes are not dwelt on."""
     keep = np.ones(len(u))
     for extreme in (u.min(), u.max()):

@@ -43,6 +43,23 @@ def improved(
 
     A search has converged where an undamped step is predicted to gain less than the tolerance, or where the boundary
     is in the way and no step gains more.
+
+    Parameters
+    ----------
+    predictor : Predictor
+        Where the search stands.
+    directions : (entries, P) array
+        What the parameters change.
+    information : (P, P) array
+        Half of the second derivative of -2 log likelihood, by Gauss and Newton.
+    gradient : (P,) array
+        Half of the derivative of -2 log likelihood.
+    errors : (n_y, n_y) array
+        Sum of e e^T there.
+    series : Series
+        The data.
+    damping : float
+        To begin with, on a unit diagonal.
     """
     bounded = False
     while True:
@@ -72,7 +89,21 @@ def improved(
 def whitened_equations(
     predictor: Predictor, directions: FloatArray, series: Series, errors: FloatArray, phi: FloatArray
 ) -> FloatArray:
-    """Return the whitened normal equations; the directions change F by multiples of the orthogonal rows of phi."""
+    """Return the whitened normal equations.
+
+    Parameters
+    ----------
+    predictor : Predictor
+        Where the search stands.
+    directions : (entries, P) array
+        What the parameters change.
+    series : Series
+        The data.
+    errors : (n_y, n_y) array
+        Sum of e e^T there.
+    phi : (K, columns of F) array
+        Orthogonal rows of which the directions change F by multiples.
+    """
     n, of_f, P = len(predictor.x0), predictor.F.size, directions.shape[1]
     change = (phi / np.maximum(np.sum(phi**2, axis=1, keepdims=True), np.finfo(np.float64).tiny)) @ directions[
         :of_f
@@ -88,6 +119,20 @@ def damped_step(information: FloatArray, gradient: FloatArray, damping: float) -
 
     A damping below the smallest eigenvalue (unit diagonal) does nothing: it is replaced by that eigenvalue for the
     next attempt.
+
+    Parameters
+    ----------
+    information : (P, P) array
+        Normal matrix.
+    gradient : (P,) array
+        The step without damping is -information^-1 gradient.
+    damping : float
+        Added to the unit diagonal.
+
+    Returns
+    -------
+    tuple
+        The (P,) step, the decrease, and the damping.
     """
     scale = np.sqrt(np.maximum(np.diag(information), 1e-12 * np.max(np.diag(information))))
     values, vectors = np.linalg.eigh(information / np.outer(scale, scale))

@@ -136,10 +136,22 @@ def propose_dither(
 
 
 def dwell_spectrum(omega_rad_s: FloatArray, shortest_s: float, longest_s: float) -> FloatArray:
-    """Return the two-sided power density [s] of a binary signal of +-1 with log-uniform dwell times.
+    """Return the two-sided power density of a binary signal of +-1 with log-uniform dwell times.
 
     An alternating renewal process with mean dwell mu and characteristic function phi of the dwell has
     4/(mu omega^2) Re((1 - phi)/(1 + phi)); its integral over omega/(2 pi) is 1.
+
+    Parameters
+    ----------
+    omega_rad_s : (W,) array
+        Angular frequencies [rad/s], positive.
+    shortest_s, longest_s : float
+        The dwells' range [s].
+
+    Returns
+    -------
+    (W,) array
+        Density [s].
     """
     dwell = np.geomspace(shortest_s, longest_s, 513)
     dwell = np.sqrt(dwell[1:] * dwell[:-1])

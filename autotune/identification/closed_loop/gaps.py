@@ -69,7 +69,7 @@ def bridged(recording: Recording, jitter: float) -> Bridged:
     put_in = int(np.sum(lengths[short] - 1))
     if put_in == 0 or put_in > SHARE * len(recording):
         return Bridged(recording=recording, gaps=0, rows=0)
-    whole = _filled(recording, kept, np.where(short, lengths, 1))
+    whole = _fill(recording, kept, np.where(short, lengths, 1))
     return Bridged(recording=whole, gaps=int(short.sum()), rows=put_in)
 
 
@@ -92,7 +92,7 @@ def _on_grid(recording: Recording, jitter: float) -> tuple[IntArray, IntArray]:
     return np.array(kept), np.array(slots)
 
 
-def _filled(recording: Recording, kept: IntArray, lengths: IntArray) -> Recording:
+def _fill(recording: Recording, kept: IntArray, lengths: IntArray) -> Recording:
     t, T_s = recording.t, recording.sample_time_s
     first = np.concatenate(([0], np.cumsum(lengths)))
     rows = np.arange(int(first[-1]) + 1)
@@ -123,10 +123,10 @@ def usable_stretch(recording: Recording) -> tuple[Recording, tuple[str, ...]]:
     IdentificationError
         It is shorter than 60 rows; names what cuts the recording.
     """
-    whole, good, broken = _examined(recording)
+    whole, good, broken = _examine(recording)
     rows = max(_pieces(good, broken), key=len, default=np.arange(0))
     _require(len(rows), good, broken, recording.name)
-    return _between(whole.recording, rows), _left_out(recording, whole, [rows])
+    return _between(whole.recording, rows), _changes_text(recording, whole, [rows])
 
 
 def usable_stretches(recording: Recording, shortest: int) -> tuple[tuple[Recording, ...], tuple[str, ...]]:
@@ -153,17 +153,17 @@ def usable_stretches(recording: Recording, shortest: int) -> tuple[tuple[Recordi
     IdentificationError
         There are not enough rows; names what cuts the recording.
     """
-    whole, good, broken = _examined(recording)
+    whole, good, broken = _examine(recording)
     pieces = _pieces(good, broken)
     pieces = [rows for rows in pieces if len(rows) >= shortest] or [max(pieces, key=len, default=np.arange(0))]
     _require(sum(map(len, pieces)), good, broken, recording.name)
-    warnings = _left_out(recording, whole, pieces)
+    warnings = _changes_text(recording, whole, pieces)
     if len(pieces) > 1:
         warnings = (f"{len(pieces)} stretches between gaps are used together", *warnings)
     return tuple(_between(whole.recording, piece) for piece in pieces), warnings
 
 
-def _examined(recording: Recording) -> tuple[Bridged, BoolArray, BoolArray]:
+def _examine(recording: Recording) -> tuple[Bridged, BoolArray, BoolArray]:
     """Return the bridged record, which of its rows hold numbers, and after which of them time jumps."""
     whole = bridged(recording, JITTER)
     columns = [whole.recording.u, whole.recording.y]
@@ -197,7 +197,7 @@ def _between(recording: Recording, rows: IntArray) -> Recording:
     return recording.between(float(recording.t[rows[0]]), float(recording.t[rows[-1]]) + 0.5 * recording.sample_time_s)
 
 
-def _left_out(recording: Recording, whole: Bridged, pieces: Sequence[IntArray]) -> tuple[str, ...]:
+def _changes_text(recording: Recording, whole: Bridged, pieces: Sequence[IntArray]) -> tuple[str, ...]:
     """Return what was put in and left out of the record as it was given, and time stamps that stray."""
     t, T_s, warnings = whole.recording.t, recording.sample_time_s, []
     if whole.gaps:

@@ -156,26 +156,26 @@ def identify_closed_loop(
     longest, starts = max(pieces, key=len), _starts(pieces)
     u, y, r = _columns(pieces)
     dt_s = longest.sample_time_s
-    law = _checked_law(longest, controller, r is not None, warnings)
+    law = _check_law(longest, controller, r is not None, warnings)
     scale_u, scale_y = float(np.std(u)), float(np.std(y))
     u_1, y_1 = ((u - u.mean()) / scale_u)[:, None], ((y - y.mean()) / scale_y)[:, None]
     with threadpool_limits(1):  # threads spin longer on these small matrices than they work
         motion = _look(u_1, y_1, r, starts, recording.name)
-        estimate, others, evidence = _fitted(u_1, y_1, starts, order, delay, max_order, progress)
+        estimate, others, evidence = _fit(u_1, y_1, starts, order, delay, max_order, progress)
         white = whiteness(estimate, residuals(estimate, u_1, y_1, starts))
         found = Structures(
-            chosen=in_units(estimate, scale_u, scale_y, dt_s),
-            others=tuple((weight, in_units(one, scale_u, scale_y, dt_s)) for weight, one in others),
+            chosen=_in_units(estimate, scale_u, scale_y, dt_s),
+            others=tuple((weight, _in_units(one, scale_u, scale_y, dt_s)) for weight, one in others),
         )
         omega = _grid(dt_s, len(y)) if omega_rad_s is None else _below_nyquist(omega_rad_s, dt_s)
         result = _report(found, omega, law, motion, white)
         if not result.excitation.enough:
-            result = replace(result, proposal=_proposal(result, limits or recorded_limits(u, y)))
+            result = replace(result, proposal=_proposal(result, limits or _recorded_limits(u, y)))
     _further_warnings(result, evidence, r, warnings)
     return replace(result, evidence=evidence, warnings=tuple(warnings))
 
 
-def _fitted(
+def _fit(
     u: FloatArray,
     y: FloatArray,
     starts: tuple[int, ...],
@@ -211,7 +211,7 @@ def _columns(pieces: Sequence[Recording]) -> tuple[FloatArray, FloatArray, Float
     return u, y, r if np.all(np.isfinite(r)) else None
 
 
-def _checked_law(
+def _check_law(
     recording: Recording, controller: Controller | None, has_r: bool, warnings: list[str]
 ) -> LawCheck | None:
     if controller is None:
@@ -246,7 +246,7 @@ def _look(u: FloatArray, y: FloatArray, r: FloatArray | None, starts: tuple[int,
     return motion
 
 
-def in_units(
+def _in_units(
     estimate: PredictionErrorEstimate, scale_u: float, scale_y: float, sample_time_s: float
 ) -> PredictionErrorEstimate:
     """Return an estimate made on scaled signals (u / scale_u, y / scale_y) in the signals' own units."""
@@ -312,7 +312,7 @@ def _report(
     )
 
 
-def recorded_limits(u: FloatArray, y: FloatArray) -> DitherLimits:
+def _recorded_limits(u: FloatArray, y: FloatArray) -> DitherLimits:
     """Return limits that keep a dither within what command and measurement did in a recording."""
     amplitude, departure = (float(np.max(np.abs(x - np.mean(x)))) for x in (u, y))
     return DitherLimits(amplitude=amplitude, departure=departure, source="what u and y did in this recording")

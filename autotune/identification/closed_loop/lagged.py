@@ -29,7 +29,20 @@ def triangle(rows: FloatArray) -> FloatArray:
 
 
 def least_squares(regressors: FloatArray, targets: FloatArray) -> FloatArray:
-    """Return the minimum-norm solution of regressors @ theta = targets, directions without data left at zero."""
+    """Return the minimum-norm solution of regressors @ theta = targets, directions without data left at zero.
+
+    Parameters
+    ----------
+    regressors : (N, P) array
+        One column a parameter.
+    targets : (N,) or (N, K) array
+        What they explain.
+
+    Returns
+    -------
+    (P,) or (P, K) array
+        theta.
+    """
     return np.asarray(np.linalg.lstsq(regressors, targets, rcond=_RANK)[0], dtype=np.float64)
 
 

@@ -75,6 +75,15 @@ def own_motion(data: LaggedData) -> float:
 def require_excitation(motion: float, *, r_recorded: bool, r_moves: bool, where: str = "") -> None:
     """Refuse a recording in which nothing but the feedback moved the command.
 
+    Parameters
+    ----------
+    motion : float
+        Share of u's motion that does not follow from past u and y.
+    r_recorded, r_moves : bool
+        Whether there is a set-point, and whether it moved.
+    where : str
+        Names the recording in the message.
+
     Raises
     ------
     IdentificationError

@@ -204,7 +204,15 @@ def _in_units(
 
 
 def markov_of(controller: DiscreteController, count: int) -> FloatArray:
-    """Return the first Markov parameters of a sampled controller, shape (count, 1, 1)."""
+    """Return the first Markov parameters of a sampled controller, shape (count, 1, 1).
+
+    Parameters
+    ----------
+    controller : DiscreteController
+        One input, one output.
+    count : int
+        How many, the one of no lag counted.
+    """
     impulse = np.zeros(count)
     impulse[0] = 1.0
     return np.asarray(lfilter(controller.num, controller.den, impulse), dtype=np.float64)[:, None, None]

@@ -91,11 +91,19 @@ class OrderChoice:
 
 
 def default_past_window(rows: int, channels: int) -> int:
-    """Return the longest past window worth trying: a twentieth of the rows per channel, 4 to 60 lags."""
+    """Return the longest past window worth trying: a twentieth of the rows per channel, 4 to 60 lags.
+
+    Parameters
+    ----------
+    rows : int
+        Of the record.
+    channels : int
+        Inputs and outputs.
+    """
     return int(np.clip(rows // (20 * channels), 4, 60))
 
 
-def start_and_polish(
+def _start_and_polish(
     data: LaggedData,
     series: Series,
     order: int,
@@ -142,6 +150,8 @@ def choose_order(
         As in :func:`autotune.identification.closed_loop.prediction_error.prediction_error`.
     progress : callable
         Told what is tried; the share is NaN, since dead times are tried only where the data hint at one.
+    starts : tuple of int
+        First row of each stretch.
 
     Returns
     -------
@@ -168,7 +178,7 @@ def choose_order(
     def try_order(order: int, delay: int, factor: LaggedData) -> None:
         progress(f"order {order}, dead time {delay}", math.nan)
         try:
-            fits[order, delay] = start_and_polish(
+            fits[order, delay] = _start_and_polish(
                 factor,
                 few,
                 order,
@@ -200,7 +210,7 @@ def choose_order(
     factor = _factor(series.head(_START_ROWS).delayed(best[1]), p=data.p)
     estimate = fits[best]
     if cut < len(u) or not estimate.converged:
-        estimate = start_and_polish(factor, series, best[0], delay=best[1], feedthrough=feedthrough, offset=offset)
+        estimate = _start_and_polish(factor, series, best[0], delay=best[1], feedthrough=feedthrough, offset=offset)
     values = pbsid_states(factor, min(factor.p, 10), feedthrough=feedthrough).singular_values
     return OrderChoice(
         estimate=estimate,
@@ -239,7 +249,7 @@ def fixed_order(
     """
     series = Series(u=u, y=y, starts=starts)
     factor = _factor(series.head(_START_ROWS).delayed(delay), p=p, least=order + 2)
-    return start_and_polish(factor, series, order, delay=delay, feedthrough=feedthrough, offset=offset)
+    return _start_and_polish(factor, series, order, delay=delay, feedthrough=feedthrough, offset=offset)
 
 
 def _factor(series: Series, p: int | None = None, least: int = 10) -> LaggedData:

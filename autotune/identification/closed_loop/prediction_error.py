@@ -183,15 +183,15 @@ def _linear_start(predictor: Predictor, series: Series, *, offset: bool) -> tupl
     n, few = len(predictor.x0), series.head(_LINEAR_ROWS)
     entries = predictor.packed().size
     of_state = np.eye(entries, n, n - entries)
-    prompt = predictor if few.is_cut else _moved_along(predictor, few, of_state)
+    prompt = predictor if few.is_cut else _solve_along(predictor, few, of_state)
     if not offset:
         return prompt, False
-    loaded = _moved_along(predictor, few, np.hstack([of_state, constant_directions(predictor)]))
+    loaded = _solve_along(predictor, few, np.hstack([of_state, constant_directions(predictor)]))
     fall = log_determinant(few.scatter(prompt)) - log_determinant(few.scatter(loaded))
     return (loaded, True) if fall > -math.log(_EVIDENT_CONSTANT) else (prompt, False)
 
 
-def _moved_along(predictor: Predictor, series: Series, directions: FloatArray) -> Predictor:
+def _solve_along(predictor: Predictor, series: Series, directions: FloatArray) -> Predictor:
     """Return the predictor at the least squares along directions that its errors are linear in."""
     one = np.eye(predictor.F.shape[1])[-1:]  # the regressor of a load; the state has none
     total = whitened_equations(predictor, directions, series, series.scatter(predictor), one)
@@ -230,7 +230,7 @@ def _search(
     while True:
         renewed = iterations % 5 == 0
         if renewed:
-            predictor = _balanced(predictor)
+            predictor = _balance(predictor)
         if renewed or n_y > 1:  # with one output they hold as long as the coordinates do
             full = behaviour_directions(predictor, feedthrough=feedthrough, offset=offset)
             directions, phi = series.moving(predictor, full), regressors(predictor)
@@ -267,7 +267,7 @@ def _search(
     )
 
 
-def _balanced(predictor: Predictor) -> Predictor:
+def _balance(predictor: Predictor) -> Predictor:
     """Return the predictor in balanced coordinates, in which no direction is badly scaled."""
     n = len(predictor.x0)
     A, B, K, C, _ = predictor.matrices

@@ -38,7 +38,17 @@ class Predictor:
 
     @classmethod
     def of(cls, model: InnovationModel, offset_x: FloatArray, offset_y: FloatArray, x0: FloatArray) -> Predictor:
-        """Return the predictor of a model with constants d (n,) and y_0 (n_y,) in its two equations."""
+        """Return the predictor of a model with constants in its two equations.
+
+        Parameters
+        ----------
+        model : InnovationModel
+            Order n, n_u inputs, n_y outputs.
+        offset_x, offset_y : (n,), (n_y,) arrays
+            Constants d and y_0 of its two equations.
+        x0 : (n,) array
+            Initial state.
+        """
         entries = np.hstack([model.A, model.B, model.K, offset_x[:, None]])
         n, n_y = model.order, len(model.C)
         H = np.hstack([model.C, model.D, offset_y[:, None]])
@@ -61,7 +71,15 @@ class Predictor:
         return n, self.H.shape[1] - n - 1, n_y
 
     def moved(self, step: FloatArray, directions: FloatArray) -> Predictor:
-        """Return the predictor after a step (P,) along the directions (entries, P)."""
+        """Return the predictor after a step.
+
+        Parameters
+        ----------
+        step : (P,) array
+            Along the directions.
+        directions : (entries, P) array
+            In the order of :meth:`packed`.
+        """
         moved = self.packed() + directions @ step
         at = np.cumsum([self.F.size, self.H.size])
         F, H, x0 = np.split(moved, at)
@@ -72,7 +90,7 @@ class Predictor:
         return np.concatenate([self.F.ravel(), self.H.ravel(), self.x0])
 
 
-def free_entries(predictor: Predictor, *, feedthrough: bool) -> IntArray:
+def _free_entries(predictor: Predictor, *, feedthrough: bool) -> IntArray:
     """Return which entries of :meth:`Predictor.packed`, constants left out, are estimated, as indices."""
     n, n_u, _ = predictor.sizes
     F, H = np.ones(predictor.F.shape, dtype=bool), np.ones(predictor.H.shape, dtype=bool)
@@ -96,7 +114,14 @@ def renaming_directions(predictor: Predictor) -> FloatArray:
 
 
 def behaviour_directions(predictor: Predictor, *, feedthrough: bool, offset: bool) -> FloatArray:
-    """Return a basis of the directions that change the behaviour, shape (entries, P).
+    """Return a basis of the directions that change the behaviour.
+
+    Parameters
+    ----------
+    predictor : Predictor
+        Where they hold.
+    feedthrough, offset : bool
+        Whether D is free, and whether y_0 is.
 
     Returns
     -------
@@ -115,7 +140,7 @@ def behaviour_directions(predictor: Predictor, *, feedthrough: bool, offset: boo
     if n_y == 1:
         behaviour = _injection_directions(predictor, entries, feedthrough=feedthrough)
     else:
-        free = free_entries(predictor, feedthrough=feedthrough)
+        free = _free_entries(predictor, feedthrough=feedthrough)
         renaming = renaming_directions(predictor)[free]
         behaviour = np.zeros((entries, len(free) - n * n))
         behaviour[free] = qr(renaming, check_finite=False)[0][:, n * n :]

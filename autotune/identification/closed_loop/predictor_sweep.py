@@ -13,7 +13,24 @@ _BLOCK = 256
 
 @njit(cache=True)
 def innovations(F: FloatArray, H: FloatArray, x0: FloatArray, u: FloatArray, y: FloatArray) -> FloatArray:
-    """Return e(t) = y - H (x, u, 1) along x(t+1) = F (x, u, y, 1), shape (N, n_y)."""
+    """Return e(t) = y - H (x, u, 1) along x(t+1) = F (x, u, y, 1).
+
+    Parameters
+    ----------
+    F : (n, n + n_u + n_y + 1) array
+        Of the state equation.
+    H : (n_y, n + n_u + 1) array
+        Of the output equation.
+    x0 : (n,) array
+        Initial state.
+    u, y : (N, n_u), (N, n_y) arrays
+        The record.
+
+    Returns
+    -------
+    (N, n_y) array
+        e [output unit].
+    """
     n, n_u, n_y = F.shape[0], u.shape[1], y.shape[1]
     x, following = x0.copy(), np.empty(n)
     e = np.empty((y.shape[0], n_y))
@@ -40,7 +57,24 @@ def innovations(F: FloatArray, H: FloatArray, x0: FloatArray, u: FloatArray, y: 
 
 @njit(cache=True)
 def scatter(F: FloatArray, H: FloatArray, x0: FloatArray, u: FloatArray, y: FloatArray) -> FloatArray:
-    """Return the sum of e e^T, shape (n_y, n_y), a block of rows at a time."""
+    """Return the sum of e e^T over :func:`innovations`.
+
+    Parameters
+    ----------
+    F : (n, n + n_u + n_y + 1) array
+        Of the state equation.
+    H : (n_y, n + n_u + 1) array
+        Of the output equation.
+    x0 : (n,) array
+        Initial state.
+    u, y : (N, n_u), (N, n_y) arrays
+        The record.
+
+    Returns
+    -------
+    (n_y, n_y) array
+        The sum.
+    """
     n, n_u, n_y = F.shape[0], u.shape[1], y.shape[1]
     total = np.zeros((n_y, n_y))
     x, following, e = x0.copy(), np.empty(n), np.empty(n_y)

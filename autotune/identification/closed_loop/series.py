@@ -73,17 +73,31 @@ class Series:
         return Series(u=u, y=y, starts=tuple(int(start) for start in starts))
 
     def less(self, u: FloatArray, y: FloatArray) -> Series:
-        """Return the series about an operating point."""
+        """Return the series about an operating point.
+
+        Parameters
+        ----------
+        u, y : (n_u,), (n_y,) arrays
+            The operating point, taken off every row.
+        """
         return replace(self, u=self.u - u, y=self.y - y)
 
     def states(self, predictor: Predictor) -> FloatArray:
         """Return the initial state of each stretch, (stretches, n): the predictor's own where there is one only."""
         if not self.is_cut:
             return predictor.x0[None]
-        return np.array([_fitted_state(predictor, u, y) for u, y in self.stretches])
+        return np.array([_fit_state(predictor, u, y) for u, y in self.stretches])
 
     def errors(self, predictor: Predictor, states: FloatArray) -> FloatArray:
-        """Return the innovations, (N, n_y), each stretch from its state."""
+        """Return the innovations, (N, n_y), each stretch from its state.
+
+        Parameters
+        ----------
+        predictor : Predictor
+            Order n.
+        states : (stretches, n) array
+            Where each stretch begins.
+        """
         parts = [
             innovations(predictor.F, predictor.H, x0, u, y) for x0, (u, y) in zip(states, self.stretches, strict=True)
         ]
@@ -96,7 +110,15 @@ class Series:
         return np.asarray(sum(parts), dtype=np.float64)
 
     def moving(self, predictor: Predictor, directions: FloatArray) -> FloatArray:
-        """Return the directions that steps are taken along: without those of the initial state where it is found."""
+        """Return the directions that steps are taken along: none of initial states that are fitted stretch by stretch.
+
+        Parameters
+        ----------
+        predictor : Predictor
+            Whose parameters they change.
+        directions : (entries, P) array
+            All of them.
+        """
         return directions[:, ~_of_state(predictor, directions)] if self.is_cut else directions
 
     def normal_equations(
@@ -124,7 +146,7 @@ class Series:
             whole: FloatArray = parts[0]
             return whole
         of_state = np.append(_of_state(predictor, directions), False)
-        return np.asarray(sum(_eliminated(part, of_state) for part in parts), dtype=np.float64)
+        return np.asarray(sum(_eliminate_state(part, of_state) for part in parts), dtype=np.float64)
 
 
 def _of_state(predictor: Predictor, directions: FloatArray) -> BoolArray:
@@ -133,7 +155,7 @@ def _of_state(predictor: Predictor, directions: FloatArray) -> BoolArray:
     return moves
 
 
-def _fitted_state(predictor: Predictor, u: FloatArray, y: FloatArray) -> FloatArray:
+def _fit_state(predictor: Predictor, u: FloatArray, y: FloatArray) -> FloatArray:
     """Return the initial state (n,) of a stretch with the least errors, corrected once for rounding."""
     n, entries = len(predictor.x0), predictor.packed().size
     inner = np.eye(entries, n, n - entries)
@@ -146,7 +168,7 @@ def _fitted_state(predictor: Predictor, u: FloatArray, y: FloatArray) -> FloatAr
     return x0
 
 
-def _eliminated(total: FloatArray, of_state: BoolArray) -> FloatArray:
+def _eliminate_state(total: FloatArray, of_state: BoolArray) -> FloatArray:
     """Return the normal equations of the other columns, those of the state at their best for every step."""
     own, cross, rest = total[np.ix_(of_state, of_state)], total[np.ix_(~of_state, of_state)], ~of_state
     return np.asarray(total[np.ix_(rest, rest)] - cross @ _inverse(own) @ cross.T, dtype=np.float64)

@@ -224,7 +224,13 @@ def h2_norm(model: InnovationModel) -> float:
 
 
 def difference(first: InnovationModel, second: InnovationModel) -> InnovationModel:
-    """Return the model whose response is the first's minus the second's (deterministic part)."""
+    """Return the model whose response is the first's minus the second's (deterministic part).
+
+    Parameters
+    ----------
+    first, second : InnovationModel
+        Of the same inputs, outputs and sample time.
+    """
     first, second = first.with_delay_as_states(), second.with_delay_as_states()
     n, k = first.order, second.order
     return replace(
@@ -243,6 +249,20 @@ def balancing(A: FloatArray, B: FloatArray, C: FloatArray) -> FloatArray:
     For a one-step predictor (A - K C, [B - K D, K], C): it is stable even where the plant is not, so the coordinates
     T x exist for unstable and integrating plants. Where a state is hardly reached or hardly seen, it is scaled as if it
     were a little more.
+
+    Parameters
+    ----------
+    A : (n, n) array
+        Of the state equation, stable.
+    B : (n, inputs) array
+        Its inputs.
+    C : (outputs, n) array
+        Its outputs.
+
+    Returns
+    -------
+    (n, n) array
+        T.
 
     Raises
     ------

@@ -65,6 +65,15 @@ def lagged_data(u: FloatArray, y: FloatArray, p: int, starts: tuple[int, ...] = 
 
     A trace of white noise (1e-6 of each signal) is supposed on the past: noise-free records, whose lags depend on each
     other exactly, then have a predictor too.
+
+    Parameters
+    ----------
+    u, y : (N, n_u), (N, n_y) arrays
+        The record.
+    p : int
+        Past window, in samples.
+    starts : tuple of int
+        First row of each stretch.
     """
     series, past = Series(u=u, y=y, starts=starts), range(-1, -p - 1, -1)
     R, rows = lagged_factor(*([(np.hstack(one), past), (one[0], [0]), (one[1], [0])] for one in series.stretches))
@@ -80,6 +89,13 @@ def _with_trace_of_noise(R: FloatArray, width: int) -> FloatArray:
 
 def autoregression(data: LaggedData, *, feedthrough: bool) -> tuple[FloatArray, FloatArray]:
     """Return the long ARX model y(t) = sum Phi_k z(t-k) + D u(t) + e.
+
+    Parameters
+    ----------
+    data : LaggedData
+        Factor of p past samples and the present one.
+    feedthrough : bool
+        Whether u(t) acts on y(t).
 
     Returns
     -------
@@ -156,6 +172,17 @@ def regress_system(
     data: LaggedData, states: StateSelection, order: int, *, feedthrough: bool = False
 ) -> InnovationModel:
     """Return A, B, C, D and K from two regressions on the states: the outputs, then the next states.
+
+    Parameters
+    ----------
+    data : LaggedData
+        Factor of the past and the present.
+    states : StateSelection
+        Weights of the past that give the states, the most telling first.
+    order : int
+        How many of them are taken.
+    feedthrough : bool
+        Whether u(t) acts on y(t).
 
     Raises
     ------

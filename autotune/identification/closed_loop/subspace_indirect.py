@@ -51,7 +51,20 @@ class IndirectEstimate:
 
 
 def toeplitz_blocks(markov: FloatArray, f: int) -> FloatArray:
-    """Return the lower triangular block Toeplitz matrix H_f of f Markov parameters (>= f, rows, columns)."""
+    """Return the lower triangular block Toeplitz matrix H_f of f Markov parameters.
+
+    Parameters
+    ----------
+    markov : (f or more, rows, columns) array
+        Markov parameters, the one of no lag first.
+    f : int
+        Future window, in samples.
+
+    Returns
+    -------
+    (f rows, f columns) array
+        H_f.
+    """
     rows, columns = markov.shape[1:]
     H = np.zeros((f * rows, f * columns))
     for i in range(f):
@@ -208,7 +221,19 @@ def controller_order(markov: FloatArray) -> int:
 
 
 def markov_from_null_space(free: FloatArray, right: FloatArray, M11: FloatArray, *, n_u: int, n_y: int) -> FloatArray:
-    """Return (f, n_y, n_u) Markov parameters L of free H(L) M11 = right, by least squares."""
+    """Return (f, n_y, n_u) Markov parameters L of free H(L) M11 = right, by least squares.
+
+    Parameters
+    ----------
+    free : (K, f n_y) array
+        Rows that annihilate the loop's observability matrix.
+    right : (K, f n_u) array
+        Right-hand side.
+    M11 : (f n_u, f n_u) array
+        Lower triangular factor of r.
+    n_u, n_y : int
+        Numbers of commands and outputs.
+    """
     f = free.shape[1] // n_y
     target = solve_triangular(M11, right.T, trans="T", lower=True).T
     blocks = free.reshape(len(free), f, n_y)
@@ -225,7 +250,26 @@ def markov_from_null_space(free: FloatArray, right: FloatArray, M11: FloatArray,
 def input_matrices(
     free: FloatArray, right: FloatArray, M11: FloatArray, gamma: FloatArray, *, n_u: int, n_y: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Return B and D from free H_f^d(B, D) M11 = right, the last equation of step 6."""
+    """Return B and D from free H_f^d(B, D) M11 = right, the last equation of step 6.
+
+    Parameters
+    ----------
+    free : (K, f n_y) array
+        Rows that annihilate the plant's observability matrix.
+    right : (K, f n_u) array
+        Right-hand side.
+    M11 : (f n_u, f n_u) array
+        Lower triangular factor of r.
+    gamma : (f n_y, n) array
+        The plant's observability matrix.
+    n_u, n_y : int
+        Numbers of commands and outputs.
+
+    Returns
+    -------
+    tuple of array
+        B, (n, n_u), and D, (n_y, n_u).
+    """
     f = free.shape[1] // n_y
     target = solve_triangular(M11, right.T, trans="T", lower=True).T
     solution = least_squares(

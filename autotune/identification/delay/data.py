@@ -109,7 +109,7 @@ def prepare(
     hold = hold if hold is not None else recording.metadata.get("hold", "zero")
     if hold not in ("zero", "linear"):
         raise InputError(f"hold = {hold!r}", where=recording.name, remedy='it is "zero" or "linear"')
-    t = _snapped(recording)
+    t = _snap(recording)
     _require_no_gap(recording)
     ty, y = t[used], recording.y[used]
     _require_motion(recording.u, y, recording.name)
@@ -129,7 +129,7 @@ def prepare(
     )
 
 
-def _snapped(recording: Recording) -> FloatArray:
+def _snap(recording: Recording) -> FloatArray:
     """Put stamps that were rounded when they were written back on their uniform grid."""
     t = recording.t
     grid = t[0] + (t[-1] - t[0]) / (t.size - 1) * np.arange(t.size)

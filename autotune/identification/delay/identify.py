@@ -13,16 +13,8 @@ import numpy as np
 from autotune.errors import IdentificationError, InputError
 from autotune.identification.delay.data import DelayData, PastInput, input_period, prepare
 from autotune.identification.delay.model import DelayModel
-from autotune.identification.delay.output_error import (
-    Point,
-    Structure,
-    finish,
-    minimise,
-    polish,
-    residuals,
-    solve_linear,
-    widened,
-)
+from autotune.identification.delay.output_error import Point, Structure, minimise, residuals, solve_linear
+from autotune.identification.delay.output_error_model import finish, polish, widened
 from autotune.identification.delay.profile import profile
 from autotune.identification.delay.search import binned, scan, search
 from autotune.identification.dependence import latest_answer_s

@@ -15,7 +15,8 @@ from autotune.errors import IdentificationError, InputError
 from autotune.identification.delay.data import DelayData, prepare
 from autotune.identification.delay.model import DelayModel
 from autotune.identification.delay.online_modulating import DelayTracking, OnlineEstimator, OnlineSample
-from autotune.identification.delay.output_error import Structure, colour_of, parameters, residuals, solve_linear
+from autotune.identification.delay.output_error import Structure, residuals, solve_linear
+from autotune.identification.delay.output_error_model import colour_of, parameters
 from autotune.identification.delay.weighted_delay import weighted_delay
 from autotune.models import Hold
 from autotune.recording import Recording

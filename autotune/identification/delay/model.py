@@ -12,8 +12,8 @@ import numpy as np
 from autotune.arrays import ComplexArray, FloatArray
 from autotune.errors import InputError
 from autotune.models import TransferFunction
-from autotune.outputs import write_json
 from autotune.text_files import read_json
+from autotune.whole_files import write_json
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -106,7 +106,15 @@ def _or_null(values: FloatArray) -> list[float | None]:
 
 
 def write_delay_model(model: DelayModel, path: str | os.PathLike[str]) -> None:
-    """Write ``delay.json``."""
+    """Write ``delay.json``.
+
+    Parameters
+    ----------
+    model : DelayModel
+        What is written.
+    path : path
+        Replaced where it exists.
+    """
     write_json(path, model.to_json())
 
 

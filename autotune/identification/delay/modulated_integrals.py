@@ -57,6 +57,19 @@ def modulated_by_fourier_sums(
 
     f is a sum of cosines, so each integral is a difference of int v(t) exp(j omega t) dt at the interval's ends,
     turned by its beginning: a step of the iteration costs nothing per row.
+
+    Parameters
+    ----------
+    recording : Recording
+        u and y over t.
+    window : SinePower
+        The modulating function f.
+    order : int
+        Order n of the equation.
+    intervals : sequence of (float, float)
+        Begin and end of each [s], in the recording's time.
+    linear : bool
+        Whether u runs linearly between its rows (else it is held).
     """
     terms = window.fourier()
     t = recording.t - recording.t[0]
@@ -110,7 +123,23 @@ def modulated_by_fourier_sums(
 def modulated_by_expansion(
     recording: Recording, window: Window, order: int, intervals: Sequence[Interval], linear: bool, expansion: int
 ) -> Modulated:
-    """Return the integrals for any window, whose shift by d is sum of d^l / l! f^(l) up to order ``expansion``."""
+    """Return the integrals for any window, whose shift by d is the sum of d^l / l! f^(l).
+
+    Parameters
+    ----------
+    recording : Recording
+        u and y over t.
+    window : Window
+        The modulating function f.
+    order : int
+        Order n of the equation.
+    intervals : sequence of (float, float)
+        Begin and end of each [s], in the recording's time.
+    linear : bool
+        Whether u runs linearly between its rows (else it is held).
+    expansion : int
+        Highest l.
+    """
     Y = np.array([_output_integrals(recording, window, order, T_1, T_2) for T_1, T_2 in intervals])
 
     longest = max(T_2 - T_1 for T_1, T_2 in intervals)
@@ -126,7 +155,24 @@ def modulated_by_expansion(
 
 @njit(cache=True)
 def running_fourier(t: FloatArray, values: FloatArray, omega: float, held: bool) -> ComplexArray:
-    """Return int v(s) exp(j omega s) ds from t[0] to every row: trapezoidal, or with v held between rows."""
+    """Return int v(s) exp(j omega s) ds from t[0] to every row.
+
+    Parameters
+    ----------
+    t : (N,) array
+        Time stamps [s], N at least 2.
+    values : (N,) array
+        The signal v.
+    omega : float
+        Angular frequency [rad/s].
+    held : bool
+        Whether v is held between rows (else linear).
+
+    Returns
+    -------
+    (N,) complex array
+        Integrals [v unit s].
+    """
     result = np.zeros(t.size, dtype=np.complex128)
     re = 0.0
     im = 0.0
@@ -162,7 +208,22 @@ def running_fourier(t: FloatArray, values: FloatArray, omega: float, held: bool)
 
 
 def interpolated(t: FloatArray, running: ComplexArray, at: FloatArray) -> ComplexArray:
-    """Return a running integral at any times, linear between its rows."""
+    """Return a running integral at any times, linear between its rows.
+
+    Parameters
+    ----------
+    t : (N,) array
+        Time stamps [s].
+    running : (N,) complex array
+        The integral up to each.
+    at : (M,) array
+        The times asked for [s].
+
+    Returns
+    -------
+    (M,) complex array
+        The integral up to these.
+    """
     row = np.clip(np.searchsorted(t, at) - 1, 0, t.size - 2)
     share = (at - t[row]) / (t[row + 1] - t[row])
     return np.asarray(running[row] + share * (running[row + 1] - running[row]), dtype=np.complex128)

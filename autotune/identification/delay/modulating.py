@@ -28,7 +28,15 @@ class SinePower:
     m: int
 
     def derivative(self, i: int, s: FloatArray) -> FloatArray:
-        """Return f^(i)(s), same shape as s."""
+        """Return f^(i)(s), same shape as s.
+
+        Parameters
+        ----------
+        i : int
+            Order of the derivative, 0 for f itself.
+        s : array
+            Place in the interval, 0 to 1; any shape.
+        """
         total = np.zeros(s.shape)
         for c, omega in self.fourier():
             total += np.real(c * (1j * omega) ** i * np.exp(1j * omega * s))
@@ -66,7 +74,15 @@ class PolynomialWindow:
     m: int
 
     def derivative(self, i: int, s: FloatArray) -> FloatArray:
-        """Return f^(i)(s), same shape as s."""
+        """Return f^(i)(s), same shape as s.
+
+        Parameters
+        ----------
+        i : int
+            Order of the derivative, 0 for f itself.
+        s : array
+            Place in the interval, 0 to 1; any shape.
+        """
         f = np.polynomial.Polynomial([0.0, 1.0]) ** self.m * np.polynomial.Polynomial([1.0, -1.0]) ** self.m
         return np.asarray(f.deriv(i)(s) if i else f(s), dtype=np.float64)
 
@@ -81,6 +97,13 @@ Window = SinePower | PolynomialWindow
 
 def require_window(window: Window, order: int) -> None:
     """Refuse a window that is too flat-footed for the order.
+
+    Parameters
+    ----------
+    window : Window
+        Of power m.
+    order : int
+        Order n of the equation.
 
     Raises
     ------

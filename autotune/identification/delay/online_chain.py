@@ -23,7 +23,21 @@ _LONGER = 3.0
 
 @njit(cache=True)
 def advance(J: FloatArray, step: float, first: float, last: float, lam: float, new: FloatArray) -> None:
-    """Carry the chain over a step during which the signal runs linearly from first to last, exactly."""
+    """Carry the chain over a step during which the signal runs linearly from first to last, exactly.
+
+    Parameters
+    ----------
+    J : (kernels,) array
+        The chain, changed in place.
+    step : float
+        Length of the step [s].
+    first, last : float
+        The signal at its ends.
+    lam : float
+        Decay of the kernels lambda [1/s].
+    new : (kernels,) array
+        Room to work in.
+    """
     decay = np.exp(-lam * step)
     for j in range(J.size):
         total = 0.0
@@ -125,6 +139,45 @@ def step_row(
     """Carry everything over to row k, in place; return state, covariance of the unknowns and whether lock holds.
 
     ``gain`` above 0 is the paper's gradient flow; otherwise the gain matrix is the inverse of the averaged equations.
+
+    Parameters
+    ----------
+    k : int
+        The row.
+    t, u : (N,) array
+        Time stamps [s] and command [u unit], up to row k at least.
+    past : (N, kernels) array
+        Chain of u at every row.
+    y : float
+        Measurement at row k [y unit].
+    Jy, Ju : (kernels,) array
+        Chains of y and u.
+    A : (P,) array
+        The unknowns: coefficients, b, b times what the delay lacks, constant.
+    R : (P, P) array
+        Averaged equations.
+    slow : (P,) array
+        Averaged right-hand side.
+    spread : (P, P) array
+        What the equations leave, averaged.
+    scalars : (8,) array
+        Delay [s], stamps and values of the last row, and weights; places as named above.
+    n : int
+        Order of the equation.
+    lam : float
+        Decay of the kernels lambda [1/s].
+    gain : float
+        Above 0 that of the paper's gradient flow; else the gain matrix is the inverse of the averaged equations.
+    memory_s : float
+        Memory of the averages [s].
+    linear : bool
+        Whether u runs linearly between its rows (else it is held).
+    delayed, offset : bool
+        Whether a delay and a constant are unknowns.
+    after : float
+        Time since the first row from which on the delay moves [s].
+    rate : float
+        How fast it does [1/s].
     """
     kernels = Jy.size
     step = t[k] - scalars[LAST_T]
@@ -145,7 +198,7 @@ def step_row(
             whole = np.ones((C.shape[0], A.size))
             whole[:, : A.size - 1] = C
             C = whole
-        _averaged(C, D, A, R, slow, spread, scalars, step, n, lam, memory_s, offset)
+        _solve_averaged(C, D, A, R, slow, spread, scalars, step, n, lam, memory_s, offset)
     if delayed and t[k] - scalars[FIRST_T] > after and A[n] != 0.0:
         lacking = A[n + 1] / A[n]
         moved = max(step * rate * lacking, -scalars[H])  # u is not known ahead of its time
@@ -183,7 +236,17 @@ def step_rows(
     after: float,
     rate: float,
 ) -> tuple[FloatArray, FloatArray, int]:
-    """Carry everything over all rows after the first; return state, covariance and the row where lock was lost or 0."""
+    """Carry everything over all rows after the first; return state, covariance and the row where lock was lost, or 0.
+
+    Parameters
+    ----------
+    t, u, past : (N,), (N,), (N, kernels) arrays
+        As of :func:`step_row`.
+    y : (N,) array
+        Measurement [y unit].
+    Jy, Ju, A, R, slow, spread, scalars, n, lam, gain, memory_s, linear, delayed, offset, after, rate : as of step_row
+        What is carried over, and the settings.
+    """
     state, covariance = np.full(n, np.nan), np.full(R.shape, np.nan)
     for k in range(1, t.size):
         state, covariance, locked = step_row(
@@ -196,7 +259,7 @@ def step_rows(
 
 
 @njit(cache=True)
-def _averaged(
+def _solve_averaged(
     C: FloatArray,
     D: FloatArray,
     A: FloatArray,

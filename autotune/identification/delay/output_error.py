@@ -9,18 +9,16 @@ autoregressive noise model independent of the plant.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from autotune.arrays import BoolArray, FloatArray
-from autotune.errors import IdentificationError
 from autotune.identification.delay.compiled import cholesky_solve
 from autotune.identification.delay.data import DelayData
-from autotune.identification.delay.model import DelayModel
-from autotune.identification.delay.response import linear_part, normal_matrix, output, sensitivities
-from autotune.identification.noise_colour import MAX_AR, WHITE, NoiseColour, noise_colour
+from autotune.identification.delay.response import linear_part, normal_matrix, output
+from autotune.identification.noise_colour import WHITE
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,7 +79,21 @@ class Point:
 def solve_linear(
     data: DelayData, structure: Structure, a: tuple[float, ...], h: float, whitening: FloatArray = WHITE
 ) -> Point:
-    """Return the best b, d and initial state for given (a, h); an unstable response that overflows costs infinity."""
+    """Return the best b, d and initial state for given (a, h); an unstable response that overflows costs infinity.
+
+    Parameters
+    ----------
+    data : DelayData
+        The record.
+    structure : Structure
+        Which parameters are free.
+    a : tuple of n floats
+        Coefficients a_0..a_{n-1}.
+    h : float
+        Delay [s].
+    whitening : (p,) array
+        Coefficients of the filter that makes the noise white.
+    """
     before = 0.0 if data.before is None else data.before
     theta, cost = linear_part(data.tu, data.u, before, data.linear, data.ty, data.y, a, h, structure.offset, whitening)
     return Point(a=a, h=h, theta=theta, cost=cost, rows=data.ty.size - whitening.size)
@@ -130,7 +142,7 @@ def minimise(
     damping = 1e-3
     point = start
     for _ in range(iterations):
-        gram, finite = _gram(data, point.a, point.h, point.theta, whitening)
+        gram, finite = gram_at(data, point.a, point.h, point.theta, whitening)
         if not finite:
             return point
         for _trial in range(8):
@@ -164,199 +176,45 @@ def _damped_step(gram: FloatArray, free: NDArray[np.intp], n: int, damping: floa
     return step, regular
 
 
-def parameters(data: DelayData, point: Point) -> FloatArray:
-    """Return (a_0.., b, delay, constant, initial state) of a point, the operating point added back."""
-    b, d = float(point.theta[0]), float(point.theta[1])
-    initial = point.theta[2:].copy()
-    initial[0] += data.y_0
-    return np.array([*point.a, b, point.h, d - b * data.u_0 - point.a[0] * data.y_0, *initial])
-
-
-def finish(data: DelayData, structure: Structure, point: Point, whitening: FloatArray = WHITE) -> DelayModel:
-    """Return the model with its covariance at a minimum, the operating point added back.
-
-    Raises
-    ------
-    IdentificationError
-        The information matrix is singular: some combination of the parameters does not show in the data.
-    """
-    n = structure.order
-    free = np.flatnonzero(structure.free)
-    gram, finite = _gram(data, point.a, point.h, point.theta, whitening)
-    information = gram[np.ix_(free, free)]
-    scale = np.sqrt(np.diag(information))
-    if not finite or not np.all(scale > 0) or np.linalg.cond(information / np.outer(scale, scale)) > 1e13:
-        raise _singular(data, structure, information)
-    inner = np.zeros((2 * n + 3, 2 * n + 3))
-    inner[np.ix_(free, free)] = np.linalg.inv(information / np.outer(scale, scale)) / np.outer(scale, scale)
-    variance = point.cost / (point.rows - structure.parameters)
-    back = _to_parameters(data, structure, point)
-    values = parameters(data, point)
-    return DelayModel(
-        a=point.a,
-        b=float(values[n]),
-        delay_s=point.h,
-        constant=float(values[n + 2]),
-        initial_time_s=float(data.ty[0]),
-        initial_state=tuple(float(value) for value in values[n + 3 :]),
-        covariance=variance * back @ inner @ back.T,
-        noise_sd=float(np.sqrt(variance)),
-        noise_ar=tuple(float(value) for value in whitening),
-        rows=point.rows,
-    )
-
-
-def _to_parameters(data: DelayData, structure: Structure, point: Point) -> FloatArray:
-    """Return the matrix from the columns' coordinates to (a, b, h, constant, initial state).
-
-    The columns s^(i) and -x' differ from dx/da_i and dx/dh by the free responses to their own initial values:
-    moving a_i by 1 along s^(i) moves x^(l)(t_s) by s^(i+l)(t_s); moving h by 1 along -x' moves it by -x^(l+1)(t_s).
-    """
-    n = structure.order
-    a = np.array(point.a)
-    b, d = point.theta[0], point.theta[1]
-    x = point.theta[2:]
-    s = np.zeros(2 * n)
-    for k in range(n):
-        s[n + k] = a @ s[k : k + n] + x[k]
-    tau = data.ty[0] - point.h
-    row = int(np.searchsorted(data.tu, tau, side="right")) - 1
-    u_s = data.u[row] if row >= 0 else (data.before or 0.0)
-    if data.linear and row >= 0:
-        u_s = float(np.interp(tau, data.tu, data.u))
-    slopes = np.append(x[1:], a @ x + b * u_s + d)
-    matrix = np.zeros((2 * n + 3, 2 * n + 3))  # columns: b, d, initial state, a, h
-    matrix[:n, 2 + n : 2 + 2 * n] = np.eye(n)
-    matrix[n, 0] = 1.0
-    matrix[n + 1, 2 + 2 * n] = 1.0
-    matrix[n + 2, [0, 1, 2 + n]] = -data.u_0, 1.0, -data.y_0
-    matrix[n + 3 :, 2 : 2 + n] = np.eye(n)
-    for i in range(n):
-        matrix[n + 3 :, 2 + n + i] = s[i : i + n]
-    matrix[n + 3 :, 2 + 2 * n] = -slopes
-    return matrix
-
-
 def residuals(data: DelayData, point: Point) -> FloatArray:
-    """Return y - x at the output times [y unit]."""
+    """Return y - x at the output times.
+
+    Parameters
+    ----------
+    data : DelayData
+        N rows of y.
+    point : Point
+        The candidate.
+
+    Returns
+    -------
+    (N,) array
+        In y's unit; NaN from where the response overflows.
+    """
     before = 0.0 if data.before is None else data.before
     return np.asarray(
         data.y - output(data.tu, data.u, before, data.linear, data.ty, point.a, point.h, point.theta), dtype=np.float64
     )
 
 
-def colour_of(
-    data: DelayData,
-    structure: Structure,
-    point: Point,
-    *,
-    max_order: int = MAX_AR,
-    samples: NDArray[np.int64] | None = None,
-) -> NoiseColour:
-    """Return the colour of the noise that a point leaves.
-
-    Parameters
-    ----------
-    data : DelayData
-        The rows that were fitted.
-    structure : Structure
-        Which parameters are free.
-    point : Point
-        The fit.
-    max_order : int
-        Largest order of the autoregression.
-    samples : (N,) array, optional
-        The sample that each row belongs to, ascending from 0: the colour is that of the means over samples.
-
-    Returns
-    -------
-    NoiseColour
-        Its freedom is that of the free ones of (a, b, h, constant, initial state).
-    """
-    before = 0.0 if data.before is None else data.before
-    columns = sensitivities(data.tu, data.u, before, data.linear, data.ty, point.a, point.h, point.theta)
-    to_free = _to_parameters(data, structure, point)[np.ix_(structure.free_parameters, structure.free)]
-    in_parameters = np.linalg.solve(to_free.T, columns[:, structure.free].T).T
-    rows = np.column_stack([in_parameters, residuals(data, point)])
-    if samples is not None:
-        first = np.flatnonzero(np.diff(samples, prepend=-1))
-        rows = np.add.reduceat(rows, first) / np.diff(first, append=len(rows))[:, None]
-    return noise_colour(rows[:, :-1], rows[:, -1], max_order)
-
-
-def widened(model: DelayModel, structure: Structure, colour: NoiseColour) -> DelayModel:
-    """Return the model with standard deviations that, 1.96 times, make Student's 95 % intervals."""
-    wider = np.ones(len(model.covariance))
-    wider[structure.free_parameters] = colour.widening()
-    return replace(model, covariance=model.covariance * np.outer(wider, wider))
-
-
-def polish(
-    data: DelayData, structure: Structure, start: Point, *, max_delay_s: float, coloured: bool = True
-) -> tuple[Point, NoiseColour]:
-    """Fit from a starting point, find the noise's colour, fit again under it; return minimum and colour.
-
-    Parameters
-    ----------
-    data : DelayData
-        Rows that any delay up to ``max_delay_s`` can explain.
-    structure : Structure
-        Which parameters are free.
-    start : Point
-        Where to begin.
-    max_delay_s : float
-        Upper limit of h [s].
-    coloured : bool
-        Whether the noise may be coloured; white is assumed otherwise.
-
-    Raises
-    ------
-    IdentificationError
-        Fewer rows than parameters, or a singular information matrix.
-    """
-    if data.ty.size < 3 * structure.parameters:
-        raise IdentificationError(
-            f"{data.ty.size} rows of y remain for {structure.parameters} parameters",
-            where=data.name,
-            remedy="record longer than the delay, or say what u was before the record",
-        )
-    point = minimise(
-        data, structure, solve_linear(data, structure, start.a, start.h), max_delay_s=max_delay_s, iterations=50
-    )
-    colour = colour_of(data, structure, point, max_order=0)
-    for _ in range(3 if coloured else 0):
-        found = colour_of(data, structure, point)
-        same = found.whitening.size == colour.whitening.size
-        if same and np.max(np.abs(found.whitening - colour.whitening), initial=0.0) < 1e-3:
-            break
-        colour = found
-        point = minimise(
-            data,
-            structure,
-            solve_linear(data, structure, point.a, point.h, colour.whitening),
-            max_delay_s=max_delay_s,
-            whitening=colour.whitening,
-        )
-    return point, colour
-
-
-def _gram(
+def gram_at(
     data: DelayData, a: tuple[float, ...], h: float, theta: FloatArray, whitening: FloatArray
 ) -> tuple[FloatArray, bool]:
+    """Return the Gram matrix with sensitivities at a candidate, and whether it is finite.
+
+    Parameters
+    ----------
+    data : DelayData
+        The record.
+    a : tuple of n floats
+        Coefficients a_0..a_{n-1}.
+    h : float
+        Delay [s].
+    theta : (2+n,) array
+        b, d and the initial state.
+    whitening : (p,) array
+        Coefficients of the filter that makes the noise white.
+    """
     before = 0.0 if data.before is None else data.before
     gram, finite = normal_matrix(data.tu, data.u, before, data.linear, data.ty, data.y, a, h, theta, True, whitening)
     return gram, finite
-
-
-def _singular(data: DelayData, structure: Structure, information: FloatArray) -> IdentificationError:
-    n = structure.order
-    names = ["b", "constant", *(f"x^({i})(t_s)" for i in range(n)), *(f"a{i}" for i in range(n)), "delay"]
-    names = [name for name, free in zip(names, structure.free, strict=True) if free]
-    scale = np.sqrt(np.maximum(np.diag(information), 1e-300))
-    _, vectors = np.linalg.eigh(information / np.outer(scale, scale))
-    worst = [names[i] for i in np.argsort(-np.abs(vectors[:, 0]))[:3]]
-    return IdentificationError(
-        f"the record does not determine order {n}: {', '.join(worst)} cannot be told apart",
-        where=data.name,
-        remedy="ask for a lower order, or excite more frequencies: a step, or relay cycles at two more inserted delays",
-    )

@@ -14,7 +14,8 @@ import numpy as np
 
 from autotune.identification.delay.data import DelayData
 from autotune.identification.delay.model import DelayModel
-from autotune.identification.delay.output_error import Point, Structure, minimise, parameters, solve_linear
+from autotune.identification.delay.output_error import Point, Structure, minimise, solve_linear
+from autotune.identification.delay.output_error_model import parameters
 
 _RISE = 1.96  # standard deviations at the ends of an interval: the root of the rise of the sum of squares
 _FIRST = 0.5  # of the linearised interval

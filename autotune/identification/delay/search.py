@@ -266,7 +266,7 @@ def _modulated(
         Y, U, starts, shifts, data.before is None, structure.integrator, structure.offset, kernels[0].sum()
     )
     return [
-        (float(shift * grid.dt), tuple(float(value) for value in _stabilised(row, data.duration_s)))
+        (float(shift * grid.dt), tuple(float(value) for value in _stabilise(row, data.duration_s)))
         for shift, row, good in zip(shifts, a, valid, strict=True)
         if good
     ]
@@ -322,7 +322,7 @@ def _instrumental(
 
 
 @njit(cache=True)
-def _stabilised(a: FloatArray, duration_s: float) -> FloatArray:
+def _stabilise(a: FloatArray, duration_s: float) -> FloatArray:
     """Mirror poles that would grow by more than a factor e over the record into the left half plane."""
     n = a.size
     if n <= 2 and np.all(a <= 0.0):

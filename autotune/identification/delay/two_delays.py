@@ -167,7 +167,7 @@ def two_delays(
     refusal: IdentificationError | None = None
     for pair in begun:
         try:
-            found.append(_iterated(recording, starts, L, pair, iterations))
+            found.append(_iterate(recording, starts, L, pair, iterations))
         except IdentificationError as error:
             refusal = refusal or error
             continue
@@ -177,10 +177,10 @@ def two_delays(
         assert refusal is not None
         raise refusal
     best = min(found, key=lambda pair: pair[0])[1]
-    return _polished(recording, starts, L, best) if polish else best
+    return _polish(recording, starts, L, best) if polish else best
 
 
-def _iterated(
+def _iterate(
     recording: Recording, starts: FloatArray, L: float, start: tuple[float, float], iterations: int
 ) -> tuple[float, TwoDelays]:
     """Return what the equations leave and the estimate at the fixed point that the paper's iteration comes to."""
@@ -191,13 +191,13 @@ def _iterated(
     f = weights * (1.0 - np.cos(2.0 * np.pi * s))
     sine = weights * np.sin(2.0 * np.pi * s)
     # L^-2 I_{x,f''}, from rows that stay where they are
-    target = omega**2 * _shifted(recording, recording.y, starts, L * s, 0.0) @ (weights * np.cos(2.0 * np.pi * s))
+    target = omega**2 * _shift(recording, recording.y, starts, L * s, 0.0) @ (weights * np.cos(2.0 * np.pi * s))
     h1, h2 = start
     count = 0
     while count < iterations:
         count += 1
-        x = _shifted(recording, recording.y, starts, L * s, h1)
-        u = _shifted(recording, recording.u, starts, L * s, h2)
+        x = _shift(recording, recording.y, starts, L * s, h1)
+        u = _shift(recording, recording.u, starts, L * s, h2)
         matrix = np.column_stack([u @ f, u @ sine, -(x @ f), -(x @ sine)])
         solution = np.linalg.lstsq(matrix, target, rcond=None)[0]
         b, b_sine, a, a_sine = solution
@@ -220,7 +220,7 @@ def _iterated(
     )  # fmt: skip
 
 
-def _polished(recording: Recording, starts: FloatArray, L: float, start: TwoDelays) -> TwoDelays:
+def _polish(recording: Recording, starts: FloatArray, L: float, start: TwoDelays) -> TwoDelays:
     """Return the minimum of the weighted equations, y being the output with white noise."""
     try:
         equations = _Equations.of(recording, Windows(starts, L, _HARMONICS), start.values)
@@ -281,7 +281,7 @@ class _Equations:
         return np.array([max(abs(values[0]), 1e-3), max(abs(values[1]), 1e-3), small, small])
 
 
-def _shifted(recording: Recording, values: FloatArray, starts: FloatArray, offsets: FloatArray, h: float) -> FloatArray:
+def _shift(recording: Recording, values: FloatArray, starts: FloatArray, offsets: FloatArray, h: float) -> FloatArray:
     """Return values(t - h) on every interval, shape (intervals, len(offsets))."""
     at = starts[:, None] + offsets - h
     slack = recording.sample_time_s

@@ -18,7 +18,8 @@ from threadpoolctl import threadpool_limits
 from autotune.arrays import ComplexArray, FloatArray
 from autotune.errors import IdentificationError
 from autotune.identification.delay.data import DelayData
-from autotune.identification.delay.output_error import Structure, colour_of, residuals, solve_linear
+from autotune.identification.delay.output_error import Structure, residuals, solve_linear
+from autotune.identification.delay.output_error_model import colour_of
 from autotune.identification.delay.weighted_equations import Weighted, Windows, minimise_weighted
 from autotune.identification.noise_colour import NoiseColour
 
@@ -67,7 +68,17 @@ class OneDelay:
 
     @classmethod
     def of(cls, data: DelayData, order: int, windows: Windows) -> OneDelay:
-        """Return the equations of a record."""
+        """Return the equations of a record.
+
+        Parameters
+        ----------
+        data : DelayData
+            The record.
+        order : int
+            Order n.
+        windows : Windows
+            What the equations are modulated with.
+        """
         width = max(windows.length_s / _SAMPLES, float(data.ty[-1] - data.ty[0]) / (data.ty.size - 1))
         samples = np.arange(windows.starts[0] + 0.5 * width, windows.starts[-1] + windows.length_s, width)
         return cls(
@@ -168,7 +179,7 @@ def _weighted(data: DelayData, order: int, length_s: float, start_s: float | Non
     if not found:
         raise _undetermined(data, order)
     values = min(found, key=lambda pair: pair[0])[1]
-    return _settled(data, order, length_s, values, largest)
+    return _settle(data, order, length_s, values, largest)
 
 
 def _minimum(equations: OneDelay, start: FloatArray, largest: float) -> Weighted | None:
@@ -181,7 +192,7 @@ def _minimum(equations: OneDelay, start: FloatArray, largest: float) -> Weighted
     return found if inside and found.freedom > 0 and np.all(np.isfinite(found.values)) else None
 
 
-def _settled(
+def _settle(
     data: DelayData, order: int, length_s: float, values: FloatArray, largest: float
 ) -> tuple[FloatArray, FloatArray]:
     """Return the estimate with the colour of the noise, and with what quadrature leaves taken off; its covariance."""
@@ -192,7 +203,7 @@ def _settled(
     found: Weighted | None = None
     for coloured in (False, True):
         for _ in range(_ROUNDS):
-            simulated, colour = _as_simulated(plain, usable, values, coloured=coloured)
+            simulated, colour = _correct_quadrature(plain, usable, values, coloured=coloured)
             found = _minimum(simulated, values, largest)
             if found is None:
                 raise _undetermined(data, order)
@@ -207,7 +218,7 @@ def _settled(
     return values, found.covariance * np.outer(wider, wider)
 
 
-def _as_simulated(
+def _correct_quadrature(
     plain: OneDelay, data: DelayData, values: FloatArray, *, coloured: bool
 ) -> tuple[OneDelay, NoiseColour | None]:
     """Return the equations less what they leave of the model's own response, and under noise of the residual's colour.

@@ -90,20 +90,27 @@ class Weighted:
 def minimise_weighted(equations: Equations, start: FloatArray) -> Weighted:
     """Return the minimum of the weighted equations in whose valley a start lies.
 
+    Parameters
+    ----------
+    equations : Equations
+        With the derivatives' steps.
+    start : (P,) array
+        Values of the unknowns.
+
     Raises
     ------
     LinAlgError
         Equations that noise on y does not enter.
     """
     values = np.asarray(start, dtype=np.float64)
-    here = _evaluated(equations, values)
+    here = _evaluate(equations, values)
     settled = False
     for _ in range(_ROUNDS):
         size = np.maximum(np.linalg.norm(here.jacobian, axis=0), np.finfo(np.float64).tiny)
         step = -np.linalg.lstsq(here.jacobian / size, here.whitened, rcond=1e-10)[0] / size
         far = float(np.linalg.norm(here.jacobian @ step)) / max(np.sqrt(here.cost / max(here.freedom, 1)), 1e-300)
         for _halving in range(8):
-            trial = _evaluated(equations, values + step)
+            trial = _evaluate(equations, values + step)
             if trial.cost <= here.cost or far < 1e-2:
                 break
             step, far = 0.5 * step, 0.5 * far
@@ -126,7 +133,7 @@ class _Evaluated:
     freedom: int
 
 
-def _evaluated(equations: Equations, values: FloatArray) -> _Evaluated:
+def _evaluate(equations: Equations, values: FloatArray) -> _Evaluated:
     """Return the whitened equations and their derivatives, those of the output that noise is taken off."""
     e, G = equations.left(values), equations.of_noise(values)
     scale = np.linalg.norm(G, axis=1)
@@ -168,11 +175,31 @@ class Windows:
         return self.starts.size * (2 * self.harmonics + 1)
 
     def running(self, t: FloatArray, values: FloatArray, held: bool) -> list[ComplexArray]:
-        """Return the running integrals of a signal that :meth:`of_signal` takes."""
+        """Return the running integrals of a signal that :meth:`of_signal` takes.
+
+        Parameters
+        ----------
+        t, values : (N,) array
+            Time stamps [s] and the signal.
+        held : bool
+            Whether it is held between rows (else linear).
+        """
         return [running_fourier(t, values, float(omega), held) for omega in self._omega]
 
     def of_signal(self, t: FloatArray, running: list[ComplexArray], shift_s: float, derivative: int) -> FloatArray:
-        """Return the integrals of v(t - shift) against the windows' derivative, (windows,)."""
+        """Return the integrals of v(t - shift) against the windows' derivative, (windows,).
+
+        Parameters
+        ----------
+        t : (N,) array
+            Time stamps [s].
+        running : list of (N,) complex array
+            As of :meth:`running`.
+        shift_s : float
+            How late the signal acts [s].
+        derivative : int
+            Order of the windows' derivative.
+        """
         first = self.starts - shift_s
         parts = []
         for omega, sums in zip(self._omega, running, strict=True):
@@ -181,7 +208,17 @@ class Windows:
         return self._combined(parts, derivative)
 
     def on(self, t: FloatArray, shift_s: float, derivative: int) -> FloatArray:
-        """Return the windows' derivative at every t + shift, (windows, times)."""
+        """Return the windows' derivative at every t + shift, (windows, times).
+
+        Parameters
+        ----------
+        t : (N,) array
+            Times [s].
+        shift_s : float
+            Added to them [s].
+        derivative : int
+            Order of the windows' derivative.
+        """
         s = t + shift_s - self.starts[:, None]
         inside = (s > 0.0) & (s < self.length_s)
         return self._combined([np.where(inside, np.exp(1j * omega * s), 0.0) for omega in self._omega], derivative)

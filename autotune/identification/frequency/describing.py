@@ -58,7 +58,7 @@ def describing_function(cycle: LimitCycle, delay_s: float, *, plant_sign: int) -
     omega = cycle.points[0].omega_rad_s
     gain = math.pi * cycle.y_peak_to_peak / (4.0 * 2.0 * cycle.u_amplitude)
     phase = -math.pi + delay_s * omega
-    reference = positive_gain_phase(cycle.points[0], plant_sign)
+    reference = _positive_gain_phase(cycle.points[0], plant_sign)
     return DescribingFunctionEstimate(
         omega_rad_s=omega,
         gain=gain,
@@ -68,7 +68,7 @@ def describing_function(cycle: LimitCycle, delay_s: float, *, plant_sign: int) -
     )
 
 
-def positive_gain_phase(point: FrequencyPoint, plant_sign: int) -> float:
+def _positive_gain_phase(point: FrequencyPoint, plant_sign: int) -> float:
     """Return the phase of the positive-gain plant in (-2 pi, 0] [rad]."""
     phase = math.atan2(plant_sign * point.response.imag, plant_sign * point.response.real)
     return phase - 2.0 * math.pi if phase > 0.0 else phase

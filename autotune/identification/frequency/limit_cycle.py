@@ -125,6 +125,13 @@ def relay_edges(t: FloatArray, u: FloatArray) -> RelayEdges:
 def whole_periods(edges: RelayEdges, end_s: float) -> WholePeriods:
     """Return the longest window of whole periods that ends by ``end_s``.
 
+    Parameters
+    ----------
+    edges : RelayEdges
+        The relay's switches.
+    end_s : float
+        Last time that counts [s].
+
     Raises
     ------
     IdentificationError

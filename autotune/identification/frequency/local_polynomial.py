@@ -95,15 +95,15 @@ def local_estimate(
     regressor = X if excited is None else np.where(excited, X, 0.0)
     if not np.any(regressor):
         return None
-    found = _fitted(omega_rad_s, regressor, Z, centre_rad_s, min(lines, 3))
-    finer = _fitted(omega_rad_s, regressor, Z, centre_rad_s, 4) if lines >= 4 else None
+    found = _fit(omega_rad_s, regressor, Z, centre_rad_s, min(lines, 3))
+    finer = _fit(omega_rad_s, regressor, Z, centre_rad_s, 4) if lines >= 4 else None
     if found is None or finer is None:
         return found
     bias = found.gain - finer.gain
     return replace(found, covariance=found.covariance + np.outer(bias, bias.conj()))
 
 
-def _fitted(
+def _fit(
     omega_rad_s: FloatArray, regressor: ComplexArray, Z: ComplexArray, centre_rad_s: float, terms_of_gain: int
 ) -> LocalEstimate | None:
     """Return the estimate with so many terms of G and three of T, its variance that of the residual."""

@@ -185,6 +185,18 @@ def free_responses(t: FloatArray, model: ReferenceModel) -> tuple[FloatArray, ..
 
     A mode that outlasts the window is a parabola beside offset and drift: its pole is moved to where the column still
     differs from those. One that is over within one sample is left out.
+
+    Parameters
+    ----------
+    t : (N,) array
+        Time stamps [s].
+    model : ReferenceModel
+        The rough model.
+
+    Returns
+    -------
+    tuple of (N,) array
+        Two columns, or fewer.
     """
     span = float(t[-1] - t[0])
     slow, fast = sorted((model.p, 1.0 / model.tau))

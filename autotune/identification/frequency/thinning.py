@@ -80,5 +80,11 @@ def _mean(omega: FloatArray, response: ComplexArray, covariance: FloatArray, fir
 
 
 def said(given: int, kept: int) -> tuple[str, ...]:
-    """Return a note that points were thinned, none where they were not."""
+    """Return a note that points were thinned, none where they were not.
+
+    Parameters
+    ----------
+    given, kept : int
+        Numbers of points before and after.
+    """
     return (f"{given} points were averaged in {kept} bands, with their information kept",) if kept < given else ()

@@ -11,7 +11,8 @@ from typer.testing import CliRunner
 from autotune.cli import app
 from autotune.controller import PIDController, read_controller, write_controller
 from autotune.errors import InputError
-from autotune.models import Block, Model, Port, write_model
+from autotune.model_tables import write_model
+from autotune.models import Block, Model, Port
 from autotune.points import points_to_json
 from tests.autotune.design.plants import REDUCED, measured
 

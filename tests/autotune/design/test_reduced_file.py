@@ -20,7 +20,8 @@ from autotune.design.specification import Specification
 from autotune.errors import DesignError, InputError
 from autotune.identification.reduced_file import read_reduced, write_reduced
 from autotune.identification.reduction import ReducedModel, reduce_points, reduce_transfer_function
-from autotune.models import TransferFunction, read_model
+from autotune.model_tables import read_model
+from autotune.models import TransferFunction
 from autotune.pipeline.analysis import on_reduced_model
 from autotune.points import points_to_json
 from tests.autotune.design.plants import BALL, measured

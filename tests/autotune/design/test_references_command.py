@@ -10,7 +10,8 @@ from typer.testing import CliRunner
 
 from autotune.cli import app
 from autotune.controller import PIDController, read_controller, write_controller
-from autotune.models import Block, Model, Port, TransferFunction, read_model, write_model
+from autotune.model_tables import read_model, write_model
+from autotune.models import Block, Model, Port, TransferFunction
 from tests.autotune.design.plants import BALL
 
 

@@ -17,7 +17,8 @@ from autotune.diagnosis.fitting.retuning import prepare
 from autotune.diagnosis.simulation.forecast import forecast
 from autotune.effects import CATALOGUE
 from autotune.experiment_design import with_next_experiment
-from autotune.models import Block, Model, Port, TransferFunction, read_model
+from autotune.model_tables import read_model
+from autotune.models import Block, Model, Port, TransferFunction
 from autotune.recording import Recording, read_recording
 
 

@@ -13,7 +13,8 @@ from autotune.cli import app
 from autotune.diagnosis.diagnose import diagnose
 from autotune.effects import counted_as
 from autotune.errors import InputError
-from autotune.models import Block, Effect, Model, Parameter, Port, TransferFunction, read_model, write_model
+from autotune.model_tables import read_model, write_model
+from autotune.models import Block, Effect, Model, Parameter, Port, TransferFunction
 from autotune.recording import Recording
 from tests.autotune.diagnosis.equations.test_diagnose_equations import as_it_is, recorded
 from tests.autotune.diagnosis.servo_rigs import servo_model, servo_recording

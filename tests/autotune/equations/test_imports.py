@@ -16,7 +16,8 @@ from autotune.equations import EquationModel, compile_model, derivatives
 from autotune.equations.imports import from_control, from_matlab
 from autotune.equations.transfer_text import parse_transfer_function
 from autotune.errors import InputError
-from autotune.models import Model, read_model
+from autotune.model_tables import read_model
+from autotune.models import Model
 
 OMEGA = np.logspace(-2, 2, 9)
 

@@ -9,18 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from autotune.errors import IdentificationError
-from autotune.experiment.plan import (
-    Choice,
-    Goal,
-    LocalModel,
-    allot,
-    choose,
-    expected_sd,
-    phase_targets,
-    predicted,
-    time_s,
-    within_reach,
-)
+from autotune.experiment.local_model import LocalModel, predicted
+from autotune.experiment.plan import Choice, Goal, allot, choose, expected_sd, phase_targets, time_s, within_reach
 from autotune.experiment.relay import RelaySettings
 from autotune.models import TransferFunction
 from autotune.points import FrequencyPoint

@@ -13,7 +13,8 @@ import pytest
 from autotune.errors import ExperimentStopped
 from autotune.experiment.cycles import read_earlier
 from autotune.experiment.dwell import Dwell, further_periods
-from autotune.experiment.plan import LocalModel, phase_targets
+from autotune.experiment.local_model import LocalModel
+from autotune.experiment.plan import phase_targets
 from autotune.experiment.result import ExperimentResult, Status
 from autotune.experiment.run import run_experiment
 from autotune.experiment.sweep import missing_phases

@@ -12,7 +12,8 @@ from autotune.identification.delay.compiled import transitions
 from autotune.identification.delay.data import prepare
 from autotune.identification.delay.identify import identify_delay
 from autotune.identification.delay.model import DelayModel
-from autotune.identification.delay.output_error import Point, Structure, finish, solve_linear
+from autotune.identification.delay.output_error import Point, Structure, solve_linear
+from autotune.identification.delay.output_error_model import finish
 from autotune.identification.delay.response import normal_matrix, output
 from autotune.recording import Recording, read_recording
 from tests.autotune.identification.delay_examples import X0, A, B, example_2, held_response

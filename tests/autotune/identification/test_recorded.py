@@ -10,9 +10,11 @@ from typer.testing import CliRunner
 from autotune.cli import app
 from autotune.errors import IdentificationError
 from autotune.identification.frequency.local_polynomial import local_estimate
-from autotune.identification.frequency.recorded import FrequencyEstimate, combine, frequency_points
+from autotune.identification.frequency.recorded import combine, frequency_points
 from autotune.identification.frequency.spectra import clean_measurement
-from autotune.models import TransferFunction, read_model
+from autotune.identification.frequency.spectral_points import FrequencyEstimate
+from autotune.model_tables import read_model
+from autotune.models import TransferFunction
 from autotune.points import read_points
 from autotune.recording import Recording, read_recording, write_recording
 from tests.autotune.identification.relay_loop import BALL, drive, held, relay_loop

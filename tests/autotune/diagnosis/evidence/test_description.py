@@ -13,7 +13,7 @@ from autotune.diagnosis.evidence.description import Description, describe
 from autotune.diagnosis.evidence.samples import inspect
 from autotune.diagnosis.fitting.retuning import prepare
 from autotune.effects import CATALOGUE
-from autotune.models import read_model
+from autotune.model_tables import read_model
 from autotune.recording import Recording, read_recording
 from tests.autotune.diagnosis.servo_rigs import servo_model, servo_recording
 

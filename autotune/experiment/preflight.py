@@ -1,0 +1,166 @@
+"""The look at a rig before anything is moved: how often it answers, its noise, whether it is at rest."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from statistics import median
+
+import numpy as np
+
+from autotune.arrays import FloatArray
+from autotune.config.procedure import OperatingPointSettings
+from autotune.errors import ExperimentStopped, LinkError
+from autotune.experiment.feasibility import supported_rad_s
+from autotune.experiment.loop import ControlLoop
+from autotune.experiment.monitor import RECENT
+from autotune.experiment.rig import Exchanges, RunsRelay
+from autotune.points import FrequencyPoint
+
+PREFLIGHT_SAMPLES = 60
+#: share of these that may take longer than 0.8 of the sample time
+SLOW_SHARE = 0.05
+#: least share of readings in preflight that differ from the one before, for a sensor of which that can be expected
+RESTLESS = 0.05
+SMALL = 1e-9
+
+Tell = Callable[[str], None]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Known:
+    """What the procedure has learnt so far.
+
+    Attributes
+    ----------
+    noise_sd, noise_half : float
+        Standard deviation and half-width of the measurement noise [y unit].
+    y_rest : float
+        Mean measurement in preflight [y unit].
+    plant_sign : int
+        Sign of the plant's gain, 0 while unknown.
+    sign_seen : bool
+        Whether that was seen on the rig, and the mid-point roughly with it, and not only said.
+    midpoint : float
+        Command that holds the plant, as far as known [u unit].
+    first_move_s : float
+        When the plant first answered [s].
+    y_moved, speed : float
+        Measurement [y unit] and speed [y unit/s] when it was seen to move.
+    points : tuple of FrequencyPoint
+        What is known of the plant.
+    swept : bool
+        Whether the points are the sweep's, and not a short look.
+    link_rad_s : float
+        Frequency up to which the link supports points [rad/s].
+    warnings : tuple of str
+        What the reader should know.
+    """
+
+    noise_sd: float = 0.0
+    noise_half: float = 0.0
+    y_rest: float = math.nan
+    plant_sign: int = 0
+    sign_seen: bool = False
+    midpoint: float = math.nan
+    first_move_s: float = 0.0
+    y_moved: float = math.nan
+    speed: float = 0.0
+    points: tuple[FrequencyPoint, ...] = ()
+    swept: bool = False
+    link_rad_s: float = math.inf
+    warnings: tuple[str, ...] = ()
+
+
+def preflight(loop: ControlLoop, point: OperatingPointSettings, gain_sd: float, tell: Tell) -> Known:
+    """Look before anything moves: link, noise, a sensor that is alive and in range.
+
+    Parameters
+    ----------
+    loop, point, tell
+        The open loop, how its operating point is reached, and who is told.
+    gain_sd : float
+        Relative standard deviation at which a point is good enough.
+
+    Raises
+    ------
+    ExperimentStopped, LinkError
+        Link too slow, sensor at its rail or frozen.
+    """
+    tell("looking at link and noise")
+    start_u = point.u_guess if point.approach == "hold" else loop.tick.u
+    first_row = loop.tick.k
+    first: tuple[float, ...] = ()
+    for _ in range(PREFLIGHT_SAMPLES):
+        loop.step(loop.nearest(start_u))
+        first = first if len(first) == RECENT else loop.monitor.recent
+        if point.approach == "ramp":
+            _check_at_rest(loop, first_row, first)
+    y = loop.history(first_row)[2][1:]
+    y = y[np.isfinite(y)]
+    timing = loop.timing
+    typical, late, _ = timing.latency_s
+    # where the device runs the relay, what the host does before may miss samples
+    may_miss = isinstance(loop.rig, RunsRelay) and not isinstance(loop.rig, Exchanges)
+    longest_s = 0.5 * loop.patience_s if may_miss else 0.8 * loop.sample_time_s
+    # one hiccup of the computer is none of the link's
+    if loop.slower_than(longest_s) > SLOW_SHARE:
+        raise LinkError(
+            f"link too slow: a reading takes {1e3 * typical:.3g} ms, up to {1e3 * late:.3g} ms in 99 %,"
+            f" the sample time is {1e3 * loop.sample_time_s:.3g} ms",
+            where="preflight",
+            remedy="raise signals.sample_time_s, or use a faster link",
+        )
+    link_rad_s = supported_rad_s(timing, loop.sample_time_s, gain_sd, exact=loop.is_exact)
+    tell(
+        f"a reading takes {1e3 * typical:.2g} ms, up to {1e3 * late:.2g} ms in 99 %, and the loop is up to"
+        f" {1e3 * timing.lateness_s[1]:.2g} ms late: this link supports points up to {link_rad_s:.3g} rad/s"
+    )
+    loop.note(link_rad_s=link_rad_s)
+    steps = np.diff(y)
+    # from differences: a plant that drifts is not taken for noise; from their median: nor are a few wild readings
+    typical = 1.4826 * float(np.median(np.abs(steps)))
+    noise_sd = min(float(np.std(steps)), typical if typical > 0.0 else math.inf) / math.sqrt(2.0)
+    noise_half = min(0.5 * float(np.max(np.abs(steps))), 3.0 * noise_sd)
+    limits = loop.envelope.settings
+    if noise_half > 0.4 * limits.swing:
+        raise ExperimentStopped(
+            f"drowned in noise: y is restless by +-{noise_half:.3g} where limits.swing allows {limits.swing:g}",
+            where="preflight",
+            remedy="filter the measurement at the device, or allow more swing",
+        )
+    changes = float(np.mean(steps != 0.0))
+    loop.monitor.noise = noise_half
+    loop.monitor.jump = 0.5 * limits.swing
+    loop.monitor.u_tolerance = 0.02 * (limits.u_max - limits.u_min)
+    if changes > RESTLESS:
+        # a sensor at its rail repeats its full scale half of the time; the longest run seen says how it repeats itself
+        loop.monitor.same_s = (4 * _longest_run(y) + 19.5) * loop.sample_time_s
+    return Known(
+        noise_sd=noise_sd,
+        noise_half=noise_half,
+        y_rest=float(np.mean(y)),
+        plant_sign=point.plant_sign,
+        link_rad_s=link_rad_s,
+    )
+
+
+def _check_at_rest(loop: ControlLoop, first_row: int, first: tuple[float, ...]) -> None:
+    """Stop where the plant moves under the command it should rest at."""
+    y = loop.history(first_row)[2]
+    if len(first) < RECENT or np.isfinite(y).sum() < RECENT:
+        return
+    moved = median(loop.monitor.recent) - median(first)
+    if abs(moved) > 0.2 * loop.envelope.settings.swing + float(np.nanmax(np.abs(np.diff(y)))):
+        raise ExperimentStopped(
+            f"wrong sign, or the plant moves where it should rest: y went by {moved:.3g} at u = {loop.tick.u:.4g}",
+            where="preflight",
+            remedy="wait until it is at rest; check limits.u_safe, and the wiring and scaling of the actuator",
+        )
+
+
+def _longest_run(y: FloatArray) -> int:
+    """Return the length of the longest run of equal readings."""
+    changes = np.flatnonzero(np.diff(y) != 0.0)
+    return int(np.max(np.diff(np.concatenate([[-1], changes, [y.size - 1]]))))
