@@ -35,7 +35,6 @@ class Thresholds:
     unknown_lags: float = known(1.0, "slowest lags", "after the dead time, commands before the recording act no more", "convention")
     most_left_out: float = known(0.03, "of a recording", "that is left out at its beginning at most", "convention")
     # noise
-    largest_correlation: float = known(0.9, "1", "of the noise from row to row: beyond it differences cannot tell it from a slow residual", "convention")
     slow_noise: float = known(0.8, "1", "correlation of the noise from which on it is no matter of single samples", "counted")
     coarse: float = known(25.0, "reduced chi2", "from which on the residual itself is taken for noise", "real rigs")
     # what samples show

@@ -13,15 +13,13 @@ from autotune.errors import InputError
 from autotune.models import Block, Model, TransferFunction, model_of
 
 
-def from_chain(model: Model, column: str = "u") -> EquationModel:
+def from_chain(model: Model) -> EquationModel:
     """Return a chain of blocks as equations.
 
     Parameters
     ----------
     model : Model
         Blocks in series; its dead times act at the input, which is the same for linear blocks.
-    column : str
-        Column of the command.
 
     Returns
     -------
@@ -29,12 +27,12 @@ def from_chain(model: Model, column: str = "u") -> EquationModel:
         A state per pole, gains and time constants as parameters. Effects of the chain are not taken along: they
         say where they act in words of a chain.
     """
-    made = _Chain([column])
-    signal: Expression = Name(column)
+    made = _Chain(["u"])
+    signal: Expression = Name("u")
     for block in model.blocks:
         signal = made.block(block.name, block.dynamics, signal, kind_of(block), block.unit)
     command = InputColumn(
-        column=column, unit=model.input.unit, hold=model.input.hold, offset=model.input.offset,
+        column="u", unit=model.input.unit, hold=model.input.hold, offset=model.input.offset,
         delay_s=sum(block.dynamics.delay_s for block in model.blocks),
     )  # fmt: skip
     output = Call("+", (signal, Number(model.output.offset))) if model.output.offset else signal

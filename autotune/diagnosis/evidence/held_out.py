@@ -57,7 +57,7 @@ def held_out(retuned: Fit, data: Data) -> FitQuality:
         return math.sqrt(squares / max(freedom, 1)) / spread
 
     nominal, tuned = error(retuned, tune=False), error(retuned, tune=True)
-    noise = noise_from_differences(retuned.residuals, data.good, data.thresholds.largest_correlation).total_sd / spread
+    noise = noise_from_differences(retuned.residuals, data.good).total_sd / spread
     return FitQuality(nominal=nominal, retuned=tuned, extended=tuned, noise_floor=noise)
 
 

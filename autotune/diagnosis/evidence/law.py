@@ -28,6 +28,8 @@ from autotune.recording import Recording
 
 #: Shortest filter of a derivative that is looked for where none is stated, in sample times; the longest is T_d.
 SHORTEST_FILTER = 0.05
+#: Order of the autoregressive noise that the dither is taken for.
+ORDER = 8
 EQUATIONS = {
     ("gain",): "u = bias + g C e with a gain g other than 1",
     ("P",): "u = bias + K e with K other than stated",
@@ -348,8 +350,8 @@ def _least_squares(X: FloatArray, u: FloatArray) -> tuple[FloatArray, FloatArray
     return np.asarray(weights), np.asarray(covariance), max(variance, 1e-300)
 
 
-def _prewhitening(residual: FloatArray, order: int = 8) -> FloatArray:
+def _prewhitening(residual: FloatArray) -> FloatArray:
     """Return 1, -a1, ..., the filter that whitens a residual, by least squares."""
-    past = np.column_stack([residual[order - k - 1 : residual.size - k - 1] for k in range(order)])
-    a = np.linalg.lstsq(past, residual[order:], rcond=1e-10)[0]
+    past = np.column_stack([residual[ORDER - k - 1 : residual.size - k - 1] for k in range(ORDER)])
+    a = np.linalg.lstsq(past, residual[ORDER:], rcond=1e-10)[0]
     return np.concatenate([[1.0], -a])

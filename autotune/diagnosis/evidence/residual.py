@@ -40,10 +40,7 @@ class FreedResidual:
         self.own = np.linalg.svd(self.J / np.maximum(np.linalg.norm(self.J, axis=0), 1e-300), full_matrices=False)[0]
         self.rows = data.rows
         # where the residual is so large that it was taken for noise, the floor is what changes from row to row alone
-        jitter = (
-            noise_from_differences(result.residuals, data.good, data.thresholds.largest_correlation).total_sd
-            / data.noise.total_sd
-        )
+        jitter = noise_from_differences(result.residuals, data.good).total_sd / data.noise.total_sd
         self.floor = data.rows * min(1.0, jitter**2)
         number = np.zeros(result.e.size, dtype=np.int64)
         for i, (a, b) in enumerate(result.windows):
