@@ -13,7 +13,7 @@ import numpy as np
 from autotune.arrays import BoolArray
 from autotune.diagnosis.evidence.adequacy import residual_tests
 from autotune.diagnosis.evidence.description import Description, describe
-from autotune.diagnosis.evidence.held_out import held_out
+from autotune.diagnosis.evidence.held_out import held_out_error
 from autotune.diagnosis.evidence.misread import misread_columns
 from autotune.diagnosis.evidence.operating_point import unmoved
 from autotune.diagnosis.evidence.own_noise import OwnNoise
@@ -99,7 +99,7 @@ class ChainEvidence(Evidence):
     def jitter_explains_more(self) -> bool:
         """Whether a clock that jitters explains more than what varies: it disturbs commands too."""
         jitter = sum(s.evidence for s in self.samples if kind_of(s.name).sought == "residual")
-        return self.residual.varies.gain < self.limits.lesser_share * jitter
+        return self.residual.varies.gain < self.limits.majority * jitter
 
     @cached_property
     def contradicted(self) -> frozenset[str]:
@@ -221,7 +221,7 @@ class ChainEvidence(Evidence):
 
         def error_of(changed: Sequence[Recording], good: Sequence[BoolArray]) -> float:
             data, retuned = prepare(self.model, changed, good, self.limits)
-            return held_out(retuned, data).retuned
+            return held_out_error(retuned, data, tune=True)
 
         return misread_columns(self.measured, self.model.input.offset, self.quality, self.limits, error_of)
 

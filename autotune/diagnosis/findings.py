@@ -105,7 +105,7 @@ def places_of(evidence: Evidence, effects: Sequence[FoundEffect], description: D
         return tuple(dict.fromkeys(place for e in effects for place in e.places))
     known: dict[str, None] = {description.place: None} if description is not None and description.terms else {}
     if not evidence.residual.is_constant and description is not None:
-        informative = known if description.explained > evidence.limits.informative else {}
+        informative = known if description.explained > evidence.limits.majority else {}
         return tuple(dict.fromkeys(evidence.residual.varies.places) | informative)
     places: dict[str, None] = dict(known)
     for names in evidence.leading[:3]:

@@ -101,7 +101,7 @@ def _promising(bench: Bench, fits: Sequence[Outcome], own: int, limits: Threshol
         return quick_score(one, noise) - 2.0 * limits.temperature * float(odds)
 
     once = {frozenset(map(key_of, one.effects)): one for one in sorted(fits, key=charged, reverse=True)}
-    few = sorted(once.values(), key=charged)[: limits.rig_judged]
+    few = sorted(once.values(), key=charged)[: limits.rig_tried]
     plain = [_plainest(bench, one) for one in few[: limits.confirmed]]
     return [one for one in few if not is_plainer(one.effects[-1])] + [one for one in plain if one is not None]
 

@@ -248,7 +248,7 @@ def _equation(residual: FreedResidual) -> tuple[tuple[Term, ...], Place, float]:
     )
     before = residual.cross_validated(np.zeros((residual.e.size, 0)))
     limits = residual.data.thresholds
-    least = max(limits.term_share * (before - residual.floor), limits.least_decrease)
+    least = max(limits.material * (before - residual.floor), limits.least_decrease)
     chosen: list[_Candidate] = []
     error = before
     groups = [*([c for c in pool if c.place == place] for place in residual.signals), memories]

@@ -131,7 +131,7 @@ def law_effect(
     for r in recordings:
         stated = stated_law(r.metadata, controller)
         shown = None if stated is None else shown_law(r, stated, limits)
-        if shown is not None and np.max(shown.off) > limits.law_sigmas:
+        if shown is not None and np.max(shown.off) > limits.off_sigmas:
             return SampleEffect(
                 name="controller.law",
                 equation=EQUATIONS[shown.parts],

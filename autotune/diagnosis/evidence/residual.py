@@ -159,7 +159,7 @@ class FreedResidual:
     def explained(self, error: float, before: float) -> float:
         """Return the share of the held-out residual above the noise that is gone."""
         return float(
-            np.clip((before - error) / max(before - self.floor, self.data.thresholds.term_share * self.floor), 0.0, 1.0)
+            np.clip((before - error) / max(before - self.floor, self.data.thresholds.material * self.floor), 0.0, 1.0)
         )
 
 

@@ -26,6 +26,9 @@ from autotune.diagnosis.thresholds import IN_USE, Thresholds
 from autotune.models import Parameter
 from autotune.recording import Recording
 
+#: The effect that is looked for in stamps, in the residual's size, and in how innovations go with steps of the command.
+JITTER = "timing.jitter"
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SampleEffect:

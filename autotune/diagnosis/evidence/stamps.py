@@ -12,7 +12,7 @@ from types import MappingProxyType
 
 import numpy as np
 
-from autotune.diagnosis.evidence.samples import SampleEffect
+from autotune.diagnosis.evidence.samples import JITTER, SampleEffect
 from autotune.diagnosis.evidence.stretches import rms
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import RUNAWAY, Fit
@@ -20,9 +20,6 @@ from autotune.diagnosis.fitting.retuning import prepare
 from autotune.diagnosis.thresholds import Thresholds
 from autotune.models import Model, Parameter
 from autotune.recording import Recording
-
-#: The effect that says so.
-JITTER = "timing.jitter"
 
 
 def uneven_share(recording: Recording) -> float:

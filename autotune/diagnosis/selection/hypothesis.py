@@ -83,7 +83,7 @@ def contradicted(h: Hypothesis, data: Data) -> frozenset[str]:
     Notes
     -----
     Squared differences of neighbouring readings where the simulated one stands still are compared with those of the
-    residual elsewhere; the share must be beyond ``most_scatter`` by two standard deviations. A limit in front of most
+    residual elsewhere; the share must be beyond ``majority`` by two standard deviations. A limit in front of most
     of the noise (a transmitter at its end, read through a noisy line) looks the same: ask only where a rig's noise is
     known to be in front of it, or where model error rules and a limit may stand for what it is not.
     """
@@ -100,4 +100,4 @@ def contradicted(h: Hypothesis, data: Data) -> frozenset[str]:
     if not at.size or not elsewhere.size:
         return frozenset()
     surely = (1.0 - 2.0 * np.sqrt(2.0 / at.size)) * np.mean(at)
-    return able if surely > data.thresholds.most_scatter * np.mean(elsewhere) else frozenset()
+    return able if surely > data.thresholds.majority * np.mean(elsewhere) else frozenset()

@@ -145,7 +145,8 @@ def _grown(
 def _roots(model: Model, bench: Bench) -> tuple[Bench, list[JudgedChain]]:
     """Return the bench with the retuned model's residual, and that model at its nominal numbers and retuned."""
     recordings = bench.long.driving
-    p = parametrise(model, [], input_size(model, recordings), recordings[0].sample_time_s)
+    p = parametrise(model, [], input_size(model, recordings), recordings[0].sample_time_s,
+                    bench.limits.prior_spread)  # fmt: skip
     result = bench.settled(p, None)
     for _ in range(2):
         bench = bench.with_sd(residual_sd(result, bench.long), bench.few.noise.sd)
@@ -197,7 +198,7 @@ def _larger(beam: Sequence[JudgedChain], bench: Bench) -> list[JudgedChain]:
         if key not in best or result.cost < best[key][0].cost:
             best[key] = result, log_odds, s.base
     ranked = sorted(best.values(), key=lambda one: one[0].cost - 2.0 * one[1])
-    able = [[one for one in ranked if one[2] is base][: bench.limits.rig_judged] for base in beam]
+    able = [[one for one in ranked if one[2] is base][: bench.limits.rig_tried] for base in beam]
     done = bench.pool.map(lambda one: bench.judged(one[0], one[1]), [one for group in able for one in group])
     return [j for j in done if j is not None and np.all(np.isfinite(j.long_squares + j.short_squares))]
 
