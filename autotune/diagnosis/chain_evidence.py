@@ -195,7 +195,7 @@ class ChainEvidence(Evidence):
             places=self.places(effect.name),
             parameters=MappingProxyType(parameters),
             equation=kind.equation,
-            windows=self.acting(effect.name, {key: q.value for key, q in effect.parameters.items()}),
+            windows=self.acting(effect),
             operating_range=self._range(kind.place),
             as_command=MappingProxyType(self._as_command(effect.name, parameters)),
         )
@@ -212,8 +212,7 @@ class ChainEvidence(Evidence):
     def _range(self, place: str) -> OperatingRange:
         column, name = {"plant": (2, "position"), "sensor": (0, "y")}.get(place, (3, "plant input"))
         values = np.concatenate([s[:, column] for s in self.search.chosen.fit.signals])
-        at_plant = next((b.unit for b in self.model.blocks if b.place == "actuator" and b.unit), self.model.input.unit)
-        unit = at_plant if name == "plant input" else self.model.output.unit
+        unit = self.model.plant_input_unit if name == "plant input" else self.model.output.unit
         return OperatingRange(signal=name, low=float(np.nanmin(values)), high=float(np.nanmax(values)), unit=unit)
 
     def misread_columns(self) -> str:

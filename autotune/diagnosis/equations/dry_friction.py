@@ -26,10 +26,7 @@ TOO_FAR = 1.2
 def with_force(effect: Effect, times: float) -> Effect:
     """Return dry friction with so many times its force, any other effect as it is."""
     levels = form_of(effect).levels
-    if not levels:
-        return effect
-    forces = {key: replace(q, value=times * q.value) for key, q in effect.parameters.items() if key in levels}
-    return replace(effect, parameters=MappingProxyType({**effect.parameters, **forces}))
+    return effect.with_values({key: times * value for key, value in effect.values.items() if key in levels})
 
 
 def swept(bench: Bench, one: Outcome) -> list[Outcome]:

@@ -12,7 +12,7 @@ import numpy as np
 
 from autotune.arrays import BoolArray, FloatArray
 from autotune.diagnosis.equations.bench import Bench, Outcome
-from autotune.diagnosis.equations.candidates import Signals, Trial, form_of, values_of
+from autotune.diagnosis.equations.candidates import Signals, Trial, form_of
 from autotune.diagnosis.equations.first_order import explained, start_bases, without_starts
 from autotune.diagnosis.equations.followed import followed, positions_of, sizes_of
 from autotune.diagnosis.equations.further import further_columns
@@ -28,7 +28,7 @@ from autotune.equations.fit_data import Fitted
 from autotune.equations.left_out import left_out_squares
 from autotune.equations.linearise import growth_rate
 from autotune.equations.model import EquationModel, InputColumn
-from autotune.equations.parameter_scales import values_of as natural
+from autotune.equations.parameter_scales import values_of
 from autotune.equations.sensitivity import Windows, side_by_side
 from autotune.equations.simulate import Compiled, simulate
 from autotune.errors import InputError
@@ -133,7 +133,7 @@ class EquationBench(Bench):
                 first = [replace(r, y=np.where(np.arange(len(r)) < k, r.y, np.nan)) for r, k, _ in each]
                 found = fit(compiled, first, z=z, windows=windows, iterations=8)
                 z, windows = found.z, list(found.windows)
-            p = natural(compiled, z)
+            p = values_of(compiled, z)
             for (r, k, _), drive, w in zip(each, self._drives, windows, strict=True):
                 if self._horizon_s is not None:
                     runs.append(forecasts(compiled, p, drive, r.y, k, self._horizon_s))
@@ -350,7 +350,7 @@ class EquationBench(Bench):
         if not seen:
             return False
         values, at = self._followed(outcome)[1], positions_of(self.model)
-        return any(judge(values_of(e), values[at[where_of(e)]]) for e, judge in seen if at[where_of(e)] in values)
+        return any(judge(e.values, values[at[where_of(e)]]) for e, judge in seen if at[where_of(e)] in values)
 
     def signals(self, outcome: Outcome) -> Signals:
         """Return states, differences across ports, and sizes of derivatives under a fit."""

@@ -147,7 +147,7 @@ class EquationEvidence(Evidence):
             places=self.places(effect.name),
             parameters=MappingProxyType(shown),
             equation=equation_of(self.found.bench.model, effect),
-            windows=self.acting(effect.name, {k: q.value for k, q in effect.parameters.items()}),
+            windows=self.acting(effect),
             operating_range=spans_at(self.found.bench, self.found.chosen, effect),
             as_command=MappingProxyType(in_commands(effect.name, shown, command, unit.unit) if command else {}),
             **{key: getattr(effect, key) for key in ("state", "port", "input", "column")},

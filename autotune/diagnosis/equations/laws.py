@@ -113,7 +113,7 @@ class EquationLine(LawLine):
         named = zip(compiled.parameters, values_of(compiled, theta), strict=True)
         there = with_values(self.outcome.effects, {p.name: (float(v), 0.0) for p, v in named})
         effect, form = there[self.number], form_of(self.effect, model)
-        values = {key: q.value for key, q in effect.parameters.items()}
+        values = effect.values
 
         def bound(name: str) -> Expression | None:
             if name == self.over:

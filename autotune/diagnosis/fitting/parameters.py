@@ -132,14 +132,10 @@ class Parametrisation:
 
 
 def _set_effects(effects: tuple[Effect, ...], values: dict[tuple[int, int], float]) -> tuple[Effect, ...]:
-    result = []
-    for number, effect in enumerate(effects):
-        parameters = {
-            key: replace(parameter, value=values[number, j]) if (number, j) in values else parameter
-            for j, (key, parameter) in enumerate(effect.parameters.items())
-        }
-        result.append(replace(effect, parameters=MappingProxyType(parameters)))
-    return tuple(result)
+    return tuple(
+        effect.with_values({k: values[i, j] for j, k in enumerate(effect.parameters) if (i, j) in values})
+        for i, effect in enumerate(effects)
+    )
 
 
 @lru_cache(maxsize=64)

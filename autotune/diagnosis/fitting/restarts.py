@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from types import MappingProxyType
 
 import numpy as np
 
@@ -76,7 +75,7 @@ def realigned(result: Fit, data: Data) -> Fit:
         return result
     number = result.parametrisation.model.effects.index(moved)
     kind, span = kind_of(moved.name), max(float(np.ptp(r.u)) for r in data.driving)
-    at: Values = {key: q.value for key, q in result.model.effects[number].parameters.items()}
+    at: Values = result.model.effects[number].values
     before = best = _moved(result, data, kind, number, at)
     wide, turn = MOVES
     for _ in range(HALVINGS):
@@ -104,9 +103,8 @@ class _Moved:
 def _moved(result: Fit, data: Data, kind: EffectKind, number: int, values: Values) -> _Moved:
     """Return what a fit leaves with an effect's parameters moved."""
     p, theta = result.parametrisation, result.theta.copy()
-    effects = list(p.model.effects)
-    parameters = dict(effects[number].parameters)
-    for key in parameters:
+    effects, held = list(p.model.effects), {}
+    for key in effects[number].parameters:
         q = kind.quantity(key)
         if q is None or key not in values:
             continue
@@ -114,8 +112,8 @@ def _moved(result: Fit, data: Data, kind: EffectKind, number: int, values: Value
             index = [f.name for f in p.free].index(f"{kind.name}.{key}")
             theta[index] = np.log(values[key]) if p.free[index].positive else values[key] / p.free[index].size
         else:
-            parameters[key] = replace(parameters[key], value=values[key])
-    effects[number] = replace(effects[number], parameters=MappingProxyType(parameters))
+            held[key] = values[key]
+    effects[number] = effects[number].with_values(held)
     p = replace(p, model=replace(p.model, effects=tuple(effects)))
     left = result.without_numbers(result.without_states(residual_at(p, data, theta, result.x0)))
     return _Moved(values=values, parametrisation=p, theta=theta, cost=float(left @ left))

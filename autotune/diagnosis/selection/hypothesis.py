@@ -68,10 +68,10 @@ def is_stand_in(h: Hypothesis, data: Data) -> bool:
     positions = np.concatenate([signals[:, 2] for signals in h.fit.signals])
     travelled = float(np.nanmax(positions) - np.nanmin(positions))
     for effect, kind in able:
-        values = {key: q.value for key, q in effect.parameters.items()}
         fitted = Fitted(
-            values=values, travelled=travelled, noise_sd=data.noise.total_sd, mechanical=h.fit.sim.chain.is_mechanical
-        )
+            values=effect.values, travelled=travelled, noise_sd=data.noise.total_sd,
+            mechanical=h.fit.sim.chain.is_mechanical,
+        )  # fmt: skip
         if kind.stand_in is not None and kind.stand_in(fitted):
             return True
     return False

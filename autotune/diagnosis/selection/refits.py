@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from types import MappingProxyType
 
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import RUNAWAY, Fit, fit
@@ -55,9 +54,7 @@ def _moved(result: Fit, number: int, key: str, shift: float, data: Data) -> Fit 
     """Fit again for a few steps with a time of change moved; nothing where the simulation runs away."""
     p = result.parametrisation
     effects = list(p.model.effects)
-    time = effects[number].parameters[key]
-    moved = {**effects[number].parameters, key: replace(time, value=time.value + shift)}
-    effects[number] = replace(effects[number], parameters=MappingProxyType(moved))
+    effects[number] = effects[number].with_values({key: effects[number].values[key] + shift})
     try:
         there = replace(p, model=replace(p.model, effects=tuple(effects)))
         return fit(there, data, result.theta, result.x0, iterations=4, rounds=1, inherit=result)
