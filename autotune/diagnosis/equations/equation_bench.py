@@ -22,7 +22,7 @@ from autotune.diagnosis.equations.sought import changed, outer, sought
 from autotune.diagnosis.evidence.stretches import stretches_in
 from autotune.effects import KINDS
 from autotune.effects.in_equations import Scales
-from autotune.equations.effects import compile_with, where_of, with_values
+from autotune.equations.effects import compile_with, where_of
 from autotune.equations.fit import LEAST_ROWS, fit, retune
 from autotune.equations.fit_data import Fitted
 from autotune.equations.left_out import left_out_squares
@@ -76,7 +76,7 @@ class EquationBench(Bench):
         self._nominal, self._further = model, further_columns(model, recordings)
         # further columns drive nothing until an effect takes them; what is measured runs on between rows
         measured = (InputColumn(column=name, hold="linear") for name in self._further)
-        super().__init__(replace(model, inputs=(*model.inputs, *measured)), recordings, good)
+        super().__init__(replace(model, inputs=(*model.inputs, *measured)), recordings, good, len(model.parameters))
         dt = max(float(np.median(np.diff(r.t))) for r in recordings)
         longest = min(self._duration_s / WINDOWS, MOST_ROWS * dt)
         rate = growth_rate(model, recordings) if model.horizon_s is None else 0.0
@@ -123,9 +123,7 @@ class EquationBench(Bench):
         """
         compiled = self._compiled(outcome.effects)
         cuts = [int((1.0 - HELD_OUT) * len(r)) for r in self.recordings]
-        z = np.zeros(len(compiled.parameters))
-        own = len(self.model.parameters)
-        z[:own] = outcome.fitted.z[:own]
+        z = self._start(compiled, outcome)
         each, runs = list(zip(self.recordings, cuts, outcome.fitted.windows, strict=True)), []
         try:
             windows = [until(w, k) for _, k, w in each]
@@ -151,7 +149,7 @@ class EquationBench(Bench):
         return left_out_squares(outcome.fitted, self.recordings, labels)
 
     def _compiled(self, effects: Sequence[Effect]) -> Compiled:
-        compiled, own = compile_with(self.model, effects), len(self.model.parameters)
+        compiled, own = compile_with(self.model, effects), self._own
         scaled_for_search = tuple(sought(p, effects, self._scales) for p in compiled.parameters[own:])
         parameters = (*compiled.parameters[:own], *scaled_for_search)
         most, spare = min(self._most_steps, compiled.most_steps), SPARE_ROWS * self._most_steps
@@ -210,13 +208,11 @@ class EquationBench(Bench):
 
     def _inner(self, effects: Sequence[Effect], start: Outcome, iterations: int) -> Outcome:
         compiled = self._compiled(effects)
-        z = np.zeros(len(compiled.parameters))
-        own = len(self.model.parameters)
-        z[:own] = start.fitted.z[:own]
         windows = [
             Windows(starts=w.starts, stops=w.stops, states=self._states(compiled, start, w, k))
             for k, w in enumerate(start.fitted.windows)
         ]
+        z = self._start(compiled, start)
         found = fit(compiled, self.recordings, z=z, windows=windows, iterations=iterations)
         return self._outcome(tuple(effects), found)
 
@@ -264,11 +260,8 @@ class EquationBench(Bench):
     def _on(self, outcome: Outcome, length_s: float, iterations: int) -> Outcome:
         """Return the same effects fitted on windows of a length, from where a fit is, its states taken over."""
         compiled = self._compiled(outcome.effects)
-        z = np.zeros(len(compiled.parameters))
-        own = len(self.model.parameters)
-        z[:own] = outcome.fitted.z[:own]
-        found = fit(compiled, self.recordings, z=z, known=outcome.fitted.windows, horizon_s=length_s,
-                    iterations=iterations)  # fmt: skip
+        found = fit(compiled, self.recordings, z=self._start(compiled, outcome), known=outcome.fitted.windows,
+                    horizon_s=length_s, iterations=iterations)  # fmt: skip
         return self._outcome(outcome.effects, found)
 
     def is_sought_outside(self, effect: Effect) -> bool:
@@ -289,19 +282,13 @@ class EquationBench(Bench):
         return np.column_stack(columns)
 
     def _outcome(self, effects: tuple[Effect, ...], found: Fitted) -> Outcome:
-        values = {
-            p.name: (float(v), float(s))
-            for p, v, s in zip(found.compiled.parameters, found.parameters, found.sd, strict=True)
-        }
-        residual = np.concatenate([r[ok] for r, ok in zip(found.residuals, self._rows, strict=True)])
         count = sum(p.spread > 0.0 for p in found.compiled.parameters) + len(outer(effects))
-        return Outcome(effects=with_values(effects, values), fitted=found, count=count, residual=residual)
+        return self._made(effects, found, count)
 
     def _simulated(self, compiled: Compiled, outcome: Outcome) -> FloatArray | None:
         """Return readings at the rows that count, the outcome's numbers and start states given."""
-        own = len(self.model.parameters)
         p = compiled.parameter_vector
-        p[:own] = outcome.fitted.parameters[:own]
+        p[: self._own] = outcome.fitted.parameters[: self._own]
         parts = []
         for k, (drive, w) in enumerate(zip(self._drives, outcome.fitted.windows, strict=True)):
             x = self._states(compiled, outcome, w, k)
