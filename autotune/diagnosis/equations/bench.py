@@ -11,6 +11,7 @@ import numpy as np
 from autotune.arrays import BoolArray, FloatArray
 from autotune.diagnosis.equations.candidates import Signals, Trial
 from autotune.diagnosis.equations.first_order import explained
+from autotune.diagnosis.thresholds import Thresholds
 from autotune.equations.effects import with_values
 from autotune.equations.fit_data import Fitted
 from autotune.equations.model import EquationModel
@@ -61,6 +62,8 @@ class Bench(ABC):
         Rows whose reading counts.
     own : int
         How many numbers the model has itself; those of effects come after them.
+    limits : Thresholds
+        What decides between two findings.
 
     Attributes
     ----------
@@ -76,9 +79,10 @@ class Bench(ABC):
     is_closed = True
 
     def __init__(
-        self, model: EquationModel, recordings: Sequence[Recording], good: Sequence[BoolArray], own: int
+        self, model: EquationModel, recordings: Sequence[Recording], good: Sequence[BoolArray], own: int,
+        limits: Thresholds,
     ) -> None:  # fmt: skip
-        self.model, self._own = model, own
+        self.model, self._own, self.limits = model, own, limits
         self.recordings = tuple(replace(r, y=np.where(ok, r.y, np.nan)) for r, ok in zip(recordings, good, strict=True))
         self._rows = [np.isfinite(r.y) for r in self.recordings]
         self._drives = [drive_of(model, r) for r in self.recordings]

@@ -13,6 +13,7 @@ from autotune.diagnosis.equations.candidates import Signals
 from autotune.diagnosis.equations.held_out import HELD_OUT
 from autotune.diagnosis.equations.sought import jumping, sought
 from autotune.diagnosis.evidence.stretches import stretches_in
+from autotune.diagnosis.thresholds import IN_USE, Thresholds
 from autotune.effects.in_equations import Scales
 from autotune.equations.black_box import BlackBox, driven, read_out
 from autotune.equations.effects import apply, at_reading, compile_with, with_values
@@ -38,10 +39,14 @@ class ClosedBench(Bench):
         What was measured.
     good : sequence of (N,) bool array
         Rows whose reading counts.
+    limits : Thresholds
+        What decides between two findings.
     """
 
-    def __init__(self, box: BlackBox, recordings: Sequence[Recording], good: Sequence[BoolArray]) -> None:
-        super().__init__(box.shell(), recordings, good, len(box.parameters))
+    def __init__(
+        self, box: BlackBox, recordings: Sequence[Recording], good: Sequence[BoolArray], limits: Thresholds = IN_USE
+    ) -> None:
+        super().__init__(box.shell(), recordings, good, len(box.parameters), limits)
         self._box = box
 
     def _compiled(self, effects: Sequence[Effect]) -> Compiled:

@@ -20,6 +20,7 @@ from autotune.diagnosis.equations.held_out import HELD_OUT, bounded_errors, fore
 from autotune.diagnosis.equations.parts import standing_out, telling_windows
 from autotune.diagnosis.equations.sought import changed, outer, sought
 from autotune.diagnosis.evidence.stretches import stretches_in
+from autotune.diagnosis.thresholds import IN_USE, Thresholds
 from autotune.effects import KINDS
 from autotune.effects.in_equations import Scales
 from autotune.equations.effects import compile_with, where_of
@@ -68,15 +69,21 @@ class EquationBench(Bench):
         What was measured.
     good : sequence of (N,) bool array
         Rows whose reading counts.
+    limits : Thresholds
+        What decides between two findings.
     """
 
     is_closed = False
 
-    def __init__(self, model: EquationModel, recordings: Sequence[Recording], good: Sequence[BoolArray]) -> None:
+    def __init__(
+        self, model: EquationModel, recordings: Sequence[Recording], good: Sequence[BoolArray],
+        limits: Thresholds = IN_USE,
+    ) -> None:  # fmt: skip
         self._nominal, self._further = model, further_columns(model, recordings)
         # further columns drive nothing until an effect takes them; what is measured runs on between rows
         measured = (InputColumn(column=name, hold="linear") for name in self._further)
-        super().__init__(replace(model, inputs=(*model.inputs, *measured)), recordings, good, len(model.parameters))
+        whole = replace(model, inputs=(*model.inputs, *measured))
+        super().__init__(whole, recordings, good, len(model.parameters), limits)
         dt = max(float(np.median(np.diff(r.t))) for r in recordings)
         longest = min(self._duration_s / WINDOWS, MOST_ROWS * dt)
         rate = growth_rate(model, recordings) if model.horizon_s is None else 0.0
@@ -247,7 +254,7 @@ class EquationBench(Bench):
                 mask[a:b] = True
             good.append(ok & mask)
             windows.append(Windows(starts=w.starts[keep], stops=w.stops[keep], states=w.states[keep]))
-        small = EquationBench(self._nominal, self.recordings, good)
+        small = EquationBench(self._nominal, self.recordings, good, self.limits)
         self.signals(outcome)  # sizes and spans, for fits on all rows too
         small.length_s, small._most_steps = self.length_s, self._most_steps
         there = replace(outcome, fitted=replace(outcome.fitted, windows=tuple(windows)))

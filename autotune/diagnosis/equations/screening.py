@@ -11,7 +11,6 @@ from autotune.arrays import FloatArray
 from autotune.diagnosis.equations.bench import Bench, Outcome
 from autotune.diagnosis.equations.candidates import Trial, is_signed, key_of, plainer, trials
 from autotune.diagnosis.equations.sought import scaled
-from autotune.diagnosis.thresholds import IN_USE, Thresholds
 from autotune.errors import InputError
 from autotune.models import Effect
 from autotune.progress import Progress
@@ -21,7 +20,7 @@ PARALLEL = 1.0 - 1e-6
 
 
 def screened(
-    bench: Bench, base: Outcome, without: Collection[str], progress: Progress, limits: Thresholds = IN_USE,
+    bench: Bench, base: Outcome, without: Collection[str], progress: Progress,
     only: Callable[[Effect], bool] = lambda effect: True,
 ) -> list[tuple[float, Effect]]:  # fmt: skip
     """Return for every effect and place the decrease that first order predicts, with the values that bring it.
@@ -34,8 +33,6 @@ def screened(
         Effects that are left out.
     progress : callable
         Told what is being done and the share done.
-    limits : Thresholds
-        What decides.
     only : callable
         Whether an effect is tried; by default all are.
 
@@ -61,7 +58,7 @@ def screened(
         if gain > 0.0 and (key not in best or gain > best[key][0]):
             best[key] = (gain, scaled(trial, factor), d)
     ranked = sorted(_apart(best.values()), key=lambda pair: -pair[0])
-    least = limits.equation_faint * ranked[0][0] if ranked else 0.0
+    least = bench.limits.equation_faint * ranked[0][0] if ranked else 0.0
     return [pair for pair in ranked if pair[0] >= least]
 
 

@@ -12,6 +12,7 @@ import math
 from collections.abc import Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -25,7 +26,7 @@ from autotune.diagnosis.fitting.parameters import parametrise
 from autotune.diagnosis.fitting.restarts import realigned
 from autotune.diagnosis.selection.bench import Bench, at_once, residual_sd
 from autotune.diagnosis.selection.hypothesis import hypothesis, is_stand_in
-from autotune.diagnosis.selection.judged import built_on, leading, ranked
+from autotune.diagnosis.selection.judged import add_smaller, built_on, leading, ranked
 from autotune.diagnosis.selection.judged_chain import Found, JudgedChain, at_both_scales
 from autotune.diagnosis.selection.prediction import distinct, extended, predictions, signal_sizes, starting_effects
 from autotune.diagnosis.selection.probability import RARE
@@ -100,8 +101,10 @@ def search(
         away = np.abs(retuned.fit.theta - retuned.fit.parametrisation.centre) / retuned.fit.parametrisation.spreads
         beam = [retuned, nominal] if float(np.max(away)) > limits.nominal_too else [retuned]
         bench = replace(bench, lasting=tuple(_lasting(retuned, bench)))
-        bench, found = _grown(retuned, beam, bench, progress, limits)
-        found = _regrown(_finished(_pruned([*found, *_begun(begun, bench)], bench), bench), bench)
+        bench, found = _grow(retuned, beam, bench, progress, limits)
+        found += _judge_begun(begun, bench)
+        found = add_smaller(found, limits.rig_pruned, limits.rig_effects, lambda some, _: _without_each(some, bench))
+        found = _refit_larger(_fit_to_end(found, bench), bench)
         chosen = at_both_scales(ranked(found)[0], found)
         retuned = chosen if not chosen.names else ranked([one for one in found if not one.names])[0]
         nominal, retuned, chosen = (one.spread_out() for one in (nominal, retuned, chosen))
@@ -118,14 +121,14 @@ def _odds(
     return tuple((k, max(k.odds.get(kind, k.odds.get("any", 0.0)), RARE)) for k in able)
 
 
-def _grown(
+def _grow(
     retuned: JudgedChain, beam: list[JudgedChain], bench: Bench, progress: Progress, limits: Thresholds
 ) -> tuple[Bench, list[JudgedChain]]:
     """Add effects one by one while one of them makes the free run better; return all that was judged."""
     found, best = [retuned], retuned
     for size in range(limits.rig_effects):
         progress("effects one by one", 0.1 + 0.8 * size / limits.rig_effects)
-        larger = _larger(beam, bench)
+        larger = _judge_larger(beam, bench)
         if not larger:
             break
         found += larger
@@ -180,7 +183,7 @@ class _Start:
     decrease: float
 
 
-def _larger(beam: Sequence[JudgedChain], bench: Bench) -> list[JudgedChain]:
+def _judge_larger(beam: Sequence[JudgedChain], bench: Bench) -> list[JudgedChain]:
     """Return hypotheses with one effect more than those of a beam, the most promising ones judged."""
     starts: list[_Start] = []
     for base in beam:
@@ -189,7 +192,7 @@ def _larger(beam: Sequence[JudgedChain], bench: Bench) -> list[JudgedChain]:
             found = [s for s in found if s.decrease > PROMISING * _charge(s)]
         found.sort(key=lambda s: -s.decrease - 2.0 * math.log(s.odds))
         starts += [s for rank, s in enumerate(found) if rank < bench.limits.rig_tried or s.odds >= bench.limits.usual]
-    fits = bench.pool.map(lambda s: _added(s, bench), starts)
+    fits = bench.pool.map(lambda s: _fit_added(s, bench), starts)
     best: dict[frozenset[str], tuple[Fit, float, JudgedChain]] = {}
     for s, result in zip(starts, fits, strict=True):
         if result is None or result.cost > s.base.fit.cost - 0.3:
@@ -225,7 +228,7 @@ def _starts(base: JudgedChain, bench: Bench) -> list[_Start]:
         if kind.name not in taken and kind.suits.holds(near.sim.chain)
     ]
     sizes = {id(data): signal_sizes(near, data) for near, data in scales}
-    effects = at_once(lambda t: _tried(t[0], t[2], t[3], sizes[id(t[3])], bench), tried)
+    effects = at_once(lambda t: _starting_points(t[0], t[2], t[3], sizes[id(t[3])], bench), tried)
     each = [(near, data, e) for (_, _, near, data), group in zip(tried, effects, strict=True) for e in group]
     predicted = iter(list(bench.pool.map(lambda t: predictions(t[0], t[2], t[1]), each)))
     found = []
@@ -239,7 +242,7 @@ def _starts(base: JudgedChain, bench: Bench) -> list[_Start]:
     return found
 
 
-def _tried(kind: EffectKind, near: Fit, data: Data, sizes: SignalSizes, bench: Bench) -> list[Effect]:
+def _starting_points(kind: EffectKind, near: Fit, data: Data, sizes: SignalSizes, bench: Bench) -> list[Effect]:
     """Return an effect's starting points: those of its record, and those that a direct search finds."""
     tried = starting_effects(kind, near, sizes)
     if kind.lasting:
@@ -247,7 +250,7 @@ def _tried(kind: EffectKind, near: Fit, data: Data, sizes: SignalSizes, bench: B
     return tried + (searched(kind.name, near, data, bench.pool) if kind.search is not None else [])
 
 
-def _added(start: _Start, bench: Bench) -> Fit | None:
+def _fit_added(start: _Start, bench: Bench) -> Fit | None:
     """Return the best fit of a hypothesis with one more effect to long windows; nothing where all run away."""
     done: list[Fit] = []
     steps = 2 * STEPS if start.kind.rough else STEPS
@@ -267,7 +270,7 @@ def _added(start: _Start, bench: Bench) -> Fit | None:
     return timed(best, bench.long) if best is not None and start.kind.is_event else best
 
 
-def _begun(begun: JudgedChain | None, bench: Bench) -> list[JudgedChain]:
+def _judge_begun(begun: JudgedChain | None, bench: Bench) -> list[JudgedChain]:
     """Return what predicted best on more rows, judged on these: a search of fewer rows may miss where it lies."""
     if begun is None:
         return []
@@ -279,28 +282,13 @@ def _begun(begun: JudgedChain | None, bench: Bench) -> list[JudgedChain]:
     return [] if judged is None else [judged]
 
 
-def _pruned(found: Sequence[JudgedChain], bench: Bench) -> list[JudgedChain]:
-    """Return hypotheses with those that the leading ones become when an effect is left out, and again of these.
-
-    Dry friction has many local minima: one more effect may only have led out of one.
-    """
-    result, done = list(found), set()
-    for _ in range(bench.limits.rig_effects):
-        fresh = [j for j in leading(result, bench.limits.rig_pruned) if id(j) not in done]
-        if not fresh:
-            break
-        done |= {id(j) for j in fresh}
-        result += [j for group in at_once(lambda j: _smaller(j, bench), fresh) for j in group]
-    return result
-
-
-def _finished(found: Sequence[JudgedChain], bench: Bench) -> list[JudgedChain]:
+def _fit_to_end(found: Sequence[JudgedChain], bench: Bench) -> list[JudgedChain]:
     """Return hypotheses and, beside them, the leading ones fitted to the end: the search leaves them before."""
     first = leading(found, bench.limits.rig_pruned)
     return [*found, *(j for j in bench.pool.map(bench.finished, first) if j is not None)]
 
 
-def _regrown(found: Sequence[JudgedChain], bench: Bench) -> list[JudgedChain]:
+def _refit_larger(found: Sequence[JudgedChain], bench: Bench) -> list[JudgedChain]:
     """Return hypotheses with those that have one effect more than the chosen one, fitted on from where that came to.
 
     Fits under dry friction end in local minima: what is larger is compared with what is smaller from the same place.
@@ -309,10 +297,10 @@ def _regrown(found: Sequence[JudgedChain], bench: Bench) -> list[JudgedChain]:
     larger = [j for j in ranked(found) if set(j.names) > set(best.names) and len(j.names) == len(best.names) + 1]
     once = {frozenset(j.names): j for j in reversed(larger)}
     chosen = sorted(once.values(), key=larger.index)[: bench.limits.rig_pruned]
-    return [*found, *(j for j in bench.pool.map(lambda j: _on_from(best, j, bench), chosen) if j is not None)]
+    return [*found, *(j for j in bench.pool.map(lambda j: _fit_from_best(best, j, bench), chosen) if j is not None)]
 
 
-def _on_from(best: JudgedChain, larger: JudgedChain, bench: Bench) -> JudgedChain | None:
+def _fit_from_best(best: JudgedChain, larger: JudgedChain, bench: Bench) -> JudgedChain | None:
     """Return a hypothesis fitted from another one's numbers, with the effect that it has besides as it was found."""
     effect = next(e for e in larger.fit.model.effects if e.name in set(larger.names) - set(best.names))
     try:
@@ -325,14 +313,14 @@ def _on_from(best: JudgedChain, larger: JudgedChain, bench: Bench) -> JudgedChai
     return bench.finite(result, larger.log_odds)
 
 
-def _smaller(best: JudgedChain, bench: Bench) -> list[JudgedChain]:
-    """Return a hypothesis with each of its effects left out: built one by one, one may have stood for another."""
+def _without_each(some: Sequence[JudgedChain], bench: Bench) -> list[JudgedChain]:
+    """Return hypotheses with each of their effects left out."""
     given = {k.name: math.log(o) for k, o in bench.odds}
 
-    def left(index: int) -> JudgedChain | None:
-        smaller = without(best.fit, index, best.data)
-        own = sum(given.get(n, -math.inf) for i, n in enumerate(best.names) if i != index)
-        return None if smaller is None else bench.judged(smaller, max(own, best.log_odds))
+    def judge_without(one: JudgedChain, index: int) -> JudgedChain | None:
+        smaller = without(one.fit, index, one.data)
+        own = sum(given.get(n, -math.inf) for i, n in enumerate(one.names) if i != index)
+        return None if smaller is None else bench.judged(smaller, max(own, one.log_odds))
 
-    indices = range(len(best.names) if len(best.names) > 1 else 0)
-    return [j for j in bench.pool.map(left, indices) if j is not None]
+    each = at_once(lambda one: list(bench.pool.map(partial(judge_without, one), range(len(one.names)))), some)
+    return [j for group in each for j in group if j is not None]
