@@ -125,8 +125,8 @@ class Thresholds:
 IN_USE = Thresholds()
 
 
-def table(thresholds: Thresholds) -> list[tuple[str, float, str, str, str]]:
-    """Return the table's rows: name, value, unit, meaning, origin."""
+def table(thresholds: Any) -> list[tuple[str, float, str, str, Origin]]:
+    """Return the rows of a table of such fields: name, value, unit, meaning, origin."""
     return [
         (f.name, float(getattr(thresholds, f.name)), f.metadata["unit"], f.metadata["meaning"], f.metadata["origin"])
         for f in fields(thresholds)

@@ -270,7 +270,7 @@ class Descent:
         found = [float(np.mean(part**2)) if part.size else 0.0 for part in parts]
         return np.where(np.isfinite(found), found, np.inf)
 
-    def fitted(self, converged: bool) -> Fitted:
+    def fitted(self) -> Fitted:
         """Return what was found."""
         compiled, p = self._compiled, values_of(self._compiled, self._z)
         if self._last is None:
@@ -287,7 +287,7 @@ class Descent:
         residuals = tuple(np.where(one.good, one.y - y, np.nan) for one, y in zip(self._data, simulated, strict=True))
         return Fitted(
             compiled=compiled, parameters=p, sd=sd, z=self._z, windows=tuple(one.windows for one in self._data),
-            simulated=simulated, residuals=residuals, noise_sd=self._sd, jacobian=whole, converged=converged,
+            simulated=simulated, residuals=residuals, noise_sd=self._sd, jacobian=whole,
         )  # fmt: skip
 
 

@@ -162,13 +162,3 @@ def as_chain(model: EquationModel, linear: Linear) -> Model:
         output=Port(unit=model.output_unit, offset=linear.y),
         blocks=(block,),
     )
-
-
-def as_control(model: EquationModel, linear: Linear) -> object:
-    """Return the linearisation as python-control's ``StateSpace``, signals named; dead times are left out."""
-    import control
-
-    return control.StateSpace(
-        linear.A, linear.B, linear.C, linear.D, states=list(compile_model(model, apply(model).extensions).states),
-        inputs=list(model.columns), outputs=["y"],
-    )  # fmt: skip

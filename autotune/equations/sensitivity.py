@@ -37,19 +37,16 @@ class Windows:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Sensitivities:
-    """A run with its derivatives.
+    """Derivatives of a simulation's readings.
 
     Attributes
     ----------
-    run : Run
-        The simulation itself.
     to_parameters : (N, P) array
         dy/dp of the parameters asked for.
     to_states : (N, n) array
         dy/dx0 with respect to the start state of the window that a row is in.
     """
 
-    run: Run
     to_parameters: FloatArray
     to_states: FloatArray
 
@@ -117,4 +114,4 @@ def sensitivities(
             to_p[:, i] = (run.y - base.y) / parameter_steps[i]
         else:
             to_x[:, i] = (run.y - base.y) / state_steps[i]
-    return Sensitivities(run=base, to_parameters=to_p, to_states=to_x)
+    return Sensitivities(to_parameters=to_p, to_states=to_x)

@@ -141,7 +141,7 @@ class ClosedBench(Bench):
         residuals = tuple(r.y - y for r, y in zip(self.recordings, runs, strict=True))
         fitted = Fitted(
             compiled=compiled, parameters=p, sd=deviation, z=z, windows=(), simulated=tuple(runs), residuals=residuals,
-            noise_sd=sd, jacobian=whole, converged=True,
+            noise_sd=sd, jacobian=whole,
         )  # fmt: skip
         return self._made(effects, fitted, int(which.size))
 

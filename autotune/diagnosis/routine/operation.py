@@ -63,11 +63,6 @@ class Operation:
         """How many stretches there are."""
         return int(self.stretch_of[-1]) + 1
 
-    @property
-    def firsts(self) -> IntArray:
-        """First row of the recording of every window, (W,) array."""
-        return self.starts[np.searchsorted(self.starts, self.windows[:, 0], side="right") - 1]
-
     def rows_of(self, recording: int) -> slice:
         """Return the rows of a recording."""
         ends = np.append(self.starts[1:], self.u.size)

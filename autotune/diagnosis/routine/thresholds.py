@@ -5,9 +5,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
-from autotune.diagnosis.thresholds import Origin, known
+from autotune.diagnosis.thresholds import known
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,12 +41,3 @@ class RoutineThresholds:
     # answers to the set-point
     badly_damped: float = known(0.1, "1", "damping ratio up to which a loop is tightly tuned: the overshoot of a step is 73 %", "convention")
     # fmt: on
-
-
-def table(thresholds: RoutineThresholds | None = None) -> tuple[tuple[str, float, str, str, Origin], ...]:
-    """Return name, value, unit, meaning and origin of every threshold."""
-    used = thresholds or RoutineThresholds()
-    return tuple(
-        (f.name, getattr(used, f.name), f.metadata["unit"], f.metadata["meaning"], f.metadata["origin"])
-        for f in fields(used)
-    )

@@ -18,7 +18,7 @@ from autotune.equations.chain import from_chain
 from autotune.equations.exports import as_latex, as_modelica, as_python, as_text
 from autotune.equations.files import read_any_model
 from autotune.equations.flatten import flattened
-from autotune.equations.linearise import as_chain, as_control, linearise, transfer_function
+from autotune.equations.linearise import as_chain, linearise, transfer_function
 from autotune.errors import InputError
 from autotune.models import Effect, Parameter, TransferFunction, read_model
 from tests.autotune.equations.models import model, one_state
@@ -178,7 +178,6 @@ def test_a_linearisation_is_the_tangent() -> None:
     wanted = TransferFunction(num=(1.0 / J,), den=(1.0, c / J, stiffness)).response(omega)
     np.testing.assert_allclose(tf.response(omega), wanted, rtol=1e-5)
     assert as_chain(model(), at).output.offset == pytest.approx(at.states[0])
-    np.testing.assert_allclose(control.poles(as_control(model(), at)), np.roots(tf.den), rtol=1e-9)
 
 
 def test_no_rest_is_refused() -> None:
