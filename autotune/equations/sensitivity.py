@@ -35,6 +35,11 @@ class Windows:
     states: FloatArray
 
 
+def run_windows(compiled: Compiled, parameters: FloatArray, drive: Drive, windows: Windows) -> Run:
+    """Simulate windows, each from its start state; see :func:`autotune.equations.simulate.simulate`."""
+    return simulate(compiled, parameters, drive, windows.states, starts=windows.starts, stops=windows.stops)
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Sensitivities:
     """Derivatives of a simulation's readings.

@@ -30,8 +30,8 @@ from autotune.equations.left_out import left_out_squares
 from autotune.equations.linearise import growth_rate
 from autotune.equations.model import EquationModel, InputColumn
 from autotune.equations.parameter_scales import values_of
-from autotune.equations.sensitivity import Windows, side_by_side
-from autotune.equations.simulate import Compiled, simulate
+from autotune.equations.sensitivity import Windows, run_windows, side_by_side
+from autotune.equations.simulate import Compiled
 from autotune.errors import InputError
 from autotune.models import Effect
 from autotune.recording import Recording
@@ -102,8 +102,7 @@ class EquationBench(Bench):
     def _steps(self, found: Fitted) -> float:
         """Return how many steps the simulation of a fit takes between two rows."""
         each = zip(self._drives, found.windows, strict=True)
-        runs = [simulate(found.compiled, found.parameters, d, w.states, starts=w.starts, stops=w.stops)
-                for d, w in each]  # fmt: skip
+        runs = [run_windows(found.compiled, found.parameters, d, w) for d, w in each]
         return float(sum(run.steps.sum() for run in runs)) / sum(len(r) for r in self.recordings)
 
     def as_it_is(self, retuned: Outcome) -> Outcome:
@@ -215,10 +214,7 @@ class EquationBench(Bench):
 
     def _inner(self, effects: Sequence[Effect], start: Outcome, iterations: int) -> Outcome:
         compiled = self._compiled(effects)
-        windows = [
-            Windows(starts=w.starts, stops=w.stops, states=self._states(compiled, start, w, k))
-            for k, w in enumerate(start.fitted.windows)
-        ]
+        windows = [replace(w, states=self._states(compiled, start, w, k)) for k, w in enumerate(start.fitted.windows)]
         z = self._start(compiled, start)
         found = fit(compiled, self.recordings, z=z, windows=windows, iterations=iterations)
         return self._outcome(tuple(effects), found)
@@ -298,8 +294,7 @@ class EquationBench(Bench):
         p[: self._own] = outcome.fitted.parameters[: self._own]
         parts = []
         for k, (drive, w) in enumerate(zip(self._drives, outcome.fitted.windows, strict=True)):
-            x = self._states(compiled, outcome, w, k)
-            run = simulate(compiled, p, drive, x, starts=w.starts, stops=w.stops)
+            run = run_windows(compiled, p, drive, replace(w, states=self._states(compiled, outcome, w, k)))
             parts.append(run.y[self._rows[k]])
         y = np.concatenate(parts)
         return y if np.all(np.isfinite(y)) else None

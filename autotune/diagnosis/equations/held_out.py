@@ -8,7 +8,7 @@ import numpy as np
 
 from autotune.arrays import FloatArray
 from autotune.equations.fit_data import window_rows
-from autotune.equations.sensitivity import Windows
+from autotune.equations.sensitivity import Windows, run_windows
 from autotune.equations.simulate import Compiled, Drive, simulate
 from autotune.equations.starts import fitted_starts
 
@@ -25,8 +25,8 @@ def free_run(
 
     Its first part tells where it starts.
     """
-    at, end = _continued(compiled, p, drive, y, windows, row), np.array([y.size])
-    return simulate(compiled, p, drive, at.states, starts=at.starts, stops=end).y, row + int(SETTLED * (y.size - row))
+    at = replace(_continued(compiled, p, drive, y, windows, row), stops=np.array([y.size]))
+    return run_windows(compiled, p, drive, at).y, row + int(SETTLED * (y.size - row))
 
 
 def _continued(compiled: Compiled, p: FloatArray, drive: Drive, y: FloatArray, before: Windows, row: int) -> Windows:
@@ -43,7 +43,7 @@ def _continued(compiled: Compiled, p: FloatArray, drive: Drive, y: FloatArray, b
     best, least = None, np.inf
     for guess in guesses:
         w = fitted_starts(compiled, p, drive, y, good, at, end, guess=guess, share=SETTLED)
-        e = (y - simulate(compiled, p, drive, w.states, starts=at, stops=until).y)[at[0] : until[0]]
+        e = (y - run_windows(compiled, p, drive, replace(w, stops=until)).y)[at[0] : until[0]]
         left = float(np.nansum(e**2)) if np.all(np.isfinite(e[good[at[0] : until[0]]])) else np.inf
         if best is None or left < least:
             best, least = w, left
@@ -65,8 +65,8 @@ def forecasts(
             compiled, p, drive, y, np.isfinite(y), np.array([before]), np.array([b]), share=(a - before) / (b - before),
             least=int(a - before), guess=guess,
         )  # fmt: skip
-        found[a:b] = simulate(compiled, p, drive, w.states, starts=w.starts, stops=w.stops).y[a:b]
-        now = simulate(compiled, p, drive, w.states, starts=w.starts, stops=np.array([a])).ends[0]
+        found[a:b] = run_windows(compiled, p, drive, w).y[a:b]
+        now = run_windows(compiled, p, drive, replace(w, stops=np.array([a]))).ends[0]
         guess, first = now if np.all(np.isfinite(now)) else None, min(first, int(a))
     return found, first
 

@@ -49,11 +49,6 @@ def simulate(
     return result, ends
 
 
-def whiten(signals: list[FloatArray], data: Data) -> FloatArray:
-    """Return the whitened residuals of all recordings, one after the other."""
-    return data.whitened_runs(signals)
-
-
 AnyArray: TypeAlias = NDArray[Any]
 
 
@@ -81,7 +76,7 @@ class Problem:
         """Simulate at a point."""
         sim = self.parametrisation.simulator(theta)
         signals, ends = simulate(sim, x0, self.data)
-        return Iterate(theta, x0, sim, ends, whiten(signals, self.data))
+        return Iterate(theta, x0, sim, ends, self.data.whitened_runs(signals))
 
     def per_recording(self, values: AnyArray) -> list[AnyArray]:
         """Split what is known per window into recordings."""
@@ -115,7 +110,7 @@ class Problem:
             shifted = [x.copy() for x in iterate.x0]
             for x in shifted:
                 x[:, j] += h
-            moved = whiten(simulate(iterate.sim, shifted, self.data)[0], self.data)
+            moved = self.data.whitened_runs(simulate(iterate.sim, shifted, self.data)[0])
             column = (moved - iterate.e) * (self.scales[j] / h)
             Jx[:, j] = column if bounded(column) else 0.0
         return J, Jx

@@ -54,15 +54,8 @@ def realigned(result: Fit, data: Data) -> Fit:
 
     Parameters
     ----------
-    result : Fit
-        Where a descent came to rest.
-    data : Data
-        What it was fitted to.
-
-    Returns
-    -------
-    Fit
-        A fit to the same data, of no greater cost; the same one where no effect of its model has such moves.
+    result, data
+        As of :func:`renewed`; the same fit is returned where no effect of its model has such moves.
 
     Notes
     -----

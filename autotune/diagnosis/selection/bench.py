@@ -43,17 +43,17 @@ class Bench:
         In short windows.
     odds : tuple of (EffectKind, float)
         What may be missing, with its prior odds.
-    lasting : tuple of Effect
-        What long direct searches found beside the retuned model.
     pool : Executor
         Where simulations run.
+    lasting : tuple of Effect
+        What long direct searches found beside the retuned model.
     """
 
     cuts: tuple[Data, ...]
     few: Data
     odds: tuple[tuple[EffectKind, float], ...]
-    lasting: tuple[Effect, ...]
     pool: Executor
+    lasting: tuple[Effect, ...] = ()
 
     @property
     def long(self) -> Data:

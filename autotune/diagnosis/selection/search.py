@@ -91,13 +91,9 @@ def search(
         lengths = lengths_of(model, recordings, limits)
         bench = Bench(
             cuts=tuple(cut(recordings, good, length, limits) for length in lengths.between),
-            few=cut(recordings, good, lengths.short, limits),
-            odds=_odds(model, recordings, left_out),
-            lasting=(),
-            pool=pool,
-        )
-        bench, roots = _roots(model, bench)
-        nominal, retuned = roots
+            few=cut(recordings, good, lengths.short, limits), odds=_odds(model, recordings, left_out), pool=pool,
+        )  # fmt: skip
+        bench, (nominal, retuned) = _roots(model, bench)
         away = np.abs(retuned.fit.theta - retuned.fit.parametrisation.centre) / retuned.fit.parametrisation.spreads
         beam = [retuned, nominal] if float(np.max(away)) > limits.nominal_too else [retuned]
         bench = replace(bench, lasting=tuple(_lasting(retuned, bench)))
