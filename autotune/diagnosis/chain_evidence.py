@@ -22,7 +22,7 @@ from autotune.diagnosis.fitting.retuning import prepare, under_noise
 from autotune.diagnosis.readable import in_commands, readable
 from autotune.diagnosis.result import FoundEffect, OperatingRange, Verdict
 from autotune.diagnosis.safe_extension import safe_extension
-from autotune.diagnosis.selection.hypothesis import contradicted
+from autotune.diagnosis.selection.hypothesis import contradicted_effects
 from autotune.diagnosis.selection.judged import of_likely
 from autotune.diagnosis.selection.judged_chain import Found, JudgedChain, at_both_scales
 from autotune.diagnosis.selection.probability import Candidate, probability_of, weighed
@@ -106,7 +106,7 @@ class ChainEvidence(Evidence):
         """Chosen effects by whose name readings do not behave; asked where the model's error and not noise decides."""
         if self.found is None or self.found.chosen.leaves_noise:
             return frozenset()
-        return contradicted(self.search.chosen, self.search.data)
+        return contradicted_effects(self.search.chosen, self.search.data)
 
     @property
     def own_noise(self) -> str:

@@ -16,10 +16,10 @@ from autotune.diagnosis.evidence.late_rows import late_rows
 from autotune.diagnosis.evidence.law import law_effect
 from autotune.diagnosis.evidence.operating_point import offset_of, unmoved
 from autotune.diagnosis.evidence.own_noise import own_noise
-from autotune.diagnosis.evidence.sample_gain import SimulatedRows, is_material, rows_of, supported
-from autotune.diagnosis.evidence.samples import JITTER, SampleEffect, spared
-from autotune.diagnosis.evidence.spoiled_rows import clear_samples, searched_beside
-from autotune.diagnosis.evidence.stamps import evened
+from autotune.diagnosis.evidence.sample_gain import SimulatedRows, is_material, rows_of, select_supported
+from autotune.diagnosis.evidence.samples import JITTER, SampleEffect, unspoiled_rows
+from autotune.diagnosis.evidence.spoiled_rows import clear_samples, search_beside
+from autotune.diagnosis.evidence.stamps import even_stamps
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import RUNAWAY, Fit
 from autotune.diagnosis.fitting.retuning import at_nominal, prepare, under_noise
@@ -62,13 +62,13 @@ def evidence_of(
     if any(kind_of(effect.name).late_stamps for effect in model.effects):
         recordings, late = [r.at_even_times() for r in recordings], None
     else:
-        recordings, late = evened(model, recordings, thresholds)
+        recordings, late = even_stamps(model, recordings, thresholds)
     own = {effect.name for effect in model.effects}
 
     retuned_rows = partial(_retuned_rows, model, recordings, thresholds)
     searched = partial(_searched, model, recordings, without, progress, thresholds, begun)
     seen = clear_samples(recordings, [name for name in without if name not in own], thresholds, retuned_rows)
-    (near, found), seen = searched_beside(searched, seen, without)
+    (near, found), seen = search_beside(searched, seen, without)
     seen = [s for s in seen if s.name not in own]
     progress("checking on held-out rows", 0.9)
 
@@ -79,7 +79,7 @@ def evidence_of(
         return [s for s in (jitter, law) if s is not None and (s is late or s.name not in without)]
 
     retuned, data = near.retuned.fit, near.data
-    samples = (*supported(seen, rows_of(retuned, data)), *beside(retuned, data))
+    samples = (*select_supported(seen, rows_of(retuned, data)), *beside(retuned, data))
     evidence = ChainEvidence(
         model=model,
         again=again,
@@ -95,7 +95,7 @@ def evidence_of(
     if found.chosen.names:
         chosen = found.chosen.fit, found.chosen.data
         rows = rows_of(*chosen)
-        samples = (*supported(seen, rows), *beside(chosen[0], under_noise(*chosen)))
+        samples = (*select_supported(seen, rows), *beside(chosen[0], under_noise(*chosen)))
         evidence = replace(evidence, samples=tuple(s for s in samples if is_material(s, rows)))
     return _with_found(evidence, found, without)
 
@@ -124,7 +124,7 @@ def _searched(
 
     Nothing is found where every simulation runs away.
     """
-    good, names = spared(recordings, seen), [*without, *(effect.name for effect in seen)]
+    good, names = unspoiled_rows(recordings, seen), [*without, *(effect.name for effect in seen)]
     progress("retuning", 0.0)
     data, retuned = prepare(model, recordings, good, limits)
     alone = Hypothesis(names=(), fit=retuned)

@@ -11,7 +11,7 @@ from autotune.arrays import BoolArray, FloatArray, IntArray, deviations_beside_p
 from autotune.diagnosis.equations.bench import Bench, Outcome
 from autotune.diagnosis.equations.candidates import Signals
 from autotune.diagnosis.equations.held_out import HELD_OUT
-from autotune.diagnosis.equations.sought import jumping, sought
+from autotune.diagnosis.equations.sought import jumping, scale_parameter
 from autotune.diagnosis.evidence.stretches import stretches_in
 from autotune.diagnosis.thresholds import IN_USE, Thresholds
 from autotune.effects.in_equations import Scales
@@ -57,7 +57,7 @@ class ClosedBench(Bench):
         size = float(np.std(u))
         scales = Scales(u=size, y=float(np.nanstd(y)), duration_s=self._duration_s, size=size, span=0.0, column=0.0)
         # a step of the finite differences is wide enough for what moves by jumps
-        inside = tuple(p if p in jumping(compiled, effects) else sought(p, effects, lambda effect: scales)
+        inside = tuple(p if p in jumping(compiled, effects) else scale_parameter(p, effects, lambda effect: scales)
                        for p in compiled.parameters)  # fmt: skip
         return replace(compiled, parameters=(*self._box.parameters, *inside))
 

@@ -29,7 +29,7 @@ def with_force(effect: Effect, times: float) -> Effect:
     return effect.with_values({key: times * value for key, value in effect.values.items() if key in levels})
 
 
-def swept(bench: Bench, one: Outcome) -> list[Outcome]:
+def sweep_levels(bench: Bench, one: Outcome) -> list[Outcome]:
     """Return a fit with dry friction and those from forces above and below it, each from the one before.
 
     Parameters
@@ -58,7 +58,7 @@ def swept(bench: Bench, one: Outcome) -> list[Outcome]:
     return found
 
 
-def settled_among(bench: Bench, fits: Sequence[Outcome], rows: float, ratio: float) -> Outcome:
+def select_minimum(bench: Bench, fits: Sequence[Outcome], rows: float, ratio: float) -> Outcome:
     """Return the minimum that predicts best among those that rows do not tell apart, its levels as far as the others.
 
     Parameters

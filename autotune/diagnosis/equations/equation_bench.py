@@ -18,7 +18,7 @@ from autotune.diagnosis.equations.followed import followed, positions_of, sizes_
 from autotune.diagnosis.equations.further import further_columns
 from autotune.diagnosis.equations.held_out import HELD_OUT, bounded_errors, forecasts, free_run, until
 from autotune.diagnosis.equations.parts import standing_out, telling_windows
-from autotune.diagnosis.equations.sought import changed, outer, sought
+from autotune.diagnosis.equations.sought import change_number, outer, scale_parameter
 from autotune.diagnosis.evidence.stretches import stretches_in
 from autotune.diagnosis.thresholds import IN_USE, Thresholds
 from autotune.effects import KINDS
@@ -156,7 +156,7 @@ class EquationBench(Bench):
 
     def _compiled(self, effects: Sequence[Effect]) -> Compiled:
         compiled, own = compile_with(self.model, effects), self._own
-        scaled_for_search = tuple(sought(p, effects, self._scales) for p in compiled.parameters[own:])
+        scaled_for_search = tuple(scale_parameter(p, effects, self._scales) for p in compiled.parameters[own:])
         parameters = (*compiled.parameters[:own], *scaled_for_search)
         most, spare = min(self._most_steps, compiled.most_steps), SPARE_ROWS * self._most_steps
         return replace(compiled, parameters=parameters, most_steps=most, spare_steps=min(spare, compiled.spare_steps))
@@ -187,7 +187,7 @@ class EquationBench(Bench):
             values = self._promising(best, i, key, tried, factor) if best else (tried / factor, tried, tried * factor)
             for value in values:
                 try:
-                    new = self._inner(changed(effects, i, key, value), best or start, 4)
+                    new = self._inner(change_number(effects, i, key, value), best or start, 4)
                 except InputError:
                     continue
                 if best is None or new.rss < best.rss:
@@ -205,7 +205,7 @@ class EquationBench(Bench):
         readings = np.concatenate([r.y[ok] for r, ok in zip(self.recordings, self._rows, strict=True)])
         left: list[tuple[float, float]] = []
         for value in (tried / factor, tried, tried * factor):
-            y = self._simulated(self._compiled(changed(best.effects, i, key, value)), best)
+            y = self._simulated(self._compiled(change_number(best.effects, i, key, value)), best)
             if y is not None:
                 e = self.without_starts(best, readings - y)
                 e = e - basis @ (basis.T @ e)

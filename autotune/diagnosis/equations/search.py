@@ -9,7 +9,7 @@ import numpy as np
 
 from autotune.diagnosis.equations.bench import Bench, Outcome
 from autotune.diagnosis.equations.candidates import is_plainer, is_usual, key_of, plainer
-from autotune.diagnosis.equations.dry_friction import settled_among, swept, with_force
+from autotune.diagnosis.equations.dry_friction import select_minimum, sweep_levels, with_force
 from autotune.diagnosis.equations.judged import JudgedEquations, Searched, judge, odds_of
 from autotune.diagnosis.equations.scores import (
     attempt,
@@ -20,8 +20,8 @@ from autotune.diagnosis.equations.scores import (
     quick_score,
     variance_ratio,
 )
-from autotune.diagnosis.equations.screening import screened
-from autotune.diagnosis.selection.judged import add_smaller, ranked
+from autotune.diagnosis.equations.screening import screen_effects
+from autotune.diagnosis.selection.judged import add_smaller, rank
 from autotune.errors import InputError
 from autotune.progress import Progress, quiet
 
@@ -63,15 +63,15 @@ def search(bench: Bench, without: Collection[str], progress: Progress, begun: Ou
         fits = _fit_larger(bench, best.outcome, without, progress, further=bool(best.names))
         larger = _judge_all(bench, _select(bench, fits, own), own)
         found += larger
-        first = ranked([best, *larger])[0]
+        first = rank([best, *larger])[0]
         if first is best or not first.is_better(best, limits.material):
             break
         best = first
     if begun is not None:
         found += _judge_all(bench, [attempt(bench, begun.effects, retuned, FINAL)], own)
     found = add_smaller(found, limits.confirmed, limits.rig_effects, lambda some, known: _smaller(bench, some, known))
-    found += _judge_all(bench, _fit_to_end(bench, ranked(found)[0], retuned), own)
-    chosen = ranked(found)[0]
+    found += _judge_all(bench, _fit_to_end(bench, rank(found)[0], retuned), own)
+    chosen = rank(found)[0]
     return Searched(nominal=bench.as_it_is(retuned), judged=tuple(found), best=chosen, taken=chosen)
 
 
@@ -138,7 +138,7 @@ def _fit_to_end(bench: Bench, one: JudgedEquations, retuned: Outcome) -> list[Ou
     with suppress(InputError):
         fits.append(bench.carried(chosen, FINAL))
     best = least(fits) or chosen
-    return [settled_among(bench, swept(bench, best), one.rows, variance_ratio(best, noise_of(bench, best)))]
+    return [select_minimum(bench, sweep_levels(bench, best), one.rows, variance_ratio(best, noise_of(bench, best)))]
 
 
 def _fit_larger(
@@ -176,7 +176,7 @@ def _fit_usual(bench: Bench, base: Outcome, found: Sequence[Outcome], without: C
     if _is_near_noise(bench, min([base, *found], key=lambda one: one.rss)):
         return []
     have = {key_of(one.effects[-1]) for one in found}
-    usual = [e for _, e in screened(bench, base, without, quiet, is_usual) if key_of(e) not in have]
+    usual = [e for _, e in screen_effects(bench, base, without, quiet, is_usual) if key_of(e) not in have]
     fits = (attempt(bench, (*base.effects, effect), base, LAST) for effect in usual)
     return [_fit_elsewhere(bench, one) for one in fits if one is not None]
 
@@ -185,7 +185,7 @@ def _fit_elsewhere(bench: Bench, one: Outcome) -> Outcome:
     """Return a fit from wherever it ends best, where a usual effect makes many minima and more than noise is left."""
     if not is_usual(one.effects[-1]) or _is_near_noise(bench, one):
         return one
-    return least(swept(bench, one)) or one
+    return least(sweep_levels(bench, one)) or one
 
 
 def _is_near_noise(bench: Bench, one: Outcome) -> bool:
@@ -234,7 +234,7 @@ def _fit_best(
     They are fitted for a few steps, and further where they are not far behind one that leaves noise. Effects that come
     down to a plainer one come after it, and only where that leaves more than noise.
     """
-    order = screened(bench, base, without, lambda what, done: told(what, 0.4 * done))
+    order = screen_effects(bench, base, without, lambda what, done: told(what, 0.4 * done))
     tried = [e for k, (_, e) in enumerate(order) if k < count or (usual and is_usual(e))]
     found: list[Outcome] = []
     for effect in sorted(tried, key=lambda one: plainer(one) is not None):

@@ -12,7 +12,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -202,7 +201,8 @@ def shown_law(r: Recording, stated: StatedLaw, limits: Thresholds = IN_USE) -> S
     law, Ts = stated.controller, r.sample_time_s
     longest = law.Td_s if isinstance(law, PIDController) and not stated.filtered else 0.0
     sought = longest > 0.0
-    best = min((_of(way, late, r.u, longest, Ts, free=not sought) for way in ways for late in (0, 1)), key=_left)
+    tried = (_of(way, late, r.u, longest, Ts, free=not sought) for way in ways for late in (0, 1))
+    best = min(tried, key=lambda one: one.left)
     found = _of(best.way, best.late, r.u, longest, Ts, free=True) if sought else best
     columns = found.columns
     return ShownLaw(
@@ -222,7 +222,7 @@ def _ways(stated: StatedLaw, r: Recording) -> list[Way]:
     y = np.where(np.isfinite(r.y), r.y, r["r"])
     if not isinstance(law, PIDController):
         wholes = [_whole(num, den, r["r"] - y) for num, den in _polynomials(law, Ts) if np.any(num)]
-        return [partial(_as_it_is, whole) for whole in wholes]
+        return [lambda _, whole=whole: whole for whole in wholes]
     if law.K == 0.0:
         return []
 
@@ -238,10 +238,6 @@ def _ways(stated: StatedLaw, r: Recording) -> list[Way]:
     ][: 3 if law.Td_s > 0.0 else 1]
 
 
-def _as_it_is(columns: _Columns, Tf: float) -> _Columns:
-    return columns
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Computed:
     """One way to compute a law, commands ``late`` rows after their samples, with the variance that it leaves."""
@@ -252,10 +248,6 @@ class _Computed:
     gains: FloatArray
     sd: FloatArray
     left: float
-
-
-def _left(found: _Computed) -> float:
-    return found.left
 
 
 def _of(way: Way, late: int, u: FloatArray, longest: float, Ts: float, free: bool) -> _Computed:

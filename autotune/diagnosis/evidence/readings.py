@@ -129,7 +129,7 @@ def spikes(y: FloatArray, good: BoolArray, sds: float = Thresholds.spike, least_
     return found
 
 
-def struck(residual: FloatArray, good: BoolArray, sds: float = Thresholds.spike) -> BoolArray:
+def outlying_rows(residual: FloatArray, good: BoolArray, sds: float = Thresholds.spike) -> BoolArray:
     """Return the rows, one or two in a row, that stand out of the median of the seven around them.
 
     Lone spikes are found in the readings themselves; two spikes in neighbouring rows show only in a simulation's

@@ -28,7 +28,7 @@ def uneven_share(recording: Recording) -> float:
     return float(np.std(off) * (len(recording) - 1) / recording.duration_s)
 
 
-def evened(
+def even_stamps(
     model: Model, recordings: Sequence[Recording], limits: Thresholds
 ) -> tuple[Sequence[Recording], SampleEffect | None]:
     """Return recordings at even times, and the jitter of their stamps, where that predicts far better.

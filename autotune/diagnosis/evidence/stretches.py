@@ -14,7 +14,7 @@ import numpy as np
 
 from autotune.arrays import BoolArray, FloatArray, IntArray
 from autotune.diagnosis.fitting.data import Data
-from autotune.diagnosis.fitting.descent import Iterate, Problem, attempted, eliminate, step_of
+from autotune.diagnosis.fitting.descent import Iterate, Problem, eliminate, step_of, try_point
 from autotune.diagnosis.fitting.fit import Fit
 
 #: Stretches that are left out, one after the other.
@@ -116,7 +116,7 @@ def _without(
         moved = None
         for share in (1.0, 0.3):
             moves = problem.per_recording(problem.scales * (gain_e + gain_J @ (share * step)))
-            trial = attempted(problem, at.theta + share * step, [x - m for x, m in zip(at.x0, moves, strict=True)])
+            trial = try_point(problem, at.theta + share * step, [x - m for x, m in zip(at.x0, moves, strict=True)])
             if trial is not None and cost(trial) < cost(at):
                 moved = trial
                 break

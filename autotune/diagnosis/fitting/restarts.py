@@ -21,7 +21,7 @@ MOVES, HALVINGS = (0.5, 0.1), 5
 RENEWALS = 3
 
 
-def renewed(result: Fit, data: Data) -> Fit:
+def renew_start_states(result: Fit, data: Data) -> Fit:
     """Return a fit whose start states were all found anew from rest, where that explains more.
 
     Parameters
@@ -49,13 +49,13 @@ def renewed(result: Fit, data: Data) -> Fit:
     return result
 
 
-def realigned(result: Fit, data: Data) -> Fit:
+def realign_effects(result: Fit, data: Data) -> Fit:
     """Return a fit whose effects were moved to where no derivative leads, where that explains more.
 
     Parameters
     ----------
     result, data
-        As of :func:`renewed`; the same fit is returned where no effect of its model has such moves.
+        As of :func:`renew_start_states`; the same fit is returned where no effect of its model has such moves.
 
     Notes
     -----
@@ -80,7 +80,7 @@ def realigned(result: Fit, data: Data) -> Fit:
     if best is before:
         return result
     again = fit(best.parametrisation, data, best.theta, result.x0, iterations=30, inherit=result)
-    return realigned(again, data) if again.cost < result.cost - data.thresholds.restart_decrease else result
+    return realign_effects(again, data) if again.cost < result.cost - data.thresholds.restart_decrease else result
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -12,7 +12,7 @@ from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import RUNAWAY, Fit, fit
 from autotune.diagnosis.fitting.noise import Noise, autoregressive_up_to, noise_from_differences
 from autotune.diagnosis.fitting.parameters import parametrise
-from autotune.diagnosis.fitting.restarts import renewed
+from autotune.diagnosis.fitting.restarts import renew_start_states
 from autotune.diagnosis.fitting.windows import known_from_s, model_lag_s, window_rows
 from autotune.diagnosis.thresholds import IN_USE, Thresholds
 from autotune.models import Model
@@ -59,7 +59,7 @@ def prepare(
         Data with windows and noise, and the fit. Of long recordings windows are left out evenly.
     """
     length = thresholds.lags_per_window * model_lag_s(model)
-    noise = floored(noise_from_differences([r.y for r in recordings], good), recordings)
+    noise = floor_noise(noise_from_differences([r.y for r in recordings], good), recordings)
     windows = [window_rows(r, length, known_from_s(model, r, thresholds), thresholds) for r in recordings]
     data = Data(
         recordings=tuple(recordings),
@@ -77,7 +77,7 @@ def prepare(
         noise = noise_from_differences(result.residuals, data.good)
         if coarse:
             noise = Noise(sd=float(np.sqrt(np.mean(np.concatenate(result.residuals) ** 2))))
-        data = replace(data, noise=floored(noise, recordings))
+        data = replace(data, noise=floor_noise(noise, recordings))
         result = fit(p, data, result.theta, result.x0, iterations=20)
     return data, _straightened(result, data) if far_from_prior(result, thresholds.far_from_prior) else result
 
@@ -85,14 +85,14 @@ def prepare(
 def _straightened(result: Fit, data: Data) -> Fit:
     """Free a chain far from its prior of start states that stayed behind while its numbers were wrong."""
     try:
-        return renewed(result, data)
+        return renew_start_states(result, data)
     except RUNAWAY:
         return result
 
 
 def under_noise(result: Fit, data: Data) -> Data:
     """Return data with the noise that the row-to-row jitter of a fit's residual shows."""
-    return replace(data, noise=floored(noise_from_differences(result.residuals, data.good), data.recordings))
+    return replace(data, noise=floor_noise(noise_from_differences(result.residuals, data.good), data.recordings))
 
 
 def far_from_prior(result: Fit, sds: float) -> bool:
@@ -101,7 +101,7 @@ def far_from_prior(result: Fit, sds: float) -> bool:
     return bool(np.max(away, initial=0.0) > sds)
 
 
-def floored(noise: Noise, recordings: Sequence[Recording]) -> Noise:
+def floor_noise(noise: Noise, recordings: Sequence[Recording]) -> Noise:
     """Return the noise, at least a millionth of the signal's spread: recordings without noise must not divide by 0."""
     spread = max(float(np.nanstd(r.y)) for r in recordings)
     least = 1e-6 * spread or 1e-12
@@ -117,7 +117,7 @@ def reduced_chi2(result: Fit, data: Data) -> float:
 
 def whiteness(result: Fit, data: Data) -> float:
     """Return the residual's slow power in units of what noise has, after an AR(2) has taken its share."""
-    noise = floored(autoregressive_up_to(result.residuals, data.good, 2)[-1], data.recordings)
+    noise = floor_noise(autoregressive_up_to(result.residuals, data.good, 2)[-1], data.recordings)
     slow = expected = 0.0
     whitened = replace(data, noise=noise).whitened(list(result.residuals))
     for e, starts, stops in zip(whitened, data.starts, data.stops, strict=True):

@@ -49,7 +49,7 @@ def penalised(h: Hypothesis) -> float:
     return h.penalised_chi2
 
 
-def merged(found: Sequence[Hypothesis]) -> list[Hypothesis]:
+def best_of_each(found: Sequence[Hypothesis]) -> list[Hypothesis]:
     """Return the better fit of every combination of effects, best first."""
     best: dict[frozenset[str], Hypothesis] = {}
     for h in found:
@@ -77,7 +77,7 @@ def is_stand_in(h: Hypothesis, data: Data) -> bool:
     return False
 
 
-def contradicted(h: Hypothesis, data: Data) -> frozenset[str]:
+def contradicted_effects(h: Hypothesis, data: Data) -> frozenset[str]:
     """Return its effects that would hold readings still where these scatter on.
 
     Notes

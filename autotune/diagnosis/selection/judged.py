@@ -128,7 +128,7 @@ def worst(one: Judged, others: Sequence[Judged]) -> float:
     return max((one.behind(other) for other in others if other is not one), default=0.0)
 
 
-def ranked(found: Sequence[_J]) -> list[_J]:
+def rank(found: Sequence[_J]) -> list[_J]:
     """Return hypotheses by how far the best rival of each is ahead of it: the first is beaten by none, or by least."""
     return sorted(found, key=lambda j: worst(j, found))
 
@@ -136,7 +136,7 @@ def ranked(found: Sequence[_J]) -> list[_J]:
 def leading(found: Sequence[_J], count: int) -> list[_J]:
     """Return the first of a ranking, the best one of each set of effects."""
     best: dict[frozenset[object], _J] = {}
-    for one in ranked(found):
+    for one in rank(found):
         best.setdefault(one.identity, one)
     return list(best.values())[:count]
 
@@ -192,7 +192,7 @@ def of_likely(found: Sequence[_J], likely: Collection[str]) -> _J:
     """
     able = [one for one in found if set(one.names) <= set(likely)]
     most = max(len({called(name) for name in one.names}) for one in able)
-    return ranked([one for one in able if len({called(name) for name in one.names}) == most])[0]
+    return rank([one for one in able if len({called(name) for name in one.names}) == most])[0]
 
 
 def probabilities(found: Sequence[_J], best: _J, unknown_odds: float) -> tuple[Candidate, ...]:

@@ -91,7 +91,7 @@ def starting_effects(kind: EffectKind, base: Fit, sizes: SignalSizes) -> list[Ef
     return [effect_with(kind.name, values, units) for values in kind.starts(sizes)]
 
 
-def extended(base: Fit, effect: Effect, data: Data) -> tuple[Parametrisation, FloatArray, tuple[FloatArray, ...]]:
+def extend(base: Fit, effect: Effect, data: Data) -> tuple[Parametrisation, FloatArray, tuple[FloatArray, ...]]:
     """Return parametrisation, starting point and start states of a fit with one more effect."""
     old = base.parametrisation
     effects = (*base.model.effects, effect)
@@ -146,14 +146,14 @@ def direction(base: Fit, effect: Effect, data: Data) -> FloatArray:
     AutotuneError, OverflowError, LinAlgError
         The simulation runs away with the effect.
     """
-    p, theta, states = extended(base, effect, data)
+    p, theta, states = extend(base, effect, data)
     moved = residual_at(p, data, theta, states) - base.e
     if not bounded(moved):
         raise IdentificationError("the simulation runs away", where=effect.name)
     return base.without_states(moved)
 
 
-def distinct(group: Sequence[Prediction]) -> list[Effect]:
+def distinct_starts(group: Sequence[Prediction]) -> list[Effect]:
     """Return the starting points of one effect that differ once they have the size that is predicted."""
     kept: list[Effect] = []
     for p in group:

@@ -14,7 +14,7 @@ from autotune.effects import kind_of
 LEAST_GAIN, LEAST_SHARE = 1.0, 0.02
 
 
-def without(result: Fit, index: int, data: Data) -> Fit | None:
+def fit_without(result: Fit, index: int, data: Data) -> Fit | None:
     """Fit again without one of the effects that a fit adds; nothing where the simulation runs away without it."""
     p = result.parametrisation
     index += p.own  # the nominal model's own effects stay
@@ -32,7 +32,7 @@ def without(result: Fit, index: int, data: Data) -> Fit | None:
         return None
 
 
-def timed(result: Fit, data: Data) -> Fit:
+def move_time_of_change(result: Fit, data: Data) -> Fit:
     """Move a time of change where a fit of everything else is better; a first-order look may take one far from it."""
     effects = result.parametrisation.model.effects
     found = [(i, q.name) for i, e in enumerate(effects) for q in kind_of(e.name).parameters if q.is_time_of_change]

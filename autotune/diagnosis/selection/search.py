@@ -23,15 +23,15 @@ from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import LAST_STEPS, RUNAWAY, STEPS, Fit, fit, fit_from
 from autotune.diagnosis.fitting.long_windows import cut, lengths_of
 from autotune.diagnosis.fitting.parameters import parametrise
-from autotune.diagnosis.fitting.restarts import realigned
+from autotune.diagnosis.fitting.restarts import realign_effects
 from autotune.diagnosis.selection.bench import Bench, at_once, residual_sd
 from autotune.diagnosis.selection.hypothesis import hypothesis, is_stand_in
-from autotune.diagnosis.selection.judged import add_smaller, built_on, leading, ranked
+from autotune.diagnosis.selection.judged import add_smaller, built_on, leading, rank
 from autotune.diagnosis.selection.judged_chain import Found, JudgedChain, at_both_scales
-from autotune.diagnosis.selection.prediction import distinct, extended, predictions, signal_sizes, starting_effects
+from autotune.diagnosis.selection.prediction import distinct_starts, extend, predictions, signal_sizes, starting_effects
 from autotune.diagnosis.selection.probability import RARE
-from autotune.diagnosis.selection.refits import timed, without
-from autotune.diagnosis.selection.scan import searched
+from autotune.diagnosis.selection.refits import fit_without, move_time_of_change
+from autotune.diagnosis.selection.scan import search_starts
 from autotune.diagnosis.simulation.assembly import input_size
 from autotune.diagnosis.simulation.chain import build_chain
 from autotune.diagnosis.thresholds import IN_USE, Thresholds
@@ -101,8 +101,8 @@ def search(
         found += _judge_begun(begun, bench)
         found = add_smaller(found, limits.rig_pruned, limits.rig_effects, lambda some, _: _without_each(some, bench))
         found = _refit_larger(_fit_to_end(found, bench), bench)
-        chosen = at_both_scales(ranked(found)[0], found)
-        retuned = chosen if not chosen.names else ranked([one for one in found if not one.names])[0]
+        chosen = at_both_scales(rank(found)[0], found)
+        retuned = chosen if not chosen.names else rank([one for one in found if not one.names])[0]
         nominal, retuned, chosen = (one.spread_out() for one in (nominal, retuned, chosen))
         return Found(nominal=nominal, retuned=retuned, judged=tuple(found), best=chosen, chosen=chosen)
 
@@ -128,7 +128,7 @@ def _grow(
         if not larger:
             break
         found += larger
-        larger = ranked((best, *larger))
+        larger = rank((best, *larger))
         leads = larger[0] is not best
         larger.remove(best)
         beam = built_on(larger, limits.rig_beam)
@@ -163,7 +163,7 @@ def _roots(model: Model, bench: Bench) -> tuple[Bench, list[JudgedChain]]:
 
 def _lasting(root: JudgedChain, bench: Bench) -> list[Effect]:
     names = [k.name for k, _ in bench.odds if k.lasting]
-    return [e for name in names for e in searched(name, root.short, root.few, bench.pool)]
+    return [e for name in names for e in search_starts(name, root.short, root.few, bench.pool)]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -187,7 +187,7 @@ def _judge_larger(beam: Sequence[JudgedChain], bench: Bench) -> list[JudgedChain
         if base.leaves_noise:
             found = [s for s in found if s.decrease > PROMISING * _charge(s)]
         found.sort(key=lambda s: -s.decrease - 2.0 * math.log(s.odds))
-        starts += [s for rank, s in enumerate(found) if rank < bench.limits.rig_tried or s.odds >= bench.limits.usual]
+        starts += [s for place, s in enumerate(found) if place < bench.limits.rig_tried or s.odds >= bench.limits.usual]
     fits = bench.pool.map(lambda s: _fit_added(s, bench), starts)
     best: dict[frozenset[str], tuple[Fit, float, JudgedChain]] = {}
     for s, result in zip(starts, fits, strict=True):
@@ -196,8 +196,8 @@ def _judge_larger(beam: Sequence[JudgedChain], bench: Bench) -> list[JudgedChain
         key, log_odds = frozenset((*s.base.names, s.kind.name)), s.base.log_odds + math.log(s.odds)
         if key not in best or result.cost < best[key][0].cost:
             best[key] = result, log_odds, s.base
-    ranked = sorted(best.values(), key=lambda one: one[0].cost - 2.0 * one[1])
-    able = [[one for one in ranked if one[2] is base][: bench.limits.rig_tried] for base in beam]
+    order = sorted(best.values(), key=lambda one: one[0].cost - 2.0 * one[1])
+    able = [[one for one in order if one[2] is base][: bench.limits.rig_tried] for base in beam]
     done = bench.pool.map(lambda one: bench.judged(one[0], one[1]), [one for group in able for one in group])
     return [j for j in done if j is not None and np.all(np.isfinite(j.long_squares + j.short_squares))]
 
@@ -230,7 +230,7 @@ def _starts(base: JudgedChain, bench: Bench) -> list[_Start]:
     found = []
     for (kind, odds, near, data), group in zip(tried, effects, strict=True):
         order = sorted((p for _ in group for p in next(predicted)), key=lambda p: -p.decrease)
-        few = tuple(distinct(order)[: bench.limits.rig_starts])
+        few = tuple(distinct_starts(order)[: bench.limits.rig_starts])
         if few:
             found.append(
                 _Start(base=base, kind=kind, odds=odds, effects=few, near=near, data=data, decrease=order[0].decrease)
@@ -243,7 +243,7 @@ def _starting_points(kind: EffectKind, near: Fit, data: Data, sizes: SignalSizes
     tried = starting_effects(kind, near, sizes)
     if kind.lasting:
         return tried + [e for e in bench.lasting if e.name == kind.name]
-    return tried + (searched(kind.name, near, data, bench.pool) if kind.search is not None else [])
+    return tried + (search_starts(kind.name, near, data, bench.pool) if kind.search is not None else [])
 
 
 def _fit_added(start: _Start, bench: Bench) -> Fit | None:
@@ -252,18 +252,18 @@ def _fit_added(start: _Start, bench: Bench) -> Fit | None:
     steps = 2 * STEPS if start.kind.rough else STEPS
     for effect in start.effects:
         try:
-            p, theta, states = extended(start.near, effect, start.data)
+            p, theta, states = extend(start.near, effect, start.data)
             result = fit(p, start.data, theta, states, iterations=steps, inherit=start.near)
             if start.data is not bench.long:
                 result = bench.settled(p, result.theta)
         except RUNAWAY:
             continue
         if start.kind.moves is not None:
-            result = realigned(result, bench.long)
+            result = realign_effects(result, bench.long)
         if not is_stand_in(hypothesis(result), bench.long):
             done.append(result)
     best = min(done, key=lambda f: f.cost, default=None)
-    return timed(best, bench.long) if best is not None and start.kind.is_event else best
+    return move_time_of_change(best, bench.long) if best is not None and start.kind.is_event else best
 
 
 def _judge_begun(begun: JudgedChain | None, bench: Bench) -> list[JudgedChain]:
@@ -289,8 +289,8 @@ def _refit_larger(found: Sequence[JudgedChain], bench: Bench) -> list[JudgedChai
 
     Fits under dry friction end in local minima: what is larger is compared with what is smaller from the same place.
     """
-    best = ranked(found)[0]
-    larger = [j for j in ranked(found) if set(j.names) > set(best.names) and len(j.names) == len(best.names) + 1]
+    best = rank(found)[0]
+    larger = [j for j in rank(found) if set(j.names) > set(best.names) and len(j.names) == len(best.names) + 1]
     once = {frozenset(j.names): j for j in reversed(larger)}
     chosen = sorted(once.values(), key=larger.index)[: bench.limits.rig_pruned]
     return [*found, *(j for j in bench.pool.map(lambda j: _fit_from_best(best, j, bench), chosen) if j is not None)]
@@ -300,7 +300,7 @@ def _fit_from_best(best: JudgedChain, larger: JudgedChain, bench: Bench) -> Judg
     """Return a hypothesis fitted from another one's numbers, with the effect that it has besides as it was found."""
     effect = next(e for e in larger.fit.model.effects if e.name in set(larger.names) - set(best.names))
     try:
-        p, theta, states = extended(best.fit, effect, bench.long)
+        p, theta, states = extend(best.fit, effect, bench.long)
         result = fit(p, bench.long, theta, states, iterations=LAST_STEPS, inherit=best.fit)
     except RUNAWAY:
         return None
@@ -314,7 +314,7 @@ def _without_each(some: Sequence[JudgedChain], bench: Bench) -> list[JudgedChain
     given = {k.name: math.log(o) for k, o in bench.odds}
 
     def judge_without(one: JudgedChain, index: int) -> JudgedChain | None:
-        smaller = without(one.fit, index, one.data)
+        smaller = fit_without(one.fit, index, one.data)
         own = sum(given.get(n, -math.inf) for i, n in enumerate(one.names) if i != index)
         return None if smaller is None else bench.judged(smaller, max(own, one.log_odds))
 
