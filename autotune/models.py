@@ -263,7 +263,7 @@ def read_model(path: str | os.PathLike[str]) -> Model:
 
 def model_of(content: Mapping[str, Any], where: str) -> Model:
     """Return the chain that a TOML content states; ``where`` names it in messages."""
-    _known(content, {"name", "input", "output", "block", "effect", "reduced"}, where)
+    require_keys(content, {"name", "input", "output", "block", "effect", "reduced"}, where)
     blocks, effects = _tables(content, "block", where), _tables(content, "effect", where)
     if not blocks:
         raise InputError("no [[block]]", where=where, remedy="a model needs at least one block")
@@ -297,7 +297,8 @@ def _shown(value: Any) -> str:
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 
-def _known(table: Any, keys: set[str], where: str) -> None:
+def require_keys(table: Any, keys: set[str], where: str) -> None:
+    """Refuse what is no table, and a table with a key that is none of those known."""
     if not isinstance(table, Mapping):
         raise InputError(f"{_shown(table)} is no table", where=where, remedy=f"write keys: {', '.join(sorted(keys))}")
     for key in table:
@@ -314,7 +315,7 @@ def _real(value: Any, key: str, where: str) -> float:
 
 
 def _port(table: Mapping[str, Any], where: str) -> Port:
-    _known(table, {"unit", "offset", "hold", "recorded"}, where)
+    require_keys(table, {"unit", "offset", "hold", "recorded"}, where)
     hold = table.get("hold", "zero")
     if hold not in get_args(Hold):
         raise InputError(f"hold = {_shown(hold)}", where=where, remedy='write "zero" (held command) or "linear"')
@@ -336,7 +337,7 @@ def _range(values: Any, where: str) -> tuple[float, float]:
 
 
 def _block(table: Mapping[str, Any], where: str) -> Block:
-    _known(table, {"name", "place", "num", "den", "delay", "output", "unit"}, where)
+    require_keys(table, {"name", "place", "num", "den", "delay", "output", "unit"}, where)
     place = table.get("place", "plant")
     if place not in get_args(Place):
         raise InputError(f"place = {_shown(place)}", where=where, remedy=f"write one of {', '.join(get_args(Place))}")
@@ -368,7 +369,7 @@ def _block(table: Mapping[str, Any], where: str) -> Block:
 def effect_of(table: Mapping[str, Any], where: str) -> Effect:
     """Return the effect that an ``[[effect]]`` table states; ``where`` names it in messages."""
     acts = ("at", "state", "input", "port", "column")
-    _known(table, {"name", "parameters", "equation", *acts}, where)
+    require_keys(table, {"name", "parameters", "equation", *acts}, where)
     name = _text(table, "name", "", where)
     if "." not in name:
         raise InputError(f"name = {_shown(name)}", where=where, remedy="write PLACE.EFFECT of the catalogue")
