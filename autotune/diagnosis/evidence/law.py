@@ -220,9 +220,12 @@ def _ways(stated: StatedLaw, r: Recording) -> list[Way]:
     """Return the ways in which a law may have been computed, each a function of a time constant that is not stated."""
     law, Ts = stated.controller, r.sample_time_s
     y = np.where(np.isfinite(r.y), r.y, r["r"])
+
+    def fixed(whole: _Columns) -> Way:
+        return lambda _: whole
+
     if not isinstance(law, PIDController):
-        wholes = [_whole(num, den, r["r"] - y) for num, den in _polynomials(law, Ts) if np.any(num)]
-        return [lambda _, whole=whole: whole for whole in wholes]
+        return [fixed(_whole(num, den, r["r"] - y)) for num, den in _polynomials(law, Ts) if np.any(num)]
     if law.K == 0.0:
         return []
 

@@ -172,7 +172,7 @@ def _fits(moments: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return for every shape the coefficients that fit y best, (G, 4), and the squared error left, (G,)."""
     own, y, total = moments[:, :-1, :-1], moments[:, :-1, -1], moments[:, -1, -1]
     fits = np.linalg.solve(own + 1e-9 * np.eye(own.shape[1]) * total[:, None, None], y[..., None])[..., 0]
-    return fits, np.asarray(total - np.einsum("gi,gi->g", fits, y))
+    return np.asarray(fits, dtype=np.float64), np.asarray(total - np.einsum("gi,gi->g", fits, y))
 
 
 def _error(moments: FloatArray, fit: FloatArray) -> float:
