@@ -56,7 +56,7 @@ def model_of(content: Mapping[str, Any], where: str) -> Model:
     InputError
         A key that is not known, or a value that no model has; names it.
     """
-    _require_keys(content, {"name", "input", "output", "block", "effect", "reduced"}, where)
+    require_keys(content, {"name", "input", "output", "block", "effect", "reduced"}, where)
     blocks, effects = _tables(content, "block", where), _tables(content, "effect", where)
     if not blocks:
         raise InputError("no [[block]]", where=where, remedy="a model needs at least one block")
@@ -90,7 +90,8 @@ def _as_text(value: Any) -> str:
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 
-def _require_keys(table: Any, keys: set[str], where: str) -> None:
+def require_keys(table: Any, keys: set[str], where: str) -> None:
+    """Refuse what is no table, and a table with a key that is none of those known."""
     if not isinstance(table, Mapping):
         raise InputError(f"{_as_text(table)} is no table", where=where, remedy=f"write keys: {', '.join(sorted(keys))}")
     for key in table:
@@ -107,7 +108,7 @@ def _real(value: Any, key: str, where: str) -> float:
 
 
 def _port(table: Mapping[str, Any], where: str) -> Port:
-    _require_keys(table, {"unit", "offset", "hold", "recorded"}, where)
+    require_keys(table, {"unit", "offset", "hold", "recorded"}, where)
     hold = table.get("hold", "zero")
     if hold not in get_args(Hold):
         raise InputError(f"hold = {_as_text(hold)}", where=where, remedy='write "zero" (held command) or "linear"')
@@ -129,7 +130,7 @@ def _range(values: Any, where: str) -> tuple[float, float]:
 
 
 def _block(table: Mapping[str, Any], where: str) -> Block:
-    _require_keys(table, {"name", "place", "num", "den", "delay", "output", "unit"}, where)
+    require_keys(table, {"name", "place", "num", "den", "delay", "output", "unit"}, where)
     place = table.get("place", "plant")
     if place not in get_args(Place):
         raise InputError(f"place = {_as_text(place)}", where=where, remedy=f"write one of {', '.join(get_args(Place))}")
@@ -174,7 +175,7 @@ def effect_of(table: Mapping[str, Any], where: str) -> Effect:
         A key that is not known, or a value that no effect has; names it.
     """
     acts = ("at", "state", "input", "port", "column")
-    _require_keys(table, {"name", "parameters", "equation", *acts}, where)
+    require_keys(table, {"name", "parameters", "equation", *acts}, where)
     name = _text(table, "name", "", where)
     if "." not in name:
         raise InputError(f"name = {_as_text(name)}", where=where, remedy="write PLACE.EFFECT of the catalogue")

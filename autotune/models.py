@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Literal, TypeAlias
 
@@ -202,6 +202,18 @@ class Effect:
     port: str = ""
     column: str = ""
 
+    @property
+    def values(self) -> dict[str, float]:
+        """Its parameters as numbers."""
+        return {key: q.value for key, q in self.parameters.items()}
+
+    def with_values(self, values: Mapping[str, float]) -> Effect:
+        """Return it with other values of some parameters, whose units and standard deviations stay."""
+        if not values:
+            return self
+        new = {key: replace(self.parameters[key], value=value) for key, value in values.items()}
+        return replace(self, parameters=MappingProxyType({**self.parameters, **new}))
+
 
 @dataclass(frozen=True, kw_only=True)
 class Model:
@@ -219,6 +231,11 @@ class Model:
         for block in self.blocks:
             product = product * block.dynamics
         return product
+
+    @property
+    def plant_input_unit(self) -> str:
+        """Unit of the plant's input: an actuator's output as far as one is stated, else the command's."""
+        return next((b.unit for b in self.blocks if b.place == "actuator" and b.unit), self.input.unit)
 
     def response(self, omega_rad_s: FloatArray) -> ComplexArray:
         """Return the complex gain from u to y, effects left out, same shape as ``omega_rad_s``."""

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
@@ -34,16 +33,8 @@ def likely(said: Mapping[str, float]) -> frozenset[str]:
 Begins: TypeAlias = Mapping[str, Sequence[tuple[int, float]]]
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Part:
-    """Recordings with a share of their rows left out."""
-
-    recordings: tuple[Recording, ...]
-
-    def tells(self, began: Sequence[tuple[int, float]]) -> bool:
-        """Whether an effect that begins at given times, if any, begins in the part: else no change is seen there."""
-        spans = [(float(r.t[0]), float(r.t[-1])) for r in self.recordings]
-        return not began or any(spans[i][0] < start < spans[i][1] for i, start in began)
+#: Recordings with a share of their rows left out.
+Part: TypeAlias = tuple[Recording, ...]
 
 
 def parts_of(recordings: Sequence[Recording], least_rows: int) -> tuple[Part, ...]:
@@ -59,9 +50,12 @@ def parts_of(recordings: Sequence[Recording], least_rows: int) -> tuple[Part, ..
     if any((1.0 - LEFT_OUT) * np.isfinite(r.y).sum() < 2 * least_rows for r in recordings):
         return ()
     cuts = ((LEFT_OUT, 1.0), (0.0, 1.0 - LEFT_OUT))
-    return tuple(
-        Part(recordings=tuple(r.only(np.arange(int(a * len(r)), int(b * len(r)))) for r in recordings)) for a, b in cuts
-    )
+    return tuple(tuple(r.only(np.arange(int(a * len(r)), int(b * len(r)))) for r in recordings) for a, b in cuts)
+
+
+def tells(part: Part, began: Sequence[tuple[int, float]]) -> bool:
+    """Whether an effect that begins at given times, if any, begins in a part: else no change is seen there."""
+    return not began or any(part[i].t[0] < start < part[i].t[-1] for i, start in began)
 
 
 def agreement(
@@ -100,7 +94,7 @@ def agreement(
     heard = [(part, said(part)) for part in parts] if whole else []
     agreed = {}
     for name in whole:
-        all_said = [whole, *(one for part, one in heard if part.tells(begins.get(name, ())))]
+        all_said = [whole, *(one for part, one in heard if tells(part, begins.get(name, ())))]
         told = [max(p, LEAST) for p in (one.get(name, 0.0) for one in all_said) if not math.isnan(p)]
         mean = float(np.exp(np.mean(np.log(told))))
         if mean >= least:

@@ -13,7 +13,7 @@ import numpy as np
 from autotune.arrays import BoolArray
 from autotune.diagnosis.evidence.adequacy import residual_tests
 from autotune.diagnosis.evidence.description import Description, describe
-from autotune.diagnosis.evidence.held_out import held_out
+from autotune.diagnosis.evidence.held_out import held_out_error
 from autotune.diagnosis.evidence.misread import misread_columns
 from autotune.diagnosis.evidence.operating_point import unmoved
 from autotune.diagnosis.evidence.own_noise import OwnNoise
@@ -22,7 +22,7 @@ from autotune.diagnosis.fitting.retuning import prepare, under_noise
 from autotune.diagnosis.readable import in_commands, readable
 from autotune.diagnosis.result import FoundEffect, OperatingRange, Verdict
 from autotune.diagnosis.safe_extension import safe_extension
-from autotune.diagnosis.selection.hypothesis import contradicted
+from autotune.diagnosis.selection.hypothesis import contradicted_effects
 from autotune.diagnosis.selection.judged import of_likely
 from autotune.diagnosis.selection.judged_chain import Found, JudgedChain, at_both_scales
 from autotune.diagnosis.selection.probability import Candidate, probability_of, weighed
@@ -99,14 +99,14 @@ class ChainEvidence(Evidence):
     def jitter_explains_more(self) -> bool:
         """Whether a clock that jitters explains more than what varies: it disturbs commands too."""
         jitter = sum(s.evidence for s in self.samples if kind_of(s.name).sought == "residual")
-        return self.residual.varies.gain < self.limits.lesser_share * jitter
+        return self.residual.varies.gain < self.limits.majority * jitter
 
     @cached_property
     def contradicted(self) -> frozenset[str]:
         """Chosen effects by whose name readings do not behave; asked where the model's error and not noise decides."""
         if self.found is None or self.found.chosen.leaves_noise:
             return frozenset()
-        return contradicted(self.search.chosen, self.search.data)
+        return contradicted_effects(self.search.chosen, self.search.data)
 
     @property
     def own_noise(self) -> str:
@@ -195,7 +195,7 @@ class ChainEvidence(Evidence):
             places=self.places(effect.name),
             parameters=MappingProxyType(parameters),
             equation=kind.equation,
-            windows=self.acting(effect.name, {key: q.value for key, q in effect.parameters.items()}),
+            windows=self.acting(effect),
             operating_range=self._range(kind.place),
             as_command=MappingProxyType(self._as_command(effect.name, parameters)),
         )
@@ -212,8 +212,7 @@ class ChainEvidence(Evidence):
     def _range(self, place: str) -> OperatingRange:
         column, name = {"plant": (2, "position"), "sensor": (0, "y")}.get(place, (3, "plant input"))
         values = np.concatenate([s[:, column] for s in self.search.chosen.fit.signals])
-        at_plant = next((b.unit for b in self.model.blocks if b.place == "actuator" and b.unit), self.model.input.unit)
-        unit = at_plant if name == "plant input" else self.model.output.unit
+        unit = self.model.plant_input_unit if name == "plant input" else self.model.output.unit
         return OperatingRange(signal=name, low=float(np.nanmin(values)), high=float(np.nanmax(values)), unit=unit)
 
     def misread_columns(self) -> str:
@@ -221,7 +220,7 @@ class ChainEvidence(Evidence):
 
         def error_of(changed: Sequence[Recording], good: Sequence[BoolArray]) -> float:
             data, retuned = prepare(self.model, changed, good, self.limits)
-            return held_out(retuned, data).retuned
+            return held_out_error(retuned, data, tune=True)
 
         return misread_columns(self.measured, self.model.input.offset, self.quality, self.limits, error_of)
 

@@ -139,7 +139,7 @@ def _on_parts(evidence: Evidence, progress: Progress) -> Callable[[Part], Mappin
 
     def said(part: Part) -> Mapping[str, float]:
         progress("once more on a part of the rows", WHOLE)
-        there, cannot_tell = evidence.on(part.recordings)
+        there, cannot_tell = evidence.on(part)
         return {} if there is None else said_by(there) | dict.fromkeys(cannot_tell, math.nan)
 
     return said

@@ -103,7 +103,7 @@ def _ended(effect: Effect, result: Fit, data: Data, nominal: Model) -> Effect:
     if kind.goes_on is None:
         return effect
     values = {q.name: q.neutral for q in kind.parameters if q.neutral is not None}
-    values |= {key: q.value for key, q in effect.parameters.items()} | {"gain": float(result.sim.chain.gains[0])}
+    values |= effect.values | {"gain": float(result.sim.chain.gains[0])}
     signal = _signal_of(kind.place, result, data)
     low, high = float(np.nanmin(signal)), float(np.nanmax(signal))
     beyond = np.linspace(0.0, high - low, _LOOKED)

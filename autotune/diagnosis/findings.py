@@ -40,7 +40,7 @@ def said_by(evidence: Evidence) -> dict[str, float]:
     if evidence.offset is not None and judged(evidence) == "effect":
         shown |= {e.name: e.probability for _, e in evidence.described() if e.name not in allowed}
     # rows that leave too much open for a verdict still weigh what it may be
-    return {name: probability_of(name, candidates, most) for name in allowed} | shown
+    return {name: probability_of(name, candidates, most) for name in sorted(allowed)} | shown
 
 
 def _of_samples(s: SampleEffect, evidence: Evidence) -> FoundEffect:
@@ -73,7 +73,8 @@ def consistent(
     Notes
     -----
     Of all distributions with those sums it is the one nearest to the given one (minimum discrimination information,
-    Csiszar 1975), found by fitting one sum after the other.
+    Csiszar 1975), found by fitting one sum after the other. Parts of the recordings may ask for sums that no
+    distribution over these hypotheses has; the likelier effect's then holds, for it is fitted last.
     """
     # effects in another order are the same hypothesis
     names = {frozenset(c.name.split("+")): c.name for c in reversed(candidates)}
@@ -84,7 +85,7 @@ def consistent(
     having = {name: {h for h in weights if counted_as(name) & h} for name in effects}
     for _ in range(ROUNDS):
         most = 0.0
-        for name, p in effects.items():
+        for name, p in sorted(effects.items(), key=lambda one: (one[1], one[0])):
             inside = sum(weights[h] for h in having[name])
             outside = sum(weights.values()) - inside
             if inside <= 0.0 or outside <= 0.0:
@@ -105,7 +106,7 @@ def places_of(evidence: Evidence, effects: Sequence[FoundEffect], description: D
         return tuple(dict.fromkeys(place for e in effects for place in e.places))
     known: dict[str, None] = {description.place: None} if description is not None and description.terms else {}
     if not evidence.residual.is_constant and description is not None:
-        informative = known if description.explained > evidence.limits.informative else {}
+        informative = known if description.explained > evidence.limits.majority else {}
         return tuple(dict.fromkeys(evidence.residual.varies.places) | informative)
     places: dict[str, None] = dict(known)
     for names in evidence.leading[:3]:

@@ -10,15 +10,16 @@ from autotune.arrays import BoolArray
 from autotune.controller import Controller
 from autotune.diagnosis.chain_evidence import ChainEvidence
 from autotune.diagnosis.evidence.adequacy import residual_tests
-from autotune.diagnosis.evidence.beside_chain import beside_chain
-from autotune.diagnosis.evidence.held_out import held_out
-from autotune.diagnosis.evidence.late_rows import JITTER, late_rows
+from autotune.diagnosis.evidence.held_out import held_out, noise_floor
+from autotune.diagnosis.evidence.jitter import jitter_effect
+from autotune.diagnosis.evidence.late_rows import late_rows
+from autotune.diagnosis.evidence.law import law_effect
 from autotune.diagnosis.evidence.operating_point import offset_of, unmoved
 from autotune.diagnosis.evidence.own_noise import own_noise
-from autotune.diagnosis.evidence.sample_gain import SimulatedRows, is_material, rows_of, supported
-from autotune.diagnosis.evidence.samples import SampleEffect, spared
-from autotune.diagnosis.evidence.spoiled_rows import clear_samples, searched_beside
-from autotune.diagnosis.evidence.stamps import evened
+from autotune.diagnosis.evidence.sample_gain import SimulatedRows, is_material, rows_of, select_supported
+from autotune.diagnosis.evidence.samples import JITTER, SampleEffect, unspoiled_rows
+from autotune.diagnosis.evidence.spoiled_rows import clear_samples, search_beside
+from autotune.diagnosis.evidence.stamps import even_stamps
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import RUNAWAY, Fit
 from autotune.diagnosis.fitting.retuning import at_nominal, prepare, under_noise
@@ -61,22 +62,24 @@ def evidence_of(
     if any(kind_of(effect.name).late_stamps for effect in model.effects):
         recordings, late = [r.at_even_times() for r in recordings], None
     else:
-        recordings, late = evened(model, recordings, thresholds)
+        recordings, late = even_stamps(model, recordings, thresholds)
     own = {effect.name for effect in model.effects}
 
     retuned_rows = partial(_retuned_rows, model, recordings, thresholds)
     searched = partial(_searched, model, recordings, without, progress, thresholds, begun)
     seen = clear_samples(recordings, [name for name in without if name not in own], thresholds, retuned_rows)
-    (near, found), seen = searched_beside(searched, seen, without)
+    (near, found), seen = search_beside(searched, seen, without)
     seen = [s for s in seen if s.name not in own]
     progress("checking on held-out rows", 0.9)
 
     def beside(result: Fit, data: Data) -> list[SampleEffect]:
-        others = [s for s in beside_chain(result, data, recordings, controller, seen) if s.name not in without]
-        return others if late is None else [late, *(s for s in others if s.name != late.name)]
+        jitter, law = late, law_effect(recordings, controller, thresholds)
+        if jitter is None and JITTER not in (*without, *_excluded(seen)):
+            jitter = jitter_effect(result, data, recordings)
+        return [s for s in (jitter, law) if s is not None and (s is late or s.name not in without)]
 
     retuned, data = near.retuned.fit, near.data
-    samples = (*supported(seen, rows_of(retuned, data)), *beside(retuned, data))
+    samples = (*select_supported(seen, rows_of(retuned, data)), *beside(retuned, data))
     evidence = ChainEvidence(
         model=model,
         again=again,
@@ -84,7 +87,7 @@ def evidence_of(
         samples=samples,
         residual=residual_tests(retuned, data, uneven=any(kind_of(s.name).uneven for s in samples)),
         quality_of=cache(lambda: held_out(retuned, data)),
-        offset=None if unmoved(model, recordings) else offset_of(retuned, thresholds.offset_sigmas),
+        offset=None if unmoved(model, recordings) else offset_of(retuned, thresholds.off_sigmas),
         evened=late is not None,
     )
     if found is None or (evidence.residual.uneven and evidence.residual.is_noise):
@@ -92,7 +95,7 @@ def evidence_of(
     if found.chosen.names:
         chosen = found.chosen.fit, found.chosen.data
         rows = rows_of(*chosen)
-        samples = (*supported(seen, rows), *beside(chosen[0], under_noise(*chosen)))
+        samples = (*select_supported(seen, rows), *beside(chosen[0], under_noise(*chosen)))
         evidence = replace(evidence, samples=tuple(s for s in samples if is_material(s, rows)))
     return _with_found(evidence, found, without)
 
@@ -121,7 +124,7 @@ def _searched(
 
     Nothing is found where every simulation runs away.
     """
-    good, names = spared(recordings, seen), [*without, *(effect.name for effect in seen)]
+    good, names = unspoiled_rows(recordings, seen), [*without, *(effect.name for effect in seen)]
     progress("retuning", 0.0)
     data, retuned = prepare(model, recordings, good, limits)
     alone = Hypothesis(names=(), fit=retuned)
@@ -147,8 +150,8 @@ def _with_found(evidence: ChainEvidence, found: Found, without: Sequence[str]) -
     offset = None
     if chosen.names and chosen.leaves_noise:
         residual = residual_tests(chosen.fit, under_noise(chosen.fit, chosen.data), uneven=residual.uneven)
-        offset = offset_of(chosen.fit, limits.offset_sigmas)
-    floor = evidence.quality.noise_floor
+        offset = offset_of(chosen.fit, limits.off_sigmas)
+    floor = noise_floor(near.retuned.fit, near.data)
     return replace(
         evidence, search=found.as_search(), residual=residual, quality_of=lambda: found.quality(floor), offset=offset,
         found=found,
@@ -157,11 +160,15 @@ def _with_found(evidence: ChainEvidence, found: Found, without: Sequence[str]) -
 
 def _late_rows(evidence: ChainEvidence, gained: float, without: Sequence[str]) -> ChainEvidence | None:
     """Return the evidence where rows that are late, and their commands with them, explain more than effects gained."""
-    excluded = {name for s in evidence.samples for name in kind_of(s.name).excludes}
-    if evidence.evened or evidence.residual.is_noise or JITTER in (*without, *excluded):
+    if evidence.evened or evidence.residual.is_noise or JITTER in (*without, *_excluded(evidence.samples)):
         return None
     late = late_rows(evidence.search.retuned.fit, evidence.search.data)
     if late is None or late.evidence < gained:
         return None
     samples = (*(s for s in evidence.samples if s.name != JITTER), late)
     return replace(evidence, samples=samples, residual=replace(evidence.residual, accounted=True), offset=None)
+
+
+def _excluded(seen: Sequence[SampleEffect]) -> set[str]:
+    """Return the effects that those seen in the samples exclude."""
+    return {name for s in seen for name in kind_of(s.name).excludes}

@@ -37,9 +37,8 @@ def readable(effect: Effect) -> dict[str, Parameter]:
     """Return an effect's parameters as people name them: limits that do not act are left out."""
     kind = kind_of(effect.name)
     parameters = dict(effect.parameters) if kind.readable is None else kind.readable(effect.parameters)
-    values = {name: p.value for name, p in effect.parameters.items()}
     for q in kind.parameters:
-        if q.role == "amplitude" and q.held is not None and q.held(values):
+        if q.role == "amplitude" and q.held is not None and q.held(effect.values):
             parameters.pop(q.name, None)  # its size is another number's, as gravity's is the spring's
         unfelt = q.role == "limit" and q.name in parameters and not math.isfinite(parameters[q.name].sd)
         if q.role == "mark" or unfelt:

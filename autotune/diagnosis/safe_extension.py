@@ -9,7 +9,7 @@ from typing import TypeVar
 import numpy as np
 
 from autotune.arrays import FloatArray
-from autotune.errors import AutotuneError
+from autotune.diagnosis.fitting.fit import RUNAWAY
 from autotune.recording import Recording
 
 M = TypeVar("M")
@@ -83,7 +83,7 @@ def _reach(model: M, r: Recording, forecast: Callable[[M, Recording], FloatArray
     """Return how far a simulation goes from where it begins; infinite where it breaks off."""
     try:
         y = forecast(model, r)
-    except (AutotuneError, OverflowError, np.linalg.LinAlgError):
+    except RUNAWAY:
         return np.inf
     return float(np.max(np.abs(y - y[0]))) if np.all(np.isfinite(y)) else np.inf
 
@@ -91,6 +91,6 @@ def _reach(model: M, r: Recording, forecast: Callable[[M, Recording], FloatArray
 def _squares(model: M, r: Recording, forecast: Callable[[M, Recording], FloatArray]) -> float:
     try:
         e = (r.y - forecast(model, r))[np.isfinite(r.y)]
-    except (AutotuneError, OverflowError, np.linalg.LinAlgError):
+    except RUNAWAY:
         return np.inf
     return float(e @ e) if np.all(np.isfinite(e)) else np.inf

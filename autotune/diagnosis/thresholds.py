@@ -35,7 +35,6 @@ class Thresholds:
     unknown_lags: float = known(1.0, "slowest lags", "after the dead time, commands before the recording act no more", "convention")
     most_left_out: float = known(0.03, "of a recording", "that is left out at its beginning at most", "convention")
     # noise
-    largest_correlation: float = known(0.9, "1", "of the noise from row to row: beyond it differences cannot tell it from a slow residual", "convention")
     slow_noise: float = known(0.8, "1", "correlation of the noise from which on it is no matter of single samples", "counted")
     coarse: float = known(25.0, "reduced chi2", "from which on the residual itself is taken for noise", "real rigs")
     # what samples show
@@ -48,9 +47,7 @@ class Thresholds:
     least_clipped: int = known(5, "rows", "at an extreme reading before a saturation is named", "chance")
     least_equal_share: float = known(0.02, "of the rows", "that equal the one before, before rounding is named", "counted")
     least_rounding: float = known(0.05, "of the noise", "variance of a converter's rounding that matters", "convention")
-    jitter_decrease: float = known(30.0, "chi2", "that the slope explains of the residual's size before jitter is named", "chance")
-    late_rows: float = known(30.0, "chi2", "that rows which are late with their commands explain before jitter is named", "chance")
-    late_rows_beside_load: float = known(10.0, "chi2", "the same beside a load that is noise: right ones bring 60 on, others less than none", "counted")
+    late_rows_beside_load: float = known(10.0, "chi2", "that rows which are late explain beside a load that is noise: right ones bring 60 on, others less than none", "counted")
     samples_clear: float = known(4.0, "2 ln odds", "that runs of spoiled rows give, from which on no fit sees these rows", "convention")
     samples_sure: float = known(60.0, "chi2", "from which on what samples show is sure", "counted")
     samples_probable: float = known(0.85, "probability", "stated of what samples show with less", "counted")
@@ -58,7 +55,6 @@ class Thresholds:
     even_share: float = known(0.7, "of the residual", "that retuning at even times may leave to say that stamps are wrong", "convention")
     rounding: float = known(0.9, "of the squared error", "that a simulation with a converter's rounding may leave to be better", "convention")
     # the control law
-    law_sigmas: float = known(6.0, "sd", "that a gain or a time is off its stated value in a broken law", "chance")
     law_least_change: float = known(0.04, "of the value", "that it is off at least", "convention")
     law_clearly_more: float = known(2.0, "times", "variance that a law must leave whose derivative's filter is not stated", "counted")
     law_most_at_limits: float = known(0.2, "of the rows", "at the command's ends from which on limits made it", "convention")
@@ -72,26 +68,23 @@ class Thresholds:
     searched_rows: int = known(30_000, "rows", "that a search works on at most; the best hypotheses are fitted to all", "cost")
     confirmed: int = known(3, "hypotheses", "leading, that are fitted to all rows where a search worked on some", "cost")
     # parsimony
-    least_decrease: float = known(30.0, "chi2", "that an effect must bring: chance among two hundred starts brought up to 15", "chance")
+    least_decrease: float = known(30.0, "chi2", "that jitter, or a term of a description, must bring: chance among two hundred starts brought up to 15", "chance")
     # adequacy
     adequate: float = known(1.04, "reduced chi2", "up to which a model is adequate, beside one sd of chance", "counted")
     adequate_quick: float = known(1.12, "reduced chi2", "the same of a residual without slow part: physics left out would be slow", "counted")
-    quick: float = known(1.0, "slow power", "of the residual over the noise's up to which it has no slow part", "counted")
     white: float = known(1.10, "slow power", "up to which a residual is white, beside two sd of chance", "counted")
     line: float = known(6.0, "log odds", "against chance of the strongest line in the spectrum of noise: one in four hundred", "chance")
     inconstant: float = known(25.0, "chi2", "of the largest of some hundred score tests; right models leave up to 15", "counted")
     inconstant_share: float = known(0.1, "of the gained", "the same beside effects: right ones leave two hundredths, wrong ones a third", "counted")
     uneven_noise: float = known(4.0, "ratio", "of the variances of innovations along a record up to which a disturbance is steady", "convention")
-    lesser_share: float = known(0.5, "of the gained", "from which on what varies weighs as much as the effects; real rigs leave a quarter", "real rigs")
+    majority: float = known(0.5, "of a whole", "from which on a part is most of it: of what jitter explains what varies beside it, of a residual what a description takes away, of the values those that stay (a slow converter, no dropout), of the residual's scatter that of readings which a limit should hold still", "convention")
     # verdict and probabilities
     numbers_decrease: float = known(25.0, "chi2", "that wrong numbers must bring to be called wrong", "chance")
     missing: float = known(1.05, "reduced chi2", "of a model without effects from which on something is missing; clean ones leave 1.02", "counted")
-    offset_sigmas: float = known(6.0, "sd", "that an operating point must be off to be an offset", "chance")
+    off_sigmas: float = known(6.0, "sd", "that a law's gain or time, or the operating point, is off what is stated before that is said", "chance")
     temperature: float = known(2.0, "chi2", "that counts as one: neither noise nor a model's error is ever ideal", "counted")
     unknown_odds: float = known(0.03, "odds", "prior, of a cause outside the catalogue where the best explains the recordings", "counted")
     most_probable: float = known(0.99, "probability", "stated at most", "convention")
-    informative: float = known(0.5, "of the residual", "held out, from which on a description tells the place", "counted")
-    term_share: float = known(0.1, "of the residual", "held out, that one more term of a description must take away", "counted")
     # rigs: where the model's error decides, stretches that were left out are what counts
     short_window: float = known(4.0, "slowest times", "length of short windows", "convention")
     least_short_rows: int = known(40, "rows", "of a short window", "convention")
@@ -101,16 +94,13 @@ class Thresholds:
     swinging: float = known(0.5, "damping", "below which a fit goes from short to long windows", "convention")
     rig_rows: int = known(9000, "rows", "fitted at most", "cost")
     foretold: float = known(2.0, "times the fitted rows'", "error of rows that were left out, up to which what leaves noise is taken for true: start states cost up to half as much again", "counted")
-    material: float = known(0.1, "of the held-out error", "that one more effect takes away where the search goes on", "cost")
+    material: float = known(0.1, "of the held-out error", "that one more effect, or term of a description, takes away where the search goes on", "cost")
     material_numbers: float = known(0.25, "of the held-out error", "that retuned numbers must take away to replace nominal ones where no effect is found", "convention")
-    most_held: float = known(0.5, "of the values", "that stay for more than a row: more of them are a slow converter, no dropout", "convention")
-    most_scatter: float = known(0.5, "of the residual's", "variance from row to row that readings may have where a limit of the sensor holds them: a rig's noise is mostly the sensor's, in front of it", "convention")
     rig_effects: int = known(4, "effects", "in one hypothesis at most", "cost")
     rig_beam: int = known(2, "hypotheses", "that are built on", "cost")
-    rig_judged: int = known(8, "hypotheses", "with one effect more than another one whose left-out stretches are judged", "cost")
     rig_starts: int = known(2, "starting points", "of an effect that are fitted", "cost")
     rig_pruned: int = known(4, "hypotheses", "leading, of which each effect is left out once more", "cost")
-    rig_tried: int = known(8, "effects", "beside one hypothesis that are fitted", "cost")
+    rig_tried: int = known(8, "effects", "beside one hypothesis that are fitted, and of the fits those that are judged on left-out stretches", "cost")
     usual: float = known(0.15, "prior odds", "from which on an effect is always fitted", "convention")
     out_of_phase: float = known(0.3, "of the spread", "held-out error from which on a free run may be out of phase", "convention")
     nominal_too: float = known(1.5, "prior sd", "of a retuned number from which on effects are looked for beside the nominal ones too", "convention")
@@ -135,8 +125,8 @@ class Thresholds:
 IN_USE = Thresholds()
 
 
-def table(thresholds: Thresholds) -> list[tuple[str, float, str, str, str]]:
-    """Return the table's rows: name, value, unit, meaning, origin."""
+def table(thresholds: Any) -> list[tuple[str, float, str, str, Origin]]:
+    """Return the rows of a table of such fields: name, value, unit, meaning, origin."""
     return [
         (f.name, float(getattr(thresholds, f.name)), f.metadata["unit"], f.metadata["meaning"], f.metadata["origin"])
         for f in fields(thresholds)

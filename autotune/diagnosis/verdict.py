@@ -7,7 +7,7 @@ handed out; each says so in a class of its own, and all that follows asks no fur
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -21,6 +21,7 @@ from autotune.diagnosis.selection.probability import Candidate
 from autotune.diagnosis.thresholds import Thresholds
 from autotune.effects import STRUCTURES, kind_of
 from autotune.equations.files import AnyModel
+from autotune.models import Effect
 from autotune.recording import Recording
 
 if TYPE_CHECKING:
@@ -134,12 +135,12 @@ class Evidence(ABC):
         """All recordings from their first row to their last."""
         return tuple((i, float(r.t[0]), float(r.t[-1])) for i, r in enumerate(self.recordings))
 
-    def acting(self, name: str, values: Mapping[str, float]) -> tuple[tuple[int, float, float], ...]:
-        """Return when an effect with some values acts: everywhere, or in a recording from a time on."""
-        kind = kind_of(name)
+    def acting(self, effect: Effect) -> tuple[tuple[int, float, float], ...]:
+        """Return when an effect acts: everywhere, or in a recording from a time on."""
+        kind = kind_of(effect.name)
         if kind.acts_in is None:
             return self.everywhere
-        number, after = kind.acts_in({"recording": -1.0, **values})
+        number, after = kind.acts_in({"recording": -1.0, **effect.values})
         pairs = [(i, r) for i, r in enumerate(self.recordings) if number in (-1, i)]
         return tuple((i, float(r.t[0] + after), float(r.t[-1])) for i, r in pairs)
 

@@ -5,24 +5,23 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import reduce
 from typing import Any
 
 from autotune.equations.expressions import Call, Expression, Name, Number
 from autotune.equations.model import EquationModel, InputColumn, ModelParameter, State, StateKind
 from autotune.errors import InputError
-from autotune.model_tables import model_of
+from autotune.model_tables import model_of, require_keys
 from autotune.models import Block, Model, TransferFunction
 
 
-def from_chain(model: Model, column: str = "u") -> EquationModel:
+def from_chain(model: Model) -> EquationModel:
     """Return a chain of blocks as equations.
 
     Parameters
     ----------
     model : Model
         Blocks in series; its dead times act at the input, which is the same for linear blocks.
-    column : str
-        Column of the command.
 
     Returns
     -------
@@ -30,19 +29,7 @@ def from_chain(model: Model, column: str = "u") -> EquationModel:
         A state per pole, gains and time constants as parameters. Effects of the chain are not taken along: they
         say where they act in words of a chain.
     """
-    made = _Chain([column])
-    signal: Expression = Name(column)
-    for block in model.blocks:
-        signal = made.block(block.name, block.dynamics, signal, kind_of(block), block.unit)
-    command = InputColumn(
-        column=column, unit=model.input.unit, hold=model.input.hold, offset=model.input.offset,
-        delay_s=sum(block.dynamics.delay_s for block in model.blocks),
-    )  # fmt: skip
-    output = Call("+", (signal, Number(model.output.offset))) if model.output.offset else signal
-    return EquationModel(
-        name=model.name, inputs=(command,), output=output, output_unit=model.output.unit,
-        states=with_speeds(made.states), parameters=tuple(made.parameters),
-    )  # fmt: skip
+    return _assembled(model, _Chain(["u"]), [_command(model, "u")])
 
 
 def chain_with_inputs(content: Mapping[str, Any], where: str) -> EquationModel:
@@ -67,28 +54,38 @@ def chain_with_inputs(content: Mapping[str, Any], where: str) -> EquationModel:
     command = {key: value for key, value in inputs[0].items() if key != "column"}
     chain = model_of({**content, "input": command}, where)
     made = _Chain([str(one.get("column", "u")) for one in inputs])
-    columns = [
-        InputColumn(
-            column=str(inputs[0].get("column", "u")), unit=chain.input.unit, hold=chain.input.hold,
-            offset=chain.input.offset, delay_s=sum(b.dynamics.delay_s for b in chain.blocks),
-        )
-    ]  # fmt: skip
+    columns = [_command(chain, str(inputs[0].get("column", "u")))]
     at_plant: list[Expression] = []
     at_output: list[Expression] = []
     for number, table in enumerate(inputs[1:], 2):
         one, path, acts = _disturbance(table, f"{where} [[input]] {number}")
         columns.append(one)
         (at_plant if acts == "plant" else at_output).append(made.block(one.column, path, Name(one.column)))
-    signal: Expression = Name(columns[0].column)
+    return replace(_assembled(chain, made, columns, at_plant, at_output), effects=chain.effects)
+
+
+def _command(chain: Model, column: str) -> InputColumn:
+    return InputColumn(
+        column=column, unit=chain.input.unit, hold=chain.input.hold, offset=chain.input.offset,
+        delay_s=sum(block.dynamics.delay_s for block in chain.blocks),
+    )  # fmt: skip
+
+
+def _assembled(
+    chain: Model, made: _Chain, inputs: Sequence[InputColumn], at_plant: Sequence[Expression] = (),
+    at_output: Sequence[Expression] = (),
+) -> EquationModel:  # fmt: skip
+    """Return a chain's equations, with what enters before its first plant block and what is added to its output."""
+    signal: Expression = Name(inputs[0].column)
     entered = False
     for block in chain.blocks:
         if block.place == "plant" and not entered:
-            entered, signal = True, _sum([signal, *at_plant])
+            entered, signal = True, sum_of([signal, *at_plant])
         signal = made.block(block.name, block.dynamics, signal, kind_of(block), block.unit)
-    output = _sum([signal, *at_output, *([Number(chain.output.offset)] if chain.output.offset else [])])
+    output = sum_of([signal, *at_output, *([Number(chain.output.offset)] if chain.output.offset else [])])
     return EquationModel(
-        name=chain.name, inputs=tuple(columns), output=output, output_unit=chain.output.unit,
-        states=with_speeds(made.states), parameters=tuple(made.parameters), effects=chain.effects,
+        name=chain.name, inputs=tuple(inputs), output=output, output_unit=chain.output.unit,
+        states=with_speeds(made.states), parameters=tuple(made.parameters),
     )  # fmt: skip
 
 
@@ -114,10 +111,7 @@ def with_speeds(states: Sequence[State]) -> tuple[State, ...]:
 
 
 def _disturbance(table: Mapping[str, Any], where: str) -> tuple[InputColumn, TransferFunction, str]:
-    for key in table:
-        if key not in ("column", "num", "den", "delay", "acts", "unit", "hold", "offset"):
-            raise InputError(f"unknown key {key!r}", where=where, remedy="known are column, num, den, delay, acts, "
-                             "unit, hold, offset")  # fmt: skip
+    require_keys(table, {"column", "num", "den", "delay", "acts", "unit", "hold", "offset"}, where)
     if not isinstance(table.get("column"), str):
         raise InputError("column is missing", where=where, remedy='add column = "NAME" of the recording')
     acts = table.get("acts", "plant")
@@ -135,11 +129,9 @@ def _disturbance(table: Mapping[str, Any], where: str) -> tuple[InputColumn, Tra
     return column, replace(path, delay_s=0.0), acts
 
 
-def _sum(parts: Sequence[Expression]) -> Expression:
-    total = parts[0]
-    for one in parts[1:]:
-        total = Call("+", (total, one))
-    return total
+def sum_of(parts: Sequence[Expression]) -> Expression:
+    """Return the sum of expressions, 0 of none."""
+    return reduce(lambda a, b: Call("+", (a, b)), parts) if parts else Number(0.0)
 
 
 class _Chain:
@@ -182,7 +174,7 @@ class _Chain:
         if num[0] != 0.0:  # direct: the highest derivative itself
             parts.append(_times(b[0], feed))
         used = [part for part in parts if part != Number(0.0)]
-        return _sum(used) if used else Number(0.0)
+        return sum_of(used)
 
     def _lag(self, label: str, gain: float, time_constant: float, signal: Expression, state: State) -> Expression:
         K, T = self._number(f"{label}_K", gain), self._number(f"{label}_T", time_constant, keep=())

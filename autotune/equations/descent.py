@@ -22,10 +22,11 @@ from autotune.equations.sensitivity import (
     WORTH_A_THREAD,
     Sensitivities,
     Windows,
+    run_windows,
     sensitivities,
     side_by_side,
 )
-from autotune.equations.simulate import Compiled, Run, simulate
+from autotune.equations.simulate import Compiled, Run
 from autotune.equations.starts import given_starts, started_anew, state_scales
 from autotune.errors import InputError
 
@@ -88,7 +89,7 @@ class Descent:
 
         def run_of(pair: tuple[FitData, Windows]) -> Run:
             one, w = pair
-            return simulate(self._compiled, p, one.drive, w.states, starts=w.starts, stops=w.stops)
+            return run_windows(self._compiled, p, one.drive, w)
 
         rows = sum(int(np.sum(w.stops - w.starts)) for w in windows)
         runs = side_by_side(run_of, each) if len(each) > 1 and rows > WORTH_A_THREAD else map(run_of, each)
@@ -127,10 +128,7 @@ class Descent:
     def simulated(self) -> list[FloatArray]:
         """Return y at every row of every recording; NaN from where a simulation runs away."""
         p = values_of(self._compiled, self._z)
-        return [
-            simulate(self._compiled, p, one.drive, w.states, starts=w.starts, stops=w.stops).y
-            for one in self._data for w in (one.windows,)
-        ]  # fmt: skip
+        return [run_windows(self._compiled, p, one.drive, one.windows).y for one in self._data]
 
     def _projected(self, one: FitData, s: Sensitivities, per_z: FloatArray) -> _Derivatives:
         J = (s.to_parameters * per_z)[:, self._which]
@@ -238,7 +236,7 @@ class Descent:
 
         A start state that made up for wrong numbers may lead to another swing than the right one, for good.
         """
-        p, before = values_of(self._compiled, self._z), self._mean_squares([one.windows for one in self._data])
+        p, before = values_of(self._compiled, self._z), [self._mean_squares(one, one.windows) for one in self._data]
         known = np.concatenate(before)
         if known.size < LEAST_WINDOWS or not np.any(known > STANDS_OUT * np.median(known)):
             return False
@@ -251,7 +249,7 @@ class Descent:
         ]
         found = False
         for i, (one, new, old) in enumerate(zip(self._data, windows, before, strict=True)):
-            better = self._mean_squares_of(one, new) < RESTARTED * old
+            better = self._mean_squares(one, new) < RESTARTED * old
             states = np.where(better[:, None], new.states, one.windows.states)
             self._data[i] = replace(one, windows=replace(one.windows, states=states))
             found = found or bool(better.any())
@@ -259,18 +257,15 @@ class Descent:
         self._errors = self._errors if errors is None else errors
         return found
 
-    def _mean_squares(self, windows: Sequence[Windows]) -> list[FloatArray]:
-        return [self._mean_squares_of(one, w) for one, w in zip(self._data, windows, strict=True)]
-
-    def _mean_squares_of(self, one: FitData, w: Windows) -> FloatArray:
+    def _mean_squares(self, one: FitData, w: Windows) -> FloatArray:
         """Return the mean square that each window leaves; infinite where it runs away."""
         p = values_of(self._compiled, self._z)
-        e = one.y - simulate(self._compiled, p, one.drive, w.states, starts=w.starts, stops=w.stops).y
+        e = one.y - run_windows(self._compiled, p, one.drive, w).y
         parts = (e[a:b][one.good[a:b]] for a, b in zip(w.starts, w.stops, strict=True))
         found = [float(np.mean(part**2)) if part.size else 0.0 for part in parts]
         return np.where(np.isfinite(found), found, np.inf)
 
-    def fitted(self, converged: bool) -> Fitted:
+    def fitted(self) -> Fitted:
         """Return what was found."""
         compiled, p = self._compiled, values_of(self._compiled, self._z)
         if self._last is None:
@@ -280,14 +275,11 @@ class Descent:
         sd, whole = np.zeros(p.size), np.zeros((J.shape[0], p.size))
         sd[self._which] = deviations_beside_prior(J) * per_z[self._which]
         whole[:, self._which] = J
-        simulated = tuple(
-            simulate(compiled, p, one.drive, one.windows.states, starts=one.windows.starts, stops=one.windows.stops).y
-            for one in self._data
-        )
+        simulated = tuple(self.simulated())
         residuals = tuple(np.where(one.good, one.y - y, np.nan) for one, y in zip(self._data, simulated, strict=True))
         return Fitted(
             compiled=compiled, parameters=p, sd=sd, z=self._z, windows=tuple(one.windows for one in self._data),
-            simulated=simulated, residuals=residuals, noise_sd=self._sd, jacobian=whole, converged=converged,
+            simulated=simulated, residuals=residuals, noise_sd=self._sd, jacobian=whole,
         )  # fmt: skip
 
 

@@ -104,8 +104,7 @@ class _Parser:
     def __init__(self, text: str, where: str) -> None:
         self._text, self._where = text, where
         self._tokens = list(self._split())
-        self._at = 0
-        self._depth = 0
+        self._at = self._depth = 0
 
     def _split(self) -> Iterator[tuple[str, str, int]]:
         at = 0
@@ -137,11 +136,9 @@ class _Parser:
             return self._tokens[self._at - 1][1]
         return None
 
-    def _need(self, sign: str) -> None:
-        if self._take(sign) is None:
-            raise self._refused(
-                f"{sign!r} is missing before {self._peek()!r}" if self._peek() else f"{sign!r} is missing"
-            )
+    def _close(self) -> None:
+        if self._take(")") is None:
+            raise self._refused(f"')' is missing before {self._peek()!r}" if self._peek() else "')' is missing")
 
     def whole(self) -> Expression:
         if not self._tokens:
@@ -208,7 +205,7 @@ class _Parser:
             return self._called(text, at) if self._take("(") is not None else self._named(text, at)
         if text == "(":
             tree = self._sum()
-            self._need(")")
+            self._close()
             return tree
         self._at -= 1
         raise self._refused("powers are written with ^, not **" if text == "**" else f"{text!r} has nothing before it")
@@ -226,7 +223,7 @@ class _Parser:
         arguments = [self._condition() if name == "if" else self._sum()]
         while self._take(",") is not None:
             arguments.append(self._sum())
-        self._need(")")
+        self._close()
         wanted = FUNCTIONS[name]
         more = name in ("min", "max") and len(arguments) > wanted
         if len(arguments) != wanted and not more:

@@ -78,14 +78,13 @@ def fit(
     each = zip(recordings, windows or none, known or none, strict=True)
     data = [data_of(compiled, one, p, length, at, before) for one, at, before in each]
     state = Descent(compiled, data, which, z)
-    converged = False
     for k in range(iterations):
-        converged = state.step()
-        if (converged or k % 2) and k + 1 < iterations and state.restarted():
-            converged = False
-        if converged:
+        rests = state.step()
+        if (rests or k % 2) and k + 1 < iterations and state.restarted():
+            continue
+        if rests:
             break
-    return state.fitted(converged)
+    return state.fitted()
 
 
 def retune(

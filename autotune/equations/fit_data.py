@@ -40,8 +40,6 @@ class Fitted:
     jacobian : (rows, P) array
         dy/dz over the noise where the last step began, start states projected out; see
         :mod:`autotune.equations.identifiability`.
-    converged : bool
-        Whether the last step changed next to nothing.
     """
 
     compiled: Compiled
@@ -53,7 +51,6 @@ class Fitted:
     residuals: tuple[FloatArray, ...]
     noise_sd: float
     jacobian: FloatArray
-    converged: bool
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

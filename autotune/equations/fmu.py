@@ -29,7 +29,7 @@ from autotune.equations.black_box import BlackBox
 from autotune.equations.read import input_of, parameter_of
 from autotune.equations.simulate import Drive
 from autotune.errors import InputError
-from autotune.model_tables import effect_of
+from autotune.model_tables import effect_of, require_keys
 
 _KEYS = {"name", "fmu", "input", "output", "parameters", "effect"}
 
@@ -84,9 +84,7 @@ def fmu_of(content: Mapping[str, Any], where: str) -> BlackBox:
     InputError
         An FMU that cannot be used, or a variable that it does not have.
     """
-    for key in content:
-        if key not in _KEYS:
-            raise InputError(f"unknown key {key!r}", where=where, remedy=f"known are {', '.join(sorted(_KEYS))}")
+    require_keys(content, _KEYS, where)
     path = (Path(where).parent / str(content["fmu"])).resolve()
     description = _description(path)
     known = {v.name: v for v in description.modelVariables}

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from autotune.arrays import FloatArray
 from autotune.equations.effects import apply
 from autotune.equations.model import EquationModel
-from autotune.equations.sensitivity import Windows
+from autotune.equations.sensitivity import Windows, run_windows
 from autotune.equations.simulate import Compiled, Drive, compile_model, drive_of, require_complete, simulate
 from autotune.equations.starts import LEAST, fitted_starts
 from autotune.errors import InputError
@@ -57,8 +59,6 @@ def forecast(model: EquationModel, recording: Recording, horizon_s: float | None
 
 def _delayed(compiled: Compiled, delays: FloatArray) -> Compiled:
     """Return the model with dead times at its inputs."""
-    from dataclasses import replace
-
     inputs = tuple(replace(one, delay_s=float(d)) for one, d in zip(compiled.model.inputs, delays, strict=True))
     return replace(compiled, model=replace(compiled.model, inputs=inputs))
 
@@ -93,9 +93,8 @@ def _windowed(compiled: Compiled, drive: Drive, recording: Recording, horizon_s:
             window = fitted_starts(
                 compiled, p, drive, y, good, np.array([start]), np.array([until]), guess=guess, share=1.0, iterations=5
             )
-            run = simulate(compiled, p, drive, window.states, starts=window.starts, stops=np.array([b]))
-            forecasts.append(run.y[a:b])
-            latest = Windows(starts=window.starts, stops=np.array([b]), states=window.states)
+            latest = replace(window, stops=np.array([b]))
+            forecasts.append(run_windows(compiled, p, drive, latest).y[a:b])
         before = latest
         best = int(np.argmin(errors)) if k > 2 else len(forecasts) - 1
         result[a:b] = forecasts[min(best, len(forecasts) - 1)]
@@ -113,7 +112,5 @@ def _carried(compiled: Compiled, drive: Drive, before: Windows, row: int) -> Flo
     a = int(before.starts[0])
     if a >= row:
         return before.states[0] if a == row else None
-    run = simulate(
-        compiled, compiled.parameter_vector, drive, before.states, starts=before.starts, stops=np.array([row])
-    )
+    run = run_windows(compiled, compiled.parameter_vector, drive, replace(before, stops=np.array([row])))
     return run.ends[0] if np.all(np.isfinite(run.ends)) else None

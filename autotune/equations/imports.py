@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from autotune.equations.expressions import Call, Expression, Name, Number
+from autotune.equations.chain import sum_of
+from autotune.equations.expressions import Call, Expression, Name
 from autotune.equations.model import EquationModel, InputColumn, ModelParameter, State
 from autotune.errors import InputError
 from autotune.models import Block, Model, Port, TransferFunction
@@ -133,19 +134,11 @@ def _from_state_space(system: Any, name: str) -> EquationModel:
             parts.append(Call("*", (Name(parameters[-1].name), Name(names[j]))))
         return parts
 
-    def total(parts: list[Expression]) -> Expression:
-        if not parts:
-            return Number(0.0)
-        tree = parts[0]
-        for one in parts[1:]:
-            tree = Call("+", (tree, one))
-        return tree
-
     states = tuple(
-        State(name=label, derivative=total(row("A", i, system.A[i], labels) + row("B", i, system.B[i], columns)))
+        State(name=label, derivative=sum_of(row("A", i, system.A[i], labels) + row("B", i, system.B[i], columns)))
         for i, label in enumerate(labels)
     )
-    output = total(row("C", 0, system.C[0], labels) + row("D", 0, system.D[0], columns))
+    output = sum_of(row("C", 0, system.C[0], labels) + row("D", 0, system.D[0], columns))
     return EquationModel(
         name=name, inputs=tuple(InputColumn(column=c) for c in columns), output=output, states=states,
         parameters=tuple(parameters),

@@ -152,21 +152,13 @@ def _differences(
     return J[:, :n], J[:, n:], g[:, :n], g[:, n:]
 
 
-def transfer_function(linear: Linear, column: int = 0) -> TransferFunction:
-    """Return the transfer function from one input to y, with its dead time.
-
-    Parameters
-    ----------
-    linear : Linear
-        The linearisation.
-    column : int
-        Place of the input.
-    """
+def transfer_function(linear: Linear) -> TransferFunction:
+    """Return the transfer function from the command to y, with its dead time."""
     from scipy.signal import ss2tf
 
-    num, den = ss2tf(linear.A, linear.B[:, [column]], linear.C, linear.D[:, [column]])
+    num, den = ss2tf(linear.A, linear.B[:, :1], linear.C, linear.D[:, :1])
     kept = np.where(np.abs(num[0]) > 1e-9 * np.max(np.abs(num[0])), num[0], 0.0)
-    return TransferFunction(num=tuple(kept), den=tuple(den), delay_s=float(linear.delays_s[column]))
+    return TransferFunction(num=tuple(kept), den=tuple(den), delay_s=float(linear.delays_s[0]))
 
 
 def as_chain(model: EquationModel, linear: Linear) -> Model:

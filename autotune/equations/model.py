@@ -209,14 +209,14 @@ class Extension:
     """What is added to a model: an effect in the model's own language.
 
     ``value`` in the expression of an input or of the output stands for what would be there without the extension; in
-    an extension that acts on just one of them its states and defines may use it too.
+    an extension that acts on just one of them its states may use it too.
 
     Attributes
     ----------
     name : str
         What it is, for messages.
-    states, parameters, defines : tuples
-        New states, parameters and helper expressions.
+    states, parameters : tuples
+        New states and parameters.
     derivative : mapping of state to Expression
         Added to the derivative of a state.
     port : mapping of port to Expression
@@ -230,7 +230,6 @@ class Extension:
     name: str
     states: tuple[State, ...] = ()
     parameters: tuple[ModelParameter, ...] = ()
-    defines: tuple[tuple[str, Expression], ...] = ()
     derivative: Mapping[str, Expression] = field(default_factory=lambda: MappingProxyType({}))
     port: Mapping[str, Expression] = field(default_factory=lambda: MappingProxyType({}))
     input: Mapping[str, Expression] = field(default_factory=lambda: MappingProxyType({}))

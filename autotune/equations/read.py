@@ -23,7 +23,7 @@ from autotune.equations.model import (
 )
 from autotune.equations.units import check_units
 from autotune.errors import InputError
-from autotune.model_tables import effect_of, effect_table
+from autotune.model_tables import effect_of, effect_table, require_keys
 from autotune.models import Hold
 from autotune.text_files import read_toml
 
@@ -66,7 +66,7 @@ def equations_of(content: Mapping[str, Any], where: str) -> EquationModel:
     InputError
         A key that is not known, or a value that no model has; names it.
     """
-    _known(content, _TOP, where)
+    require_keys(content, _TOP, where)
     states = _tables(content, "state", where)
     if not states:
         raise InputError("no [[state]]", where=where, remedy="equations need at least one state with its derivative")
@@ -74,7 +74,7 @@ def equations_of(content: Mapping[str, Any], where: str) -> EquationModel:
     if not inputs:
         raise InputError("no [[input]]", where=where, remedy='name the command: [[input]] column = "u"')
     output = _table(content, "output", where)
-    _known(output, {"value", "unit"}, f"{where} [output]")
+    require_keys(output, {"value", "unit"}, f"{where} [output]")
     horizon = content.get("horizon_s")
     model = EquationModel(
         name=str(content.get("name", Path(where).stem)),
@@ -95,12 +95,6 @@ def equations_of(content: Mapping[str, Any], where: str) -> EquationModel:
     )
     check_units(model)
     return model
-
-
-def _known(table: Mapping[str, Any], keys: set[str], where: str) -> None:
-    for key in table:
-        if key not in keys:
-            raise InputError(f"unknown key {key!r}", where=where, remedy=f"known are {', '.join(sorted(keys))}")
 
 
 def _tables(content: Mapping[str, Any], key: str, where: str) -> list[Mapping[str, Any]]:
@@ -176,7 +170,7 @@ def input_of(table: Mapping[str, Any], where: str) -> InputColumn:
     InputError
         A key that is not known, or a value that no input has; names it.
     """
-    _known(table, {"column", "unit", "hold", "kind", "delay", "offset"}, where)
+    require_keys(table, {"column", "unit", "hold", "kind", "delay", "offset"}, where)
     delay = _real(table.get("delay", 0.0), "delay", where)
     if delay < 0.0:
         raise InputError(f"delay = {delay:g} s is negative", where=where, remedy="write seconds, 0 or more")
@@ -191,7 +185,7 @@ def input_of(table: Mapping[str, Any], where: str) -> InputColumn:
 
 
 def _state(table: Mapping[str, Any], where: str) -> State:
-    _known(table, {"name", "unit", "kind", "of", "derivative", "start"}, where)
+    require_keys(table, {"name", "unit", "kind", "of", "derivative", "start"}, where)
     return State(
         name=_name(table, "name", where),
         derivative=_expression(table, "derivative", where),
@@ -221,7 +215,7 @@ def parameter_of(name: str, given: Any, where: str) -> ModelParameter:
     """
     where = f"{where} [parameters.{name}]"
     table = given if isinstance(given, dict) else {"value": given}
-    _known(table, {"value", "unit", "spread", "fixed", "sd"}, where)
+    require_keys(table, {"value", "unit", "spread", "fixed", "sd"}, where)
     if "value" not in table:
         raise InputError("value is missing", where=where, remedy="add value = NUMBER")
     fixed = table.get("fixed", False)
@@ -239,7 +233,7 @@ def parameter_of(name: str, given: Any, where: str) -> ModelParameter:
 
 
 def _port(table: Mapping[str, Any], where: str) -> ModelPort:
-    _known(table, {"name", "kind", "across", "unit"}, where)
+    require_keys(table, {"name", "kind", "across", "unit"}, where)
     return ModelPort(
         name=_name(table, "name", where),
         kind=_one_of(table, "kind", PORT_KINDS, "", where),

@@ -35,21 +35,23 @@ class Windows:
     states: FloatArray
 
 
+def run_windows(compiled: Compiled, parameters: FloatArray, drive: Drive, windows: Windows) -> Run:
+    """Simulate windows, each from its start state; see :func:`autotune.equations.simulate.simulate`."""
+    return simulate(compiled, parameters, drive, windows.states, starts=windows.starts, stops=windows.stops)
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Sensitivities:
-    """A run with its derivatives.
+    """Derivatives of a simulation's readings.
 
     Attributes
     ----------
-    run : Run
-        The simulation itself.
     to_parameters : (N, P) array
         dy/dp of the parameters asked for.
     to_states : (N, n) array
         dy/dx0 with respect to the start state of the window that a row is in.
     """
 
-    run: Run
     to_parameters: FloatArray
     to_states: FloatArray
 
@@ -125,4 +127,4 @@ def sensitivities(
             to_p[:, i] = (run.y - base.y) / parameter_steps[i]
         else:
             to_x[:, i] = (run.y - base.y) / state_steps[i]
-    return Sensitivities(run=base, to_parameters=to_p, to_states=to_x)
+    return Sensitivities(to_parameters=to_p, to_states=to_x)

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import least_squares
 
 from autotune.arrays import BoolArray, FloatArray, IntArray
-from autotune.equations.sensitivity import STEP, Windows, sensitivities
-from autotune.equations.simulate import Compiled, Drive, derivatives, simulate
+from autotune.equations.sensitivity import STEP, Windows, run_windows, sensitivities
+from autotune.equations.simulate import Compiled, Drive, Run, derivatives, simulate
 
 #: Rows that a start state is fitted to at least; where those run away, to a part of them first, this many at least.
 LEAST, LEAST_WINDOW = 30, 4
@@ -54,7 +54,6 @@ def rest_state(compiled: Compiled, parameters: FloatArray, inputs: FloatArray, y
     base = np.where(np.isfinite(given), given, 0.0)
     if free.size == 0:
         return base
-    u = inputs[None, :]
 
     def point(z: FloatArray) -> FloatArray:
         x = base.copy()
@@ -63,7 +62,7 @@ def rest_state(compiled: Compiled, parameters: FloatArray, inputs: FloatArray, y
 
     def misses(z: FloatArray) -> FloatArray:
         x = point(z)
-        slopes, outputs = derivatives(compiled, parameters, x[None, :], u)
+        slopes, outputs = derivatives(compiled, parameters, x[None, :], inputs[None, :])
         off = outputs[0, 0] - y if np.isfinite(y) else 0.0
         found = np.append(slopes[0], 1e3 * off)
         return np.where(np.isfinite(found), np.clip(found, -1e12, 1e12), 1e12)
@@ -141,84 +140,40 @@ def fitted_starts(
         Rows that it is fitted to at least.
     known : Windows, optional
         Where an earlier fit knows the state, on its own windows: a window that starts within one takes it over. Its
-        numbers are worth following, so that others begin where the readings lead, see :func:`_followed`.
+        numbers are worth following, so that others begin where the readings lead, see :meth:`_Readings.followed`.
 
     Returns
     -------
     Windows
         With their states.
     """
-    given = given_starts(compiled)
-    first = int(starts[0])
+    given, first = given_starts(compiled), int(starts[0])
     reading = float(y[first:][good[first:]][0]) if good[first:].any() else float("nan")
     x = rest_state(compiled, parameters, drive.inputs[max(first - 1, 0)], reading) if guess is None else guess
     scales = state_scales(compiled, parameters, drive, x)
+    at = _Readings(compiled=compiled, parameters=parameters, drive=drive, y=y, good=good, scales=scales)
     found = []
     for k, (a, b) in enumerate(zip(starts, stops, strict=True)):
-        free = _free(given, a)
         until = _until(a, b, share, least)
         window = Windows(starts=np.array([a]), stops=np.array([until]), states=x[None, :])
-        taken = None if known is None else _state_at(compiled, parameters, drive, known, int(a))
+        taken = None if known is None else at.state_at(known, int(a))
         if taken is not None:
             window = replace(window, states=taken[None, :])
-        elif k and _is_lost(compiled, parameters, drive, y, good, window):
+        elif k and at.is_lost(window):
             # what runs away ends far from the readings: the window begins at rest at its own first one
             ahead = y[a:until][good[a:until]]
             at_rest = rest_state(compiled, parameters, drive.inputs[a - 1], float(ahead[0]) if ahead.size else np.nan)
             window = replace(window, states=at_rest[None, :])
-        for end in _ends(compiled, parameters, drive, window) if taken is None else ():
-            window = replace(window, stops=np.array([end]))
-            window = _fitted(compiled, parameters, drive, y, good, window, scales, free, iterations)
+        for end in at.ends(window) if taken is None else ():
+            window = at.fitted(replace(window, stops=np.array([end])), _free(given, a), iterations)
         found.append(window.states[0])
         if k + 1 < starts.size:
             whole = replace(window, stops=np.array([b]))
-            run = simulate(compiled, parameters, drive, whole.states, starts=whole.starts, stops=whole.stops)
+            run = at.run(whole)
             x = run.ends[0] if np.all(np.isfinite(run.ends)) else x
-            if known is not None and _strays(run.y, y, good, whole):
-                x = _followed(compiled, parameters, drive, y, good, whole, scales, iterations)
+            if known is not None and at.strays(run.y, whole):
+                x = at.followed(whole, iterations)
     return Windows(starts=starts, stops=stops, states=np.array(found))
-
-
-def _state_at(
-    compiled: Compiled, parameters: FloatArray, drive: Drive, known: Windows, row: int
-) -> FloatArray | None:  # fmt: skip
-    """Return the state at a row within known windows; nothing elsewhere, or where the simulation runs away."""
-    inside = np.flatnonzero((known.starts <= row) & (row < known.stops))
-    if inside.size == 0:
-        return None
-    k = inside[-1:]
-    run = simulate(compiled, parameters, drive, known.states[k], starts=known.starts[k], stops=np.array([row]))
-    x = known.states[k[0]] if known.starts[k[0]] == row else run.ends[0]
-    return np.array(x) if np.all(np.isfinite(x)) else None
-
-
-def _hop(window: Windows) -> int:
-    return max(int(window.stops[0] - window.starts[0]) // HOPS, LEAST)
-
-
-def _strays(simulated: FloatArray, y: FloatArray, good: BoolArray, window: Windows) -> bool:
-    """Whether a simulation ends much further from the readings than it begins, or does not reach its end."""
-    a, b, hop = int(window.starts[0]), int(window.stops[0]), _hop(window)
-    error = np.where(good[a:b], y[a:b] - simulated[a:b], 0.0) ** 2
-    return not float(np.mean(error[-hop:])) <= STRAYS**2 * float(np.mean(error[:hop]))
-
-
-def _followed(
-    compiled: Compiled, parameters: FloatArray, drive: Drive, y: FloatArray, good: BoolArray, window: Windows,
-    scales: FloatArray, iterations: int,
-) -> FloatArray:  # fmt: skip
-    """Return the state at a window's end, found anew from the readings part by part.
-
-    A simulation that strays ends on another swing than the readings, and the next window would begin there.
-    """
-    b, hop, x = int(window.stops[0]), _hop(window), window.states[0]
-    for at in range(int(window.starts[0]), b, hop):
-        one = Windows(starts=np.array([at]), stops=np.array([min(at + hop, b)]), states=x[None, :])
-        if at > window.starts[0]:
-            one = _fitted(compiled, parameters, drive, y, good, one, scales, np.arange(x.size), iterations)
-        ends = simulate(compiled, parameters, drive, one.states, starts=one.starts, stops=one.stops).ends[0]
-        x = ends if np.all(np.isfinite(ends)) else x
-    return np.array(x)
 
 
 def started_anew(
@@ -241,17 +196,17 @@ def started_anew(
         How large each state typically is.
     """
     w, states, given = windows, windows.states.copy(), given_starts(compiled)
+    at = _Readings(compiled=compiled, parameters=parameters, drive=drive, y=y, good=good, scales=scales)
     for k in which:
         start, stop = int(w.starts[k]), int(w.stops[k])
         one = Windows(starts=w.starts[k : k + 1], stops=w.stops[k : k + 1], states=states[k : k + 1].copy())
         if k and w.stops[k - 1] == start:
-            before = simulate(
-                compiled, parameters, drive, states[k - 1 : k], starts=w.starts[k - 1 : k], stops=one.starts
-            )
-            one = replace(one, states=before.ends) if np.all(np.isfinite(before.ends)) else one
+            before = Windows(starts=w.starts[k - 1 : k], stops=one.starts, states=states[k - 1 : k])
+            ends = at.run(before).ends
+            one = replace(one, states=ends) if np.all(np.isfinite(ends)) else one
         for share in ANEW:
             one = replace(one, stops=np.array([_until(start, stop, share, LEAST)]))
-            one = _fitted(compiled, parameters, drive, y, good, one, scales, _free(given, start), ANEW_STEPS)
+            one = at.fitted(one, _free(given, start), ANEW_STEPS)
         states[k] = one.states[0]
     return replace(w, states=states)
 
@@ -266,64 +221,96 @@ def _until(start: int, stop: int, share: float, least: int) -> int:
     return min(max(int(start + share * (stop - start)), start + least), stop)
 
 
-def _ends(compiled: Compiled, parameters: FloatArray, drive: Drive, window: Windows) -> list[int]:
-    """Return where to fit a start up to, one after the other: a first part that does not run away, twice that, all."""
-    first, ends = int(window.starts[0]), [int(window.stops[0])]
-    while ends[0] - first > LEAST_WINDOW:
-        run = simulate(compiled, parameters, drive, window.states, starts=window.starts, stops=np.array(ends[:1]))
-        if run.is_complete:
-            break
-        ends.insert(0, first + (ends[0] - first) // 2)
-    return ends
+def _hop(window: Windows) -> int:
+    return max(int(window.stops[0] - window.starts[0]) // HOPS, LEAST)
 
 
-def _is_lost(
-    compiled: Compiled, parameters: FloatArray, drive: Drive, y: FloatArray, good: BoolArray, window: Windows
-) -> bool:
-    """Whether a window's simulation leaves the readings by more than these have moved altogether."""
-    rows = np.flatnonzero(good[window.starts[0] : window.stops[0]]) + int(window.starts[0])
-    run = simulate(compiled, parameters, drive, window.states, starts=window.starts, stops=window.stops)
-    off = np.abs(y[rows] - run.y[rows])
-    return bool(rows.size and not np.all(off < np.ptp(y[good])))
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Readings:
+    """Readings of a recording, which of them count, and the model that runs beside them with its states' sizes (n,)."""
 
+    compiled: Compiled
+    parameters: FloatArray
+    drive: Drive
+    y: FloatArray
+    good: BoolArray
+    scales: FloatArray
 
-def _fitted(
-    compiled: Compiled, parameters: FloatArray, drive: Drive, y: FloatArray, good: BoolArray, window: Windows,
-    scales: FloatArray, free: IntArray, iterations: int,
-) -> Windows:  # fmt: skip
-    """Return one window with the start state that fits its readings; what they do not tell stays as it was."""
-    if free.size == 0:
-        return window
-    a, b = int(window.starts[0]), int(window.stops[0])
-    rows = np.flatnonzero(good[a:b]) + a
-    no_steps = np.ones(parameters.size)
-    damping = 1e-6
+    def run(self, window: Windows) -> Run:
+        """Simulate windows."""
+        return run_windows(self.compiled, self.parameters, self.drive, window)
 
-    def left(states: FloatArray) -> FloatArray:
-        run = simulate(compiled, parameters, drive, states, starts=window.starts, stops=window.stops)
-        return np.asarray(y[rows] - run.y[rows])
+    def state_at(self, known: Windows, row: int) -> FloatArray | None:
+        """Return the state at a row within known windows; nothing elsewhere, or where the simulation runs away."""
+        inside = np.flatnonzero((known.starts <= row) & (row < known.stops))
+        if inside.size == 0:
+            return None
+        k = inside[-1:]
+        run = self.run(Windows(starts=known.starts[k], stops=np.array([row]), states=known.states[k]))
+        x = known.states[k[0]] if known.starts[k[0]] == row else run.ends[0]
+        return np.array(x) if np.all(np.isfinite(x)) else None
 
-    r = left(window.states)
-    for _ in range(iterations):
-        s = sensitivities(
-            compiled, parameters, drive, window, parameter_steps=no_steps, state_steps=STEP * scales, which=(),
-            which_states=free.tolist(),
-        )  # fmt: skip
-        J = s.to_states[rows][:, free] * scales[free]
-        if not np.all(np.isfinite(J)) or not np.all(np.isfinite(r)):
+    def strays(self, simulated: FloatArray, window: Windows) -> bool:
+        """Whether a simulation ends much further from the readings than it begins, or does not reach its end."""
+        a, b, hop = int(window.starts[0]), int(window.stops[0]), _hop(window)
+        error = np.where(self.good[a:b], self.y[a:b] - simulated[a:b], 0.0) ** 2
+        return not float(np.mean(error[-hop:])) <= STRAYS**2 * float(np.mean(error[:hop]))
+
+    def followed(self, window: Windows, iterations: int) -> FloatArray:
+        """Return the state at a window's end, found anew from the readings part by part.
+
+        A simulation that strays ends on another swing than the readings, and the next window would begin there.
+        """
+        b, hop, x = int(window.stops[0]), _hop(window), window.states[0]
+        for row in range(int(window.starts[0]), b, hop):
+            one = Windows(starts=np.array([row]), stops=np.array([min(row + hop, b)]), states=x[None, :])
+            if row > window.starts[0]:
+                one = self.fitted(one, np.arange(x.size), iterations)
+            ends = self.run(one).ends[0]
+            x = ends if np.all(np.isfinite(ends)) else x
+        return np.array(x)
+
+    def ends(self, window: Windows) -> list[int]:
+        """Return where to fit a start up to in turn: a first part that does not run away, twice that, all."""
+        first, ends = int(window.starts[0]), [int(window.stops[0])]
+        while ends[0] - first > LEAST_WINDOW and not self.run(replace(window, stops=np.array(ends[:1]))).is_complete:
+            ends.insert(0, first + (ends[0] - first) // 2)
+        return ends
+
+    def is_lost(self, window: Windows) -> bool:
+        """Whether a window's simulation leaves the readings by more than these have moved altogether."""
+        rows = np.flatnonzero(self.good[window.starts[0] : window.stops[0]]) + int(window.starts[0])
+        off = np.abs(self.y[rows] - self.run(window).y[rows])
+        return bool(rows.size and not np.all(off < np.ptp(self.y[self.good])))
+
+    def fitted(self, window: Windows, free: IntArray, iterations: int) -> Windows:
+        """Return one window with the start state that fits its readings; what they do not tell stays as it was."""
+        if free.size == 0:
             return window
-        H = J.T @ J
-        H += np.diag(damping * np.diag(H) + 1e-9 * float(np.trace(H)) + 1e-300)
-        states = window.states.copy()
-        states[0, free] += scales[free] * np.linalg.solve(H, J.T @ r)
-        new = left(states)
-        if not np.all(np.isfinite(new)) or new @ new > r @ r:
-            damping = max(damping, 1e-6) * 100.0
-            if damping > 1e6:
+        a, b, scales = int(window.starts[0]), int(window.stops[0]), self.scales
+        rows, damping = np.flatnonzero(self.good[a:b]) + a, 1e-6
+        r = self.y[rows] - self.run(window).y[rows]
+        for _ in range(iterations):
+            s = sensitivities(
+                self.compiled, self.parameters, self.drive, window, parameter_steps=np.ones(self.parameters.size),
+                state_steps=STEP * scales, which=(), which_states=free.tolist(),
+            )  # fmt: skip
+            J = s.to_states[rows][:, free] * scales[free]
+            if not np.all(np.isfinite(J)) or not np.all(np.isfinite(r)):
+                return window
+            H = J.T @ J
+            H += np.diag(damping * np.diag(H) + 1e-9 * float(np.trace(H)) + 1e-300)
+            states = window.states.copy()
+            states[0, free] += scales[free] * np.linalg.solve(H, J.T @ r)
+            moved = replace(window, states=states)
+            new = self.y[rows] - self.run(moved).y[rows]
+            if not np.all(np.isfinite(new)) or new @ new > r @ r:
+                damping = max(damping, 1e-6) * 100.0
+                if damping > 1e6:
+                    break
+                continue
+            small = r @ r - new @ new < 1e-6 * (r @ r)
+            window, r = moved, new
+            if small:
                 break
-            continue
-        small = r @ r - new @ new < 1e-6 * (r @ r)
-        window, r = Windows(starts=window.starts, stops=window.stops, states=states), new
-        if small:
-            break
-    return window
+        return window

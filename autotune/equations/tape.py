@@ -192,7 +192,6 @@ class _Translation:
                 if place not in now:
                     raise InputError(f"no input {place!r}", where=extension.name, remedy="name an input of the model")
             before = now[next(iter(changed))] if len(changed) == 1 else None
-            trees |= {name: _valued(tree, before) for name, tree in extension.defines}
             self._slopes |= {one.name: _valued(one.derivative, before) for one in extension.states}
             for place, tree in changed.items():
                 trees[f"{place}|{number}"] = _valued(tree, now[place])

@@ -12,6 +12,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from autotune.arrays import FloatArray
+from autotune.equations.expressions import Call, Expression, Name, Number, parse, to_text
 from autotune.errors import InputError
 from autotune.models import TransferFunction
 
@@ -23,8 +24,8 @@ _DELAY = re.compile(
 )
 _TOKEN = re.compile(rf"\s*(?:({_NUMBER})|([sp])|([-+*/^()]))")
 _Pair: TypeAlias = tuple[Any, Any]  # polynomials above and below, descending powers
-#: Longest text, deepest nesting and highest power that are read.
-_LONGEST, _DEEPEST, _HIGHEST = 2000, 40, 20
+#: Longest text and highest power that are read.
+_LONGEST, _HIGHEST = 2000, 20
 
 
 def parse_transfer_function(text: str) -> TransferFunction:
@@ -61,7 +62,7 @@ def parse_transfer_function(text: str) -> TransferFunction:
         found = _gain_and_lags(plain)
     else:
         delays = [float(next((g for g in m.groups() if g), "1")) for m in _DELAY.finditer(plain)]
-        num, den = _Rational(_DELAY.sub(" ", plain), text).whole()
+        num, den = _rational(_DELAY.sub(" ", plain), text)
         found = _made(num, den, sum(delays), text)
     if not found.is_proper:
         raise _refused(text, "the numerator has a higher degree than the denominator")
@@ -114,99 +115,59 @@ def _gain_and_lags(text: str) -> TransferFunction:
     return _made(np.array([gain]), np.append(den, np.zeros(min(integrators, _HIGHEST))), delay, text)
 
 
-class _Rational:
-    """A rational function of s: one pass over its tokens, each value a pair of polynomials."""
+def _with_products(plain: str, text: str) -> str:
+    """Return a text with the signs of multiplication that are missing in it, as on paper."""
+    written, at, before, divides = "", 0, "", [False]
+    while plain[at:].strip():
+        found = _TOKEN.match(plain, at)
+        if not found:
+            raise _refused(text, f"{plain[at:].strip()[0]!r} has no meaning here")
+        token, at = found[0].strip(), found.end()
+        if before not in ("", *"-+*/^(") and token not in "-+*/^)":
+            if divides[-1]:
+                raise _refused(text, f"what stands behind the / before {token!r} is not clear: write brackets")
+            written += "*"
+        if token in "-+*/" and before not in ("*", "/"):
+            divides[-1] = token == "/"
+        elif token == "(":
+            divides.append(False)
+        elif token == ")" and len(divides) > 1:
+            divides.pop()
+        written, before = f"{written} {token}", token
+    return written
 
-    def __init__(self, plain: str, text: str) -> None:
-        self._text = text
-        self._tokens: list[str] = []
-        at = 0
-        while plain[at:].strip():
-            found = _TOKEN.match(plain, at)
-            if not found:
-                raise _refused(text, f"{plain[at:].strip()[0]!r} has no meaning here")
-            self._tokens.append(found[0].strip())
-            at = found.end()
-        self._at = self._depth = 0
 
-    def whole(self) -> _Pair:
-        if not self._tokens:
-            raise _refused(self._text, "nothing is written")
-        value = self._sum()
-        if self._at < len(self._tokens):
-            raise _refused(self._text, f"{self._tokens[self._at]!r} is one too many")
-        return value
+def _rational(plain: str, text: str) -> _Pair:
+    """Return numerator and denominator of a rational function of s."""
+    try:
+        return _folded(parse(_with_products(plain, text)))
+    except InputError as error:
+        raise _refused(text, error.what) from None
 
-    def _peek(self) -> str:
-        return self._tokens[self._at] if self._at < len(self._tokens) else ""
 
-    def _sum(self) -> _Pair:
-        self._depth += 1
-        if self._depth > _DEEPEST:
-            raise _refused(self._text, "nested too deep")
-        sign = 1.0
-        while self._peek() in ("+", "-"):
-            sign *= -1.0 if self._peek() == "-" else 1.0
-            self._at += 1
-        num, den = self._product()
-        num = sign * num
-        while self._peek() in ("+", "-"):
-            sign = 1.0 if self._peek() == "+" else -1.0
-            self._at += 1
-            other_num, other_den = self._product()
-            num = np.polyadd(np.polymul(num, other_den), sign * np.polymul(other_num, den))
-            den = np.polymul(den, other_den)
-        self._depth -= 1
-        return num, den
-
-    def _product(self) -> _Pair:
-        num, den = self._power()
-        divides = False
-        while (token := self._peek()) and token not in "+-)":
-            if divides and token not in "*/":
-                raise _refused(self._text, f"what stands behind the / before {token!r} is not clear: write brackets")
-            divides = token == "/"
-            if token in "*/":
-                self._at += 1
-                negative = self._peek() == "-"
-                self._at += self._peek() in ("+", "-") and self._peek() != ""
-            else:
-                negative = False  # the sign of multiplication is missing, as on paper
-            other_num, other_den = self._power()
-            if divides:
-                other_num, other_den = other_den, other_num
-            num = np.polymul(num, other_num) * (-1.0 if negative else 1.0)
-            den = np.polymul(den, other_den)
-        return num, den
-
-    def _power(self) -> _Pair:
-        num, den = self._atom()
-        if self._peek() == "^":
-            self._at += 1
-            exponent = self._peek()
-            if not re.fullmatch(r"\d+", exponent) or int(exponent) > _HIGHEST:
-                raise _refused(self._text, f"{exponent!r} is no whole power")
-            self._at += 1
-            base = num, den
+def _folded(tree: Expression) -> _Pair:
+    """Return the polynomials that an expression in s is the ratio of."""
+    match tree:
+        case Number(value):
+            return np.array([value]), np.ones(1)
+        case Name():
+            return np.array([1.0, 0.0]), np.ones(1)
+        case Call("neg", (inner,)):
+            num, den = _folded(inner)
+            return -num, den
+        case Call("^", (base, Number(power))) if power == int(power) <= _HIGHEST:
             num, den = np.ones(1), np.ones(1)
-            for _ in range(int(exponent)):
-                num, den = np.polymul(num, base[0]), np.polymul(den, base[1])
-        return num, den
-
-    def _atom(self) -> _Pair:
-        token = self._peek()
-        self._at += 1
-        if token in ("s", "p"):
-            return np.array([1.0, 0.0]), np.array([1.0])
-        if token == "(":
-            value = self._sum()
-            if self._peek() != ")":
-                raise _refused(self._text, "')' is missing")
-            self._at += 1
-            return value
-        try:
-            return np.array([float(token)]), np.array([1.0])
-        except ValueError:
-            raise _refused(
-                self._text, f"{token!r} has nothing before it" if token else "something is missing"
-            ) from None
+            above, below = _folded(base)
+            for _ in range(int(power)):
+                num, den = np.polymul(num, above), np.polymul(den, below)
+            return num, den
+        case Call("/", (left, Call("neg", (right,)))):
+            return _folded(Call("neg", (Call("/", (left, right)),)))
+        case Call(sign, (left, right)) if sign != "^":
+            (a, b), (c, d) = _folded(left), _folded(right)
+            if sign in "+-":
+                c = c if sign == "+" else -c
+                return np.polyadd(np.polymul(a, d), np.polymul(c, b)), np.polymul(b, d)
+            c, d = (c, d) if sign == "*" else (d, c)
+            return np.polymul(a, c), np.polymul(b, d)
+    raise InputError(f"{to_text(tree)} has no whole power up to {_HIGHEST}", where="transfer function")

@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from autotune.diagnosis.routine.result import RoutineDiagnosis
-from autotune.diagnosis.routine.thresholds import table
+from autotune.diagnosis.routine.thresholds import RoutineThresholds
+from autotune.diagnosis.thresholds import table
 from autotune.report.chart import make_subplots
 from autotune.report.page import (
     BLUE,
@@ -130,7 +131,7 @@ def _comparison(found: RoutineDiagnosis) -> Section:
 
 
 def _method() -> Section:
-    rows = tuple((name, f"{value:g}", unit, meaning, origin) for name, value, unit, meaning, origin in table())
+    rows = tuple((name, f"{value:g}", *said) for name, value, *said in table(RoutineThresholds()))
     return Section(
         title="Method",
         text=("y is predicted one step ahead, linearly, from its own past, a sine of the dominant period and the past"

@@ -204,9 +204,8 @@ def _signals(found: Diagnosis) -> Section:
 
 def _title(name: str, found: Diagnosis) -> str:
     """Return the title of a signal's axis, with its unit."""
-    blocks, (u, y) = found.search.retuned.fit.model.blocks, found.search.units
-    at_plant = next((b.unit for b in blocks if b.place == "actuator" and b.unit), u)
-    units = {"command u": u, "command": u, "u_applied": u, "plant input": at_plant}
+    model, (u, y) = found.search.retuned.fit.model, found.search.units
+    units = {"command u": u, "command": u, "u_applied": u, "plant input": model.plant_input_unit}
     units |= {"reading": y, "position": y, "level": y, "speed": f"{y}/s", "rate of the reading": f"{y}/s"}
     return f"{name} [{units.get(name) or '-'}]" if name in units else name
 

@@ -11,9 +11,11 @@ import numpy as np
 from autotune.arrays import BoolArray, FloatArray
 from autotune.diagnosis.equations.candidates import Signals, Trial
 from autotune.diagnosis.equations.first_order import explained
+from autotune.diagnosis.thresholds import Thresholds
+from autotune.equations.effects import with_values
 from autotune.equations.fit_data import Fitted
 from autotune.equations.model import EquationModel
-from autotune.equations.simulate import drive_of
+from autotune.equations.simulate import Compiled, drive_of
 from autotune.models import Effect
 from autotune.recording import Recording
 
@@ -58,6 +60,10 @@ class Bench(ABC):
         What was measured.
     good : sequence of (N,) bool array
         Rows whose reading counts.
+    own : int
+        How many numbers the model has itself; those of effects come after them.
+    limits : Thresholds
+        What decides between two findings.
 
     Attributes
     ----------
@@ -72,8 +78,11 @@ class Bench(ABC):
     grows = 1.0
     is_closed = True
 
-    def __init__(self, model: EquationModel, recordings: Sequence[Recording], good: Sequence[BoolArray]) -> None:
-        self.model = model
+    def __init__(
+        self, model: EquationModel, recordings: Sequence[Recording], good: Sequence[BoolArray], own: int,
+        limits: Thresholds,
+    ) -> None:  # fmt: skip
+        self.model, self._own, self.limits = model, own, limits
         self.recordings = tuple(replace(r, y=np.where(ok, r.y, np.nan)) for r, ok in zip(recordings, good, strict=True))
         self._rows = [np.isfinite(r.y) for r in self.recordings]
         self._drives = [drive_of(model, r) for r in self.recordings]
@@ -107,6 +116,20 @@ class Bench(ABC):
     @abstractmethod
     def left_out_squares(self, outcome: Outcome) -> FloatArray:
         """Return squared errors on stretches, the numbers fitted to the other ones."""
+
+    def _start(self, compiled: Compiled, start: Outcome | None) -> FloatArray:
+        """Return where a fit begins: the model's own numbers where another fit ended, if any, the others nominal."""
+        z = np.zeros(len(compiled.parameters))
+        if start is not None:
+            z[: self._own] = start.fitted.z[: self._own]
+        return z
+
+    def _made(self, effects: Sequence[Effect], fitted: Fitted, count: int) -> Outcome:
+        """Return a fit with its effects at their fitted values."""
+        named = zip(fitted.compiled.parameters, fitted.parameters, fitted.sd, strict=True)
+        values = {p.name: (float(v), float(s)) for p, v, s in named}
+        residual = np.concatenate([r[ok] for r, ok in zip(fitted.residuals, self._rows, strict=True)])
+        return Outcome(effects=with_values(effects, values), fitted=fitted, count=count, residual=residual)
 
     def shortened(self, outcome: Outcome) -> Outcome | None:
         """Return the same effects on short windows, from the nominal numbers; nothing where there are none."""

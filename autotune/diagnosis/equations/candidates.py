@@ -45,11 +45,6 @@ def form_of(effect: Effect) -> InEquations:
     return form
 
 
-def values_of(effect: Effect) -> dict[str, float]:
-    """Return an effect's parameters as numbers."""
-    return {key: q.value for key, q in effect.parameters.items()}
-
-
 def is_usual(effect: Effect) -> bool:
     """Whether nearly every machine has it: tried beside a large effect whatever others predict."""
     return form_of(effect).usual
@@ -58,7 +53,7 @@ def is_usual(effect: Effect) -> bool:
 def plainer(effect: Effect) -> Effect | None:
     """Return the effect of fewer numbers that another one comes down to in a limit; nothing where there is none."""
     form = form_of(effect)
-    less = None if form.plainer is None else form.plainer(values_of(effect))
+    less = None if form.plainer is None else form.plainer(effect.values)
     if less is None:
         return None
     name, values = less
@@ -70,7 +65,7 @@ def plainer(effect: Effect) -> Effect | None:
 def is_plainer(effect: Effect) -> bool:
     """Whether an effect came to where it is one of fewer numbers."""
     form = form_of(effect)
-    return form.is_plainer is not None and form.is_plainer(values_of(effect))
+    return form.is_plainer is not None and form.is_plainer(effect.values)
 
 
 def is_signed(effect: Effect, key: str) -> bool:

@@ -11,8 +11,9 @@ from autotune.arrays import BoolArray, FloatArray, IntArray, deviations_beside_p
 from autotune.diagnosis.equations.bench import Bench, Outcome
 from autotune.diagnosis.equations.candidates import Signals
 from autotune.diagnosis.equations.held_out import HELD_OUT
-from autotune.diagnosis.equations.sought import jumping, sought
+from autotune.diagnosis.equations.sought import jumping, scale_parameter
 from autotune.diagnosis.evidence.stretches import stretches_in
+from autotune.diagnosis.thresholds import IN_USE, Thresholds
 from autotune.effects.in_equations import Scales
 from autotune.equations.black_box import BlackBox, driven, read_out
 from autotune.equations.effects import apply, at_reading, compile_with, with_values
@@ -38,10 +39,14 @@ class ClosedBench(Bench):
         What was measured.
     good : sequence of (N,) bool array
         Rows whose reading counts.
+    limits : Thresholds
+        What decides between two findings.
     """
 
-    def __init__(self, box: BlackBox, recordings: Sequence[Recording], good: Sequence[BoolArray]) -> None:
-        super().__init__(box.shell(), recordings, good)
+    def __init__(
+        self, box: BlackBox, recordings: Sequence[Recording], good: Sequence[BoolArray], limits: Thresholds = IN_USE
+    ) -> None:
+        super().__init__(box.shell(), recordings, good, len(box.parameters), limits)
         self._box = box
 
     def _compiled(self, effects: Sequence[Effect]) -> Compiled:
@@ -52,7 +57,7 @@ class ClosedBench(Bench):
         size = float(np.std(u))
         scales = Scales(u=size, y=float(np.nanstd(y)), duration_s=self._duration_s, size=size, span=0.0, column=0.0)
         # a step of the finite differences is wide enough for what moves by jumps
-        inside = tuple(p if p in jumping(compiled, effects) else sought(p, effects, lambda effect: scales)
+        inside = tuple(p if p in jumping(compiled, effects) else scale_parameter(p, effects, lambda effect: scales)
                        for p in compiled.parameters)  # fmt: skip
         return replace(compiled, parameters=(*self._box.parameters, *inside))
 
@@ -72,16 +77,17 @@ class ClosedBench(Bench):
         return found
 
     def _fit(
-        self, effects: Sequence[Effect], z: FloatArray, iterations: int, free: bool, rows: Sequence[BoolArray]
+        self, effects: Sequence[Effect], start: Outcome | None, iterations: int, rows: Sequence[BoolArray] | None = None
     ) -> Outcome:
-        """Return a Gauss-Newton fit with Levenberg's damping, beliefs counted."""
-        compiled = self._compiled(effects)
-        which = np.flatnonzero([free and q.spread > 0.0 for q in compiled.parameters])
-        y = np.concatenate([r.y[ok] for r, ok in zip(self.recordings, rows, strict=True)])
+        """Return a Gauss-Newton fit with Levenberg's damping, beliefs counted; without iterations nothing is free."""
+        compiled, counted = self._compiled(effects), self._rows if rows is None else rows
+        z = self._start(compiled, start)
+        which = np.flatnonzero([iterations > 0 and q.spread > 0.0 for q in compiled.parameters])
+        y = np.concatenate([r.y[ok] for r, ok in zip(self.recordings, counted, strict=True)])
 
         def left(at: FloatArray) -> FloatArray:
             runs = self._simulated(compiled, effects, at)
-            return np.asarray(y - np.concatenate([run[ok] for run, ok in zip(runs, rows, strict=True)]))
+            return np.asarray(y - np.concatenate([run[ok] for run, ok in zip(runs, counted, strict=True)]))
 
         e, damping, J = left(z), 1e-3, np.zeros((y.size, which.size))
         if not np.all(np.isfinite(e)):
@@ -135,32 +141,21 @@ class ClosedBench(Bench):
         residuals = tuple(r.y - y for r, y in zip(self.recordings, runs, strict=True))
         fitted = Fitted(
             compiled=compiled, parameters=p, sd=deviation, z=z, windows=(), simulated=tuple(runs), residuals=residuals,
-            noise_sd=sd, jacobian=whole, converged=True,
+            noise_sd=sd, jacobian=whole,
         )  # fmt: skip
-        values = {q.name: (float(v), float(s)) for q, v, s in zip(compiled.parameters, p, deviation, strict=True)}
-        residual = np.concatenate([r[ok] for r, ok in zip(residuals, self._rows, strict=True)])
-        return Outcome(effects=with_values(effects, values), fitted=fitted, count=int(which.size), residual=residual)
-
-    def _start(self, compiled: Compiled, start: Outcome | None) -> FloatArray:
-        z = np.zeros(len(compiled.parameters))
-        if start is not None:
-            own = len(self._box.parameters)
-            z[:own] = start.fitted.z[:own]
-        return z
+        return self._made(effects, fitted, int(which.size))
 
     def retuned(self) -> Outcome:
         """Return the model with its own numbers retuned."""
-        effects = self._box.effects
-        return self._fit(effects, self._start(self._compiled(effects), None), 20, True, self._rows)
+        return self._fit(self._box.effects, None, 20)
 
     def as_it_is(self, retuned: Outcome) -> Outcome:
         """Return the model with its nominal numbers."""
-        effects = self._box.effects
-        return self._fit(effects, self._start(self._compiled(effects), None), 1, False, self._rows)
+        return self._fit(self._box.effects, None, 0)
 
     def fitted(self, effects: Sequence[Effect], start: Outcome, iterations: int = 15) -> Outcome:
         """Return the model fitted with effects, from where another fit ended."""
-        return self._fit(effects, self._start(self._compiled(effects), start), iterations, True, self._rows)
+        return self._fit(effects, start, iterations)
 
     def with_trial(self, outcome: Outcome, effect: Effect) -> FloatArray | None:
         """Return how the readings change at the rows that count with one more effect."""
@@ -186,7 +181,7 @@ class ClosedBench(Bench):
         squares = np.zeros(1 + max(int(label.max(initial=-1)) for label in labels))
         for k in range(squares.size):
             kept = [ok & (label != k) for ok, label in zip(self._rows, labels, strict=True)]
-            there = self._fit(outcome.effects, self._start(self._compiled(outcome.effects), outcome), 1, True, kept)
+            there = self._fit(outcome.effects, outcome, 1, kept)
             for e, label in zip(there.fitted.residuals, labels, strict=True):
                 squares[k] += float(np.nansum(e[label == k] ** 2))
         return squares
@@ -196,6 +191,6 @@ class ClosedBench(Bench):
         cut = [int((1.0 - HELD_OUT) * len(r)) for r in self.recordings]
         first = [ok & (np.arange(ok.size) < k) for ok, k in zip(self._rows, cut, strict=True)]
         if refits:
-            outcome = self._fit(outcome.effects, self._start(self._compiled(outcome.effects), outcome), 6, True, first)
+            outcome = self._fit(outcome.effects, outcome, 6, first)
         e = np.concatenate([r[k:] for r, k in zip(outcome.fitted.residuals, cut, strict=True)])
         return float(np.sqrt(np.nanmean(e**2)))

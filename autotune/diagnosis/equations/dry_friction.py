@@ -26,13 +26,10 @@ TOO_FAR = 1.2
 def with_force(effect: Effect, times: float) -> Effect:
     """Return dry friction with so many times its force, any other effect as it is."""
     levels = form_of(effect).levels
-    if not levels:
-        return effect
-    forces = {key: replace(q, value=times * q.value) for key, q in effect.parameters.items() if key in levels}
-    return replace(effect, parameters=MappingProxyType({**effect.parameters, **forces}))
+    return effect.with_values({key: times * value for key, value in effect.values.items() if key in levels})
 
 
-def swept(bench: Bench, one: Outcome) -> list[Outcome]:
+def sweep_levels(bench: Bench, one: Outcome) -> list[Outcome]:
     """Return a fit with dry friction and those from forces above and below it, each from the one before.
 
     Parameters
@@ -61,7 +58,7 @@ def swept(bench: Bench, one: Outcome) -> list[Outcome]:
     return found
 
 
-def settled_among(bench: Bench, fits: Sequence[Outcome], rows: float, ratio: float) -> Outcome:
+def select_minimum(bench: Bench, fits: Sequence[Outcome], rows: float, ratio: float) -> Outcome:
     """Return the minimum that predicts best among those that rows do not tell apart, its levels as far as the others.
 
     Parameters

@@ -12,25 +12,26 @@ import numpy as np
 
 from autotune.arrays import BoolArray, FloatArray
 from autotune.diagnosis.equations.bench import Bench, Outcome
-from autotune.diagnosis.equations.candidates import Signals, Trial, form_of, values_of
+from autotune.diagnosis.equations.candidates import Signals, Trial, form_of
 from autotune.diagnosis.equations.first_order import explained, start_bases, without_starts
 from autotune.diagnosis.equations.followed import followed, positions_of, sizes_of
 from autotune.diagnosis.equations.further import further_columns
 from autotune.diagnosis.equations.held_out import HELD_OUT, bounded_errors, forecasts, free_run, until
 from autotune.diagnosis.equations.parts import standing_out, telling_windows
-from autotune.diagnosis.equations.sought import changed, outer, sought
+from autotune.diagnosis.equations.sought import change_number, outer, scale_parameter
 from autotune.diagnosis.evidence.stretches import stretches_in
+from autotune.diagnosis.thresholds import IN_USE, Thresholds
 from autotune.effects import KINDS
 from autotune.effects.in_equations import Scales
-from autotune.equations.effects import compile_with, where_of, with_values
+from autotune.equations.effects import compile_with, where_of
 from autotune.equations.fit import LEAST_ROWS, fit, retune
 from autotune.equations.fit_data import Fitted
 from autotune.equations.left_out import left_out_squares
 from autotune.equations.linearise import growth_rate
 from autotune.equations.model import EquationModel, InputColumn
-from autotune.equations.parameter_scales import values_of as natural
-from autotune.equations.sensitivity import Windows, side_by_side
-from autotune.equations.simulate import Compiled, simulate
+from autotune.equations.parameter_scales import values_of
+from autotune.equations.sensitivity import Windows, run_windows, side_by_side
+from autotune.equations.simulate import Compiled
 from autotune.errors import InputError
 from autotune.models import Effect
 from autotune.recording import Recording
@@ -68,15 +69,21 @@ class EquationBench(Bench):
         What was measured.
     good : sequence of (N,) bool array
         Rows whose reading counts.
+    limits : Thresholds
+        What decides between two findings.
     """
 
     is_closed = False
 
-    def __init__(self, model: EquationModel, recordings: Sequence[Recording], good: Sequence[BoolArray]) -> None:
+    def __init__(
+        self, model: EquationModel, recordings: Sequence[Recording], good: Sequence[BoolArray],
+        limits: Thresholds = IN_USE,
+    ) -> None:  # fmt: skip
         self._nominal, self._further = model, further_columns(model, recordings)
         # further columns drive nothing until an effect takes them; what is measured runs on between rows
         measured = (InputColumn(column=name, hold="linear") for name in self._further)
-        super().__init__(replace(model, inputs=(*model.inputs, *measured)), recordings, good)
+        whole = replace(model, inputs=(*model.inputs, *measured))
+        super().__init__(whole, recordings, good, len(model.parameters), limits)
         dt = max(float(np.median(np.diff(r.t))) for r in recordings)
         longest = min(self._duration_s / WINDOWS, MOST_ROWS * dt)
         rate = growth_rate(model, recordings) if model.horizon_s is None else 0.0
@@ -95,8 +102,7 @@ class EquationBench(Bench):
     def _steps(self, found: Fitted) -> float:
         """Return how many steps the simulation of a fit takes between two rows."""
         each = zip(self._drives, found.windows, strict=True)
-        runs = [simulate(found.compiled, found.parameters, d, w.states, starts=w.starts, stops=w.stops)
-                for d, w in each]  # fmt: skip
+        runs = [run_windows(found.compiled, found.parameters, d, w) for d, w in each]
         return float(sum(run.steps.sum() for run in runs)) / sum(len(r) for r in self.recordings)
 
     def as_it_is(self, retuned: Outcome) -> Outcome:
@@ -123,9 +129,7 @@ class EquationBench(Bench):
         """
         compiled = self._compiled(outcome.effects)
         cuts = [int((1.0 - HELD_OUT) * len(r)) for r in self.recordings]
-        z = np.zeros(len(compiled.parameters))
-        own = len(self.model.parameters)
-        z[:own] = outcome.fitted.z[:own]
+        z = self._start(compiled, outcome)
         each, runs = list(zip(self.recordings, cuts, outcome.fitted.windows, strict=True)), []
         try:
             windows = [until(w, k) for _, k, w in each]
@@ -133,7 +137,7 @@ class EquationBench(Bench):
                 first = [replace(r, y=np.where(np.arange(len(r)) < k, r.y, np.nan)) for r, k, _ in each]
                 found = fit(compiled, first, z=z, windows=windows, iterations=8)
                 z, windows = found.z, list(found.windows)
-            p = natural(compiled, z)
+            p = values_of(compiled, z)
             for (r, k, _), drive, w in zip(each, self._drives, windows, strict=True):
                 if self._horizon_s is not None:
                     runs.append(forecasts(compiled, p, drive, r.y, w, k, self._horizon_s))
@@ -151,8 +155,8 @@ class EquationBench(Bench):
         return left_out_squares(outcome.fitted, self.recordings, labels)
 
     def _compiled(self, effects: Sequence[Effect]) -> Compiled:
-        compiled, own = compile_with(self.model, effects), len(self.model.parameters)
-        scaled_for_search = tuple(sought(p, effects, self._scales) for p in compiled.parameters[own:])
+        compiled, own = compile_with(self.model, effects), self._own
+        scaled_for_search = tuple(scale_parameter(p, effects, self._scales) for p in compiled.parameters[own:])
         parameters = (*compiled.parameters[:own], *scaled_for_search)
         most, spare = min(self._most_steps, compiled.most_steps), SPARE_ROWS * self._most_steps
         return replace(compiled, parameters=parameters, most_steps=most, spare_steps=min(spare, compiled.spare_steps))
@@ -183,7 +187,7 @@ class EquationBench(Bench):
             values = self._promising(best, i, key, tried, factor) if best else (tried / factor, tried, tried * factor)
             for value in values:
                 try:
-                    new = self._inner(changed(effects, i, key, value), best or start, 4)
+                    new = self._inner(change_number(effects, i, key, value), best or start, 4)
                 except InputError:
                     continue
                 if best is None or new.rss < best.rss:
@@ -201,7 +205,7 @@ class EquationBench(Bench):
         readings = np.concatenate([r.y[ok] for r, ok in zip(self.recordings, self._rows, strict=True)])
         left: list[tuple[float, float]] = []
         for value in (tried / factor, tried, tried * factor):
-            y = self._simulated(self._compiled(changed(best.effects, i, key, value)), best)
+            y = self._simulated(self._compiled(change_number(best.effects, i, key, value)), best)
             if y is not None:
                 e = self.without_starts(best, readings - y)
                 e = e - basis @ (basis.T @ e)
@@ -210,13 +214,8 @@ class EquationBench(Bench):
 
     def _inner(self, effects: Sequence[Effect], start: Outcome, iterations: int) -> Outcome:
         compiled = self._compiled(effects)
-        z = np.zeros(len(compiled.parameters))
-        own = len(self.model.parameters)
-        z[:own] = start.fitted.z[:own]
-        windows = [
-            Windows(starts=w.starts, stops=w.stops, states=self._states(compiled, start, w, k))
-            for k, w in enumerate(start.fitted.windows)
-        ]
+        windows = [replace(w, states=self._states(compiled, start, w, k)) for k, w in enumerate(start.fitted.windows)]
+        z = self._start(compiled, start)
         found = fit(compiled, self.recordings, z=z, windows=windows, iterations=iterations)
         return self._outcome(tuple(effects), found)
 
@@ -251,7 +250,7 @@ class EquationBench(Bench):
                 mask[a:b] = True
             good.append(ok & mask)
             windows.append(Windows(starts=w.starts[keep], stops=w.stops[keep], states=w.states[keep]))
-        small = EquationBench(self._nominal, self.recordings, good)
+        small = EquationBench(self._nominal, self.recordings, good, self.limits)
         self.signals(outcome)  # sizes and spans, for fits on all rows too
         small.length_s, small._most_steps = self.length_s, self._most_steps
         there = replace(outcome, fitted=replace(outcome.fitted, windows=tuple(windows)))
@@ -264,11 +263,8 @@ class EquationBench(Bench):
     def _on(self, outcome: Outcome, length_s: float, iterations: int) -> Outcome:
         """Return the same effects fitted on windows of a length, from where a fit is, its states taken over."""
         compiled = self._compiled(outcome.effects)
-        z = np.zeros(len(compiled.parameters))
-        own = len(self.model.parameters)
-        z[:own] = outcome.fitted.z[:own]
-        found = fit(compiled, self.recordings, z=z, known=outcome.fitted.windows, horizon_s=length_s,
-                    iterations=iterations)  # fmt: skip
+        found = fit(compiled, self.recordings, z=self._start(compiled, outcome), known=outcome.fitted.windows,
+                    horizon_s=length_s, iterations=iterations)  # fmt: skip
         return self._outcome(outcome.effects, found)
 
     def is_sought_outside(self, effect: Effect) -> bool:
@@ -289,23 +285,16 @@ class EquationBench(Bench):
         return np.column_stack(columns)
 
     def _outcome(self, effects: tuple[Effect, ...], found: Fitted) -> Outcome:
-        values = {
-            p.name: (float(v), float(s))
-            for p, v, s in zip(found.compiled.parameters, found.parameters, found.sd, strict=True)
-        }
-        residual = np.concatenate([r[ok] for r, ok in zip(found.residuals, self._rows, strict=True)])
         count = sum(p.spread > 0.0 for p in found.compiled.parameters) + len(outer(effects))
-        return Outcome(effects=with_values(effects, values), fitted=found, count=count, residual=residual)
+        return self._made(effects, found, count)
 
     def _simulated(self, compiled: Compiled, outcome: Outcome) -> FloatArray | None:
         """Return readings at the rows that count, the outcome's numbers and start states given."""
-        own = len(self.model.parameters)
         p = compiled.parameter_vector
-        p[:own] = outcome.fitted.parameters[:own]
+        p[: self._own] = outcome.fitted.parameters[: self._own]
         parts = []
         for k, (drive, w) in enumerate(zip(self._drives, outcome.fitted.windows, strict=True)):
-            x = self._states(compiled, outcome, w, k)
-            run = simulate(compiled, p, drive, x, starts=w.starts, stops=w.stops)
+            run = run_windows(compiled, p, drive, replace(w, states=self._states(compiled, outcome, w, k)))
             parts.append(run.y[self._rows[k]])
         y = np.concatenate(parts)
         return y if np.all(np.isfinite(y)) else None
@@ -350,7 +339,7 @@ class EquationBench(Bench):
         if not seen:
             return False
         values, at = self._followed(outcome)[1], positions_of(self.model)
-        return any(judge(values_of(e), values[at[where_of(e)]]) for e, judge in seen if at[where_of(e)] in values)
+        return any(judge(e.values, values[at[where_of(e)]]) for e, judge in seen if at[where_of(e)] in values)
 
     def signals(self, outcome: Outcome) -> Signals:
         """Return states, differences across ports, and sizes of derivatives under a fit."""

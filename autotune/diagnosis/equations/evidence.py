@@ -27,6 +27,7 @@ from autotune.diagnosis.result import FoundEffect, Verdict
 from autotune.diagnosis.safe_extension import safe_extension
 from autotune.diagnosis.selection.judged import of_likely
 from autotune.diagnosis.selection.probability import Candidate, probability_of
+from autotune.diagnosis.thresholds import Thresholds
 from autotune.diagnosis.verdict import Evidence
 from autotune.effects import kind_of
 from autotune.equations.black_box import BlackBox
@@ -147,7 +148,7 @@ class EquationEvidence(Evidence):
             places=self.places(effect.name),
             parameters=MappingProxyType(shown),
             equation=equation_of(self.found.bench.model, effect),
-            windows=self.acting(effect.name, {k: q.value for k, q in effect.parameters.items()}),
+            windows=self.acting(effect),
             operating_range=spans_at(self.found.bench, self.found.chosen, effect),
             as_command=MappingProxyType(in_commands(effect.name, shown, command, unit.unit) if command else {}),
             **{key: getattr(effect, key) for key in ("state", "port", "input", "column")},
@@ -159,7 +160,7 @@ class EquationEvidence(Evidence):
             return ""
 
         def error_of(changed: Sequence[Recording], good: Sequence[BoolArray]) -> float:
-            bench = bench_of(self.model, changed, good)
+            bench = bench_of(self.model, changed, good, self.limits)
             return bench.held_out_error(bench.retuned(), True) / spread_of(changed)
 
         return misread_columns(self.given, self.model.inputs[0].offset, self.quality, self.limits, error_of)
@@ -186,10 +187,12 @@ class EquationEvidence(Evidence):
         return self.model if stands else _with_numbers(self.model, found.retuned)
 
 
-def bench_of(model: EquationModel | BlackBox, recordings: Sequence[Recording], good: Sequence[BoolArray]) -> Bench:
+def bench_of(
+    model: EquationModel | BlackBox, recordings: Sequence[Recording], good: Sequence[BoolArray], limits: Thresholds
+) -> Bench:
     """Return a model on its recordings, of whose rows some count."""
     kind = ClosedBench if isinstance(model, BlackBox) else EquationBench
-    bench: Bench = kind(model, recordings, good)  # type: ignore[arg-type]  # each kind has its bench
+    bench: Bench = kind(model, recordings, good, limits)  # type: ignore[arg-type]  # each kind has its bench
     return bench
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -11,9 +12,9 @@ from autotune.equations.effects import compile_with, position_under
 from autotune.equations.expressions import Expression, Name, Number, to_text
 from autotune.equations.fit_data import Fitted
 from autotune.equations.model import EquationModel, Extension
-from autotune.equations.sensitivity import Windows
+from autotune.equations.sensitivity import Windows, run_windows
 from autotune.equations.shared_forces import Joint, joint_at
-from autotune.equations.simulate import Compiled, Drive, compile_model, derivatives, simulate
+from autotune.equations.simulate import Compiled, Drive, compile_model, derivatives
 from autotune.models import Effect
 
 
@@ -39,8 +40,8 @@ def followed(
     compiled = compile_with(model, effects, list(wanted.values()))
     runs: list[FloatArray] = []
     for drive, w in zip(drives, fitted.windows, strict=True):
-        x = states(compiled, w, len(runs))
-        runs.append(simulate(compiled, fitted.parameters, drive, x, starts=w.starts, stops=w.stops).outputs)
+        begun = replace(w, states=states(compiled, w, len(runs)))
+        runs.append(run_windows(compiled, fitted.parameters, drive, begun).outputs)
     columns = np.concatenate(runs)
     columns = columns[np.all(np.isfinite(columns), axis=1)]
     return columns[:, 0], {name: columns[:, 1 + i] for i, name in enumerate(wanted)}

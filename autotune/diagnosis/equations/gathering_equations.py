@@ -20,9 +20,9 @@ from autotune.diagnosis.equations.evidence import (
 from autotune.diagnosis.equations.judged import Searched
 from autotune.diagnosis.equations.search import search
 from autotune.diagnosis.evidence.law import law_effect
-from autotune.diagnosis.evidence.sample_gain import SimulatedRows, is_material, supported
-from autotune.diagnosis.evidence.samples import SampleEffect, spared
-from autotune.diagnosis.evidence.spoiled_rows import clear_samples, searched_beside
+from autotune.diagnosis.evidence.sample_gain import SimulatedRows, is_material, select_supported
+from autotune.diagnosis.evidence.samples import SampleEffect, unspoiled_rows
+from autotune.diagnosis.evidence.spoiled_rows import clear_samples, search_beside
 from autotune.diagnosis.thresholds import Thresholds
 from autotune.effects import KINDS
 from autotune.equations.black_box import BlackBox
@@ -57,18 +57,18 @@ def evidence_of_equations(
     own = {effect.name for effect in model.effects}
 
     def retuned_rows(good: Sequence[BoolArray]) -> SimulatedRows:
-        bench = bench_of(model, recordings, good)
-        return _rows_of(bench.retuned(), recordings, bench, limits)
+        bench = bench_of(model, recordings, good, limits)
+        return _rows_of(bench.retuned(), recordings, bench)
 
     def searched(seen: list[SampleEffect]) -> tuple[Searched, SimulatedRows]:
-        bench = bench_of(model, recordings, spared(recordings, seen))
-        found = search(bench, [*without, *(s.name for s in seen)], progress, limits, begun)
-        return found, _rows_of(found.chosen, recordings, bench, limits)
+        bench = bench_of(model, recordings, unspoiled_rows(recordings, seen), limits)
+        found = search(bench, [*without, *(s.name for s in seen)], progress, begun)
+        return found, _rows_of(found.chosen, recordings, bench)
 
     seen = clear_samples(recordings, [name for name in without if name not in own], limits, retuned_rows)
-    found, seen = searched_beside(searched, seen, without)
-    run = _rows_of(found.chosen, recordings, found.bench, limits)
-    samples = [s for s in supported(seen, run) if s.name not in own]
+    found, seen = search_beside(searched, seen, without)
+    run = _rows_of(found.chosen, recordings, found.bench)
+    samples = [s for s in select_supported(seen, run) if s.name not in own]
     samples = [s for s in samples if not found.taken.names or is_material(s, run)]
     law = law_effect(recordings, controller, limits)
     samples += [] if law is None or law.name in without else [law]
@@ -85,14 +85,12 @@ def evidence_of_equations(
     )  # fmt: skip
 
 
-def _rows_of(
-    outcome: Outcome, recordings: Sequence[Recording], bench: Bench, limits: Thresholds
-) -> SimulatedRows:  # fmt: skip
+def _rows_of(outcome: Outcome, recordings: Sequence[Recording], bench: Bench) -> SimulatedRows:
     """Return the rows that a fit simulates."""
     whole = [(np.zeros(1, dtype=np.int64), np.array([len(r)])) for r in recordings]
     windows = [(w.starts, w.stops) for w in outcome.fitted.windows] or whole
     return SimulatedRows(
         recordings=tuple(recordings), good=tuple(np.isfinite(r.y) for r in bench.recordings),
         starts=tuple(a for a, _ in windows), stops=tuple(b for _, b in windows),
-        simulated=outcome.fitted.simulated, limits=limits,
+        simulated=outcome.fitted.simulated, limits=bench.limits,
     )  # fmt: skip

@@ -9,7 +9,7 @@ import numpy as np
 
 from autotune.arrays import FloatArray, IntArray
 from autotune.equations.fit_data import window_rows
-from autotune.equations.sensitivity import Windows
+from autotune.equations.sensitivity import Windows, run_windows
 from autotune.equations.simulate import Compiled, Drive, simulate
 from autotune.equations.starts import LEAST, fitted_starts
 
@@ -26,8 +26,8 @@ def free_run(
 
     Its first part tells where it starts.
     """
-    at, end = _continued(compiled, p, drive, y, windows, row), np.array([y.size])
-    return simulate(compiled, p, drive, at.states, starts=at.starts, stops=end).y, row + int(SETTLED * (y.size - row))
+    at = replace(_continued(compiled, p, drive, y, windows, row), stops=np.array([y.size]))
+    return run_windows(compiled, p, drive, at).y, row + int(SETTLED * (y.size - row))
 
 
 def _continued(compiled: Compiled, p: FloatArray, drive: Drive, y: FloatArray, before: Windows, row: int) -> Windows:
@@ -58,7 +58,7 @@ def _started(
     best, smallest = None, np.inf
     for guess in (None, *(one for one in guesses if one is not None)):
         w = fitted_starts(compiled, p, drive, y, good, at, end, guess=guess, share=share, least=least)
-        e = (y - simulate(compiled, p, drive, w.states, starts=at, stops=np.array([last])).y)[first:last]
+        e = (y - run_windows(compiled, p, drive, replace(w, stops=np.array([last]))).y)[first:last]
         left = float(np.nansum(e**2)) if np.all(np.isfinite(e[good[first:last]])) else np.inf
         if best is None or left < smallest:
             best, smallest = w, left
@@ -79,7 +79,7 @@ def forecasts(
         guess = _reached(compiled, p, drive, windows, int(before))
         share, window = (a - before) / (b - before), (np.array([before]), np.array([b]))
         windows = _started(compiled, p, drive, y, window, [guess], share, int(a - before))
-        found[a:b] = simulate(compiled, p, drive, windows.states, starts=windows.starts, stops=windows.stops).y[a:b]
+        found[a:b] = run_windows(compiled, p, drive, windows).y[a:b]
         first = min(first, int(a))
     return found, first
 

@@ -34,19 +34,16 @@ class JudgedEquations(Judged):
         Effects that the model has itself.
     bench : Bench
         What it was fitted on.
-    table : Thresholds
-        What decides between two findings.
     """
 
     outcome: Outcome
     own: int
     bench: Bench
-    table: Thresholds
 
     @property
     def limits(self) -> Thresholds:
         """What decides between two findings."""
-        return self.table
+        return self.bench.limits
 
     @cached_property
     def noise(self) -> Noise:
@@ -56,7 +53,7 @@ class JudgedEquations(Judged):
     @cached_property
     def leaves_noise(self) -> bool:
         """Whether what it leaves is noise: no more variance, no slow part, and stretches are foretold about as well."""
-        outcome, limits = self.outcome, self.table
+        outcome, limits = self.outcome, self.limits
         chance = math.sqrt(2.0 / outcome.residual.size)
         if self.noise.ar and self.noise.ar[0] > limits.slow_noise:
             return False
@@ -91,7 +88,7 @@ def odds_of(effect: Effect) -> float:
     return min(max(*kind_of(effect.name).odds.values(), RARE, RARE), MOST)
 
 
-def judged(bench: Bench, outcome: Outcome, own: int, limits: Thresholds) -> JudgedEquations | None:
+def judge(bench: Bench, outcome: Outcome, own: int) -> JudgedEquations | None:
     """Return a fit with its errors on left-out stretches; nothing where an effect is no longer what its name says."""
     if bench.is_stand_in(outcome):
         return None
@@ -101,7 +98,7 @@ def judged(bench: Bench, outcome: Outcome, own: int, limits: Thresholds) -> Judg
     added = outcome.effects[own:]
     return JudgedEquations(
         names=tuple(e.name for e in added), long_squares=squares, short_squares=squares,
-        log_odds=math.fsum(math.log(odds_of(e)) for e in added), outcome=outcome, own=own, bench=bench, table=limits,
+        log_odds=math.fsum(math.log(odds_of(e)) for e in added), outcome=outcome, own=own, bench=bench,
     )  # fmt: skip
 
 
@@ -127,7 +124,7 @@ class Searched:
     @property
     def limits(self) -> Thresholds:
         """What decided."""
-        return self.best.table
+        return self.best.limits
 
     @property
     def bench(self) -> Bench:

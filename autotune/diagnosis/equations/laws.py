@@ -32,7 +32,8 @@ from autotune.equations.effects import (
 from autotune.equations.expressions import Call, Expression, Name, Number, names_in, parse, substituted, to_text
 from autotune.equations.model import EquationModel, Extension, InputColumn, State
 from autotune.equations.parameter_scales import values_of
-from autotune.equations.simulate import compile_model, derivatives, drive_of, simulate
+from autotune.equations.sensitivity import run_windows
+from autotune.equations.simulate import compile_model, derivatives, drive_of
 from autotune.models import Effect
 
 #: Name of the column that marks a bin's rows, and its size in sizes of the law: small, for the first order is asked.
@@ -114,7 +115,6 @@ class EquationLine(LawLine):
         named = zip(compiled.parameters, values_of(compiled, theta), strict=True)
         there = with_values(self.outcome.effects, {p.name: (float(v), 0.0) for p, v in named})
         effect, form = there[self.number], form_of(self.effect, model)
-        values = {key: q.value for key, q in effect.parameters.items()}
 
         def bound(name: str) -> Expression | None:
             if name == self.over:
@@ -123,7 +123,7 @@ class EquationLine(LawLine):
                 return None
             q = KINDS[effect.name].quantity(name)
             neutral = form.defaults.get(name, None if q is None else q.neutral)
-            return Number(float(values.get(name, 0.0 if neutral is None else neutral)))
+            return Number(float(effect.values.get(name, 0.0 if neutral is None else neutral)))
 
         shell = EquationModel(
             name="law", inputs=(InputColumn(column="x"),), parameters=(),
@@ -165,12 +165,8 @@ def line_in_equations(bench: EquationBench, outcome: Outcome, number: int) -> Eq
 
     Parameters
     ----------
-    bench : EquationBench
-        The model on its recordings.
-    outcome : Outcome
-        The fit.
-    number : int
-        The effect's position among those of the fit.
+    bench, outcome, number
+        As of :class:`EquationLine`.
 
     Returns
     -------
@@ -190,10 +186,7 @@ def line_in_equations(bench: EquationBench, outcome: Outcome, number: int) -> Eq
         return None
     compiled, signals = compile_with(model, outcome.effects, [to_text(tree)]), []
     for r, w in zip(bench.recordings, outcome.fitted.windows, strict=True):
-        run = simulate(
-            compiled, outcome.fitted.parameters, drive_of(model, r), w.states, starts=w.starts, stops=w.stops
-        )  # fmt: skip
-        signals.append(run.outputs[:, 1])
+        signals.append(run_windows(compiled, outcome.fitted.parameters, drive_of(model, r), w).outputs[:, 1])
     return EquationLine(bench=bench, outcome=outcome, number=number, over=over, signals=tuple(signals))
 
 
@@ -211,7 +204,7 @@ def _simulated(line: EquationLine, rows: BoolArray, size: float) -> FloatArray:
     runs = zip(line.bench.recordings, marks, outcome.fitted.windows, outcome.fitted.simulated, strict=True)
     for r, mark, w, before in runs:
         drive = drive_of(marked, replace(r, extra={**r.extra, MARK: mark.astype(np.float64)}))
-        y = simulate(compiled, p, drive, w.states, starts=w.starts, stops=w.stops).y
+        y = run_windows(compiled, p, drive, w).y
         found.append((y - before)[np.isfinite(r.y)])
     return np.concatenate(found)
 

@@ -46,17 +46,17 @@ def variance_ratio(one: Outcome, noise: Noise) -> float:
     return one.rss / one.residual.size / max(noise.total_sd**2, 1e-300)
 
 
-def is_noise(bench: Bench, one: Outcome, most: float, limits: Thresholds) -> bool:
+def is_noise(bench: Bench, one: Outcome, most: float) -> bool:
     """Whether a residual has a noise's variance; what goes on from row to row may be physics that is left out."""
     noise = noise_of(bench, one)
-    return variance_ratio(one, noise) < most and not (noise.ar and noise.ar[0] > limits.slow_noise)
+    return variance_ratio(one, noise) < most and not (noise.ar and noise.ar[0] > bench.limits.slow_noise)
 
 
-def is_settled(bench: Bench, one: Outcome, best: Outcome, limits: Thresholds) -> bool:
+def is_settled(bench: Bench, one: Outcome, best: Outcome) -> bool:
     """Whether a fit need not be finished: another one of the same rows leaves noise alone, and it is far behind."""
-    if one is best or variance_ratio(best, noise_of(bench, best)) >= limits.adequate_quick:
+    if one is best or variance_ratio(best, noise_of(bench, best)) >= bench.limits.adequate_quick:
         return False
-    return one.residual.size * float(np.log(one.rss / max(best.rss, 1e-300))) > limits.equation_behind
+    return one.residual.size * float(np.log(one.rss / max(best.rss, 1e-300))) > bench.limits.equation_behind
 
 
 def is_slow(one: Outcome, noise: Noise, limits: Thresholds) -> bool:

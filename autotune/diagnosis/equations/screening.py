@@ -10,8 +10,7 @@ import numpy as np
 from autotune.arrays import FloatArray
 from autotune.diagnosis.equations.bench import Bench, Outcome
 from autotune.diagnosis.equations.candidates import Trial, is_signed, key_of, plainer, trials
-from autotune.diagnosis.equations.sought import scaled
-from autotune.diagnosis.thresholds import IN_USE, Thresholds
+from autotune.diagnosis.equations.sought import scale_trial
 from autotune.errors import InputError
 from autotune.models import Effect
 from autotune.progress import Progress
@@ -20,8 +19,8 @@ from autotune.progress import Progress
 PARALLEL = 1.0 - 1e-6
 
 
-def screened(
-    bench: Bench, base: Outcome, without: Collection[str], progress: Progress, limits: Thresholds = IN_USE,
+def screen_effects(
+    bench: Bench, base: Outcome, without: Collection[str], progress: Progress,
     only: Callable[[Effect], bool] = lambda effect: True,
 ) -> list[tuple[float, Effect]]:  # fmt: skip
     """Return for every effect and place the decrease that first order predicts, with the values that bring it.
@@ -34,8 +33,6 @@ def screened(
         Effects that are left out.
     progress : callable
         Told what is being done and the share done.
-    limits : Thresholds
-        What decides.
     only : callable
         Whether an effect is tried; by default all are.
 
@@ -56,12 +53,12 @@ def screened(
         progress("trying every effect", k / len(all_trials))
         if d is None:
             continue
-        gain, factor = predicted(e, d, trial)
+        gain, factor = predict_decrease(e, d, trial)
         key = (*key_of(trial.effect), plainer(trial.effect) is None)
         if gain > 0.0 and (key not in best or gain > best[key][0]):
-            best[key] = (gain, scaled(trial, factor), d)
+            best[key] = (gain, scale_trial(trial, factor), d)
     ranked = sorted(_apart(best.values()), key=lambda pair: -pair[0])
-    least = limits.equation_faint * ranked[0][0] if ranked else 0.0
+    least = bench.limits.equation_faint * ranked[0][0] if ranked else 0.0
     return [pair for pair in ranked if pair[0] >= least]
 
 
@@ -81,7 +78,7 @@ def _apart(found: Iterable[tuple[float, Effect, FloatArray]]) -> list[tuple[floa
 def _direction(bench: Bench, base: Outcome, trial: Trial, basis: FloatArray) -> FloatArray | None:
     """Return how readings change with a trial beyond what numbers and starts explain."""
     for shrink in (1.0, 0.1):
-        one = trial if shrink == 1.0 else replace(trial, effect=scaled(trial, shrink))
+        one = trial if shrink == 1.0 else replace(trial, effect=scale_trial(trial, shrink))
         try:
             d = bench.with_trial(base, one.effect)
         except InputError:
@@ -94,7 +91,7 @@ def _direction(bench: Bench, base: Outcome, trial: Trial, basis: FloatArray) -> 
     return None
 
 
-def predicted(e: FloatArray, d: FloatArray, trial: Trial) -> tuple[float, float]:
+def predict_decrease(e: FloatArray, d: FloatArray, trial: Trial) -> tuple[float, float]:
     """Return the decrease predicted along a direction, and the factor of its amplitude, or of the whole of it."""
     size = float(d @ d)
     if size <= 1e-12 * float(e @ e):

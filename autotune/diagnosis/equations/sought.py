@@ -27,23 +27,19 @@ def jumping(compiled: Compiled, effects: Sequence[Effect]) -> tuple[ModelParamet
     return tuple(one.parameter for one in compiled.held if one.parameter.name in names)
 
 
-def changed(effects: Sequence[Effect], i: int, key: str, value: float) -> tuple[Effect, ...]:
+def change_number(effects: Sequence[Effect], i: int, key: str, value: float) -> tuple[Effect, ...]:
     """Return effects with one number of one of them changed."""
-    parameters = dict(effects[i].parameters)
-    parameters[key] = replace(parameters[key], value=value)
-    return (*effects[:i], replace(effects[i], parameters=parameters), *effects[i + 1 :])
+    return (*effects[:i], effects[i].with_values({key: value}), *effects[i + 1 :])
 
 
-def scaled(trial: Trial, factor: float) -> Effect:
+def scale_trial(trial: Trial, factor: float) -> Effect:
     """Return a trial's effect with its amplitude times a factor; what may not change its sign keeps it."""
-    parameters = dict(trial.effect.parameters)
-    for key in trial.scaled:
-        times = factor if is_signed(trial.effect, key) else abs(factor)
-        parameters[key] = replace(parameters[key], value=parameters[key].value * times)
-    return replace(trial.effect, parameters=parameters)
+    effect = trial.effect
+    times = {key: factor if is_signed(effect, key) else abs(factor) for key in trial.scaled}
+    return effect.with_values({key: effect.values[key] * by for key, by in times.items()})
 
 
-def sought(p: ModelParameter, effects: Sequence[Effect], scales: Callable[[Effect], Scales]) -> ModelParameter:
+def scale_parameter(p: ModelParameter, effects: Sequence[Effect], scales: Callable[[Effect], Scales]) -> ModelParameter:
     """Return an effect's parameter with the scale that it is sought on."""
     effect, key = _effect_and_key(p.name, effects)
     form = form_of(effect)

@@ -196,6 +196,14 @@ _SHAPES: tuple[tuple[str, int, Callable[[FloatArray], FloatArray]], ...] = (
 )
 
 
+def _candidate(
+    residual: FreedResidual, place: Place, text: str, values: Sequence[FloatArray], factor: float
+) -> _Candidate:  # fmt: skip
+    """Return a function with its values, (N,) per recording, sent through the chain from where it is added."""
+    unit, column = residual.unit[place], residual.shown(place, values)
+    return _Candidate(place=place, text=text, unit=unit, factor=factor, column=column)
+
+
 def _size(values: Sequence[FloatArray]) -> float:
     return float(np.quantile(np.abs(np.concatenate(values)), 0.98)) or 1.0
 
@@ -203,20 +211,16 @@ def _size(values: Sequence[FloatArray]) -> float:
 def _candidates(residual: FreedResidual) -> Iterator[_Candidate]:
     """Yield the dictionary: shapes of single signals, products of two, and time."""
     for place, group in residual.signals.items():
-        unit = residual.unit[place]
         for name, values in group.items():
             size = _size(values)
             for text, power, shape in _SHAPES if name != DIRECTION else _SHAPES[:1]:
-                column = residual.shown(place, [shape(s / size) for s in values])
-                yield _Candidate(place=place, text=text.format(name), unit=unit, factor=size**-power, column=column)
-        for (a, x), (b, z) in itertools.combinations(group.items(), 2):
-            if place == "plant":
-                size = _size(x) * _size(z)
-                column = residual.shown(place, [p * q / size for p, q in zip(x, z, strict=True)])
-                yield _Candidate(place=place, text=f"{a} * {b}", unit=unit, factor=1.0 / size, column=column)
+                yield _candidate(residual, place, text.format(name), [shape(s / size) for s in values], size**-power)
+        for (a, x), (b, z) in itertools.combinations(group.items(), 2) if place == "plant" else ():
+            size = _size(x) * _size(z)
+            product = [p * q / size for p, q in zip(x, z, strict=True)]
+            yield _candidate(residual, place, f"{a} * {b}", product, 1.0 / size)
         clock = [r.t - r.t[0] for r in residual.data.recordings]
-        column = residual.shown(place, [t / _size(clock) for t in clock])
-        yield _Candidate(place=place, text="time", unit=unit, factor=1.0 / _size(clock), column=column)
+        yield _candidate(residual, place, "time", [t / _size(clock) for t in clock], 1.0 / _size(clock))
 
 
 def _memories(residual: FreedResidual) -> Iterator[_Candidate]:
@@ -225,20 +229,17 @@ def _memories(residual: FreedResidual) -> Iterator[_Candidate]:
     The command is the one held while the reading was taken: that of the row itself follows the reading's noise.
     """
     data, values = residual.data, residual.signals["sensor"].get("reading")
-    unit = residual.unit["sensor"]
     held = [np.concatenate([r.u[:1], r.u[:-1]]) - residual.result.sim.u_offset for r in data.recordings]
     if np.ptp(np.concatenate(held)) > 0.0:
         size = _size(held)
-        column = residual.shown("sensor", [w / size for w in held])
-        yield _Candidate(place="sensor", text="command", unit=unit, factor=1.0 / size, column=column)
+        yield _candidate(residual, "sensor", "command", [w / size for w in held], 1.0 / size)
     if values is None:
         return
     Ts, size = data.sample_times[0], _size(values)
     longest = max(int(np.max(b - a)) for a, b in zip(data.starts, data.stops, strict=True)) * Ts / DELAYS_PER_WINDOW
     for delay in np.geomspace(SHORTEST_DELAY * Ts, max(longest, 2.0 * SHORTEST_DELAY * Ts), DELAYS):
         before = [np.interp(r.t - delay, r.t, y) / size for r, y in zip(data.recordings, values, strict=True)]
-        column, text = residual.shown("sensor", before), f"(reading {delay:.3g} s before)"
-        yield _Candidate(place="sensor", text=text, unit=unit, factor=1.0 / size, column=column)
+        yield _candidate(residual, "sensor", f"(reading {delay:.3g} s before)", before, 1.0 / size)
 
 
 def _equation(residual: FreedResidual) -> tuple[tuple[Term, ...], Place, float]:
@@ -248,7 +249,7 @@ def _equation(residual: FreedResidual) -> tuple[tuple[Term, ...], Place, float]:
     )
     before = residual.cross_validated(np.zeros((residual.e.size, 0)))
     limits = residual.data.thresholds
-    least = max(limits.term_share * (before - residual.floor), limits.least_decrease)
+    least = max(limits.material * (before - residual.floor), limits.least_decrease)
     chosen: list[_Candidate] = []
     error = before
     groups = [*([c for c in pool if c.place == place] for place in residual.signals), memories]

@@ -119,7 +119,7 @@ class EffectLine(LawLine):
             case "command":
                 return model.input.unit
             case "plant input":
-                return plant_unit(self.result)
+                return model.plant_input_unit
             case "speed":
                 return next(
                     (b.unit for b in model.blocks if b.unit and b.output.lower() in ("speed", "velocity")), f"{y}/s"
@@ -141,7 +141,7 @@ class EffectLine(LawLine):
         elif to == "command":
             given = "command that acts", model.input.unit
         elif to == "plant":
-            given = "net inflow" if self.signal == "level" else "force at the plant's input", plant_unit(self.result)
+            given = "net inflow" if self.signal == "level" else "force at the plant's input", model.plant_input_unit
         else:
             given = "flow at the lower level's input" if to == "last" else "reading", model.output.unit
         return self.signal, self.unit, *given
@@ -243,14 +243,8 @@ class EffectLine(LawLine):
         They are (N, q) per recording, and what they show is (N, q), all recordings one after the other.
         """
         sim, data = self.result.sim, self.data
-        plain = replace(sim.linear(), u_offset=0.0, y_offset=0.0, linear_hold=False)
         way = ADDED[self.line.stage][1]
-        if way > 0:
-            B = np.zeros_like(sim.chain.B)
-            B[:, 0] = sim.chain.B[:, way]
-            chain = replace(sim.chain, B=B, gains=np.array([*sim.chain.gains[:2], 0.0, 0.0]), delay_s=0.0)
-            plain = replace(plain, chain=chain, falling=chain)
-        shown = []
+        plain, shown = sim.driven_at(max(way, 0)), []
         for q in range(columns[0].shape[1]):
             rows = []
             for r, s, ok, windows in zip(data.recordings, columns, data.good, data.windows, strict=True):
@@ -259,12 +253,6 @@ class EffectLine(LawLine):
                 rows.append(np.where(ok, out, 0.0))
             shown.append(self.result.without_states(np.concatenate(data.whitened(rows))))
         return np.column_stack(shown)
-
-
-def plant_unit(result: Fit) -> str:
-    """Return the unit of the plant's input."""
-    model = result.parametrisation.model
-    return next((b.unit for b in model.blocks if b.place == "actuator" and b.unit), model.input.unit)
 
 
 def line_of(result: Fit, data: Data, number: int, kind: EffectKind) -> EffectLine | None:

@@ -10,6 +10,7 @@ import numpy as np
 
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import RUNAWAY, Fit, fit, states_of
+from autotune.diagnosis.fitting.long_windows import spread_of
 from autotune.diagnosis.fitting.noise import noise_from_differences
 
 
@@ -34,7 +35,13 @@ class FitQuality:
 
 
 def held_out(retuned: Fit, data: Data) -> FitQuality:
-    """Return errors on windows with numbers fitted to the others.
+    """Return errors on windows that were not fitted, of a nominal structure to which nothing was added."""
+    nominal, tuned = (held_out_error(retuned, data, tune=tune) for tune in (False, True))
+    return FitQuality(nominal=nominal, retuned=tuned, extended=tuned, noise_floor=noise_floor(retuned, data))
+
+
+def held_out_error(retuned: Fit, data: Data, *, tune: bool) -> float:
+    """Return the error on windows with numbers fitted to the others, as a share of the spread of y.
 
     Every second window is left out, then the others: each half is tried with the numbers of the other one.
 
@@ -44,21 +51,20 @@ def held_out(retuned: Fit, data: Data) -> FitQuality:
         The nominal structure, to which nothing was added.
     data : Data
         What it was fitted to.
+    tune : bool
+        Whether numbers are fitted to the other half; else the nominal ones are tried.
     """
     halves = _half(data, 0), _half(data, 1)
-    y = np.concatenate([r.y[g] for r, g in zip(data.recordings, data.good, strict=True)])
-    spread = float(np.std(y)) or 1.0
+    with ThreadPoolExecutor(2) as pool:
+        fits = list(pool.map(lambda pair: _tested(retuned, tune, *pair), (halves, halves[::-1])))
+    squares = sum(float(e @ e) for f in fits for e in f.residuals)
+    freedom = sum(f.rows - f.states_told for f in fits)
+    return math.sqrt(squares / max(freedom, 1)) / spread_of(data)
 
-    def error(result: Fit, tune: bool) -> float:
-        with ThreadPoolExecutor(2) as pool:
-            fits = list(pool.map(lambda pair: _tested(result, tune, *pair), (halves, halves[::-1])))
-        squares = sum(float(e @ e) for f in fits for e in f.residuals)
-        freedom = sum(f.rows - f.states_told for f in fits)
-        return math.sqrt(squares / max(freedom, 1)) / spread
 
-    nominal, tuned = error(retuned, tune=False), error(retuned, tune=True)
-    noise = noise_from_differences(retuned.residuals, data.good, data.thresholds.largest_correlation).total_sd / spread
-    return FitQuality(nominal=nominal, retuned=tuned, extended=tuned, noise_floor=noise)
+def noise_floor(retuned: Fit, data: Data) -> float:
+    """Return the noise that a residual shows from row to row, as a share of the spread of y."""
+    return noise_from_differences(retuned.residuals, data.good).total_sd / spread_of(data)
 
 
 def _tested(result: Fit, tune: bool, known: Data, unknown: Data) -> Fit:

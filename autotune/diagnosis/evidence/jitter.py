@@ -6,49 +6,72 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from autotune.diagnosis.evidence.samples import SampleEffect
+from autotune.arrays import FloatArray
+from autotune.diagnosis.evidence.adequacy import is_noise
+from autotune.diagnosis.evidence.constancy import largest_variation
+from autotune.diagnosis.evidence.samples import JITTER, SampleEffect
+from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import Fit
-from autotune.diagnosis.thresholds import Thresholds
 from autotune.models import Parameter
 from autotune.recording import Recording
 
+#: Times that slope and weights are estimated in turn, and means of the squares at which single ones are cut.
+TURNS, LARGEST = 3, 20.0
 
-def jitter_effect(
-    result: Fit, recordings: Sequence[Recording], least_decrease: float = Thresholds.jitter_decrease
-) -> SampleEffect | None:
+
+def jitter_effect(result: Fit, data: Data, recordings: Sequence[Recording]) -> SampleEffect | None:
     """Return timing jitter where the residual's variance grows with the output's squared slope.
 
-    A stamp that is wrong by d adds d dy/dt to the reading: Var e = s^2 + d_sd^2 (dy/dt)^2.
+    Parameters
+    ----------
+    result : Fit
+        A fit at its minimum.
+    data : Data
+        What it was fitted to.
+    recordings : sequence of Recording
+        All rows of what was measured.
+
+    Notes
+    -----
+    A stamp that is wrong by d adds d dy/dt to the reading: Var e = s^2 + d_sd^2 (dy/dt)^2. It disturbs single rows;
+    what goes with a signal grows with the slope as well, so that nothing else may explain more of the residual.
+    """
+    x, z = _squares(result, recordings)
+    level = float(np.median(z)) / 0.455
+    if level <= 0.0 or float(np.ptp(x)) == 0.0:
+        return None
+    z = np.minimum(z, LARGEST * float(np.mean(z)))
+    X, weight = np.column_stack([np.ones(x.size), x]), np.full(x.size, 1.0 / level)
+    for _ in range(TURNS):
+        root = np.sqrt(weight)
+        coefficients = np.linalg.lstsq(X * root[:, None], z * root, rcond=None)[0]
+        varies = X @ np.maximum(coefficients, [1e-6 * level, 0.0])
+        weight = 1.0 / np.maximum(varies, 1e-3 * level) ** 2
+    fitted, constant = np.maximum(varies, 1e-9 * level), float(np.mean(z))
+    gain = float(np.sum(np.log(constant) + z / constant - np.log(fitted) - z / fitted))
+    if coefficients[1] <= 0.0 or gain < data.thresholds.least_decrease:
+        return None
+    if not (is_noise(result, data) and largest_variation(result, data).gain < gain):
+        return None
+    return SampleEffect(
+        name=JITTER,
+        equation="y is taken at t + d, d random from row to row",
+        parameters={"sd": Parameter(value=float(np.sqrt(coefficients[1])), unit="s")},
+        evidence=gain,
+    )
+
+
+def _squares(result: Fit, recordings: Sequence[Recording]) -> tuple[FloatArray, FloatArray]:
+    """Return the reading's squared slope and the residual's square, of its fast part, at all rows that count.
+
+    What is missing and slow grows with the slope.
     """
     slopes, squares = [], []
     for r, e, out in zip(recordings, result.residuals, result.signals, strict=True):
         slope = np.gradient(out[:, 0], r.t)
         use = (e != 0.0) & np.isfinite(slope)
         slopes.append(slope[use] ** 2)
-        # the fast part alone: what is missing and slow grows with the slope
         fast = np.zeros_like(e)
         fast[1:-1] = (e[1:-1] - 0.5 * (e[:-2] + e[2:])) / np.sqrt(1.5)
         squares.append(fast[use] ** 2)
-    x, z = np.concatenate(slopes), np.concatenate(squares)
-    level = float(np.median(z)) / 0.455
-    if level <= 0.0 or float(np.ptp(x)) == 0.0:
-        return None
-    z = np.minimum(z, 20.0 * float(np.mean(z)))
-    X = np.column_stack([np.ones(x.size), x])
-    weight = 1.0 / level
-    for _ in range(3):
-        coefficients = np.linalg.lstsq(X * np.sqrt(weight)[..., None] if np.ndim(weight) else X * weight**0.5,
-                                       z * np.sqrt(weight), rcond=None)[0]  # fmt: skip
-        weight = 1.0 / np.maximum(X @ np.maximum(coefficients, [1e-6 * level, 0.0]), 1e-3 * level) ** 2
-    fitted = np.maximum(X @ np.maximum(coefficients, [1e-6 * level, 0.0]), 1e-9 * level)
-    constant = float(np.mean(z))
-    gain = float(np.sum(np.log(constant) + z / constant - np.log(fitted) - z / fitted))
-    if coefficients[1] <= 0.0 or gain < least_decrease:
-        return None
-    sd = float(np.sqrt(coefficients[1]))
-    return SampleEffect(
-        name="timing.jitter",
-        equation="y is taken at t + d, d random from row to row",
-        parameters={"sd": Parameter(value=sd, unit="s")},
-        evidence=gain,
-    )
+    return np.concatenate(slopes), np.concatenate(squares)

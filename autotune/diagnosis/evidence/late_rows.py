@@ -19,14 +19,12 @@ from scipy.linalg import expm
 
 from autotune.arrays import BoolArray, FloatArray
 from autotune.diagnosis.evidence.adequacy import line_in
-from autotune.diagnosis.evidence.samples import SampleEffect
+from autotune.diagnosis.evidence.samples import JITTER, SampleEffect
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import Fit
 from autotune.diagnosis.simulation import kernel
 from autotune.models import Parameter
 
-#: The effect that is looked for in the residual's size, and in how its innovations go with steps of the command.
-JITTER = "timing.jitter"
 #: Correlations of the measurement noise from row to row that are tried; standard deviations of d in sample times.
 CORRELATIONS, SIZES = (0.0, 0.3, 0.6, 0.85), np.geomspace(0.003, 0.6, 7)
 #: Steps of that grid: of the correlation, and of the logarithm of the size; how it is made finer.
@@ -110,7 +108,7 @@ def late_rows(retuned: Fit, data: Data) -> SampleEffect | None:
             (c + i * factor * GRID[0], size * math.exp(k * factor * GRID[1])) for i in (-1, 0, 1) for k in (-1, 0, 1)
         ]
         late, c, size = max((told(c, size).score, c, size) for c, size in near if 0.0 <= c < 1.0)
-    if late - plain < limits.late_rows:
+    if late - plain < limits.least_decrease:
         return None
     noisy = max(told(one, 0.0, load).score for one in {c, a} for load in loads)
     best = told(c, size)

@@ -12,7 +12,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -28,6 +27,8 @@ from autotune.recording import Recording
 
 #: Shortest filter of a derivative that is looked for where none is stated, in sample times; the longest is T_d.
 SHORTEST_FILTER = 0.05
+#: Order of the autoregressive noise that the dither is taken for.
+ORDER = 8
 EQUATIONS = {
     ("gain",): "u = bias + g C e with a gain g other than 1",
     ("P",): "u = bias + K e with K other than stated",
@@ -129,7 +130,7 @@ def law_effect(
     for r in recordings:
         stated = stated_law(r.metadata, controller)
         shown = None if stated is None else shown_law(r, stated, limits)
-        if shown is not None and np.max(shown.off) > limits.law_sigmas:
+        if shown is not None and np.max(shown.off) > limits.off_sigmas:
             return SampleEffect(
                 name="controller.law",
                 equation=EQUATIONS[shown.parts],
@@ -200,7 +201,8 @@ def shown_law(r: Recording, stated: StatedLaw, limits: Thresholds = IN_USE) -> S
     law, Ts = stated.controller, r.sample_time_s
     longest = law.Td_s if isinstance(law, PIDController) and not stated.filtered else 0.0
     sought = longest > 0.0
-    best = min((_of(way, late, r.u, longest, Ts, free=not sought) for way in ways for late in (0, 1)), key=_left)
+    tried = (_of(way, late, r.u, longest, Ts, free=not sought) for way in ways for late in (0, 1))
+    best = min(tried, key=lambda one: one.left)
     found = _of(best.way, best.late, r.u, longest, Ts, free=True) if sought else best
     columns = found.columns
     return ShownLaw(
@@ -218,9 +220,12 @@ def _ways(stated: StatedLaw, r: Recording) -> list[Way]:
     """Return the ways in which a law may have been computed, each a function of a time constant that is not stated."""
     law, Ts = stated.controller, r.sample_time_s
     y = np.where(np.isfinite(r.y), r.y, r["r"])
+
+    def fixed(whole: _Columns) -> Way:
+        return lambda _: whole
+
     if not isinstance(law, PIDController):
-        wholes = [_whole(num, den, r["r"] - y) for num, den in _polynomials(law, Ts) if np.any(num)]
-        return [partial(_as_it_is, whole) for whole in wholes]
+        return [fixed(_whole(num, den, r["r"] - y)) for num, den in _polynomials(law, Ts) if np.any(num)]
     if law.K == 0.0:
         return []
 
@@ -236,10 +241,6 @@ def _ways(stated: StatedLaw, r: Recording) -> list[Way]:
     ][: 3 if law.Td_s > 0.0 else 1]
 
 
-def _as_it_is(columns: _Columns, Tf: float) -> _Columns:
-    return columns
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Computed:
     """One way to compute a law, commands ``late`` rows after their samples, with the variance that it leaves."""
@@ -250,10 +251,6 @@ class _Computed:
     gains: FloatArray
     sd: FloatArray
     left: float
-
-
-def _left(found: _Computed) -> float:
-    return found.left
 
 
 def _of(way: Way, late: int, u: FloatArray, longest: float, Ts: float, free: bool) -> _Computed:
@@ -348,8 +345,8 @@ def _least_squares(X: FloatArray, u: FloatArray) -> tuple[FloatArray, FloatArray
     return np.asarray(weights), np.asarray(covariance), max(variance, 1e-300)
 
 
-def _prewhitening(residual: FloatArray, order: int = 8) -> FloatArray:
+def _prewhitening(residual: FloatArray) -> FloatArray:
     """Return 1, -a1, ..., the filter that whitens a residual, by least squares."""
-    past = np.column_stack([residual[order - k - 1 : residual.size - k - 1] for k in range(order)])
-    a = np.linalg.lstsq(past, residual[order:], rcond=1e-10)[0]
+    past = np.column_stack([residual[ORDER - k - 1 : residual.size - k - 1] for k in range(ORDER)])
+    a = np.linalg.lstsq(past, residual[ORDER:], rcond=1e-10)[0]
     return np.concatenate([[1.0], -a])

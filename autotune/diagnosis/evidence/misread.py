@@ -5,13 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
-import numpy as np
-
 from autotune.arrays import BoolArray
 from autotune.diagnosis.evidence.held_out import FitQuality
 from autotune.diagnosis.evidence.samples import inspect
+from autotune.diagnosis.fitting.fit import RUNAWAY
 from autotune.diagnosis.thresholds import Thresholds
-from autotune.errors import AutotuneError
 from autotune.recording import Recording
 
 
@@ -61,7 +59,7 @@ def misread_columns(
             if not all(ok.any() for ok in good):  # a command that never moves is no reading
                 continue
             error = error_of(changed, good)
-        except (AutotuneError, OverflowError, np.linalg.LinAlgError):
+        except RUNAWAY:
             continue
         if 2.0 * error**2 < min(1.0, quality.retuned**2) and error < (1.0 + limits.material) * quality.extended:
             return (

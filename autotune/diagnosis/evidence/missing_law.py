@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from autotune.arrays import BoolArray, FloatArray, IntArray
+from autotune.diagnosis.evidence.residual import last_move
 
 #: Bins over the signal: as many of these as the data tell apart; rows of a bin at least; points of the curve.
 BINS, LEAST_ROWS, POINTS = (12, 8, 5, 3, 2), 20, 161
@@ -212,13 +213,6 @@ def _band(line: LawLine, x: FloatArray) -> FloatArray:
     return np.asarray(np.sqrt(np.maximum(np.einsum("ki,ij,kj->k", D, covariance, D), 0.0)))
 
 
-def _rising(x: FloatArray) -> BoolArray:
-    """Return where a signal went up when it last moved."""
-    moved = np.sign(np.diff(x, prepend=x[0]))
-    last = np.maximum.accumulate(np.where(moved != 0.0, np.arange(x.size), 0))
-    return np.asarray(moved[last] > 0.0)
-
-
 def _edges(x: FloatArray, bins: int, turns: bool) -> FloatArray:
     """Return edges of bins: half way between equal rows and equal widths; one at 0 where the law turns round there."""
     shares = np.linspace(0.0, 1.0, bins + 1)
@@ -233,9 +227,10 @@ def _bins(
     line: LawLine, way: str, ends: tuple[float, float], curve: tuple[FloatArray, FloatArray]
 ) -> tuple[FloatArray, FloatArray, FloatArray, IntArray]:
     """Return mean signal, value, 1-sigma and rows of every bin that tells something."""
-    masks = [_rising(s) if way == "rising" else ~_rising(s) if way else np.ones(s.size, bool) for s in line.values()]
-    counts, signal = line.counts() & np.concatenate(masks), np.concatenate(line.values())
-    counts &= (signal >= ends[0]) & (signal <= ends[1])
+    signal, counts = np.concatenate(line.values()), line.counts()
+    if way:
+        counts = counts & ((np.concatenate([last_move(s) for s in line.values()]) > 0.0) == (way == "rising"))
+    counts = counts & (signal >= ends[0]) & (signal <= ends[1])
     none = np.zeros(0)
     if counts.sum() < 2 * LEAST_ROWS:
         return none, none, none, np.zeros(0, dtype=np.int64)

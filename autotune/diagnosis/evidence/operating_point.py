@@ -45,7 +45,7 @@ def _begins_with_a_step(model: Model, recording: Recording) -> bool:
     return at_rest and float(recording.u[0]) != model.input.offset
 
 
-def offset_of(result: Fit, sigmas: float = Thresholds.offset_sigmas) -> Offset | None:
+def offset_of(result: Fit, sigmas: float = Thresholds.off_sigmas) -> Offset | None:
     """Return the operating point's shift where it is far outside its uncertainty.
 
     A shift may wander from window to window: its uncertainty is at least that of the windows' mean.

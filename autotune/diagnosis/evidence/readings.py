@@ -129,7 +129,7 @@ def spikes(y: FloatArray, good: BoolArray, sds: float = Thresholds.spike, least_
     return found
 
 
-def struck(residual: FloatArray, good: BoolArray, sds: float = Thresholds.spike) -> BoolArray:
+def outlying_rows(residual: FloatArray, good: BoolArray, sds: float = Thresholds.spike) -> BoolArray:
     """Return the rows, one or two in a row, that stand out of the median of the seven around them.
 
     Lone spikes are found in the readings themselves; two spikes in neighbouring rows show only in a simulation's
@@ -171,7 +171,7 @@ def lost_rows(recordings: Sequence[Recording], limits: Thresholds) -> list[BoolA
     """
     least, chance = chance_run(recordings, limits.least_run)
     if chance <= CONTINUOUS:
-        if held_share(recordings) >= limits.most_held:
+        if held_share(recordings) >= limits.majority:
             return [np.zeros(len(r), dtype=bool) for r in recordings]
         return [frozen_rows(r.y, least) for r in recordings]
     far = CAUGHT_UP * usual_change(np.concatenate([r.y for r in recordings]))

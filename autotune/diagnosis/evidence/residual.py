@@ -40,10 +40,7 @@ class FreedResidual:
         self.own = np.linalg.svd(self.J / np.maximum(np.linalg.norm(self.J, axis=0), 1e-300), full_matrices=False)[0]
         self.rows = data.rows
         # where the residual is so large that it was taken for noise, the floor is what changes from row to row alone
-        jitter = (
-            noise_from_differences(result.residuals, data.good, data.thresholds.largest_correlation).total_sd
-            / data.noise.total_sd
-        )
+        jitter = noise_from_differences(result.residuals, data.good).total_sd / data.noise.total_sd
         self.floor = data.rows * min(1.0, jitter**2)
         number = np.zeros(result.e.size, dtype=np.int64)
         for i, (a, b) in enumerate(result.windows):
@@ -51,17 +48,8 @@ class FreedResidual:
         # few windows may go by direction, one and one: blocks of two are taken
         self.first_half: BoolArray = (number // 2) % 2 == 0
         model = result.parametrisation.model
-        at_plant = next((b.unit for b in model.blocks if b.place == "actuator" and b.unit), model.input.unit)
-        self.unit = {"actuator": model.input.unit, "plant": at_plant, "sensor": model.output.unit}
-        plain = replace(result.sim.linear(), u_offset=0.0, y_offset=0.0, linear_hold=False)
-        chain = result.sim.chain
-        force = np.zeros_like(chain.B)
-        force[:, 0] = chain.B[:, 1]
-        gains = np.array([chain.gains[0], chain.gains[1], 0.0, 0.0])
-        forced = replace(chain, B=force, gains=gains, delay_s=0.0)
-        self._ways: dict[Place, Simulator] = {
-            "actuator": plain, "plant": replace(plain, chain=forced, falling=forced)
-        }  # fmt: skip
+        self.unit = {"actuator": model.input.unit, "plant": model.plant_input_unit, "sensor": model.output.unit}
+        self._ways: dict[Place, Simulator] = {"actuator": result.sim.driven_at(0), "plant": result.sim.driven_at(1)}
 
     def freed(self, direction: FloatArray) -> FloatArray:
         """Return a whitened direction, (N,) or (N, q), without what the windows' start states explain."""
@@ -118,7 +106,7 @@ class FreedResidual:
         rate = [np.gradient(s[:, 0], r.t) for s, r in zip(out, data.recordings, strict=True)]
         named: dict[Place, dict[str, list[FloatArray]]] = {
             "plant": plant,
-            "actuator": {"command": command, DIRECTION: [_last_move(u) for u in command]},
+            "actuator": {"command": command, DIRECTION: [last_move(u) for u in command]},
             "sensor": {"reading": [s[:, 0] - sim.y_offset for s in out], "rate of the reading": rate},
         }
         return {
@@ -162,7 +150,7 @@ class FreedResidual:
     def explained(self, error: float, before: float) -> float:
         """Return the share of the held-out residual above the noise that is gone."""
         return float(
-            np.clip((before - error) / max(before - self.floor, self.data.thresholds.term_share * self.floor), 0.0, 1.0)
+            np.clip((before - error) / max(before - self.floor, self.data.thresholds.material * self.floor), 0.0, 1.0)
         )
 
 
@@ -186,8 +174,8 @@ def _smoothed(e: FloatArray, starts: IntArray, stops: IntArray, rows: int) -> Fl
     return value
 
 
-def _last_move(u: FloatArray) -> FloatArray:
-    """Return the sign of the command's last change, 0 before the first."""
+def last_move(u: FloatArray) -> FloatArray:
+    """Return the sign of a signal's last change, 0 before the first."""
     sign = np.sign(np.diff(u, prepend=u[0]))
     last = np.maximum.accumulate(np.where(sign != 0.0, np.arange(u.size), 0))
     return np.asarray(sign[last])

@@ -73,7 +73,7 @@ def rows_of(result: Fit, data: Data) -> SimulatedRows:
     )  # fmt: skip
 
 
-def supported(effects: Sequence[SampleEffect], run: SimulatedRows) -> list[SampleEffect]:
+def select_supported(effects: Sequence[SampleEffect], run: SimulatedRows) -> list[SampleEffect]:
     """Return the effects of single samples that runs of a simulation speak for, with how much they do.
 
     Parameters

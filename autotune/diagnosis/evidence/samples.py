@@ -26,6 +26,9 @@ from autotune.diagnosis.thresholds import IN_USE, Thresholds
 from autotune.models import Parameter
 from autotune.recording import Recording
 
+#: The effect that is looked for in stamps, in the residual's size, and in how innovations go with steps of the command.
+JITTER = "timing.jitter"
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SampleEffect:
@@ -128,7 +131,7 @@ def outliers_in(
     return _outliers(recordings, lone, count / total, float(np.median(heights)), unit)
 
 
-def together(found: Sequence[SampleEffect]) -> SampleEffect:
+def join_outliers(found: Sequence[SampleEffect]) -> SampleEffect:
     """Return outliers that were found one after the other as one effect; the last ones' size, all their shares."""
     last = found[-1]
     share = sum(one.parameters["share"].value for one in found)
@@ -142,7 +145,7 @@ def together(found: Sequence[SampleEffect]) -> SampleEffect:
     )
 
 
-def spared(recordings: Sequence[Recording], effects: Sequence[SampleEffect]) -> list[BoolArray]:
+def unspoiled_rows(recordings: Sequence[Recording], effects: Sequence[SampleEffect]) -> list[BoolArray]:
     """Return the rows whose reading no effect spoils."""
     good = [np.isfinite(r.y) for r in recordings]
     for one in effects:

@@ -9,9 +9,9 @@ from typing import TypeVar
 import numpy as np
 
 from autotune.arrays import BoolArray
-from autotune.diagnosis.evidence.readings import struck
-from autotune.diagnosis.evidence.sample_gain import SimulatedRows, supported
-from autotune.diagnosis.evidence.samples import SampleEffect, inspect, outliers_in, together
+from autotune.diagnosis.evidence.readings import outlying_rows
+from autotune.diagnosis.evidence.sample_gain import SimulatedRows, select_supported
+from autotune.diagnosis.evidence.samples import SampleEffect, inspect, join_outliers, outliers_in
 from autotune.diagnosis.thresholds import Thresholds
 from autotune.recording import Recording
 
@@ -43,10 +43,10 @@ def clear_samples(
     if not any(s.rows for s in seen):
         return seen
     run = retuned_rows(good)
-    return seen if run is None else [s for s in supported(seen, run) if s.speaks > limits.samples_clear]
+    return seen if run is None else [s for s in select_supported(seen, run) if s.speaks > limits.samples_clear]
 
 
-def searched_beside(
+def search_beside(
     search: Callable[[list[SampleEffect]], tuple[T, SimulatedRows]], seen: list[SampleEffect], without: Collection[str]
 ) -> tuple[T, list[SampleEffect]]:
     """Return what a search finds, and what the samples show; searched again without spikes that it leaves alone.
@@ -67,9 +67,9 @@ def searched_beside(
     spikes = outliers_in(run.residuals, run.recordings, known, run.limits)
     if spikes is None or spikes.name in without:
         return found, seen
-    beside = [struck(e, ok, run.limits.spike) for e, ok in zip(run.residuals, known, strict=True)]
+    beside = [outlying_rows(e, ok, run.limits.spike) for e, ok in zip(run.residuals, known, strict=True)]
     spikes = replace(spikes, rows=tuple(a | b for a, b in zip(spikes.rows, beside, strict=True)))
-    confirmed = supported([together([*(one for one in seen if one.name == spikes.name), spikes])], run)
+    confirmed = select_supported([join_outliers([*(one for one in seen if one.name == spikes.name), spikes])], run)
     if not confirmed:
         return found, seen
     seen = [*(one for one in seen if one.name != spikes.name), *confirmed]

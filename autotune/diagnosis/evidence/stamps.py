@@ -12,7 +12,7 @@ from types import MappingProxyType
 
 import numpy as np
 
-from autotune.diagnosis.evidence.samples import SampleEffect
+from autotune.diagnosis.evidence.samples import JITTER, SampleEffect
 from autotune.diagnosis.evidence.stretches import rms
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import RUNAWAY, Fit
@@ -21,9 +21,6 @@ from autotune.diagnosis.thresholds import Thresholds
 from autotune.models import Model, Parameter
 from autotune.recording import Recording
 
-#: The effect that says so.
-JITTER = "timing.jitter"
-
 
 def uneven_share(recording: Recording) -> float:
     """Return the spread of the stamps about even ones, in sample times."""
@@ -31,7 +28,7 @@ def uneven_share(recording: Recording) -> float:
     return float(np.std(off) * (len(recording) - 1) / recording.duration_s)
 
 
-def evened(
+def even_stamps(
     model: Model, recordings: Sequence[Recording], limits: Thresholds
 ) -> tuple[Sequence[Recording], SampleEffect | None]:
     """Return recordings at even times, and the jitter of their stamps, where that predicts far better.

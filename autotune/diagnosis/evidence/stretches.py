@@ -14,7 +14,7 @@ import numpy as np
 
 from autotune.arrays import BoolArray, FloatArray, IntArray
 from autotune.diagnosis.fitting.data import Data
-from autotune.diagnosis.fitting.descent import Iterate, Problem, attempted, eliminate, step_of
+from autotune.diagnosis.fitting.descent import Iterate, Problem, eliminate, step_of, try_point
 from autotune.diagnosis.fitting.fit import Fit
 
 #: Stretches that are left out, one after the other.
@@ -60,7 +60,7 @@ def stretches_in(rows: Sequence[int], firsts: Sequence[IntArray], ends: Sequence
     return labels
 
 
-def held_out_squares(result: Fit, data: Data, tuned: bool = True) -> FloatArray:
+def held_out_squares(result: Fit, data: Data) -> FloatArray:
     """Return the sum of squared errors on every stretch, with numbers fitted to the others.
 
     Parameters
@@ -69,9 +69,6 @@ def held_out_squares(result: Fit, data: Data, tuned: bool = True) -> FloatArray:
         A fit to all rows of the data, whose noise is white.
     data : Data
         What it was fitted to.
-    tuned : bool
-        Whether numbers are fitted to the other stretches; else those of the fit are judged as they are, as a model's
-        nominal ones.
 
     Returns
     -------
@@ -90,8 +87,7 @@ def held_out_squares(result: Fit, data: Data, tuned: bool = True) -> FloatArray:
         [r.u for r in data.driving], [r.y[g] for r, g in zip(data.recordings, data.good, strict=True)]
     )
     start = problem.iterate(result.theta, [x.copy() for x in result.x0])
-    Jx = problem.jacobian(start, np.zeros(result.theta.size, dtype=bool))[1]
-    J = result.jacobian[0] if tuned else np.zeros_like(result.jacobian[0])
+    J, Jx = result.jacobian[0], problem.jacobian(start, np.zeros(result.theta.size, dtype=bool))[1]
     squares = np.zeros(STRETCHES)
     for k in range(STRETCHES):
         out = labels == k
@@ -120,7 +116,7 @@ def _without(
         moved = None
         for share in (1.0, 0.3):
             moves = problem.per_recording(problem.scales * (gain_e + gain_J @ (share * step)))
-            trial = attempted(problem, at.theta + share * step, [x - m for x, m in zip(at.x0, moves, strict=True)])
+            trial = try_point(problem, at.theta + share * step, [x - m for x, m in zip(at.x0, moves, strict=True)])
             if trial is not None and cost(trial) < cost(at):
                 moved = trial
                 break

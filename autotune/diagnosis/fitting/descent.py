@@ -49,11 +49,6 @@ def simulate(
     return result, ends
 
 
-def whiten(signals: list[FloatArray], data: Data) -> FloatArray:
-    """Return the whitened residuals of all recordings, one after the other."""
-    return data.whitened_runs(signals)
-
-
 AnyArray: TypeAlias = NDArray[Any]
 
 
@@ -81,7 +76,7 @@ class Problem:
         """Simulate at a point."""
         sim = self.parametrisation.simulator(theta)
         signals, ends = simulate(sim, x0, self.data)
-        return Iterate(theta, x0, sim, ends, whiten(signals, self.data))
+        return Iterate(theta, x0, sim, ends, self.data.whitened_runs(signals))
 
     def per_recording(self, values: AnyArray) -> list[AnyArray]:
         """Split what is known per window into recordings."""
@@ -115,7 +110,7 @@ class Problem:
             shifted = [x.copy() for x in iterate.x0]
             for x in shifted:
                 x[:, j] += h
-            moved = whiten(simulate(iterate.sim, shifted, self.data)[0], self.data)
+            moved = self.data.whitened_runs(simulate(iterate.sim, shifted, self.data)[0])
             column = (moved - iterate.e) * (self.scales[j] / h)
             Jx[:, j] = column if bounded(column) else 0.0
         return J, Jx
@@ -217,11 +212,11 @@ def descend(
         predicted = cost - problem.cost(left, iterate.theta + step, prior)
         moves = problem.per_recording(problem.scales * (gain_e + gain_J @ step))
         trial = [x - move for x, move in zip(iterate.x0, moves, strict=True)]
-        new = attempted(problem, iterate.theta + step, trial)
+        new = try_point(problem, iterate.theta + step, trial)
         decrease = -np.inf if new is None else cost - problem.cost(new.e, new.theta, prior)
         if new is not None and decrease < 0.6 * predicted:
             # start states follow the step in theta to first order alone: they are put right before it is judged
-            settled = resettled(problem, new, derivatives[1], damping)
+            settled = resettle(problem, new, derivatives[1], damping)
             better = -np.inf if settled is None else cost - problem.cost(settled.e, settled.theta, prior)
             if better > decrease:
                 new, decrease = settled, better
@@ -262,14 +257,14 @@ def step_of(
     return np.asarray(step)
 
 
-def resettled(problem: Problem, iterate: Iterate, Jx: FloatArray, damping: float) -> Iterate | None:
+def resettle(problem: Problem, iterate: Iterate, Jx: FloatArray, damping: float) -> Iterate | None:
     """Return a point with the start states that fit its theta, one linear step from where they are."""
     gain = eliminate(problem, (np.empty((iterate.e.size, 0)), Jx), iterate.e, damping)[2]
     moves = problem.per_recording(problem.scales * gain)
-    return attempted(problem, iterate.theta, [x - move for x, move in zip(iterate.x0, moves, strict=True)])
+    return try_point(problem, iterate.theta, [x - move for x, move in zip(iterate.x0, moves, strict=True)])
 
 
-def continued(problem: Problem, iterate: Iterate) -> Iterate:
+def continue_windows(problem: Problem, iterate: Iterate) -> Iterate:
     """Start every window where the one before ended, where that fits better: a restart for stuck start states."""
     if all(len(x) == 1 for x in iterate.x0):
         return iterate
@@ -277,12 +272,12 @@ def continued(problem: Problem, iterate: Iterate) -> Iterate:
     for i, (x, ends) in enumerate(zip(trial, iterate.ends, strict=True)):
         follows = problem.data.stops[i][:-1] == problem.data.starts[i][1:]
         x[1:][follows] = ends[:-1][follows]
-    new = attempted(problem, iterate.theta, trial)
+    new = try_point(problem, iterate.theta, trial)
     if new is None:
         return iterate
     better = problem.per_recording(problem.chi2(new.e) < 0.9 * problem.chi2(iterate.e) - 2.0)
     trial = [np.where(b[:, None], x, old) for b, x, old in zip(better, trial, iterate.x0, strict=True)]
-    mixed = attempted(problem, iterate.theta, trial)
+    mixed = try_point(problem, iterate.theta, trial)
     return iterate if mixed is None or mixed.e @ mixed.e >= iterate.e @ iterate.e else mixed
 
 
@@ -291,7 +286,7 @@ def bounded(values: FloatArray) -> bool:
     return bool(np.max(np.abs(values), initial=0.0) < 1e15)  # NaN compares false
 
 
-def attempted(problem: Problem, theta: FloatArray, x0: list[FloatArray]) -> Iterate | None:
+def try_point(problem: Problem, theta: FloatArray, x0: list[FloatArray]) -> Iterate | None:
     """Return a trial point, None where the model there is refused or the simulation diverges."""
     try:
         iterate = problem.iterate(theta, x0)

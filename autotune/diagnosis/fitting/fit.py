@@ -22,7 +22,7 @@ from autotune.diagnosis.fitting.descent import (
     Iterate,
     Problem,
     bounded,
-    continued,
+    continue_windows,
     descend,
     eliminate,
     freed_of,
@@ -213,8 +213,8 @@ def fit(
     if not bounded(iterate.e):
         raise IdentificationError("the simulation runs away at the starting point", where="fit")
     derivatives = None
-    near = inherit is not None and float(iterate.e @ iterate.e) < 2.0 * inherit.chi2
-    if inherit is not None and near and inherit.jacobian[1].shape[1] == sim.order:
+    alike = inherit is not None and inherit.jacobian[1].shape[1] == sim.order
+    if inherit is not None and alike and float(iterate.e @ iterate.e) < 2.0 * inherit.chi2:
         derivatives = problem.inherited(point, states, iterate.e, inherit.jacobian)
     return _descended(problem, iterate, derivatives, may, iterations, rounds)
 
@@ -243,18 +243,13 @@ def fit_from(
 
 
 def _descended(
-    problem: Problem,
-    iterate: Iterate,
-    derivatives: Derivatives | None,
-    may: BoolArray,
-    iterations: int,
-    rounds: int,
+    problem: Problem, iterate: Iterate, derivatives: Derivatives | None, may: BoolArray, iterations: int, rounds: int
 ) -> Fit:
     """Return the fit that rounds of descent lead to, start states carried over between them."""
     for _ in range(rounds):
         iterate, derivatives = descend(problem, iterate, derivatives, may, iterations)
         before = iterate.e @ iterate.e
-        iterate = continued(problem, iterate)
+        iterate = continue_windows(problem, iterate)
         if before - iterate.e @ iterate.e < 2.0 + 1e-4 * before:
             break
         derivatives = None

@@ -13,8 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from autotune.arrays import BoolArray, FloatArray
-from autotune.diagnosis.thresholds import Thresholds
 
+#: Correlation from row to row beyond which a first difference cannot tell noise from a slow residual.
+LARGEST_CORRELATION = 0.9
 #: Ratio of the standard deviations that the farthest tenth and the median of differences tell, from which on most of
 #: them are small and some are jumps: normal noise has 1, Laplace's 1.4.
 MOSTLY_SMALL = 2.0
@@ -48,11 +49,7 @@ class Noise:
         return float(self.sd * np.sqrt(response @ response))
 
 
-def noise_from_differences(
-    residuals: Sequence[FloatArray],
-    good: Sequence[BoolArray],
-    largest_correlation: float = Thresholds.largest_correlation,
-) -> Noise:
+def noise_from_differences(residuals: Sequence[FloatArray], good: Sequence[BoolArray]) -> Noise:
     """Estimate the measurement noise as AR(1).
 
     Parameters
@@ -61,8 +58,6 @@ def noise_from_differences(
         y - y_sim per recording, or y itself.
     good : sequence of (N,) bool array
         Rows that count.
-    largest_correlation : float
-        Bound of the correlation: beyond it a first difference cannot tell noise from a slow residual.
 
     Returns
     -------
@@ -90,7 +85,7 @@ def noise_from_differences(
         n += float(use.sum())
     if n == 0.0 or c0 == 0.0:
         return Noise(sd=0.0)
-    rho = float(np.clip(1.0 + 2.0 * c1 / c0, 0.0, largest_correlation))
+    rho = float(np.clip(1.0 + 2.0 * c1 / c0, 0.0, LARGEST_CORRELATION))
     return Noise(sd=float(np.sqrt(c0 / n * (1.0 + rho) / 2.0)), ar=(rho,))
 
 
@@ -104,26 +99,11 @@ def _usual_spread(d: FloatArray) -> float:
     return far if far > MOSTLY_SMALL * usual else usual
 
 
-def autoregressive(residuals: Sequence[FloatArray], good: Sequence[BoolArray], order: int = 2) -> Noise:
-    """Estimate an autoregressive model of a residual that is taken to be noise alone, by Yule and Walker.
-
-    Parameters
-    ----------
-    residuals, good : sequence of (N,) array
-        As in :func:`noise_from_differences`.
-    order : int
-        Number of coefficients.
-
-    Returns
-    -------
-    Noise
-        Innovations and coefficients.
-    """
-    return _yule_walker(_autocovariances(residuals, good, order))
-
-
 def autoregressive_up_to(residuals: Sequence[FloatArray], good: Sequence[BoolArray], orders: int) -> list[Noise]:
-    """Return :func:`autoregressive` for every order from 1 on; the covariances are the same for all."""
+    """Return autoregressive models of a residual that is taken to be noise alone, of every order from 1 on.
+
+    They are Yule and Walker's; residuals and rows that count as in :func:`noise_from_differences`.
+    """
     c = _autocovariances(residuals, good, orders)
     return [_yule_walker(c[: order + 1]) for order in range(1, orders + 1)]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from types import MappingProxyType
 from typing import Literal, TypeAlias
@@ -67,8 +67,6 @@ class Parametrisation:
         What is free.
     centre : (p,) array
         Nominal values in units of the search; also the prior's mean.
-    fixed : mapping
-        Effect parameters that are not searched, by (effect, parameter name).
     own : int
         How many of the effects, the first ones, the nominal model has itself: they are its structure, not a finding.
     """
@@ -76,7 +74,6 @@ class Parametrisation:
     model: Model
     free: tuple[Free, ...]
     centre: FloatArray
-    fixed: MappingProxyType[str, float] = field(default_factory=lambda: MappingProxyType({}))
     own: int = 0
 
     @property
@@ -135,14 +132,10 @@ class Parametrisation:
 
 
 def _set_effects(effects: tuple[Effect, ...], values: dict[tuple[int, int], float]) -> tuple[Effect, ...]:
-    result = []
-    for number, effect in enumerate(effects):
-        parameters = {
-            key: replace(parameter, value=values[number, j]) if (number, j) in values else parameter
-            for j, (key, parameter) in enumerate(effect.parameters.items())
-        }
-        result.append(replace(effect, parameters=MappingProxyType(parameters)))
-    return tuple(result)
+    return tuple(
+        effect.with_values({k: values[i, j] for j, k in enumerate(effect.parameters) if (i, j) in values})
+        for i, effect in enumerate(effects)
+    )
 
 
 @lru_cache(maxsize=64)
@@ -178,7 +171,7 @@ def gain_block(blocks: Sequence[Block]) -> int:
 
 @lru_cache(maxsize=16)
 def chain_parameters(
-    blocks: tuple[Block, ...], input_size: float, sample_time_s: float, prior_spread: float = Thresholds.prior_spread
+    blocks: tuple[Block, ...], input_size: float, sample_time_s: float, prior_spread: float
 ) -> tuple[tuple[Free, ...], tuple[float, ...]]:
     """Return the chain's free numbers and their centres; a search asks for the same ones with every effect it tries.
 

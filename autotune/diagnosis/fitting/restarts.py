@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from types import MappingProxyType
 
 import numpy as np
 
@@ -22,7 +21,7 @@ MOVES, HALVINGS = (0.5, 0.1), 5
 RENEWALS = 3
 
 
-def renewed(result: Fit, data: Data) -> Fit:
+def renew_start_states(result: Fit, data: Data) -> Fit:
     """Return a fit whose start states were all found anew from rest, where that explains more.
 
     Parameters
@@ -50,20 +49,13 @@ def renewed(result: Fit, data: Data) -> Fit:
     return result
 
 
-def realigned(result: Fit, data: Data) -> Fit:
+def realign_effects(result: Fit, data: Data) -> Fit:
     """Return a fit whose effects were moved to where no derivative leads, where that explains more.
 
     Parameters
     ----------
-    result : Fit
-        Where a descent came to rest.
-    data : Data
-        What it was fitted to.
-
-    Returns
-    -------
-    Fit
-        A fit to the same data, of no greater cost; the same one where no effect of its model has such moves.
+    result, data
+        As of :func:`renew_start_states`; the same fit is returned where no effect of its model has such moves.
 
     Notes
     -----
@@ -76,7 +68,7 @@ def realigned(result: Fit, data: Data) -> Fit:
         return result
     number = result.parametrisation.model.effects.index(moved)
     kind, span = kind_of(moved.name), max(float(np.ptp(r.u)) for r in data.driving)
-    at: Values = {key: q.value for key, q in result.model.effects[number].parameters.items()}
+    at: Values = result.model.effects[number].values
     before = best = _moved(result, data, kind, number, at)
     wide, turn = MOVES
     for _ in range(HALVINGS):
@@ -88,7 +80,7 @@ def realigned(result: Fit, data: Data) -> Fit:
     if best is before:
         return result
     again = fit(best.parametrisation, data, best.theta, result.x0, iterations=30, inherit=result)
-    return realigned(again, data) if again.cost < result.cost - data.thresholds.restart_decrease else result
+    return realign_effects(again, data) if again.cost < result.cost - data.thresholds.restart_decrease else result
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -104,9 +96,8 @@ class _Moved:
 def _moved(result: Fit, data: Data, kind: EffectKind, number: int, values: Values) -> _Moved:
     """Return what a fit leaves with an effect's parameters moved."""
     p, theta = result.parametrisation, result.theta.copy()
-    effects = list(p.model.effects)
-    parameters = dict(effects[number].parameters)
-    for key in parameters:
+    effects, held = list(p.model.effects), {}
+    for key in effects[number].parameters:
         q = kind.quantity(key)
         if q is None or key not in values:
             continue
@@ -114,8 +105,8 @@ def _moved(result: Fit, data: Data, kind: EffectKind, number: int, values: Value
             index = [f.name for f in p.free].index(f"{kind.name}.{key}")
             theta[index] = np.log(values[key]) if p.free[index].positive else values[key] / p.free[index].size
         else:
-            parameters[key] = replace(parameters[key], value=values[key])
-    effects[number] = replace(effects[number], parameters=MappingProxyType(parameters))
+            held[key] = values[key]
+    effects[number] = effects[number].with_values(held)
     p = replace(p, model=replace(p.model, effects=tuple(effects)))
     left = result.without_numbers(result.without_states(residual_at(p, data, theta, result.x0)))
     return _Moved(values=values, parametrisation=p, theta=theta, cost=float(left @ left))

@@ -10,9 +10,9 @@ import numpy as np
 from autotune.arrays import BoolArray
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import RUNAWAY, Fit, fit
-from autotune.diagnosis.fitting.noise import Noise, autoregressive, noise_from_differences
+from autotune.diagnosis.fitting.noise import Noise, autoregressive_up_to, noise_from_differences
 from autotune.diagnosis.fitting.parameters import parametrise
-from autotune.diagnosis.fitting.restarts import renewed
+from autotune.diagnosis.fitting.restarts import renew_start_states
 from autotune.diagnosis.fitting.windows import known_from_s, model_lag_s, window_rows
 from autotune.diagnosis.thresholds import IN_USE, Thresholds
 from autotune.models import Model
@@ -22,14 +22,14 @@ from autotune.recording import Recording
 BLOCKS = 24
 
 
-def at_nominal(base: Fit, data: Data, iterations: int = 10) -> Fit:
+def at_nominal(base: Fit, data: Data) -> Fit:
     """Fit the start states alone at a retuned model's nominal numbers.
 
     Numbers that run away have no error that could be told: the retuned model stands for them.
     """
     held = np.zeros(base.theta.size, dtype=bool)
     try:
-        return fit(base.parametrisation, data, x0=base.x0, free=held, iterations=iterations)
+        return fit(base.parametrisation, data, x0=base.x0, free=held)
     except RUNAWAY:
         return base
 
@@ -59,8 +59,7 @@ def prepare(
         Data with windows and noise, and the fit. Of long recordings windows are left out evenly.
     """
     length = thresholds.lags_per_window * model_lag_s(model)
-    largest = thresholds.largest_correlation
-    noise = floored(noise_from_differences([r.y for r in recordings], good, largest), recordings)
+    noise = floor_noise(noise_from_differences([r.y for r in recordings], good), recordings)
     windows = [window_rows(r, length, known_from_s(model, r, thresholds), thresholds) for r in recordings]
     data = Data(
         recordings=tuple(recordings),
@@ -75,10 +74,10 @@ def prepare(
     result = fit(p, data)
     for _ in range(2):
         coarse = reduced_chi2(result, data) > thresholds.coarse
-        noise = noise_from_differences(result.residuals, data.good, largest)
+        noise = noise_from_differences(result.residuals, data.good)
         if coarse:
             noise = Noise(sd=float(np.sqrt(np.mean(np.concatenate(result.residuals) ** 2))))
-        data = replace(data, noise=floored(noise, recordings))
+        data = replace(data, noise=floor_noise(noise, recordings))
         result = fit(p, data, result.theta, result.x0, iterations=20)
     return data, _straightened(result, data) if far_from_prior(result, thresholds.far_from_prior) else result
 
@@ -86,15 +85,14 @@ def prepare(
 def _straightened(result: Fit, data: Data) -> Fit:
     """Free a chain far from its prior of start states that stayed behind while its numbers were wrong."""
     try:
-        return renewed(result, data)
+        return renew_start_states(result, data)
     except RUNAWAY:
         return result
 
 
 def under_noise(result: Fit, data: Data) -> Data:
     """Return data with the noise that the row-to-row jitter of a fit's residual shows."""
-    noise = noise_from_differences(result.residuals, data.good, data.thresholds.largest_correlation)
-    return replace(data, noise=floored(noise, data.recordings))
+    return replace(data, noise=floor_noise(noise_from_differences(result.residuals, data.good), data.recordings))
 
 
 def far_from_prior(result: Fit, sds: float) -> bool:
@@ -103,7 +101,7 @@ def far_from_prior(result: Fit, sds: float) -> bool:
     return bool(np.max(away, initial=0.0) > sds)
 
 
-def floored(noise: Noise, recordings: Sequence[Recording]) -> Noise:
+def floor_noise(noise: Noise, recordings: Sequence[Recording]) -> Noise:
     """Return the noise, at least a millionth of the signal's spread: recordings without noise must not divide by 0."""
     spread = max(float(np.nanstd(r.y)) for r in recordings)
     least = 1e-6 * spread or 1e-12
@@ -119,7 +117,7 @@ def reduced_chi2(result: Fit, data: Data) -> float:
 
 def whiteness(result: Fit, data: Data) -> float:
     """Return the residual's slow power in units of what noise has, after an AR(2) has taken its share."""
-    noise = floored(autoregressive(result.residuals, data.good), data.recordings)
+    noise = floor_noise(autoregressive_up_to(result.residuals, data.good, 2)[-1], data.recordings)
     slow = expected = 0.0
     whitened = replace(data, noise=noise).whitened(list(result.residuals))
     for e, starts, stops in zip(whitened, data.starts, data.stops, strict=True):

@@ -68,7 +68,7 @@ def diagnose_routine(
     answer, seen = setpoint_answer(operation, limits.badly_damped), _oscillation(operation)
     found = RoutineDiagnosis(
         verdict=_verdict(valves, seen, answer, limits),
-        kinds_apart=min(valves.sticks, 1.0 - valves.sticks) < limits.kinds_apart,
+        kinds_apart=min(valves.sticks, 1.0 - valves.sticks) < limits.unlikely,
         valves=valves, oscillation=seen, answer=answer, sentences=(), following="", operation=operation,
     )  # fmt: skip
     return replace(found, sentences=sentences.said(found, limits), following=sentences.following(found))
@@ -97,7 +97,7 @@ def _verdict(
     clear = valves.chance <= limits.chance and valves.decrease > limits.least_decrease
     if clear and valves.reversals >= limits.least_reversals:
         return "stiction" if valves.valve.J > 0.0 else "backlash"
-    if answer is not None and answer.explained > limits.least_answer:
+    if answer is not None and answer.explained > limits.least_share:
         moved = answer.ratios[np.abs(answer.ratios) > 1e-9]  # elsewhere the set-point says nothing
         damped = moved.size > 3 and chance_of(moved) < limits.chance
         if damped and float(np.max(answer.dampings)) <= limits.badly_damped:
@@ -105,5 +105,5 @@ def _verdict(
     follows = valves.decrease <= limits.least_decrease or valves.chance > limits.unlikely
     if seen.phase_kept > limits.least_phase and seen.periods >= limits.least_periods and follows:
         return "outside_oscillation"
-    oscillates = seen.regularity > limits.regular and seen.share > limits.oscillating
+    oscillates = seen.regularity > limits.regular and seen.share > limits.least_share
     return "abstain" if oscillates else "none"

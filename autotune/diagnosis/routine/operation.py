@@ -63,11 +63,6 @@ class Operation:
         """How many stretches there are."""
         return int(self.stretch_of[-1]) + 1
 
-    @property
-    def firsts(self) -> IntArray:
-        """First row of the recording of every window, (W,) array."""
-        return self.starts[np.searchsorted(self.starts, self.windows[:, 0], side="right") - 1]
-
     def rows_of(self, recording: int) -> slice:
         """Return the rows of a recording."""
         ends = np.append(self.starts[1:], self.u.size)
@@ -186,12 +181,9 @@ def _period(us: Sequence[FloatArray], ys: Sequence[FloatArray], followed: bool) 
     u, y = us[longest], ys[longest]
     y = np.where(np.isfinite(y), y, np.nanmean(y))
     n = u.size
-    trend = np.vander(np.linspace(-1.0, 1.0, n), 3)
-    taper = np.hanning(n)
     crossed = np.ones(4 * n // 2 + 1)
     for x in (u, y):
-        free = x - trend @ np.linalg.lstsq(trend, x, rcond=None)[0]
-        crossed = crossed * np.abs(np.fft.rfft(taper * free, 4 * n))
+        crossed = crossed * np.abs(np.fft.rfft(np.hanning(n) * without_trend(x), 4 * n))
     if followed:
         crossed = crossed * np.arange(crossed.size) ** 2
     least = 4 * 3  # at least three periods in the record
@@ -203,6 +195,12 @@ def _period(us: Sequence[FloatArray], ys: Sequence[FloatArray], followed: bool) 
         before, top, after = np.log(np.maximum(around, 1e-300))
         return float(4 * n / (peak + 0.5 * (after - before) / max(2.0 * top - before - after, 1e-12)))
     return float(4 * n / peak)
+
+
+def without_trend(x: FloatArray) -> FloatArray:
+    """Return a signal (N,) without the parabola that fits it best."""
+    trend = np.vander(np.linspace(-1.0, 1.0, x.size), 3)
+    return np.asarray(x - trend @ np.linalg.lstsq(trend, x, rcond=None)[0])
 
 
 def _windows(sizes: Sequence[int], period: float, limits: RoutineThresholds) -> tuple[IntArray, IntArray]:

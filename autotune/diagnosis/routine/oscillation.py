@@ -20,7 +20,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 from autotune.arrays import FloatArray
-from autotune.diagnosis.routine.operation import Operation
+from autotune.diagnosis.routine.operation import Operation, without_trend
 
 _CROSSINGS = 10
 #: Damping ratios that are tried, and periods of a loop's answer: the shortest [rows], and how many up to half a record.
@@ -35,9 +35,7 @@ def regularity(x: FloatArray) -> float:
     autocovariance; 0 where fewer than five crossings lie in the first half of the lags.
     """
     n = x.size
-    trend = np.vander(np.linspace(-1.0, 1.0, n), 3)
-    free = x - trend @ np.linalg.lstsq(trend, x, rcond=None)[0]
-    covariance = np.fft.irfft(np.abs(np.fft.rfft(free, 2 * n)) ** 2)[: n // 2]
+    covariance = np.fft.irfft(np.abs(np.fft.rfft(without_trend(x), 2 * n)) ** 2)[: n // 2]
     crossings = np.flatnonzero(np.diff(np.signbit(covariance)))[: _CROSSINGS + 1]
     if crossings.size < 5:
         return 0.0
@@ -53,8 +51,7 @@ def line_share(at: Operation) -> float:
     within, total = 0.0, 0.0
     for number in range(at.starts.size):
         y = _filled(at.y[at.rows_of(number)])
-        trend = np.vander(np.linspace(-1.0, 1.0, y.size), 3)
-        power = np.abs(np.fft.rfft(np.hanning(y.size) * (y - trend @ np.linalg.lstsq(trend, y, rcond=None)[0]))) ** 2
+        power = np.abs(np.fft.rfft(np.hanning(y.size) * without_trend(y))) ** 2
         frequency = np.arange(power.size) * at.period_rows / y.size
         near = np.abs(frequency - 1.0) < np.maximum(0.125, 2.0 * at.period_rows / y.size)
         within += float(power[near].sum())
@@ -86,7 +83,7 @@ def phase_kept(at: Operation) -> tuple[float, float]:
     for share in shares[shares > 0.5]:
         angle = 2.0 * np.pi * rows / (at.period_rows / share)
         tables.append(np.column_stack([np.cos(angle), np.sin(angle)]))
-    free = [_detrended(column, inside, part.start) for column in (y[rows], *(c for table in tables for c in table.T))]
+    free = [_detrended(column, inside) for column in (y[rows], *(c for table in tables for c in table.T))]
     target, columns = free[0], [np.column_stack(free[1 + 2 * i : 3 + 2 * i]) for i in range(len(tables))]
     wrong = 0.0
     for number in np.unique(stretch):
@@ -98,7 +95,7 @@ def phase_kept(at: Operation) -> tuple[float, float]:
     return 1.0 - wrong / max(float(target @ target), 1e-300), n / at.period_rows
 
 
-def _detrended(x: FloatArray, inside: list[tuple[FloatArray, int]], start: int) -> FloatArray:
+def _detrended(x: FloatArray, inside: list[tuple[FloatArray, int]]) -> FloatArray:
     """Return rows of windows, each without its mean and slope."""
     left, first = np.empty_like(x), 0
     for (begin, end), _ in inside:
@@ -155,26 +152,27 @@ def setpoint_answer(at: Operation, badly_damped: float) -> SetpointAnswer | None
     shapes = [(zeta, float(p)) for zeta in DAMPINGS for p in np.geomspace(_SHORTEST, longest, _PERIODS)]
     moments = np.stack([_moments(at, zeta, period) for zeta, period in shapes])  # (G, M, 5, 5)
     damped = np.array([zeta > 2.0 * badly_damped for zeta, _ in shapes])
-    size, stretches = 4, moments.shape[1]
+    stretches = moments.shape[1]
     ratios, chosen, wrong, total = np.empty(stretches), np.empty(stretches), 0.0, 0.0
     for number in range(stretches):
-        kept = moments.sum(1) - moments[:, number]
-        fits = np.linalg.solve(kept[:, :size, :size] + 1e-9 * np.eye(size) * kept[:, size, size, None, None],
-                               kept[:, :size, size, None])[..., 0]  # fmt: skip
-        errors = kept[:, size, size] - np.einsum("gi,gi->g", fits, kept[:, :size, size])
+        fits, errors = _fits(moments.sum(1) - moments[:, number])
         best, calm = int(np.argmin(errors)), int(np.argmin(np.where(damped, errors, np.inf)))
         left = [_error(moments[i, number], fits[i]) for i in (best, calm)]
         ratios[number] = math.log(max(left[1], 1e-300) / max(left[0], 1e-300))
         chosen[number] = shapes[best][0]
-        wrong, total = wrong + left[0], total + moments[best, number, size, size]
-    whole = moments.sum(1)
-    fits = np.linalg.solve(whole[:, :size, :size] + 1e-9 * np.eye(size) * whole[:, size, size, None, None],
-                           whole[:, :size, size, None])[..., 0]  # fmt: skip
-    best = int(np.argmin(whole[:, size, size] - np.einsum("gi,gi->g", fits, whole[:, :size, size])))
+        wrong, total = wrong + left[0], total + moments[best, number, -1, -1]
+    best = int(np.argmin(_fits(moments.sum(1))[1]))
     return SetpointAnswer(
         damping=shapes[best][0], period_s=shapes[best][1] * at.dt_s, explained=1.0 - wrong / max(total, 1e-300),
         ratios=ratios, dampings=chosen,
     )  # fmt: skip
+
+
+def _fits(moments: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return for every shape the coefficients that fit y best, (G, 4), and the squared error left, (G,)."""
+    own, y, total = moments[:, :-1, :-1], moments[:, :-1, -1], moments[:, -1, -1]
+    fits = np.linalg.solve(own + 1e-9 * np.eye(own.shape[1]) * total[:, None, None], y[..., None])[..., 0]
+    return np.asarray(fits, dtype=np.float64), np.asarray(total - np.einsum("gi,gi->g", fits, y))
 
 
 def _error(moments: FloatArray, fit: FloatArray) -> float:

@@ -5,9 +5,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
-from autotune.diagnosis.thresholds import Origin, known
+from autotune.diagnosis.thresholds import known
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,26 +29,15 @@ class RoutineThresholds:
     order: int = known(8, "rows", "of the past that a prediction sees: a third of a period", "convention")
     chance: float = known(0.005, "probability", "that the best faulty valve gains as much in the same loop with a linear one", "chance")
     least_decrease: float = known(0.2, "ln of squared error", "that predictions by the valve's position must bring: 18 % less", "counted")
-    kinds_apart: float = known(0.05, "of the resamplings", "up to which the other kind of fault may win before sticking and play are told apart", "convention")
     least_reversals: int = known(6, "reversals", "of the best faulty valve, before its fault is named: what has not turned has shown nothing of its band", "convention")
     least_band: float = known(0.1, "of u's range", "the narrowest band of a valve that is looked for; narrower ones act as dead time", "counted")
-    unlikely: float = known(0.05, "probability", "of chance from which on a faulty valve is no better than a linear one, before an oscillation is said to come from outside", "convention")
+    unlikely: float = known(0.05, "probability", "up to which what is not said may be true: that the other kind of fault wins in a resampling where sticking and play are told apart, or that chance made a faulty valve better than a linear one", "convention")
     resamplings: int = known(399, "resamplings", "of the linear loop's errors, for the chance, and of the half cycles, for the band's interval", "cost")
     # an oscillation
     regular: float = known(1.0, "1", "regularity from which on a signal oscillates (Thornhill et al. 2003)", "convention")
-    oscillating: float = known(0.3, "of y's variance", "in one line, from which on an oscillation is worth a word", "convention")
+    least_share: float = known(0.3, "of y's variance", "in one line, or on stretches left out predicted from the set-point, before it is read", "convention")
     least_phase: float = known(0.8, "of y's variance", "on stretches left out that one sine predicts, before it is called persistent", "counted")
     least_periods: float = known(20.0, "periods", "through which a phase must last: a ringing loop of damping 0.01 has forgotten it by then", "convention")
     # answers to the set-point
     badly_damped: float = known(0.1, "1", "damping ratio up to which a loop is tightly tuned: the overshoot of a step is 73 %", "convention")
-    least_answer: float = known(0.3, "of y's variance", "on stretches left out that the set-point predicts, before its answer is read", "convention")
     # fmt: on
-
-
-def table(thresholds: RoutineThresholds | None = None) -> tuple[tuple[str, float, str, str, Origin], ...]:
-    """Return name, value, unit, meaning and origin of every threshold."""
-    used = thresholds or RoutineThresholds()
-    return tuple(
-        (f.name, getattr(used, f.name), f.metadata["unit"], f.metadata["meaning"], f.metadata["origin"])
-        for f in fields(used)
-    )

@@ -18,7 +18,7 @@ from autotune.diagnosis.fitting.long_windows import spread_of
 from autotune.diagnosis.fitting.parameters import Parametrisation
 from autotune.diagnosis.selection.hypothesis import hypothesis, is_stand_in
 from autotune.diagnosis.selection.judged_chain import JudgedChain
-from autotune.diagnosis.selection.refits import timed
+from autotune.diagnosis.selection.refits import move_time_of_change
 from autotune.diagnosis.thresholds import Thresholds
 from autotune.effects.base import EffectKind
 from autotune.models import Effect
@@ -43,17 +43,17 @@ class Bench:
         In short windows.
     odds : tuple of (EffectKind, float)
         What may be missing, with its prior odds.
-    lasting : tuple of Effect
-        What long direct searches found beside the retuned model.
     pool : Executor
         Where simulations run.
+    lasting : tuple of Effect
+        What long direct searches found beside the retuned model.
     """
 
     cuts: tuple[Data, ...]
     few: Data
     odds: tuple[tuple[EffectKind, float], ...]
-    lasting: tuple[Effect, ...]
     pool: Executor
+    lasting: tuple[Effect, ...] = ()
 
     @property
     def long(self) -> Data:
@@ -134,7 +134,7 @@ class Bench:
         try:
             if bench is not self:
                 closer = fit(result.parametrisation, bench.long, result.theta, result.x0, iterations=STEPS)
-                result = timed(closer, bench.long)
+                result = move_time_of_change(closer, bench.long)
             return bench._judged(result, log_odds)
         except RUNAWAY:
             return None

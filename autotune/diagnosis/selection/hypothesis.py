@@ -49,7 +49,7 @@ def penalised(h: Hypothesis) -> float:
     return h.penalised_chi2
 
 
-def merged(found: Sequence[Hypothesis]) -> list[Hypothesis]:
+def best_of_each(found: Sequence[Hypothesis]) -> list[Hypothesis]:
     """Return the better fit of every combination of effects, best first."""
     best: dict[frozenset[str], Hypothesis] = {}
     for h in found:
@@ -68,22 +68,22 @@ def is_stand_in(h: Hypothesis, data: Data) -> bool:
     positions = np.concatenate([signals[:, 2] for signals in h.fit.signals])
     travelled = float(np.nanmax(positions) - np.nanmin(positions))
     for effect, kind in able:
-        values = {key: q.value for key, q in effect.parameters.items()}
         fitted = Fitted(
-            values=values, travelled=travelled, noise_sd=data.noise.total_sd, mechanical=h.fit.sim.chain.is_mechanical
-        )
+            values=effect.values, travelled=travelled, noise_sd=data.noise.total_sd,
+            mechanical=h.fit.sim.chain.is_mechanical,
+        )  # fmt: skip
         if kind.stand_in is not None and kind.stand_in(fitted):
             return True
     return False
 
 
-def contradicted(h: Hypothesis, data: Data) -> frozenset[str]:
+def contradicted_effects(h: Hypothesis, data: Data) -> frozenset[str]:
     """Return its effects that would hold readings still where these scatter on.
 
     Notes
     -----
     Squared differences of neighbouring readings where the simulated one stands still are compared with those of the
-    residual elsewhere; the share must be beyond ``most_scatter`` by two standard deviations. A limit in front of most
+    residual elsewhere; the share must be beyond ``majority`` by two standard deviations. A limit in front of most
     of the noise (a transmitter at its end, read through a noisy line) looks the same: ask only where a rig's noise is
     known to be in front of it, or where model error rules and a limit may stand for what it is not.
     """
@@ -100,4 +100,4 @@ def contradicted(h: Hypothesis, data: Data) -> frozenset[str]:
     if not at.size or not elsewhere.size:
         return frozenset()
     surely = (1.0 - 2.0 * np.sqrt(2.0 / at.size)) * np.mean(at)
-    return able if surely > data.thresholds.most_scatter * np.mean(elsewhere) else frozenset()
+    return able if surely > data.thresholds.majority * np.mean(elsewhere) else frozenset()

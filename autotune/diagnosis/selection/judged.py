@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from statistics import fmean
 from typing import TypeVar
@@ -128,7 +128,7 @@ def worst(one: Judged, others: Sequence[Judged]) -> float:
     return max((one.behind(other) for other in others if other is not one), default=0.0)
 
 
-def ranked(found: Sequence[_J]) -> list[_J]:
+def rank(found: Sequence[_J]) -> list[_J]:
     """Return hypotheses by how far the best rival of each is ahead of it: the first is beaten by none, or by least."""
     return sorted(found, key=lambda j: worst(j, found))
 
@@ -136,9 +136,33 @@ def ranked(found: Sequence[_J]) -> list[_J]:
 def leading(found: Sequence[_J], count: int) -> list[_J]:
     """Return the first of a ranking, the best one of each set of effects."""
     best: dict[frozenset[object], _J] = {}
-    for one in ranked(found):
+    for one in rank(found):
         best.setdefault(one.identity, one)
     return list(best.values())[:count]
+
+
+def add_smaller(
+    found: Sequence[_J], count: int, rounds: int, smaller: Callable[[Sequence[_J], Sequence[_J]], list[_J]]
+) -> list[_J]:
+    """Return hypotheses with those that the leading ones become when an effect is left out, and again of these.
+
+    Parameters
+    ----------
+    found : sequence of Judged
+        What a search came to, effect by effect: one may have stood for another, or only led out of a local minimum.
+    count, rounds : int
+        How many lead, and how often they are gone over at most.
+    smaller : callable
+        Given hypotheses of several effects and all that are known, returns what they become.
+    """
+    result, done = list(found), set()
+    for _ in range(rounds):
+        fresh = [one for one in leading(result, count) if len(one.names) > 1 and id(one) not in done]
+        if not fresh:
+            break
+        done |= {id(one) for one in fresh}
+        result += smaller(fresh, result)
+    return result
 
 
 def built_on(found: Sequence[_J], count: int) -> list[_J]:
@@ -168,7 +192,7 @@ def of_likely(found: Sequence[_J], likely: Collection[str]) -> _J:
     """
     able = [one for one in found if set(one.names) <= set(likely)]
     most = max(len({called(name) for name in one.names}) for one in able)
-    return ranked([one for one in able if len({called(name) for name in one.names}) == most])[0]
+    return rank([one for one in able if len({called(name) for name in one.names}) == most])[0]
 
 
 def probabilities(found: Sequence[_J], best: _J, unknown_odds: float) -> tuple[Candidate, ...]:

@@ -20,7 +20,7 @@ from autotune.diagnosis.fitting.retuning import reduced_chi2, under_noise
 from autotune.diagnosis.fitting.spreading import spread_out
 from autotune.diagnosis.selection.hypothesis import Hypothesis
 from autotune.diagnosis.selection.judged import Judged, probabilities
-from autotune.diagnosis.selection.prediction import extended
+from autotune.diagnosis.selection.prediction import extend
 from autotune.diagnosis.selection.probability import Candidate
 from autotune.diagnosis.selection.searched import Search
 from autotune.diagnosis.thresholds import Thresholds
@@ -92,7 +92,7 @@ class JudgedChain(Judged):
         """Return the effects that would change what is read by less than one row's residual does."""
         names = set()
         for effect in effects:
-            p, theta, states = extended(self.fit, effect, self.data)
+            p, theta, states = extend(self.fit, effect, self.data)
             try:
                 change = residual_at(p, self.data, theta, states) - self.fit.e
             except RUNAWAY:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from types import MappingProxyType
 
 import numpy as np
 
@@ -81,9 +80,8 @@ def signal_sizes(base: Fit, data: Data) -> SignalSizes:
 
 def units_of(kind: EffectKind, model: Model) -> list[str]:
     """Return the units of an effect's parameters in a model."""
-    units = {"u": model.input.unit, "y": model.output.unit}
-    plant_in = next((b.unit for b in model.blocks if b.place == "actuator" and b.unit), units["u"])
-    units |= {"f": plant_in, "v": f"{units['y']}/s"}
+    y = model.output.unit
+    units = {"u": model.input.unit, "y": y, "f": model.plant_input_unit, "v": f"{y}/s"}
     return [q.unit.format(**units) for q in kind.parameters]
 
 
@@ -93,7 +91,7 @@ def starting_effects(kind: EffectKind, base: Fit, sizes: SignalSizes) -> list[Ef
     return [effect_with(kind.name, values, units) for values in kind.starts(sizes)]
 
 
-def extended(base: Fit, effect: Effect, data: Data) -> tuple[Parametrisation, FloatArray, tuple[FloatArray, ...]]:
+def extend(base: Fit, effect: Effect, data: Data) -> tuple[Parametrisation, FloatArray, tuple[FloatArray, ...]]:
     """Return parametrisation, starting point and start states of a fit with one more effect."""
     old = base.parametrisation
     effects = (*base.model.effects, effect)
@@ -116,8 +114,7 @@ def carried_states(base: Fit, effect: Effect, data: Data) -> tuple[FloatArray, .
     part = kind_of(effect.name).linear
     if part is None or part.start is None or (part.unless_lagged and base.sim.chain.has_actuator_lag):
         return base.x0
-    values = {key: q.value for key, q in effect.parameters.items()}
-    states = []
+    values, states = effect.values, []
     for r, starts, x in zip(data.driving, data.first_rows, base.x0, strict=True):
         u, y = r.u[np.maximum(starts - 1, 0)] - base.sim.u_offset, x @ base.sim.chain.taps[3]
         added = part.start(u, y, values)
@@ -149,14 +146,14 @@ def direction(base: Fit, effect: Effect, data: Data) -> FloatArray:
     AutotuneError, OverflowError, LinAlgError
         The simulation runs away with the effect.
     """
-    p, theta, states = extended(base, effect, data)
+    p, theta, states = extend(base, effect, data)
     moved = residual_at(p, data, theta, states) - base.e
     if not bounded(moved):
         raise IdentificationError("the simulation runs away", where=effect.name)
     return base.without_states(moved)
 
 
-def distinct(group: Sequence[Prediction]) -> list[Effect]:
+def distinct_starts(group: Sequence[Prediction]) -> list[Effect]:
     """Return the starting points of one effect that differ once they have the size that is predicted."""
     kept: list[Effect] = []
     for p in group:
@@ -200,7 +197,4 @@ def _scaled(effect: Effect, a: float, most: float = np.inf, least: float = 0.05)
         return effect
     factor = float(np.sign(a) * np.clip(abs(a), least, most))
     amplitudes = kind_of(effect.name).amplitudes
-    parameters = {
-        key: replace(q, value=q.value * factor) if key in amplitudes else q for key, q in effect.parameters.items()
-    }
-    return replace(effect, parameters=MappingProxyType(parameters))
+    return effect.with_values({key: value * factor for key, value in effect.values.items() if key in amplitudes})

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from types import MappingProxyType
 
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import RUNAWAY, Fit, fit
@@ -15,7 +14,7 @@ from autotune.effects import kind_of
 LEAST_GAIN, LEAST_SHARE = 1.0, 0.02
 
 
-def without(result: Fit, index: int, data: Data) -> Fit | None:
+def fit_without(result: Fit, index: int, data: Data) -> Fit | None:
     """Fit again without one of the effects that a fit adds; nothing where the simulation runs away without it."""
     p = result.parametrisation
     index += p.own  # the nominal model's own effects stay
@@ -33,7 +32,7 @@ def without(result: Fit, index: int, data: Data) -> Fit | None:
         return None
 
 
-def timed(result: Fit, data: Data) -> Fit:
+def move_time_of_change(result: Fit, data: Data) -> Fit:
     """Move a time of change where a fit of everything else is better; a first-order look may take one far from it."""
     effects = result.parametrisation.model.effects
     found = [(i, q.name) for i, e in enumerate(effects) for q in kind_of(e.name).parameters if q.is_time_of_change]
@@ -55,9 +54,7 @@ def _moved(result: Fit, number: int, key: str, shift: float, data: Data) -> Fit 
     """Fit again for a few steps with a time of change moved; nothing where the simulation runs away."""
     p = result.parametrisation
     effects = list(p.model.effects)
-    time = effects[number].parameters[key]
-    moved = {**effects[number].parameters, key: replace(time, value=time.value + shift)}
-    effects[number] = replace(effects[number], parameters=MappingProxyType(moved))
+    effects[number] = effects[number].with_values({key: effects[number].values[key] + shift})
     try:
         there = replace(p, model=replace(p.model, effects=tuple(effects)))
         return fit(there, data, result.theta, result.x0, iterations=4, rounds=1, inherit=result)

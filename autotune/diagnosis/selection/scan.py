@@ -185,7 +185,7 @@ class FitScan:
         return result
 
 
-def searched(name: str, base: Fit, data: Data, pool: Executor) -> list[Effect]:
+def search_starts(name: str, base: Fit, data: Data, pool: Executor) -> list[Effect]:
     """Return the starting points that an effect's direct search finds on top of a base; none where it has no search."""
     kind = kind_of(name)
     if kind.search is None:

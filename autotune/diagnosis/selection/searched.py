@@ -13,7 +13,7 @@ from autotune.diagnosis.evidence.missing_law import MissingLaw, law_of
 from autotune.diagnosis.evidence.unseen_run import UnseenRun, unseen_run
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import Fit
-from autotune.diagnosis.selection.hypothesis import Hypothesis, merged, penalised
+from autotune.diagnosis.selection.hypothesis import Hypothesis, best_of_each, penalised
 from autotune.diagnosis.selection.retuned_numbers import RetunedNumber, retuned_numbers
 from autotune.diagnosis.thresholds import Thresholds
 from autotune.effects import kind_of
@@ -113,7 +113,7 @@ class Search:
     def hypotheses(self) -> list[tuple[str, float]]:
         """Return combinations of effects with the decrease of chi-square, numbers paid for, the best first."""
         base = penalised(self.retuned)
-        return [(" + ".join(h.names), base - penalised(h)) for h in merged(self.others)]
+        return [(" + ".join(h.names), base - penalised(h)) for h in best_of_each(self.others)]
 
     def laws(self) -> tuple[MissingLaw, ...]:
         """Return the laws of the chosen effects over their signals, with the data in bins."""

@@ -26,6 +26,8 @@ PASTS = (0.02, 0.05, 0.1, 0.25, 0.5, 1.0, 2.0, 4.0)
 CHOICES, FIRST_CHOICE = tuple((past, bias) for past in PASTS for bias in (False, True)), (0.5, False)
 #: Rows that a state estimate needs at least, and of which it takes a third first, per state.
 LEAST_PAST, ROWS_PER_STATE = 6, 6
+#: Gauss-Newton steps of a state estimate.
+STEPS = 4
 #: How fast old forecasts lose their say in which past is used, per window.
 MEMORY = 0.9
 #: Rows from which forecasts are tried, as shares of a window; more of them in the first.
@@ -58,7 +60,7 @@ class _Estimator:
         out, _ = sim.run(self.recording, z[:n] * self.scales, window, sample_time_s=self.dt_s, signals=1)
         return np.asarray(out[first:last, 0])
 
-    def estimate(self, first: int, last: int, bias: bool, iterations: int = 4) -> FloatArray:
+    def estimate(self, first: int, last: int, bias: bool) -> FloatArray:
         """Return the state at row first that fits rows first to last best (and a constant force, if asked).
 
         Rows are taken in growing numbers: what swings has one minimum near it for few rows, many for all.
@@ -71,10 +73,10 @@ class _Estimator:
             counts.append(counts[-1] // 3)
         grown = z
         for count in counts[::-1]:
-            grown = self._settled(first, first + count, grown, iterations)
+            grown = self._settled(first, first + count, grown, STEPS)
         if len(counts) == 1 or self.sim.is_linear:
             return grown
-        direct = self._settled(first, last, z, iterations + 2)
+        direct = self._settled(first, last, z, STEPS + 2)
         return min(grown, direct, key=lambda s: self._error(first, last, s))
 
     def _settled(self, first: int, last: int, z: FloatArray, iterations: int) -> FloatArray:

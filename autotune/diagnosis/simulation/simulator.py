@@ -96,6 +96,16 @@ class Simulator:
         """Return the chain alone."""
         return replace(self, kinds=(), acts=np.zeros_like(self.acts), falling=self.chain)
 
+    def driven_at(self, column: int) -> Simulator:
+        """Return the chain alone, in deviations, driven where a column of its ``B`` enters: 0 is the command's."""
+        plain = replace(self.linear(), u_offset=0.0, y_offset=0.0, linear_hold=False)
+        if column == 0:
+            return plain
+        B = np.zeros_like(self.chain.B)
+        B[:, 0] = self.chain.B[:, column]
+        chain = replace(self.chain, B=B, gains=np.array([*self.chain.gains[:2], 0.0, 0.0]), delay_s=0.0)
+        return replace(plain, chain=chain, falling=chain)
+
     def without_steps(self) -> Simulator:
         """Return the simulator without what makes steps of the readings."""
         kept = tuple(kind for kind in self.kinds if not kind.steps)

@@ -10,7 +10,7 @@ from typing import TypeAlias
 import numpy as np
 import pytest
 
-from autotune.diagnosis.agreement import LEFT_OUT, Begins, Part, agreement, parts_of
+from autotune.diagnosis.agreement import LEFT_OUT, Begins, agreement, parts_of, tells
 from autotune.recording import Recording
 
 Said: TypeAlias = Mapping[str, float]
@@ -28,9 +28,9 @@ def shares(whole: Said, parts: Sequence[Said], begins: Begins = MappingProxyType
 
 def test_each_part_leaves_a_fifth_of_every_recording_out_at_one_of_its_ends() -> None:
     first, last = parts_of((recorded(1000), recorded(500)), 100)
-    assert [len(r) for r in first.recordings] == [len(r) for r in last.recordings] == [800, 400]
-    assert first.recordings[0].y[0] == LEFT_OUT * 1000
-    assert last.recordings[0].y[-1] == (1.0 - LEFT_OUT) * 1000 - 1
+    assert [len(r) for r in first] == [len(r) for r in last] == [800, 400]
+    assert first[0].y[0] == LEFT_OUT * 1000
+    assert last[0].y[-1] == (1.0 - LEFT_OUT) * 1000 - 1
     assert parts_of((recorded(1000), recorded(120)), 100) == ()
 
 
@@ -47,7 +47,7 @@ def test_a_part_without_the_moment_at_which_an_effect_begins_is_not_asked() -> N
     # 10 s lie within the first fifth
     assert shares({STEP: 0.9}, both, {STEP: [(0, 10.0)]}) == {STEP: pytest.approx(0.9)}
     assert shares({STEP: 0.9}, both, {STEP: [(0, 50.0)]}) == {}
-    assert Part(recordings=(recorded(1000),)).tells([])
+    assert tells((recorded(1000),), [])
 
 
 def test_nothing_is_diagnosed_again_where_nothing_was_found() -> None:

@@ -240,3 +240,12 @@ def test_hypotheses_of_an_effect_add_up_to_the_probability_that_is_stated_for_it
     for name, wanted in ((NAMES[0], p), (NAMES[1], q)):
         having = sum(c.probability for c in told if counted_as(name) & set(c.name.split("+")))
         assert having == pytest.approx(wanted, abs=2e-3)
+
+
+def test_effects_whose_probabilities_exclude_one_another_give_the_same_hypotheses_in_any_order() -> None:
+    dry, drag = "plant.coulomb_friction", "plant.quadratic_drag"
+    given_ = [Candidate(name=name, probability=p) for name, p in ((dry, 0.5), (drag, 0.4), ("unknown", 0.1))]
+    said = {drag: 0.6, dry: 0.7}  # no hypothesis has both, and together they are more than one
+    one, other = (consistent(given_, dict(order), (dry,)) for order in (said.items(), reversed(said.items())))
+    assert one == other
+    assert sum(c.probability for c in one if dry in c.name.split("+")) == pytest.approx(0.7)

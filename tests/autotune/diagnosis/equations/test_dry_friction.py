@@ -7,7 +7,7 @@ from types import MappingProxyType
 import numpy as np
 import pytest
 
-from autotune.diagnosis.equations.dry_friction import settled_among, swept, with_force
+from autotune.diagnosis.equations.dry_friction import select_minimum, sweep_levels, with_force
 from autotune.diagnosis.equations.equation_bench import EquationBench
 from autotune.equations import Drive, simulate
 from autotune.equations.effects import compile_with
@@ -40,13 +40,13 @@ def test_other_levels_lead_out_of_a_wrong_minimum_and_tell_how_far_a_level_may_b
     bench.signals(retuned)
     stuck = bench.fitted([coulomb(8.0 * LEVEL)], retuned, 8)
     assert stuck.effects[0].parameters["level"].value > 2.0 * LEVEL
-    fits = swept(bench, stuck)
+    fits = sweep_levels(bench, stuck)
     assert min(one.rss for one in fits) < 0.01 * stuck.rss
-    told = settled_among(bench, fits, 1000.0, 1.0).effects[0].parameters["level"]
+    told = select_minimum(bench, fits, 1000.0, 1.0).effects[0].parameters["level"]
     assert told.value == pytest.approx(LEVEL, rel=0.02)
     assert told.sd < 0.01 * LEVEL
     # where the model's own error is so large that rows tell none of these minima from another
-    vague = settled_among(bench, fits, 1000.0, 1e6).effects[0].parameters["level"]
+    vague = select_minimum(bench, fits, 1000.0, 1e6).effects[0].parameters["level"]
     assert vague.sd >= abs(stuck.effects[0].parameters["level"].value - vague.value)
 
 

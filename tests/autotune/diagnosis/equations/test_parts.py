@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import MappingProxyType
 
 import numpy as np
@@ -9,10 +10,13 @@ import pytest
 
 from autotune.arrays import FloatArray
 from autotune.diagnosis import diagnose
+from autotune.diagnosis.equations.bench import Outcome
 from autotune.diagnosis.equations.equation_bench import EquationBench
 from autotune.diagnosis.equations.parts import telling_windows
+from autotune.diagnosis.equations.search import _lengthen
 from autotune.equations import Drive, compile_model, simulate
 from autotune.equations.effects import compile_with
+from autotune.errors import InputError
 from autotune.models import Effect, Parameter
 from autotune.recording import Recording
 from tests.autotune.equations.models import PENDULUM, model, one_state
@@ -53,6 +57,17 @@ def test_an_effect_is_sought_on_a_part_and_judged_on_all_rows() -> None:
     assert found.effects[0].parameters["high"].value == pytest.approx(0.3, abs=0.01)
     assert all(one.residual.size == 6000 for one in (found.search.found.chosen, *found.search.found.tried))
     assert found.fit.extended == pytest.approx(found.fit.noise_floor, rel=0.1)
+
+
+def test_where_the_best_fit_runs_away_on_long_windows_the_others_are_not_compared_with_it() -> None:
+    class Fleeing(EquationBench):
+        def lengthened(self, outcome: Outcome) -> Outcome:
+            raise InputError("the simulation runs away", where=self.model.name)
+
+    recording = recorded(1, 1000, 9.0, slice(0))
+    bench = Fleeing(LAG, [recording], [np.isfinite(recording.y)])
+    noise = bench.retuned()
+    assert _lengthen(bench, [noise, replace(noise, residual=10.0 * noise.residual)]) == []
 
 
 def swung(seed: int, size: float = 0.8, rows: int = 900) -> Recording:

@@ -11,8 +11,8 @@ import pytest
 
 from autotune.diagnosis.evidence.adequacy import strongest_line
 from autotune.diagnosis.evidence.operating_point import offset_of
-from autotune.diagnosis.evidence.sample_gain import rows_of, supported
-from autotune.diagnosis.evidence.samples import SampleEffect, inspect, outliers_in, spared
+from autotune.diagnosis.evidence.sample_gain import rows_of, select_supported
+from autotune.diagnosis.evidence.samples import SampleEffect, inspect, outliers_in, unspoiled_rows
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import Fit
 from autotune.diagnosis.fitting.retuning import prepare
@@ -65,7 +65,7 @@ def spiked(y: np.ndarray) -> np.ndarray:
 def named(r: Recording, model: Model | None = None) -> dict[str, SampleEffect]:
     good, seen = inspect([r])
     data, retuned = prepare(process() if model is None else model, [r], good)
-    return {one.name: one for one in supported(seen, rows_of(retuned, data))}
+    return {one.name: one for one in select_supported(seen, rows_of(retuned, data))}
 
 
 @pytest.mark.parametrize(
@@ -116,8 +116,8 @@ def test_spikes_that_a_moving_reading_hides_stand_out_of_the_residual() -> None:
     outliers = outliers_in(left, [r], data.good, IN_USE)
     assert outliers is not None
     assert np.array_equal(np.flatnonzero(outliers.rows[0]), rows)
-    assert supported([outliers], rows_of(retuned, data))
-    assert np.array_equal(np.flatnonzero(~spared([r], [outliers])[0]), rows)
+    assert select_supported([outliers], rows_of(retuned, data))
+    assert np.array_equal(np.flatnonzero(~unspoiled_rows([r], [outliers])[0]), rows)
 
 
 def fitted(r: Recording) -> tuple[Data, Fit]:

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from autotune.diagnosis.evidence.readings import converter_step, frozen_rows, spikes
 from autotune.diagnosis.evidence.samples import inspect
-from autotune.diagnosis.fitting.noise import autoregressive, noise_from_differences
+from autotune.diagnosis.fitting.noise import autoregressive_up_to, noise_from_differences
 from autotune.recording import Recording
 
 
@@ -117,7 +117,7 @@ def test_yule_walker_recovers_an_autoregressive_noise() -> None:
     n = np.zeros(20000)
     for k in range(2, n.size):
         n[k] = 0.4 * n[k - 1] + 0.2 * n[k - 2] + 2.0 * rng.normal()
-    noise = autoregressive([n], [np.ones(n.size, dtype=bool)])
+    noise = autoregressive_up_to([n], [np.ones(n.size, dtype=bool)], 2)[-1]
     assert noise.sd == pytest.approx(2.0, rel=0.02)
     assert noise.ar == pytest.approx((0.4, 0.2), abs=0.03)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from autotune.diagnosis.evidence.stamps import evened
+from autotune.diagnosis.evidence.stamps import even_stamps
 from autotune.diagnosis.thresholds import IN_USE
 from autotune.models import Block, Model, Port, TransferFunction
 from autotune.recording import Recording
@@ -33,7 +33,7 @@ def test_rows_that_were_taken_evenly_and_stamped_on_arrival_are_simulated_at_eve
     n, dt = 1200, 0.004
     arrived = bursts(n, dt)
     recording = Recording(t=arrived, u=np.zeros(n), y=decay(dt * np.arange(n)))
-    changed, jitter = evened(ARM, [recording], IN_USE)
+    changed, jitter = even_stamps(ARM, [recording], IN_USE)
     assert jitter is not None
     assert jitter.name == "timing.jitter"
     assert np.ptp(np.diff(changed[0].t)) < 1e-9
@@ -55,13 +55,13 @@ def test_rows_that_were_taken_when_their_stamps_say_keep_them():
     n, dt = 1200, 0.004
     taken = bursts(n, dt)
     recording = Recording(t=taken, u=np.zeros(n), y=decay(taken))
-    changed, jitter = evened(ARM, [recording], IN_USE)
+    changed, jitter = even_stamps(ARM, [recording], IN_USE)
     assert jitter is None
     assert changed[0] is recording
 
 
 def test_even_stamps_are_not_looked_at():
     recording = Recording(t=0.004 * np.arange(200), u=np.zeros(200), y=np.zeros(200))
-    changed, jitter = evened(ARM, [recording], IN_USE)
+    changed, jitter = even_stamps(ARM, [recording], IN_USE)
     assert jitter is None
     assert changed[0] is recording

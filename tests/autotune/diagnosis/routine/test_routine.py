@@ -18,8 +18,9 @@ from autotune.diagnosis.routine import RoutineDiagnosis, diagnose_routine
 from autotune.diagnosis.routine.kernels import valve_position
 from autotune.diagnosis.routine.operation import operation_of
 from autotune.diagnosis.routine.oscillation import phase_kept, regularity, setpoint_answer
-from autotune.diagnosis.routine.thresholds import RoutineThresholds, table
+from autotune.diagnosis.routine.thresholds import RoutineThresholds
 from autotune.diagnosis.routine.valves import compare_valves
+from autotune.diagnosis.thresholds import table
 from autotune.errors import IdentificationError, InputError
 from autotune.recording import Recording, read_recording, write_recording
 from sim.valve_cases import CaseKind, valve_case
@@ -173,7 +174,7 @@ def test_a_set_point_at_rest_has_no_answer():
 
 
 def test_every_threshold_has_a_unit_a_meaning_and_an_origin():
-    assert all(unit and meaning and origin for _, _, unit, meaning, origin in table())
+    assert all(unit and meaning and origin for _, _, unit, meaning, origin in table(LIMITS))
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2, 3, 4, 6, 7])

@@ -9,8 +9,8 @@ from scipy import signal
 from autotune.diagnosis.fitting.fit import fit
 from autotune.diagnosis.fitting.parameters import effect_with
 from autotune.diagnosis.fitting.retuning import prepare
-from autotune.diagnosis.selection.hypothesis import contradicted, hypothesis
-from autotune.diagnosis.selection.prediction import extended
+from autotune.diagnosis.selection.hypothesis import contradicted_effects, hypothesis
+from autotune.diagnosis.selection.prediction import extend
 from autotune.models import Block, Model, Port, TransferFunction
 from autotune.recording import Recording
 
@@ -46,13 +46,13 @@ def test_readings_that_scatter_on_at_a_limit_speak_against_a_limit_of_the_sensor
 ) -> None:
     data, base = prepare(MODEL, [recording], [np.ones(len(recording), dtype=bool)])
     effect = effect_with("sensor.saturation", (-2.0, LIMIT), ("K", "K"))
-    parametrisation, theta, x0 = extended(base, effect, data)
+    parametrisation, theta, x0 = extend(base, effect, data)
     found = hypothesis(fit(parametrisation, data, theta, x0))
     assert found.names == ("sensor.saturation",)
-    assert contradicted(found, data) == names
+    assert contradicted_effects(found, data) == names
 
 
 def test_without_a_limit_nothing_is_contradicted() -> None:
     recording = limited(0.0, NOISE)
     data, base = prepare(MODEL, [recording], [np.ones(len(recording), dtype=bool)])
-    assert contradicted(hypothesis(base), data) == frozenset()
+    assert contradicted_effects(hypothesis(base), data) == frozenset()

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from autotune.diagnosis.evidence.stretches import STRETCHES
-from autotune.diagnosis.selection.judged import Judged, built_on, of_likely, probabilities, ranked
+from autotune.diagnosis.selection.judged import Judged, built_on, of_likely, probabilities, rank
 from autotune.diagnosis.selection.probability import probability_of
 from autotune.diagnosis.thresholds import IN_USE, Thresholds
 
@@ -61,7 +61,7 @@ def test_what_beats_one_that_beats_another_beats_that(three: list[tuple[float, f
 def test_what_is_rare_needs_more_evidence_than_what_is_usual() -> None:
     rare = hypothesis_of((CURVED,), 0.66, math.log(0.01))
     usual = hypothesis_of((DRY,), 0.7, math.log(0.5))
-    assert ranked([hypothesis_of((), 1.0), rare, usual])[0] is usual
+    assert rank([hypothesis_of((), 1.0), rare, usual])[0] is usual
 
 
 def test_what_is_likely_is_taken_together_where_that_was_fitted() -> None:
@@ -69,8 +69,8 @@ def test_what_is_likely_is_taken_together_where_that_was_fitted() -> None:
     plain, alone = hypothesis_of((), 3.0), hypothesis_of((DRY,), 1.0)
     others = [hypothesis_of((DRY, name), 0.97) for name in (CURVED, GRAVITY)]
     found = [plain, alone, *others]
-    assert ranked(found)[0] in others
-    candidates = probabilities(found, ranked(found)[0], 0.03)
+    assert rank(found)[0] in others
+    candidates = probabilities(found, rank(found)[0], 0.03)
     said = {name: probability_of(name, candidates) for name in (DRY, CURVED, GRAVITY)}
     assert said[DRY] > 0.9 > 0.5 > max(said[CURVED], said[GRAVITY])
     assert of_likely(found, {DRY}) is alone
@@ -88,7 +88,7 @@ def test_of_two_that_command_and_reading_cannot_tell_apart_one_is_taken() -> Non
 def test_what_predicts_best_is_built_on_though_it_is_too_rare_to_lead() -> None:
     usual = [hypothesis_of((name,), size) for name, size in ((DRY, 0.8), (CURVED, 0.85), (LAG, 0.9))]
     rare = hypothesis_of((GRAVITY,), 0.7, math.log(1e-4))
-    order = ranked([*usual, rare])
+    order = rank([*usual, rare])
     assert order[0] is usual[0]
     assert order.index(rare) > 1
     assert built_on(order, 2) == [*order[:2], rare]

@@ -14,7 +14,7 @@ from autotune.diagnosis.fitting.fit import fit
 from autotune.diagnosis.fitting.noise import Noise
 from autotune.diagnosis.fitting.parameters import effect_with, parametrise
 from autotune.diagnosis.fitting.retuning import prepare
-from autotune.diagnosis.selection.prediction import extended
+from autotune.diagnosis.selection.prediction import extend
 from autotune.diagnosis.selection.probability import weighed
 from autotune.models import Block, Model, Port, TransferFunction
 from autotune.recording import Recording
@@ -83,7 +83,7 @@ def test_a_friction_three_times_too_large_comes_down_to_the_true_level() -> None
     )
     r = rubbing(0.2, seed=1)
     data, base = prepare(model, [r], [np.ones(len(r), dtype=bool)])
-    p, theta, states = extended(base, effect_with("plant.coulomb_friction", (0.6,)), data)
+    p, theta, states = extend(base, effect_with("plant.coulomb_friction", (0.6,)), data)
     result = fit(p, data, theta, states, iterations=40)
     assert result.model.effects[0].parameters["level"].value == pytest.approx(0.2, rel=0.05)
     again = parametrise(model, result.model.effects, 1.0, 0.02)

@@ -13,7 +13,7 @@ from autotune.diagnosis.agreement import NAMED
 from autotune.diagnosis.fitting.fit import fit
 from autotune.diagnosis.fitting.retuning import prepare
 from autotune.diagnosis.selection.judged_chain import JudgedChain, at_both_scales
-from autotune.diagnosis.selection.prediction import extended
+from autotune.diagnosis.selection.prediction import extend
 from autotune.diagnosis.selection.search import search
 from autotune.diagnosis.simulation.chain import build_chain
 from autotune.diagnosis.thresholds import IN_USE
@@ -163,7 +163,7 @@ def test_what_stands_for_something_else_once_it_is_fitted_to_the_end_is_not_judg
     recording = Recording(t=t, u=np.full(t.size, 50.0), y=y)
     data, start = prepare(model, [recording], good(recording), IN_USE)
     values = {"frequency": Parameter(value=0.0044), "damping": Parameter(value=0.9)}
-    p, theta, states = extended(start, Effect(name="plant.resonance", parameters=values), data)
+    p, theta, states = extend(start, Effect(name="plant.resonance", parameters=values), data)
     known = fit(p, data, theta, states)
     assert known.model.effects[0].parameters["damping"].value > 1.0
     begun = JudgedChain(

@@ -14,11 +14,11 @@ from autotune.diagnosis.diagnose import diagnose
 from autotune.diagnosis.evidence.samples import inspect
 from autotune.diagnosis.fitting.fit import fit
 from autotune.diagnosis.fitting.parameters import effect_with
-from autotune.diagnosis.fitting.restarts import realigned
+from autotune.diagnosis.fitting.restarts import realign_effects
 from autotune.diagnosis.fitting.retuning import prepare
 from autotune.diagnosis.selection.hypothesis import Hypothesis, is_stand_in
-from autotune.diagnosis.selection.prediction import extended
-from autotune.diagnosis.selection.scan import searched
+from autotune.diagnosis.selection.prediction import extend
+from autotune.diagnosis.selection.scan import search_starts
 from autotune.diagnosis.selection.search import search
 from autotune.diagnosis.thresholds import IN_USE
 from autotune.effects import ALL, CATALOGUE
@@ -96,8 +96,8 @@ def test_a_loads_frequency_is_found_to_a_hundredth_of_what_the_recording_resolve
     rigs = [shaken(1), shaken(2)]
     data, base = prepare(servo_model(), rigs, inspect(rigs)[0])
     with ThreadPoolExecutor(1) as pool:
-        start = searched("environment.periodic_load", base, data, pool)[0]
-    p, theta, states = extended(base, start, data)
+        start = search_starts("environment.periodic_load", base, data, pool)[0]
+    p, theta, states = extend(base, start, data)
     found = fit(p, data, theta, states, iterations=30).model.effects[0].parameters
     assert abs(found["frequency"].value - hertz) < 0.01 / (rows * 0.02)
     assert np.hypot(found["in_phase"].value, found["quadrature"].value) == pytest.approx(0.1, rel=0.03)
@@ -107,7 +107,7 @@ def test_the_band_of_a_sticking_valve_is_found_on_a_criterion_of_narrow_peaks() 
     r = [valve(0.083, 3), valve(0.083, 4)]
     data, base = prepare(lag(2.0), r, inspect(r)[0])
     with ThreadPoolExecutor(1) as pool:
-        starts = searched("actuator.stiction", base, data, pool)
+        starts = search_starts("actuator.stiction", base, data, pool)
     assert starts[0].parameters["band"].value == pytest.approx(0.083, rel=0.02)
 
 
@@ -117,7 +117,7 @@ def test_a_converters_step_is_a_line_of_the_residual_over_the_command(step: floa
     r = [converted(step, 0.41, 5), converted(step, 0.41, 6)]
     data, base = prepare(lag(2.0), r, inspect(r)[0])
     with ThreadPoolExecutor(1) as pool:
-        found = searched("actuator.quantisation", base, data, pool)[0].parameters
+        found = search_starts("actuator.quantisation", base, data, pool)[0].parameters
     levels = (0.41 - found["origin"].value) / found["step"].value
     # so near that the levels are a tenth of a step off at most where u, within 1 V of its middle, is farthest
     assert found["step"].value == pytest.approx(step, rel=0.1 * step)
@@ -131,7 +131,7 @@ def test_a_converters_step_is_found_where_a_command_takes_few_values(step: float
     model = replace(lag(2.0), input=Port(unit="%", offset=50.0))
     data, base = prepare(model, r, inspect(r)[0])
     with ThreadPoolExecutor(1) as pool:
-        found = searched("actuator.quantisation", base, data, pool)[0].parameters
+        found = search_starts("actuator.quantisation", base, data, pool)[0].parameters
     assert found["step"].value == pytest.approx(step, rel=2e-3)
 
 
@@ -140,10 +140,10 @@ def test_a_converter_that_is_off_its_levels_is_moved_onto_them() -> None:
     data, base = prepare(lag(2.0), r, inspect(r)[0])
     found = []
     for step, origin in ((0.0504, 0.012), (0.05, 0.01)):
-        p, theta, states = extended(base, effect_with("actuator.quantisation", (step, origin)), data)
+        p, theta, states = extend(base, effect_with("actuator.quantisation", (step, origin)), data)
         found.append(fit(p, data, theta, states))
     stuck, truth = found
-    moved = realigned(stuck, data)
+    moved = realign_effects(stuck, data)
     assert stuck.cost > 1.1 * truth.cost
     assert moved.cost < 1.02 * truth.cost
     assert moved.model.effects[0].parameters["step"].value == pytest.approx(0.05, rel=0.002)
@@ -171,7 +171,7 @@ def test_a_spring_by_another_name_is_refused(name: str, values: Callable[[float]
     way = float(np.nanmax(positions) - np.nanmin(positions))
 
     def fitted(effect: Effect) -> Hypothesis:
-        p, theta, states = extended(base, effect, data)
+        p, theta, states = extend(base, effect, data)
         return Hypothesis(names=(effect.name,), fit=fit(p, data, theta, states, iterations=30))
 
     spring = fitted(effect_with("plant.leak", (0.3 * GAIN,)))
