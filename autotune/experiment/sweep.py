@@ -20,7 +20,7 @@ from autotune.experiment.preflight import Known
 from autotune.experiment.relay import RelaySettings
 from autotune.experiment.result import Cycle, Segment, State
 from autotune.experiment.sweep_warnings import relative_sd, sweep_warnings
-from autotune.experiment.together import estimate_beside, goes_on, is_together, was_tried
+from autotune.experiment.together import Price, estimate_beside, goes_on, is_together, was_tried
 from autotune.identification.sweep_noted import NOTED, note_of
 
 #: part of limits.swing that a limit cycle is planned for: the rest is for a mid-point that is not quite right
@@ -43,6 +43,7 @@ def sweep(
     oscillation: Oscillation,
     show: Show,
     earlier: Earlier,
+    price: Price | None = None,
 ) -> tuple[tuple[Segment, ...], Known]:
     """Measure a point at every phase that is wanted and not yet measured, within the budget of rig time.
 
@@ -58,6 +59,9 @@ def sweep(
         Told what happens, the rig time that is expected to remain [s], what is known and which relay runs.
     earlier : Earlier
         Limit cycles that earlier sittings finished; their phases are passed over, their points and time count.
+    price : callable, optional
+        Says what is left unknown of points that are estimated together costs the controller: the sweep then ends where
+        the rest of the budget would make it better by less than 1 %.
 
     Returns
     -------
@@ -83,7 +87,7 @@ def sweep(
     if wanted.together and targets and len(every) >= FEW and not was_tried(earlier):
         # few and short cycles that an earlier sitting left are quicker run again than gone on with
         run.segments = []
-        left = _together(run, every, end_s)
+        left = _together(run, every, end_s, price)
         if left is None:
             return tuple(run.segments), run.known
         targets = left
@@ -191,9 +195,9 @@ def _one_by_one(run: _Sweep, targets: Sequence[float], end_s: float) -> None:
         run.cycle(choices[0], periods[0], end_s - reserved_s)
 
 
-def _together(run: _Sweep, targets: Sequence[float], end_s: float) -> list[float] | None:
+def _together(run: _Sweep, targets: Sequence[float], end_s: float, price: Price | None) -> list[float] | None:
     """Run few limit cycles and estimate their rows together; return which phases need a cycle of their own, if any."""
-    loop = run.loop
+    loop, budget_s = run.loop, run.wanted.budget_s
     first = (targets[0], targets[len(targets) // 2], targets[-1])
     unvisited = [phase for phase in targets if phase not in first]
     others = [phase if run.known.plant_sign > 0 else phase + math.pi for phase in unvisited]
@@ -205,24 +209,25 @@ def _together(run: _Sweep, targets: Sequence[float], end_s: float) -> list[float
         run.cycle(choices[0], LEAST_PERIODS, end_s)
     while True:
         run.tell("estimating all points together", 0.0)
-        found = estimate_beside(run.oscillation, run.segments, others, run.known.first_move_s)
+        found = estimate_beside(run.oscillation, run.segments, others, run.known, price)
         run.settled = not goes_on(loop)
-        why = found if isinstance(found, str) else found.refused
-        if loop.monitor.commands.found:
-            why = "commands of another master"
-        if why or isinstance(found, str) or found.worst_sd <= run.wanted.gain_sd:
+        why = "commands of another master" if loop.monitor.commands.found else found.why
+        if why or found.estimate is None:
+            break
+        left_s = end_s - loop.tick.t_s
+        share = found.wanted_sd(run.wanted.gain_sd, budget_s - left_s, budget_s) / found.estimate.worst_sd
+        if share >= 1.0:
             break
         choices = run.choices(first)
-        periods = _further(run, choices, found.worst_sd, end_s - loop.tick.t_s)
+        periods = _further(run, choices, share, left_s)
         if not any(periods):
             break
         most = max(range(len(first)), key=lambda i: periods[i] * 2.0 * math.pi / choices[i].omega_rad_s)
         remaining_s = sum(time_s(choice, count) for choice, count in zip(choices, periods, strict=True) if count)
-        said = f"all points are known to {100 * found.worst_sd:.2g} %: {math.degrees(first[most]):.0f} deg again"
+        said = f"{found.words}: {math.degrees(first[most]):.0f} deg again"
         run.tell(said, remaining_s, choices[most].settings)
         run.cycle(choices[most], periods[most], end_s)
-    estimate = None if isinstance(found, str) else found
-    loop.note(**{NOTED: note_of(estimate, why, len(run.segments), others)})
+    loop.note(**{NOTED: note_of(found.estimate, why, len(run.segments), others)})
     if not why:
         return None
     run.tell(f"each point by itself: {why}", math.nan)
@@ -230,8 +235,8 @@ def _together(run: _Sweep, targets: Sequence[float], end_s: float) -> list[float
     return _by_themselves(run, first, unvisited, end_s)
 
 
-def _further(run: _Sweep, choices: Sequence[Choice], sd: float, left_s: float) -> tuple[int, ...]:
-    """Return the further periods that each of the limit cycles needs, for all points to be as good as is wanted."""
+def _further(run: _Sweep, choices: Sequence[Choice], share: float, left_s: float) -> tuple[int, ...]:
+    """Return the further periods that each limit cycle needs, for the worst point to be known so much better."""
     noise, middle = max(run.known.noise_sd, 1e-300), sorted(run.known.points, key=lambda point: point.omega_rad_s)[1]
     model = LocalModel.through(middle.omega_rad_s, middle.gain, lag_beyond_integrator(middle, run.known.plant_sign))
     done = [
@@ -245,8 +250,7 @@ def _further(run: _Sweep, choices: Sequence[Choice], sd: float, left_s: float) -
     ahead = [
         Dwell(omega_rad_s=one.omega_rad_s, signal=one.y_amplitude / noise, periods=LEAST_PERIODS) for one in choices
     ]
-    factor = run.wanted.gain_sd / sd
-    return further_periods(done, ahead, model, run.loop.sample_time_s, factor=factor, left_s=left_s)
+    return further_periods(done, ahead, model, run.loop.sample_time_s, factor=share, left_s=left_s)
 
 
 def _by_themselves(run: _Sweep, first: Sequence[float], others: Sequence[float], end_s: float) -> list[float]:
