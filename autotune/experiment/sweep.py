@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -207,9 +208,9 @@ def _together(run: _Sweep, targets: Sequence[float], end_s: float, price: Price 
         said = f"limit cycle {i + 1} of {FEW}: {math.degrees(target):.0f} deg, for all points together"
         run.tell(said, remaining_s, choices[0].settings)
         run.cycle(choices[0], LEAST_PERIODS, end_s)
-    while True:
+    for look in itertools.count(1):
         run.tell("estimating all points together", 0.0)
-        found = estimate_beside(run.oscillation, run.segments, others, run.known, price)
+        found = estimate_beside(run.oscillation, run.segments, others, run.known, look, price)
         run.settled = not goes_on(loop)
         why = "commands of another master" if loop.monitor.commands.found else found.why
         if why or found.estimate is None:

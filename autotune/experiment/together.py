@@ -117,6 +117,7 @@ def estimate_beside(
     segments: Sequence[Segment],
     phases_rad: Sequence[float],
     known: Known,
+    look: int,
     price: Price | None = None,
 ) -> Found:
     """Return what all rows say together; where the rig's clock goes on, the relay does meanwhile.
@@ -129,6 +130,8 @@ def estimate_beside(
         The sweep so far.
     known : Known
         When the plant first answered, and the noise.
+    look : int
+        How often the sweep's rows are looked at, with this time.
     price : callable, optional
         Asked what is left unknown costs the controller.
 
@@ -144,8 +147,9 @@ def estimate_beside(
     def work() -> None:
         try:
             one = estimate_together(segments, rows, phases_rad, first_move_s=known.first_move_s, swing=swing)
-            costs = math.nan if price is None or one.refused else price(one, known.noise_sd)
-            found.append(Found(estimate=one, why=one.refused, price=costs))
+            why = one.refused(look)
+            costs = math.nan if price is None or why else price(one, known.noise_sd)
+            found.append(Found(estimate=one, why=why, price=costs))
         except AutotuneError as error:
             found.append(Found(estimate=None, why=str(error)))
         except (ArithmeticError, ValueError) as error:  # of a linear algebra that does not converge
