@@ -139,10 +139,11 @@ def _through(omega: FloatArray, G: ComplexArray, structure: Structure, h: float)
     powers = s[None, :] ** np.arange(n + 1)[:, None]
     late = powers[: structure.zeros + 1] * np.exp(-1j * omega * h)
     columns = np.vstack([powers[first:n] * G, late])
-    denominator = np.ones_like(s)
+    denominator, x = np.ones_like(s), np.empty(0)
     for _ in range(_REWEIGHTED):
         weight = 1.0 / (np.abs(denominator) * np.abs(G))
-        x, *_ = np.linalg.lstsq(as_parts(columns * weight).T, as_parts(powers[n] * G * weight), rcond=None)
+        sides = as_parts(np.asarray(np.vstack([columns, powers[n] * G]) * weight, dtype=np.complex128))
+        x = np.linalg.lstsq(sides[:-1].T, sides[-1], rcond=None)[0]
         denominator = powers[n] - x[: n - first] @ powers[first:n]
     missed = x[n - first :] @ late / denominator / G - 1.0
     a = np.concatenate([np.zeros(first), x[: n - first]]) * scale ** np.arange(n, 0, -1)
