@@ -17,7 +17,7 @@ import numpy as np
 from scipy.optimize import OptimizeResult, least_squares
 from scipy.stats import chi2
 
-from autotune.arrays import ComplexArray, FloatArray
+from autotune.arrays import ComplexArray, FloatArray, inverse_in_any_units, principal_axes
 from autotune.errors import IdentificationError
 from autotune.models import TransferFunction
 from autotune.points import FrequencyPoint
@@ -96,7 +96,8 @@ class PlantFit:
         rng : numpy.random.Generator
             Source of the draws.
         """
-        samples = rng.multivariate_normal(self.parameters, self.covariance, count, method="eigh")
+        steps = rng.standard_normal((count, self.parameters.size)) @ principal_axes(self.covariance).T
+        samples = self.parameters + steps
         return tuple(self.build(self._within(sample)) for sample in samples)
 
     def _within(self, sample: FloatArray) -> FloatArray:
@@ -128,8 +129,7 @@ class PlantFit:
         if not self.covariance.any():
             return (self.plant,)
         radius = math.sqrt(chi2.ppf(probability, self.parameters.size))
-        values, vectors = np.linalg.eigh(self.covariance)
-        axes = vectors * np.sqrt(np.maximum(values, 0.0))
+        axes = principal_axes(self.covariance)
         between = np.random.default_rng(0).standard_normal((_DIRECTIONS, self.parameters.size))
         between /= np.linalg.norm(between, axis=1, keepdims=True)
         directions = np.vstack((np.eye(self.parameters.size), -np.eye(self.parameters.size), between, -between))
@@ -251,7 +251,8 @@ def _fit_structure(
     sign, found = min(((sign, fit(sign, ratios)) for sign, ratios in starts), key=lambda pair: float(pair[1].cost))
     chi_square = 2 * float(found.cost)
     freedom = 2 * omega.size - found.x.size
-    covariance = np.linalg.pinv(found.jac.T @ found.jac) * (max(1.0, chi_square / freedom) if freedom > 0 else 1.0)
+    excess = max(1.0, chi_square / freedom) if freedom > 0 else 1.0
+    covariance = excess * inverse_in_any_units(found.jac.T @ found.jac)
 
     def build(x: FloatArray) -> TransferFunction:
         return _plant(x, sign, integrating)

@@ -16,7 +16,7 @@ from itertools import product
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from autotune.arrays import FloatArray
+from autotune.arrays import FloatArray, inverse_in_any_units
 from autotune.errors import AutotuneError, IdentificationError
 from autotune.identification.delay.identify import identify_delay
 from autotune.identification.delay.model import DelayModel
@@ -214,8 +214,8 @@ def _join(found: _Fitted, common: Sequence[int], unit: int | None = None) -> Pla
     unit = _largest_term(max(models, key=lambda model: model.rows)) if unit is None else unit
     free = [i for i in range(n + 2) if not (structure.integrator and i == 0)]
     forms = [_over(model, unit) for model in models]
-    information = [np.linalg.pinv(covariance[np.ix_(free, free)]) for _, covariance in forms]
-    covariance = np.linalg.pinv(np.sum(information, axis=0))
+    information = [inverse_in_any_units(covariance[np.ix_(free, free)]) for _, covariance in forms]
+    covariance = inverse_in_any_units(np.sum(information, axis=0))
     x = forms[0][0].copy()
     x[free] = covariance @ np.sum([J @ v[free] for J, (v, _) in zip(information, forms, strict=True)], axis=0)
     apart = float(sum((v - x)[free] @ J @ (v - x)[free] for J, (v, _) in zip(information, forms, strict=True)))
