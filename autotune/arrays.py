@@ -12,6 +12,9 @@ ComplexArray: TypeAlias = NDArray[np.complex128]
 BoolArray: TypeAlias = NDArray[np.bool_]
 IntArray: TypeAlias = NDArray[np.int64]
 
+#: part of the largest eigenvalue of a product below which another may be rounding
+_ROUNDING = 1e-13
+
 
 def is_real(value: Any) -> bool:
     """Return whether something is a number that floating point holds, NaN and infinity included; True is none."""
@@ -43,7 +46,7 @@ def inverse_in_any_units(matrix: FloatArray) -> FloatArray:
     minutes, that of a small gain per second is none.
     """
     scale = _deviations(matrix)
-    unit = np.linalg.pinv(matrix / np.outer(scale, scale), hermitian=True)
+    unit = np.linalg.pinv(matrix / np.outer(scale, scale), rcond=_ROUNDING, hermitian=True)
     return np.asarray(unit / np.outer(scale, scale), dtype=np.float64)
 
 
