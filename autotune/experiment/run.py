@@ -13,7 +13,7 @@ import numpy as np
 from autotune.config import Config
 from autotune.errors import AutotuneError, ExperimentStopped
 from autotune.experiment.approach import approach, find_midpoint
-from autotune.experiment.cycles import Earlier, refined
+from autotune.experiment.cycles import Earlier, noise_of, refined
 from autotune.experiment.device import DeviceOscillation
 from autotune.experiment.limits import Envelope, Watch
 from autotune.experiment.loop import ControlLoop, Timing
@@ -276,7 +276,7 @@ def _result(
         plant_sign=segments[-1].settings.plant_sign,
         u_rest=float(np.mean(u_means)),
         u_rest_sd=spread / math.sqrt(u_means.size),
-        noise_sd=segments[-1].noise_sd,
+        noise_sd=noise_of(segments),
         timing=timing,
         rig_time_s=sum(part.rig_time_s for part in parts),
         first_move_s=known.first_move_s,

@@ -9,7 +9,7 @@ from dataclasses import replace
 
 from autotune.config.procedure import ExperimentSettings, OperatingPointSettings
 from autotune.errors import ExperimentStopped, IdentificationError
-from autotune.experiment.cycles import Earlier, measured
+from autotune.experiment.cycles import Earlier, measured, noise_of
 from autotune.experiment.dwell import Dwell, further_periods
 from autotune.experiment.limit_cycle_run import LEAST_PERIODS, run_limit_cycle
 from autotune.experiment.limits import Envelope
@@ -26,7 +26,7 @@ from autotune.identification.sweep_noted import NOTED, note_of
 
 #: part of limits.swing that a limit cycle is planned for: the rest is for a mid-point that is not quite right
 PEAK_SHARE = 0.87
-#: the same for the first point, whose gain is foreseen from a short look at the plant
+#: the same for the first point, whose gain is foreseen from a short look at the plant, and for those that are far apart
 FIRST_PEAK_SHARE = 0.79
 #: part of the amplitude so foreseen that it reaches for sure
 FIRST_SURE = 0.9
@@ -111,6 +111,8 @@ class _Sweep:
         Whether the relay is at the extremum of y of a cycle of the same peak.
     by_itself : bool
         Whether each point is of its own cycle: then it is said how well it is known.
+    far : bool
+        Whether the next cycle's frequency is far beyond those measured: then its gain is foreseen from afar.
     """
 
     def __init__(
@@ -126,7 +128,7 @@ class _Sweep:
         self.loop, self.y_centre, self.wanted, self.oscillation = loop, y_centre, wanted, oscillation
         self._show, self._part = show, len(earlier.recordings)
         self.segments = list(earlier.segments)
-        self.settled, self.by_itself = False, False
+        self.settled, self.by_itself, self.far = False, False, False
         self.known = Known()
 
     def know(self, known: Known) -> None:
@@ -151,7 +153,8 @@ class _Sweep:
     @property
     def goal(self) -> Goal:
         """What the next limit cycle works under."""
-        return _goal(self.loop.envelope, self.wanted.relay_amplitude, self.known)
+        share = PEAK_SHARE if self.known.swept and not self.far else FIRST_PEAK_SHARE
+        return _goal(self.loop.envelope, share, self.wanted.relay_amplitude, self.known)
 
     def choices(self, phases_rad: Sequence[float]) -> list[Choice]:
         """Return the settings for the phases as the plant is known now."""
@@ -179,7 +182,7 @@ class _Sweep:
         self.segments.append(segment)
         self.settled = True
         loop.note(relay=[one.to_table() for one in self.segments if one.part == self._part])
-        self.know(replace(known, midpoint=segment.u_mean, noise_sd=segment.noise_sd))
+        self.know(replace(known, midpoint=segment.u_mean, noise_sd=noise_of(self.segments)))
 
 
 def _one_by_one(run: _Sweep, targets: Sequence[float], end_s: float) -> None:
@@ -202,12 +205,14 @@ def _together(run: _Sweep, targets: Sequence[float], end_s: float, price: Price 
     first = (targets[0], targets[len(targets) // 2], targets[-1])
     unvisited = [phase for phase in targets if phase not in first]
     others = [phase if run.known.plant_sign > 0 else phase + math.pi for phase in unvisited]
+    run.far = True
     for i, target in enumerate(first):
         choices = run.choices(first[i:])
         remaining_s = sum(time_s(choice, LEAST_PERIODS) for choice in choices)
         said = f"limit cycle {i + 1} of {FEW}: {math.degrees(target):.0f} deg, for all points together"
         run.tell(said, remaining_s, choices[0].settings)
         run.cycle(choices[0], LEAST_PERIODS, end_s)
+    run.far = False
     for look in itertools.count(1):
         run.tell("estimating all points together", 0.0)
         found = estimate_beside(run.oscillation, run.segments, others, run.known, look, price)
@@ -306,10 +311,10 @@ def _missing(ends_deg: tuple[float, float], wanted: ExperimentSettings, earlier:
     return tuple(_phases_between(ends_deg, wanted, earlier.segments))
 
 
-def _goal(envelope: Envelope, amplitude: float | None, known: Known) -> Goal:
+def _goal(envelope: Envelope, peak_share: float, amplitude: float | None, known: Known) -> Goal:
     limits = envelope.settings
     return Goal(
-        peak=(PEAK_SHARE if known.swept else FIRST_PEAK_SHARE) * limits.swing,
+        peak=peak_share * limits.swing,
         noise_sd=known.noise_sd,
         sample_time_s=envelope.sample_time_s,
         u_step=envelope.u_step,

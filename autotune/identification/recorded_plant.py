@@ -16,7 +16,7 @@ from itertools import product
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from autotune.arrays import FloatArray
+from autotune.arrays import FloatArray, inverse_in_any_units
 from autotune.errors import AutotuneError, IdentificationError
 from autotune.identification.delay.identify import identify_delay
 from autotune.identification.delay.model import DelayModel
@@ -272,8 +272,8 @@ def _joined(equations: Sequence[Equation], unit: int | None, coefficients: int, 
     unit = _largest_term(max(equations, key=lambda one: one.rows).plant) if unit is None else unit
     free = [i for i in range(size) if not (integrator and i == 0)]
     forms = [_over(one, unit) for one in equations]
-    information = [np.linalg.pinv(covariance[np.ix_(free, free)]) for _, covariance in forms]
-    covariance = np.linalg.pinv(np.sum(information, axis=0))
+    information = [inverse_in_any_units(covariance[np.ix_(free, free)]) for _, covariance in forms]
+    covariance = inverse_in_any_units(np.sum(information, axis=0))
     x = forms[0][0].copy()
     x[free] = covariance @ np.sum([J @ v[free] for J, (v, _) in zip(information, forms, strict=True)], axis=0)
     apart = float(sum((v - x)[free] @ J @ (v - x)[free] for J, (v, _) in zip(information, forms, strict=True)))
