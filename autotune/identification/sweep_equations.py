@@ -13,7 +13,7 @@ from autotune.arrays import ComplexArray, FloatArray
 from autotune.errors import IdentificationError
 from autotune.identification.delay.data import DelayData
 from autotune.identification.delay.output_error import Point, Structure, gram_at, minimise, solve_linear
-from autotune.identification.recorded_plant import Equation
+from autotune.identification.equation_region import Equation
 from autotune.points import FrequencyPoint
 
 _ORDERS, _ZEROS = (1, 2, 3, 4), (0, 1)

@@ -26,9 +26,9 @@ from scipy.stats import chi2
 from autotune.arrays import ComplexArray, FloatArray
 from autotune.identification.delay.data import prepare
 from autotune.identification.envelope import polar_sd
+from autotune.identification.equation_region import plant_fit
 from autotune.identification.frequency.limit_cycle import WholePeriods
 from autotune.identification.parametric import PlantFit
-from autotune.identification.recorded_plant import plant_fit
 from autotune.identification.sweep_adequacy import TESTS, colour_beside, judge_equation, own_columns
 from autotune.identification.sweep_equations import Fitted, as_parts, fit_again, fit_from_points
 from autotune.points import FrequencyPoint, as_pairs
