@@ -15,7 +15,7 @@ from autotune.experiment.limits import Envelope
 from autotune.experiment.local_model import LocalModel, lag_beyond_integrator
 from autotune.experiment.loop import ControlLoop
 from autotune.experiment.oscillation import Oscillation
-from autotune.experiment.plan import Choice, Goal, allot, choose, phase_targets, time_s, within_reach
+from autotune.experiment.plan import PEAK_SHARE, Choice, Goal, allot, choose, phase_targets, time_s, within_reach
 from autotune.experiment.preflight import Known
 from autotune.experiment.relay import RelaySettings
 from autotune.experiment.result import Cycle, Segment, State
@@ -23,9 +23,7 @@ from autotune.experiment.sweep_warnings import relative_sd, sweep_warnings
 from autotune.experiment.together import estimate_beside, goes_on, is_together, was_tried
 from autotune.identification.sweep_noted import NOTED, note_of
 
-#: part of limits.swing that a limit cycle is planned for: the rest is for a mid-point that is not quite right
-PEAK_SHARE = 0.87
-#: the same for the first point, whose gain is foreseen from a short look at the plant, and for those that are far apart
+#: part of limits.swing that a first point is planned for, its gain foreseen from a short look, and those far apart
 FIRST_PEAK_SHARE = 0.79
 #: part of the amplitude so foreseen that it reaches for sure
 FIRST_SURE = 0.9
