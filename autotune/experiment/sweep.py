@@ -16,7 +16,7 @@ from autotune.experiment.limits import Envelope
 from autotune.experiment.local_model import LocalModel, lag_beyond_integrator
 from autotune.experiment.loop import ControlLoop
 from autotune.experiment.oscillation import Oscillation
-from autotune.experiment.plan import Choice, Goal, allot, choose, phase_targets, time_s, within_reach
+from autotune.experiment.plan import PEAK_SHARE, Choice, Goal, allot, choose, phase_targets, time_s, within_reach
 from autotune.experiment.preflight import Known
 from autotune.experiment.relay import RelaySettings
 from autotune.experiment.result import Cycle, Segment, State
@@ -24,9 +24,7 @@ from autotune.experiment.sweep_warnings import relative_sd, sweep_warnings
 from autotune.experiment.together import Price, estimate_beside, goes_on, is_together, was_tried
 from autotune.identification.sweep_noted import NOTED, note_of
 
-#: part of limits.swing that a limit cycle is planned for: the rest is for a mid-point that is not quite right
-PEAK_SHARE = 0.87
-#: the same for the first point, whose gain is foreseen from a short look at the plant, and for those that are far apart
+#: part of limits.swing that a first point is planned for, its gain foreseen from a short look, and those far apart
 FIRST_PEAK_SHARE = 0.79
 #: part of the amplitude so foreseen that it reaches for sure
 FIRST_SURE = 0.9
@@ -112,7 +110,8 @@ class _Sweep:
     by_itself : bool
         Whether each point is of its own cycle: then it is said how well it is known.
     far : bool
-        Whether the next cycle's frequency is far beyond those measured: then its gain is foreseen from afar.
+        Whether the next cycle's frequency is far from the last one's: its gain is foreseen from afar, and y goes over to
+        it with a swing of its own.
     """
 
     def __init__(
@@ -212,7 +211,6 @@ def _together(run: _Sweep, targets: Sequence[float], end_s: float, price: Price 
         said = f"limit cycle {i + 1} of {FEW}: {math.degrees(target):.0f} deg, for all points together"
         run.tell(said, remaining_s, choices[0].settings)
         run.cycle(choices[0], LEAST_PERIODS, end_s)
-    run.far = False
     for look in itertools.count(1):
         run.tell("estimating all points together", 0.0)
         found = estimate_beside(run.oscillation, run.segments, others, run.known, look, price)
@@ -233,6 +231,7 @@ def _together(run: _Sweep, targets: Sequence[float], end_s: float, price: Price 
         said = f"{found.words}: {math.degrees(first[most]):.0f} deg again"
         run.tell(said, remaining_s, choices[most].settings)
         run.cycle(choices[most], periods[most], end_s)
+    run.far = False
     loop.note(**{NOTED: note_of(found.estimate, why, len(run.segments), others)})
     if not why:
         return None

@@ -183,6 +183,14 @@ def test_zeros_and_poles_that_ring_are_equations_too(name: str, tmp_path: Path) 
         assert parts @ np.linalg.solve(np.array(point.covariance), parts) < chi2.ppf(0.9999, 2)
 
 
+def test_a_cycle_too_short_for_a_point_of_its_own_still_tells_of_the_plant(tmp_path: Path) -> None:
+    case = next(case for case in CASES if case.name == "lag, dead time 1")
+    rig = SimulatedRig(LinearPlant(case, seed=1), u_safe=5.0)
+    result = run_experiment(rig, case.config(together=True), tmp_path / "r.csv")
+    assert result.together is not None
+    assert session_points([read_recording(tmp_path / "r.csv")]).points == result.points
+
+
 def test_a_load_step_in_the_sweep_is_told_and_sends_it_to_cycles_of_their_own(tmp_path: Path) -> None:
     case = next(case for case in CASES if case.name == "integrator, lag 1, dead time 0.05")
     case = replace(case, load=0.006, load_s=8.0 * case.time_s)
