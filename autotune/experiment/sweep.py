@@ -110,8 +110,7 @@ class _Sweep:
     by_itself : bool
         Whether each point is of its own cycle: then it is said how well it is known.
     far : bool
-        Whether the next cycle's frequency is far from the last one's: its gain is foreseen from afar, and y goes over to
-        it with a swing of its own.
+        Whether the next cycle's frequency is far from the last one's, so that its gain is foreseen from afar.
     """
 
     def __init__(
@@ -211,6 +210,7 @@ def _together(run: _Sweep, targets: Sequence[float], end_s: float, price: Price 
         said = f"limit cycle {i + 1} of {FEW}: {math.degrees(target):.0f} deg, for all points together"
         run.tell(said, remaining_s, choices[0].settings)
         run.cycle(choices[0], LEAST_PERIODS, end_s)
+    run.far = False
     for look in itertools.count(1):
         run.tell("estimating all points together", 0.0)
         found = estimate_beside(run.oscillation, run.segments, others, run.known, look, price)
@@ -227,11 +227,12 @@ def _together(run: _Sweep, targets: Sequence[float], end_s: float, price: Price 
         if not any(periods):
             break
         most = max(range(len(first)), key=lambda i: periods[i] * 2.0 * math.pi / choices[i].omega_rad_s)
+        # to much slower ones by way of the one between: y, as fast as it is, would go far before the relay answers
+        most = min(most, 1 + first.index(run.segments[-1].phase_rad))
         remaining_s = sum(time_s(choice, count) for choice, count in zip(choices, periods, strict=True) if count)
         said = f"{found.words}: {math.degrees(first[most]):.0f} deg again"
         run.tell(said, remaining_s, choices[most].settings)
-        run.cycle(choices[most], periods[most], end_s)
-    run.far = False
+        run.cycle(choices[most], max(periods[most], LEAST_PERIODS), end_s)
     loop.note(**{NOTED: note_of(found.estimate, why, len(run.segments), others)})
     if not why:
         return None
