@@ -1,4 +1,4 @@
-"""Array types that every room uses in its signatures, and deviations that rounding leaves whole."""
+"""Array types that every room uses in its signatures, and inverses and deviations that rounding leaves whole."""
 
 from __future__ import annotations
 
@@ -12,6 +12,9 @@ ComplexArray: TypeAlias = NDArray[np.complex128]
 BoolArray: TypeAlias = NDArray[np.bool_]
 IntArray: TypeAlias = NDArray[np.int64]
 
+#: part of the largest eigenvalue of a product below which another may be rounding
+_ROUNDING = 1e-13
+
 
 def is_real(value: Any) -> bool:
     """Return whether something is a number that floating point holds, NaN and infinity included; True is none."""
@@ -22,6 +25,53 @@ def is_real(value: Any) -> bool:
     except (TypeError, ValueError, OverflowError):
         return False
     return True
+
+
+def inverse_in_any_units(matrix: FloatArray) -> FloatArray:
+    """Return the pseudo-inverse of a covariance or an information, whatever the units of its rows.
+
+    Parameters
+    ----------
+    matrix : (P, P) array
+        Symmetric, not negative.
+
+    Returns
+    -------
+    (P, P) array
+        Its inverse; directions that the matrix does not hold, once every diagonal element is 1, stay 0.
+
+    Notes
+    -----
+    What a pseudo-inverse leaves out as rounding depends on the units otherwise: beside the variance of a dead time of
+    minutes, that of a small gain per second is none.
+    """
+    scale = _deviations(matrix)
+    unit = np.linalg.pinv(matrix / np.outer(scale, scale), rcond=_ROUNDING, hermitian=True)
+    return np.asarray(unit / np.outer(scale, scale), dtype=np.float64)
+
+
+def principal_axes(covariance: FloatArray) -> FloatArray:
+    """Return A with A A' = covariance, to the accuracy of each row's own deviation.
+
+    Parameters
+    ----------
+    covariance : (P, P) array
+        Symmetric, not negative.
+
+    Returns
+    -------
+    (P, P) array
+        Its columns are the principal axes where every parameter is measured in its standard deviation.
+    """
+    scale = _deviations(covariance)
+    values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
+    return np.asarray(scale[:, None] * vectors * np.sqrt(np.maximum(values, 0.0)), dtype=np.float64)
+
+
+def _deviations(matrix: FloatArray) -> FloatArray:
+    """Return the roots of the diagonal, 1 where it is 0."""
+    scale = np.sqrt(np.maximum(np.diagonal(matrix), 0.0))
+    return np.where(scale > 0.0, scale, 1.0)
 
 
 def deviations_beside_prior(J: FloatArray) -> FloatArray:

@@ -101,6 +101,13 @@ class ExperimentSettings(Section):
     gain_sd: Annotated[
         float, Field(gt=0, lt=0.5, description="relative standard deviation at which a point is good enough")
     ] = 0.004
+    goal: Annotated[
+        Literal["points", "controller"],
+        Field(
+            description="when points that are estimated together are good enough: at gain_sd, or where the rest of the"
+            " budget would make the controller better by less than 1 %"
+        ),
+    ] = "points"
     budget_s: Annotated[Time, Field(description="rig time for the sweep [s]")] = 60.0
     together: Annotated[
         bool,

@@ -5,16 +5,19 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from statistics import median
+from typing import NoReturn
 
 import numpy as np
 
 from autotune.config.procedure import OperatingPointSettings
 from autotune.errors import ExperimentStopped, IdentificationError
 from autotune.experiment.limits import Watch
+from autotune.experiment.local_model import lag_beyond_integrator
 from autotune.experiment.loop import ControlLoop
 from autotune.experiment.oscillation import Oscillation, mean_command, noise_half, too_noisy
 from autotune.experiment.preflight import SMALL, Known, Tell
 from autotune.experiment.relay import RelaySettings
+from autotune.identification.envelope import polar_sd
 from autotune.identification.frequency.limit_cycle_points import limit_cycle_points
 
 #: smoothing of the relay while nothing is known of the plant
@@ -195,7 +198,7 @@ def find_midpoint(
     )
     _lead(oscillation, point.y, known)
     loop.watch = Watch(y_centre=point.y, in_range=True)
-    return _balance(oscillation, known, tell), oscillation
+    return _balance(oscillation, largest, known, tell), oscillation
 
 
 def _lead(oscillation: Oscillation, y: float, known: Known) -> None:
@@ -212,8 +215,11 @@ def _lead(oscillation: Oscillation, y: float, known: Known) -> None:
         oscillation.step()
 
 
-def _balance(oscillation: Oscillation, known: Known, tell: Tell) -> Known:
-    """Oscillate until the duty is near one half and two whole periods agree; take the first point from them."""
+def _balance(oscillation: Oscillation, largest: float | None, known: Known, tell: Tell) -> Known:
+    """Oscillate until the duty is near one half and two whole periods agree; take the first point from them.
+
+    The relay grows while noise hides whether the plant lags by more than an integrator.
+    """
     loop = oscillation.loop
     swing = loop.envelope.settings.swing
     oscillation.change(
@@ -233,19 +239,8 @@ def _balance(oscillation: Oscillation, known: Known, tell: Tell) -> Known:
         high = float(np.nanmax(y)) - float(np.nanmin(y)) - 2.0 * known.noise_half
         if abs(asymmetry) > 0.3:
             tries += 1
-            if tries > 12 and too_noisy(loop):
-                raise ExperimentStopped(
-                    f"drowned in noise: the relay switches on noise of +-{noise_half(loop):.3g} and not on y",
-                    where="find the mid-point",
-                    remedy="filter the measurement at the device, or allow more swing",
-                )
             if tries > 12:
-                raise ExperimentStopped(
-                    f"asymmetric: the command is on one side for {50 + 50 * abs(asymmetry):.0f} % of the time"
-                    " in spite of a corrected mid-point",
-                    where="find the mid-point",
-                    remedy="look for a drifting load or an actuator that answers up and down differently",
-                )
+                _refuse_lopsided(loop, asymmetry)
             oscillation.move_midpoint(mean)
             oscillation.forget()
         elif high > 1.7 * swing:
@@ -259,12 +254,41 @@ def _balance(oscillation: Oscillation, known: Known, tell: Tell) -> Known:
                 if len(edges) > 20:
                     raise
                 continue
-            tell(f"mid-point {cycle.u_mean:.4g}, first oscillation {cycle.points[0].omega_rad_s:.3g} rad/s")
+            first = cycle.points[0]
+            is_clear = abs(lag_beyond_integrator(first, known.plant_sign)) > 2.0 * polar_sd(first)[1]
+            if not is_clear and high < 0.8 * swing and _may_double(oscillation, largest):
+                oscillation.settings = replace(oscillation.settings, amplitude=2.0 * oscillation.settings.amplitude)
+                oscillation.forget()
+                continue
+            tell(f"mid-point {cycle.u_mean:.4g}, first oscillation {first.omega_rad_s:.3g} rad/s")
             loop.monitor.noise = 2.0 * cycle.noise_sd
             return replace(
                 known,
                 midpoint=cycle.u_mean,
                 noise_sd=cycle.noise_sd,
                 noise_half=2.0 * cycle.noise_sd,
-                points=(cycle.points[0],),
+                points=(first,),
             )
+
+
+def _refuse_lopsided(loop: ControlLoop, asymmetry: float) -> NoReturn:
+    """Say why the duty does not come near one half."""
+    if too_noisy(loop):
+        raise ExperimentStopped(
+            f"drowned in noise: the relay switches on noise of +-{noise_half(loop):.3g} and not on y",
+            where="find the mid-point",
+            remedy="filter the measurement at the device, or allow more swing",
+        )
+    raise ExperimentStopped(
+        f"asymmetric: the command is on one side for {50 + 50 * abs(asymmetry):.0f} % of the time"
+        " in spite of a corrected mid-point",
+        where="find the mid-point",
+        remedy="look for a drifting load or an actuator that answers up and down differently",
+    )
+
+
+def _may_double(oscillation: Oscillation, largest: float | None) -> bool:
+    """Return whether the command has room for a relay of twice the amplitude, and no smaller one was asked for."""
+    limits, relay = oscillation.loop.envelope.settings, oscillation.settings
+    room = min(relay.midpoint - limits.u_min, limits.u_max - relay.midpoint)
+    return 2.0 * relay.amplitude <= min(largest or math.inf, 0.9 * room)

@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from statistics import median_low
 
 import numpy as np
 
@@ -65,6 +66,17 @@ def _segment(cycle: Cycle, found: LimitCycle, sample_time_s: float) -> Segment:
         noise_sd=found.noise_sd,
         asymmetry=found.asymmetry,
     )
+
+
+def noise_of(segments: Sequence[Segment]) -> float:
+    """Return the standard deviation of the measurement noise [y unit]: what a cycle leaves that had settled.
+
+    Parameters
+    ----------
+    segments : sequence of Segment
+        One at least; of one that had not quite settled more than noise is left.
+    """
+    return median_low(one.noise_sd for one in segments)
 
 
 def refined(segments: Sequence[Segment], rows: Callable[[int], Rows], sample_time_s: float) -> tuple[Segment, ...]:

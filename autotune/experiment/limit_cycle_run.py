@@ -6,7 +6,8 @@ import math
 
 import numpy as np
 
-from autotune.experiment.oscillation import PATIENCE, Oscillation, mean_command
+from autotune.arrays import FloatArray
+from autotune.experiment.oscillation import PATIENCE, Oscillation, mean_command, noise_half
 from autotune.experiment.plan import Choice
 from autotune.identification.frequency.limit_cycle import WholePeriods
 
@@ -14,12 +15,17 @@ from autotune.identification.frequency.limit_cycle import WholePeriods
 LEAST_PERIODS = 2
 #: asymmetry of the duty (part of the period, less one half) from which on the mid-point is corrected within a point
 LARGEST_ASYMMETRY = 0.12
+#: relative difference of first and last period from which on a cycle has not settled: half of the room that a planned
+#: peak leaves below the swing, as the next settings are planned from its gain
+UNSETTLED = 0.06
+#: half periods that a cycle is given at most to settle, beyond its whole periods
+SETTLING = 2 * LEAST_PERIODS
 
 
 def run_limit_cycle(
     oscillation: Oscillation, choice: Choice, wanted: int, until_s: float, *, settled: bool, foreseen: bool
 ) -> WholePeriods:
-    """Run one setting for whole periods, or until its time is over.
+    """Run one setting for whole periods that repeat themselves, or until its time is over.
 
     Parameters
     ----------
@@ -47,7 +53,7 @@ def run_limit_cycle(
     # sample times count here and not rows: some may have been missed
     start, start_row, lead = loop.tick.slot if settled else -1, oscillation.start_row, 0
     turning = round(choice.turning_s / step_s)
-    skip = 0  # edges before the cycle that is measured
+    skip = moved = 0  # edges before the cycle that is measured; half periods by which its window was put off
     foreign = loop.monitor.commands.found
     disturbed = len(foreign)
     while True:
@@ -69,11 +75,28 @@ def run_limit_cycle(
         at_extremum = turning <= since_switch <= turning + 0.15 * period
         if tick.slot < start + periods * period + 1 or not at_extremum:
             continue
-        t = loop.history(start_row)[0]
-        t = t[int(np.searchsorted(t, t[0] + (lead - 0.5) * step_s)) :]
+        t, _, y = loop.history(start_row)
+        inside = int(np.searchsorted(t, t[0] + (lead - 0.5) * step_s))
+        t, y = t[inside:], y[inside:]
+        if moved < SETTLING and tick.t_s < until_s and not _repeats(t, y, period * step_s, 0.5 * noise_half(loop)):
+            skip += next(i for i, edge in enumerate(edges) if edge + turning > start)
+            start, moved = -1, moved + 1
+            continue
         # a sample time on the clock of the stamps, which may be the device's
         slot_s = (t[-1] - t[0]) / round((t[-1] - t[0]) / step_s)
         return WholePeriods(start_s=float(t[0]), end_s=float(t[0] + periods * period * slot_s), periods=periods)
+
+
+def _repeats(t: FloatArray, y: FloatArray, period_s: float, noise_sd: float) -> bool:
+    """Return whether y goes through the last period as it went through the first, but for noise and switching instants.
+
+    Noise is in both, and moves the switches between them by as much of y; so does the sample of each switch.
+    """
+    last = t > t[-1] - period_s
+    earlier = np.interp(t[last] - period_s * round((t[-1] - t[0]) / period_s - 1.0), t, y)
+    size, apart = float(np.nanstd(y[last])), float(np.sqrt(np.nanmean((y[last] - earlier) ** 2)))
+    step = float(np.sqrt(np.nanmean(np.diff(y) ** 2)))
+    return apart <= UNSETTLED * size + 2.0 * noise_sd + step
 
 
 def _rebalance(oscillation: Oscillation) -> bool:
@@ -82,7 +105,10 @@ def _rebalance(oscillation: Oscillation) -> bool:
     mean = mean_command(oscillation.loop, oscillation.edges)
     if abs(mean - settings.midpoint) / settings.amplitude <= 2.0 * LARGEST_ASYMMETRY:
         return False
-    step = oscillation.loop.envelope.u_step
+    envelope = oscillation.loop.envelope
+    step, limits = envelope.u_step, envelope.settings
+    # both levels stay within the command's range
+    mean = min(max(mean, limits.u_min + settings.amplitude), limits.u_max - settings.amplitude)
     midpoint = step * round(mean / step) if step > 0.0 else mean
     if midpoint == settings.midpoint:
         return False

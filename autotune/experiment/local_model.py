@@ -14,6 +14,8 @@ from autotune.points import FrequencyPoint
 
 #: difference of two points' logarithms (frequency, tangent of the lag) from which on they tell a slope
 APART = 0.1
+#: largest lag of which the tangent is taken, and how near 90 degrees the lag of one lag counts as that [rad]
+STEEPEST, NEARLY = 1.55, 0.02
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -133,8 +135,10 @@ def predicted(points: Sequence[FrequencyPoint], plant_sign: int, phase_rad: floa
     lag_rad = -phase_rad - math.pi / 2.0
     less = 0.5 * math.pi if lag_rad < 0.0 else 0.0
     lags = [(point, lag_beyond_integrator(point, plant_sign) + less) for point in points]
+    # one lag far above its corner lags by 90 degrees but for what noise hides
+    lags = [(point, STEEPEST if less and abs(lag - less) < NEARLY else lag) for point, lag in lags]
     usable = sorted(
-        ((math.log(p.omega_rad_s), math.log(math.tan(lag)), p) for p, lag in lags if 0.02 < lag < 1.55),
+        ((math.log(p.omega_rad_s), math.log(math.tan(lag)), p) for p, lag in lags if 0.02 < lag <= STEEPEST),
         key=lambda entry: entry[1],
     )
     if not usable:

@@ -11,6 +11,7 @@ import numpy as np
 
 from autotune.errors import ExperimentStopped, LinkError
 from autotune.experiment.loop import ControlLoop, Tick
+from autotune.experiment.plan import PEAK_SHARE
 from autotune.experiment.relay import RelaySettings, RelayState, relay_step
 
 #: waited-for half periods after which a switch that does not come is called no oscillation
@@ -46,6 +47,17 @@ def jumped(loop: ControlLoop) -> bool:
     steps = np.abs(np.diff(y[np.isfinite(y)]))
     usual = 1.4826 * float(np.median(steps[:-JUMP_ROWS])) if steps.size > 2 * JUMP_ROWS else math.inf
     return bool(np.any(steps[-JUMP_ROWS:] > JUMP_SIGMAS * usual)) and usual > 0.0
+
+
+def late_by(loop: ControlLoop, row: int) -> tuple[float, float]:
+    """Return how late the latest sample since a row came at most [s], and by how much y moves meanwhile [y unit]."""
+    t, _, y = loop.history(row)
+    steps, known = np.diff(t), np.isfinite(y)
+    if steps.size < 2 or np.sum(known) < 3:
+        return 0.0, 0.0
+    late_s = float(np.max(steps)) - loop.sample_time_s
+    speed = float(np.median(np.abs(np.gradient(y[known], t[known]))))
+    return late_s, late_s * speed
 
 
 def mean_command(loop: ControlLoop, edges: Sequence[int]) -> float:
@@ -210,6 +222,13 @@ class Oscillation:
             return LinkError(
                 f"link too slow: {100 * self.loop.missed_share:.0f} % of the latest samples were missed, and"
                 f" y = {y:.4g} left the swing of {limits.swing:g} around {self.settings.y_centre:g}",
+                remedy="unload the computer or the link (autotune doctor measures it), or raise signals.sample_time_s",
+            )
+        late_s, moved = late_by(self.loop, self.edges[-2] if len(self.edges) > 1 else self.start_row)
+        if moved > abs(away) - PEAK_SHARE * limits.swing:
+            return LinkError(
+                f"link too slow: a sample came {late_s:.3g} s late, and y = {y:.4g} left the swing of {limits.swing:g}"
+                f" around {self.settings.y_centre:g}",
                 remedy="unload the computer or the link (autotune doctor measures it), or raise signals.sample_time_s",
             )
         if jumped(self.loop):

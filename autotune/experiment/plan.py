@@ -12,6 +12,8 @@ from autotune.experiment.local_model import lag_beyond_integrator, predicted
 from autotune.experiment.relay import RelaySettings
 from autotune.points import FrequencyPoint
 
+#: part of limits.swing that a limit cycle is planned for: the rest is for a mid-point that is not quite right
+PEAK_SHARE = 0.87
 #: part of the half-range of phases that targets keep away from its ends: the reached phase is near its target only
 PHASE_MARGIN = 0.13
 #: part of a period that the relay may look back over; a longer average would blunt the crossing it looks for

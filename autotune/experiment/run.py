@@ -13,7 +13,7 @@ import numpy as np
 from autotune.config import Config
 from autotune.errors import AutotuneError, ExperimentStopped
 from autotune.experiment.approach import approach, find_midpoint
-from autotune.experiment.cycles import Earlier, refined
+from autotune.experiment.cycles import Earlier, noise_of, refined
 from autotune.experiment.device import DeviceOscillation
 from autotune.experiment.limits import Envelope, Watch
 from autotune.experiment.loop import ControlLoop, Timing
@@ -24,7 +24,7 @@ from autotune.experiment.return_to_setpoint import return_by_relay, setpoint_bef
 from autotune.experiment.rig import Rig, RunsRelay, ShowsOutput
 from autotune.experiment.sweep import missing_phases, sweep
 from autotune.experiment.sweep_warnings import sweep_warnings
-from autotune.experiment.together import is_together
+from autotune.experiment.together import Price, is_together
 from autotune.identification.frequency.windows import Rows
 from autotune.identification.sweep_noted import estimate_again, reason_noted
 from autotune.recording import Recording, RecordingWriter
@@ -67,6 +67,7 @@ def run_experiment(
     *,
     earlier: Earlier | None = None,
     on_status: OnStatus | None = None,
+    price: Price | None = None,
 ) -> ExperimentResult:
     """Run the whole experiment on a rig and leave it safe.
 
@@ -83,6 +84,8 @@ def run_experiment(
         rig is not touched where none is.
     on_status : callable, optional
         Called a few times per second of rig time at most.
+    price : callable, optional
+        As :func:`autotune.experiment.sweep.sweep`.
 
     Raises
     ------
@@ -101,7 +104,7 @@ def run_experiment(
     extra = further_columns(rig)
     writer = RecordingWriter(recording, ("t", "u", "y", *extra), recording_metadata(config))
     with ControlLoop(rig=rig, envelope=envelope_of(config), writer=writer, extra=extra) as loop:
-        swept = _experiment_on(loop, config, earlier=earlier, on_status=on_status)
+        swept = _experiment_on(loop, config, earlier=earlier, on_status=on_status, price=price)
     sitting = len(earlier.recordings)
 
     def rows(number: int) -> Rows:
@@ -134,7 +137,12 @@ class Swept:
 
 
 def _experiment_on(
-    loop: ControlLoop, config: Config, *, earlier: Earlier | None = None, on_status: OnStatus | None = None
+    loop: ControlLoop,
+    config: Config,
+    *,
+    earlier: Earlier | None = None,
+    on_status: OnStatus | None = None,
+    price: Price | None = None,
 ) -> Swept:
     """Go through the states on an open loop; the plant is left at rest, under the command that holds it.
 
@@ -158,7 +166,7 @@ def _experiment_on(
         if isinstance(loop.rig, RunsRelay):
             oscillation = DeviceOscillation(loop.rig, oscillation)
         journal.enter(State.SWEEP)
-        segments, known = sweep(loop, point, wanted, known, oscillation, journal.show, earlier)
+        segments, known = sweep(loop, point, wanted, known, oscillation, journal.show, earlier, price)
     except AutotuneError as error:
         error.where = error.where or journal.state.value
         raise
@@ -268,7 +276,7 @@ def _result(
         plant_sign=segments[-1].settings.plant_sign,
         u_rest=float(np.mean(u_means)),
         u_rest_sd=spread / math.sqrt(u_means.size),
-        noise_sd=segments[-1].noise_sd,
+        noise_sd=noise_of(segments),
         timing=timing,
         rig_time_s=sum(part.rig_time_s for part in parts),
         first_move_s=known.first_move_s,

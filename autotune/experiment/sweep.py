@@ -2,30 +2,29 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 from autotune.config.procedure import ExperimentSettings, OperatingPointSettings
 from autotune.errors import ExperimentStopped, IdentificationError
-from autotune.experiment.cycles import Earlier, measured
+from autotune.experiment.cycles import Earlier, measured, noise_of
 from autotune.experiment.dwell import Dwell, further_periods
 from autotune.experiment.limit_cycle_run import LEAST_PERIODS, run_limit_cycle
 from autotune.experiment.limits import Envelope
 from autotune.experiment.local_model import LocalModel, lag_beyond_integrator
 from autotune.experiment.loop import ControlLoop
 from autotune.experiment.oscillation import Oscillation
-from autotune.experiment.plan import Choice, Goal, allot, choose, phase_targets, time_s, within_reach
+from autotune.experiment.plan import PEAK_SHARE, Choice, Goal, allot, choose, phase_targets, time_s, within_reach
 from autotune.experiment.preflight import Known
 from autotune.experiment.relay import RelaySettings
 from autotune.experiment.result import Cycle, Segment, State
 from autotune.experiment.sweep_warnings import relative_sd, sweep_warnings
-from autotune.experiment.together import estimate_beside, goes_on, is_together, was_tried
+from autotune.experiment.together import Price, estimate_beside, goes_on, is_together, was_tried
 from autotune.identification.sweep_noted import NOTED, note_of
 
-#: part of limits.swing that a limit cycle is planned for: the rest is for a mid-point that is not quite right
-PEAK_SHARE = 0.87
-#: the same for the first point, whose gain is foreseen from a short look at the plant
+#: part of limits.swing that a first point is planned for, its gain foreseen from a short look, and those far apart
 FIRST_PEAK_SHARE = 0.79
 #: part of the amplitude so foreseen that it reaches for sure
 FIRST_SURE = 0.9
@@ -43,6 +42,7 @@ def sweep(
     oscillation: Oscillation,
     show: Show,
     earlier: Earlier,
+    price: Price | None = None,
 ) -> tuple[tuple[Segment, ...], Known]:
     """Measure a point at every phase that is wanted and not yet measured, within the budget of rig time.
 
@@ -58,6 +58,9 @@ def sweep(
         Told what happens, the rig time that is expected to remain [s], what is known and which relay runs.
     earlier : Earlier
         Limit cycles that earlier sittings finished; their phases are passed over, their points and time count.
+    price : callable, optional
+        Says what is left unknown of points that are estimated together costs the controller: the sweep then ends where
+        the rest of the budget would make it better by less than 1 %.
 
     Returns
     -------
@@ -83,7 +86,7 @@ def sweep(
     if wanted.together and targets and len(every) >= FEW and not was_tried(earlier):
         # few and short cycles that an earlier sitting left are quicker run again than gone on with
         run.segments = []
-        left = _together(run, every, end_s)
+        left = _together(run, every, end_s, price)
         if left is None:
             return tuple(run.segments), run.known
         targets = left
@@ -106,6 +109,8 @@ class _Sweep:
         Whether the relay is at the extremum of y of a cycle of the same peak.
     by_itself : bool
         Whether each point is of its own cycle: then it is said how well it is known.
+    far : bool
+        Whether the next cycle's frequency is far from the last one's, so that its gain is foreseen from afar.
     """
 
     def __init__(
@@ -121,7 +126,7 @@ class _Sweep:
         self.loop, self.y_centre, self.wanted, self.oscillation = loop, y_centre, wanted, oscillation
         self._show, self._part = show, len(earlier.recordings)
         self.segments = list(earlier.segments)
-        self.settled, self.by_itself = False, False
+        self.settled, self.by_itself, self.far = False, False, False
         self.known = Known()
 
     def know(self, known: Known) -> None:
@@ -146,7 +151,8 @@ class _Sweep:
     @property
     def goal(self) -> Goal:
         """What the next limit cycle works under."""
-        return _goal(self.loop.envelope, self.wanted.relay_amplitude, self.known)
+        share = PEAK_SHARE if self.known.swept and not self.far else FIRST_PEAK_SHARE
+        return _goal(self.loop.envelope, share, self.wanted.relay_amplitude, self.known)
 
     def choices(self, phases_rad: Sequence[float]) -> list[Choice]:
         """Return the settings for the phases as the plant is known now."""
@@ -174,7 +180,7 @@ class _Sweep:
         self.segments.append(segment)
         self.settled = True
         loop.note(relay=[one.to_table() for one in self.segments if one.part == self._part])
-        self.know(replace(known, midpoint=segment.u_mean, noise_sd=segment.noise_sd))
+        self.know(replace(known, midpoint=segment.u_mean, noise_sd=noise_of(self.segments)))
 
 
 def _one_by_one(run: _Sweep, targets: Sequence[float], end_s: float) -> None:
@@ -191,38 +197,43 @@ def _one_by_one(run: _Sweep, targets: Sequence[float], end_s: float) -> None:
         run.cycle(choices[0], periods[0], end_s - reserved_s)
 
 
-def _together(run: _Sweep, targets: Sequence[float], end_s: float) -> list[float] | None:
+def _together(run: _Sweep, targets: Sequence[float], end_s: float, price: Price | None) -> list[float] | None:
     """Run few limit cycles and estimate their rows together; return which phases need a cycle of their own, if any."""
-    loop = run.loop
+    loop, budget_s = run.loop, run.wanted.budget_s
     first = (targets[0], targets[len(targets) // 2], targets[-1])
     unvisited = [phase for phase in targets if phase not in first]
     others = [phase if run.known.plant_sign > 0 else phase + math.pi for phase in unvisited]
+    run.far = True
     for i, target in enumerate(first):
         choices = run.choices(first[i:])
         remaining_s = sum(time_s(choice, LEAST_PERIODS) for choice in choices)
         said = f"limit cycle {i + 1} of {FEW}: {math.degrees(target):.0f} deg, for all points together"
         run.tell(said, remaining_s, choices[0].settings)
         run.cycle(choices[0], LEAST_PERIODS, end_s)
-    while True:
+    run.far = False
+    for look in itertools.count(1):
         run.tell("estimating all points together", 0.0)
-        found = estimate_beside(run.oscillation, run.segments, others, run.known.first_move_s)
+        found = estimate_beside(run.oscillation, run.segments, others, run.known, look, price)
         run.settled = not goes_on(loop)
-        why = found if isinstance(found, str) else found.refused
-        if loop.monitor.commands.found:
-            why = "commands of another master"
-        if why or isinstance(found, str) or found.worst_sd <= run.wanted.gain_sd:
+        why = "commands of another master" if loop.monitor.commands.found else found.why
+        if why or found.estimate is None:
+            break
+        left_s = end_s - loop.tick.t_s
+        share = found.wanted_sd(run.wanted.gain_sd, budget_s - left_s, budget_s) / found.estimate.worst_sd
+        if share >= 1.0:
             break
         choices = run.choices(first)
-        periods = _further(run, choices, found.worst_sd, end_s - loop.tick.t_s)
+        periods = _further(run, choices, share, left_s)
         if not any(periods):
             break
         most = max(range(len(first)), key=lambda i: periods[i] * 2.0 * math.pi / choices[i].omega_rad_s)
+        # to much slower ones by way of the one between: y, as fast as it is, would go far before the relay answers
+        most = min(most, 1 + first.index(run.segments[-1].phase_rad))
         remaining_s = sum(time_s(choice, count) for choice, count in zip(choices, periods, strict=True) if count)
-        said = f"all points are known to {100 * found.worst_sd:.2g} %: {math.degrees(first[most]):.0f} deg again"
+        said = f"{found.words}: {math.degrees(first[most]):.0f} deg again"
         run.tell(said, remaining_s, choices[most].settings)
-        run.cycle(choices[most], periods[most], end_s)
-    estimate = None if isinstance(found, str) else found
-    loop.note(**{NOTED: note_of(estimate, why, len(run.segments), others)})
+        run.cycle(choices[most], max(periods[most], LEAST_PERIODS), end_s)
+    loop.note(**{NOTED: note_of(found.estimate, why, len(run.segments), others)})
     if not why:
         return None
     run.tell(f"each point by itself: {why}", math.nan)
@@ -230,8 +241,8 @@ def _together(run: _Sweep, targets: Sequence[float], end_s: float) -> list[float
     return _by_themselves(run, first, unvisited, end_s)
 
 
-def _further(run: _Sweep, choices: Sequence[Choice], sd: float, left_s: float) -> tuple[int, ...]:
-    """Return the further periods that each of the limit cycles needs, for all points to be as good as is wanted."""
+def _further(run: _Sweep, choices: Sequence[Choice], share: float, left_s: float) -> tuple[int, ...]:
+    """Return the further periods that each limit cycle needs, for the worst point to be known so much better."""
     noise, middle = max(run.known.noise_sd, 1e-300), sorted(run.known.points, key=lambda point: point.omega_rad_s)[1]
     model = LocalModel.through(middle.omega_rad_s, middle.gain, lag_beyond_integrator(middle, run.known.plant_sign))
     done = [
@@ -245,8 +256,7 @@ def _further(run: _Sweep, choices: Sequence[Choice], sd: float, left_s: float) -
     ahead = [
         Dwell(omega_rad_s=one.omega_rad_s, signal=one.y_amplitude / noise, periods=LEAST_PERIODS) for one in choices
     ]
-    factor = run.wanted.gain_sd / sd
-    return further_periods(done, ahead, model, run.loop.sample_time_s, factor=factor, left_s=left_s)
+    return further_periods(done, ahead, model, run.loop.sample_time_s, factor=share, left_s=left_s)
 
 
 def _by_themselves(run: _Sweep, first: Sequence[float], others: Sequence[float], end_s: float) -> list[float]:
@@ -301,10 +311,10 @@ def _missing(ends_deg: tuple[float, float], wanted: ExperimentSettings, earlier:
     return tuple(_phases_between(ends_deg, wanted, earlier.segments))
 
 
-def _goal(envelope: Envelope, amplitude: float | None, known: Known) -> Goal:
+def _goal(envelope: Envelope, peak_share: float, amplitude: float | None, known: Known) -> Goal:
     limits = envelope.settings
     return Goal(
-        peak=(PEAK_SHARE if known.swept else FIRST_PEAK_SHARE) * limits.swing,
+        peak=peak_share * limits.swing,
         noise_sd=known.noise_sd,
         sample_time_s=envelope.sample_time_s,
         u_step=envelope.u_step,

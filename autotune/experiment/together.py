@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -12,6 +13,7 @@ from autotune.errors import AutotuneError
 from autotune.experiment.cycles import Earlier
 from autotune.experiment.loop import ControlLoop
 from autotune.experiment.oscillation import Oscillation
+from autotune.experiment.preflight import Known
 from autotune.experiment.priority import GoesOn
 from autotune.experiment.result import Segment
 from autotune.identification.frequency.limit_cycle import WholePeriods
@@ -20,8 +22,56 @@ from autotune.identification.sweep_estimate import SweepEstimate, estimate_sweep
 from autotune.identification.sweep_noted import NOTED, is_noted
 from autotune.recording import Recording
 
+#: of an estimate, beside noise of this standard deviation [y unit]: by how much smaller, relative, the controller's
+#: norm would be, were nothing left unknown of the plant
+Price = Callable[[SweepEstimate, float], float]
+
+#: the rest of a budget is left where it would make the norm smaller by less
+WORTH = 0.01
 #: rows before the first limit cycle are used for so many of its periods at most
 PERIODS_BEFORE = 10.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Found:
+    """What all rows of a sweep said so far.
+
+    Attributes
+    ----------
+    estimate : SweepEstimate or None
+        None where the rows determine no plant.
+    why : str
+        Why the estimate may not be used; empty where it may.
+    price : float
+        What is left unknown costs the controller, relative to its norm; NaN where nobody asked.
+    """
+
+    estimate: SweepEstimate | None
+    why: str
+    price: float = math.nan
+
+    def wanted_sd(self, gain_sd: float, swept_s: float, budget_s: float) -> float:
+        """Return the largest standard deviation of a point that is good enough.
+
+        Where a price is known it is proportional to that standard deviation, which falls with the root of the time:
+        the rest of the budget is worth price (1 - sqrt(swept / budget)) of the norm.
+
+        Parameters
+        ----------
+        gain_sd : float
+            What is good enough where no price is known, relative.
+        swept_s, budget_s : float
+            Rig time of the sweep so far, and all that it may take [s].
+        """
+        if self.estimate is None or math.isnan(self.price):
+            return gain_sd
+        return self.estimate.worst_sd * (WORTH / max(self.price, 1e-9) + math.sqrt(min(swept_s / budget_s, 1.0)))
+
+    @property
+    def words(self) -> str:
+        """How well the points are known."""
+        known = "" if self.estimate is None else f"all points are known to {100 * self.estimate.worst_sd:.2g} %"
+        return known if math.isnan(self.price) else f"{known}, which costs the controller {100 * self.price:.2g} %"
 
 
 def estimate_together(
@@ -63,16 +113,27 @@ def estimate_together(
 
 
 def estimate_beside(
-    oscillation: Oscillation, segments: Sequence[Segment], phases_rad: Sequence[float], first_move_s: float
-) -> SweepEstimate | str:
-    """Return the estimate, or why there is none; where the rig's clock goes on, the relay does meanwhile.
+    oscillation: Oscillation,
+    segments: Sequence[Segment],
+    phases_rad: Sequence[float],
+    known: Known,
+    look: int,
+    price: Price | None = None,
+) -> Found:
+    """Return what all rows say together; where the rig's clock goes on, the relay does meanwhile.
 
     Parameters
     ----------
     oscillation : Oscillation
         What runs meanwhile, and holds the rows.
-    segments, phases_rad, first_move_s : as of estimate_together
+    segments, phases_rad : as of estimate_together
         The sweep so far.
+    known : Known
+        When the plant first answered, and the noise.
+    look : int
+        How often the sweep's rows are looked at, with this time.
+    price : callable, optional
+        Asked what is left unknown costs the controller.
 
     Raises
     ------
@@ -81,15 +142,18 @@ def estimate_beside(
     """
     loop = oscillation.loop
     rows, swing = loop.history(), loop.envelope.settings.swing
-    found: list[SweepEstimate | str] = []
+    found: list[Found] = []
 
     def work() -> None:
         try:
-            found.append(estimate_together(segments, rows, phases_rad, first_move_s=first_move_s, swing=swing))
+            one = estimate_together(segments, rows, phases_rad, first_move_s=known.first_move_s, swing=swing)
+            why = one.refused(look)
+            costs = math.nan if price is None or why else price(one, known.noise_sd)
+            found.append(Found(estimate=one, why=why, price=costs))
         except AutotuneError as error:
-            found.append(str(error))
+            found.append(Found(estimate=None, why=str(error)))
         except (ArithmeticError, ValueError) as error:  # of a linear algebra that does not converge
-            found.append(f"the rows determine no plant: {error}")
+            found.append(Found(estimate=None, why=f"the rows determine no plant: {error}"))
 
     if not goes_on(loop):
         work()
@@ -98,7 +162,7 @@ def estimate_beside(
     thread.start()
     while thread.is_alive():
         oscillation.step()
-    return found[0] if found else "the estimate failed"
+    return found[0] if found else Found(estimate=None, why="the estimate failed")
 
 
 def goes_on(loop: ControlLoop) -> bool:

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.optimize import OptimizeResult, least_squares
 from scipy.stats import chi2
 
-from autotune.arrays import ComplexArray, FloatArray
+from autotune.arrays import ComplexArray, FloatArray, inverse_in_any_units, principal_axes
 from autotune.errors import IdentificationError
 from autotune.models import TransferFunction
 from autotune.points import FrequencyPoint
@@ -26,6 +26,8 @@ from autotune.points import FrequencyPoint
 _MAX_LAGS = 2
 #: a structure whose Bayesian criterion is higher than the best one's by more is excluded by the data: odds of 20 to 1
 EXCLUDED = 2.0 * math.log(20.0)
+#: what a standard deviation may raise the sum of squares by where 1 is its rise to first order, and what shortens it
+_MOST_RISE, _SHORTER = 2.0, 0.7
 #: directions besides the principal ones in which the border of a parameter region is visited
 _DIRECTIONS = 48
 
@@ -96,7 +98,8 @@ class PlantFit:
         rng : numpy.random.Generator
             Source of the draws.
         """
-        samples = rng.multivariate_normal(self.parameters, self.covariance, count, method="eigh")
+        steps = rng.standard_normal((count, self.parameters.size)) @ principal_axes(self.covariance).T
+        samples = self.parameters + steps
         return tuple(self.build(self._within(sample)) for sample in samples)
 
     def _within(self, sample: FloatArray) -> FloatArray:
@@ -128,8 +131,7 @@ class PlantFit:
         if not self.covariance.any():
             return (self.plant,)
         radius = math.sqrt(chi2.ppf(probability, self.parameters.size))
-        values, vectors = np.linalg.eigh(self.covariance)
-        axes = vectors * np.sqrt(np.maximum(values, 0.0))
+        axes = principal_axes(self.covariance)
         between = np.random.default_rng(0).standard_normal((_DIRECTIONS, self.parameters.size))
         between /= np.linalg.norm(between, axis=1, keepdims=True)
         directions = np.vstack((np.eye(self.parameters.size), -np.eye(self.parameters.size), between, -between))
@@ -249,9 +251,15 @@ def _fit_structure(
     upper = np.array([np.inf, *[math.log(1e3 / omega[0])] * lags, 2 * np.pi / omega[0]])
     starts = [(sign, ratios) for sign in (1, -1) for ratios in combinations_with_replacement((0.3, 3.0), lags)]
     sign, found = min(((sign, fit(sign, ratios)) for sign, ratios in starts), key=lambda pair: float(pair[1].cost))
-    chi_square = 2 * float(found.cost)
-    freedom = 2 * omega.size - found.x.size
-    covariance = np.linalg.pinv(found.jac.T @ found.jac) * (max(1.0, chi_square / freedom) if freedom > 0 else 1.0)
+    chi_square, freedom = 2 * float(found.cost), 2 * omega.size - found.x.size
+    excess = max(1.0, chi_square / freedom) if freedom > 0 else 1.0
+
+    def rise(step: FloatArray) -> float:
+        with np.errstate(over="ignore", invalid="ignore"):
+            error = whitened(_response(omega, found.x + step, sign, integrating) - measured)
+            return float(error @ error) - chi_square
+
+    covariance = excess * _as_far_as_it_rises(inverse_in_any_units(found.jac.T @ found.jac), rise)
 
     def build(x: FloatArray) -> TransferFunction:
         return _plant(x, sign, integrating)
@@ -269,6 +277,19 @@ def _fit_structure(
         criterion=chi_square + found.x.size * math.log(2 * omega.size),
         largest_residual=float(np.max(np.abs(_response(omega, found.x, sign, integrating) / measured - 1.0))),
     )
+
+
+def _as_far_as_it_rises(covariance: FloatArray, rise: Callable[[FloatArray], float]) -> FloatArray:
+    """Return the covariance, its principal axes no longer than the sum of squares says.
+
+    Two equal lags have one derivative: to first order nothing is known of their difference, and the sum of squares,
+    which rises by 1 over a standard deviation, rises by far more. Where it does so to one side only, the axis stays.
+    """
+    axes = principal_axes(covariance)
+    for axis in axes.T:
+        while axis.any() and not min(rise(axis), rise(-axis)) <= _MOST_RISE:
+            axis *= _SHORTER
+    return np.asarray(axes @ axes.T, dtype=np.float64)
 
 
 def _response(omega: FloatArray, parameters: FloatArray, sign: int, integrating: bool) -> ComplexArray:

@@ -21,16 +21,13 @@ from autotune.errors import AutotuneError, IdentificationError
 from autotune.identification.delay.identify import identify_delay
 from autotune.identification.delay.model import DelayModel
 from autotune.identification.dependence import is_fed_back
+from autotune.identification.equation_region import LEAST_SHARE, Equation, joined, largest_term
 from autotune.identification.parametric import EXCLUDED, PlantFit, not_excluded
 from autotune.models import TransferFunction
 from autotune.progress import Progress, quiet
 from autotune.recording import Recording
 
 _ORDERS = (1, 2, 3)
-#: a plant that the data hold for self-regulating stays so in its region: a_0 below this share of its estimate
-_LEAST_SHARE = 0.02
-
-
 #: a zero is looked for on each side where so small a part of the lags' sum as its time constant already fits better
 _FIRST_ZERO = 0.1
 _ZEROS = (0.25, 0.5, 1.0, 2.0)
@@ -114,16 +111,6 @@ def fit_recordings(recordings: Sequence[Recording], progress: Progress = quiet) 
     return not_excluded([_with_zero(recordings, one, rows) if one.tau_s else _join(one, rows) for one in found])
 
 
-def plant_fit(models: Sequence[tuple[DelayModel, bool]]) -> PlantFit:
-    """Return the fit of one recording's models, each with whether it integrates, that its rows do not exclude."""
-    found = [
-        _Fitted(structure=_Structure(order=model.order, integrator=integrator), models=(model,))
-        for model, integrator in models
-    ]
-    rows = [min(model.rows for model, _ in models)]
-    return not_excluded([_join(one, rows) for one in found])
-
-
 def _leading(recording: Recording, tau_s: float) -> Recording:
     """Return the recording with the command (1 + tau s) u: a jump of u acts once more, over the rows around it."""
     return replace(recording, u=recording.u + tau_s * np.gradient(recording.u, recording.t))
@@ -175,7 +162,7 @@ def _zero(recordings: Sequence[Recording], without: _Fitted) -> _Fitted | None:
 
 def _with_zero(recordings: Sequence[Recording], found: _Fitted, rows: Sequence[int]) -> PlantFit:
     """Return the fit with tau among its parameters; its variance is the curvature of what is left beside it."""
-    unit = _largest_term(max(found.models, key=lambda model: model.rows))
+    unit = largest_term(max(found.models, key=lambda model: model.rows).transfer_function())
     middle = _join(found, rows, unit)
     way = 0.1 * found.tau_s
     slope, variance = np.zeros(middle.parameters.size), (0.5 * found.tau_s) ** 2
@@ -191,7 +178,7 @@ def _with_zero(recordings: Sequence[Recording], found: _Fitted, rows: Sequence[i
     along = np.append(slope, 1.0)
     covariance = variance * np.outer(along, along)
     covariance[:-1, :-1] += middle.covariance
-    ends = found.tau_s * np.array([_LEAST_SHARE, 2.0])
+    ends = found.tau_s * np.array([LEAST_SHARE, 2.0])
 
     def build(parameters: FloatArray) -> TransferFunction:
         plant = middle.build(parameters[:-1])
@@ -209,94 +196,6 @@ def _with_zero(recordings: Sequence[Recording], found: _Fitted, rows: Sequence[i
 
 
 def _join(found: _Fitted, common: Sequence[int], unit: int | None = None) -> PlantFit:
-    """Return the fit of one structure to all recordings: information adds, and so do the criteria."""
-    structure, models, n = found.structure, found.models, found.structure.order
-    unit = _largest_term(max(models, key=lambda model: model.rows)) if unit is None else unit
-    free = [i for i in range(n + 2) if not (structure.integrator and i == 0)]
-    forms = [_over(model, unit) for model in models]
-    information = [np.linalg.pinv(covariance[np.ix_(free, free)]) for _, covariance in forms]
-    covariance = np.linalg.pinv(np.sum(information, axis=0))
-    x = forms[0][0].copy()
-    x[free] = covariance @ np.sum([J @ v[free] for J, (v, _) in zip(information, forms, strict=True)], axis=0)
-    apart = float(sum((v - x)[free] @ J @ (v - x)[free] for J, (v, _) in zip(information, forms, strict=True)))
-    freedom = len(free) * (len(models) - 1)
-    full = np.zeros((n + 2, n + 2))
-    full[np.ix_(free, free)] = covariance * max(1.0, apart / freedom if freedom else 1.0)
-    rows = sum(model.rows for model in models)
-    lower, upper = _bounds(x, structure)
-
-    def build(parameters: FloatArray) -> TransferFunction:
-        *a, b, h = (float(value) for value in parameters)
-        den = [-value for value in a]
-        den.insert(unit, 1.0)
-        return TransferFunction(
-            num=(b / den[-1],), den=tuple(value / den[-1] for value in den[::-1]), delay_s=max(0.0, h)
-        )
-
-    return PlantFit(
-        plant=build(x),
-        integrating=structure.integrator,
-        parameters=x,
-        covariance=full,
-        sign=1 if x[n] > 0.0 else -1,
-        chi_square=float(rows - found.coefficients) + apart,
-        degrees_of_freedom=rows - found.coefficients + freedom,
-        bounds=np.stack((lower, upper)),
-        build=build,
-        criterion=found.criterion(common) + apart,
-        source="recording",
-    )
-
-
-def _largest_term(model: DelayModel) -> int:
-    """Return the power of s whose term is the denominator's largest where the phase is -135 degrees.
-
-    Over its coefficient a slow pole is a rate and a fast one a lag, and what the record determines of them together (a
-    fast lag and the dead time as their sum) stays linear in the parameters. In a_0, ..., b it is not: on the border of
-    their region a lag of 3 s known to 20 % and a dead time add up to 4 s more than the record allows.
-    """
-    n = len(model.a)
-    plant = model.transfer_function()
-    scales = [abs(pole) for pole in plant.poles if pole]
-    if model.delay_s > 0.0:
-        scales.append(1.0 / model.delay_s)
-    if n == 1 or not scales or max(pole.real for pole in plant.poles) > 0.0:
-        return n
-    omega = np.geomspace(1e-3 * min(scales), 1e3 * max(scales), 1200)
-    phase = np.unwrap(np.angle(plant.response(omega)))
-    static = -0.5 * math.pi * plant.integrators
-    turned = phase - phase[0] + static
-    beyond = np.flatnonzero(turned <= -0.75 * math.pi)
-    if not beyond.size:
-        return n
-    terms = np.abs([*model.a, 1.0]) * omega[beyond[0]] ** np.arange(n + 1)
-    return int(np.argmax(terms))
-
-
-def _over(model: DelayModel, unit: int) -> tuple[FloatArray, FloatArray]:
-    """Return a_i, -1 for s^n, and b over the coefficient of s^unit, which is left out, h, and their covariance."""
-    n = len(model.a)
-    values, covariance = model.values[: n + 2], model.covariance[: n + 2, : n + 2]
-    if unit == n:
-        return values, covariance
-    scale = -values[unit]  # the coefficient of s^unit in the denominator
-    others = [i for i in range(n) if i != unit]
-    x = np.array([*(values[others] / scale), -1.0 / scale, values[n] / scale, values[n + 1]])
-    jacobian = np.zeros((n + 2, n + 2))
-    for row, i in enumerate([*others, n]):
-        jacobian[row if i < n else n, i] = 1.0 / scale
-    jacobian[n + 1, n + 1] = 1.0
-    jacobian[: n + 1, unit] = x[: n + 1] / scale
-    return x, np.asarray(jacobian @ covariance @ jacobian.T, dtype=np.float64)
-
-
-def _bounds(x: FloatArray, structure: _Structure) -> tuple[FloatArray, FloatArray]:
-    """Return bounds of the parameters: a stable plant stays so, a gain keeps its sign, a delay is not negative."""
-    n = structure.order
-    lower, upper = np.full(n + 2, -np.inf), np.full(n + 2, np.inf)
-    for i in range(n):
-        if x[i] < 0.0:
-            upper[i] = _LEAST_SHARE * x[i]
-    (lower if x[n] > 0.0 else upper)[n] = _LEAST_SHARE * x[n]
-    lower[n + 1] = 0.0
-    return lower, upper
+    """Return the fit of one structure to all recordings."""
+    equations = [Equation.of(model, found.structure.integrator) for model in found.models]
+    return joined(equations, unit, found.coefficients, found.criterion(common))

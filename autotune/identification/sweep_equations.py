@@ -10,49 +10,76 @@ from itertools import product
 import numpy as np
 
 from autotune.arrays import ComplexArray, FloatArray
-from autotune.errors import AutotuneError, IdentificationError
+from autotune.errors import IdentificationError
 from autotune.identification.delay.data import DelayData
-from autotune.identification.delay.model import DelayModel
-from autotune.identification.delay.output_error import Point, Structure, minimise, solve_linear
-from autotune.identification.delay.output_error_model import finish
-from autotune.identification.parametric import fit_structures
+from autotune.identification.delay.output_error import Point, Structure, gram_at, minimise, solve_linear
+from autotune.identification.equation_region import Equation
 from autotune.points import FrequencyPoint
 
-_ORDERS = (1, 2, 3)
+_ORDERS, _ZEROS = (1, 2, 3, 4), (0, 1)
+#: dead times, of the longest, from which an equation through the cycles' points is begun
+_SHARES = np.linspace(0.0, 1.0, 25) ** 1.5
+#: of each structure so many dead times are tried on the rows
+_TRIED = 4
+#: times that the equation's error is weighted anew with the denominator before
+_REWEIGHTED = 4
 #: rows by which a delay is moved to leave a local minimum, and variances by which the next one has to be lower
 _STRIDE, _LOWER = 1.5, 1e-3
 _ITERATIONS = 40
-#: of the slowest limit cycle's frequency: a pole there looks like an integrator's in all limit cycles
-_SLOW = 0.05
+#: condition of the information beyond which the rows do not determine all numbers
+_UNDETERMINED = 1e13
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Fitted:
-    """One structure at its minimum."""
+    """One structure at its minimum.
+
+    Attributes
+    ----------
+    structure, point
+        What was fitted, and where its minimum lies.
+    covariance : (n + m + 2, n + m + 2) array
+        Of a_0..a_(n-1), b_0..b_m, h; zero rows for what is known.
+    """
 
     structure: Structure
     point: Point
-    model: DelayModel
+    covariance: FloatArray
 
     @property
     def criterion(self) -> float:
         """Akaike's: it keeps a pole that the rows only just show, whose lack would bias every point."""
         return self.point.rows * math.log(self.point.cost / self.point.rows) + 2.0 * self.structure.parameters
 
+    @property
+    def equation(self) -> Equation:
+        """The equation."""
+        n, point = self.structure.order, self.point
+        return Equation(
+            order=n,
+            integrator=self.structure.integrator,
+            values=np.array([*point.a, point.theta[0], *point.theta[2 + n :], point.h]),
+            covariance=self.covariance,
+            noise_sd=math.sqrt(point.cost / (point.rows - self.structure.parameters)),
+            rows=point.rows,
+        )
+
     def response(self, omega_rad_s: FloatArray) -> tuple[ComplexArray, FloatArray]:
         """Return the response (W,) and, to first order, the covariance of its (real, imaginary) parts, (2W, 2W)."""
-        model, n, s = self.model, self.model.order, 1j * omega_rad_s
-        powers = s[None, :] ** np.arange(n)[:, None]
-        denominator = s**n - np.array(model.a) @ powers
-        G = model.b * np.exp(-s * model.delay_s) / denominator
-        slopes = np.vstack([G * powers / denominator, (G / model.b)[None, :], (-s * G)[None, :]])
+        n, values, s = self.structure.order, self.equation.values, 1j * omega_rad_s
+        powers = s[None, :] ** np.arange(n + 1)[:, None]
+        denominator = powers[n] - values[:n] @ powers[:n]
+        late = np.exp(-s * values[-1])
+        of_u = powers[: values.size - n - 1] * late / denominator
+        G = values[n:-1] @ of_u
+        slopes = np.vstack([G * powers[:n] / denominator, of_u, (-s * G)[None, :]])
         parts = as_parts(slopes)
-        covariance = parts.T @ model.covariance[: n + 2, : n + 2] @ parts
+        covariance = parts.T @ self.covariance @ parts
         return np.asarray(G, dtype=np.complex128), np.asarray(covariance, dtype=np.float64)
 
 
-def starts_of(points: Sequence[FrequencyPoint], data: DelayData, largest: float) -> list[tuple[Structure, Point]]:
-    """Return a start for each structure: lags and dead time through the cycles' own points.
+def fit_from_points(points: Sequence[FrequencyPoint], data: DelayData, largest: float) -> list[Fitted]:
+    """Return every structure at its minimum that the rows determine, under white noise.
 
     Parameters
     ----------
@@ -62,33 +89,75 @@ def starts_of(points: Sequence[FrequencyPoint], data: DelayData, largest: float)
         Its rows.
     largest : float
         Longest delay [s].
+
+    Raises
+    ------
+    IdentificationError
+        The rows determine none.
+
+    Notes
+    -----
+    A structure begins at the equations through the points, or where smaller ones ended: with a zero more, a lag, or two
+    poles that ring, of whose places the rows take theirs.
     """
-    fits = fit_structures(points)
-    slowest = min(point.omega_rad_s for point in points)
-    found: list[tuple[Structure, Point]] = []
-    for n, integrator in product(_ORDERS, (True, False)):
-        structure = Structure(order=n, integrator=integrator)
-        near = next((f for f in fits if f.integrating == integrator and len(f.plant.den) == n + 1), None)
-        if near is not None:
-            a = tuple(-value / near.plant.den[0] for value in near.plant.den[:0:-1])
-            h = near.plant.delay_s
-        else:  # of three lags: an integrator and two, leaking
-            integrating = found[-1][1]
-            a, h = (integrating.a[1] * _SLOW * slowest, *integrating.a[1:]), integrating.h
-        found.append((structure, solve_linear(data, structure, a, min(h, largest))))
-    return found
+    omega = np.array([point.omega_rad_s for point in points])
+    G = np.array([point.response for point in points])
+    found: list[Fitted] = []
+    for n, zeros, integrator in product(_ORDERS, _ZEROS, (True, False)):
+        structure = Structure(order=n, integrator=integrator, zeros=zeros)
+        if zeros >= n or n + 1 - integrator + zeros > 2 * len(points):
+            continue
+        through = sorted((*_through(omega, G, structure, h), h) for h in largest * _SHARES)
+        places = [(a, h) for _, a, h in through[:_TRIED]]
+        places += [place for one in found for place in _grown(one, structure, omega)]
+        begun = min((solve_linear(data, structure, *place) for place in places), key=lambda point: point.cost)
+        found += _fitted(data, structure, begun, largest, np.empty(0))
+    return _determined(found, data)
 
 
-def fit_all(
-    data: DelayData, starts: Sequence[tuple[Structure, Point]], largest: float, whitening: FloatArray
-) -> list[Fitted]:
-    """Return every structure at its minimum that the rows determine.
+def _grown(one: Fitted, structure: Structure, omega: FloatArray) -> list[tuple[tuple[float, ...], float]]:
+    """Return places (a, h) of a structure that a smaller one's minimum leads to; none where it is no step away."""
+    more = structure.order - one.structure.order
+    if one.structure.integrator != structure.integrator or structure.zeros - one.structure.zeros != (more == 0):
+        return []
+    if more == 0:
+        return [(one.point.a, share * one.point.h) for share in (0.3, 0.6, 1.0)]
+    high, low = float(omega.max()), float(omega.min())
+    factors = [[1.0, w] for w in (high, 3.0 * high)] if more == 1 else []
+    if more == 2:
+        factors = [[1.0, 2.0 * d * w, w * w] for w in np.geomspace(low, 8.0 * high, 10) for d in (0.05, 0.3)]
+    den = np.array([1.0, *(-value for value in one.point.a[::-1])])
+    made = [np.polymul(den, factor) for factor in factors]
+    return [(tuple((-each[:0:-1]).tolist()), share * one.point.h) for each in made for share in (0.5, 1.0)]
+
+
+def _through(omega: FloatArray, G: ComplexArray, structure: Structure, h: float) -> tuple[float, tuple[float, ...]]:
+    """Return how far an equation with a dead time misses points, relative, and its a_0..a_(n-1)."""
+    n, scale = structure.order, float(np.exp(np.mean(np.log(omega))))
+    s = 1j * omega / scale
+    first = 1 if structure.integrator else 0
+    powers = s[None, :] ** np.arange(n + 1)[:, None]
+    late = powers[: structure.zeros + 1] * np.exp(-1j * omega * h)
+    columns = np.vstack([powers[first:n] * G, late])
+    denominator, x = np.ones_like(s), np.empty(0)
+    for _ in range(_REWEIGHTED):
+        weight = 1.0 / (np.abs(denominator) * np.abs(G))
+        sides = as_parts(np.asarray(np.vstack([columns, powers[n] * G]) * weight, dtype=np.complex128))
+        x = np.linalg.lstsq(sides[:-1].T, sides[-1], rcond=None)[0]
+        denominator = powers[n] - x[: n - first] @ powers[first:n]
+    missed = x[n - first :] @ late / denominator / G - 1.0
+    a = np.concatenate([np.zeros(first), x[: n - first]]) * scale ** np.arange(n, 0, -1)
+    return float(np.sum(np.abs(missed) ** 2)), tuple(a.tolist())
+
+
+def fit_again(data: DelayData, found: Sequence[Fitted], largest: float, whitening: FloatArray) -> list[Fitted]:
+    """Return structures at their minima under noise of another colour.
 
     Parameters
     ----------
     data : DelayData
         The sweep's rows.
-    starts : sequence of (Structure, Point)
+    found : sequence of Fitted
         Where each begins.
     largest : float
         Longest delay [s].
@@ -100,19 +169,26 @@ def fit_all(
     IdentificationError
         The rows determine none.
     """
-    found: list[Fitted] = []
-    for structure, start in starts:
-        at = solve_linear(data, structure, start.a, start.h, whitening)
-        if not math.isfinite(at.cost):
-            continue
-        at = _lowest(data, structure, at, largest, whitening)
-        try:
-            found.append(Fitted(structure=structure, point=at, model=finish(data, structure, at, whitening)))
-        except AutotuneError:  # more than the rows determine
-            continue
+    again: list[Fitted] = []
+    for one in found:
+        begun = solve_linear(data, one.structure, one.point.a, one.point.h, whitening)
+        again += _fitted(data, one.structure, begun, largest, whitening)
+    return _determined(again, data)
+
+
+def _determined(found: list[Fitted], data: DelayData) -> list[Fitted]:
     if not found:
         raise IdentificationError("no equation is determined by the rows of the sweep", where=data.name)
     return found
+
+
+def _fitted(data: DelayData, structure: Structure, begun: Point, largest: float, whitening: FloatArray) -> list[Fitted]:
+    """Return a structure at its minimum; nothing where the rows do not determine it."""
+    if not math.isfinite(begun.cost):
+        return []
+    at = _lowest(data, structure, begun, largest, whitening)
+    covariance = _covariance(data, structure, at, whitening)
+    return [] if covariance is None else [Fitted(structure=structure, point=at, covariance=covariance)]
 
 
 def _lowest(data: DelayData, structure: Structure, start: Point, largest: float, whitening: FloatArray) -> Point:
@@ -132,6 +208,28 @@ def _lowest(data: DelayData, structure: Structure, start: Point, largest: float,
             at = beside
         best = min(best, at, key=lambda one: one.cost)
     return best
+
+
+def _covariance(data: DelayData, structure: Structure, at: Point, whitening: FloatArray) -> FloatArray | None:
+    """Return the covariance of a_0.., b_0.., h at a minimum; None where the rows do not determine them.
+
+    Only the initial state's depends on the free responses that the sensitivities leave out.
+    """
+    n, free = structure.order, np.flatnonzero(structure.free)
+    gram, finite = gram_at(data, at.a, at.h, at.theta, whitening)
+    information = gram[np.ix_(free, free)]
+    scale = np.sqrt(np.diag(information))
+    if not finite or not np.all(scale > 0.0):
+        return None
+    scaled = information / np.outer(scale, scale)
+    if np.linalg.cond(scaled) > _UNDETERMINED:
+        return None
+    inner = np.zeros((len(gram) - 1, len(gram) - 1))
+    inner[np.ix_(free, free)] = np.linalg.inv(scaled) / np.outer(scale, scale)
+    linear = structure.linear.size
+    wanted = [*range(linear, linear + n), 0, *range(2 + n, linear), linear + n]
+    variance = at.cost / (at.rows - structure.parameters)
+    return np.asarray(variance * inner[np.ix_(wanted, wanted)])
 
 
 def as_parts(values: ComplexArray) -> FloatArray:

@@ -26,17 +26,17 @@ from scipy.stats import chi2
 from autotune.arrays import ComplexArray, FloatArray
 from autotune.identification.delay.data import prepare
 from autotune.identification.envelope import polar_sd
+from autotune.identification.equation_region import plant_fit
 from autotune.identification.frequency.limit_cycle import WholePeriods
 from autotune.identification.parametric import PlantFit
-from autotune.identification.recorded_plant import plant_fit
 from autotune.identification.sweep_adequacy import TESTS, colour_beside, judge_equation, own_columns
-from autotune.identification.sweep_equations import Fitted, as_parts, fit_all, starts_of
+from autotune.identification.sweep_equations import Fitted, as_parts, fit_again, fit_from_points
 from autotune.points import FrequencyPoint, as_pairs
 from autotune.recording import Recording
 
 Cycle: TypeAlias = tuple[FrequencyPoint, WholePeriods]
 
-#: probability with which the three tests together send a right equation away
+#: probability with which the tests of a sweep send a right equation away, however often its rows are looked at
 LEVEL = 0.05
 
 
@@ -62,10 +62,16 @@ class SweepEstimate:
     start_s: float
     end_s: float
 
-    @property
-    def refused(self) -> str:
-        """Say what the rows show that the equation has not; empty where the points may be used."""
-        shown = [what for what, p in zip(TESTS, self.p_values, strict=True) if p < LEVEL / len(TESTS)]
+    def refused(self, look: int = 1) -> str:
+        """Say what the rows show that the equation has not; empty where the points may be used.
+
+        Parameters
+        ----------
+        look : int
+            How often this sweep's rows were looked at, with this time: the k-th look may be wrong with LEVEL / 2^k.
+        """
+        least = LEVEL / 2.0**look / len(TESTS)
+        shown = [what for what, p in zip(TESTS, self.p_values, strict=True) if p < least]
         return f"the rows show {' and '.join(shown)}" if shown else ""
 
     @property
@@ -114,11 +120,9 @@ def estimate_sweep(
     data = prepare(rows, start_s=start_s, past_input="held", skip_missing=True)
     largest = 0.5 * max(window.period_s for _, window in cycles)
     columns, kinds = own_columns(data.ty, [window for _, window in cycles])
-    white = fit_all(data, starts_of([point for point, _ in cycles], data, largest), largest, np.empty(0))
+    white = fit_from_points([point for point, _ in cycles], data, largest)
     whitening = colour_beside(data, min(white, key=lambda one: one.criterion), columns)
-    found = (
-        fit_all(data, [(one.structure, one.point) for one in white], largest, whitening) if whitening.size else white
-    )
+    found = fit_again(data, white, largest, whitening) if whitening.size else white
     best = min(found, key=lambda one: one.criterion)
     p_values, excess = judge_equation(data, best, columns, kinds, whitening)
     omega = _frequencies(best, omega_rad_s, phases_rad)
@@ -133,7 +137,7 @@ def estimate_sweep(
         )
         for i in range(omega.size)
     )
-    fit = plant_fit([(one.model, one.structure.integrator) for one in found])
+    fit = plant_fit([one.equation for one in found])
     widened = replace(
         fit, covariance=excess * fit.covariance, source="points", shared_errors=_shared_errors(covariance)
     )

@@ -10,7 +10,6 @@ from pathlib import Path
 
 from autotune.config import Config
 from autotune.controller import PIDController
-from autotune.design.noise import LoopFacts
 from autotune.errors import AutotuneError, ExperimentStopped, OperatorStop
 from autotune.experiment.cycles import Earlier
 from autotune.experiment.judgement import Verification
@@ -36,7 +35,7 @@ from autotune.pipeline.folder import (
 )
 from autotune.pipeline.held_gains import held_by, on_registers
 from autotune.pipeline.result import write_result
-from autotune.pipeline.swept import analyse_sweep
+from autotune.pipeline.swept import analyse_sweep, facts_of, price_of
 from autotune.run_log import RunLog
 
 #: how long an operator may ask for the old gains after new ones were handed over [s]; then the new ones stay
@@ -148,9 +147,15 @@ def _tune(
         recording = next_free(out / RECORDING, ".toml")
         if missing_phases(config.experiment, earlier):
             log.recording(recording)
-        experiment = run_experiment(rig, config, recording, earlier=earlier, on_status=on_status)
+        experiment = run_experiment(
+            rig, config, recording, earlier=earlier, on_status=on_status, price=price_of(config)
+        )
         analysis = analyse_sweep(
-            experiment, config.design, _facts(config, experiment), out, _teller(on_status, experiment.rig_time_s)
+            experiment,
+            config.design,
+            facts_of(config, experiment.noise_sd),
+            out,
+            _teller(on_status, experiment.rig_time_s),
         )
         if deploy:  # what the rig can hold is what is verified, reported and handed over
             held = held_by(rig, analysis.controller, config.design, fit=analysis.fit)
@@ -255,11 +260,3 @@ def _teller(on_status: OnStatus, elapsed_s: float) -> Callable[[str], None]:
         on_status(Status(state=State.HAND_BACK, elapsed_s=elapsed_s, remaining_s=math.nan, message=message))
 
     return tell
-
-
-def _facts(config: Config, experiment: ExperimentResult) -> LoopFacts:
-    return LoopFacts(
-        noise_sd=experiment.noise_sd,
-        u_range=config.limits.u_max - config.limits.u_min,
-        sample_time_s=config.signals.sample_time_s,
-    )

@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from autotune.config import Config
 from autotune.config.procedure import DesignSettings
 from autotune.design.noise import LoopFacts
+from autotune.design.on_fit import design_on_fit
+from autotune.design.synthesis import design
 from autotune.errors import AutotuneError, DesignError, IdentificationError
 from autotune.experiment.judgement import CONTRADICTED, contradict
 from autotune.experiment.result import ExperimentResult
+from autotune.experiment.together import Price
 from autotune.identification.parametric import PlantFit
 from autotune.identification.recorded_plant import fit_recordings
-from autotune.pipeline.analysis import Analysis, analyse
+from autotune.identification.sweep_estimate import SweepEstimate
+from autotune.pipeline.analysis import Analysis, analyse, specification
 from autotune.pipeline.one_thread import on_one_thread
 from autotune.recording import Recording, read_recording
 
@@ -87,6 +93,44 @@ def fit_rows(recordings: Sequence[Recording]) -> PlantFit:
             remedy="autotune diagnose looks for what else is in the plant",
         )
     return fit
+
+
+def facts_of(config: Config, noise_sd: float) -> LoopFacts:
+    """Return what a configuration, and the noise that its sweep measured [y unit], say of the loop."""
+    return LoopFacts(
+        noise_sd=noise_sd,
+        u_range=config.limits.u_max - config.limits.u_min,
+        sample_time_s=config.signals.sample_time_s,
+    )
+
+
+def price_of(config: Config) -> Price | None:
+    """Return what says how much dearer a controller is for what a sweep has not told yet; None where points are wanted.
+
+    Parameters
+    ----------
+    config : Config
+        Says what is wanted of sweep and controller.
+
+    Notes
+    -----
+    It is the norm (11), on the estimate, of the controller that keeps its margins on all of the region, over that of
+    the controller that keeps them on the estimate alone, less 1.
+    """
+    if config.experiment.goal == "points":
+        return None
+    settings = config.design
+
+    def price(estimate: SweepEstimate, noise_sd: float) -> float:
+        fit, highest = estimate.fit, estimate.points[-1].omega_rad_s
+        asked, _ = specification(settings, fit, facts_of(config, noise_sd), highest)
+        try:
+            kept = design_on_fit(fit, asked, settings.kind).h2
+            return kept / design(fit.plant, asked, settings.kind, certificate=False).h2 - 1.0
+        except AutotuneError:  # no controller keeps the margins on so large a region
+            return math.inf
+
+    return price
 
 
 def _swept(experiment: ExperimentResult, folder: Path) -> tuple[Recording, ...]:

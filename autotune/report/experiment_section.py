@@ -84,8 +84,9 @@ def _together_text(experiment: ExperimentResult) -> tuple[str, ...]:
     tests = ", ".join(f"{what} {p:.2g}" for what, p in zip(TESTS, found.p_values, strict=True))
     return (
         f"The points are estimated together from all rows between {found.start_s:.4g} and {found.end_s:.4g} s. What the"
-        f" fitted equation leaves shows nothing else: the probabilities of as much by noise alone are {tests}; below"
-        f" {LEVEL / len(TESTS):.2g} each point would have been measured by itself.",
+        f" fitted equation leaves shows nothing else: the probabilities of as much by noise alone are {tests}; so"
+        f" small ones that noise gives them in {100 * LEVEL:.0f} of 100 sweeps would have had each point measured by"
+        " itself.",
     )
 
 

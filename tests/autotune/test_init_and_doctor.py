@@ -23,7 +23,7 @@ from autotune.equations.transfer_text import parse_transfer_function
 from autotune.errors import InputError
 from autotune.model_tables import read_model
 from drivers.kinds import KINDS
-from tests.benchmarks.twins import PLANTS, REACHED, TextbookPlant, run_twin
+from tests.benchmarks.twins import PLANTS
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 REAL = [
@@ -311,12 +311,6 @@ def test_a_twin_of_a_transfer_function_has_a_sensor_as_rigs_have(tmp_path: Path,
     assert twin.resolution == pytest.approx(80.0 / 4096.0, rel=0.05)
 
 
-@pytest.mark.parametrize("plant", [PLANTS[0], PLANTS[18]], ids=lambda plant: plant.name)
-def test_one_lag_and_a_plant_that_rings_run_from_init_to_accepted(tmp_path: Path, plant: TextbookPlant) -> None:
-    outcome = run_twin(plant, tmp_path)
-    assert outcome.accepted, outcome.said
-
-
 def test_a_run_hands_nothing_over_where_a_second_person_is_asked_for(tmp_path: Path) -> None:
     path, plant = tmp_path / "rig.toml", PLANTS[2]
     command("init", path, "--kind", "simulated", "--model", plant.written, *plant.answers)
@@ -326,19 +320,3 @@ def test_a_run_hands_nothing_over_where_a_second_person_is_asked_for(tmp_path: P
     assert "not handed over: [approval] asks for a second person: autotune deploy" in said
     assert (tmp_path / "out" / "journal.jsonl").read_text().count("gains") == 1  # read, and nothing written
     assert not (tmp_path / "out" / "audit.jsonl").exists()
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(1200)
-@pytest.mark.parametrize("plant", PLANTS, ids=lambda plant: plant.name)
-def test_a_plant_as_people_write_it_runs_from_init_to_accepted(tmp_path: Path, plant: TextbookPlant) -> None:
-    outcome = run_twin(plant, tmp_path)
-    assert outcome.accepted, outcome.said
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(1200)
-@pytest.mark.parametrize("kind", REACHED)
-def test_the_twin_of_a_rig_that_init_described_is_rehearsed_to_accepted(tmp_path: Path, kind: str) -> None:
-    outcome = run_twin(PLANTS[2], tmp_path, kind)
-    assert outcome.accepted, outcome.said

@@ -18,10 +18,11 @@ import sys
 import tempfile
 import time
 import tomllib
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 from pathlib import Path
 
 from autotune.experiment.timing import Timing
+from tests.drivers.tcp_relay import run_before_others
 from tests.drivers.test_rig_commands import free_port
 
 CONFIG = Path(__file__).resolve().parents[2] / "configs" / "ball_modbus_tcp.toml"
@@ -36,12 +37,6 @@ def main() -> None:
         print(f"{busy} busy processes: {accepted} of {runs} accepted", flush=True)
 
 
-def _first() -> None:
-    """Let this process run before all others."""
-    with suppress(OSError):
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(30))
-
-
 def _run(busy: int) -> bool:
     with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
         path = Path(folder) / "rig.toml"
@@ -50,7 +45,9 @@ def _run(busy: int) -> bool:
         for _ in range(busy):
             stack.callback(subprocess.Popen([sys.executable, "-c", "while True: pass"]).kill)
         command = [sys.executable, "-m", "autotune.cli"]
-        served = subprocess.Popen([*command, "rig", str(path)], stdout=subprocess.PIPE, text=True, preexec_fn=_first)
+        served = subprocess.Popen(
+            [*command, "rig", str(path)], stdout=subprocess.PIPE, text=True, preexec_fn=run_before_others
+        )
         stack.callback(served.kill)
         assert served.stdout is not None
         while not served.stdout.readline().startswith("serving"):

@@ -30,7 +30,7 @@ from scipy.stats import chi2
 from autotune.arrays import FloatArray
 from autotune.config import Config, load_config
 from autotune.config.rig import ReplaySettings, RigSettings
-from autotune.errors import AutotuneError
+from autotune.errors import AutotuneError, InputError
 from autotune.experiment.rig import Rig
 from autotune.experiment.run import run_experiment
 from autotune.points import FrequencyPoint
@@ -112,7 +112,11 @@ def virtual_runs(folder: Path) -> Iterator[tuple[str, tuple[FrequencyPoint, ...]
     twin = twin_of(config.rig)
     rig = on_registers(config, make_plant("ball", seed=twin.seed, noise=twin.noise))
     yield "Modbus registers", run_experiment(rig, config, folder / "registers.csv").points
-    elf = build_uno(folder)
+    try:
+        elf = build_uno(folder)
+    except subprocess.CalledProcessError as error:
+        said = error.stderr.decode(errors="replace").strip().splitlines() or ["make failed"]
+        raise InputError(said[-1], where="firmware", remedy="apt install what .ci/packages lists") from None
     config = load_config(CONFIGS / "ball_serial.toml")
     for relay in ("host", "device"):
         rig = virtual_rig(Uno(elf, folder, twin_ball(config)), config, relay=relay)
@@ -140,9 +144,12 @@ def main() -> None:
     reference: tuple[FrequencyPoint, ...] = ()
     missing: list[str] = []
     with tempfile.TemporaryDirectory() as folder:
-        for name, points in virtual_runs(Path(folder)):
-            reference = reference or points
-            table.add_row(*row(name, points, reference))
+        try:
+            for name, points in virtual_runs(Path(folder)):
+                reference = reference or points
+                table.add_row(*row(name, points, reference))
+        except InputError as error:
+            missing.append(str(error))
         for kind in os.environ.get("LINKS", "tcp").split():
             try:
                 table.add_row(*row(kind, real_run(kind, Path(folder)), reference))

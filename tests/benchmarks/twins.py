@@ -8,7 +8,8 @@ one rule, whatever the plant: the command goes from 0 to 10 V and holds the plan
 as the plant answers to half of that, an integrator as far as it goes in four of its times under half of it; it is left
 at the command that holds it; it is sampled forty times in its time, the sum of its lags and dead time.
 
-``TWINS=3`` runs every third plant; ``TWIN=resonant`` those whose name has the pattern in it.
+``TWINS=3`` runs every third plant; ``TWIN=oscillating`` those whose name has the pattern in it; ``SEEDS=3`` each with
+the noise of three seeds, ``FIRST_SEED`` and those after it.
 """
 
 from __future__ import annotations
@@ -112,12 +113,25 @@ REACHED = {
 REGISTERS = ("--y-register", "input:0:float32", "--u-register", "holding:0:float32")
 
 
-def run_twin(plant: TextbookPlant, folder: Path, kind: str = "simulated") -> Outcome:
-    """Write the plant's configuration with ``init``, run it or its twin, and return what was said."""
+def run_twin(plant: TextbookPlant, folder: Path, kind: str = "simulated", seed: int = 0) -> Outcome:
+    """Write the plant's configuration with ``init``, run it or its twin, and return what was said.
+
+    Parameters
+    ----------
+    plant : TextbookPlant
+        With the answers to ``init``.
+    folder : Path
+        Holds the configuration and what the run writes.
+    kind : str
+        How the rig is reached; any but "simulated" is rehearsed on its twin.
+    seed : int
+        Draws the sensor's noise.
+    """
     config, began_s = folder / "rig.toml", time.monotonic()
     reached = (*REACHED.get(kind, ()), *(REGISTERS if kind.startswith("modbus") else ()))
     written, said = _call("init", str(config), "--kind", kind, *reached, "--model", plant.written, *plant.answers)
     if written:
+        config.write_text(re.sub(r"^#: seed = 0", f"seed = {seed}", config.read_text(), flags=re.MULTILINE))
         dry = () if kind == "simulated" else ("--dry-run",)
         _, said = _call("run", str(config), "--out", str(folder / "out"), *dry)
     lines = [line for line in said.splitlines() if line.strip()]
@@ -134,13 +148,17 @@ def _call(*arguments: str) -> tuple[bool, str]:
 def main() -> None:
     """Print a line for each plant and each rehearsal as it is done, and how many were accepted."""
     wanted, every = os.environ.get("TWIN", ""), int(os.environ.get("TWINS", "1"))
+    first = int(os.environ.get("FIRST_SEED", "0"))
+    seeds = range(first, first + int(os.environ.get("SEEDS", "1")))
     runs = [(plant.name, plant, "simulated") for plant in PLANTS[::every]]
     runs += [(f"--dry-run of {kind}", PLANTS[2], kind) for kind in REACHED]
     runs = [run for run in runs if re.search(wanted, run[0])]
     accepted = 0
     for name, plant, kind in runs:
-        with tempfile.TemporaryDirectory() as folder:
-            outcome = run_twin(plant, Path(folder), kind)
-        accepted += outcome.accepted
-        print(f"{name}: {plant.written}, {outcome.seconds:.0f} s: {outcome.said}", flush=True)
-    print(f"accepted: {accepted} of {len(runs)}")
+        for seed in seeds:
+            with tempfile.TemporaryDirectory() as folder:
+                outcome = run_twin(plant, Path(folder), kind, seed)
+            accepted += outcome.accepted
+            said = f"{name}: {plant.written}, seed {seed}, {outcome.seconds:.0f} s: {outcome.said}"
+            print(said, flush=True)
+    print(f"accepted: {accepted} of {len(runs) * len(seeds)}")

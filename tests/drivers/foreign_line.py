@@ -22,7 +22,7 @@ from sim.register_device import OutputChange
 from tests.drivers.bench import DEADMAN_S, LIMIT_S, tcp_settings
 from tests.drivers.campaign import FAULTS, Fault
 from tests.drivers.lines import TIMEOUT_S, Harm, Line, by_float, tcp_line
-from tests.drivers.tcp_relay import TcpRelay, refuses
+from tests.drivers.tcp_relay import TcpRelay, refuses, run_before_others
 from tests.drivers.test_own_controller import PEER
 
 #: of the campaign's sessions on this plant, which begins at rest at its safe output of 0
@@ -56,7 +56,7 @@ class ControllerProcess:
 
     def _begun(self) -> subprocess.Popen[str]:
         command = [*self._command, str(self.port), *self._rest]
-        process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, preexec_fn=run_before_others)
         assert process.stdout is not None
         self.port = int(process.stdout.readline().split()[1])
         return process

@@ -33,6 +33,7 @@ from tests.autotune.experiment.test_verify import CONFIG as BALL
 from tests.autotune.experiment.test_verify import FIT as BALL_FIT
 from tests.autotune.experiment.test_verify import PI, fitted
 from tests.drivers.bench import tcp_settings
+from tests.drivers.tcp_relay import run_before_others
 from tests.drivers.virtual_device import DirectLink, virtual_rig
 
 #: the ball's, and a register for the load
@@ -315,7 +316,8 @@ def compiled_controller(folder: Path) -> Path:
 
 @contextmanager
 def controller(program: Path, law_name: str) -> Iterator[int]:
-    with subprocess.Popen([program, law_name], stdout=subprocess.PIPE, text=True) as process:
+    command = [program, law_name]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, preexec_fn=run_before_others) as process:
         try:
             assert process.stdout is not None
             yield int(process.stdout.readline().split()[1])

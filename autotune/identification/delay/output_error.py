@@ -33,25 +33,28 @@ class Structure:
         Whether a_0 = 0 is known.
     offset : bool
         Whether the constant d is estimated.
+    zeros : int
+        Degree m of b_0 + b_1 s + .. + b_m s^m, below n.
     """
 
     order: int
     integrator: bool = False
     offset: bool = True
+    zeros: int = 0
 
     @property
     def linear(self) -> BoolArray:
-        """Which of (b, d, initial state) are free."""
-        return np.array([True, self.offset, *[True] * self.order])
+        """Which of (b_0, d, initial state, b_1..b_m) are free."""
+        return np.array([True, self.offset, *[True] * (self.order + self.zeros)])
 
     @property
     def free(self) -> BoolArray:
-        """Which of (b, d, initial state, a, h) are free."""
+        """Which of (b_0, d, initial state, b_1..b_m, a, h) are free."""
         return np.array([*self.linear, not self.integrator, *[True] * self.order])
 
     @property
     def free_parameters(self) -> BoolArray:
-        """Which of (a, b, h, constant, initial state) are free."""
+        """Which of (a, b, h, constant, initial state) are free; of an equation without zeros."""
         return np.array([not self.integrator, *[True] * (self.order + 1), self.offset, *[True] * self.order])
 
     @property
@@ -62,7 +65,7 @@ class Structure:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Point:
-    """A candidate: nonlinear parameters (a, h), what the linear ones (b, d, initial state) then are, and its cost."""
+    """A candidate: (a, h), what the linear parameters (b_0, d, initial state, b_1..b_m) then are, and its cost."""
 
     a: tuple[float, ...]
     h: float
@@ -95,7 +98,9 @@ def solve_linear(
         Coefficients of the filter that makes the noise white.
     """
     before = 0.0 if data.before is None else data.before
-    theta, cost = linear_part(data.tu, data.u, before, data.linear, data.ty, data.y, a, h, structure.offset, whitening)
+    theta, cost = linear_part(
+        data.tu, data.u, before, data.linear, data.ty, data.y, a, h, structure.offset, structure.zeros, whitening
+    )
     return Point(a=a, h=h, theta=theta, cost=cost, rows=data.ty.size - whitening.size)
 
 
@@ -129,14 +134,14 @@ def minimise(
     tolerance : float
         Stops when a step gains less than this many residual variances: 1e-4 is 0.01 standard deviations.
     held : int, optional
-        Index in (b, d, initial state, a, h) of a coefficient, or of the delay, that stays where it is.
+        Index in (b_0, d, initial state, b_1..b_m, a, h) of a coefficient, or of the delay, that stays where it is.
 
     Returns
     -------
     Point
         Never costlier than ``start``.
     """
-    n = structure.order
+    n, linear = structure.order, structure.linear.size
     every = np.flatnonzero(structure.free)
     every = every[every != held]
     damping = 1e-3
@@ -146,13 +151,13 @@ def minimise(
         if not finite:
             return point
         for _trial in range(8):
-            step, regular = _damped_step(gram, every, n, damping)
+            step, regular = _damped_step(gram, every, linear, damping)
             if regular and not 0.0 <= point.h + step[-1] <= max_delay_s and point.h in (0.0, max_delay_s):
-                step, regular = _damped_step(gram, every[every != 2 * n + 2], n, damping)  # along the limit of h
+                step, regular = _damped_step(gram, every[every != linear + n], linear, damping)  # along the limit of h
             if not regular:
                 damping *= 8.0
                 continue
-            a = tuple(float(value) for value in np.array(point.a) + step[2 + n : 2 + 2 * n])
+            a = tuple(float(value) for value in np.array(point.a) + step[linear : linear + n])
             h = float(min(max(point.h + step[-1], 0.0), max_delay_s))
             trial = solve_linear(data, structure, a, h, whitening)
             if trial.cost < point.cost:
@@ -168,11 +173,11 @@ def minimise(
     return point
 
 
-def _damped_step(gram: FloatArray, free: NDArray[np.intp], n: int, damping: float) -> tuple[FloatArray, bool]:
-    """Return the step of (b, d, initial state, a, h) and whether the matrix was regular."""
+def _damped_step(gram: FloatArray, free: NDArray[np.intp], linear: int, damping: float) -> tuple[FloatArray, bool]:
+    """Return the step of (b_0, d, initial state, b_1..b_m, a, h), and whether the matrix was regular."""
     G = gram[np.ix_(free, free)]
-    step = np.zeros(2 * n + 3)
-    step[free], _, regular = cholesky_solve(G + np.diag(damping * (free >= 2 + n) * np.diag(G)), gram[free, -1], 1e-13)
+    step = np.zeros(len(gram) - 1)
+    step[free], _, regular = cholesky_solve(G + np.diag(damping * (free >= linear) * np.diag(G)), gram[free, -1], 1e-13)
     return step, regular
 
 
@@ -210,8 +215,8 @@ def gram_at(
         Coefficients a_0..a_{n-1}.
     h : float
         Delay [s].
-    theta : (2+n,) array
-        b, d and the initial state.
+    theta : (2+n+m,) array
+        b_0, d, the initial state, b_1..b_m.
     whitening : (p,) array
         Coefficients of the filter that makes the noise white.
     """

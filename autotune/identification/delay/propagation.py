@@ -18,7 +18,7 @@ BLOCK = 2048  # pieces that are carried at once
 def begin(
     tu: FloatArray, ty: FloatArray, a: tuple[float, ...], h: float, theta: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return a_0.., chains (columns z, e, phi_0.., s, x; rows the derivatives) and clock at the first output.
+    """Return a_0.., chains (columns z, e, phi_0.., s, x, r, z; rows the derivatives) and clock at the first output.
 
     Parameters
     ----------
@@ -30,11 +30,11 @@ def begin(
         Coefficients a_0..a_{n-1}.
     h : float
         Delay [s].
-    theta : (2+n,) array
-        b, d and the initial state.
+    theta : (2+n+m,) array
+        b_0, d, the initial state, b_1..b_m.
     """
     n = len(a)
-    coefficients, chains = np.empty(n), np.zeros((n, n + 4))
+    coefficients, chains = np.empty(n), np.zeros((n, n + 6))
     for i in range(n):
         coefficients[i], chains[i, 2 + i], chains[i, 3 + n] = a[i], 1.0, theta[2 + i]
     return coefficients, chains, np.array([ty[0], np.searchsorted(tu, ty[0] - h, side="right") - 1, 0.0])
@@ -141,10 +141,11 @@ def propagate(
     F: FloatArray,
     which: NDArray[np.int64],
     pieces: FloatArray,
+    zeros: int,
     carried: FloatArray,
     out: FloatArray,
 ) -> bool:
-    """Carry z, e and phi over the pieces, write them at the outputs, and say whether they stayed finite.
+    """Carry z, e and phi over the pieces, write them and z'.. at the outputs, and say whether they stayed finite.
 
     Parameters
     ----------
@@ -154,9 +155,11 @@ def propagate(
         From :func:`piece_transitions`.
     pieces : (BLOCK, 4) array
         From :func:`schedule`.
-    carried : (n, n+4) array
+    zeros : int
+        m: as many derivatives of z are written behind phi.
+    carried : (n, n+6) array
         The chains, changed in place.
-    out : (outputs or more, 2+n or more) array
+    out : (outputs or more, 2+n+m or more) array
         Takes the columns.
     """
     n = len(a)
@@ -184,6 +187,8 @@ def propagate(
         if pieces[p, 3] > 0.0:
             for c in range(2 + n):
                 out[k, c] = chains[0, c]
+            for j in range(zeros):
+                out[k, 2 + n + j] = chains[j + 1, 0]
             k += 1
     for i in range(n):
         for c in range(n + 2):
@@ -195,59 +200,90 @@ def propagate(
 @njit(cache=True, nogil=True)
 def propagate_sensitivities(
     a: tuple[float, ...],
-    b: float,
-    d: float,
+    theta: FloatArray,
     F: FloatArray,
     which: NDArray[np.int64],
     pieces: FloatArray,
     carried: FloatArray,
     out: FloatArray,
 ) -> None:
-    """Carry x and s over the pieces and write s..s^(n-1), -x' and x at the outputs, into the last columns.
+    """Carry x and s over the pieces and write s..s^(n-1), -y' and y at the outputs, into the last columns.
+
+    With zeros, y = x + b_1 z' + .. + b_m z^(m), where x is the response to b_0 u + d; z is from rest, of b = 1, and r
+    is driven by z as s is by x: what y drives is s + b_1 r' + .. + b_m r^(m).
 
     Parameters
     ----------
     a : tuple of n floats
         Coefficients a_0..a_{n-1}.
-    b, d : float
-        Gain and constant.
+    theta : (2+n+m,) array
+        b_0, d, the initial state, b_1..b_m.
     F, which : arrays
         From :func:`piece_transitions`.
     pieces : (BLOCK, 4) array
         From :func:`schedule`.
-    carried : (n, n+4) array
-        The chains, changed in place.
-    out : (outputs or more, 2n+4) array
+    carried : (n, n+6) array
+        The chains, of which s, x, r and the last z are changed in place.
+    out : (outputs or more, 2n+4+m) array
         Takes the columns.
     """
     n = len(a)
-    x = np.empty(n)
-    s = np.empty(n)
-    new_x = np.empty(n)
-    new_s = np.empty(n)
+    m = theta.size - 2 - n
+    state = np.empty((4, n))  # x, s, z, r
+    new = np.empty((4, n))
+    more = np.empty((2, 2 * n))  # z and r with their higher derivatives
     for i in range(n):
-        x[i] = carried[i, n + 3]
-        s[i] = carried[i, n + 2]
+        state[0, i] = carried[i, n + 3]
+        state[1, i] = carried[i, n + 2]
+        state[2, i] = carried[i, n + 5]
+        state[3, i] = carried[i, n + 4]
+    b = theta[0]
+    d = theta[1]
     k = 0
     for p in range(which.size):
         f = which[p]
-        w = b * pieces[p, 1] + d
-        v = b * pieces[p, 2]
-        for i in range(n):
-            new_s[i] = F[f, i, 2 * n] * w + F[f, i, 2 * n + 1] * v
-            new_x[i] = F[f, i, 2 * n + 2] * w + F[f, i, 2 * n + 3] * v
-            for j in range(n):
-                new_s[i] += F[f, i, j] * s[j] + F[f, i, n + j] * x[j]
-                new_x[i] += F[f, i, j] * x[j]
-        for i in range(n):
-            x[i] = new_x[i]
-            s[i] = new_s[i]
-        if pieces[p, 3] > 0.0:
+        w = pieces[p, 1]
+        v = pieces[p, 2]
+        for h in range(2 if m > 0 else 1):
+            drive = w if h > 0 else b * w + d
+            slope = v if h > 0 else b * v
             for i in range(n):
-                out[k, 2 + n + i] = s[i]
-            out[k, 2 + 2 * n] = -x[1] if n > 1 else -(a[0] * x[0] + w + v * pieces[p, 0])
-            out[k, 3 + 2 * n] = x[0]
+                new[2 * h, i] = F[f, i, 2 * n + 2] * drive + F[f, i, 2 * n + 3] * slope
+                new[2 * h + 1, i] = F[f, i, 2 * n] * drive + F[f, i, 2 * n + 1] * slope
+                for j in range(n):
+                    new[2 * h, i] += F[f, i, j] * state[2 * h, j]
+                    new[2 * h + 1, i] += F[f, i, j] * state[2 * h + 1, j] + F[f, i, n + j] * state[2 * h, j]
+            for i in range(n):
+                state[2 * h, i] = new[2 * h, i]
+                state[2 * h + 1, i] = new[2 * h + 1, i]
+        if pieces[p, 3] > 0.0:
+            end = w + v * pieces[p, 0]
+            for i in range(n):
+                out[k, 2 + n + m + i] = state[1, i]
+            turned = state[0, 1] if n > 1 else a[0] * state[0, 0] + b * end + d
+            y = state[0, 0]
+            if m > 0:
+                for i in range(n):
+                    more[0, i] = state[2, i]
+                    more[1, i] = state[3, i]
+                more[0, n] = end
+                for j in range(n):
+                    more[0, n] += a[j] * more[0, j]
+                for i in range(m):
+                    more[1, n + i] = more[0, i]
+                    for j in range(n):
+                        more[1, n + i] += a[j] * more[1, i + j]
+                for j in range(1, m + 1):
+                    c = theta[1 + n + j]
+                    y += c * more[0, j]
+                    turned += c * more[0, j + 1]
+                    for i in range(n):
+                        out[k, 2 + n + m + i] += c * more[1, i + j]
+            out[k, 2 + 2 * n + m] = -turned
+            out[k, 3 + 2 * n + m] = y
             k += 1
     for i in range(n):
-        carried[i, n + 3] = x[i]
-        carried[i, n + 2] = s[i]
+        carried[i, n + 3] = state[0, i]
+        carried[i, n + 2] = state[1, i]
+        carried[i, n + 4] = state[3, i]
+        carried[i, n + 5] = state[2, i]

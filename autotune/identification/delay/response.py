@@ -4,9 +4,10 @@ The input is piecewise constant or linear between its own time stamps, the outpu
 stamps t_j + h cut the time between two outputs into pieces on which the transition is a matrix exponential.
 
 With z the response to u(t - h) from rest, e the response to the constant 1 and phi_i the free responses,
-x = b z + d e + sum x^(i)(t_s) phi_i. The sensitivities need one further chain s from rest, s^(n) = sum a_i s^(i) + x:
-up to a free response, dx/da_i = s^(i) and dx/dh = -x'. The free responses matter to the covariance of the initial
-state only.
+x = b_0 z + b_1 z' + .. + b_m z^(m) + d e + sum x^(i)(t_s) phi_i; without zeros, m = 0, b_0 is b. With them what belongs
+to phi_i is the state of the equation whose input is u, not x^(i)(t_s). The sensitivities need one further chain s from
+rest, s^(n) = sum a_i s^(i) + x: up to a free response, dx/da_i = s^(i) and dx/dh = -x'. The free responses matter to
+the covariance of the initial state only.
 
 The coefficients are passed as a tuple: its length is the order, and known to the compiler, which unrolls the loops
 over the states (ten times faster than with an array).
@@ -59,8 +60,8 @@ def normal_matrix(
         Coefficients a_0..a_{n-1}.
     h : float
         Delay [s], at least 0.
-    theta : (2+n,) array
-        b, d and the initial state; used with sensitivities only.
+    theta : (2+n+m,) array
+        b_0, d, the initial state, b_1..b_m; without sensitivities its size counts and not its values.
     sensitive : bool
         Whether the sensitivities to a and h are wanted besides.
     whitening : (p,) array
@@ -70,7 +71,7 @@ def normal_matrix(
     Returns
     -------
     gram : (c+1, c+1) array
-        Columns z, e, phi_0.. against y; with sensitivities z, e, phi_0.., s.., -x' against the residual y - x.
+        Columns z, e, phi_0.., z'.. against y; with sensitivities z, e, phi_0.., z'.., s.., -x' against the residual.
     finite : bool
         False where the response overflowed.
 
@@ -78,9 +79,9 @@ def normal_matrix(
     -----
     Time is linear in the rows; memory is one block of rows, whatever the record's length.
     """
-    n = len(a)
+    n, m = len(a), theta.size - 2 - len(a)
     order = whitening.size
-    width = 2 * n + 4 if sensitive else 3 + n
+    width = 2 * n + m + 4 if sensitive else 3 + n + m
     gram = np.zeros((width, width))
     coefficients, chains, clock = begin(tu, ty, a, h, theta)
     rows = np.zeros((order + BLOCK, width))
@@ -89,11 +90,11 @@ def normal_matrix(
     while first < ty.size:
         pieces, count, outputs = schedule(tu, u, before, linear, ty, h, clock)
         F, which = piece_transitions(coefficients, pieces, count, 1e-13 * abs(clock[0]))
-        finite = propagate(a, F, which, pieces, chains, rows[order:])
+        finite = propagate(a, F, which, pieces, m, chains, rows[order:])
         if not finite:
             return gram, False
         if sensitive:
-            propagate_sensitivities(a, theta[0], theta[1], F, which, pieces, chains, rows[order:])
+            propagate_sensitivities(a, theta, F, which, pieces, chains, rows[order:])
         for k in range(outputs):
             rows[order + k, width - 1] = y[first + k] - (rows[order + k, width - 1] if sensitive else 0.0)
         skip = max(0, min(order - first, outputs))
@@ -145,18 +146,18 @@ def output(
         Coefficients a_0..a_{n-1}.
     h : float
         Delay [s], at least 0.
-    theta : (2+n,) array
-        b, d and the initial state.
+    theta : (2+n+m,) array
+        b_0, d, the initial state, b_1..b_m.
     """
     n = len(a)
     x = np.full(ty.size, np.nan)
     coefficients, chains, clock = begin(tu, ty, a, h, theta)
-    rows = np.zeros((BLOCK, 2 + n))
+    rows = np.zeros((BLOCK, theta.size))
     first = 0
     while first < ty.size:
         pieces, count, outputs = schedule(tu, u, before, linear, ty, h, clock)
         F, which = piece_transitions(coefficients, pieces, count, 1e-13 * abs(clock[0]))
-        if not propagate(a, F, which, pieces, chains, rows):
+        if not propagate(a, F, which, pieces, theta.size - 2 - n, chains, rows):
             break
         x[first : first + outputs] = rows[:outputs] @ theta
         first += outputs
@@ -174,7 +175,7 @@ def sensitivities(
     h: float,
     theta: FloatArray,
 ) -> FloatArray:
-    """Return the columns z, e, phi_0.., s.., -x' of :func:`normal_matrix` row by row, shape (N, 2n+3).
+    """Return the columns z, e, phi_0.., z'.., s.., -x' of :func:`normal_matrix` row by row, shape (N, 2n+m+3).
 
     Parameters
     ----------
@@ -190,21 +191,21 @@ def sensitivities(
         Coefficients a_0..a_{n-1}.
     h : float
         Delay [s], at least 0.
-    theta : (2+n,) array
-        b, d and the initial state.
+    theta : (2+n+m,) array
+        b_0, d, the initial state, b_1..b_m.
     """
-    n = len(a)
-    columns = np.zeros((ty.size, 2 * n + 4))
+    n, m = len(a), theta.size - 2 - len(a)
+    columns = np.zeros((ty.size, 2 * n + m + 4))
     coefficients, chains, clock = begin(tu, ty, a, h, theta)
     first = 0
     while first < ty.size:
         pieces, count, outputs = schedule(tu, u, before, linear, ty, h, clock)
         F, which = piece_transitions(coefficients, pieces, count, 1e-13 * abs(clock[0]))
-        if not propagate(a, F, which, pieces, chains, columns[first:]):
+        if not propagate(a, F, which, pieces, m, chains, columns[first:]):
             break
-        propagate_sensitivities(a, theta[0], theta[1], F, which, pieces, chains, columns[first:])
+        propagate_sensitivities(a, theta, F, which, pieces, chains, columns[first:])
         first += outputs
-    return columns[:, : 2 * n + 3]
+    return columns[:, : 2 * n + m + 3]
 
 
 @njit(cache=True, nogil=True)
@@ -218,6 +219,7 @@ def linear_part(
     a: tuple[float, ...],
     h: float,
     offset: bool,
+    zeros: int,
     whitening: FloatArray,
 ) -> tuple[FloatArray, float]:
     """Return the best b, d and initial state for given (a, h), and the sum of squares; infinite where not finite.
@@ -238,24 +240,26 @@ def linear_part(
         Delay [s], at least 0.
     offset : bool
         Whether d is estimated.
+    zeros : int
+        m, below n.
     whitening : (p,) array
         As of :func:`normal_matrix`.
 
     Returns
     -------
     tuple
-        The (2+n,) theta, and the sum of squares [y unit^2].
+        The (2+n+m,) theta, and the sum of squares [y unit^2].
     """
-    n = len(a)
-    theta = np.zeros(2 + n)
+    size = 2 + len(a) + zeros
+    theta = np.zeros(size)
     gram, finite = normal_matrix(tu, u, before, linear, ty, y, a, h, theta, False, whitening)
     if not finite:
         return theta, np.inf
-    free = np.array([i for i in range(2 + n) if offset or i != 1])
-    solution, explained, regular = cholesky_solve(gram[free][:, free], gram[free, 2 + n], 1e-12)
+    free = np.array([i for i in range(size) if offset or i != 1])
+    solution, explained, regular = cholesky_solve(gram[free][:, free], gram[free, size], 1e-12)
     if not regular:
         return theta, np.inf
     for i in range(free.size):
         theta[free[i]] = solution[i]
-    total = gram[2 + n, 2 + n]
+    total = gram[size, size]
     return theta, max(total - explained, 1e-15 * total)

@@ -75,7 +75,9 @@ def _switches(t: FloatArray, u: FloatArray, jump: float) -> tuple[FloatArray, Bo
         elif abs(step + ahead) >= 0.6 * jump and step * ahead > 0:
             direction = 1 if step > 0 else -1
             part = ahead / (step + ahead)
-        if direction != 0 and direction != state:
+        if direction == state and count == 1:  # the first was no switch but the end of another relay's level
+            count = 0
+        if direction != 0 and (direction != state or count == 0):
             times[count] = t[k] + part * (t[k + 1] - t[k]) if part > 0.0 else t[k]
             rising[count] = direction > 0
             count += 1

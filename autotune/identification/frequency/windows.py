@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TypeAlias
 
 from autotune.arrays import FloatArray
+from autotune.errors import IdentificationError
 from autotune.identification.frequency.limit_cycle import WholePeriods
 from autotune.identification.frequency.limit_cycle_points import LimitCycle, limit_cycle_points
 from autotune.points import FrequencyPoint
@@ -72,13 +74,15 @@ def windowed_cycles(cycles: Sequence[Windowed]) -> tuple[LimitCycle, ...]:
     IdentificationError
         One of them has no response above the noise, or too few samples per period.
     """
-    first: list[FrequencyPoint] = []
+    first: list[LimitCycle] = []
     for cycle in cycles:
-        first.append(cycle.estimate(first).points[0])
-    return tuple(
-        cycle.estimate([point for point in first if point is not own], ALL_HARMONICS)
-        for cycle, own in zip(cycles, first, strict=True)
-    )
+        first.append(cycle.estimate([one.points[0] for one in first]))
+    found = list(first)
+    for i, cycle in enumerate(cycles):
+        others = [one.points[0] for k, one in enumerate(first) if k != i]
+        with contextlib.suppress(IdentificationError):  # no response above the noise, beside so many harmonics
+            found[i] = cycle.estimate(others, ALL_HARMONICS)
+    return tuple(found)
 
 
 def noted_windows(recording: Recording) -> tuple[Windowed, ...]:

@@ -89,3 +89,27 @@ def test_a_swing_that_is_left_while_samples_are_lost_is_the_links_and_not_the_ac
     rig.plant = FaultyPlant(rig.plant, [Fault(kind="inverted actuator", start_s=45.0, value=5.0)])
     with pytest.raises(LinkError, match=r"link too slow: \d+ % of the latest samples were missed, and y"):
         run_experiment(rig, ball_config(**EACH), tmp_path / "asleep.csv", on_status=fall_asleep)
+
+
+class StalledNowAndThen(BusyComputer):
+    """A rig whose host is held up for .14 s, as long as the loop may be late, once in 1.3 s."""
+
+    is_armed = False
+    last_s = 0.0
+
+    def read(self) -> Reading:
+        reading = super().read()
+        if self.is_armed and self.clock.now() - self.last_s > 1.3:
+            self.last_s = self.clock.now()
+            self.clock.sleep_until(self.clock.now() + 0.14)
+        return reading
+
+
+def test_late_samples_that_lead_y_out_of_its_swing_are_the_links_and_not_the_actuators(tmp_path: Path) -> None:
+    rig = StalledNowAndThen(0.0)
+
+    def arm(progress: Status) -> None:
+        rig.is_armed = progress.message.startswith("point")
+
+    with pytest.raises(LinkError, match=r"link too slow: a sample came 0\.1\d* s late, and y = .* left the swing"):
+        run_experiment(rig, ball_config(**EACH), tmp_path / "stalled.csv", on_status=arm)

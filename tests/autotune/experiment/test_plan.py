@@ -134,3 +134,13 @@ def test_rig_time_is_shared_without_being_overdrawn(omegas: list[float], left_s:
         if count > 2:
             samples = (count - 1) * 2.0 * math.pi / choice.omega_rad_s / GOAL.sample_time_s
             assert expected_sd(GOAL.noise_sd, choice.y_amplitude, samples) > 0.004
+
+
+@pytest.mark.parametrize("noise_deg", [-0.9, 0.0, 0.9])
+def test_one_lag_far_above_its_corner_is_one_lag_though_noise_turns_its_phase(noise_deg: float) -> None:
+    omega = 25.0
+    response = TransferFunction(num=(2.0,), den=(1.0, 1.0)).response(np.array([omega]))[0]
+    turned = abs(response) * np.exp(-1j * math.radians(90.0 + noise_deg))
+    first = FrequencyPoint(omega_rad_s=omega, response=complex(turned), covariance=NO_DOUBT)
+    foreseen, _ = predicted([first], 1, math.radians(-70.0))
+    assert 1.0 / 3.0 < foreseen / math.tan(math.radians(70.0)) < 5.0

@@ -6,9 +6,14 @@ import math
 import threading
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.stats import chi2
 
 from autotune.errors import ExperimentStopped
 from autotune.experiment.cycles import read_earlier
@@ -18,9 +23,12 @@ from autotune.experiment.plan import phase_targets
 from autotune.experiment.result import ExperimentResult, Status
 from autotune.experiment.run import run_experiment
 from autotune.experiment.sweep import missing_phases
+from autotune.experiment.together import WORTH, Found
 from autotune.identification.envelope import polar_sd
 from autotune.identification.frequency.recorded import session_points
+from autotune.identification.sweep_estimate import SweepEstimate
 from autotune.pipeline.measured import measured_of
+from autotune.pipeline.swept import price_of
 from autotune.recording import read_recording
 from drivers.simulated import SimulatedRig
 from sim.ball import make_ball
@@ -51,6 +59,44 @@ def test_all_points_are_known_as_well_as_is_wanted_in_half_the_time(
     targets = phase_targets(*wanted.phases_deg, wanted.points)
     reached = sorted(float(np.angle(-point.response)) for point in result.points)
     assert reached == pytest.approx(targets, abs=math.radians(5.0))
+
+
+@pytest.mark.parametrize("price", [0.0, math.inf])
+def test_a_sweep_for_a_controller_goes_on_while_the_rest_of_its_budget_is_worth_it(
+    tmp_path: Path, price: float
+) -> None:
+    # a gain_sd that three cycles never reach: it is not asked where a price is known
+    wanted = {"goal": "controller", "gain_sd": 1e-5, "budget_s": 40.0}
+    path = tmp_path / "recording.csv"
+    result = run_experiment(ball_rig(seed=3), ball_config(experiment=wanted), path, price=lambda *_: price)
+    assert result.together is not None
+    assert (len(result.segments) > 3) is (price > 0.0)
+    assert result.sweep_time_s <= 40.0
+
+
+def test_the_price_of_what_is_not_known_falls_with_it(swept: tuple[ExperimentResult, Path]) -> None:
+    estimate = swept[0].together
+    assert estimate is not None
+    config = ball_config(experiment={"goal": "controller"})
+    price = price_of(config)
+    assert price is not None
+    assert price_of(ball_config()) is None
+    fit = estimate.fit
+    half, none = (replace(estimate, fit=replace(fit, covariance=k * fit.covariance)) for k in (0.25, 1e-12))
+    whole, halved, known = (price(one, swept[0].noise_sd) for one in (estimate, half, none))
+    assert whole > halved > 0.0
+    assert known == pytest.approx(0.0, abs=2e-3)  # a design's tolerance
+
+
+@given(price=st.floats(1e-6, 10.0), sd=st.floats(1e-5, 0.3), swept_s=st.floats(1.0, 59.0))
+def test_what_is_wanted_is_what_the_rest_of_the_budget_is_worth(price: float, sd: float, swept_s: float) -> None:
+    estimate = cast(SweepEstimate, SimpleNamespace(worst_sd=sd))
+    wanted = Found(estimate=estimate, why="", price=price).wanted_sd(0.0, swept_s, 60.0)
+    worth = price * (1.0 - math.sqrt(swept_s / 60.0))
+    assert (wanted >= sd) is (worth <= WORTH) or worth == pytest.approx(WORTH)
+    if wanted < sd:  # there, at what it costs then, the rest is worth just so much
+        at_s = swept_s * (sd / wanted) ** 2
+        assert price * wanted / sd * (1.0 - math.sqrt(at_s / 60.0)) == pytest.approx(WORTH)
 
 
 def test_a_sweep_that_was_stopped_with_few_points_tells_of_the_plant_by_its_rows(tmp_path: Path) -> None:
@@ -113,16 +159,36 @@ def test_an_actuator_that_clips_in_mid_sweep_gives_no_points_of_all_rows_that_ar
         assert result.by_itself
 
 
-@pytest.mark.parametrize("name", ["inverse response 0.6", "resonance at 5, damping 0.1"])
-def test_what_is_no_equation_of_low_order_gets_a_cycle_for_each_point(name: str, tmp_path: Path) -> None:
-    case = next(case for case in CASES if case.name == name)
+@pytest.mark.parametrize("violated", [{"play": 0.01}, {"curve": 0.15}])
+def test_what_is_no_equation_gets_a_cycle_for_each_point(violated: dict[str, float], tmp_path: Path) -> None:
+    case = replace(next(case for case in CASES if case.name == "lags 1 and 0.3, dead time 0.2"), **violated)
     rig = SimulatedRig(LinearPlant(case, seed=2), u_safe=5.0)
     told: list[Status] = []
     result = run_experiment(rig, case.config(together=True), tmp_path / "r.csv", on_status=told.append)
     assert result.together is None
-    assert "the rows show other dynamics" in result.by_itself
+    assert "the rows show " in result.by_itself
     assert any(result.by_itself in one.message for one in told)
     assert len({one.phase_rad for one in result.segments}) == len(result.points) == 5
+
+
+@pytest.mark.parametrize("name", ["inverse response 0.3", "resonance at 5, damping 0.1", "oscillating"])
+def test_zeros_and_poles_that_ring_are_equations_too(name: str, tmp_path: Path) -> None:
+    case = next(case for case in CASES if case.name == name)
+    plant = LinearPlant(case, seed=2)
+    result = run_experiment(SimulatedRig(plant, u_safe=5.0), case.config(together=True), tmp_path / "r.csv")
+    assert result.together is not None
+    for point in result.points:
+        miss = point.response - plant.response(np.array([point.omega_rad_s]))[0]
+        parts = np.array([miss.real, miss.imag])
+        assert parts @ np.linalg.solve(np.array(point.covariance), parts) < chi2.ppf(0.9999, 2)
+
+
+def test_a_cycle_too_short_for_a_point_of_its_own_still_tells_of_the_plant(tmp_path: Path) -> None:
+    case = next(case for case in CASES if case.name == "lag, dead time 1")
+    rig = SimulatedRig(LinearPlant(case, seed=1), u_safe=5.0)
+    result = run_experiment(rig, case.config(together=True), tmp_path / "r.csv")
+    assert result.together is not None
+    assert session_points([read_recording(tmp_path / "r.csv")]).points == result.points
 
 
 def test_a_load_step_in_the_sweep_is_told_and_sends_it_to_cycles_of_their_own(tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.signal import lsim
 
 from autotune.errors import IdentificationError, InputError
 from autotune.identification.delay.compiled import transitions
@@ -14,7 +15,7 @@ from autotune.identification.delay.identify import identify_delay
 from autotune.identification.delay.model import DelayModel
 from autotune.identification.delay.output_error import Point, Structure, solve_linear
 from autotune.identification.delay.output_error_model import finish
-from autotune.identification.delay.response import normal_matrix, output
+from autotune.identification.delay.response import linear_part, normal_matrix, output, sensitivities
 from autotune.recording import Recording, read_recording
 from tests.autotune.identification.delay_examples import X0, A, B, example_2, held_response
 from tests.benchmarks.delay_plants import errors_in_deviations, random_plant, recording_of
@@ -86,6 +87,31 @@ def test_analytic_sensitivities_are_the_derivatives(n):
     expected = np.linalg.inv(J.T @ J)
     scale = np.sqrt(np.diag(expected))
     assert np.max(np.abs(covariance - expected) / np.outer(scale, scale)) < 1e-3
+
+
+@pytest.mark.parametrize(("a", "b"), [((-1.0, -0.6), (1.3, -0.7)), ((0.0, -2.5, -1.4), (1.3, -0.7, 0.2))])
+def test_an_equation_with_zeros_answers_as_its_transfer_function_and_so_do_its_sensitivities(a, b):
+    """Against scipy's simulation of the held command, and central differences."""
+    n, m, step_s, h, fine = len(a), len(b) - 1, 0.05, 0.13, 50
+    u = np.repeat(np.random.default_rng(n).choice([-1.0, 1.0], 20), 20)
+    t = step_s * np.arange(u.size)
+    late = np.floor((step_s / fine * np.arange(u.size * fine) - h) / step_s + 1e-9).astype(int)
+    held = np.where(late >= 0, u[np.maximum(late, 0)], 0.0)
+    system = (b[::-1], (1.0, *(-value for value in a[::-1])))
+    _, expected, _ = lsim(system, held, step_s / fine * np.arange(held.size), interp=False)
+    theta = np.array([b[0], 0.0, *[0.0] * n, *b[1:]])
+
+    def x(values: np.ndarray) -> np.ndarray:
+        return output(t, u, 0.0, False, t, tuple(values[:-1]), values[-1], theta)
+
+    values = np.array([*a, h])
+    np.testing.assert_allclose(x(values), expected[::fine], atol=1e-9)
+    J = np.array([(x(values + d) - x(values - d)) / 2e-6 for d in 1e-6 * np.eye(n + 1)]).T
+    columns = sensitivities(t, u, 0.0, False, t, a, h, theta)
+    np.testing.assert_allclose(columns[:, 2 + n + m :], J, atol=1e-6 * np.abs(J).max())
+    best, cost = linear_part(t, u, 0.0, False, t, x(values), a, h, True, m, np.empty(0))
+    np.testing.assert_allclose(best, theta, atol=1e-6)
+    assert cost < 1e-9
 
 
 def test_example_2_is_recovered_without_a_starting_value():

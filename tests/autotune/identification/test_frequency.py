@@ -34,6 +34,20 @@ def distance(cycle: LimitCycle, plant: TransferFunction = BALL) -> complex:
     return point.response / truth - 1
 
 
+def test_a_row_of_the_relay_before_is_no_switch_of_the_relay_after_it() -> None:
+    """A device takes a setting a sample later: the row of the change still has the level of three times the size."""
+    t, u, y = relay_loop(BALL, d=0.06, hysteresis=0.4, delay=35.0, noise=np.zeros(3000))
+    use = last_periods(t, u, 3, 0.06)
+    t, u, y = t[use], u[use].copy(), y[use]
+    high = float(np.max(u))
+    up = u > 0.5 * (np.max(u) + np.min(u))
+    start = int(np.argmax(up))
+    t, u, y = t[start:], u[start:], y[start:]
+    alike = limit_cycle_points(t, u, y).points[0].response
+    u[0] = high + 0.09
+    assert abs(limit_cycle_points(t, u, y).points[0].response / alike - 1.0) < 0.02
+
+
 @settings(max_examples=10)
 @given(
     d=st.floats(0.03, 0.3),

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from autotune.errors import IdentificationError
-from autotune.identification.parametric import fit_plant
+from autotune.identification.parametric import fit_plant, fit_structures
 from autotune.models import TransferFunction
 from autotune.points import FrequencyPoint
 
@@ -61,3 +61,15 @@ def test_draws_scatter_as_the_covariance_says() -> None:
 def test_two_points_are_too_few() -> None:
     with pytest.raises(IdentificationError, match="at least three"):
         fit_plant(measured(BALL, np.array([1.0, 2.0]), 0.01, 0))
+
+
+def test_plants_with_two_lags_alike_scatter_no_more_than_the_points_allow() -> None:
+    """To first order nothing is known of the difference of two equal lags."""
+    plant = TransferFunction(num=(10.0,), den=tuple(np.polymul([0.05, 1.0], [0.05, 1.0])))
+    omega, relative_sd = np.geomspace(20.0, 80.0, 5), 0.002
+    for seed in range(20):
+        fits = fit_structures(measured(plant, omega, relative_sd, seed))
+        fit = next(fit for fit in fits if not fit.integrating and fit.parameters.size == 4)
+        drawn = np.array([one.response(omega) for one in fit.draws(60, np.random.default_rng(0))])
+        scatter = np.std(np.abs(drawn / fit.plant.response(omega)))
+        assert 0.1 * relative_sd < scatter < 5.0 * relative_sd

@@ -65,6 +65,24 @@ def test_the_region_is_no_wider_than_the_record_where_a_controller_works(seed: i
     assert worst < 20.0 * chi2.ppf(0.95, 4)  # the region is of first order; beyond that only its shape is wrong
 
 
+@pytest.mark.parametrize(("slower", "smaller"), [(600.0, 1e-4), (1e-4, 1e4)])
+def test_units_of_time_and_of_the_measurement_change_neither_plant_nor_region(slower: float, smaller: float) -> None:
+    recording = recorded(0)
+    other = Recording(t=slower * T, u=recording.u, y=smaller * recording.y, name="the same in other units")
+    omega = np.geomspace(1e-3, 0.1, 20)
+
+    def responses(of: Recording, per_s: float, per_y: float) -> tuple[FloatArray, FloatArray]:
+        fit = fit_recordings([of])
+        drawn = [plant.response(omega / per_s) / per_y for plant in fit.draws(400, np.random.default_rng(0))]
+        plant = fit.plant.response(omega / per_s) / per_y
+        return plant, np.std(np.abs(np.array(drawn) / plant), axis=0)
+
+    plant, scatter = responses(recording, 1.0, 1.0)
+    scaled, scaled_scatter = responses(other, slower, smaller)
+    np.testing.assert_allclose(scaled, plant, rtol=1e-3)
+    np.testing.assert_allclose(scaled_scatter, scatter, rtol=0.25)
+
+
 def test_parameters_say_the_same_plant_over_any_coefficient() -> None:
     recording = recorded(0)
     fit, model = fit_recordings([recording]), identify_delay(recording, 2)
