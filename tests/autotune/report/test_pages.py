@@ -21,7 +21,7 @@ from autotune.report.campaign_page import campaign_page
 from autotune.report.maker_forms import maker_table
 from autotune.report.page import write_page
 from autotune.report.proof_page import proof_page
-from autotune.report.run_page import analysis_page
+from autotune.report.tuned_page import analysis_page
 from sim.score import wilson
 
 
