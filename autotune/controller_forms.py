@@ -21,10 +21,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 
-from autotune.controller import PIDController
 from autotune.errors import DesignError, InputError
+
+if TYPE_CHECKING:
+    from autotune.controller import PIDController
 
 _NEEDED = math.nan
 
@@ -122,6 +124,7 @@ def to_form(
     if not u_span > 0.0 or not y_span > 0.0:
         raise DesignError("spans must be positive", where=form)
     spans = Spans(u=u_span, y=y_span, sample_time_s=sample_time_s)
+    require_complete({form: FORMS[form]})
     values = FORMS[form].encode(replace(controller, K=abs(controller.K)), spans)
     action = {"reverse_acting": 1.0 if controller.K >= 0.0 else 0.0}
     return Settings(form=form, values={**values, **action}, spans=spans)
@@ -132,8 +135,16 @@ def from_form(settings: Settings) -> PIDController:
 
     The set-point weight comes back only from forms that have one.
     """
+    require_complete({settings.form: FORMS[settings.form]})
     found = FORMS[settings.form].decode(settings.values, settings.spans)
     return replace(found, K=found.K if settings.values["reverse_acting"] else -found.K)
+
+
+def _pid(K: float, Ti_s: float, Td_s: float = 0.0, Tf_s: float = 0.0) -> PIDController:
+    # imported here: the command line needs the names of the forms alone, and its help is there in half the time
+    from autotune.controller import PIDController
+
+    return PIDController(K=K, Ti_s=Ti_s, Td_s=Td_s, Tf_s=Tf_s)
 
 
 def _isa(c: PIDController, spans: Spans) -> Values:
@@ -141,7 +152,7 @@ def _isa(c: PIDController, spans: Spans) -> Values:
 
 
 def _of_isa(v: Values, spans: Spans) -> PIDController:
-    return PIDController(K=v["K"], Ti_s=v["Ti_s"], Td_s=v["Td_s"], Tf_s=v["Tf_s"])
+    return _pid(K=v["K"], Ti_s=v["Ti_s"], Td_s=v["Td_s"], Tf_s=v["Tf_s"])
 
 
 def _parallel(c: PIDController, spans: Spans) -> Values:
@@ -150,7 +161,7 @@ def _parallel(c: PIDController, spans: Spans) -> Values:
 
 def _of_parallel(v: Values, spans: Spans) -> PIDController:
     K = v["Kp"]
-    return PIDController(K=K, Ti_s=_inverse(_over(v["Ki_per_s"], K)), Td_s=_over(v["Kd_s"], K), Tf_s=v["Tf_s"])
+    return _pid(K=K, Ti_s=_inverse(_over(v["Ki_per_s"], K)), Td_s=_over(v["Kd_s"], K), Tf_s=v["Tf_s"])
 
 
 def _series(c: PIDController, spans: Spans) -> Values:
@@ -169,9 +180,9 @@ def _series(c: PIDController, spans: Spans) -> Values:
 
 def _of_series(v: Values, spans: Spans) -> PIDController:
     if v["Ti_s"] == 0.0:  # as delivered
-        return PIDController(K=v["K"], Ti_s=math.inf, Tf_s=v["Tf_s"])
+        return _pid(K=v["K"], Ti_s=math.inf, Tf_s=v["Tf_s"])
     total = v["Ti_s"] + v["Td_s"]
-    return PIDController(K=v["K"] * total / v["Ti_s"], Ti_s=total, Td_s=v["Ti_s"] * v["Td_s"] / total, Tf_s=v["Tf_s"])
+    return _pid(K=v["K"] * total / v["Ti_s"], Ti_s=total, Td_s=v["Ti_s"] * v["Td_s"] / total, Tf_s=v["Tf_s"])
 
 
 def _velocity(c: PIDController, spans: Spans) -> Values:
@@ -187,7 +198,7 @@ def _of_velocity(v: Values, spans: Spans) -> PIDController:
     i = _over(v["q0"] + v["q1"] + v["q2"], K) / T_s
     # the three sum to the integral's share, of which rounding leaves a trace where there is none
     i = i if abs(i) * T_s > 1e-12 else 0.0
-    return PIDController(K=K, Ti_s=_inverse(i), Td_s=_over(v["q2"], K) * T_s, Tf_s=v["Tf_s"])
+    return _pid(K=K, Ti_s=_inverse(i), Td_s=_over(v["q2"], K) * T_s, Tf_s=v["Tf_s"])
 
 
 def _band(c: PIDController, spans: Spans) -> Values:
@@ -201,7 +212,7 @@ def _band(c: PIDController, spans: Spans) -> Values:
 
 def _of_band(v: Values, spans: Spans) -> PIDController:
     K = _over(100.0 * spans.ratio, v["PB_percent"])
-    return PIDController(K=K, Ti_s=60.0 * v["reset_min"], Td_s=60.0 * v["rate_min"], Tf_s=v["pv_filter_s"])
+    return _pid(K=K, Ti_s=60.0 * v["reset_min"], Td_s=60.0 * v["rate_min"], Tf_s=v["pv_filter_s"])
 
 
 def _siemens(c: PIDController, spans: Spans) -> Values:
@@ -228,7 +239,7 @@ def _rockwell_dependent(c: PIDController, spans: Spans) -> Values:
 
 def _of_rockwell_dependent(v: Values, spans: Spans) -> PIDController:
     Ti = v["IGain_min"] * 60.0 or math.inf
-    return PIDController(K=v["PGain"] * spans.ratio, Ti_s=Ti, Td_s=v["DGain_min"] * 60.0, Tf_s=v["pv_filter_s"])
+    return _pid(K=v["PGain"] * spans.ratio, Ti_s=Ti, Td_s=v["DGain_min"] * 60.0, Tf_s=v["pv_filter_s"])
 
 
 def _rockwell_independent(c: PIDController, spans: Spans) -> Values:
@@ -239,7 +250,7 @@ def _rockwell_independent(c: PIDController, spans: Spans) -> Values:
 def _of_rockwell_independent(v: Values, spans: Spans) -> PIDController:
     P = v["PGain"]
     Ti, Td = _inverse(_over(v["IGain_per_min"], P) / 60.0), _over(v["DGain_min"], P) * 60.0
-    return PIDController(K=P * spans.ratio, Ti_s=Ti, Td_s=Td, Tf_s=v["pv_filter_s"])
+    return _pid(K=P * spans.ratio, Ti_s=Ti, Td_s=Td, Tf_s=v["pv_filter_s"])
 
 
 def _schneider_mixed(c: PIDController, spans: Spans) -> Values:
@@ -343,7 +354,7 @@ def require_complete(forms: Mapping[str, ControllerForm]) -> None:
     InputError
         The first that is wrong, with what is missing and how to add it.
     """
-    usual, spans = PIDController(K=2.0, Ti_s=8.0, Td_s=1.0, Tf_s=0.1), Spans(u=100.0, y=50.0, sample_time_s=0.1)
+    usual, spans = _pid(K=2.0, Ti_s=8.0, Td_s=1.0, Tf_s=0.1), Spans(u=100.0, y=50.0, sample_time_s=0.1)
     for name, form in forms.items():
         settings, values = set(form.settings), form.encode(usual, spans)
         if settings != set(values):
@@ -396,13 +407,10 @@ def _derivative_filtered(c: PIDController, form: str) -> tuple[float, float, flo
 def _measurement_filtered(K: float, Ti: float, Td: float, filter_s: float) -> PIDController:
     """Inverse of :func:`_derivative_filtered`."""
     if math.isinf(Ti):
-        return PIDController(K=K, Ti_s=Ti, Td_s=Td + filter_s, Tf_s=filter_s)
+        return _pid(K=K, Ti_s=Ti, Td_s=Td + filter_s, Tf_s=filter_s)
     total = Ti + filter_s
-    return PIDController(K=K * total / Ti, Ti_s=total, Td_s=Ti * (filter_s + Td) / total, Tf_s=filter_s)
+    return _pid(K=K * total / Ti, Ti_s=total, Td_s=Ti * (filter_s + Td) / total, Tf_s=filter_s)
 
 
 def _derivative_gain(Td: float, filter_s: float) -> float:
     return Td / filter_s if filter_s > 0.0 else 10.0
-
-
-require_complete(FORMS)

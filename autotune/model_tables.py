@@ -56,6 +56,12 @@ def model_of(content: Mapping[str, Any], where: str) -> Model:
     InputError
         A key that is not known, or a value that no model has; names it.
     """
+    if "num" in content or "den" in content:  # what everybody writes first
+        raise InputError(
+            "num and den stand outside of a table",
+            where=where,
+            remedy="write [[block]] above them, and the dead time [s] as delay",
+        )
     require_keys(content, {"name", "input", "output", "block", "effect", "reduced"}, where)
     blocks, effects = _tables(content, "block", where), _tables(content, "effect", where)
     if not blocks:

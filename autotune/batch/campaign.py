@@ -199,6 +199,7 @@ def failed(loop: LoopSettings, error: Exception) -> Row:
         loop=loop.name,
         attention="failed",
         reason=f"not analysed ({error or type(error).__name__}); run the campaign again to try once more",
+        area=loop.area,
         file=loop.file,
         u_unit=loop.u_unit,
         y_unit=loop.y_unit,

@@ -102,7 +102,7 @@ def analyse_loop(work: Work) -> Finding:
         A disk or a network drive failed, which may pass.
     """
     loop = work.loop
-    row = Row(loop=loop.name, attention="fine", file=loop.file, u_unit=loop.u_unit, y_unit=loop.y_unit)
+    row = Row(loop=loop.name, attention="fine", area=loop.area, file=loop.file, u_unit=loop.u_unit, y_unit=loop.y_unit)
     try:
         with threadpool_limits(1):
             return _finding(work, row)
@@ -232,8 +232,8 @@ def _add_design(row: Row, analysis: Analysis, present: Controller | None, settin
         **plant_figures(analysis.fit.plant),
     )
     if present is not None:
-        row = _judge_present(row, present, margins(analysis.fit.plant, present), settings)
-    return row
+        return _judge_present(row, present, margins(analysis.fit.plant, present), settings)
+    return replace(row, attention="designed")
 
 
 def _judge_present(row: Row, present: Controller, m: Margins, settings: CampaignSettings) -> Row:

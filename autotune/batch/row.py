@@ -7,10 +7,10 @@ from typing import Literal, TypeAlias
 
 from pydantic import ConfigDict
 
-Attention: TypeAlias = Literal["act", "failed", "look", "fine"]
+Attention: TypeAlias = Literal["act", "failed", "look", "designed", "fine"]
 
 #: What comes first in the table.
-ATTENTION: tuple[Attention, ...] = ("act", "failed", "look", "fine")
+ATTENTION: tuple[Attention, ...] = ("act", "failed", "look", "designed", "fine")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -21,13 +21,16 @@ class Row:
     ----------
     loop : str
         Name.
-    attention : {"act", "failed", "look", "fine"}
-        What the reader should do.
+    attention : {"act", "failed", "look", "designed", "fine"}
+        What the reader should do; ``designed`` of a loop whose present gains are not known, so that nothing is said of
+        them.
     severity : float
         0 to 1. Within ``act``: 1 for an unstable loop, else the share by which a margin is missed, or the part of the
         simulation error that is not noise; within ``look``: the part of (11) that another controller would spare.
     reason : str
         Why, in a sentence.
+    area : str
+        Part of the plant in which the loop is shown.
     file, u_unit, y_unit : str
         Where the record lies, and its units.
     rows, bad_rows, pieces : int
@@ -71,6 +74,7 @@ class Row:
     attention: Attention
     severity: float = 0.0
     reason: str = ""
+    area: str = ""
     file: str = ""
     u_unit: str = ""
     y_unit: str = ""

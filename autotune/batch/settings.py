@@ -26,6 +26,7 @@ class LoopSettings(Section):
 
     name: Annotated[Text, Field(min_length=1, description="name of the loop, each only once")]
     file: Annotated[str, Field(min_length=1, description=_FILE)]
+    area: Annotated[Text, Field(description="part of the plant, by which the page groups its loops")] = ""
     u: Annotated[str, Field(description="column or tag of the command")] = "u"
     y: Annotated[str, Field(description="column or tag of the measurement")] = "y"
     r: Annotated[str, Field(description="column or tag of the set-point; default r where the file has it")] = ""

@@ -26,6 +26,7 @@ app = typer.Typer(
     name="autotune",
     help="Commission a control loop: measure its Bode points with a relay, design its controller, verify it.",
     no_args_is_help=True,
+    context_settings={"help_option_names": ["-h", "--help"]},
     add_completion=True,
     pretty_exceptions_enable=False,
     rich_markup_mode="markdown",  # rich would take the units in brackets for styles, and show none

@@ -73,7 +73,7 @@ def batch(
     page = campaign_page(settings, ordered)
     write_page(page, work.out / REPORT)
     counts = Counter(row.attention for row in ordered)
-    for row in [row for row in ordered if row.attention != "fine"][:10]:
+    for row in [row for row in ordered if row.attention not in ("designed", "fine")][:10]:
         console.print(f"{row.attention:7s} {row.loop}: {row.reason}", markup=False)
     if sum(counts[attention] for attention in ATTENTION[:3]) > 10:
         console.print("and more, in the report", markup=False)

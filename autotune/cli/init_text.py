@@ -5,11 +5,12 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, get_args
-
-from pydantic import BaseModel
+from typing import TYPE_CHECKING, Any, get_args
 
 from autotune.cli.init_keys import Table
+
+if TYPE_CHECKING:
+    from pydantic import BaseModel
 
 
 def text_of(content: Table, path: Path) -> str:
@@ -39,6 +40,8 @@ def text_of(content: Table, path: Path) -> str:
 
 def _model(annotation: Any, given: Mapping[str, Any]) -> type[BaseModel] | None:
     """Return the settings that a key holds: of the kinds of a union the one that was given."""
+    from pydantic import BaseModel
+
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         kinds = annotation.model_fields.get("kind")
         return None if kinds and "kind" in given and given["kind"] not in get_args(kinds.annotation) else annotation

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext, suppress
+from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -20,6 +21,7 @@ from autotune.whole_files import write_json
 
 if TYPE_CHECKING:
     from autotune.config import Config
+    from autotune.controller import PIDController
     from autotune.diagnosis.result import Diagnosis
     from autotune.pipeline import Tuning
 
@@ -162,6 +164,16 @@ def _diagnose(config: Config, tuning: Tuning, folder: Path, console: Console) ->
     return found
 
 
+def _pid_in_use(path: Path) -> PIDController:
+    """Return the PI or PID of a file; another law has no gains to stand beside the new ones."""
+    from autotune.controller import PIDController, read_controller
+
+    found = read_controller(path)
+    if not isinstance(found, PIDController):
+        raise InputError("no PI or PID", where=str(path), remedy='--present takes kind = "pi" with K and Ti_s')
+    return found
+
+
 @app.command()
 def tune(
     out: _OUT,
@@ -205,6 +217,10 @@ def tune(
         Literal["auto", "reduced model", "points", "fitted plant"],
         typer.Option(help="what to design on; auto: the first that keeps its margins on everything measured"),
     ] = "auto",
+    present: Annotated[
+        Path | None,
+        typer.Option(metavar="C.toml", help="the gains in use today: the page shows the new ones beside them"),
+    ] = None,
     t: T = None,
     u: U = None,
     y: Y = None,
@@ -217,7 +233,7 @@ def tune(
     from autotune.pipeline import CONTROLLER, RESULT, analyse, analysis_json, measured_of
     from autotune.points import read_points, require_regions
     from autotune.report.page import write_page
-    from autotune.report.run_page import analysis_page
+    from autotune.report.tuned_page import analysis_page
     from autotune.schema import validated
 
     recordings, files = recordings or [], points or []
@@ -237,6 +253,7 @@ def tune(
         {"kind": kind, "specification": specification, "source": source, "criterion": criterion, **given_options},
         "autotune tune",
     )
+    today = None if present is None else _pid_in_use(present)
     read = read_all(recordings, signal_names(t, u, y, r))
     given = [point for path in files for point in read_points(path)]
     if given and not read:
@@ -251,7 +268,8 @@ def tune(
         u_unit=str(units.get("u", "")),
         y_unit=str(units.get("y", "")),
     )
-    page = analysis_page(", ".join(path.stem for path in (*recordings, *files)), signals, read, analysis, notes)
+    name, now = ", ".join(path.stem for path in (*recordings, *files)), datetime.now().astimezone()
+    page = analysis_page(name, signals, read, analysis, notes, present=today, made=now)
     with place.filled() as folder:
         write_json(folder / RESULT, analysis_json(analysis))
         write_controller(analysis.controller, folder / CONTROLLER)

@@ -148,7 +148,7 @@ def _follow(recording: Path, out: Output, settings: _Tracking, quiet_s: float) -
 
     while quiet_s > 0.0 and not recording.exists():
         time.sleep(0.1)
-    after, done, retune_at, rows, size = -math.inf, -math.inf, None, -1, -1
+    after, done, retune_at, rows, size, reason = -math.inf, -math.inf, None, -1, -1, ""
     quiet_since = time.monotonic()
     with out.growing() as table:
         while True:
@@ -170,7 +170,7 @@ def _follow(recording: Path, out: Output, settings: _Tracking, quiet_s: float) -
                         integrator=settings.integrator,
                         after_s=after,
                     ):
-                        verdict = _report(fitted, settings, table)
+                        verdict, reason = _report(fitted, settings, table, reason), fitted.reason
                         after, done = fitted.end_s, max(done, fitted.end_s if fitted.model else done)
                         if verdict == "retune" and retune_at is None:
                             retune_at = fitted.end_s
@@ -216,13 +216,17 @@ def _readable(recording: Path, settings: _Tracking) -> Recording | None:
         return None
 
 
-def _report(fitted: Window, settings: _Tracking, table: TextIO) -> str:
-    """Write one window to the table and to the terminal, and return the verdict on the controller, empty without."""
+def _report(fitted: Window, settings: _Tracking, table: TextIO, before: str) -> str:
+    """Write one window to the table and to the terminal, and return the verdict on the controller, empty without.
+
+    A reason that is that of the window before is not said again.
+    """
     from autotune.identification.delay.tracking import quantities
     from autotune.watch import advise
 
     if fitted.model is None:
-        typer.echo(f"t {fitted.end_s:.4g} s: not determined: {fitted.reason}")
+        why = ", as before" if fitted.reason == before else f": {fitted.reason}"
+        typer.echo(f"t {fitted.end_s:.4g} s: not determined{why}")
         return ""
     found = quantities(fitted.model)
     line = ", ".join(f"{q.name} {q.value:.4g} +- {1.96 * q.sd:.2g} {q.unit}" for q in found)

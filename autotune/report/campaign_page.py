@@ -9,12 +9,28 @@ import numpy as np
 
 from autotune.batch.row import ATTENTION, Attention, Row
 from autotune.batch.settings import CampaignSettings
-from autotune.report.page import GREEN, GREY, ORANGE, RED, Figure, Page, Picture, Section, Table, Tone, lines_figure
+from autotune.report.glance import glance, identity
+from autotune.report.page import (
+    BLUE,
+    GREEN,
+    GREY,
+    ORANGE,
+    RED,
+    Anchor,
+    Figure,
+    Page,
+    Picture,
+    Section,
+    Table,
+    Tone,
+    lines_figure,
+)
 
 _TITLES: dict[Attention, str] = {
     "act": "Needs action",
     "failed": "Not analysed",
     "look": "Deserves a look",
+    "designed": "New gains to try",
     "fine": "Fine",
 }
 #: Of one loop, of several.
@@ -22,9 +38,10 @@ _WORDS: dict[Attention, tuple[str, str]] = {
     "act": ("needs action", "need action"),
     "failed": ("could not be analysed", "could not be analysed"),
     "look": ("deserves a look", "deserve a look"),
+    "designed": ("has new gains to try", "have new gains to try"),
     "fine": ("is fine", "are fine"),
 }
-_COLOURS: dict[Attention, str] = {"act": RED, "failed": GREY, "look": ORANGE, "fine": GREEN}
+_COLOURS: dict[Attention, str] = {"act": RED, "failed": GREY, "look": ORANGE, "designed": BLUE, "fine": GREEN}
 
 _SURE_IN_OPERATION = (
     "A valve is blamed where the past of its position predicts y better than the command does, and better than it"
@@ -35,10 +52,11 @@ _TODO_IN_OPERATION: dict[Attention, str] = {
     "act": "See to the valves and gains under 'Needs action' first, from the top; each with the test that tells.",
     "failed": "Read why the loops under 'Not analysed' failed; each names its remedy.",
     "look": "Loops that oscillate, not by their valve as far as is seen: look upstream, or make the test that tells.",
+    "designed": "",
     "fine": "Nothing to do; look again when a loop oscillates.",
 }
 
-_Columns = dict[str, Callable[[Row], str | Picture]]
+_Columns = dict[str, Callable[[Row], str | Picture | Anchor]]
 
 
 def campaign_page(settings: CampaignSettings, rows: Sequence[Row]) -> Page:
@@ -76,6 +94,7 @@ def campaign_page(settings: CampaignSettings, rows: Sequence[Row]) -> Page:
         verdict=f"Of {len(rows)} loops, {said}.",
         tone=tone,
         answers=_answers(counts, settings),
+        drawing=glance(rows, _COLOURS, _TITLES),
         summary=tuple(summary),
         sections=(*sections, *_present_margins(settings, rows), *_notes(rows)),
     )
@@ -90,6 +109,7 @@ def _answers(counts: Counter[Attention], settings: CampaignSettings) -> tuple[tu
         "act": "Retune what needs action first: its margins are missed or physics is missing.",
         "failed": "Read why the loops under 'Not analysed' failed; each names its remedy.",
         "look": "Look at the loops that could do better when there is time.",
+        "designed": "Try the new gains; where K and Ti_s of today are given, loops are ranked by what is to be gained.",
         "fine": "Nothing to do.",
     }
     sure = "Every figure rests on the loop's own record; what was left out of it is said under Notes."
@@ -97,8 +117,11 @@ def _answers(counts: Counter[Attention], settings: CampaignSettings) -> tuple[tu
 
 
 def _section(settings: CampaignSettings, attention: Attention, rows: Sequence[Row]) -> Section:
-    columns: _Columns = {"loop": lambda row: row.loop}
-    if attention != "fine":
+    columns: _Columns = {
+        "loop": lambda row: Anchor(says=row.loop, identity=identity(row)),
+        "area": lambda row: row.area,
+    }
+    if attention not in ("designed", "fine"):
         columns["why"] = lambda row: row.reason.removeprefix(f"{row.loop}: ")
     columns |= _FAILED if attention == "failed" else _COLUMNS[settings.task]
     chosen = [row for row in rows if row.attention == attention]

@@ -1,7 +1,4 @@
-"""What a controller will do: steps of set-point and load with the band of all plants, slower and faster ones beside it.
-
-And what it rests on: the fitted plant run over the recordings, with its numbers and their intervals.
-"""
+"""What a controller will do: steps of set-point and load with the band of all plants, and slower and faster ones."""
 
 from __future__ import annotations
 
@@ -10,23 +7,20 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.signal import lfilter
 
-from autotune.arrays import ComplexArray, FloatArray
+from autotune.arrays import FloatArray
 from autotune.config.procedure import SignalSettings
 from autotune.controller import PIDController
 from autotune.design.law import PILaw
 from autotune.design.margins import Margins, margins
 from autotune.design.synthesis import design
 from autotune.errors import AutotuneError
-from autotune.experiment.prediction import Prediction, predict, sampled
-from autotune.identification.parametric import PlantFit
+from autotune.experiment.prediction import Prediction, predict
 from autotune.models import TransferFunction
 from autotune.pipeline import Analysis
-from autotune.recording import Recording
 from autotune.report.chart import Chart, make_subplots
-from autotune.report.figures import axis_title, ratio_title, recording_figure
-from autotune.report.page import BLUE, GREEN, GREY, ORANGE, Figure, Section, Table, add_line, thinned
+from autotune.report.figures import axis_title, ratio_title
+from autotune.report.page import BLUE, GREY, ORANGE, Figure, Section, Table, add_line
 
 #: Plants that are drawn from the region.
 DRAWS = 40
@@ -244,98 +238,3 @@ def _figure(
     chart.update_yaxes(title=axis_title("change of u", signals.u_unit), row=2, col=1)
     chart.update_xaxes(title="time [s]", row=2, col=1)
     return chart
-
-
-def model_figures(fit: PlantFit, recordings: Sequence[Recording], signals: SignalSettings) -> tuple[Figure, ...]:
-    """Return the recordings with the fitted plant run over them, each with its fit in per cent.
-
-    Parameters
-    ----------
-    fit : PlantFit
-        Plant.
-    recordings : sequence of Recording
-        Any of it; where the plant was fitted to them, that is said.
-    signals : SignalSettings
-        Units.
-
-    Notes
-    -----
-    The operating point and what was under way at the first row are fitted, nothing else is: one free run of the plant
-    under the recorded command. The fit is 100 (1 - |y - simulated| / |y - mean|), the usual figure of identification.
-    """
-    figures = []
-    for recording in recordings:
-        found = _run(fit.plant, recording)
-        if found is None:
-            continue
-        simulated, percent = found
-        chart = recording_figure(recording, signals.u_unit, signals.y_unit)
-        add_line(chart, *thinned(recording.t, simulated), "fitted plant", GREEN, width=1.6, row=1, col=1)
-        own = "the rows that it was fitted to" if fit.source == "recording" else "rows that its points came from"
-        caption = f"{recording.name}: the fitted plant runs freely over {own}, and explains {percent:.0f} % of y."
-        figures.append(Figure(figure=chart, caption=caption))
-    return tuple(figures)
-
-
-def _run(plant: TransferFunction, recording: Recording) -> tuple[FloatArray, float] | None:
-    """Return y of a free run at every row, and its fit in per cent; None of uneven rows, or where it runs away."""
-    steps, y = np.diff(recording.t), recording.y
-    T_s = float(np.median(steps))
-    if y.size < 10 or float(np.max(np.abs(steps - T_s))) > 0.05 * T_s or not np.all(np.isfinite(recording.u)):
-        return None
-    num, den = sampled(plant, T_s)
-    forced = np.asarray(lfilter(num, den, recording.u - recording.u[0]), dtype=np.float64)
-    t = recording.t - recording.t[0]
-    # what was under way at the first row dies away, or goes on, as the plant's own modes; one at 0 is a constant
-    modes: list[FloatArray] = [np.ones(t.size)]
-    for pole in (p for p in np.atleast_1d(plant.poles) if p.imag >= 0.0):
-        mode: ComplexArray = np.exp(np.clip((pole * t).real, -50.0, 50.0)) * np.exp(1j * (pole * t).imag)
-        modes += [mode.real, mode.imag] if pole.imag else [mode.real if pole else t]
-    good = np.isfinite(y)
-    columns = np.column_stack(modes)
-    scale = np.linalg.norm(columns[good], axis=0)
-    scale[scale == 0.0] = 1.0
-    if not np.all(np.isfinite(forced)) or not np.any(good):
-        return None
-    x = np.linalg.lstsq(columns[good] / scale, (y - forced)[good], rcond=1e-9)[0]
-    simulated = forced + columns / scale @ x
-    spread = float(np.linalg.norm(y[good] - np.mean(y[good])))
-    return simulated, 100.0 * (1.0 - float(np.linalg.norm((y - simulated)[good])) / (spread or 1.0))
-
-
-def numbers_table(fit: PlantFit, signals: SignalSettings) -> Table:
-    """Return the plant's gain, lags and dead time with the ends of their 95 % intervals.
-
-    Parameters
-    ----------
-    fit : PlantFit
-        The fitted plant, with the region of its numbers.
-    signals : SignalSettings
-        Names the units.
-    """
-    drawn = [_numbers(plant) for plant in fit.draws(DRAWS * 5, np.random.default_rng(0))]
-    rows = []
-    for i, (name, value) in enumerate(_numbers(fit.plant)):
-        values = [one[i][1] for one in drawn if len(one) > i and one[i][0] == name]
-        told = len(values) > 0.9 * len(drawn) and fit.covariance.any()
-        low, high = np.quantile(values, [0.025, 0.975]) if told else (math.nan, math.nan)
-        rows.append((_title(name, signals), f"{value:.4g}", f"{low:.4g} to {high:.4g}" if told else "not told"))
-    return Table(header=("fitted plant", "value", "95 %"), rows=tuple(rows))
-
-
-def _title(name: str, signals: SignalSettings) -> str:
-    if name.startswith("gain"):
-        return ratio_title(name, signals.y_unit, f"{signals.u_unit} s" if "integrator" in name else signals.u_unit)
-    return name
-
-
-def _numbers(plant: TransferFunction) -> list[tuple[str, float]]:
-    """Return a plant's numbers as people know them, lags from the longest."""
-    gain = plant.num[-1] / plant.den[-1 - plant.integrators]
-    named = [("gain of the integrator" if plant.integrators else "gain", float(gain))]
-    poles = [p for p in np.atleast_1d(plant.poles) if p != 0.0 and p.imag >= 0.0]
-    lags = sorted((-1.0 / p.real for p in poles if p.imag == 0.0), key=lambda lag: -lag)
-    named += [(f"lag {i} [s]", float(lag)) for i, lag in enumerate(lags, 1)]
-    for p in (p for p in poles if p.imag > 0.0):
-        named += [("resonance [rad/s]", float(abs(p))), ("damping", float(-p.real / abs(p)))]
-    return [*named, ("dead time [s]", float(plant.delay_s))]

@@ -47,11 +47,27 @@ class Picture:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Anchor:
+    """A cell of a table that links lead to.
+
+    Attributes
+    ----------
+    says : str
+        The cell.
+    identity : str
+        What a link names after its ``#``.
+    """
+
+    says: str
+    identity: str
+
+
+@dataclass(frozen=True, kw_only=True)
 class Table:
     """Rows of cells under a header; numbers are formatted by the caller, with their units in the header."""
 
     header: tuple[str, ...]
-    rows: tuple[tuple[str | Picture, ...], ...]
+    rows: tuple[tuple[str | Picture | Anchor, ...], ...]
     caption: str = ""
 
 
@@ -255,9 +271,11 @@ def _table(table: Table) -> str:
     return f'{caption}{sought}<div class="wide">{drawn}</div>'
 
 
-def _cell(cell: str | Picture) -> str:
+def _cell(cell: str | Picture | Anchor) -> str:
     if isinstance(cell, str):
         return _text(cell)
+    if isinstance(cell, Anchor):
+        return f'<span id="{html.escape(cell.identity)}">{_text(cell.says)}</span>'
     low, high = float(np.min(cell.values)), float(np.max(cell.values))
     x = np.linspace(1.0, 99.0, cell.values.size)
     y = 27.0 - 25.0 * (cell.values - low) / ((high - low) or 1.0)

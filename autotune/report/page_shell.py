@@ -33,6 +33,12 @@ th[aria-sort="descending"] button::after { content: " \\2193"; }
 .answers { grid-template-columns: repeat(auto-fit, minmax(min(17rem, 100%), 1fr)); }
 .answers div { background: var(--card); padding: 0.6rem 0.9rem; border-radius: 6px; }
 .answers dt { color: var(--faint); font-size: 0.86rem; } .answers dd { margin: 0.15rem 0 0; overflow-wrap: anywhere; }
+.glance { --side: 14px; margin: 1rem 0; } .glance h3 { font-size: 0.86rem; margin: 0 0 0.2rem; font-weight: 600; }
+.glance > div { display: flex; flex-wrap: wrap; gap: 0.7rem 1.4rem; } .glance section > div { line-height: 0; }
+.glance a, .glance i { display: inline-block; width: var(--side); height: var(--side); margin: 0 1px 1px 0; }
+.glance a:hover, .glance a:focus { outline: 2px solid var(--ink); } .glance .key { margin-bottom: 0.8rem; }
+.glance .key { font-size: 0.86rem; } .glance i { width: 0.8em; height: 0.8em; margin-right: 0.35em; }
+tr:has(:target) { background: #d9820033; }
 .square { width: min(100%, 560px); aspect-ratio: 1; } .small { width: 100px; height: 28px; }
 .chain { margin: 1.1rem 0; } .chain svg { width: 100%; height: auto; display: block; } .upright { display: none; }
 .chain rect { fill: var(--card); stroke: var(--line); stroke-width: 1.5; } .chain text { fill: var(--ink); }

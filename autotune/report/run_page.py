@@ -10,14 +10,14 @@ from autotune.controller import PIDController
 from autotune.diagnosis.result import Diagnosis
 from autotune.experiment.judgement import Verification
 from autotune.experiment.leaving import sentence
-from autotune.pipeline import Analysis, Tuning
+from autotune.pipeline import Tuning
 from autotune.pipeline.deployment import Deployment
 from autotune.recording import Recording
 from autotune.report.analysis_sections import analysis_sections
-from autotune.report.analysis_words import based_on, designed_text, gains_text, margins_sentence
+from autotune.report.analysis_words import designed_text, gains_text, margins_sentence
 from autotune.report.experiment_section import experiment_section
 from autotune.report.figures import ratio_title, recording_figure
-from autotune.report.outlook import model_figures, numbers_table, outlook_section
+from autotune.report.outlook import outlook_section
 from autotune.report.page import Figure, Page, Section, Table
 from autotune.report.verification_section import verification_section
 
@@ -56,7 +56,7 @@ def run_page(
         sections += outlook_section(tuning.analysis, signals, tuning.old_controller)
     sections += reversed(analysis_sections(tuning.analysis, signals, experiment))
     sections.append(experiment_section(recordings, experiment, signals))
-    sections += _warnings_sections((*experiment.warnings, *tuning.analysis.warnings))
+    sections += warnings_sections((*experiment.warnings, *tuning.analysis.warnings))
     verdict, good = _verdict(tuning, signals, dry_run)
     return Page(
         title=f"Rehearsal: {name}" if dry_run else f"Commissioning: {name}",
@@ -64,53 +64,6 @@ def run_page(
         tone="good" if good else "bad" if verification is not None else "warn",
         answers=_answers(tuning, signals, diagnosis),
         sections=tuple(sections),
-    )
-
-
-def analysis_page(
-    name: str, signals: SignalSettings, recordings: Sequence[Recording], analysis: Analysis, notes: Sequence[str] = ()
-) -> Page:
-    """Return the page of a design from recordings, without a rig.
-
-    Parameters
-    ----------
-    name : str
-        Title.
-    signals : SignalSettings
-        Units.
-    recordings : sequence of Recording
-        What the points were made from; may be empty.
-    analysis : Analysis
-        Points, model and controller.
-    notes : sequence of str
-        What was left out or corrected on the way to the points.
-    """
-    figures = tuple(
-        Figure(figure=recording_figure(recording, signals.u_unit, signals.y_unit), caption=recording.name)
-        for recording in recordings
-    )
-    figures = model_figures(analysis.fit, recordings, signals) or figures
-    tables = (numbers_table(analysis.fit, signals),)
-    first = (Section(title="The plant over the recordings", figures=figures, tables=tables),) if figures else ()
-    sections = (
-        *outlook_section(analysis, signals),
-        *reversed(analysis_sections(analysis, signals, None)),
-        *first,
-        *_warnings_sections((*notes, *analysis.warnings)),
-    )
-    return Page(
-        title=f"Controller from recordings: {name}",
-        verdict=f"{designed_text(analysis.design, signals)}: not yet tried on the rig.",
-        tone="warn",
-        answers=(
-            ("Found", f"{designed_text(analysis.design, signals)}, {based_on(analysis)}."),
-            ("How sure", margins_sentence(analysis, signals)),
-            (
-                "What to do",
-                "Try it on the rig, or have autotune deploy and verify do so, before the loop is left to it.",
-            ),
-        ),
-        sections=sections,
     )
 
 
@@ -297,5 +250,6 @@ def _diagnosis_section(found: Diagnosis) -> Section:
     )
 
 
-def _warnings_sections(warnings: Sequence[str]) -> tuple[Section, ...]:
+def warnings_sections(warnings: Sequence[str]) -> tuple[Section, ...]:
+    """Return a section of warnings, each said once; none where there are none."""
     return (Section(title="Warnings", text=tuple(dict.fromkeys(warnings))),) if warnings else ()

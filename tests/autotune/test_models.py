@@ -108,6 +108,7 @@ def test_a_written_model_reads_back_equal(tmp_path: Path) -> None:
         (("delay = 0.02", "delay = -0.02"), "negative"),
         (("offset = 5.0", 'offset = "five"'), "offset = 'five'"),
         (('unit = "V/s"', 'units = "V/s"'), "unknown key 'units'"),
+        (('name = "ball in tube"', "den = [2.0, 1.0]"), r"den stand outside of a table; write \[\[block\]\] above"),
         (("offset = 5.0", "recorded = [1.0]"), "recorded = "),
         (("offset = 5.0", "recorded = [2.0, 1.0]"), "recorded = "),
     ],

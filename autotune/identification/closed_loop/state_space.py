@@ -48,6 +48,18 @@ class InnovationModel:
             if getattr(self, name).shape != shape:
                 raise InputError(f"{name} has shape {getattr(self, name).shape}, not {shape}", where="state space")
 
+    def __str__(self) -> str:
+        """Return a few lines for people; the matrices are in the attributes."""
+        upper = [p for p in self.poles if p.imag >= 0.0]
+        poles = [f"{p.real:.4g}" if p.imag == 0.0 else f"{p.real:.4g} +- {p.imag:.4g}j" for p in upper]
+        sd = ", ".join(f"{value:.4g}" for value in np.sqrt(np.diag(self.innovation_covariance)))
+        return (
+            f"model of order {self.order}, {self.B.shape[1]} input(s), {self.C.shape[0]} output(s), "
+            f"a row every {self.sample_time_s:g} s, {self.input_delay} row(s) of dead time\n"
+            f"poles in z: {', '.join(poles) or 'none'}\n"
+            f"standard deviation of the innovations: {sd}"
+        )
+
     @property
     def order(self) -> int:
         """Number of states, dead time not counted."""

@@ -37,6 +37,22 @@ def test_a_bare_import_brings_nothing_heavy():
     assert done.stdout.strip() == "[]"
 
 
+def test_the_help_of_the_command_line_needs_no_arrays_and_no_schema():
+    script = (
+        "import sys, autotune.cli; "
+        "print([m for m in ('numpy', 'scipy', 'pydantic', 'plotly', 'numba') if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize("command", [[], ["tune"], ["identify", "delay"]])
+def test_the_short_option_for_help_is_heard_everywhere(command):
+    asked = [sys.executable, "-m", "autotune", *command, "-h"]
+    done = subprocess.run(asked, capture_output=True, text=True, check=True)
+    assert "Usage: " in done.stdout
+
+
 def test_every_public_name_is_there_has_a_docstring_and_no_room_hides_it():
     for name in at.__all__:
         value = getattr(at, name)

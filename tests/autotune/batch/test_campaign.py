@@ -131,7 +131,7 @@ def test_the_command_runs_a_campaign_on_an_existing_scheduler_and_continues_it(d
     assert "Of 4 loops, 1 needs action, 2 could not be analysed, 1 is fine." in said.output
     assert (alone / RESULTS).read_bytes() == (tmp_path / RESULTS).read_bytes()
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
-    assert page.index("<td>hot</td>") < page.index("<td>broken</td>") < page.index("<td>good</td>")
+    assert page.index(">hot</span>") < page.index(">broken</span>") < page.index(">good</span>")
     again = CliRunner().invoke(app, words, catch_exceptions=False)
     assert "4 of 4 loops are done already" in again.output
 
@@ -274,6 +274,14 @@ def test_a_loop_under_control_is_identified_by_subspace(tmp_path):
     for point in finding.points:
         truth = GAIN / (1.0 + 1j * point["omega_rad_s"] * TAU_S)
         assert point["gain"] == pytest.approx(abs(truth), rel=0.1)
+
+
+def test_a_loop_whose_present_gains_are_not_known_is_not_called_fine(tmp_path):
+    file = str(plant_file(tmp_path / "a.csv", 3))
+    bare = analyse_loop(Work(loop=LoopSettings(name="a", file=file, area="mill"), settings=CampaignSettings(name="a")))
+    assert (bare.row.attention, bare.row.area, bare.row.reason) == ("designed", "mill", "")
+    same = LoopSettings(name="a", file=file, K=bare.row.K, Ti_s=bare.row.Ti_s)
+    assert analyse_loop(Work(loop=same, settings=CampaignSettings(name="a"))).row.attention == "fine"
 
 
 def test_a_defect_in_the_tool_is_a_row_that_says_where(tmp_path, monkeypatch):

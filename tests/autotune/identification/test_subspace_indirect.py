@@ -31,6 +31,13 @@ def test_loop_of_the_example_is_stable_with_the_published_spectral_radius() -> N
     assert spectral_radius(feedback(PLANT, CONTROLLER).A) == pytest.approx(0.98886, abs=5e-6)
 
 
+def test_a_model_prints_as_a_few_lines_with_its_poles() -> None:
+    lines = str(PLANT).splitlines()
+    assert len(lines) <= 4
+    assert f"order {PLANT.order}, 1 input(s), 1 output(s)" in lines[0]
+    assert f"{PLANT.poles[0].real:.4g}" in lines[1]
+
+
 @pytest.mark.parametrize("instrument", ["r", "r and y"])
 def test_paper_method_is_exact_without_noise(instrument: str) -> None:
     d = example_set(1, sd=0.0)

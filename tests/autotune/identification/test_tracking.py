@@ -124,6 +124,19 @@ def test_the_way_to_the_operating_point_is_not_tracked(tmp_path):
     assert abs(found["dead_time"] - 0.4) < 5.0 * found["dead_time_sd"]
 
 
+def test_a_reason_that_stays_the_same_is_said_once(tmp_path):
+    """A plant at rest under a command that does not move tells nothing in any window."""
+    y = np.random.default_rng(1).standard_normal(400)
+    write_recording(Recording(t=np.arange(400.0), u=np.full(400, 5.0), y=y, name="rest"), tmp_path / "rest.csv")
+    command = ["watch", str(tmp_path / "rest.csv"), "--window", "100", "--out", str(tmp_path / "w.csv")]
+    watched = CliRunner().invoke(app, command)
+    assert watched.exit_code == 0, watched.output
+    first, *others = [line for line in watched.output.splitlines() if "not determined" in line]
+    assert not first.endswith("as before")
+    assert len(others) > 3
+    assert all(line.endswith("not determined, as before") for line in others)
+
+
 def test_a_window_longer_than_the_record_is_refused():
     with pytest.raises(InputError, match="window 1000 s"):
         next(track(loop_in_operation(), 2, window_s=1000.0, every_s=10.0))

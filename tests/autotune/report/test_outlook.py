@@ -20,7 +20,8 @@ from autotune.identification.parametric import PlantFit
 from autotune.models import TransferFunction
 from autotune.pipeline.analysis import Analysis, analyse
 from autotune.recording import Recording
-from autotune.report.outlook import model_figures, numbers_table, outlook_section
+from autotune.report.outlook import outlook_section
+from autotune.report.plant_section import model_figures, numbers_table
 
 SIGNALS = SignalSettings(sample_time_s=0.1, u_unit="%", y_unit="degC")
 
@@ -125,7 +126,7 @@ def test_a_plant_explains_all_of_its_own_recording(gain: float, lag: float, dela
     for k in range(1, fine.size):
         y[k] = blend * y[k - 1] + (1.0 - blend) * gain * held[k - 1]
     recording = Recording(t=t, u=u, y=7.0 + y[::40], name="made")
-    (figure,) = model_figures(known(plant), (recording,), SIGNALS)
+    (figure,) = model_figures(replace(known(plant), source="points"), (recording,), SIGNALS)
     found = re.search(r"explains (-?\d+) % of y", figure.caption)
     assert found is not None
     assert int(found[1]) >= 99
@@ -136,7 +137,7 @@ def test_a_plant_that_rings_explains_its_own_decay():
     plant = TransferFunction(num=(1.0,), den=(1.0, 0.2, 1.0))
     decay = np.exp(-0.1 * t) * np.sin(math.sqrt(0.99) * t)  # from a speed, with the command at rest
     recording = Recording(t=t, u=np.full(t.size, 2.0), y=2.0 + decay, name="ringing")
-    (figure,) = model_figures(replace(known(OVEN), plant=plant), (recording,), SIGNALS)
+    (figure,) = model_figures(replace(known(OVEN), plant=plant, source="points"), (recording,), SIGNALS)
     assert "explains 100 % of y" in figure.caption
 
 

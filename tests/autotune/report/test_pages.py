@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import html
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -21,7 +23,7 @@ from autotune.report.campaign_page import campaign_page
 from autotune.report.maker_forms import maker_table
 from autotune.report.page import write_page
 from autotune.report.proof_page import proof_page
-from autotune.report.run_page import analysis_page
+from autotune.report.tuned_page import analysis_page
 from sim.score import wilson
 
 
@@ -78,6 +80,25 @@ def test_a_page_gives_the_gains_as_makers_blocks_take_them():
     assert "direct" in table.caption
     pid = PIDController(K=1.0, Ti_s=3.0, Td_s=1.0, Tf_s=0.1)
     assert "complex" in dict(maker_table(pid).rows)["series (interacting)"]
+
+
+def test_every_loop_of_a_large_campaign_is_a_square_that_leads_to_its_row(tmp_path):
+    kinds = ("act", "fine", "look", "fine", "fine")
+    rows = [
+        Row(loop=f'"{i}" <loop>', area="mill" if i % 2 else "boilers", attention=kinds[i % 5], reason="a & b", K=1.0)
+        for i in range(40)
+    ]
+    rows.sort(key=lambda row: row.order)
+    write_page(campaign_page(CampaignSettings(name="site"), rows), tmp_path / "page.html")
+    page = (tmp_path / "page.html").read_text(encoding="utf-8")
+    squares = re.findall(r'<a href="#([^"]+)" title="([^"]+)" style="background:#', page)
+    assert len(squares) == 40
+    for target, title in squares:
+        (cell,) = re.findall(rf'<td><span id="{target}">([^/]+)</span>', page)
+        assert html.unescape(title) == f"{html.unescape(cell)}: a & b"
+    assert re.findall("<h3>(.*?)</h3>", page) == ["boilers (20)", "mill (20)"]
+    few = campaign_page(CampaignSettings(name="site"), rows[:5])
+    assert few.drawing == ""
 
 
 def test_a_campaigns_page_shows_every_loops_plant_and_says_what_to_do(tmp_path):
