@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, SupportsFloat, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +18,8 @@ _ROUNDING = 1e-13
 
 def is_real(value: Any) -> bool:
     """Return whether something is a number that floating point holds, NaN and infinity included; True is none."""
-    if isinstance(value, bool | str | bytes) or not isinstance(value, SupportsFloat):
+    # hasattr and not isinstance(value, SupportsFloat), which says the same and takes twenty times as long
+    if isinstance(value, bool | str | bytes) or not hasattr(value, "__float__"):
         return False
     try:
         float(value)

@@ -54,6 +54,7 @@ def run(
     token_file: TOKEN_FILE = None,
 ) -> None:
     """Commission a rig: relay sweep, Bode points, reduced model, controller, verification, report."""
+    content = _configuration(config, out, resume, dry_run)  # a mistake there is told before the method is imported
     from autotune.live.session import LivePage, given_token
     from autotune.pipeline import tune
     from autotune.pipeline.folder import FILES_OF_A_RUN, may_store
@@ -61,7 +62,6 @@ def run(
     from autotune.report.page import write_page
     from autotune.report.run_page import run_page
 
-    content = _configuration(config, out, resume, dry_run)
     rig = rig_of(content)
     if out is not None:
         new_folder(out, FILES_OF_A_RUN)
@@ -124,19 +124,23 @@ def _page_where_stopped(config: Config, folder: Path) -> Iterator[None]:
 def _configuration(config: Path | None, out: Path | None, resume: Path | None, dry_run: bool) -> Config:
     """Return the configuration that was given, or the one that the interrupted run began with."""
     from autotune.config import load_config
-    from autotune.pipeline.folder import stored_config
-    from drivers import twin_of
 
     if (out is None) == (resume is None):
         raise InputError("give --out for a new run, or --resume for an interrupted one", where="autotune run")
     if config is not None:
         content = load_config(config)
     elif resume is not None:
+        from autotune.pipeline.folder import stored_config
+
         content = stored_config(resume)
     else:
         raise InputError("CONFIG.toml is missing", where="autotune run", remedy="autotune run CONFIG.toml --out DIR")
+    if not dry_run:
+        return content
+    from drivers import twin_of
+
     # so that nobody goes on at the rig with what its twin has measured
-    return content.model_copy(update={"rig": twin_of(content.rig)}) if dry_run else content
+    return content.model_copy(update={"rig": twin_of(content.rig)})
 
 
 def _diagnose(config: Config, tuning: Tuning, folder: Path, console: Console) -> Diagnosis | None:

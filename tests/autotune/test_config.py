@@ -102,15 +102,24 @@ def test_every_key_of_the_schema_says_what_it_is() -> None:
     assert undescribed == []
 
 
-def test_a_refusal_on_the_command_line_is_one_line_and_status_2(tmp_path: Path) -> None:
+#: the command line, which says on stdout whether the method was imported
+COMMAND = """
+import atexit, sys
+from autotune.cli import main
+atexit.register(lambda: print("scipy" in sys.modules))
+main()
+"""
+
+
+def test_a_refusal_on_the_command_line_is_one_line_and_status_2_before_the_method_is_imported(tmp_path: Path) -> None:
     path = write(tmp_path, COMPLETE.replace("swing", "swimg"))
     done = subprocess.run(
-        [sys.executable, "-m", "autotune.cli", "run", str(path), "--out", str(tmp_path / "out")],
+        [sys.executable, "-c", COMMAND, "run", str(path), "--out", str(tmp_path / "out")],
         capture_output=True,
         text=True,
         check=False,
     )
-    assert done.returncode == 2
+    assert (done.returncode, done.stdout) == (2, "False\n")
     assert done.stderr.count("\n") == 1
     assert "limits.swimg" in done.stderr
     assert not (tmp_path / "out").exists()

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 import zipfile
 from pathlib import Path
 
@@ -25,6 +23,7 @@ from autotune.identification.delay.tracking import track
 from autotune.models import Block, Model, Port, TransferFunction
 from autotune.pipeline.audit import audit_log
 from autotune.recording import Recording, read_recording
+from tests.autotune.command import autotune
 
 ROOT = Path(__file__).parents[2]
 BALL = (ROOT / "configs" / "ball_sim.toml").read_text()
@@ -139,9 +138,7 @@ def test_units_of_recordings_taken_together_are_compared(tmp_path: Path) -> None
         (tmp_path / f"{name}.csv").write_text(f"t,u,y\n{rows}")
         (tmp_path / f"{name}.toml").write_text(f'[units]\ny = "{unit}"\n')
     line = ["identify", "frequency", "a.csv", "b.csv", "--out", "p.json"]
-    done = subprocess.run(
-        [sys.executable, "-m", "autotune", *line], cwd=tmp_path, capture_output=True, text=True, check=False
-    )
+    done = autotune(*line, cwd=tmp_path)
     assert done.returncode == 2
     assert "b.csv: y is in mV, and in V in a.csv: a factor of 0.001" in done.stderr
 
@@ -211,9 +208,7 @@ OPTIONS = {
 
 @pytest.mark.parametrize("named", OPTIONS)
 def test_an_option_beyond_its_range_is_one_line_that_names_it(tmp_path: Path, named: str) -> None:
-    done = subprocess.run(
-        [sys.executable, "-m", "autotune", *OPTIONS[named]], cwd=tmp_path, capture_output=True, text=True, check=False
-    )
+    done = autotune(*OPTIONS[named], cwd=tmp_path)
     assert done.returncode == 2
     assert named in done.stderr
     assert done.stderr.count("\n") == 1
@@ -233,9 +228,7 @@ REFERENCES = {
 def test_a_reference_of_no_limit_or_too_many_rows_is_refused(tmp_path: Path, named: str) -> None:
     (tmp_path / "m.toml").write_text('name = "lag"\n' + LAG.format(last=1.0))
     line = ["reference", "--model", "m.toml", "--u-min", "-3", "--u-max", "3", "--out", "r.csv", *REFERENCES[named]]
-    done = subprocess.run(
-        [sys.executable, "-m", "autotune", *line], cwd=tmp_path, capture_output=True, text=True, check=False
-    )
+    done = autotune(*line, cwd=tmp_path)
     assert done.returncode == 2, done.stderr
     assert named in done.stderr
     assert done.stderr.count("\n") == 1
@@ -248,9 +241,7 @@ def test_a_command_computed_for_an_unstable_plant_is_said_to_need_a_controller(
 ) -> None:
     (tmp_path / "m.toml").write_text('name = "lag"\n' + LAG.format(last=last))
     line = ["reference", "--model", "m.toml", "--u-min", "-3", "--u-max", "3", "--out", "r.csv"]
-    done = subprocess.run(
-        [sys.executable, "-m", "autotune", *line], cwd=tmp_path, capture_output=True, text=True, check=False
-    )
+    done = autotune(*line, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert ("the plant is unstable" in done.stderr) == warned
 
@@ -280,10 +271,7 @@ def points_of(frequencies: list[float], sd: float) -> str:
 @pytest.mark.parametrize("command", ["design", "tune", "reduce"])
 def test_points_on_which_no_design_can_rest_are_refused(tmp_path: Path, command: str, points: str, said: str) -> None:
     (tmp_path / "p.json").write_text(points)
-    done = subprocess.run(
-        [sys.executable, "-m", "autotune", command, "--points", "p.json", "--out", "o"],
-        cwd=tmp_path, capture_output=True, text=True, check=False,
-    )  # fmt: skip
+    done = autotune(command, "--points", "p.json", "--out", "o", cwd=tmp_path)
     assert done.returncode == 2
     assert said in done.stderr
     assert [file.name for file in tmp_path.iterdir()] == ["p.json"]

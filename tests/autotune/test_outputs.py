@@ -18,6 +18,7 @@ from autotune.errors import InputError
 from autotune.outputs import Output, OutputFolder, claim
 from autotune.recording import RecordingWriter, read_recording
 from autotune.whole_files import append_whole, write_json, write_whole
+from tests.autotune.command import autotune
 
 WRITING = (outputs.__file__, whole_files.__file__)
 
@@ -175,13 +176,7 @@ def test_no_command_replaces_its_input_or_another_file(tmp_path: Path, command: 
     names = ("r.csv", "r.toml", "model.toml", "c.toml", "points.json", "config.toml", "result.json", "diagnosis.json")
     for name in names:
         (tmp_path / name).write_text(f"# {name}\n")
-    done = subprocess.run(
-        [sys.executable, "-m", "autotune", *COMMANDS[command]],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    done = autotune(*COMMANDS[command], cwd=tmp_path)
     assert done.returncode == 2, done.stderr
     assert done.stderr.count("\n") == 1
     assert "is read by this command" in done.stderr or "exists already" in done.stderr

@@ -224,7 +224,7 @@ def interpolated(t: FloatArray, running: ComplexArray, at: FloatArray) -> Comple
     (M,) complex array
         The integral up to these.
     """
-    row = np.clip(np.searchsorted(t, at) - 1, 0, t.size - 2)
+    row = np.minimum(np.maximum(np.searchsorted(t, at) - 1, 0), t.size - 2)
     share = (at - t[row]) / (t[row + 1] - t[row])
     return np.asarray(running[row] + share * (running[row + 1] - running[row]), dtype=np.complex128)
 
