@@ -40,16 +40,23 @@ class Fitted:
         What was fitted, and where its minimum lies.
     covariance : (n + m + 2, n + m + 2) array
         Of a_0..a_(n-1), b_0..b_m, h; zero rows for what is known.
+    places : int
+        From how many the search could begin.
     """
 
     structure: Structure
     point: Point
     covariance: FloatArray
+    places: int
 
     @property
     def criterion(self) -> float:
-        """Akaike's: it keeps a pole that the rows only just show, whose lack would bias every point."""
-        return self.point.rows * math.log(self.point.cost / self.point.rows) + 2.0 * self.structure.parameters
+        """Akaike's, which keeps a pole that the rows only just show, whose lack would bias every point.
+
+        The best of so many places fits noise better by twice their logarithm: poles that ring are looked for in many.
+        """
+        paid = 2.0 * self.structure.parameters + 2.0 * math.log(self.places)
+        return self.point.rows * math.log(self.point.cost / self.point.rows) + paid
 
     @property
     def equation(self) -> Equation:
@@ -111,7 +118,7 @@ def fit_from_points(points: Sequence[FrequencyPoint], data: DelayData, largest: 
         places = [(a, h) for _, a, h in through[:_TRIED]]
         places += [place for one in found for place in _grown(one, structure, omega)]
         begun = min((solve_linear(data, structure, *place) for place in places), key=lambda point: point.cost)
-        found += _fitted(data, structure, begun, largest, np.empty(0))
+        found += _fitted(data, structure, begun, len(places), largest, np.empty(0))
     return _determined(found, data)
 
 
@@ -172,7 +179,7 @@ def fit_again(data: DelayData, found: Sequence[Fitted], largest: float, whitenin
     again: list[Fitted] = []
     for one in found:
         begun = solve_linear(data, one.structure, one.point.a, one.point.h, whitening)
-        again += _fitted(data, one.structure, begun, largest, whitening)
+        again += _fitted(data, one.structure, begun, one.places, largest, whitening)
     return _determined(again, data)
 
 
@@ -182,13 +189,15 @@ def _determined(found: list[Fitted], data: DelayData) -> list[Fitted]:
     return found
 
 
-def _fitted(data: DelayData, structure: Structure, begun: Point, largest: float, whitening: FloatArray) -> list[Fitted]:
+def _fitted(
+    data: DelayData, structure: Structure, begun: Point, places: int, largest: float, whitening: FloatArray
+) -> list[Fitted]:
     """Return a structure at its minimum; nothing where the rows do not determine it."""
     if not math.isfinite(begun.cost):
         return []
     at = _lowest(data, structure, begun, largest, whitening)
     covariance = _covariance(data, structure, at, whitening)
-    return [] if covariance is None else [Fitted(structure=structure, point=at, covariance=covariance)]
+    return [] if covariance is None else [Fitted(structure=structure, point=at, covariance=covariance, places=places)]
 
 
 def _lowest(data: DelayData, structure: Structure, start: Point, largest: float, whitening: FloatArray) -> Point:
