@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from autotune.arrays import FloatArray
+from autotune.live.axis_ends import linear_ends, log_ends, phase_ends
 from autotune.live.story import Story
 from autotune.report.figures import frequencies, gain_phase, gain_phase_bars, region, usual_range
 from autotune.report.page import BLUE, GREEN, GREY, ORANGE, PURPLE, RED, thinned
@@ -22,8 +23,8 @@ MAGNIFIED = 10.0
 #: part of the picture that a region's axis must reach to be drawn in its true size
 SEEN_SHARE = 0.03
 ROWS = 900
-#: part of the time shown that a state must last for its name to have room
-LABEL_SHARE = 0.05
+#: part of the time shown that a state must last for its name to have room above the picture
+LABEL_SHARE = 0.11
 INK = "getComputedStyle(document.body).color"
 
 Options = dict[str, Any]
@@ -94,13 +95,13 @@ def strip_options(story: Story, span_s: float) -> Options:
         "markArea": _swing(low, high) if limits else {},
     }
     u_line = _line("u", t, u, ORANGE, grid=1, step=True) | {"markLine": _marks(u_lines, [(at, "") for at, _ in marks])}
-    seconds = _axis("s", grid=1) | {"min": max(0.0, now_s - span_s) if t.size else 0.0, "max": max(now_s, 1.0)}
+    seconds = _seconds(grid=1) | {"min": max(0.0, now_s - span_s) if t.size else 0.0, "max": max(now_s, 1.0)}
     return _options(
-        grids=[{"top": 34, "height": "54%"}, {"top": "67%", "bottom": 30}],
+        grids=[{"top": 48, "height": "51%"}, {"top": "67%", "bottom": 30}],
         x_axes=[seconds | {"gridIndex": 0, "name": "", ":axisLabel": "({show: false})"}, seconds],
         y_axes=[
-            _axis(f"y [{y_unit}]", *_pad(float(shown.min()), float(shown.max()))),
-            _axis(f"u [{u_unit}]", *u_range, grid=1) | {"splitNumber": 3},
+            _axis(f"y [{y_unit}]") | linear_ends(float(shown.min()), float(shown.max())),
+            _axis(f"u [{u_unit}]", grid=1) | linear_ends(*u_range),
         ],
         series=[y_line, _line("set-point", t, r, GREY, dash="dashed", width=1.2), u_line],
         legend=["y", "set-point", "u"],
@@ -126,13 +127,13 @@ def bode_options(story: Story) -> Options:
                 curve = gain_phase(sign * model.response(omega))
                 series += [_line(name, omega, curve[0], colour), _line(name, omega, curve[1], colour, grid=1)]
                 names.append(name)
-    frequency = _axis("rad/s", grid=1) | {"type": "log", **_decades(at)}
+    frequency = _axis("rad/s", grid=1) | {"type": "log", **log_ends(at)}
     return _options(
         grids=[{"top": 34, "height": "38%"}, {"top": "55%", "bottom": 30}],
         x_axes=[frequency | {"gridIndex": 0, "name": "", ":axisLabel": "({show: false})"}, frequency],
         y_axes=[
-            _axis(f"gain [{y_unit}/{u_unit}]") | {"type": "log", **_decades(gain)},
-            _axis("phase [deg]", grid=1) | _degrees(phase_deg),
+            _axis(f"gain [{y_unit}/{u_unit}]") | {"type": "log", **log_ends(gain)},
+            _axis("phase [deg]", grid=1) | phase_ends(phase_deg),
         ],
         series=series,
         legend=names,
@@ -178,7 +179,7 @@ def steps_options(story: Story) -> Options:
     band |= STACK | {"areaStyle": {"color": GREEN, "opacity": 0.2}}
     return _options(
         grids=[{"top": 34, "bottom": 30}],
-        x_axes=[_axis("s") | {"min": 0.0, "max": float(t[-1])}],
+        x_axes=[_seconds() | {"min": 0.0, "max": float(t[-1])}],
         y_axes=[_axis(f"y - operating point [{story.units[1]}]") | {"scale": True}],
         series=[
             _line("low", t, steps["low"], GREEN, width=0.0) | STACK,
@@ -206,8 +207,8 @@ def _options(
     }
 
 
-def _axis(name: str, low: float | None = None, high: float | None = None, *, grid: int = 0) -> Options:
-    axis: Options = {
+def _axis(name: str, *, grid: int = 0) -> Options:
+    return {
         "type": "value",
         "gridIndex": grid,
         "name": name,
@@ -218,7 +219,12 @@ def _axis(name: str, low: float | None = None, high: float | None = None, *, gri
         "axisLine": {"lineStyle": {"color": GREY}},
         "splitLine": {"lineStyle": {"color": "rgba(128,128,128,0.25)"}},
     }
-    return axis if low is None or high is None else axis | {"min": low, "max": high}
+
+
+def _seconds(*, grid: int = 0) -> Options:
+    """Return an axis of time whose end is now, which is no round number and gets no label."""
+    axis = _axis("s", grid=grid)
+    return axis | {"axisLabel": axis["axisLabel"] | {"showMaxLabel": False}}
 
 
 def _line(
@@ -269,17 +275,17 @@ def _bars(x: FloatArray, y: FloatArray, half: FloatArray, colour: str, *, grid: 
 
 def _marks(lines: list[tuple[float, str]], instants: list[tuple[float, str]]) -> Options:
     def mark(where: dict[str, float], text: str, colour: str, label: Options) -> Options:
-        shown = {"formatter": text, "show": bool(text), ":color": INK, "fontSize": 11, **PLATE} | label
+        shown = {"formatter": text, "show": bool(text), ":color": INK, "fontSize": 12, **PLATE} | label
         return where | {"lineStyle": {"color": colour, "type": "dotted"}, "label": shown}
 
     limits = [mark({"yAxis": value}, text, RED, {"position": "insideEndTop"}) for value, text in lines]
-    begins = [mark({"xAxis": at}, text, GREY, {"position": "insideEndBottom"}) for at, text in instants]
+    begins = [mark({"xAxis": at}, text, GREY, {"position": "end", "rotate": 0, "distance": 2}) for at, text in instants]
     return {"symbol": "none", "silent": True, "animation": False, "data": [*limits, *begins]}
 
 
 def _swing(low: float, high: float) -> Options:
     area = [{"yAxis": low, "name": "allowed swing"}, {"yAxis": high}]
-    label = {"position": "insideBottomLeft", ":color": INK, "fontSize": 11}
+    label = {"position": "insideBottomLeft", ":color": INK, "fontSize": 12}
     return {"silent": True, "itemStyle": {"color": "rgba(128,128,128,0.10)"}, "label": label, "data": [area]}
 
 
@@ -293,26 +299,3 @@ def _pairs(x: FloatArray, y: FloatArray) -> list[list[float | None]]:
 def _near(limits: list[float], low: float, high: float) -> list[float]:
     """Return the limits that the axis can reach without making the swing small."""
     return [limit for limit in limits if low - (high - low) <= limit <= high + (high - low)]
-
-
-def _pad(low: float, high: float) -> tuple[float, float]:
-    room = 0.06 * (high - low)
-    return low - room, high + room
-
-
-def _degrees(phase_deg: FloatArray) -> Options:
-    """Return the ends and the ticks of an axis of phases: multiples of 15 or 45 degrees."""
-    low, high = (float(phase_deg.min()), float(phase_deg.max())) if phase_deg.size else (-180.0, -90.0)
-    tick = 15 if high - low < 60.0 else 45
-    return {
-        "min": tick * math.floor((low - 4.0) / tick),
-        "max": tick * math.ceil((high + 4.0) / tick),
-        "interval": tick,
-    }
-
-
-def _decades(values: FloatArray) -> Options:
-    """Return the ends of a logarithmic axis a little beyond the values."""
-    if not values.size:
-        return {"min": 0.1, "max": 10.0}
-    return {"min": float(f"{values.min() / 1.6:.2g}"), "max": float(f"{values.max() * 1.6:.2g}")}

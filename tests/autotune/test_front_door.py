@@ -27,8 +27,8 @@ FILES = {door.name: door for door in DOORS}
 
 @pytest.mark.parametrize(
     ("name", "worst"),
-    # the region of the closed loop's short record is wide, and margins are kept over all of it
-    [("oven_step.csv", 1.1), ("doublet.csv", 1.1), ("inverse.csv", 1.1), ("closed_loop.csv", 1.3)],
+    # what the closed loop's record holds costs 1.14 to 1.17 with the plant's order and the noise's colour given
+    [("oven_step.csv", 1.1), ("doublet.csv", 1.1), ("inverse.csv", 1.1), ("closed_loop.csv", 1.2)],
 )
 def test_a_recording_goes_to_a_controller_with_margins_near_the_best(name: str, worst: float, tmp_path: Path) -> None:
     door = FILES[name]

@@ -14,6 +14,7 @@ from autotune.cli import app
 from autotune.config import Config, load_config
 from autotune.config.procedure import DesignSettings
 from autotune.controller import PIDController
+from autotune.design.specification import Design
 from autotune.errors import DesignError, IdentificationError, InputError, LinkError
 from autotune.experiment.judgement import Verification
 from autotune.experiment.rig import Reading, TrialGains
@@ -89,6 +90,16 @@ def test_exact_points_of_the_ball_give_the_optimum_of_its_reduced_model() -> Non
     assert analysis.margins.phase_rad > analysis.design.margins.phase_rad
     assert not analysis.unscaled.holds  # (10) as printed fails: the nu-gap depends on the units
     assert analysis.scaled.holds
+
+
+def test_a_bound_on_the_norm_is_proved_of_the_design_that_is_chosen_and_of_no_other() -> None:
+    points = points_of(BALL, np.array([0.9, 1.5, 2.4, 3.5, 5.0]), 1e-3)
+    chosen = analyse(points, DesignSettings(source="reduced model", noise_gain=0.1)).design
+    beside = dict(analyse(points, DesignSettings(source="points", noise_gain=0.1)).alternatives)["reduced model"]
+    assert isinstance(beside, Design)
+    assert chosen.h2_lower_bound is not None
+    assert beside.h2_lower_bound is None
+    assert beside.controller == chosen.controller
 
 
 def test_points_that_do_not_reach_135_degrees_are_refused_with_the_remedy() -> None:
