@@ -108,7 +108,7 @@ def test_a_chain_with_a_measured_disturbance_finds_friction_and_further_columns(
     assert [(one.name, one.kind, one.of) for one in chain.states if one.kind != "other"] == [
         ("speed", "speed", "position"), ("position", "position", "")]  # fmt: skip
 
-    def belt(seed: int, friction: float, wind: float, rows: int = 1500) -> Recording:
+    def belt(seed: int, friction: float, wind: float, rows: int = 750) -> Recording:
         random, t = np.random.default_rng(seed), 0.02 * np.arange(rows)
         u, slope, air = (
             np.repeat(random.normal(0.0, 1.0, rows // 50), 50), slow_noise(seed + 9, rows), slow_noise(seed + 5, rows)
