@@ -97,7 +97,22 @@ def _as_text(value: Any) -> str:
 
 
 def require_keys(table: Any, keys: set[str], where: str) -> None:
-    """Refuse what is no table, and a table with a key that is none of those known."""
+    """Refuse what is no table, and a table with a key that is none of those known.
+
+    Parameters
+    ----------
+    table : object
+        What a file states.
+    keys : set of str
+        Those that are known.
+    where : str
+        Names the file and the table in messages.
+
+    Raises
+    ------
+    InputError
+        Names the key.
+    """
     if not isinstance(table, Mapping):
         raise InputError(f"{_as_text(table)} is no table", where=where, remedy=f"write keys: {', '.join(sorted(keys))}")
     for key in table:

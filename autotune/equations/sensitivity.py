@@ -36,7 +36,19 @@ class Windows:
 
 
 def run_windows(compiled: Compiled, parameters: FloatArray, drive: Drive, windows: Windows) -> Run:
-    """Simulate windows, each from its start state; see :func:`autotune.equations.simulate.simulate`."""
+    """Simulate windows, each from its start state; see :func:`autotune.equations.simulate.simulate`.
+
+    Parameters
+    ----------
+    compiled : Compiled
+        The model.
+    parameters : (P,) array
+        Its numbers, each in its own unit.
+    drive : Drive
+        Time stamps and inputs.
+    windows : Windows
+        Their first and last rows, and the states at the first.
+    """
     return simulate(compiled, parameters, drive, windows.states, starts=windows.starts, stops=windows.stops)
 
 

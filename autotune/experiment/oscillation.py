@@ -50,7 +50,15 @@ def jumped(loop: ControlLoop) -> bool:
 
 
 def late_by(loop: ControlLoop, row: int) -> tuple[float, float]:
-    """Return how late the latest sample since a row came at most [s], and by how much y moves meanwhile [y unit]."""
+    """Return how late the latest sample since a row came at most [s], and by how much y moves meanwhile [y unit].
+
+    Parameters
+    ----------
+    loop : ControlLoop
+        With its rows so far.
+    row : int
+        The first that is looked at.
+    """
     t, _, y = loop.history(row)
     steps, known = np.diff(t), np.isfinite(y)
     if steps.size < 2 or np.sum(known) < 3:

@@ -250,12 +250,32 @@ def _delayed(fit: PlantFit, delay_s: float) -> PlantFit:
 
 
 def beside(law: PILaw, load: float) -> PILaw:
-    """Return the law whose command stays within the limits together with a load that is added to it [u unit]."""
+    """Return the law whose command stays within the limits together with a load that is added to it.
+
+    Parameters
+    ----------
+    law : PILaw
+        The law.
+    load : float
+        The load [u unit].
+    """
     return law if load == 0.0 else replace(law, u_min=law.u_min - load, u_max=law.u_max - load)
 
 
 def law_for(controller: PIDController, limits: LimitSettings, sample_time_s: float, reserve: float = 0.0) -> PILaw:
-    """Return the law within the safety envelope; ``reserve`` [u unit] is kept, both ways, for what is added to it."""
+    """Return the law within the safety envelope.
+
+    Parameters
+    ----------
+    controller : PIDController
+        Its gains.
+    limits : LimitSettings
+        Range and rate of the command.
+    sample_time_s : float
+        Control period [s].
+    reserve : float
+        What is kept of the range, both ways, for what is added to the law's command [u unit].
+    """
     return PILaw(
         controller=controller,
         sample_time_s=sample_time_s,

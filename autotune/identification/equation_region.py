@@ -46,7 +46,15 @@ class Equation:
 
     @staticmethod
     def of(model: DelayModel, integrator: bool) -> Equation:
-        """Return a model's equation, which has no zeros."""
+        """Return a model's equation, which has no zeros.
+
+        Parameters
+        ----------
+        model : DelayModel
+            The model.
+        integrator : bool
+            Whether its a_0 = 0 was known.
+        """
         size = model.order + 2
         return Equation(
             order=model.order,

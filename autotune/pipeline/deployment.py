@@ -96,7 +96,17 @@ def hand_over(
 
 
 def restore_interrupted(rig: HoldsGains, journal: Path, *, audit: AuditLog | None = None) -> None:
-    """Write the gains back that the rig held before a hand-over that did not come to its end, where there was one."""
+    """Write the gains back that the rig held before a hand-over that did not come to its end, where there was one.
+
+    Parameters
+    ----------
+    rig : HoldsGains
+        Connected.
+    journal : path
+        Of hand-overs to this rig.
+    audit : AuditLog, optional
+        Told of it.
+    """
     before = Journal(journal).unfinished()
     if before is not None:
         restore(rig, before, journal, audit=audit, why="an earlier hand-over was interrupted")

@@ -54,6 +54,15 @@ class Journal:
     def note(self, step: Step, controller: PIDController, why: str = "") -> None:
         """Append a step and bring it to the disk; in the audit log with why it is taken.
 
+        Parameters
+        ----------
+        step : Step
+            What is about to be done, or was.
+        controller : PIDController
+            Whose gains it is about.
+        why : str
+            For the audit log.
+
         Raises
         ------
         ExperimentStopped

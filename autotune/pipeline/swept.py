@@ -96,7 +96,15 @@ def fit_rows(recordings: Sequence[Recording]) -> PlantFit:
 
 
 def facts_of(config: Config, noise_sd: float) -> LoopFacts:
-    """Return what a configuration, and the noise that its sweep measured [y unit], say of the loop."""
+    """Return what a configuration and its sweep say of the loop.
+
+    Parameters
+    ----------
+    config : Config
+        Range of the command, and sample time.
+    noise_sd : float
+        Standard deviation of the noise that the sweep measured [y unit].
+    """
     return LoopFacts(
         noise_sd=noise_sd,
         u_range=config.limits.u_max - config.limits.u_min,
