@@ -23,7 +23,7 @@ sys.meta_path.insert(0, Interrupting())
 """
 
 
-@pytest.mark.parametrize("name", ["autotune.version", "autotune.cli", "numpy"])
+@pytest.mark.parametrize("name", ["autotune.version", "autotune.cli", "typer"])
 @pytest.mark.parametrize("script", [True, False])
 def test_an_interrupt_during_the_import_is_one_line(name: str, script: bool, tmp_path: Path) -> None:
     (tmp_path / "sitecustomize.py").write_text(CUSTOM.format(name=name), encoding="utf-8")
