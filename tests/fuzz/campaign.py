@@ -26,7 +26,7 @@ from typing import Any
 import typer
 
 from tests.fuzz.families import FAMILIES, Family
-from tests.fuzz.sound import Call
+from tests.fuzz.sound import Call, sound_files
 
 #: an input that has not been answered after this time of a processor, or after ten times as long, hangs [s]
 HANG_S = 20.0
@@ -76,8 +76,8 @@ def _ring(*_: object) -> None:
     raise _Hang
 
 
-def try_one(family: Family, number: int, seed: int, folder: Path) -> Answer:
-    """Make one input and try it in this process."""
+def try_one(family: Family, number: int, seed: int, folder: Path, hang_s: float = HANG_S) -> Answer:
+    """Make one input and try it in this process; 0 lets it take its time."""
     rng = random.Random(f"{seed} {family.name} {number}")
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
@@ -85,7 +85,7 @@ def try_one(family: Family, number: int, seed: int, folder: Path) -> Answer:
     began_s, before_mb = time.monotonic(), _peak_mb()
     out, err = io.StringIO(), io.StringIO()
     signal.signal(signal.SIGPROF, _ring)
-    signal.setitimer(signal.ITIMER_PROF, HANG_S)
+    signal.setitimer(signal.ITIMER_PROF, hang_s)
     try:
         with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
             status = _called(call)
@@ -157,16 +157,24 @@ def _fault(status: int, out: str, err: str) -> str:
     return ""
 
 
-def _work(orders: Connection, seed: int, folder: str, warm: bool) -> None:
+def _sound_run(_: random.Random, folder: Path) -> Call:
+    out = str(folder / "run")
+    return ["run", sound_files(folder)["config"], "--dry-run", "--no-verify", "--out", out]
+
+
+#: inputs of a family for which what it needs is compiled
+_COMPILING = dict.fromkeys(("models", "recordings", "points"), 12) | {"configs": 1}
+
+
+def _work(orders: Connection, seed: int, folder: str, warm: Sequence[str]) -> None:
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY_BYTES, MEMORY_BYTES))
     os.chdir(tempfile.mkdtemp(dir=folder))
     families = {family.name: family for family in FAMILIES}
-    for name in (
-        ("models", "recordings", "points") if warm else ()
-    ):  # what compiles or loads at first takes longer than any input
-        for number in range(12):
-            with contextlib.suppress(_Hang):
-                try_one(families[name], -number - 1, 0, Path(folder) / str(os.getpid()))
+    # what compiles or loads at first takes longer than any input, and a compiler that is interrupted leaves half of it
+    compiling = families | {"configs": Family(name="configs", make=_sound_run, share=0.0)}
+    for name in warm:
+        for number in range(_COMPILING[name]):
+            try_one(compiling[name], -number - 1, 0, Path(folder) / str(os.getpid()), hang_s=0.0)
     while (order := orders.recv()) is not None:
         name, number = order
         orders.send(try_one(families[name], number, seed, Path(folder) / str(os.getpid())))
@@ -184,7 +192,7 @@ def plan(inputs: int, seed: int, names: Sequence[str] = ()) -> Iterator[tuple[st
 
 
 class _Worker:
-    def __init__(self, seed: int, folder: str, warm: bool = True) -> None:
+    def __init__(self, seed: int, folder: str, warm: Sequence[str] = ()) -> None:
         context = multiprocessing.get_context("spawn")
         self.line, theirs = context.Pipe()
         self.process = context.Process(target=_work, args=(theirs, seed, folder, warm), daemon=True)
@@ -227,7 +235,7 @@ def campaign(
     faults: list[Answer] = []
     orders, until_s = plan(inputs, seed, names), time.monotonic() + seconds
     with tempfile.TemporaryDirectory(prefix="autotune-fuzz-") as folder:
-        pool = [_Worker(seed, folder, warm=i == 0) for i in range(workers)]
+        pool = [_Worker(seed, folder, warm=tuple(_COMPILING) if i == 0 else ()) for i in range(workers)]
         busy = []
         for worker in pool:
             if (order := next(orders, None)) is not None:
@@ -247,7 +255,7 @@ def campaign(
                 fresh = worker
                 if answer.status == -9 or answer.fault.startswith("hang"):
                     worker.process.kill()
-                    fresh = _Worker(seed, folder, warm=False)
+                    fresh = _Worker(seed, folder)
                 order = next(orders, None) if time.monotonic() < until_s else None
                 if order is None:
                     fresh.process.kill()
@@ -263,7 +271,8 @@ def campaign(
 
 def answers(orders: Sequence[tuple[str, int]], seed: int, folder: Path) -> list[Answer]:
     """Return what became of chosen inputs, tried one after the other in a process of their own."""
-    worker, found = _Worker(seed, str(folder), warm=False), []
+    warm = ("configs",) if any(name == "configs" for name, _ in orders) else ()
+    worker, found = _Worker(seed, str(folder), warm), []
     try:
         for order in orders:
             worker.give(order)
