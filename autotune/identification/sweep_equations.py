@@ -12,7 +12,8 @@ import numpy as np
 from autotune.arrays import ComplexArray, FloatArray
 from autotune.errors import IdentificationError
 from autotune.identification.delay.data import DelayData
-from autotune.identification.delay.output_error import Point, Structure, gram_at, minimise, solve_linear
+from autotune.identification.delay.output_error import Point, Structure, minimise, solve_linear
+from autotune.identification.delay.output_error_model import inverse_information
 from autotune.identification.equation_region import Equation
 from autotune.points import FrequencyPoint
 
@@ -26,8 +27,6 @@ _REWEIGHTED = 4
 #: rows by which a delay is moved to leave a local minimum, and variances by which the next one has to be lower
 _STRIDE, _LOWER = 1.5, 1e-3
 _ITERATIONS = 40
-#: condition of the information beyond which the rows do not determine all numbers
-_UNDETERMINED = 1e13
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -220,25 +219,15 @@ def _lowest(data: DelayData, structure: Structure, start: Point, largest: float,
 
 
 def _covariance(data: DelayData, structure: Structure, at: Point, whitening: FloatArray) -> FloatArray | None:
-    """Return the covariance of a_0.., b_0.., h at a minimum; None where the rows do not determine them.
-
-    Only the initial state's depends on the free responses that the sensitivities leave out.
-    """
-    n, free = structure.order, np.flatnonzero(structure.free)
-    gram, finite = gram_at(data, at.a, at.h, at.theta, whitening)
-    information = gram[np.ix_(free, free)]
-    scale = np.sqrt(np.diag(information))
-    if not finite or not np.all(scale > 0.0):
+    """Return the covariance of a_0.., b_0.., h at a minimum; None where the rows do not determine them."""
+    inverse = inverse_information(data, structure, at, whitening)
+    if inverse is None:
         return None
-    scaled = information / np.outer(scale, scale)
-    if np.linalg.cond(scaled) > _UNDETERMINED:
-        return None
-    inner = np.zeros((len(gram) - 1, len(gram) - 1))
-    inner[np.ix_(free, free)] = np.linalg.inv(scaled) / np.outer(scale, scale)
+    n = structure.order
     linear = structure.linear.size
     wanted = [*range(linear, linear + n), 0, *range(2 + n, linear), linear + n]
     variance = at.cost / (at.rows - structure.parameters)
-    return np.asarray(variance * inner[np.ix_(wanted, wanted)])
+    return np.asarray(variance * inverse[np.ix_(wanted, wanted)])
 
 
 def as_parts(values: ComplexArray) -> FloatArray:

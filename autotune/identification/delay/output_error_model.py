@@ -57,14 +57,9 @@ def finish(data: DelayData, structure: Structure, point: Point, whitening: Float
         The information matrix is singular: some combination of the parameters does not show in the data.
     """
     n = structure.order
-    free = np.flatnonzero(structure.free)
-    gram, finite = gram_at(data, point.a, point.h, point.theta, whitening)
-    information = gram[np.ix_(free, free)]
-    scale = np.sqrt(np.diag(information))
-    if not finite or not np.all(scale > 0) or np.linalg.cond(information / np.outer(scale, scale)) > 1e13:
-        raise _singular(data, structure, information)
-    inner = np.zeros((2 * n + 3, 2 * n + 3))
-    inner[np.ix_(free, free)] = np.linalg.inv(information / np.outer(scale, scale)) / np.outer(scale, scale)
+    inner = inverse_information(data, structure, point, whitening)
+    if inner is None:
+        raise _singular(data, structure, point, whitening)
     variance = point.cost / (point.rows - structure.parameters)
     back = _to_parameters(data, structure, point)
     values = parameters(data, point)
@@ -80,6 +75,39 @@ def finish(data: DelayData, structure: Structure, point: Point, whitening: Float
         noise_ar=tuple(float(value) for value in whitening),
         rows=point.rows,
     )
+
+
+def inverse_information(
+    data: DelayData, structure: Structure, point: Point, whitening: FloatArray = WHITE
+) -> FloatArray | None:
+    """Return the inverse of the sensitivities' Gram matrix at a minimum; None where the rows do not determine all.
+
+    Parameters
+    ----------
+    data : DelayData
+        The record.
+    structure : Structure
+        Which parameters are free.
+    point : Point
+        The minimum.
+    whitening : (p,) array
+        Coefficients of the filter that makes the noise white.
+
+    Returns
+    -------
+    (2n + m + 3, 2n + m + 3) array or None
+        Of (b_0, d, initial state, b_1..b_m, a, h), rows of what is known 0; times the variance of what is left it is
+        their covariance, but for the initial state's, which leaves out the free responses.
+    """
+    free = np.flatnonzero(structure.free)
+    gram, finite = gram_at(data, point.a, point.h, point.theta, whitening)
+    information = gram[np.ix_(free, free)]
+    scale = np.sqrt(np.diag(information))
+    if not finite or not np.all(scale > 0) or np.linalg.cond(information / np.outer(scale, scale)) > 1e13:
+        return None
+    inverse = np.zeros((len(gram) - 1, len(gram) - 1))
+    inverse[np.ix_(free, free)] = np.linalg.inv(information / np.outer(scale, scale)) / np.outer(scale, scale)
+    return inverse
 
 
 def _to_parameters(data: DelayData, structure: Structure, point: Point) -> FloatArray:
@@ -218,8 +246,9 @@ def polish(
     return point, colour
 
 
-def _singular(data: DelayData, structure: Structure, information: FloatArray) -> IdentificationError:
-    n = structure.order
+def _singular(data: DelayData, structure: Structure, point: Point, whitening: FloatArray) -> IdentificationError:
+    n, free = structure.order, np.flatnonzero(structure.free)
+    information = gram_at(data, point.a, point.h, point.theta, whitening)[0][np.ix_(free, free)]
     names = ["b", "constant", *(f"x^({i})(t_s)" for i in range(n)), *(f"a{i}" for i in range(n)), "delay"]
     names = [name for name, free in zip(names, structure.free, strict=True) if free]
     scale = np.sqrt(np.maximum(np.diag(information), 1e-300))
