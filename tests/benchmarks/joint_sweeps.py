@@ -6,9 +6,9 @@ sweeps, whichever way their points were made; *time* is the median of the sweeps
 cycle for each point.
 
 ``SEEDS=5`` runs each so often, 3 where nothing is said; ``CASE=tanks`` those whose name has the pattern in it;
-``VIOLATED=1`` runs the ball's linear twin with play, a curve, a drift and a load instead. A plant with play or a curve has
-no transfer function: a point is held against the linear part's response, and against the ratio of the fundamentals in
-a limit cycle without noise at the same phase, which is what a relay's point is of (its describing function).
+``VIOLATED=1`` runs the ball's linear twin with play, a curve, a drift and a load instead. A plant with play or a curve
+has no transfer function: a point is held against the linear part's response, and against the ratio of the fundamentals
+in a limit cycle without noise at the same phase, which is what a relay's point is of (its describing function).
 """
 
 from __future__ import annotations
