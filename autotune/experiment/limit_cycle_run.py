@@ -30,7 +30,7 @@ def run_limit_cycle(
     Parameters
     ----------
     oscillation : Oscillation
-        The relay, at the extremum of y.
+        The relay; the setting takes over at the next extremum of y.
     choice : Choice
         The setting.
     wanted : int
@@ -44,6 +44,7 @@ def run_limit_cycle(
     """
     loop = oscillation.loop
     step_s = loop.sample_time_s
+    oscillation.go_to_extremum()
     oscillation.change(
         choice.settings,
         patience_s=PATIENCE * math.pi / choice.omega_rad_s,
@@ -71,9 +72,7 @@ def run_limit_cycle(
         period = (edges[-1] + edges[-2] - edges[1] - edges[0]) / (len(edges) - 2)
         periods = max(LEAST_PERIODS, min(wanted, int((until_s / step_s - start) / period)))
         # the next setting takes over at the extremum of y: not before it, and not when the next switch is near
-        since_switch = tick.slot - edges[-1]
-        at_extremum = turning <= since_switch <= turning + 0.15 * period
-        if tick.slot < start + periods * period + 1 or not at_extremum:
+        if tick.slot < start + periods * period + 1 or not oscillation.is_turning:
             continue
         t, _, y = loop.history(start_row)
         inside = int(np.searchsorted(t, t[0] + (lead - 0.5) * step_s))

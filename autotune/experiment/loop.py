@@ -240,7 +240,6 @@ class ControlLoop:
         self.rig.write(u)
         gap = max(0, int((self.rig.clock.now() - self._deadline_s) / self.sample_time_s))
         self._deadline_s += gap * self.sample_time_s
-        self.monitor.recent = ()  # how far y may get from one sample to the next says nothing of a gap
         self.tick = replace(self.tick, slot=self.tick.slot + gap)
         self._wait()
         self._reading = self.rig.read()

@@ -35,7 +35,8 @@ class ReadingMonitor:
     noise : float
         Half-width of the measurement noise as far as known [y unit].
     jump : float
-        Largest credible change of y within a few samples, noise apart [y unit]; a reading beyond it is unusable.
+        Largest credible change of y within a few samples, noise apart [y unit]; a reading beyond it is unusable. Where
+        samples were lost, as much more as there are more of them.
     same_s : float
         Time of equal readings after which the sensor counts as frozen [s]; infinite while nobody knows what to expect.
     u_tolerance : float
@@ -57,7 +58,9 @@ class ReadingMonitor:
         self._bad_run = self._repeats = self._not_followed = 0
         # when a reading was last usable, y last changed, and the actuator first did not follow
         self._usable_s = self._changed_s = self._astray_s = math.nan
-        self._last_device_time_s = math.nan
+        self._last_device_time_s = self._last_s = math.nan
+        self._sample_time_s = sample_time_s
+        self._lost: deque[int] = deque(maxlen=RECENT)  # samples lost before each of the latest readings
         longest_run = min(patience.samples, patience.seconds / sample_time_s)
         self._usable: deque[bool] = deque(maxlen=max(GARBLED_OF, math.ceil(longest_run / GARBLED_SHARE)))
 
@@ -77,6 +80,9 @@ class ReadingMonitor:
             The verdict on a sensor, link or actuator that has failed.
         """
         self.commands.look(reading, u, self.u_tolerance)
+        pace = (reading.t_s - self._last_s) / self._sample_time_s
+        self._last_s = reading.t_s
+        self._lost.append(max(0, round(pace) - 1) if math.isfinite(pace) else 0)
         reason = self._unusable(reading)
         self._usable.append(not reason)
         if math.isnan(self._usable_s):
@@ -111,7 +117,8 @@ class ReadingMonitor:
         if reading.suspect:
             return "the link answers unreliably"
         # compared with the median, so that one wild reading that was let through does not make the next good one wild
-        if self.recent and abs(reading.y - median(self.recent)) > self.jump + 2.0 * self.noise:
+        jump = self.jump * (1.0 + sum(self._lost) / RECENT)
+        if self.recent and abs(reading.y - median(self.recent)) > jump + 2.0 * self.noise:
             return f"the sensor jumps from {median(self.recent):.4g} to {reading.y:.4g}"
         return ""
 

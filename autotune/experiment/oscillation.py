@@ -26,6 +26,8 @@ NOISE_ROWS = 100
 JUMP_ROWS, JUMP_SIGMAS = 6, 6.0
 #: share of missed samples from which on a relay that fails has failed on them
 MISSED_SHARE = 0.2
+#: part of a half period from when y turns in which another setting may take over
+TURNING = 0.3
 #: half-width of the noise, as a part of limits.swing, from which on a relay that fails has failed on it
 NOISY_SHARE = 0.25
 
@@ -42,9 +44,10 @@ def noise_half(loop: ControlLoop) -> float:
 
 
 def jumped(loop: ControlLoop) -> bool:
-    """Return whether y came where it is in one step that no earlier one resembles."""
-    y = loop.history(max(0, loop.tick.k - NOISE_ROWS))[2]
-    steps = np.abs(np.diff(y[np.isfinite(y)]))
+    """Return whether y came where it is in one step that no earlier one resembles, lost samples counted."""
+    t, _, y = loop.history(max(0, loop.tick.k - NOISE_ROWS))
+    known = np.isfinite(y)
+    steps = np.abs(np.diff(y[known])) / np.maximum(np.diff(t[known]) / loop.sample_time_s, 1.0)
     usual = 1.4826 * float(np.median(steps[:-JUMP_ROWS])) if steps.size > 2 * JUMP_ROWS else math.inf
     return bool(np.any(steps[-JUMP_ROWS:] > JUMP_SIGMAS * usual)) and usual > 0.0
 
@@ -139,6 +142,27 @@ class Oscillation:
     def switched(self) -> int:
         """Decisions the relay has taken in its life."""
         return self._state.switches
+
+    @property
+    def is_turning(self) -> bool:
+        """Whether y is at its extremum: the switch has turned it, and no decision is on its way."""
+        if not math.isfinite(self._turning_s) or len(self.slots) < 2:
+            return False
+        since, turning = self.loop.tick.slot - self.slots[-1], round(self._turning_s / self.loop.sample_time_s)
+        return turning <= since <= turning + TURNING * (self.slots[-1] - self.slots[-2])
+
+    def go_to_extremum(self) -> None:
+        """Go on until y turns, where it is known when that is.
+
+        Elsewhere another setting would have y run away under its amplitude until a decision of this one's arrived.
+
+        Raises
+        ------
+        ExperimentStopped
+            As a step.
+        """
+        while math.isfinite(self._turning_s) and not self.is_turning:
+            self.step()
 
     def change(
         self,

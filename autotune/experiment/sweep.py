@@ -21,7 +21,7 @@ from autotune.experiment.preflight import Known
 from autotune.experiment.relay import RelaySettings
 from autotune.experiment.result import Cycle, Segment, State
 from autotune.experiment.sweep_warnings import relative_sd, sweep_warnings
-from autotune.experiment.together import Price, estimate_beside, goes_on, is_together, was_tried
+from autotune.experiment.together import Price, estimate_beside, is_together, was_tried
 from autotune.identification.sweep_noted import NOTED, note_of
 
 #: part of limits.swing that a first point is planned for, its gain foreseen from a short look, and those far apart
@@ -214,7 +214,6 @@ def _together(run: _Sweep, targets: Sequence[float], end_s: float, price: Price 
     for look in itertools.count(1):
         run.tell("estimating all points together", 0.0)
         found = estimate_beside(run.oscillation, run.segments, others, run.known, look, price)
-        run.settled = not goes_on(loop)
         why = "commands of another master" if loop.monitor.commands.found else found.why
         if why or found.estimate is None:
             break

@@ -96,8 +96,11 @@ def _dwell_table(experiment: ExperimentResult) -> Table:
     for i, one in enumerate(experiment.segments, start=1):
         dwell = f"{one.end_s - one.start_s:.1f}"
         cells = (f"{i}", f"{math.degrees(one.phase_rad):.0f}", f"{one.point.omega_rad_s:.3g}", f"{one.periods}", dwell)
-        rows.append((*cells, f"{100 * relative_sd(one):.2g} %"))
-    header = ("cycle", "aimed at [deg]", "ω [rad/s]", "periods", "dwell [s]", "its own rows know its point to")
+        known = 100 * relative_sd(one)
+        further = known * math.sqrt(one.periods / (one.periods + 1))
+        rows.append((*cells, f"{known:.2g} %", f"{further:.2g} %"))
+    header = ("cycle", "aimed at [deg]", "ω [rad/s]", "periods", "dwell [s]", "its own rows know its point to",
+              "one period more, to")  # fmt: skip
     return Table(header=header, rows=tuple(rows))
 
 

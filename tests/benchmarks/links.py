@@ -7,8 +7,8 @@ lines that ``LINKS="tcp rtu tls serial"`` names (TCP by default; none where it i
 ``autotune rig`` in a process of its own.
 
 A point is divided by the ball's own response at its frequency, so that points of different frequencies can be compared.
-*from truth* and *from in process* are the sums of their squared distances in standard deviations, on their own and on
-the joint covariance; below *95 %* in 95 % of runs. *delay* is the dead time that the phases have too much.
+*truth* and *in process* are the points in whose 95 % regions these lie; points of all rows of a sweep share their
+errors, so that a run has mostly all of them or few. *delay* is the dead time that the phases have too much.
 """
 
 from __future__ import annotations
@@ -82,9 +82,10 @@ def distance(error: FloatArray, covariance: FloatArray) -> float:
 def row(name: str, points: Sequence[FrequencyPoint], reference: Sequence[FrequencyPoint]) -> tuple[str, ...]:
     """Return the table's row of one link."""
     own, other = [relative(point) for point in points], [relative(point) for point in reference]
-    truth = sum(distance(error, covariance) for error, covariance in own)
+    bound = chi2.ppf(0.95, 2)
+    truth = sum(distance(error, covariance) < bound for error, covariance in own)
     pairs = zip(own, other, strict=True)
-    apart = sum(distance(e1 - e2, c1 + c2) for (e1, c1), (e2, c2) in pairs)
+    alike = sum(distance(e1 - e2, c1 + c2) < bound for (e1, c1), (e2, c2) in pairs)
     omega = np.array([point.omega_rad_s for point in points])
     weight = np.array([1.0 / covariance[1, 1] for _, covariance in own])
     phase = np.array([error[1] for error, _ in own])
@@ -95,9 +96,8 @@ def row(name: str, points: Sequence[FrequencyPoint], reference: Sequence[Frequen
         name,
         f"{100 * worst:.2f}",
         f"{delay_ms:+.2f} +- {delay_sd_ms:.2f}",
-        f"{truth:.1f}",
-        f"{apart:.1f}",
-        f"{chi2.ppf(0.95, 2 * len(points)):.1f}",
+        f"{truth} of {len(own)}",
+        f"{alike} of {len(own)}",
     )
 
 
@@ -139,7 +139,7 @@ def real_run(kind: str, folder: Path) -> tuple[FrequencyPoint, ...]:
 def main() -> None:
     """Print the table."""
     console = Console(highlight=False, width=110)
-    headers: tuple[Any, ...] = ("link", "worst error [%]", "delay [ms]", "from truth", "from in process", "95 %")
+    headers: tuple[Any, ...] = ("link", "worst error [%]", "delay [ms]", "truth", "in process")
     table = Table(*headers, title="Points over every link")
     reference: tuple[FrequencyPoint, ...] = ()
     missing: list[str] = []

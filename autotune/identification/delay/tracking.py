@@ -133,7 +133,7 @@ def track(
             )
 
         try:
-            require_answer([part])
+            require_answer([part.between(at - window_s, np.inf)])  # the rows of y that are fitted
             last = _fit_window(fit, last)
             data = prepare(part, hold=hold, start_s=at - window_s, skip_missing=True)
             structure = Structure(order=order, integrator=integrator)

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from autotune.config.procedure import LimitSettings
 from autotune.errors import ExperimentStopped
 from autotune.experiment.limits import Envelope
-from autotune.experiment.monitor import FEWEST_REPEATS, ReadingMonitor
+from autotune.experiment.monitor import FEWEST_REPEATS, RECENT, ReadingMonitor
 from autotune.experiment.rig import Reading
 
 T_S = 0.01
@@ -86,3 +86,23 @@ def test_one_reading_after_a_pause_does_not_blame_the_actuator() -> None:
     one.judge(Reading(t_s=0.0, y=5.0, u_applied=5.0), 5.0)
     one.judge(Reading(t_s=1.0, y=5.1, u_applied=3.0), 5.0)  # the device shows the command of before
     one.judge(Reading(t_s=1.01, y=5.0, u_applied=5.0), 5.0)
+
+
+@given(st.integers(0, 100), st.sampled_from((-1.0, 1.0)))
+def test_a_plant_that_went_on_while_samples_were_lost_is_no_jump_of_the_sensor(lost: int, sign: float) -> None:
+    one = monitor()
+    one.jump = 1.5
+    speed = sign * one.jump / RECENT  # per sample: as fast as the loop calls credible
+    for k in (*range(10), *range(10 + lost, 20 + lost)):
+        y, usable = one.judge(Reading(t_s=k * T_S, y=5.0 + k * speed), 5.0)
+        assert usable
+        assert y == 5.0 + k * speed
+
+
+@given(st.integers(0, 10))
+def test_a_sensor_that_jumps_while_samples_are_lost_is_still_one(lost: int) -> None:
+    one = monitor()
+    one.jump = 1.5
+    readings = [Reading(t_s=k * T_S, y=5.0 if k < 10 else 5.0 + 1.1 * one.jump * (1 + lost / RECENT))
+                for k in (*range(10), *range(10 + lost, 30 + lost))]  # fmt: skip
+    assert stopped_after(one, readings)[1] < 20

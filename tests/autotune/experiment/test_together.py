@@ -19,6 +19,7 @@ from autotune.errors import ExperimentStopped
 from autotune.experiment.cycles import read_earlier
 from autotune.experiment.dwell import Dwell, further_periods
 from autotune.experiment.local_model import LocalModel
+from autotune.experiment.oscillation import Oscillation
 from autotune.experiment.plan import phase_targets
 from autotune.experiment.result import ExperimentResult, Status
 from autotune.experiment.run import run_experiment
@@ -221,6 +222,22 @@ def test_the_relay_goes_on_while_the_estimate_runs_beside_it(tmp_path: Path) -> 
     assert rig.beside > 0
     assert len(result.points) == 5
     assert np.abs(read_recording(tmp_path / "r.csv").between(result.segments[0].start_s, 1e9).y - 5.0).max() < 3.4
+
+
+@pytest.mark.parametrize("rows", [150, 200, 300, 450])
+def test_whenever_an_estimate_ends_the_next_cycle_keeps_within_the_swing(
+    rows: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse_after(oscillation: Oscillation, *_: object) -> Found:
+        for _ in range(rows):  # of a slow cycle's 590
+            oscillation.step()
+        return Found(estimate=None, why="so long the estimate takes")
+
+    monkeypatch.setattr("autotune.experiment.sweep.estimate_beside", refuse_after)
+    result = run_experiment(ball_rig(seed=7), ball_config(limits={"time_s": 1e4}), tmp_path / "r.csv")
+    assert len(result.points) == 5
+    rows_of_it = read_recording(tmp_path / "r.csv").between(result.segments[0].start_s, 1e9)
+    assert np.abs(rows_of_it.y - 5.0).max() < 3.4
 
 
 def test_the_dwell_goes_where_a_period_tells_most() -> None:
