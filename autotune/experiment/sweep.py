@@ -106,7 +106,7 @@ class _Sweep:
     known : Known
         What was learnt.
     settled : bool
-        Whether the relay is at the extremum of y of a cycle of the same peak.
+        Whether the cycle before has the same peak: the next one, begun where y turns, is settled from its first row on.
     by_itself : bool
         Whether each point is of its own cycle: then it is said how well it is known.
     far : bool

@@ -85,9 +85,8 @@ class Case:
 class LinearPlant:
     """A transfer function behind an actuator that may have play, a curve or a load; see :class:`sim.plant.Plant`."""
 
-    def __init__(self, case: Case, *, seed: int, noise: float = NOISE) -> None:
+    def __init__(self, case: Case, *, seed: int) -> None:
         self._case, self._random = case, np.random.default_rng((seed, *case.name.encode()))
-        self._noise = noise
         self._step_s = case.sample_time_s / STEPS
         plant = case.plant
         A, B, self._C, _ = tf2ss(plant.num, plant.den)
@@ -131,7 +130,7 @@ class LinearPlant:
 
     def measure(self) -> float:
         """Return a measurement."""
-        return self.y_true + self._noise * float(self._random.uniform(-1.0, 1.0))
+        return self.y_true + NOISE * float(self._random.uniform(-1.0, 1.0))
 
     def response(self, omega_rad_s: FloatArray) -> ComplexArray:
         """Return the truth."""

@@ -6,9 +6,7 @@ sweeps, whichever way their points were made; *time* is the median of the sweeps
 cycle for each point.
 
 ``SEEDS=5`` runs each so often, 3 where nothing is said; ``CASE=tanks`` those whose name has the pattern in it;
-``VIOLATED=1`` runs the ball's linear twin with play, a curve, a drift and a load instead. A plant with play or a curve
-has no transfer function: a point is held against the linear part's response, and against the ratio of the fundamentals
-in a limit cycle without noise at the same phase, which is what a relay's point is of (its describing function).
+``VIOLATED=1`` runs the ball's linear twin with play, a curve, a drift and a load instead.
 """
 
 from __future__ import annotations
@@ -16,20 +14,17 @@ from __future__ import annotations
 import os
 import re
 import tempfile
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from autotune.arrays import ComplexArray, FloatArray
+from autotune.arrays import FloatArray
 from autotune.errors import AutotuneError
-from autotune.experiment.result import ExperimentResult
 from autotune.experiment.run import run_experiment
-from autotune.points import FrequencyPoint
 from drivers.simulated import SimulatedRig
-from tests.benchmarks._joint_plants import CASES, NOISE, Case, LinearPlant
-from tests.benchmarks.relay_points import CHI2_95
+from tests.benchmarks._joint_plants import CASES, Case, LinearPlant
+from tests.benchmarks.relay_points import CHI2_95, chi_square
 
 VIOLATIONS: dict[str, dict[str, float]] = {
     "nothing": {},
@@ -48,54 +43,27 @@ VIOLATED = ("integrator, lag 1, dead time 0.05", "lags 1 and 0.3, dead time 0.2"
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Outcome:
-    """One sweep: relative errors, chi-square of each point, time [s], and why its points are not of all rows.
-
-    ``cycle_chi2`` is that against limit cycles without noise.
-    """
+    """One sweep: relative errors, chi-square of each point, time [s], and why its points are not of all rows."""
 
     errors: FloatArray
     chi2: FloatArray
-    cycle_chi2: FloatArray
     time_s: float
     why: str
 
 
-def swept(case: Case, seed: int, *, together: bool, noise: float = NOISE) -> tuple[ExperimentResult, ComplexArray]:
-    """Sweep a plant; return the result, and the responses of its linear part at the points."""
-    plant = LinearPlant(case, seed=seed, noise=noise)
+def outcome(case: Case, seed: int, *, together: bool) -> Outcome:
+    """Sweep a plant."""
+    plant = LinearPlant(case, seed=seed)
     with tempfile.TemporaryDirectory() as folder:
         rig = SimulatedRig(plant, u_safe=5.0)
         result = run_experiment(rig, case.config(together=together), Path(folder) / "sweep.csv")
-    return result, plant.response(np.array([point.omega_rad_s for point in result.points]))
-
-
-def describing(case: Case) -> ComplexArray:
-    """Return what limit cycles without noise show at each phase, over the response of the linear part."""
-    if not case.play and not case.curve:
-        return np.ones(1, dtype=complex)
-    result, linear = swept(replace(case, drift=0.0, load=0.0), 0, together=False, noise=0.0)
-    return np.array([point.response for point in result.points]) / linear
-
-
-def chi_square(points: Sequence[FrequencyPoint], truth: ComplexArray) -> FloatArray:
-    """Return how far each point is from the truth, by its covariance."""
-    found = []
-    for point, miss in zip(points, np.array([point.response for point in points]) - truth, strict=True):
-        vector = np.array([miss.real, miss.imag])
-        found.append(float(vector @ np.linalg.solve(np.array(point.covariance), vector)))
-    return np.array(found)
-
-
-def outcome(case: Case, seed: int, ratios: ComplexArray, *, together: bool) -> Outcome:
-    """Sweep a plant, and hold its points against the truth."""
-    result, truth = swept(case, seed, together=together)
+    truth = plant.response(np.array([point.omega_rad_s for point in result.points]))
     misses = np.array([point.response for point in result.points]) - truth
     begun = result.segments[0].start_s  # the search for the mid-point is the same both ways
     end = max(one.end_s for one in result.segments)
     return Outcome(
-        errors=np.abs(misses / truth), chi2=chi_square(result.points, truth),
-        cycle_chi2=chi_square(result.points, truth * ratios), time_s=end - begun, why=result.by_itself,
-    )  # fmt: skip
+        errors=np.abs(misses / truth), chi2=chi_square(result.points, truth), time_s=end - begun, why=result.by_itself
+    )
 
 
 def covered(outcomes: list[Outcome]) -> float:
@@ -119,10 +87,9 @@ def main() -> None:
     print(f"{'plant':>60}: together; error, covered both ways; time over that of one by one")
     for case in cases:
         own: dict[bool, list[Outcome]] = {True: [], False: []}
-        shown = describing(case)
         for seed in range(1, seeds + 1):
             try:
-                pair = {together: outcome(case, seed, shown, together=together) for together in (True, False)}
+                pair = {together: outcome(case, seed, together=together) for together in (True, False)}
             except AutotuneError as error:
                 failed += 1
                 print(f"{case.name} {seed}: {error}", flush=True)
@@ -149,8 +116,7 @@ def main() -> None:
     print(
         f"covered: {covered(every[True]):.3f}, one by one {covered(every[False]):.3f}; together: {covered(jointly):.3f}"
     )
-    for said, name in (("the linear part", "chi2"), ("limit cycles without noise", "cycle_chi2")):
-        inside = [bool(np.all(getattr(one, name) < CHI2_95)) or bool(one.why) for one in every[True]]
-        print(f"sent to cycles of their own, or all points hold {said} in their regions: {np.mean(inside):.3f}")
+    inside = np.mean([bool(np.all(one.chi2 < CHI2_95)) or bool(one.why) for one in every[True]])
+    print(f"sent to cycles of their own, or all points inside their regions: {inside:.3f}")
     quarters = np.quantile(ratios, [0.25, 0.5, 0.75]).round(2)
     print(f"time over that of one by one, quartiles of the plants: {quarters}")

@@ -25,7 +25,6 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 from rich.table import Table
-from scipy.stats import chi2
 
 from autotune.arrays import FloatArray
 from autotune.config import Config, load_config
@@ -37,6 +36,7 @@ from autotune.points import FrequencyPoint
 from drivers import open_rig, twin_of
 from sim.plant import make_plant
 from tests.benchmarks.memory import on_registers
+from tests.benchmarks.relay_points import CHI2_95
 from tests.drivers.bench import certificates_by_the_book
 from tests.drivers.firmware_build import build_uno
 from tests.drivers.simavr_bench import Uno, twin_ball, virtual_rig
@@ -82,10 +82,9 @@ def distance(error: FloatArray, covariance: FloatArray) -> float:
 def row(name: str, points: Sequence[FrequencyPoint], reference: Sequence[FrequencyPoint]) -> tuple[str, ...]:
     """Return the table's row of one link."""
     own, other = [relative(point) for point in points], [relative(point) for point in reference]
-    bound = chi2.ppf(0.95, 2)
-    truth = sum(distance(error, covariance) < bound for error, covariance in own)
+    truth = sum(distance(error, covariance) < CHI2_95 for error, covariance in own)
     pairs = zip(own, other, strict=True)
-    alike = sum(distance(e1 - e2, c1 + c2) < bound for (e1, c1), (e2, c2) in pairs)
+    alike = sum(distance(e1 - e2, c1 + c2) < CHI2_95 for (e1, c1), (e2, c2) in pairs)
     omega = np.array([point.omega_rad_s for point in points])
     weight = np.array([1.0 / covariance[1, 1] for _, covariance in own])
     phase = np.array([error[1] for error, _ in own])

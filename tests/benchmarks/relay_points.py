@@ -10,13 +10,14 @@ import math
 import os
 import tempfile
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 
-from autotune.arrays import FloatArray
+from autotune.arrays import ComplexArray, FloatArray
 from autotune.batch.engine import cluster, run_all
 from autotune.config import Config, load_config
 from autotune.errors import AutotuneError
@@ -24,6 +25,7 @@ from autotune.experiment.plan import phase_targets
 from autotune.experiment.result import ExperimentResult, Segment
 from autotune.experiment.run import run_experiment
 from autotune.identification.frequency.harmonics import held_coefficients
+from autotune.points import FrequencyPoint
 from autotune.recording import read_recording
 from drivers.simulated import SimulatedRig
 from sim.ball import FLOOR, Ball, make_ball
@@ -101,14 +103,19 @@ def load_kernels() -> None:
         outcome(0, Path(folder))
 
 
+def chi_square(points: Sequence[FrequencyPoint], truth: ComplexArray) -> FloatArray:
+    """Return how far each point is from the truth, by its covariance."""
+    found = []
+    for point, miss in zip(points, np.array([point.response for point in points]) - truth, strict=True):
+        vector = np.array([miss.real, miss.imag])
+        found.append(float(vector @ np.linalg.solve(np.array(point.covariance), vector)))
+    return np.array(found)
+
+
 def scored(result: ExperimentResult, rig: WatchedRig, recording: Path, cpu_s: float) -> Outcome:
     points = result.points
     truth = rig.ball.response(np.array([point.omega_rad_s for point in points]))
     misses = np.array([point.response for point in points]) - truth
-    chi2 = []
-    for point, miss in zip(points, misses, strict=True):
-        vector = np.array([miss.real, miss.imag])
-        chi2.append(vector @ np.linalg.solve(np.array(point.covariance), vector))
     heights = np.array(rig.heights)
     step_s = config().signals.sample_time_s
     floats = int(np.argmax(heights < FLOOR))
@@ -118,7 +125,7 @@ def scored(result: ExperimentResult, rig: WatchedRig, recording: Path, cpu_s: fl
     return Outcome(
         errors=misses / truth,
         phases_deg=np.degrees(np.angle(-truth)),
-        chi2=np.array(chi2),
+        chi2=chi_square(points, truth),
         over_bound=_over_bounds(result, rig, recording),
         why=result.by_itself,
         afloat_s=end * step_s - floats * step_s,
