@@ -60,7 +60,9 @@ def transitions(a: FloatArray, durations: FloatArray) -> FloatArray:
     series = np.empty((_TERMS + 1, n * width))
     power = np.eye(m)
     for term in range(_TERMS + 1):
-        series[term] = _blocks(power, n).ravel()
+        blocks = _blocks(power, n)
+        for q in range(n * width):
+            series[term, q] = blocks[q // width, q % width]
         power = power @ matrix / (term + 1)
     unscaled = _blocks(np.outer(scale, 1.0 / scale), n)
     result = np.empty((durations.size, n, width))
@@ -97,8 +99,11 @@ def transitions(a: FloatArray, durations: FloatArray) -> FloatArray:
 def _blocks(matrix: FloatArray, n: int) -> FloatArray:
     """Return the blocks E, S, G, H of a matrix over (s, x, w, v), side by side."""
     blocks = np.empty((n, 2 * n + 4))
-    blocks[:, : 2 * n + 2] = matrix[:n]
-    blocks[:, 2 * n + 2 :] = matrix[n : 2 * n, 2 * n :]
+    for i in range(n):  # entry by entry: an assigned slice is compiled with the text of its error, for seconds
+        for j in range(2 * n + 2):
+            blocks[i, j] = matrix[i, j]
+        for j in range(2):
+            blocks[i, 2 * n + 2 + j] = matrix[n + i, 2 * n + j]
     return blocks
 
 

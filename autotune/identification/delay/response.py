@@ -103,7 +103,8 @@ def normal_matrix(
         used = white[skip:outputs] if order > 0 else rows[:outputs]
         gram += used.T @ used
         for i in range(order):
-            rows[i] = rows[outputs + i]
+            for c in range(width):
+                rows[i, c] = rows[outputs + i, c]
         first += outputs
     return gram, bool(np.all(np.isfinite(gram)))
 
@@ -159,7 +160,11 @@ def output(
         F, which = piece_transitions(coefficients, pieces, count, 1e-13 * abs(clock[0]))
         if not propagate(a, F, which, pieces, theta.size - 2 - n, chains, rows):
             break
-        x[first : first + outputs] = rows[:outputs] @ theta
+        for k in range(outputs):
+            total = 0.0
+            for c in range(theta.size):
+                total += rows[k, c] * theta[c]
+            x[first + k] = total
         first += outputs
     return x
 
@@ -208,7 +213,6 @@ def sensitivities(
     return columns[:, : 2 * n + m + 3]
 
 
-@njit(cache=True, nogil=True)
 def linear_part(
     tu: FloatArray,
     u: FloatArray,
@@ -250,16 +254,22 @@ def linear_part(
     tuple
         The (2+n+m,) theta, and the sum of squares [y unit^2].
     """
-    size = 2 + len(a) + zeros
-    theta = np.zeros(size)
+    # not compiled itself: :func:`normal_matrix` would be compiled for every order a second time, as a part of it
+    theta = np.zeros(2 + len(a) + zeros)
     gram, finite = normal_matrix(tu, u, before, linear, ty, y, a, h, theta, False, whitening)
-    if not finite:
-        return theta, np.inf
+    cost = _least_squares(gram, offset, theta) if finite else np.inf
+    return theta, cost
+
+
+@njit(cache=True, nogil=True)
+def _least_squares(gram: FloatArray, offset: bool, theta: FloatArray) -> float:
+    """Write the best theta, and return its sum of squares; infinite where the columns are not told apart."""
+    size = theta.size
     free = np.array([i for i in range(size) if offset or i != 1])
     solution, explained, regular = cholesky_solve(gram[free][:, free], gram[free, size], 1e-12)
     if not regular:
-        return theta, np.inf
+        return np.inf
     for i in range(free.size):
         theta[free[i]] = solution[i]
     total = gram[size, size]
-    return theta, max(total - explained, 1e-15 * total)
+    return max(total - explained, 1e-15 * total)
