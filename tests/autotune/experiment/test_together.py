@@ -139,12 +139,16 @@ def test_a_recording_that_lost_a_cycle_is_not_taken_for_a_whole_sweep(
     assert missing_phases(ball_config().experiment, earlier)
 
 
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> ExperimentResult:
+    return run_experiment(ball_rig(seed=3), ball_config(), tmp_path_factory.mktemp("whole") / "whole.csv")
+
+
 @pytest.mark.parametrize("start_s", [16.0, 20.0, 24.0, 28.0])
 @pytest.mark.parametrize("share", [0.85, 0.93])
 def test_an_actuator_that_clips_in_mid_sweep_gives_no_points_of_all_rows_that_are_wrong(
-    start_s: float, share: float, tmp_path: Path
+    start_s: float, share: float, tmp_path: Path, whole: ExperimentResult
 ) -> None:
-    whole = run_experiment(ball_rig(seed=3), ball_config(), tmp_path / "whole.csv")
     hit = next((one for one in whole.segments if one.end_s > start_s), whole.segments[-1])
     level = hit.settings.midpoint + share * hit.settings.amplitude
     plant = FaultyPlant(make_ball(seed=3, noise=0.35), [Fault(kind="saturated actuator", start_s=start_s, value=level)])
