@@ -205,7 +205,8 @@ def _lowest(data: DelayData, structure: Structure, start: Point, largest: float,
     step_s = float(np.median(np.diff(data.tu)))
     for rows in (1.0, -1.0):
         at = best
-        while True:  # on, as long as it goes down
+        room_s = largest - best.h if rows > 0.0 else best.h
+        for _ in range(1 + math.ceil(room_s / (_STRIDE * step_s))):  # on, as long as it goes down and there are rows
             h = at.h + rows * _STRIDE * step_s
             beside = solve_linear(data, structure, at.a, min(max(h, 0.0), largest), whitening)
             if not math.isfinite(beside.cost):
