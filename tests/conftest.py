@@ -11,6 +11,11 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
+# Small matrices on several cores are waited for longer than they are worked on. Workers and programs that tests start
+# read this before they import numpy.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
 # one profile everywhere: the machine's load decides how long an example takes, so there is no deadline
 settings.register_profile("project", deadline=None, print_blob=True)
 settings.load_profile("project")

@@ -78,8 +78,6 @@ class Reader:
             "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}",
             "COLUMNS": "120",
             "SOURCE": str(ROOT),
-            "OMP_NUM_THREADS": "1",  # pages are read side by side; linear algebra that spins on every core only waits
-            "OPENBLAS_NUM_THREADS": "1",
         }
 
     def __enter__(self) -> Reader:

@@ -34,8 +34,7 @@ def _tables(book: Any) -> list[str]:
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-def test_a_notebook_runs_and_shows_what_is_stored(path, monkeypatch):
-    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+def test_a_notebook_runs_and_shows_what_is_stored(path):
     stored, fresh = _tables(nbformat.read(path, as_version=4)), _tables(executed(path))
     assert len(stored) == len(fresh) >= 3
     for before, after in zip(stored, fresh, strict=True):
