@@ -23,7 +23,6 @@ from functools import lru_cache
 
 import numpy as np
 from numba import njit
-from scipy.linalg import solve_toeplitz
 from scipy.optimize import minimize
 
 from autotune.arrays import FloatArray
@@ -98,12 +97,14 @@ def whitening_filter(residual: FloatArray, max_order: int = MAX_AR) -> FloatArra
     max_order = min(max_order, N // 20)
     r = _autocovariances(residual, max_order)
     best, filter_best = N * np.log(r[0]), WHITE
-    for order in range(1, max_order + 1):
-        c = -solve_toeplitz(r[:order], r[1 : order + 1])
-        variance = r[0] + c @ r[1 : order + 1]
+    c, variance = WHITE, float(r[0])
+    for order, product in enumerate(np.asarray_chkfinite(r[1:]), 1):  # each order from the last (Levinson, Durbin)
+        partial = -(product + c @ r[order - 1 : 0 : -1]) / variance
+        c = np.append(c + partial * c[::-1], partial)
+        variance *= 1.0 - partial * partial
         if variance <= 0:
             break
-        criterion = N * np.log(variance) + order * np.log(N)
+        criterion = N * math.log(variance) + order * math.log(N)
         if criterion < best:
             best, filter_best = criterion, c
     return np.asarray(filter_best, dtype=np.float64)
