@@ -384,4 +384,5 @@ def _round(value: float) -> float:
     """Return the largest 1, 2 or 5 times a power of ten that is not above the magnitude."""
     value = max(abs(value), sys.float_info.min)  # a hundredth of the smallest gain there is may be none
     power = 10.0 ** math.floor(math.log10(value))
-    return max(step * power for step in (1.0, 2.0, 5.0) if step * power <= abs(value))
+    # half of it too: the logarithm of just less than a power of ten rounds to that of the power
+    return max(step * power for step in (0.5, 1.0, 2.0, 5.0) if step * power <= value)

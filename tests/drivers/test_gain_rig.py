@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from autotune.cli.served import spec_of
@@ -231,6 +231,7 @@ def test_a_resolution_that_takes_a_margin_is_refused_and_one_that_does_not_is_th
 
 
 @given(K=st.floats(-30.0, 30.0), Ti_s=st.floats(0.01, 600.0), scale=st.sampled_from([1e-3, 0.02, 0.1, 1.0]))
+@example(K=1e-11, Ti_s=1.0, scale=1e-3)  # a hundredth of it is just less than a power of ten
 def test_what_a_register_can_hold_is_held_unchanged(K: float, Ti_s: float, scale: float) -> None:
     rig = rig_of(tcp_settings(1, coarse(scale)))  # nothing is asked of the line
     assert isinstance(rig, RoundsGains)
