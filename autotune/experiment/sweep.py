@@ -2,36 +2,27 @@
 
 from __future__ import annotations
 
-import itertools
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
 
 from autotune.config.procedure import ExperimentSettings, OperatingPointSettings
-from autotune.errors import ExperimentStopped, IdentificationError
-from autotune.experiment.cycles import Earlier, measured, noise_of
+from autotune.experiment.cycles import Earlier
 from autotune.experiment.dwell import Dwell, further_periods
-from autotune.experiment.limit_cycle_run import LEAST_PERIODS, run_limit_cycle
-from autotune.experiment.limits import Envelope
+from autotune.experiment.limit_cycle_run import LEAST_PERIODS
 from autotune.experiment.local_model import LocalModel, lag_beyond_integrator
 from autotune.experiment.loop import ControlLoop
 from autotune.experiment.oscillation import Oscillation
-from autotune.experiment.plan import PEAK_SHARE, Choice, Goal, allot, choose, phase_targets, time_s, within_reach
+from autotune.experiment.plan import Choice, allot, phase_targets, time_s, within_reach
 from autotune.experiment.preflight import Known
-from autotune.experiment.relay import RelaySettings
-from autotune.experiment.result import Cycle, Segment, State
-from autotune.experiment.sweep_warnings import relative_sd, sweep_warnings
-from autotune.experiment.together import Price, estimate_beside, is_together, was_tried
-from autotune.identification.sweep_noted import NOTED, note_of
+from autotune.experiment.result import Segment
+from autotune.experiment.sweep_run import Show, SweepRun, is_aimed
+from autotune.experiment.sweep_warnings import relative_sd
+from autotune.experiment.together import Price, is_together, was_tried
 
-#: part of limits.swing that a first point is planned for, its gain foreseen from a short look, and those far apart
-FIRST_PEAK_SHARE = 0.79
 #: part of the amplitude so foreseen that it reaches for sure
 FIRST_SURE = 0.9
 #: limit cycles whose rows are estimated together
 FEW = 3
-
-Show = Callable[[str, float, Known, RelaySettings], None]
 
 
 def sweep(
@@ -48,7 +39,8 @@ def sweep(
 
     Three limit cycles, at the ends and in the middle of the range, are run first, and their rows estimated together;
     where the rows say that they may be, and all points are known well enough then, the sweep ends. Else every phase
-    gets a limit cycle of its own.
+    gets a limit cycle of its own, and the rows of all are asked once more: what refused them by chance is gone then,
+    what the equation lacks shows the more.
 
     Parameters
     ----------
@@ -79,7 +71,7 @@ def sweep(
         ends = within_reach(ends, known.points[0], known.plant_sign)
     targets = list(_missing(ends, wanted, earlier))
     end_s = known.first_move_s + wanted.budget_s - earlier.swept_s
-    run = _Sweep(loop=loop, y_centre=point.y, wanted=wanted, oscillation=oscillation, show=show, earlier=earlier)
+    run = SweepRun(loop=loop, y_centre=point.y, wanted=wanted, oscillation=oscillation, show=show, earlier=earlier)
     loop.note(first_move_s=known.first_move_s, phases_deg=list(ends))
     run.know(known)
     every = phase_targets(*ends, wanted.points)
@@ -93,97 +85,12 @@ def sweep(
         run.segments = [*earlier.segments, *run.segments]
     run.measure_each()
     _one_by_one(run, targets, end_s)
+    if run.looks:
+        _once_more(run, every)
     return tuple(run.segments), run.known
 
 
-class _Sweep:
-    """A sweep on its way: its limit cycles so far, and what they tell.
-
-    Attributes
-    ----------
-    segments : list of Segment
-        Finished limit cycles, the earlier ones first.
-    known : Known
-        What was learnt.
-    settled : bool
-        Whether the cycle before has the same peak: the next one, begun where y turns, is settled from its first row on.
-    by_itself : bool
-        Whether each point is of its own cycle: then it is said how well it is known.
-    far : bool
-        Whether the next cycle's frequency is far from the last one's, so that its gain is foreseen from afar.
-    """
-
-    def __init__(
-        self,
-        *,
-        loop: ControlLoop,
-        y_centre: float,
-        wanted: ExperimentSettings,
-        oscillation: Oscillation,
-        show: Show,
-        earlier: Earlier,
-    ) -> None:
-        self.loop, self.y_centre, self.wanted, self.oscillation = loop, y_centre, wanted, oscillation
-        self._show, self._part = show, len(earlier.recordings)
-        self.segments = list(earlier.segments)
-        self.settled, self.by_itself, self.far = False, False, False
-        self.known = Known()
-
-    def know(self, known: Known) -> None:
-        """Take what is known, and the points measured so far."""
-        if self.segments:
-            points = tuple(one.point for one in self.segments)
-            warnings = sweep_warnings(self.segments, self.wanted, known.link_rad_s) if self.by_itself else ()
-            known = replace(known, points=points, swept=True, warnings=warnings)
-        self.known = known
-
-    def measure_each(self) -> None:
-        """Go on with a point of each cycle's own rows, the best known of each phase; a cycle replaces its phase's."""
-        best = {one.phase_rad: one for one in sorted(self.segments, key=relative_sd, reverse=True)}
-        self.by_itself = True
-        self.segments = [one for one in self.segments if best[one.phase_rad] is one]
-        self.know(self.known)
-
-    def tell(self, message: str, remaining_s: float, settings: RelaySettings | None = None) -> None:
-        """Say what happens."""
-        self._show(message, remaining_s, self.known, settings or self.oscillation.settings)
-
-    @property
-    def goal(self) -> Goal:
-        """What the next limit cycle works under."""
-        share = PEAK_SHARE if self.known.swept and not self.far else FIRST_PEAK_SHARE
-        return _goal(self.loop.envelope, share, self.wanted.relay_amplitude, self.known)
-
-    def choices(self, phases_rad: Sequence[float]) -> list[Choice]:
-        """Return the settings for the phases as the plant is known now."""
-        return [_choice(self.goal, self.y_centre, self.known, phase) for phase in phases_rad]
-
-    def cycle(self, choice: Choice, periods: int, until_s: float) -> None:
-        """Run a limit cycle of so many whole periods, or until its time is over, and take its point."""
-        loop, known = self.loop, self.known
-        foreseen = known.swept and self.wanted.relay_amplitude is None
-        window = run_limit_cycle(self.oscillation, choice, periods, until_s, settled=self.settled, foreseen=foreseen)
-        cycle = Cycle(
-            part=self._part,
-            phase_rad=choice.phase_rad,
-            settings=self.oscillation.settings,
-            start_s=window.start_s,
-            end_s=window.end_s,
-            periods=window.periods,
-        )
-        try:
-            segment = measured(cycle, loop.history(), loop.sample_time_s, known.points if known.swept else ())
-        except IdentificationError as error:
-            raise ExperimentStopped(error.what, where=State.SWEEP.value, remedy=error.remedy) from error
-        if self.by_itself:
-            self.segments = [one for one in self.segments if one.phase_rad != choice.phase_rad]
-        self.segments.append(segment)
-        self.settled = True
-        loop.note(relay=[one.to_table() for one in self.segments if one.part == self._part])
-        self.know(replace(known, midpoint=segment.u_mean, noise_sd=noise_of(self.segments)))
-
-
-def _one_by_one(run: _Sweep, targets: Sequence[float], end_s: float) -> None:
+def _one_by_one(run: SweepRun, targets: Sequence[float], end_s: float) -> None:
     """Give every phase a limit cycle of its own, as long as its point needs or the budget allows."""
     count = len(run.segments)
     for i, target in enumerate(targets):
@@ -197,12 +104,10 @@ def _one_by_one(run: _Sweep, targets: Sequence[float], end_s: float) -> None:
         run.cycle(choices[0], periods[0], end_s - reserved_s)
 
 
-def _together(run: _Sweep, targets: Sequence[float], end_s: float, price: Price | None) -> list[float] | None:
+def _together(run: SweepRun, targets: Sequence[float], end_s: float, price: Price | None) -> list[float] | None:
     """Run few limit cycles and estimate their rows together; return which phases need a cycle of their own, if any."""
     loop, budget_s = run.loop, run.wanted.budget_s
     first = (targets[0], targets[len(targets) // 2], targets[-1])
-    unvisited = [phase for phase in targets if phase not in first]
-    others = [phase if run.known.plant_sign > 0 else phase + math.pi for phase in unvisited]
     run.far = True
     for i, target in enumerate(first):
         choices = run.choices(first[i:])
@@ -211,20 +116,18 @@ def _together(run: _Sweep, targets: Sequence[float], end_s: float, price: Price 
         run.tell(said, remaining_s, choices[0].settings)
         run.cycle(choices[0], LEAST_PERIODS, end_s)
     run.far = False
-    for look in itertools.count(1):
-        run.tell("estimating all points together", 0.0)
-        found = estimate_beside(run.oscillation, run.segments, others, run.known, look, price)
-        why = "commands of another master" if loop.monitor.commands.found else found.why
-        if why or found.estimate is None:
+    while True:
+        found = run.look(targets, price)
+        if found.why or found.estimate is None:
             break
         left_s = end_s - loop.tick.t_s
         share = found.wanted_sd(run.wanted.gain_sd, budget_s - left_s, budget_s) / found.estimate.worst_sd
         if share >= 1.0:
-            break
+            return None
         choices = run.choices(first)
         periods = _further(run, choices, share, left_s)
         if not any(periods):
-            break
+            return None
         most = max(range(len(first)), key=lambda i: periods[i] * 2.0 * math.pi / choices[i].omega_rad_s)
         # to much slower ones by way of the one between: y, as fast as it is, would go far before the relay answers
         most = min(most, 1 + first.index(run.segments[-1].phase_rad))
@@ -232,15 +135,18 @@ def _together(run: _Sweep, targets: Sequence[float], end_s: float, price: Price 
         said = f"{found.words}: {math.degrees(first[most]):.0f} deg again"
         run.tell(said, remaining_s, choices[most].settings)
         run.cycle(choices[most], max(periods[most], LEAST_PERIODS), end_s)
-    loop.note(**{NOTED: note_of(found.estimate, why, len(run.segments), others)})
-    if not why:
-        return None
-    run.tell(f"each point by itself: {why}", math.nan)
+    run.tell(f"each point by itself: {found.why}", math.nan)
     run.settled = False
-    return _by_themselves(run, first, unvisited, end_s)
+    return _by_themselves(run, first, [phase for phase in targets if phase not in first], end_s)
 
 
-def _further(run: _Sweep, choices: Sequence[Choice], share: float, left_s: float) -> tuple[int, ...]:
+def _once_more(run: SweepRun, targets: Sequence[float]) -> None:
+    """Ask the rows of all limit cycles, after those of the first were refused."""
+    if not run.look(targets).why:
+        run.take_together()
+
+
+def _further(run: SweepRun, choices: Sequence[Choice], share: float, left_s: float) -> tuple[int, ...]:
     """Return the further periods that each limit cycle needs, for the worst point to be known so much better."""
     noise, middle = max(run.known.noise_sd, 1e-300), sorted(run.known.points, key=lambda point: point.omega_rad_s)[1]
     model = LocalModel.through(middle.omega_rad_s, middle.gain, lag_beyond_integrator(middle, run.known.plant_sign))
@@ -258,7 +164,7 @@ def _further(run: _Sweep, choices: Sequence[Choice], share: float, left_s: float
     return further_periods(done, ahead, model, run.loop.sample_time_s, factor=share, left_s=left_s)
 
 
-def _by_themselves(run: _Sweep, first: Sequence[float], others: Sequence[float], end_s: float) -> list[float]:
+def _by_themselves(run: SweepRun, first: Sequence[float], others: Sequence[float], end_s: float) -> list[float]:
     """Return the phases to be measured by themselves: those without a cycle, and the others again as time allows.
 
     The first three cycles are short, and followed on each other over large changes, whose transients a point by itself
@@ -292,11 +198,7 @@ def missing_phases(wanted: ExperimentSettings, earlier: Earlier) -> tuple[float,
 
 def _phases_between(ends_deg: Sequence[float], wanted: ExperimentSettings, segments: Sequence[Segment]) -> list[float]:
     """Return the wanted phases of a range [deg] that no limit cycle aimed at [rad]."""
-    return [phase for phase in phase_targets(ends_deg[0], ends_deg[1], wanted.points) if not _is_aimed(phase, segments)]
-
-
-def _is_aimed(phase_rad: float, segments: Sequence[Segment]) -> bool:
-    return any(math.isclose(phase_rad, one.phase_rad) for one in segments)
+    return [phase for phase in phase_targets(ends_deg[0], ends_deg[1], wanted.points) if not is_aimed(phase, segments)]
 
 
 def _ends_deg(wanted: ExperimentSettings, earlier: Earlier) -> tuple[float, float]:
@@ -308,29 +210,3 @@ def _ends_deg(wanted: ExperimentSettings, earlier: Earlier) -> tuple[float, floa
 
 def _missing(ends_deg: tuple[float, float], wanted: ExperimentSettings, earlier: Earlier) -> tuple[float, ...]:
     return tuple(_phases_between(ends_deg, wanted, earlier.segments))
-
-
-def _goal(envelope: Envelope, peak_share: float, amplitude: float | None, known: Known) -> Goal:
-    limits = envelope.settings
-    return Goal(
-        peak=peak_share * limits.swing,
-        noise_sd=known.noise_sd,
-        sample_time_s=envelope.sample_time_s,
-        u_step=envelope.u_step,
-        u_room=0.95 * min(known.midpoint - limits.u_min, limits.u_max - known.midpoint),
-        amplitude=amplitude,
-    )
-
-
-def _choice(goal: Goal, y_centre: float, known: Known, phase_rad: float) -> Choice:
-    midpoint = known.midpoint
-    if goal.u_step > 0.0:
-        midpoint = goal.u_step * round(midpoint / goal.u_step)
-    return choose(
-        known.points,
-        phase_rad,
-        goal,
-        midpoint=midpoint,
-        y_centre=y_centre,
-        plant_sign=known.plant_sign,
-    )

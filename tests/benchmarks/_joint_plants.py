@@ -133,8 +133,17 @@ class LinearPlant:
         return self.y_true + NOISE * float(self._random.uniform(-1.0, 1.0))
 
     def response(self, omega_rad_s: FloatArray) -> ComplexArray:
-        """Return the truth."""
+        """Return the response of the linear part."""
         return self._case.plant.response(np.atleast_1d(omega_rad_s))
+
+    def gain(self, amplitude: float, midpoint: float) -> float:
+        """Return what play and a curve are to a command of two levels, a gain.
+
+        Each step goes through the play at once, so that the actuator has two levels as well: no relay of that
+        amplitude can tell it from a plant of that gain.
+        """
+        play = 1.0 - 5.0 * self._case.play / amplitude
+        return play * (1.0 + 2.0 * self._case.curve * (midpoint - 5.0) / 5.0)
 
 
 def _case(name: str, num: list[float], den: list[float], delay: float, time_s: float) -> Case:

@@ -272,4 +272,4 @@ def _least_squares(gram: FloatArray, offset: bool, theta: FloatArray) -> float:
     for i in range(free.size):
         theta[free[i]] = solution[i]
     total = gram[size, size]
-    return max(total - explained, 1e-15 * total)
+    return float(max(total - explained, 1e-15 * total))

@@ -176,6 +176,26 @@ def test_what_is_no_equation_gets_a_cycle_for_each_point(violated: dict[str, flo
     assert len({one.phase_rad for one in result.segments}) == len(result.points) == 5
 
 
+def test_rows_that_were_refused_by_chance_give_all_points_once_there_are_more(tmp_path: Path) -> None:
+    """Rows of the first three cycles deny the equation here, as one sweep in twenty does; those of all eight do not."""
+    case = next(case for case in CASES if case.name == "tanks (1.0, 0.5, 0.2), dead time")
+    plant = LinearPlant(replace(case, name=f"nothing: {case.name}"), seed=1)
+    told: list[Status] = []
+    result = run_experiment(
+        SimulatedRig(plant, u_safe=5.0), case.config(together=True), tmp_path / "r.csv", on_status=told.append
+    )
+    assert any("each point by itself: the rows show " in one.message for one in told)
+    assert result.together is not None
+    assert not result.by_itself
+    assert result.together.refused(look=2) == ""
+    assert len(result.segments) > len(result.points) == 5
+    assert session_points([read_recording(tmp_path / "r.csv")]).points == result.points
+    for point in result.points:
+        miss = point.response - plant.response(np.array([point.omega_rad_s]))[0]
+        parts = np.array([miss.real, miss.imag])
+        assert parts @ np.linalg.solve(np.array(point.covariance), parts) < chi2.ppf(0.9999, 2)
+
+
 @pytest.mark.parametrize("name", ["inverse response 0.3", "resonance at 5, damping 0.1", "oscillating"])
 def test_zeros_and_poles_that_ring_are_equations_too(name: str, tmp_path: Path) -> None:
     case = next(case for case in CASES if case.name == name)
