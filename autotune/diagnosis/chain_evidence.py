@@ -23,9 +23,9 @@ from autotune.diagnosis.readable import in_commands, readable
 from autotune.diagnosis.result import FoundEffect, OperatingRange, Verdict
 from autotune.diagnosis.safe_extension import safe_extension
 from autotune.diagnosis.selection.hypothesis import contradicted_effects
-from autotune.diagnosis.selection.judged import of_likely
-from autotune.diagnosis.selection.judged_chain import Found, JudgedChain, at_both_scales
+from autotune.diagnosis.selection.judged_chain import JudgedChain, as_search, at_both_scales, quality, varies_more
 from autotune.diagnosis.selection.probability import Candidate, probability_of, weighed
+from autotune.diagnosis.selection.search import Found
 from autotune.diagnosis.selection.searched import Search
 from autotune.diagnosis.simulation.chain import build_chain
 from autotune.diagnosis.simulation.forecast import forecast
@@ -58,7 +58,7 @@ class ChainEvidence(Evidence):
 
     model: Model
     search: Search
-    found: Found | None = None
+    found: Found[JudgedChain] | None = None
     own: OwnNoise | None = None
     again: Callable[[Sequence[Recording], Collection[str], JudgedChain | None], ChainEvidence]
 
@@ -93,7 +93,7 @@ class ChainEvidence(Evidence):
     @property
     def varies_more(self) -> bool:
         """Whether what varies beside chosen effects that leave noise explains more than it may where they are true."""
-        return self.found is not None and self.found.varies_more(self.limits)
+        return self.found is not None and varies_more(self.found)
 
     @property
     def jitter_explains_more(self) -> bool:
@@ -140,7 +140,7 @@ class ChainEvidence(Evidence):
         found = self.found
         if found is None or self.own is not None:
             return kept
-        best = of_likely(found.judged, names)
+        best = found.likely(names)
         if best.names == found.chosen.names:
             return kept
         left, residual = at_both_scales(best, found.judged).spread_out() if best.names else found.retuned, self.residual
@@ -149,7 +149,7 @@ class ChainEvidence(Evidence):
         found = replace(found, chosen=left)
         floor = self.quality.noise_floor
         return replace(
-            kept, search=found.as_search(), residual=residual, quality_of=lambda: found.quality(floor), found=found
+            kept, search=as_search(found), residual=residual, quality_of=lambda: quality(found, floor), found=found
         )
 
     def on(self, part: Sequence[Recording]) -> tuple[ChainEvidence, Collection[str]]:

@@ -16,6 +16,7 @@ from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import Fit
 from autotune.diagnosis.result import Verdict
 from autotune.diagnosis.selection.hypothesis import Hypothesis
+from autotune.diagnosis.selection.judged_chain import keeps_nominal
 from autotune.effects import kind_of
 from autotune.models import Effect, Model, Parameter
 
@@ -61,9 +62,7 @@ def extended_model(evidence: ChainEvidence, verdict: Verdict) -> Model:
     named = evidence.quality.is_better and verdict in ("effect", "unexplained")
     use = found.chosen if named else found.retuned
     searched = evidence.found
-    stands = (
-        searched is not None and evidence.more_than_noise and searched.keeps_nominal(evidence.limits.material_numbers)
-    )
+    stands = searched is not None and evidence.more_than_noise and keeps_nominal(searched)
     extended = nominal if verdict == "none" or stands else use.fit.model
     own = {e.name for e in nominal.effects}
     if len(found.data.recordings) == 1:

@@ -19,6 +19,8 @@ from autotune.diagnosis.selection.probability import Candidate, weighed
 from autotune.diagnosis.thresholds import Thresholds
 from autotune.effects import called
 
+_Self = TypeVar("_Self", bound="Judged")
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Judged(ABC):
@@ -68,6 +70,10 @@ class Judged(ABC):
     @abstractmethod
     def identity(self) -> frozenset[object]:
         """What tells hypotheses apart that are fitted."""
+
+    def spread_out(self: _Self) -> _Self:
+        """Return it with all rows of the recordings, where it was fitted to a part of them."""
+        return self
 
     @property
     def log_squares(self) -> float:
