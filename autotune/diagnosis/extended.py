@@ -16,7 +16,6 @@ from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import Fit
 from autotune.diagnosis.result import Verdict
 from autotune.diagnosis.selection.hypothesis import Hypothesis
-from autotune.diagnosis.selection.judged_chain import keeps_nominal
 from autotune.effects import kind_of
 from autotune.models import Effect, Model, Parameter
 
@@ -61,13 +60,11 @@ def extended_model(evidence: ChainEvidence, verdict: Verdict) -> Model:
     found, nominal = evidence.search, evidence.model
     named = evidence.quality.is_better and verdict in ("effect", "unexplained")
     use = found.chosen if named else found.retuned
-    searched = evidence.found
-    stands = searched is not None and evidence.more_than_noise and keeps_nominal(searched)
-    extended = nominal if verdict == "none" or stands else use.fit.model
+    extended = nominal if verdict == "none" or evidence.nominal_stands else use.fit.model
     own = {e.name for e in nominal.effects}
     if len(found.data.recordings) == 1:
         # what came at a time of one recording is no property of the rig; a drift goes on while its law holds
-        holds = searched is not None and searched.chosen.leaves_noise
+        holds = evidence.found is not None and evidence.found.chosen.leaves_noise
         lasting = tuple(
             e
             for e in extended.effects

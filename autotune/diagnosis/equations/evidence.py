@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from types import MappingProxyType
@@ -25,7 +25,7 @@ from autotune.diagnosis.evidence.samples import SampleEffect
 from autotune.diagnosis.readable import in_commands, readable
 from autotune.diagnosis.result import FoundEffect, Verdict
 from autotune.diagnosis.safe_extension import safe_extension
-from autotune.diagnosis.selection.probability import Candidate, probability_of
+from autotune.diagnosis.selection.probability import probability_of
 from autotune.diagnosis.selection.search import Found
 from autotune.diagnosis.thresholds import Thresholds
 from autotune.diagnosis.verdict import Evidence
@@ -35,7 +35,6 @@ from autotune.equations.effects import equation_of
 from autotune.equations.files import forecast_any
 from autotune.equations.linearise import settles
 from autotune.equations.model import EquationModel
-from autotune.errors import InputError
 from autotune.models import Effect
 from autotune.recording import Recording
 
@@ -54,15 +53,12 @@ class EquationEvidence(Evidence):
         What the search found.
     error_of : callable
         Held-out error of a fit; kept, for it takes fits.
-    again : callable
-        Returns what other recordings show among some effects, beginning with a hypothesis of these ones.
     """
 
     model: EquationModel | BlackBox
     given: tuple[Recording, ...]
     found: Found[JudgedEquations]
     error_of: Callable[[Outcome], float]
-    again: Callable[[Sequence[Recording], Collection[str], JudgedEquations], EquationEvidence]
 
     @cached_property
     def result(self) -> EquationSearch:
@@ -75,26 +71,6 @@ class EquationEvidence(Evidence):
         return self.found.best.bench
 
     @property
-    def names(self) -> tuple[str, ...]:
-        """Effects of the hypothesis to go on with."""
-        return self.found.chosen.names
-
-    @cached_property
-    def candidates(self) -> tuple[Candidate, ...]:
-        """Every hypothesis with its probability, best first."""
-        return self.found.candidates(self.unknown_odds if self.residual.is_noise else self.limits.unknown_odds)
-
-    @property
-    def leading(self) -> tuple[tuple[str, ...], ...]:
-        """Effects of the leading hypotheses, the best first."""
-        return tuple(one.names for one in self.found.others)
-
-    @property
-    def more_than_noise(self) -> bool:
-        """Whether something was found, or the retuned model leaves more than noise."""
-        return bool(self.names) or not (self.found.judged[0].leaves_noise or self.residual.accounted)
-
-    @property
     def leaves_noise(self) -> bool:
         """Whether what the chosen model leaves is noise."""
         return self.found.chosen.leaves_noise or self.residual.accounted
@@ -104,31 +80,13 @@ class EquationEvidence(Evidence):
         """Decrease of chi-square that retuning brings beside the nominal numbers."""
         return self._score(self.found.nominal) - self._score(self.found.retuned)
 
-    def keeping(self, names: Collection[str]) -> EquationEvidence:
-        """Return the evidence with no other effects than those named: the hypothesis of them that was fitted."""
-        samples, found = tuple(s for s in self.samples if s.name in names), self.found
-        if not set(found.chosen.names) <= set(names):
-            found = replace(found, chosen=found.likely(names))
+    def going_on(self, best: JudgedEquations) -> EquationEvidence:
+        """Return the evidence with another hypothesis to go on with."""
+        found = replace(self.found, chosen=best)
         return replace(
-            self, samples=samples, found=found, quality_of=lambda: held_out_quality(found, self.error_of, self.given),
-            residual=residual_left(found, samples),
+            self, found=found, quality_of=lambda: held_out_quality(found, self.error_of, self.given),
+            residual=residual_left(found, self.samples),
         )  # fmt: skip
-
-    def on(self, part: Sequence[Recording]) -> tuple[EquationEvidence | None, Collection[str]]:
-        """Return what a part of the recordings shows, and effects that it cannot tell."""
-        known = {name for one in self.found.judged for name in one.names} | {s.name for s in self.samples}
-        best = self.found.best
-        try:
-            there = self.again(part, known, best)
-            unfelt = {e.name for e in best.added if not there.feels(e)}
-        except InputError:  # nothing runs there
-            return None, ()
-        return there, unfelt
-
-    def feels(self, effect: Effect) -> bool:
-        """Whether an effect changes what is read by as much as one row's noise: of others these rows tell nothing."""
-        change = self.bench.with_trial(self.found.retuned.outcome, effect)
-        return change is None or float(change @ change) > self.found.best.noise.total_sd**2
 
     def described(self) -> list[tuple[float, FoundEffect]]:
         """Return the chosen effects as people read them."""
@@ -189,9 +147,7 @@ class EquationEvidence(Evidence):
             return self.model
         if self.names and quality.is_better and verdict in ("effect", "unexplained"):
             return _with_numbers(self.model, found.chosen.outcome)
-        stands = not self.names and self.more_than_noise
-        stands = stands and quality.retuned > (1.0 - self.limits.material_numbers) * quality.nominal
-        return self.model if stands else _with_numbers(self.model, found.retuned.outcome)
+        return self.model if self.nominal_stands else _with_numbers(self.model, found.retuned.outcome)
 
 
 def bench_of(

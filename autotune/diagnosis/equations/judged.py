@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -81,6 +82,12 @@ class JudgedEquations(Judged):
     def numbers(self) -> int:
         """Numbers that were fitted, the model's own ones with them, which all hypotheses have."""
         return self.outcome.count
+
+    def unfelt(self, effects: Sequence[Effect]) -> frozenset[str]:
+        """Return the effects that would change what is read by less than one row's noise does."""
+        changes = ((e.name, self.bench.with_trial(self.outcome, e)) for e in effects)
+        least = self.noise.total_sd**2
+        return frozenset(name for name, d in changes if d is not None and float(d @ d) <= least)
 
     @property
     def identity(self) -> frozenset[object]:

@@ -18,6 +18,7 @@ from autotune.diagnosis.evidence.stretches import STRETCHES, reduction
 from autotune.diagnosis.selection.probability import Candidate, weighed
 from autotune.diagnosis.thresholds import Thresholds
 from autotune.effects import called
+from autotune.models import Effect
 
 _Self = TypeVar("_Self", bound="Judged")
 
@@ -65,6 +66,15 @@ class Judged(ABC):
     @abstractmethod
     def numbers(self) -> int:
         """Numbers of its effects that were fitted."""
+
+    @property
+    @abstractmethod
+    def added(self) -> tuple[Effect, ...]:
+        """Its effects with their fitted values."""
+
+    @abstractmethod
+    def unfelt(self, effects: Sequence[Effect]) -> frozenset[str]:
+        """Return the effects that would change what is read by less than one row of what it leaves."""
 
     @property
     @abstractmethod

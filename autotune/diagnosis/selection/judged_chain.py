@@ -55,6 +55,11 @@ class JudgedChain(Judged):
         return self.fit.rows
 
     @property
+    def added(self) -> tuple[Effect, ...]:
+        """Its effects with their fitted values."""
+        return self.fit.model.effects[self.fit.parametrisation.own :]
+
+    @property
     def numbers(self) -> int:
         """Numbers of its effects that were fitted."""
         return self.fit.parametrisation.effect_numbers
@@ -185,9 +190,3 @@ def varies_more(found: Found[JudgedChain]) -> bool:
     explained = max(share, 0.0) * sum(int(g.sum()) for g in chosen.data.good)
     left = largest_variation(chosen.fit, under_noise(chosen.fit, chosen.data)).gain
     return left > max(limits.inconstant, limits.inconstant_share * explained)
-
-
-def keeps_nominal(found: Found[JudgedChain]) -> bool:
-    """Whether the nominal numbers predict about as well as those retuned, so that they stand."""
-    ratio = float(found.retuned.long_squares.sum() / found.nominal.long_squares.sum())
-    return not found.chosen.names and math.sqrt(ratio) > 1.0 - found.limits.material_numbers
