@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from types import MappingProxyType
@@ -13,7 +13,7 @@ import numpy as np
 from autotune.arrays import BoolArray
 from autotune.diagnosis.evidence.adequacy import residual_tests
 from autotune.diagnosis.evidence.description import Description, describe
-from autotune.diagnosis.evidence.held_out import held_out_error
+from autotune.diagnosis.evidence.held_out import FitQuality, held_out_error
 from autotune.diagnosis.evidence.misread import misread_columns
 from autotune.diagnosis.evidence.operating_point import unmoved
 from autotune.diagnosis.evidence.own_noise import OwnNoise
@@ -45,6 +45,8 @@ class ChainEvidence(Evidence):
         The nominal chain.
     search : Search
         Hypotheses with their fits.
+    quality_of : callable
+        Returns errors on rows that were not fitted.
     own : OwnNoise, optional
         What is left, where it is noise of its own colour.
     """
@@ -52,6 +54,7 @@ class ChainEvidence(Evidence):
     free = frozenset({OFFSET})
     model: Model
     search: Search
+    quality_of: Callable[[], FitQuality]
     found: Found[JudgedChain] | None = None
     own: OwnNoise | None = None
 
@@ -59,6 +62,11 @@ class ChainEvidence(Evidence):
     def result(self) -> Search:
         """What the search found."""
         return self.search
+
+    @cached_property
+    def quality(self) -> FitQuality:
+        """Errors on rows that were not fitted."""
+        return self.quality_of()
 
     @property
     def varies_more(self) -> bool:

@@ -49,8 +49,6 @@ class Evidence(ABC):
         What single samples, the residual's size over the slope, and the recomputed law show.
     residual : ResidualTests
         What the chosen model leaves.
-    quality_of : callable
-        Returns errors on rows that were not fitted; it may take fits, and is asked where a verdict is.
     again : callable
         Returns what other recordings show among some effects, beginning with a hypothesis of these ones.
     found : Found, optional
@@ -65,7 +63,6 @@ class Evidence(ABC):
     model: AnyModel
     samples: tuple[SampleEffect, ...]
     residual: ResidualTests
-    quality_of: Callable[[], FitQuality]
     again: Callable[[Sequence[Recording], Collection[str], Any], Evidence]
     found: Found[Any] | None = None
     offset: Offset | None = None
@@ -168,10 +165,10 @@ class Evidence(ABC):
         """Return what is left as a function of the signals, where no effect explains it and that can be told."""
         return None
 
-    @cached_property
+    @property
+    @abstractmethod
     def quality(self) -> FitQuality:
-        """Errors on rows that were not fitted."""
-        return self.quality_of()
+        """Errors on rows that were not fitted; they may take fits, and are asked for where a verdict is."""
 
     @property
     def everywhere(self) -> tuple[tuple[int, float, float], ...]:

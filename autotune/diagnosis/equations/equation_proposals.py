@@ -28,8 +28,7 @@ from autotune.diagnosis.equations.scores import (
 )
 from autotune.diagnosis.equations.screening import screen_effects
 from autotune.diagnosis.selection.judged import rank
-from autotune.diagnosis.selection.search import Found, search
-from autotune.diagnosis.thresholds import Thresholds
+from autotune.diagnosis.selection.search import Found, Proposals, search
 from autotune.errors import InputError
 from autotune.progress import Progress, quiet
 
@@ -65,13 +64,13 @@ def search_equations(
     retuned = judge(bench, outcome, len(outcome.effects))
     if retuned is None:
         raise InputError("the model runs away on left-out stretches", where="diagnose", remedy="check its numbers")
-    nominal = replace(retuned, outcome=bench.as_it_is(outcome))
+    nominal = replace(retuned, outcome=bench.as_it_is(outcome), tuned=False)
     return search(EquationProposals(bench=bench, without=without, nominal=nominal, roots=(retuned,)), progress, begun)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class EquationProposals:
-    """Equations on recordings, as :class:`autotune.diagnosis.selection.search.Proposals` asks for them.
+class EquationProposals(Proposals[JudgedEquations]):
+    """Equations on recordings, as a search asks for them: fits are in units of the residual that each leaves.
 
     Attributes
     ----------
@@ -91,11 +90,6 @@ class EquationProposals:
     roots: tuple[JudgedEquations, ...]
 
     @property
-    def limits(self) -> Thresholds:
-        """What decides between two findings."""
-        return self.bench.limits
-
-    @property
     def retuned(self) -> Outcome:
         """The model with its own numbers retuned."""
         return self.roots[0].outcome
@@ -108,14 +102,6 @@ class EquationProposals:
                 fits = _fit_larger(self.bench, base.outcome, self.without, progress, further=bool(base.names))
                 found += self._judged(_select(self.bench, fits, base.own))
         return found
-
-    def beside(self, best: JudgedEquations) -> EquationProposals:
-        """Return what proposes beside a hypothesis: fits are in units of the residual that each leaves."""
-        return self
-
-    def again(self, one: JudgedEquations) -> JudgedEquations:
-        """Return a hypothesis, which was fitted in units of the residual that it leaves."""
-        return one
 
     def resumed(self, one: JudgedEquations) -> JudgedEquations | None:
         """Return a hypothesis that was fitted to more rows, fitted to these from its numbers; None if it runs away."""
@@ -138,13 +124,9 @@ class EquationProposals:
             seen |= {other.identity for other in result}
         return result
 
-    def finished(self, found: Sequence[JudgedEquations]) -> list[JudgedEquations]:
+    def finish_leading(self, found: Sequence[JudgedEquations]) -> list[JudgedEquations]:
         """Return the leading hypothesis fitted to the end."""
         return self._judged(_fit_to_end(self.bench, rank(found)[0], self.retuned))
-
-    def settled(self, best: JudgedEquations, found: Sequence[JudgedEquations]) -> JudgedEquations:
-        """Return a hypothesis as it is: windows have one length."""
-        return best
 
     def _judged(self, fits: Iterable[Outcome | None]) -> list[JudgedEquations]:
         """Return fits with their errors on left-out stretches, without those that ran away or are something else."""

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from types import MappingProxyType
-
-import numpy as np
 
 from autotune.arrays import BoolArray
 from autotune.diagnosis.equations.bench import Bench, Outcome
@@ -51,14 +49,11 @@ class EquationEvidence(Evidence):
         What was measured, rows that samples spoil among them.
     found : Found
         What the search found.
-    error_of : callable
-        Held-out error of a fit; kept, for it takes fits.
     """
 
     model: EquationModel | BlackBox
     given: tuple[Recording, ...]
     found: Found[JudgedEquations]
-    error_of: Callable[[Outcome], float]
 
     @cached_property
     def result(self) -> EquationSearch:
@@ -69,6 +64,11 @@ class EquationEvidence(Evidence):
     def bench(self) -> Bench:
         """The model on the rows that count."""
         return self.found.best.bench
+
+    @cached_property
+    def quality(self) -> FitQuality:
+        """Errors on the last third of every recording, the numbers fitted to the rest."""
+        return self.found.quality(self.found.best.noise.total_sd / self.bench.spread)
 
     @property
     def leaves_noise(self) -> bool:
@@ -83,10 +83,7 @@ class EquationEvidence(Evidence):
     def going_on(self, best: JudgedEquations) -> EquationEvidence:
         """Return the evidence with another hypothesis to go on with."""
         found = replace(self.found, chosen=best)
-        return replace(
-            self, found=found, quality_of=lambda: held_out_quality(found, self.error_of, self.given),
-            residual=residual_left(found, self.samples),
-        )  # fmt: skip
+        return replace(self, found=found, residual=residual_left(found, self.samples))
 
     def described(self) -> list[tuple[float, FoundEffect]]:
         """Return the chosen effects as people read them."""
@@ -126,7 +123,7 @@ class EquationEvidence(Evidence):
 
         def error_of(changed: Sequence[Recording], good: Sequence[BoolArray]) -> float:
             bench = bench_of(self.model, changed, good, self.limits)
-            return bench.held_out_error(bench.retuned(), True) / spread_of(changed)
+            return bench.held_out_error(bench.retuned(), True) / bench.spread
 
         return misread_columns(self.given, self.model.inputs[0].offset, self.quality, self.limits, error_of)
 
@@ -157,20 +154,6 @@ def bench_of(
     kind = ClosedBench if isinstance(model, BlackBox) else EquationBench
     bench: Bench = kind(model, recordings, good, limits)  # type: ignore[arg-type]  # each kind has its bench
     return bench
-
-
-def spread_of(recordings: Sequence[Recording]) -> float:
-    """Return the spread of y, which errors are shares of."""
-    return float(np.nanstd(np.concatenate([r.y for r in recordings]))) or 1.0
-
-
-def held_out_quality(
-    found: Found[JudgedEquations], error_of: Callable[[Outcome], float], recordings: Sequence[Recording]
-) -> FitQuality:
-    """Return errors on the last third of every recording, the numbers fitted to the rest."""
-    nominal, retuned, extended = (error_of(one.outcome) for one in (found.nominal, found.retuned, found.chosen))
-    noise = found.best.noise.total_sd / spread_of(recordings)
-    return FitQuality(nominal=nominal, retuned=retuned, extended=extended, noise_floor=noise)
 
 
 def residual_left(found: Found[JudgedEquations], samples: Sequence[SampleEffect]) -> ResidualTests:

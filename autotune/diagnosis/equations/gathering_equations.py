@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from functools import cache
 
 import numpy as np
 
@@ -11,13 +10,7 @@ from autotune.arrays import BoolArray
 from autotune.controller import Controller
 from autotune.diagnosis.equations.bench import Bench, Outcome
 from autotune.diagnosis.equations.equation_proposals import search_equations
-from autotune.diagnosis.equations.evidence import (
-    EquationEvidence,
-    bench_of,
-    held_out_quality,
-    residual_left,
-    spread_of,
-)
+from autotune.diagnosis.equations.evidence import EquationEvidence, bench_of, residual_left
 from autotune.diagnosis.equations.judged import JudgedEquations
 from autotune.diagnosis.evidence.law import law_effect
 from autotune.diagnosis.evidence.sample_gain import SimulatedRows, is_material, select_supported
@@ -73,9 +66,6 @@ def evidence_of_equations(
     samples = [s for s in samples if not found.chosen.names or is_material(s, run)]
     law = law_effect(recordings, controller, limits)
     samples += [] if law is None or law.name in without else [law]
-    error_of = cache(
-        lambda one: found.best.bench.held_out_error(one, one is not found.nominal.outcome) / spread_of(recordings)
-    )
 
     def again(part: Sequence[Recording], known: Collection[str], begun: JudgedEquations) -> EquationEvidence:
         others = [*without, *(name for name in KINDS if name not in known)]
@@ -83,8 +73,7 @@ def evidence_of_equations(
 
     return EquationEvidence(
         model=model, given=tuple(recordings), found=found, samples=tuple(samples),
-        residual=residual_left(found, samples), quality_of=cache(lambda: held_out_quality(found, error_of, recordings)),
-        error_of=error_of, again=again,
+        residual=residual_left(found, samples), again=again,
     )  # fmt: skip
 
 

@@ -35,11 +35,14 @@ class JudgedEquations(Judged):
         Effects that the model has itself.
     bench : Bench
         What it was fitted on.
+    tuned : bool
+        Whether its numbers were fitted, or are the nominal ones.
     """
 
     outcome: Outcome
     own: int
     bench: Bench
+    tuned: bool = True
 
     @property
     def added(self) -> tuple[Effect, ...]:
@@ -82,6 +85,11 @@ class JudgedEquations(Judged):
     def numbers(self) -> int:
         """Numbers that were fitted, the model's own ones with them, which all hypotheses have."""
         return self.outcome.count
+
+    @cached_property
+    def error(self) -> float:
+        """Error on the last third of every recording, its numbers fitted to the rest, as a share of the spread of y."""
+        return self.bench.held_out_error(self.outcome, self.tuned) / self.bench.spread
 
     def unfelt(self, effects: Sequence[Effect]) -> frozenset[str]:
         """Return the effects that would change what is read by less than one row's noise does."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -16,27 +16,32 @@ from threadpoolctl import threadpool_limits
 
 from autotune.arrays import BoolArray
 from autotune.diagnosis.evidence.operating_point import unmoved
-from autotune.diagnosis.fitting.fit import LAST_STEPS, RUNAWAY, fit, fit_from
+from autotune.diagnosis.fitting.data import Data
+from autotune.diagnosis.fitting.fit import LAST_STEPS, RUNAWAY, STEPS, Fit, fit, fit_from
 from autotune.diagnosis.fitting.long_windows import cut, lengths_of
 from autotune.diagnosis.fitting.parameters import parametrise
+from autotune.diagnosis.fitting.restarts import realign_effects
 from autotune.diagnosis.selection.bench import Bench, at_once, residual_sd
-from autotune.diagnosis.selection.chain_additions import judge_larger
+from autotune.diagnosis.selection.hypothesis import hypothesis, is_stand_in
 from autotune.diagnosis.selection.judged import leading, rank
 from autotune.diagnosis.selection.judged_chain import JudgedChain, at_both_scales
-from autotune.diagnosis.selection.prediction import extend
+from autotune.diagnosis.selection.prediction import distinct_starts, extend, predictions, signal_sizes, starting_effects
 from autotune.diagnosis.selection.probability import RARE
-from autotune.diagnosis.selection.refits import fit_without
+from autotune.diagnosis.selection.refits import fit_without, move_time_of_change
 from autotune.diagnosis.selection.scan import search_starts
-from autotune.diagnosis.selection.search import Found, search
+from autotune.diagnosis.selection.search import Found, Proposals, search
 from autotune.diagnosis.simulation.assembly import input_size
 from autotune.diagnosis.simulation.chain import build_chain
 from autotune.diagnosis.thresholds import IN_USE, Thresholds
-from autotune.effects import ALL
-from autotune.effects.base import EffectKind
+from autotune.effects import ALL, taken_by
+from autotune.effects.base import EffectKind, SignalSizes
 from autotune.effects.rigs import rig_kind
 from autotune.models import Effect, Model
 from autotune.progress import Progress, quiet
 from autotune.recording import Recording
+
+#: Share of what its numbers must bring near the noise that the first order must predict before an effect is fitted.
+PROMISING = 0.5
 
 
 def search_chain(
@@ -56,12 +61,8 @@ def search_chain(
         Nominal model, what was measured, and which rows count.
     left_out : collection of str
         Effects that are not looked for.
-    progress : callable
-        Told what is being done and the share done, 0 to 1.
-    limits : Thresholds
-        What decides between findings.
-    begun : JudgedChain, optional
-        What predicted best on more rows of these recordings.
+    progress, limits, begun
+        As in :func:`autotune.diagnosis.selection.search.search`; what decides between findings.
 
     Returns
     -------
@@ -84,60 +85,72 @@ def search_chain(
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class ChainProposals:
-    """A chain on its recordings, as :class:`autotune.diagnosis.selection.search.Proposals` asks for it.
+class ChainProposals(Bench, Proposals[JudgedChain]):
+    """A chain on its recordings, as a search asks for it.
 
     Attributes
     ----------
-    bench : Bench
-        Data at both scales, fits and judgement.
     nominal : JudgedChain
         The chain with its nominal numbers, the operating point fitted.
     roots : tuple of JudgedChain
         The retuned chain, and the nominal one where retuning moves a number far.
     """
 
-    bench: Bench
     nominal: JudgedChain
     roots: tuple[JudgedChain, ...]
 
-    @property
-    def limits(self) -> Thresholds:
-        """What decides between two findings."""
-        return self.bench.limits
-
     def larger(self, beam: Sequence[JudgedChain], progress: Progress) -> list[JudgedChain]:
         """Return hypotheses with one effect more than those of a beam, the most promising ones."""
-        return judge_larger(beam, self.bench)
+        starts: list[_Start] = []
+        for base in beam:
+            found = _starts(base, self)
+            if base.leaves_noise:
+                found = [s for s in found if s.decrease > PROMISING * _charge(s)]
+            found.sort(key=lambda s: -s.decrease - 2.0 * math.log(s.odds))
+            starts += [s for k, s in enumerate(found) if k < self.limits.rig_tried or s.odds >= self.limits.usual]
+        fits = self.pool.map(lambda s: _fit_added(s, self), starts)
+        best: dict[frozenset[str], tuple[Fit, float, JudgedChain]] = {}
+        for s, result in zip(starts, fits, strict=True):
+            if result is None or result.cost > s.base.fit.cost - 0.3:
+                continue
+            key, log_odds = frozenset((*s.base.names, s.kind.name)), s.base.log_odds + math.log(s.odds)
+            if key not in best or result.cost < best[key][0].cost:
+                best[key] = result, log_odds, s.base
+        order = sorted(best.values(), key=lambda one: one[0].cost - 2.0 * one[1])
+        able = [[one for one in order if one[2] is base][: self.limits.rig_tried] for base in beam]
+        done = self.pool.map(lambda one: self.judged(one[0], one[1]), [one for group in able for one in group])
+        return [j for j in done if j is not None and np.all(np.isfinite(j.long_squares + j.short_squares))]
 
     def beside(self, best: JudgedChain) -> ChainProposals:
         """Return what proposes beside a hypothesis, in units of the residual that it leaves."""
-        sds = residual_sd(best.fit, best.data), residual_sd(best.short, best.few)
-        return replace(self, bench=self.bench.with_sd(*sds))
-
-    def again(self, one: JudgedChain) -> JudgedChain:
-        """Return a hypothesis fitted again, in units of the residual that the best one leaves."""
-        return self.bench.again(one)
+        return self.with_sd(residual_sd(best.fit, best.data), residual_sd(best.short, best.few))
 
     def resumed(self, one: JudgedChain) -> JudgedChain | None:
         """Return a hypothesis that was fitted to more rows, fitted to these from its numbers; None if it runs away."""
         try:
-            there = fit_from(one.fit.parametrisation, self.bench.long, one.fit.theta, iterations=LAST_STEPS)
-            return self.bench.finite(there, one.log_odds)
+            there = fit_from(one.fit.parametrisation, self.long, one.fit.theta, iterations=LAST_STEPS)
+            return self.finite(there, one.log_odds)
         except RUNAWAY:
             return None
 
     def smaller(self, some: Sequence[JudgedChain], known: Sequence[JudgedChain]) -> list[JudgedChain]:
         """Return hypotheses with each of their effects left out."""
-        return _without_each(some, self.bench)
+        given = {k.name: math.log(o) for k, o in self.odds}
 
-    def finished(self, found: Sequence[JudgedChain]) -> list[JudgedChain]:
+        def judge_without(one: JudgedChain, index: int) -> JudgedChain | None:
+            fewer = fit_without(one.fit, index, one.data)
+            own = sum(given.get(n, -math.inf) for i, n in enumerate(one.names) if i != index)
+            return None if fewer is None else self.judged(fewer, max(own, one.log_odds))
+
+        each = at_once(lambda one: list(self.pool.map(partial(judge_without, one), range(len(one.names)))), some)
+        return [j for group in each for j in group if j is not None]
+
+    def finish_leading(self, found: Sequence[JudgedChain]) -> list[JudgedChain]:
         """Return the leading hypotheses fitted to the end, and what is larger fitted on from where the first one is."""
-        first = leading(found, self.limits.rig_pruned)
-        done = [j for j in self.bench.pool.map(self.bench.finished, first) if j is not None]
-        return [*done, *_refit_larger([*found, *done], self.bench)]
+        done = [j for j in self.pool.map(self.finished, leading(found, self.limits.rig_pruned)) if j is not None]
+        return [*done, *_refit_larger([*found, *done], self)]
 
-    def settled(self, best: JudgedChain, found: Sequence[JudgedChain]) -> JudgedChain:
+    def settle_numbers(self, best: JudgedChain, found: Sequence[JudgedChain]) -> JudgedChain:
         """Return a hypothesis with the numbers that suit long and short windows together."""
         return at_both_scales(best, found)
 
@@ -172,12 +185,11 @@ def _begin(model: Model, bench: Bench) -> ChainProposals:
     nominal = nominal if nominal is not None else retuned
     away = float(np.max(np.abs(retuned.fit.theta - p.centre) / p.spreads))
     roots = (retuned, nominal) if away > bench.limits.nominal_too else (retuned,)
-    return ChainProposals(bench=replace(bench, lasting=tuple(_lasting(retuned, bench))), nominal=nominal, roots=roots)
-
-
-def _lasting(root: JudgedChain, bench: Bench) -> list[Effect]:
     names = [k.name for k, _ in bench.odds if k.lasting]
-    return [e for name in names for e in search_starts(name, root.short, root.few, bench.pool)]
+    lasting = tuple(e for name in names for e in search_starts(name, retuned.short, retuned.few, bench.pool))
+    return ChainProposals(
+        cuts=bench.cuts, few=bench.few, odds=bench.odds, pool=bench.pool, lasting=lasting, nominal=nominal, roots=roots
+    )
 
 
 def _refit_larger(found: Sequence[JudgedChain], bench: Bench) -> list[JudgedChain]:
@@ -205,14 +217,78 @@ def _fit_from_best(best: JudgedChain, larger: JudgedChain, bench: Bench) -> Judg
     return bench.finite(result, larger.log_odds)
 
 
-def _without_each(some: Sequence[JudgedChain], bench: Bench) -> list[JudgedChain]:
-    """Return hypotheses with each of their effects left out."""
-    given = {k.name: math.log(o) for k, o in bench.odds}
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Start:
+    """An effect to be added to a hypothesis: where from, at which scale, and what the first order predicts."""
 
-    def judge_without(one: JudgedChain, index: int) -> JudgedChain | None:
-        smaller = fit_without(one.fit, index, one.data)
-        own = sum(given.get(n, -math.inf) for i, n in enumerate(one.names) if i != index)
-        return None if smaller is None else bench.judged(smaller, max(own, one.log_odds))
+    base: JudgedChain
+    kind: EffectKind
+    odds: float
+    effects: tuple[Effect, ...]
+    near: Fit
+    data: Data
+    decrease: float
 
-    each = at_once(lambda one: list(bench.pool.map(partial(judge_without, one), range(len(one.names)))), some)
-    return [j for group in each for j in group if j is not None]
+
+def _charge(start: _Start) -> float:
+    """Return the decrease of chi-square that the numbers of an effect must bring, priors apart (Schwarz 1978)."""
+    fitted = sum(q.is_fitted for q in start.kind.parameters)
+    return fitted * math.log(start.base.fit.rows)
+
+
+def _starts(base: JudgedChain, bench: Bench) -> list[_Start]:
+    """Return every effect's starting points from which the first order predicts most, at each scale that helps.
+
+    Where the free run through long windows is out of phase, no derivative there leads anywhere: short ones do.
+    """
+    scales = [(base.fit, bench.long)]
+    if bench.has_shorter and base.error > bench.limits.out_of_phase:
+        scales.append((bench.shortened(base.fit), bench.few))
+    taken = taken_by(base.names)
+    tried = [
+        (kind, odds, near, data)
+        for kind, odds in bench.odds
+        for near, data in scales
+        if kind.name not in taken and kind.suits.holds(near.sim.chain)
+    ]
+    sizes = {id(data): signal_sizes(near, data) for near, data in scales}
+    effects = at_once(lambda t: _starting_points(t[0], t[2], t[3], sizes[id(t[3])], bench), tried)
+    each = [(near, data, e) for (_, _, near, data), group in zip(tried, effects, strict=True) for e in group]
+    predicted = iter(list(bench.pool.map(lambda t: predictions(t[0], t[2], t[1]), each)))
+    found = []
+    for (kind, odds, near, data), group in zip(tried, effects, strict=True):
+        order = sorted((p for _ in group for p in next(predicted)), key=lambda p: -p.decrease)
+        few = tuple(distinct_starts(order)[: bench.limits.rig_starts])
+        if few:
+            found.append(
+                _Start(base=base, kind=kind, odds=odds, effects=few, near=near, data=data, decrease=order[0].decrease)
+            )
+    return found
+
+
+def _starting_points(kind: EffectKind, near: Fit, data: Data, sizes: SignalSizes, bench: Bench) -> list[Effect]:
+    """Return an effect's starting points: those of its record, and those that a direct search finds."""
+    tried = starting_effects(kind, near, sizes)
+    if kind.lasting:
+        return tried + [e for e in bench.lasting if e.name == kind.name]
+    return tried + (search_starts(kind.name, near, data, bench.pool) if kind.search is not None else [])
+
+
+def _fit_added(start: _Start, bench: Bench) -> Fit | None:
+    """Return the best fit of a hypothesis with one more effect to long windows; nothing where all run away."""
+    done: list[Fit] = []
+    steps = 2 * STEPS if start.kind.rough else STEPS
+    for effect in start.effects:
+        try:
+            p, theta, states = extend(start.near, effect, start.data)
+            result = fit(p, start.data, theta, states, iterations=steps, inherit=start.near)
+            if start.data is not bench.long:
+                result = bench.settled(p, result.theta)
+        except RUNAWAY:
+            continue
+        if start.kind.moves is not None:
+            result = realign_effects(result, bench.long)
+        if not is_stand_in(hypothesis(result), bench.long):
+            done.append(result)
+    best = min(done, key=lambda f: f.cost, default=None)
+    return move_time_of_change(best, bench.long) if best is not None and start.kind.is_event else best

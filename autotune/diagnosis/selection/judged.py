@@ -69,6 +69,11 @@ class Judged(ABC):
 
     @property
     @abstractmethod
+    def error(self) -> float:
+        """Error on rows that were not fitted, as a share of the spread of y."""
+
+    @property
+    @abstractmethod
     def added(self) -> tuple[Effect, ...]:
         """Its effects with their fitted values."""
 

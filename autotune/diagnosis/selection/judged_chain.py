@@ -158,22 +158,18 @@ def gained(found: Found[JudgedChain]) -> float:
 
 
 def quality(found: Found[JudgedChain], noise_floor: float) -> FitQuality:
-    """Return errors of free runs through stretches that were left out, beside the noise.
+    """Return errors beside the noise of the retuned model from row to row, or of the chosen one where that is less.
 
     Parameters
     ----------
     found : Found
         What a search found.
     noise_floor : float
-        What the retuned model's residual shows from row to row, as a share of the spread of y: a missing sign looks
-        like noise there. What the chosen hypothesis leaves counts where it is less.
+        What the retuned model shows, as a share of the spread of y: a missing sign looks like noise there.
     """
     chosen = found.chosen
     shown = under_noise(chosen.fit, chosen.data).noise.total_sd / spread_of(chosen.data)
-    return FitQuality(
-        nominal=found.nominal.error, retuned=found.retuned.error, extended=chosen.error,
-        noise_floor=min(noise_floor, shown),
-    )  # fmt: skip
+    return found.quality(min(noise_floor, shown))
 
 
 def varies_more(found: Found[JudgedChain]) -> bool:

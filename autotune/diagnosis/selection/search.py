@@ -6,10 +6,12 @@ that of equations (:class:`Proposals`); the search knows neither.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
-from typing import Generic, Protocol, TypeVar
+from typing import Generic, TypeVar
 
+from autotune.diagnosis.evidence.held_out import FitQuality
 from autotune.diagnosis.selection.judged import Judged, add_smaller, built_on, of_likely, probabilities, rank
 from autotune.diagnosis.selection.probability import Candidate
 from autotune.diagnosis.thresholds import Thresholds
@@ -18,41 +20,47 @@ from autotune.progress import Progress, quiet
 _J = TypeVar("_J", bound=Judged)
 
 
-class Proposals(Protocol[_J]):
-    """A model on its recordings, as a search asks for it: hypotheses that are fitted and judged."""
+class Proposals(ABC, Generic[_J]):
+    """A model on its recordings, as a search asks for it: hypotheses that are fitted and judged.
 
-    @property
-    def limits(self) -> Thresholds:
-        """What decides between two findings."""
+    Attributes
+    ----------
+    nominal : Judged
+        The model with its nominal numbers.
+    roots : tuple of Judged
+        What effects are added to first: the retuned model, and others beside it.
+    """
 
-    @property
-    def nominal(self) -> _J:
-        """The model with its nominal numbers."""
+    nominal: _J
+    roots: tuple[_J, ...]
 
-    @property
-    def roots(self) -> Sequence[_J]:
-        """What effects are added to first: the retuned model, and others beside it."""
-
+    @abstractmethod
     def larger(self, beam: Sequence[_J], progress: Progress) -> list[_J]:
         """Return hypotheses with one effect more than those of a beam, the most promising ones."""
 
     def beside(self, best: _J) -> Proposals[_J]:
-        """Return what proposes beside a hypothesis, in units of the residual that it leaves."""
+        """Return what proposes beside a hypothesis; a chain does it in units of the residual that this leaves."""
+        return self
 
     def again(self, one: _J) -> _J:
-        """Return a hypothesis fitted again, in units of the residual that the best one leaves."""
+        """Return a hypothesis fitted again, where fits are in units of the residual that the best one leaves."""
+        return one
 
+    @abstractmethod
     def resumed(self, one: _J) -> _J | None:
         """Return a hypothesis that was fitted to more rows, fitted to these from its numbers; None if it runs away."""
 
+    @abstractmethod
     def smaller(self, some: Sequence[_J], known: Sequence[_J]) -> list[_J]:
         """Return what hypotheses become when one of their effects is left out, as far as that is not known."""
 
-    def finished(self, found: Sequence[_J]) -> list[_J]:
+    @abstractmethod
+    def finish_leading(self, found: Sequence[_J]) -> list[_J]:
         """Return the leading hypotheses fitted to the end: a search leaves them before."""
 
-    def settled(self, best: _J, found: Sequence[_J]) -> _J:
+    def settle_numbers(self, best: _J, found: Sequence[_J]) -> _J:
         """Return a hypothesis with the numbers that are handed out, of all fits of it that were found."""
+        return best
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -87,6 +95,11 @@ class Found(Generic[_J]):
         """All hypotheses with effects, first the one that the least speaks against."""
         return tuple(sorted((j for j in self.judged if j.names), key=lambda j: j.behind(self.chosen)))
 
+    def quality(self, noise_floor: float) -> FitQuality:
+        """Return errors on rows that were not fitted, beside the noise as a share of the spread of y."""
+        nominal, retuned, extended = (one.error for one in (self.nominal, self.retuned, self.chosen))
+        return FitQuality(nominal=nominal, retuned=retuned, extended=extended, noise_floor=noise_floor)
+
     def candidates(self, unknown_odds: float) -> tuple[Candidate, ...]:
         """Return every hypothesis with its probability: what chose it weighs here too."""
         return probabilities(self.judged, self.best, unknown_odds)
@@ -120,13 +133,13 @@ def search(proposals: Proposals[_J], progress: Progress = quiet, begun: _J | Non
     evidence outweigh that it is not. Where the model's error decides, it takes away a tenth of the held-out error, and
     stretches agree on it: what is excited in no stretch but one is found with less power.
     """
-    limits = proposals.limits
+    limits = proposals.nominal.limits
     at, found = _grow(proposals, progress)
     resumed = None if begun is None else at.resumed(begun)
     found += [] if resumed is None else [resumed]
     found = add_smaller(found, limits.rig_pruned, limits.rig_effects, at.smaller)
-    found += at.finished(found)
-    chosen = at.settled(rank(found)[0], found)
+    found += at.finish_leading(found)
+    chosen = at.settle_numbers(rank(found)[0], found)
     retuned = chosen if not chosen.names else rank([one for one in found if not one.names])[0]
     nominal, retuned, chosen = (one.spread_out() for one in (proposals.nominal, retuned, chosen))
     return Found(nominal=nominal, retuned=retuned, judged=tuple(found), best=chosen, chosen=chosen)
@@ -134,7 +147,8 @@ def search(proposals: Proposals[_J], progress: Progress = quiet, begun: _J | Non
 
 def _grow(at: Proposals[_J], progress: Progress) -> tuple[Proposals[_J], list[_J]]:
     """Add effects one by one while one of them makes the free run better; return all that was judged."""
-    limits, beam, best = at.limits, list(at.roots), at.roots[0]
+    beam, best = list(at.roots), at.roots[0]
+    limits = best.limits
     found = [best]
     for size in range(limits.rig_effects):
         told = _from(progress, 0.1 + 0.8 * size / limits.rig_effects)
