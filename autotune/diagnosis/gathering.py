@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache, partial
 
@@ -29,7 +29,7 @@ from autotune.diagnosis.selection.judged_chain import JudgedChain, as_search, ga
 from autotune.diagnosis.selection.search import Found
 from autotune.diagnosis.selection.searched import Search
 from autotune.diagnosis.thresholds import Thresholds
-from autotune.effects import KINDS, kind_of
+from autotune.effects import kind_of
 from autotune.models import Model
 from autotune.progress import Progress, quiet
 from autotune.recording import Recording
@@ -55,10 +55,6 @@ def evidence_of(
     """
     given, without = without, [*without, *unmoved(model, recordings)]
 
-    def again(part: Sequence[Recording], known: Collection[str], begun: JudgedChain | None) -> ChainEvidence:
-        others = [*given, *(name for name in KINDS if name not in known)]
-        return evidence_of(model, part, controller, others, quiet, thresholds, begun)
-
     progress("looking at the samples", 0.0)
     if any(kind_of(effect.name).late_stamps for effect in model.effects):
         recordings, late = [r.at_even_times() for r in recordings], None
@@ -83,7 +79,7 @@ def evidence_of(
     samples = (*select_supported(seen, rows_of(retuned, data)), *beside(retuned, data))
     evidence = ChainEvidence(
         model=model,
-        again=again,
+        again=lambda part, more, begun: evidence_of(model, part, controller, [*given, *more], quiet, thresholds, begun),
         search=near,
         samples=samples,
         residual=residual_tests(retuned, data, uneven=any(kind_of(s.name).uneven for s in samples)),

@@ -17,10 +17,11 @@ from autotune.diagnosis.evidence.held_out import FitQuality
 from autotune.diagnosis.evidence.operating_point import Offset
 from autotune.diagnosis.evidence.samples import SampleEffect
 from autotune.diagnosis.result import FoundEffect, SearchResult, Verdict
+from autotune.diagnosis.selection.judged import of_likely, probabilities
 from autotune.diagnosis.selection.probability import Candidate, weighed
 from autotune.diagnosis.selection.search import Found
 from autotune.diagnosis.thresholds import Thresholds
-from autotune.effects import STRUCTURES, kind_of
+from autotune.effects import KINDS, STRUCTURES, kind_of
 from autotune.equations.files import AnyModel
 from autotune.errors import InputError
 from autotune.models import Effect
@@ -50,7 +51,7 @@ class Evidence(ABC):
     residual : ResidualTests
         What the chosen model leaves.
     again : callable
-        Returns what other recordings show among some effects, beginning with a hypothesis of these ones.
+        Returns what other recordings show, some effects left out, beginning with a hypothesis of these ones.
     found : Found, optional
         What a search found, where simulations do not run away and what is left is not noise of some rows.
     offset : Offset, optional
@@ -93,7 +94,8 @@ class Evidence(ABC):
         """Every hypothesis with its probability by all rows, best first."""
         if self.found is None:
             return weighed({"none": 0.0}, 1.0, self.unknown_odds)
-        return self.found.candidates(self.unknown_odds if self.residual.is_noise else self.limits.unknown_odds)
+        unknown = self.unknown_odds if self.residual.is_noise else self.limits.unknown_odds
+        return probabilities(self.found.judged, self.found.best, unknown)
 
     @property
     def more_than_noise(self) -> bool:
@@ -122,7 +124,7 @@ class Evidence(ABC):
         kept = replace(self, samples=samples, offset=self.offset if OFFSET in names else None)
         if self.found is None or self.own_noise:
             return kept
-        best = self.found.likely(names)
+        best = of_likely(self.found.judged, names)
         return kept if best.names == self.found.chosen.names else kept.going_on(best)
 
     @abstractmethod
@@ -138,7 +140,7 @@ class Evidence(ABC):
         best = None if self.found is None else self.found.chosen
         untold = self.untold(part)
         try:
-            there = self.again(part, known, best)
+            there = self.again(part, [name for name in KINDS if name not in known], best)
             if best is not None and there.found is not None:
                 untold |= there.found.retuned.unfelt(best.added)
         except InputError:  # nothing runs there

@@ -9,7 +9,6 @@ import numpy as np
 from autotune.arrays import FloatArray
 from autotune.diagnosis.equations.bench import Outcome
 from autotune.diagnosis.equations.judged import JudgedEquations
-from autotune.diagnosis.equations.scores import quick_score
 from autotune.diagnosis.result import Diagnosis, NextExperiment, told_apart
 from autotune.equations.effects import apply
 from autotune.equations.model import EquationModel
@@ -50,11 +49,7 @@ def planned_in_equations(found: Diagnosis) -> NextExperiment | None:
 
 def _open(found: Diagnosis) -> dict[str, tuple[Outcome, float]]:
     """Return the hypotheses that are probable enough, each with its best fit."""
-    searched, limits = found.search.found, found.search.limits
-
-    def score(one: JudgedEquations) -> float:
-        return quick_score(one.outcome, searched.best.noise)
-
+    searched, limits, score = found.search.found, found.search.limits, found.search.score
     best: dict[str, JudgedEquations] = {}
     for one in (searched.retuned, *searched.others):
         name = "+".join(one.names) or "none"

@@ -45,14 +45,10 @@ def search_equations(
 
     Parameters
     ----------
-    bench : Bench
-        The model on its recordings.
-    without : collection of str
-        Effects that are left out.
-    progress : callable
-        Told what is being done and the share done.
-    begun : JudgedEquations, optional
-        What predicted best on more rows of these recordings.
+    bench, without
+        The model on its recordings, and effects that are left out.
+    progress, begun
+        As in :func:`autotune.diagnosis.selection.search.search`.
 
     Raises
     ------
@@ -65,34 +61,17 @@ def search_equations(
     if retuned is None:
         raise InputError("the model runs away on left-out stretches", where="diagnose", remedy="check its numbers")
     nominal = replace(retuned, outcome=bench.as_it_is(outcome), tuned=False)
-    return search(EquationProposals(bench=bench, without=without, nominal=nominal, roots=(retuned,)), progress, begun)
+    return search(_EquationProposals(bench=bench, without=without, nominal=nominal, roots=(retuned,)), progress, begun)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class EquationProposals(Proposals[JudgedEquations]):
-    """Equations on recordings, as a search asks for them: fits are in units of the residual that each leaves.
-
-    Attributes
-    ----------
-    bench : Bench
-        The model on its recordings.
-    without : collection of str
-        Effects that are left out.
-    nominal : JudgedEquations
-        The model with its nominal numbers.
-    roots : tuple of JudgedEquations
-        The retuned model.
-    """
+class _EquationProposals(Proposals[JudgedEquations]):
+    """Equations on recordings, some effects left out; fits are in units of the residual that each leaves."""
 
     bench: Bench
     without: Collection[str]
     nominal: JudgedEquations
     roots: tuple[JudgedEquations, ...]
-
-    @property
-    def retuned(self) -> Outcome:
-        """The model with its own numbers retuned."""
-        return self.roots[0].outcome
 
     def larger(self, beam: Sequence[JudgedEquations], progress: Progress) -> list[JudgedEquations]:
         """Return hypotheses with one effect more than those of a beam, beside which more than noise is left."""
@@ -105,7 +84,7 @@ class EquationProposals(Proposals[JudgedEquations]):
 
     def resumed(self, one: JudgedEquations) -> JudgedEquations | None:
         """Return a hypothesis that was fitted to more rows, fitted to these from its numbers; None if it runs away."""
-        return next(iter(self._judged([attempt(self.bench, one.outcome.effects, self.retuned, FINAL)])), None)
+        return next(iter(self._judged([attempt(self.bench, one.outcome.effects, self.roots[0].outcome, FINAL)])), None)
 
     def smaller(self, some: Sequence[JudgedEquations], known: Sequence[JudgedEquations]) -> list[JudgedEquations]:
         """Return hypotheses without each of their effects, or with a plainer one, as far as these are not known yet.
@@ -126,7 +105,7 @@ class EquationProposals(Proposals[JudgedEquations]):
 
     def finish_leading(self, found: Sequence[JudgedEquations]) -> list[JudgedEquations]:
         """Return the leading hypothesis fitted to the end."""
-        return self._judged(_fit_to_end(self.bench, rank(found)[0], self.retuned))
+        return self._judged(_fit_to_end(self.bench, rank(found)[0], self.roots[0].outcome))
 
     def _judged(self, fits: Iterable[Outcome | None]) -> list[JudgedEquations]:
         """Return fits with their errors on left-out stretches, without those that ran away or are something else."""

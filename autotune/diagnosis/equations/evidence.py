@@ -13,7 +13,7 @@ from autotune.diagnosis.equations.bench import Bench, Outcome
 from autotune.diagnosis.equations.closed import ClosedBench
 from autotune.diagnosis.equations.equation_bench import EquationBench
 from autotune.diagnosis.equations.judged import JudgedEquations
-from autotune.diagnosis.equations.scores import quick_score, slow_power, variance_ratio
+from autotune.diagnosis.equations.scores import slow_power, variance_ratio
 from autotune.diagnosis.equations.shown import EquationSearch
 from autotune.diagnosis.equations.sizes import command_of, spans_at, with_units
 from autotune.diagnosis.evidence.adequacy import ResidualTests
@@ -60,15 +60,10 @@ class EquationEvidence(Evidence):
         """What the search found."""
         return EquationSearch(model=self.model, recordings=self.given, found=self.found)
 
-    @property
-    def bench(self) -> Bench:
-        """The model on the rows that count."""
-        return self.found.best.bench
-
     @cached_property
     def quality(self) -> FitQuality:
         """Errors on the last third of every recording, the numbers fitted to the rest."""
-        return self.found.quality(self.found.best.noise.total_sd / self.bench.spread)
+        return self.found.quality(self.found.best.noise.total_sd / self.result.bench.spread)
 
     @property
     def leaves_noise(self) -> bool:
@@ -78,7 +73,7 @@ class EquationEvidence(Evidence):
     @property
     def numbers(self) -> float:
         """Decrease of chi-square that retuning brings beside the nominal numbers."""
-        return self._score(self.found.nominal) - self._score(self.found.retuned)
+        return self.result.score(self.found.nominal) - self.result.score(self.found.retuned)
 
     def going_on(self, best: JudgedEquations) -> EquationEvidence:
         """Return the evidence with another hypothesis to go on with."""
@@ -88,21 +83,17 @@ class EquationEvidence(Evidence):
     def described(self) -> list[tuple[float, FoundEffect]]:
         """Return the chosen effects as people read them."""
         found, described = self.found, []
-        scores = {frozenset(one.names): self._score(one) for one in found.judged}
+        scores = {frozenset(one.names): self.result.score(one) for one in found.judged}
         for effect in found.chosen.added:
-            without = scores.get(frozenset(self.names) - {effect.name}, self._score(found.retuned))
-            described.append((without - self._score(found.chosen), self._described(effect)))
+            without = scores.get(frozenset(self.names) - {effect.name}, self.result.score(found.retuned))
+            described.append((without - self.result.score(found.chosen), self._described(effect)))
         return described
 
-    def _score(self, one: JudgedEquations) -> float:
-        """Return Schwarz's criterion of a fit, up to a constant."""
-        return quick_score(one.outcome, self.found.best.noise)
-
     def _described(self, effect: Effect) -> FoundEffect:
-        named = with_units(self.bench.model, effect, self.model.output_unit)
+        named = with_units(self.result.bench.model, effect, self.model.output_unit)
         fitted = {k: q for k, q in named.parameters.items() if math.isfinite(q.sd) and q.sd != 0.0}
         shown = readable(replace(named, parameters=MappingProxyType(fitted or dict(named.parameters))))
-        bench, chosen = self.bench, self.found.chosen.outcome
+        bench, chosen = self.result.bench, self.found.chosen.outcome
         command, unit = command_of(bench, chosen, effect), bench.model.inputs[0]
         return FoundEffect(
             name=effect.name,
@@ -163,7 +154,7 @@ def residual_left(found: Found[JudgedEquations], samples: Sequence[SampleEffect]
     return ResidualTests(
         reduced_chi2=ratio, reduced_chi2_chance=math.sqrt(2.0 / chosen.residual.size), slow=slow, slow_chance=chance,
         uneven=any(kind_of(s.name).uneven for s in samples),
-        accounted=bool(samples) and ratio < found.limits.equation_astray, limits=found.limits,
+        accounted=bool(samples) and ratio < found.best.limits.equation_astray, limits=found.best.limits,
     )  # fmt: skip
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -18,7 +18,6 @@ from autotune.diagnosis.evidence.samples import SampleEffect, unspoiled_rows
 from autotune.diagnosis.evidence.spoiled_rows import clear_samples, search_beside
 from autotune.diagnosis.selection.search import Found
 from autotune.diagnosis.thresholds import Thresholds
-from autotune.effects import KINDS
 from autotune.equations.black_box import BlackBox
 from autotune.equations.model import EquationModel
 from autotune.progress import Progress, quiet
@@ -67,13 +66,12 @@ def evidence_of_equations(
     law = law_effect(recordings, controller, limits)
     samples += [] if law is None or law.name in without else [law]
 
-    def again(part: Sequence[Recording], known: Collection[str], begun: JudgedEquations) -> EquationEvidence:
-        others = [*without, *(name for name in KINDS if name not in known)]
-        return evidence_of_equations(model, part, controller, others, quiet, limits, begun)
-
     return EquationEvidence(
         model=model, given=tuple(recordings), found=found, samples=tuple(samples),
-        residual=residual_left(found, samples), again=again,
+        residual=residual_left(found, samples),
+        again=lambda part, more, then: evidence_of_equations(
+            model, part, controller, [*without, *more], quiet, limits, then
+        ),
     )  # fmt: skip
 
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from autotune.diagnosis.equations.bench import Bench, Outcome
 from autotune.diagnosis.equations.candidates import key_of
-from autotune.diagnosis.equations.scores import innovations_variance, is_slow, noise_of, variance_ratio
+from autotune.diagnosis.equations.scores import innovations_variance, is_noise, is_slow, noise_of
 from autotune.diagnosis.fitting.noise import Noise
 from autotune.diagnosis.selection.judged import Judged
 from autotune.diagnosis.selection.probability import RARE
@@ -63,10 +63,8 @@ class JudgedEquations(Judged):
     def leaves_noise(self) -> bool:
         """Whether what it leaves is noise: no more variance, no slow part, and stretches are foretold about as well."""
         outcome, limits = self.outcome, self.limits
-        chance = math.sqrt(2.0 / outcome.residual.size)
-        if self.noise.ar and self.noise.ar[0] > limits.slow_noise:
-            return False
-        if variance_ratio(outcome, self.noise) > limits.adequate_quick + chance or is_slow(outcome, self.noise, limits):
+        most = limits.adequate_quick + math.sqrt(2.0 / outcome.residual.size)
+        if not is_noise(self.bench, outcome, most) or is_slow(outcome, self.noise, limits):
             return False
         error = math.sqrt(float(self.long_squares.sum()) / outcome.residual.size)
         return error < limits.foretold * self.bench.grows * math.sqrt(outcome.rss / outcome.residual.size)

@@ -53,7 +53,7 @@ class EquationSearch:
     @property
     def limits(self) -> Thresholds:
         """What decided."""
-        return self.found.limits
+        return self.found.best.limits
 
     @property
     def units(self) -> tuple[str, str]:
@@ -103,11 +103,15 @@ class EquationSearch:
         """Return the directions of the numbers by how well the recordings determine them, the least first."""
         return combinations(self.found.chosen.outcome.fitted, len(self.model.parameters))
 
+    def score(self, one: JudgedEquations) -> float:
+        """Return Schwarz's criterion of a fit, up to a constant."""
+        return quick_score(one.outcome, self.found.best.noise)
+
     def hypotheses(self) -> list[tuple[str, float]]:
         """Return what was fitted to all rows with the decrease of chi-square, numbers paid for, the best first."""
-        noise, base = self.found.best.noise, self.found.retuned.outcome
-        each = ((one.outcome, [f"{e.name} at {where_told(e)}" for e in one.added]) for one in self.found.others)
-        found = ((" + ".join(names), quick_score(base, noise) - quick_score(one, noise)) for one, names in each)
+        base = self.score(self.found.retuned)
+        each = ((one, [f"{e.name} at {where_told(e)}" for e in one.added]) for one in self.found.others)
+        found = ((" + ".join(names), base - self.score(one)) for one, names in each)
         return sorted(found, key=lambda pair: -pair[1])
 
     def laws(self) -> tuple[MissingLaw, ...]:

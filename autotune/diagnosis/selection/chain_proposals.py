@@ -85,16 +85,8 @@ def search_chain(
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class ChainProposals(Bench, Proposals[JudgedChain]):
-    """A chain on its recordings, as a search asks for it.
-
-    Attributes
-    ----------
-    nominal : JudgedChain
-        The chain with its nominal numbers, the operating point fitted.
-    roots : tuple of JudgedChain
-        The retuned chain, and the nominal one where retuning moves a number far.
-    """
+class _ChainProposals(Bench, Proposals[JudgedChain]):
+    """A chain on its recordings; beside the retuned one the nominal one is a root where retuning moves a number far."""
 
     nominal: JudgedChain
     roots: tuple[JudgedChain, ...]
@@ -121,7 +113,7 @@ class ChainProposals(Bench, Proposals[JudgedChain]):
         done = self.pool.map(lambda one: self.judged(one[0], one[1]), [one for group in able for one in group])
         return [j for j in done if j is not None and np.all(np.isfinite(j.long_squares + j.short_squares))]
 
-    def beside(self, best: JudgedChain) -> ChainProposals:
+    def beside(self, best: JudgedChain) -> _ChainProposals:
         """Return what proposes beside a hypothesis, in units of the residual that it leaves."""
         return self.with_sd(residual_sd(best.fit, best.data), residual_sd(best.short, best.few))
 
@@ -165,7 +157,7 @@ def _odds(
     return tuple((k, max(k.odds.get(kind, k.odds.get("any", 0.0)), RARE)) for k in able)
 
 
-def _begin(model: Model, bench: Bench) -> ChainProposals:
+def _begin(model: Model, bench: Bench) -> _ChainProposals:
     """Return the bench in units of the retuned model's residual, with that model at its nominal numbers and retuned."""
     recordings = bench.long.driving
     p = parametrise(model, [], input_size(model, recordings), recordings[0].sample_time_s,
@@ -185,11 +177,9 @@ def _begin(model: Model, bench: Bench) -> ChainProposals:
     nominal = nominal if nominal is not None else retuned
     away = float(np.max(np.abs(retuned.fit.theta - p.centre) / p.spreads))
     roots = (retuned, nominal) if away > bench.limits.nominal_too else (retuned,)
-    names = [k.name for k, _ in bench.odds if k.lasting]
-    lasting = tuple(e for name in names for e in search_starts(name, retuned.short, retuned.few, bench.pool))
-    return ChainProposals(
-        cuts=bench.cuts, few=bench.few, odds=bench.odds, pool=bench.pool, lasting=lasting, nominal=nominal, roots=roots
-    )
+    sought = (search_starts(k.name, retuned.short, retuned.few, bench.pool) for k, _ in bench.odds if k.lasting)
+    known = vars(bench) | {"lasting": tuple(e for found in sought for e in found)}
+    return _ChainProposals(**known, nominal=nominal, roots=roots)
 
 
 def _refit_larger(found: Sequence[JudgedChain], bench: Bench) -> list[JudgedChain]:
@@ -232,8 +222,7 @@ class _Start:
 
 def _charge(start: _Start) -> float:
     """Return the decrease of chi-square that the numbers of an effect must bring, priors apart (Schwarz 1978)."""
-    fitted = sum(q.is_fitted for q in start.kind.parameters)
-    return fitted * math.log(start.base.fit.rows)
+    return sum(q.is_fitted for q in start.kind.parameters) * math.log(start.base.fit.rows)
 
 
 def _starts(base: JudgedChain, bench: Bench) -> list[_Start]:

@@ -139,7 +139,7 @@ def as_search(found: Found[JudgedChain]) -> Search:
     chosen = found.chosen
 
     def scaled(one: JudgedChain) -> Fit:
-        """Return a fit with its chi-square in units of the residual that the chosen hypothesis was fitted at."""
+        # chi-square in units of the residual that the chosen hypothesis was fitted at
         return replace(one.fit, chi2=one.fit.chi2 * (one.data.noise.sd / chosen.data.noise.sd) ** 2)
 
     return Search(
@@ -178,7 +178,7 @@ def varies_more(found: Found[JudgedChain]) -> bool:
     It may be a share of what was gained, which simulations are wrong by. Where the model's error decides, much varies
     beside what is true as well, and says nothing.
     """
-    chosen, limits = found.chosen, found.limits
+    chosen, limits = found.chosen, found.chosen.limits
     if not chosen.names or not chosen.leaves_noise:
         return False
     before = rms(found.retuned.fit.residuals, found.retuned.data.good)

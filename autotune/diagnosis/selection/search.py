@@ -7,14 +7,12 @@ that of equations (:class:`Proposals`); the search knows neither.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Generic, TypeVar
 
 from autotune.diagnosis.evidence.held_out import FitQuality
-from autotune.diagnosis.selection.judged import Judged, add_smaller, built_on, of_likely, probabilities, rank
-from autotune.diagnosis.selection.probability import Candidate
-from autotune.diagnosis.thresholds import Thresholds
+from autotune.diagnosis.selection.judged import Judged, built_on, leading, rank
 from autotune.progress import Progress, quiet
 
 _J = TypeVar("_J", bound=Judged)
@@ -36,7 +34,13 @@ class Proposals(ABC, Generic[_J]):
 
     @abstractmethod
     def larger(self, beam: Sequence[_J], progress: Progress) -> list[_J]:
-        """Return hypotheses with one effect more than those of a beam, the most promising ones."""
+        """Return hypotheses with one effect more than those of a beam, the most promising ones.
+
+        Parameters
+        ----------
+        beam, progress
+            Hypotheses that effects are added to; told what is being done.
+        """
 
     def beside(self, best: _J) -> Proposals[_J]:
         """Return what proposes beside a hypothesis; a chain does it in units of the residual that this leaves."""
@@ -52,7 +56,13 @@ class Proposals(ABC, Generic[_J]):
 
     @abstractmethod
     def smaller(self, some: Sequence[_J], known: Sequence[_J]) -> list[_J]:
-        """Return what hypotheses become when one of their effects is left out, as far as that is not known."""
+        """Return what hypotheses become when one of their effects is left out.
+
+        Parameters
+        ----------
+        some, known
+            Hypotheses of several effects; all that are known, which need not be fitted again.
+        """
 
     @abstractmethod
     def finish_leading(self, found: Sequence[_J]) -> list[_J]:
@@ -86,11 +96,6 @@ class Found(Generic[_J]):
     chosen: _J
 
     @property
-    def limits(self) -> Thresholds:
-        """What decided."""
-        return self.best.limits
-
-    @property
     def others(self) -> tuple[_J, ...]:
         """All hypotheses with effects, first the one that the least speaks against."""
         return tuple(sorted((j for j in self.judged if j.names), key=lambda j: j.behind(self.chosen)))
@@ -99,14 +104,6 @@ class Found(Generic[_J]):
         """Return errors on rows that were not fitted, beside the noise as a share of the spread of y."""
         nominal, retuned, extended = (one.error for one in (self.nominal, self.retuned, self.chosen))
         return FitQuality(nominal=nominal, retuned=retuned, extended=extended, noise_floor=noise_floor)
-
-    def candidates(self, unknown_odds: float) -> tuple[Candidate, ...]:
-        """Return every hypothesis with its probability: what chose it weighs here too."""
-        return probabilities(self.judged, self.best, unknown_odds)
-
-    def likely(self, names: Collection[str]) -> _J:
-        """Return the hypothesis with no other effects than those named that is to be gone on with."""
-        return of_likely(self.judged, names)
 
 
 def search(proposals: Proposals[_J], progress: Progress = quiet, begun: _J | None = None) -> Found[_J]:
@@ -133,11 +130,10 @@ def search(proposals: Proposals[_J], progress: Progress = quiet, begun: _J | Non
     evidence outweigh that it is not. Where the model's error decides, it takes away a tenth of the held-out error, and
     stretches agree on it: what is excited in no stretch but one is found with less power.
     """
-    limits = proposals.nominal.limits
     at, found = _grow(proposals, progress)
     resumed = None if begun is None else at.resumed(begun)
     found += [] if resumed is None else [resumed]
-    found = add_smaller(found, limits.rig_pruned, limits.rig_effects, at.smaller)
+    found = _prune(at, found)
     found += at.finish_leading(found)
     chosen = at.settle_numbers(rank(found)[0], found)
     retuned = chosen if not chosen.names else rank([one for one in found if not one.names])[0]
@@ -151,9 +147,9 @@ def _grow(at: Proposals[_J], progress: Progress) -> tuple[Proposals[_J], list[_J
     limits = best.limits
     found = [best]
     for size in range(limits.rig_effects):
-        told = _from(progress, 0.1 + 0.8 * size / limits.rig_effects)
-        told("effects one by one", 0.0)
-        larger = at.larger(beam, told)
+        done = 0.1 + 0.8 * size / limits.rig_effects
+        progress("effects one by one", done)
+        larger = at.larger(beam, lambda what, _, done=done: progress(what, done))
         if not larger:
             break
         found += larger
@@ -170,6 +166,16 @@ def _grow(at: Proposals[_J], progress: Progress) -> tuple[Proposals[_J], list[_J
     return at, found
 
 
-def _from(progress: Progress, done: float) -> Progress:
-    """Return what is told of one step, from which share done that may be."""
-    return lambda what, _: progress(what, done)
+def _prune(at: Proposals[_J], found: Sequence[_J]) -> list[_J]:
+    """Return hypotheses with those that the leading ones become when an effect is left out, and again of these.
+
+    What a search came to, effect by effect, may have one that stood for another, or only led out of a local minimum.
+    """
+    result, done, limits = list(found), set[int](), found[0].limits
+    for _ in range(limits.rig_effects):
+        fresh = [one for one in leading(result, limits.rig_pruned) if len(one.names) > 1 and id(one) not in done]
+        if not fresh:
+            break
+        done |= {id(one) for one in fresh}
+        result += at.smaller(fresh, result)
+    return result
