@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from types import MappingProxyType
@@ -13,7 +13,7 @@ import numpy as np
 from autotune.arrays import BoolArray
 from autotune.diagnosis.evidence.adequacy import residual_tests
 from autotune.diagnosis.evidence.description import Description, describe
-from autotune.diagnosis.evidence.held_out import held_out_error
+from autotune.diagnosis.evidence.held_out import FitQuality, held_out_error
 from autotune.diagnosis.evidence.misread import misread_columns
 from autotune.diagnosis.evidence.operating_point import unmoved
 from autotune.diagnosis.evidence.own_noise import OwnNoise
@@ -23,19 +23,16 @@ from autotune.diagnosis.readable import in_commands, readable
 from autotune.diagnosis.result import FoundEffect, OperatingRange, Verdict
 from autotune.diagnosis.safe_extension import safe_extension
 from autotune.diagnosis.selection.hypothesis import contradicted_effects
-from autotune.diagnosis.selection.judged import of_likely
-from autotune.diagnosis.selection.judged_chain import Found, JudgedChain, at_both_scales
-from autotune.diagnosis.selection.probability import Candidate, probability_of, weighed
+from autotune.diagnosis.selection.judged_chain import JudgedChain, as_search, at_both_scales, quality, varies_more
+from autotune.diagnosis.selection.probability import probability_of
+from autotune.diagnosis.selection.search import Found
 from autotune.diagnosis.selection.searched import Search
 from autotune.diagnosis.simulation.chain import build_chain
 from autotune.diagnosis.simulation.forecast import forecast
-from autotune.diagnosis.verdict import Evidence
+from autotune.diagnosis.verdict import OFFSET, Evidence
 from autotune.effects import STRUCTURES, kind_of
 from autotune.models import Effect, Model, Parameter
 from autotune.recording import Recording
-
-#: The effect that every fit has as a free number.
-OFFSET = "actuator.offset"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -48,52 +45,33 @@ class ChainEvidence(Evidence):
         The nominal chain.
     search : Search
         Hypotheses with their fits.
-    found : Found, optional
-        What a search found, where simulations do not run away and what is left is not noise of some rows.
+    quality_of : callable
+        Returns errors on rows that were not fitted.
     own : OwnNoise, optional
         What is left, where it is noise of its own colour.
-    again : callable
-        Returns what other recordings show among some effects, beginning with a hypothesis of these ones.
     """
 
+    free = frozenset({OFFSET})
     model: Model
     search: Search
-    found: Found | None = None
+    quality_of: Callable[[], FitQuality]
+    found: Found[JudgedChain] | None = None
     own: OwnNoise | None = None
-    again: Callable[[Sequence[Recording], Collection[str], JudgedChain | None], ChainEvidence]
 
     @property
     def result(self) -> Search:
         """What the search found."""
         return self.search
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Effects of the hypothesis to go on with."""
-        return self.search.chosen.names
-
     @cached_property
-    def candidates(self) -> tuple[Candidate, ...]:
-        """Every hypothesis with its probability, best first."""
-        if self.found is not None:
-            unknown = self.unknown_odds if self.residual.is_noise else self.limits.unknown_odds
-            return self.found.candidates(unknown)
-        return weighed({"none": 0.0}, 1.0, self.unknown_odds)
-
-    @property
-    def leading(self) -> tuple[tuple[str, ...], ...]:
-        """Effects of the leading hypotheses, the best first."""
-        return tuple(h.names for h in self.search.others)
-
-    @property
-    def more_than_noise(self) -> bool:
-        """Whether something was found, or the retuned model leaves more than noise."""
-        return self.found is not None and (bool(self.found.chosen.names) or not self.residual.is_noise)
+    def quality(self) -> FitQuality:
+        """Errors on rows that were not fitted."""
+        return self.quality_of()
 
     @property
     def varies_more(self) -> bool:
         """Whether what varies beside chosen effects that leave noise explains more than it may where they are true."""
-        return self.found is not None and self.found.varies_more(self.limits)
+        return self.found is not None and varies_more(self.found)
 
     @property
     def jitter_explains_more(self) -> bool:
@@ -133,35 +111,21 @@ class ChainEvidence(Evidence):
         retuned = self.search.retuned.fit
         return self.search.nominal.chi2 - retuned.chi2 - retuned.penalty
 
-    def keeping(self, names: Collection[str]) -> ChainEvidence:
-        """Return the evidence with no other effects than those named: the hypothesis of them that was fitted."""
-        samples = tuple(s for s in self.samples if s.name in names)
-        kept = replace(self, samples=samples, offset=self.offset if OFFSET in names else None)
-        found = self.found
-        if found is None or self.own is not None:
-            return kept
-        best = of_likely(found.judged, names)
-        if best.names == found.chosen.names:
-            return kept
-        left, residual = at_both_scales(best, found.judged).spread_out() if best.names else found.retuned, self.residual
+    def going_on(self, best: JudgedChain) -> ChainEvidence:
+        """Return the evidence with another hypothesis to go on with."""
+        assert self.found is not None
+        found, residual, floor = self.found, self.residual, self.quality.noise_floor
+        left = at_both_scales(best, found.judged).spread_out() if best.names else found.retuned
         if found.chosen.leaves_noise or left.leaves_noise:
             residual = residual_tests(left.fit, under_noise(left.fit, left.data), uneven=residual.uneven)
         found = replace(found, chosen=left)
-        floor = self.quality.noise_floor
         return replace(
-            kept, search=found.as_search(), residual=residual, quality_of=lambda: found.quality(floor), found=found
+            self, search=as_search(found), residual=residual, quality_of=lambda: quality(found, floor), found=found
         )
 
-    def on(self, part: Sequence[Recording]) -> tuple[ChainEvidence, Collection[str]]:
-        """Return what a part of the recordings shows, and effects that it cannot tell."""
-        known = {name for h in self.search.all for name in h.names} | {s.name for s in self.samples} | {OFFSET}
-        begun = None if self.found is None else self.found.chosen
-        there = self.again(part, known, begun)
-        cannot_tell = set(unmoved(self.model, part))
-        if there.found is not None:
-            fitted = self.search.chosen.fit
-            cannot_tell |= there.found.retuned.unfelt(fitted.model.effects[fitted.parametrisation.own :])
-        return there, cannot_tell
+    def untold(self, part: Sequence[Recording]) -> frozenset[str]:
+        """Return the effects that are not told from others where no command moves."""
+        return frozenset(unmoved(self.model, part))
 
     def described(self) -> list[tuple[float, FoundEffect]]:
         """Return the chosen effects as people read them, and the offset that is one."""

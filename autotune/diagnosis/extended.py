@@ -60,15 +60,11 @@ def extended_model(evidence: ChainEvidence, verdict: Verdict) -> Model:
     found, nominal = evidence.search, evidence.model
     named = evidence.quality.is_better and verdict in ("effect", "unexplained")
     use = found.chosen if named else found.retuned
-    searched = evidence.found
-    stands = (
-        searched is not None and evidence.more_than_noise and searched.keeps_nominal(evidence.limits.material_numbers)
-    )
-    extended = nominal if verdict == "none" or stands else use.fit.model
+    extended = nominal if verdict == "none" or evidence.nominal_stands else use.fit.model
     own = {e.name for e in nominal.effects}
     if len(found.data.recordings) == 1:
         # what came at a time of one recording is no property of the rig; a drift goes on while its law holds
-        holds = searched is not None and searched.chosen.leaves_noise
+        holds = evidence.found is not None and evidence.found.chosen.leaves_noise
         lasting = tuple(
             e
             for e in extended.effects

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache, partial
 
@@ -23,12 +23,13 @@ from autotune.diagnosis.evidence.stamps import even_stamps
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import RUNAWAY, Fit
 from autotune.diagnosis.fitting.retuning import at_nominal, prepare, under_noise
+from autotune.diagnosis.selection.chain_proposals import search_chain
 from autotune.diagnosis.selection.hypothesis import Hypothesis
-from autotune.diagnosis.selection.judged_chain import Found, JudgedChain
-from autotune.diagnosis.selection.search import search
+from autotune.diagnosis.selection.judged_chain import JudgedChain, as_search, gained, quality
+from autotune.diagnosis.selection.search import Found
 from autotune.diagnosis.selection.searched import Search
 from autotune.diagnosis.thresholds import Thresholds
-from autotune.effects import KINDS, kind_of
+from autotune.effects import kind_of
 from autotune.models import Model
 from autotune.progress import Progress, quiet
 from autotune.recording import Recording
@@ -54,10 +55,6 @@ def evidence_of(
     """
     given, without = without, [*without, *unmoved(model, recordings)]
 
-    def again(part: Sequence[Recording], known: Collection[str], begun: JudgedChain | None) -> ChainEvidence:
-        others = [*given, *(name for name in KINDS if name not in known)]
-        return evidence_of(model, part, controller, others, quiet, thresholds, begun)
-
     progress("looking at the samples", 0.0)
     if any(kind_of(effect.name).late_stamps for effect in model.effects):
         recordings, late = [r.at_even_times() for r in recordings], None
@@ -82,7 +79,7 @@ def evidence_of(
     samples = (*select_supported(seen, rows_of(retuned, data)), *beside(retuned, data))
     evidence = ChainEvidence(
         model=model,
-        again=again,
+        again=lambda part, more, begun: evidence_of(model, part, controller, [*given, *more], quiet, thresholds, begun),
         search=near,
         samples=samples,
         residual=residual_tests(retuned, data, uneven=any(kind_of(s.name).uneven for s in samples)),
@@ -119,7 +116,7 @@ def _searched(
     limits: Thresholds,
     begun: JudgedChain | None,
     seen: list[SampleEffect],
-) -> tuple[tuple[Search, Found | None], SimulatedRows]:
+) -> tuple[tuple[Search, Found[JudgedChain] | None], SimulatedRows]:
     """Return the retuned model near the noise, what was found beside it, and the rows that the best one simulates.
 
     Nothing is found where every simulation runs away.
@@ -130,19 +127,19 @@ def _searched(
     alone = Hypothesis(names=(), fit=retuned)
     near = Search(data=data, nominal=at_nominal(retuned, data), retuned=alone, chosen=alone)
     try:
-        found = search(model, recordings, good, names, progress, limits, begun)
+        found = search_chain(model, recordings, good, names, progress, limits, begun)
     except RUNAWAY:
         return (near, None), rows_of(retuned, data)
     return (near, found), rows_of(found.chosen.fit, found.chosen.data)
 
 
-def _with_found(evidence: ChainEvidence, found: Found, without: Sequence[str]) -> ChainEvidence:
+def _with_found(evidence: ChainEvidence, found: Found[JudgedChain], without: Sequence[str]) -> ChainEvidence:
     """Return the evidence with what a search found; as it was where what is left needs no effect."""
     chosen, near = found.chosen, evidence.search
-    if not chosen.leaves_noise and (late := _late_rows(evidence, found.gained, without)) is not None:
+    if not chosen.leaves_noise and (late := _late_rows(evidence, gained(found), without)) is not None:
         return late
     if not chosen.names and evidence.residual.is_noise:
-        return replace(evidence, search=found.as_search(), found=found)
+        return replace(evidence, search=as_search(found), found=found)
     if not chosen.names and (own := own_noise(near.retuned.fit, near.data)) is not None:
         # such a disturbance has a mean of its own in every recording: it is no offset
         return replace(evidence, residual=own.residual, offset=None, own=own, found=found)
@@ -153,7 +150,7 @@ def _with_found(evidence: ChainEvidence, found: Found, without: Sequence[str]) -
         offset = offset_of(chosen.fit, limits.off_sigmas)
     floor = noise_floor(near.retuned.fit, near.data)
     return replace(
-        evidence, search=found.as_search(), residual=residual, quality_of=lambda: found.quality(floor), offset=offset,
+        evidence, search=as_search(found), residual=residual, quality_of=lambda: quality(found, floor), offset=offset,
         found=found,
     )  # fmt: skip
 

@@ -8,19 +8,22 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 from autotune.diagnosis.evidence.adequacy import ResidualTests
 from autotune.diagnosis.evidence.held_out import FitQuality
 from autotune.diagnosis.evidence.operating_point import Offset
 from autotune.diagnosis.evidence.samples import SampleEffect
 from autotune.diagnosis.result import FoundEffect, SearchResult, Verdict
-from autotune.diagnosis.selection.probability import Candidate
+from autotune.diagnosis.selection.judged import of_likely, probabilities
+from autotune.diagnosis.selection.probability import Candidate, weighed
+from autotune.diagnosis.selection.search import Found
 from autotune.diagnosis.thresholds import Thresholds
-from autotune.effects import STRUCTURES, kind_of
+from autotune.effects import KINDS, STRUCTURES, kind_of
 from autotune.equations.files import AnyModel
+from autotune.errors import InputError
 from autotune.models import Effect
 from autotune.recording import Recording
 
@@ -29,6 +32,8 @@ if TYPE_CHECKING:
 
 #: Held-out error, as a share of the spread of y, from which on a simulation follows nothing: 1 is y's mean.
 ASTRAY = 0.9
+#: The effect that every fit of a chain has as a free number.
+OFFSET = "actuator.offset"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -39,22 +44,28 @@ class Evidence(ABC):
     ----------
     model : Model, EquationModel or BlackBox
         The nominal model.
+    free : frozenset of str
+        Effects that every fit has as free numbers: they are never searched for.
     samples : tuple of SampleEffect
         What single samples, the residual's size over the slope, and the recomputed law show.
     residual : ResidualTests
         What the chosen model leaves.
-    quality_of : callable
-        Returns errors on rows that were not fitted; it may take fits, and is asked where a verdict is.
+    again : callable
+        Returns what other recordings show, some effects left out, beginning with a hypothesis of these ones.
+    found : Found, optional
+        What a search found, where simulations do not run away and what is left is not noise of some rows.
     offset : Offset, optional
         Shift of the operating point that is far outside its uncertainty.
     evened : bool
         Whether stamps were late, so that everything runs at even times.
     """
 
+    free: ClassVar[frozenset[str]] = frozenset()
     model: AnyModel
     samples: tuple[SampleEffect, ...]
     residual: ResidualTests
-    quality_of: Callable[[], FitQuality]
+    again: Callable[[Sequence[Recording], Collection[str], Any], Evidence]
+    found: Found[Any] | None = None
     offset: Offset | None = None
     evened: bool = False
 
@@ -74,19 +85,28 @@ class Evidence(ABC):
         return self.result.recordings
 
     @property
-    @abstractmethod
     def names(self) -> tuple[str, ...]:
         """Effects of the hypothesis to go on with."""
+        return () if self.found is None else self.found.chosen.names
 
-    @property
-    @abstractmethod
+    @cached_property
     def candidates(self) -> tuple[Candidate, ...]:
         """Every hypothesis with its probability by all rows, best first."""
+        if self.found is None:
+            return weighed({"none": 0.0}, 1.0, self.unknown_odds)
+        unknown = self.unknown_odds if self.residual.is_noise else self.limits.unknown_odds
+        return probabilities(self.found.judged, self.found.best, unknown)
 
     @property
-    @abstractmethod
     def more_than_noise(self) -> bool:
         """Whether something was found, or the retuned model leaves more than noise."""
+        return self.found is not None and (bool(self.names) or not self.leaves_noise)
+
+    @property
+    def nominal_stands(self) -> bool:
+        """Whether nothing was found and the nominal numbers predict about as well as those retuned."""
+        share = 1.0 - self.limits.material_numbers
+        return not self.names and self.more_than_noise and self.quality.retuned > share * self.quality.nominal
 
     @property
     @abstractmethod
@@ -94,20 +114,42 @@ class Evidence(ABC):
         """Decrease of chi-square that retuning brings beside the nominal numbers."""
 
     @property
-    @abstractmethod
     def leading(self) -> tuple[tuple[str, ...], ...]:
         """Effects of the leading hypotheses that have any, the best first."""
+        return () if self.found is None or self.own_noise else tuple(one.names for one in self.found.others)
 
-    @abstractmethod
-    def keeping(self, names: Collection[str]) -> Evidence:
+    def keeping(self, names: Collection[str]) -> Self:
         """Return the evidence with no other effects than those named: the hypothesis of them that was fitted."""
+        samples = tuple(s for s in self.samples if s.name in names)
+        kept = replace(self, samples=samples, offset=self.offset if OFFSET in names else None)
+        if self.found is None or self.own_noise:
+            return kept
+        best = of_likely(self.found.judged, names)
+        return kept if best.names == self.found.chosen.names else kept.going_on(best)
 
     @abstractmethod
+    def going_on(self, best: Any) -> Self:
+        """Return the evidence with another hypothesis to go on with."""
+
     def on(self, part: Sequence[Recording]) -> tuple[Evidence | None, Collection[str]]:
         """Return what a part of the recordings shows, searched among what all of them made a candidate.
 
         Beside it stand effects that the part cannot tell; nothing where no simulation runs there.
         """
+        known = {name for names in self.leading for name in names} | {s.name for s in self.samples} | self.free
+        best = None if self.found is None else self.found.chosen
+        untold = self.untold(part)
+        try:
+            there = self.again(part, [name for name in KINDS if name not in known], best)
+            if best is not None and there.found is not None:
+                untold |= there.found.retuned.unfelt(best.added)
+        except InputError:  # nothing runs there
+            return None, ()
+        return there, untold
+
+    def untold(self, part: Sequence[Recording]) -> frozenset[str]:
+        """Return the effects that are not told from others on a part of the recordings, whatever they do there."""
+        return frozenset()
 
     @abstractmethod
     def described(self) -> list[tuple[float, FoundEffect]]:
@@ -125,10 +167,10 @@ class Evidence(ABC):
         """Return what is left as a function of the signals, where no effect explains it and that can be told."""
         return None
 
-    @cached_property
+    @property
+    @abstractmethod
     def quality(self) -> FitQuality:
-        """Errors on rows that were not fitted."""
-        return self.quality_of()
+        """Errors on rows that were not fitted; they may take fits, and are asked for where a verdict is."""
 
     @property
     def everywhere(self) -> tuple[tuple[int, float, float], ...]:

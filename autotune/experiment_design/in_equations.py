@@ -8,6 +8,7 @@ import numpy as np
 
 from autotune.arrays import FloatArray
 from autotune.diagnosis.equations.bench import Outcome
+from autotune.diagnosis.equations.judged import JudgedEquations
 from autotune.diagnosis.result import Diagnosis, NextExperiment, told_apart
 from autotune.equations.effects import apply
 from autotune.equations.model import EquationModel
@@ -43,19 +44,19 @@ def planned_in_equations(found: Diagnosis) -> NextExperiment | None:
     if not isinstance(given, EquationModel) or given.horizon_s is not None:
         return None
     # with the further columns that a hypothesis may be driven by
-    return _plan(found, found.search.found.retuned.fitted.compiled.model)
+    return _plan(found, found.search.found.retuned.outcome.fitted.compiled.model)
 
 
 def _open(found: Diagnosis) -> dict[str, tuple[Outcome, float]]:
     """Return the hypotheses that are probable enough, each with its best fit."""
-    searched, limits = found.search.found, found.search.limits
-    base, best = len(searched.retuned.effects), dict[str, Outcome]()
-    for one in (searched.retuned, *searched.tried):
-        name = "+".join(e.name for e in one.effects[base:]) or "none"
-        if name not in best or searched.score(one) < searched.score(best[name]):
+    searched, limits, score = found.search.found, found.search.limits, found.search.score
+    best: dict[str, JudgedEquations] = {}
+    for one in (searched.retuned, *searched.others):
+        name = "+".join(one.names) or "none"
+        if name not in best or score(one) < score(best[name]):
             best[name] = one
     alive = [c for c in found.candidates if c.name in best and c.probability >= limits.still_open]
-    return {c.name: (best[c.name], c.probability) for c in alive[: limits.most_open]}
+    return {c.name: (best[c.name].outcome, c.probability) for c in alive[: limits.most_open]}
 
 
 def _plan(found: Diagnosis, model: EquationModel) -> NextExperiment | None:
@@ -63,7 +64,7 @@ def _plan(found: Diagnosis, model: EquationModel) -> NextExperiment | None:
     alive = _open(found)
     if len(alive) < 2:
         return None
-    noise, most = max(found.search.found.noise.total_sd, 1e-300), 0.0
+    noise, most = max(found.search.found.best.noise.total_sd, 1e-300), 0.0
     best: Excitation | None = None
     for excitation, drive in _excitations(found, model):
         runs = [(_simulate(model, one, drive), p) for one, p in alive.values()]

@@ -21,8 +21,8 @@ import numpy as np
 from scipy.signal import lfilter, savgol_filter
 
 from autotune.batch.engine import cluster, run_all
-from autotune.diagnosis.selection.hypothesis import hypothesis, penalised
-from autotune.diagnosis.selection.search import search
+from autotune.diagnosis.selection.chain_proposals import search_chain
+from autotune.diagnosis.selection.hypothesis import hypothesis
 from autotune.model_tables import read_model
 from autotune.recording import read_recording
 from sim.proof import Campaign, conceal, diagnose, forecast_nrmse, mark_all, seal
@@ -177,9 +177,9 @@ def criterion_only(case: Path) -> tuple[str, float]:
     """
     recordings = [read_recording(case / f"{name}.csv") for name in ("rec1", "rec2")]
     good = [np.isfinite(r.y) for r in recordings]
-    found = search(read_model(case / "model.toml"), recordings, good)
-    ranked = sorted((hypothesis(j.fit) for j in found.judged if len(j.names) < 2), key=penalised)
-    weight = 1.0 / sum(np.exp(0.5 * (penalised(ranked[0]) - penalised(h))) for h in ranked)
+    found = search_chain(read_model(case / "model.toml"), recordings, good)
+    ranked = sorted((hypothesis(j.fit) for j in found.judged if len(j.names) < 2), key=lambda h: h.penalised_chi2)
+    weight = 1.0 / sum(np.exp(0.5 * (ranked[0].penalised_chi2 - h.penalised_chi2)) for h in ranked)
     return "+".join(ranked[0].names), float(weight)
 
 

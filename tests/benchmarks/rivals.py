@@ -24,8 +24,8 @@ from typing import Any
 import numpy as np
 
 from autotune.diagnosis.fitting.retuning import prepare
-from autotune.diagnosis.selection.hypothesis import hypothesis, penalised
-from autotune.diagnosis.selection.search import search
+from autotune.diagnosis.selection.chain_proposals import search_chain
+from autotune.diagnosis.selection.hypothesis import hypothesis
 from autotune.diagnosis.simulation.forecast import forecast
 from autotune.diagnosis.thresholds import IN_USE
 from autotune.errors import AutotuneError
@@ -89,8 +89,8 @@ def criterion(case: Case, folder: Path) -> Answer:
     The fits are this project's own; what is left out are left-out stretches, tests of adequacy and calibration.
     """
     recordings = [read_recording(path) for path in case.given]
-    found = search(read_model(case.model), recordings, [np.isfinite(r.y) for r in recordings])
-    best = min((hypothesis(j.fit) for j in found.judged if len(j.names) < 2), key=penalised)
+    found = search_chain(read_model(case.model), recordings, [np.isfinite(r.y) for r in recordings])
+    best = min((hypothesis(j.fit) for j in found.judged if len(j.names) < 2), key=lambda h: h.penalised_chi2)
     return best.names, _of_model(case, best.fit.model)
 
 

@@ -89,6 +89,11 @@ class Bench(ABC):
         self._dt_s = float(np.median(np.concatenate([np.diff(r.t) for r in recordings])))
         self._duration_s = max(float(r.t[-1] - r.t[0]) for r in recordings)
 
+    @property
+    def spread(self) -> float:
+        """Standard deviation of the readings that count, which errors are shares of."""
+        return float(np.nanstd(np.concatenate([r.y for r in self.recordings]))) or 1.0
+
     @abstractmethod
     def retuned(self) -> Outcome:
         """Return the model with its own numbers retuned."""

@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from types import MappingProxyType
-
-import numpy as np
 
 from autotune.arrays import BoolArray
 from autotune.diagnosis.equations.bench import Bench, Outcome
 from autotune.diagnosis.equations.closed import ClosedBench
 from autotune.diagnosis.equations.equation_bench import EquationBench
-from autotune.diagnosis.equations.judged import Searched
-from autotune.diagnosis.equations.scores import slow_power
+from autotune.diagnosis.equations.judged import JudgedEquations
+from autotune.diagnosis.equations.scores import slow_power, variance_ratio
 from autotune.diagnosis.equations.shown import EquationSearch
 from autotune.diagnosis.equations.sizes import command_of, spans_at, with_units
 from autotune.diagnosis.evidence.adequacy import ResidualTests
@@ -25,8 +23,8 @@ from autotune.diagnosis.evidence.samples import SampleEffect
 from autotune.diagnosis.readable import in_commands, readable
 from autotune.diagnosis.result import FoundEffect, Verdict
 from autotune.diagnosis.safe_extension import safe_extension
-from autotune.diagnosis.selection.judged import of_likely
-from autotune.diagnosis.selection.probability import Candidate, probability_of
+from autotune.diagnosis.selection.probability import probability_of
+from autotune.diagnosis.selection.search import Found
 from autotune.diagnosis.thresholds import Thresholds
 from autotune.diagnosis.verdict import Evidence
 from autotune.effects import kind_of
@@ -35,7 +33,6 @@ from autotune.equations.effects import equation_of
 from autotune.equations.files import forecast_any
 from autotune.equations.linearise import settles
 from autotune.equations.model import EquationModel
-from autotune.errors import InputError
 from autotune.models import Effect
 from autotune.recording import Recording
 
@@ -50,106 +47,62 @@ class EquationEvidence(Evidence):
         The nominal model.
     given : tuple of Recording
         What was measured, rows that samples spoil among them.
-    found : Searched
+    found : Found
         What the search found.
-    error_of : callable
-        Held-out error of a fit; kept, for it takes fits.
-    again : callable
-        Returns what other recordings show among some effects, beginning with a hypothesis of these ones.
     """
 
     model: EquationModel | BlackBox
     given: tuple[Recording, ...]
-    found: Searched
-    error_of: Callable[[Outcome], float]
-    again: Callable[[Sequence[Recording], Collection[str], Outcome], EquationEvidence]
+    found: Found[JudgedEquations]
 
     @cached_property
     def result(self) -> EquationSearch:
         """What the search found."""
         return EquationSearch(model=self.model, recordings=self.given, found=self.found)
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Effects of the hypothesis to go on with."""
-        return self.found.taken.names
-
     @cached_property
-    def candidates(self) -> tuple[Candidate, ...]:
-        """Every hypothesis with its probability, best first."""
-        return self.found.candidates(self.unknown_odds if self.residual.is_noise else self.limits.unknown_odds)
-
-    @property
-    def leading(self) -> tuple[tuple[str, ...], ...]:
-        """Effects of the leading hypotheses, the best first."""
-        own = len(self.model.effects)
-        return tuple(tuple(e.name for e in one.effects[own:]) for one in self.found.tried)
-
-    @property
-    def more_than_noise(self) -> bool:
-        """Whether something was found, or the retuned model leaves more than noise."""
-        return bool(self.names) or not (self.found.judged[0].leaves_noise or self.residual.accounted)
+    def quality(self) -> FitQuality:
+        """Errors on the last third of every recording, the numbers fitted to the rest."""
+        return self.found.quality(self.found.best.noise.total_sd / self.result.bench.spread)
 
     @property
     def leaves_noise(self) -> bool:
         """Whether what the chosen model leaves is noise."""
-        return self.found.taken.leaves_noise or self.residual.accounted
+        return self.found.chosen.leaves_noise or self.residual.accounted
 
     @property
     def numbers(self) -> float:
         """Decrease of chi-square that retuning brings beside the nominal numbers."""
-        return self.found.score(self.found.nominal) - self.found.score(self.found.retuned)
+        return self.result.score(self.found.nominal) - self.result.score(self.found.retuned)
 
-    def keeping(self, names: Collection[str]) -> EquationEvidence:
-        """Return the evidence with no other effects than those named: the hypothesis of them that was fitted."""
-        samples, found = tuple(s for s in self.samples if s.name in names), self.found
-        if not set(found.taken.names) <= set(names):
-            found = replace(found, taken=of_likely(found.judged, names))
-        return replace(
-            self, samples=samples, found=found, quality_of=lambda: held_out_quality(found, self.error_of, self.given),
-            residual=residual_left(found, samples),
-        )  # fmt: skip
-
-    def on(self, part: Sequence[Recording]) -> tuple[EquationEvidence | None, Collection[str]]:
-        """Return what a part of the recordings shows, and effects that it cannot tell."""
-        known = {name for one in self.found.judged for name in one.names} | {s.name for s in self.samples}
-        best = self.found.best
-        try:
-            there = self.again(part, known, best.outcome)
-            unfelt = {e.name for e in best.outcome.effects[best.own :] if not there.feels(e)}
-        except InputError:  # nothing runs there
-            return None, ()
-        return there, unfelt
-
-    def feels(self, effect: Effect) -> bool:
-        """Whether an effect changes what is read by as much as one row's noise: of others these rows tell nothing."""
-        change = self.found.bench.with_trial(self.found.retuned, effect)
-        return change is None or float(change @ change) > self.found.noise.total_sd**2
+    def going_on(self, best: JudgedEquations) -> EquationEvidence:
+        """Return the evidence with another hypothesis to go on with."""
+        found = replace(self.found, chosen=best)
+        return replace(self, found=found, residual=residual_left(found, self.samples))
 
     def described(self) -> list[tuple[float, FoundEffect]]:
         """Return the chosen effects as people read them."""
-        found, own = self.found, len(self.model.effects)
-        base = found.score(found.chosen)
-        scores = {frozenset(one.names): found.score(one.outcome) for one in found.judged}
-        described = []
-        for effect in found.chosen.effects[own:]:
-            rest = frozenset(self.names) - {effect.name}
-            described.append((scores.get(rest, found.score(found.retuned)) - base, self._described(effect)))
+        found, described = self.found, []
+        scores = {frozenset(one.names): self.result.score(one) for one in found.judged}
+        for effect in found.chosen.added:
+            without = scores.get(frozenset(self.names) - {effect.name}, self.result.score(found.retuned))
+            described.append((without - self.result.score(found.chosen), self._described(effect)))
         return described
 
     def _described(self, effect: Effect) -> FoundEffect:
-        named = with_units(self.found.bench.model, effect, self.model.output_unit)
+        named = with_units(self.result.bench.model, effect, self.model.output_unit)
         fitted = {k: q for k, q in named.parameters.items() if math.isfinite(q.sd) and q.sd != 0.0}
         shown = readable(replace(named, parameters=MappingProxyType(fitted or dict(named.parameters))))
-        command, unit = command_of(self.found.bench, self.found.chosen, effect), self.found.bench.model.inputs[0]
+        bench, chosen = self.result.bench, self.found.chosen.outcome
+        command, unit = command_of(bench, chosen, effect), bench.model.inputs[0]
         return FoundEffect(
             name=effect.name,
             probability=probability_of(effect.name, self.candidates, self.limits.most_probable),
             places=self.places(effect.name),
             parameters=MappingProxyType(shown),
-            equation=equation_of(self.found.bench.model, effect),
+            equation=equation_of(bench.model, effect),
             windows=self.acting(effect),
-            operating_range=spans_at(self.found.bench, self.found.chosen, effect),
+            operating_range=spans_at(bench, chosen, effect),
             as_command=MappingProxyType(in_commands(effect.name, shown, command, unit.unit) if command else {}),
             **{key: getattr(effect, key) for key in ("state", "port", "input", "column")},
         )
@@ -161,7 +114,7 @@ class EquationEvidence(Evidence):
 
         def error_of(changed: Sequence[Recording], good: Sequence[BoolArray]) -> float:
             bench = bench_of(self.model, changed, good, self.limits)
-            return bench.held_out_error(bench.retuned(), True) / spread_of(changed)
+            return bench.held_out_error(bench.retuned(), True) / bench.spread
 
         return misread_columns(self.given, self.model.inputs[0].offset, self.quality, self.limits, error_of)
 
@@ -172,7 +125,7 @@ class EquationEvidence(Evidence):
             return nominal, nominal
         lasting = not any(kind_of(name).at_a_time for name in self.names)
         comparable = lasting and (isinstance(nominal, BlackBox) or settles(nominal, self.given))
-        able = (wanted, _with_numbers(nominal, self.found.retuned))
+        able = (wanted, _with_numbers(nominal, self.found.retuned.outcome))
         return safe_extension(able, nominal, self.given, forecast_any, comparable=comparable), wanted
 
     def _wanted(self, verdict: Verdict) -> EquationModel | BlackBox:
@@ -181,10 +134,8 @@ class EquationEvidence(Evidence):
         if verdict == "none":
             return self.model
         if self.names and quality.is_better and verdict in ("effect", "unexplained"):
-            return _with_numbers(self.model, found.chosen)
-        stands = not self.names and self.more_than_noise
-        stands = stands and quality.retuned > (1.0 - self.limits.material_numbers) * quality.nominal
-        return self.model if stands else _with_numbers(self.model, found.retuned)
+            return _with_numbers(self.model, found.chosen.outcome)
+        return self.model if self.nominal_stands else _with_numbers(self.model, found.retuned.outcome)
 
 
 def bench_of(
@@ -196,28 +147,14 @@ def bench_of(
     return bench
 
 
-def spread_of(recordings: Sequence[Recording]) -> float:
-    """Return the spread of y, which errors are shares of."""
-    return float(np.nanstd(np.concatenate([r.y for r in recordings]))) or 1.0
-
-
-def held_out_quality(
-    found: Searched, error_of: Callable[[Outcome], float], recordings: Sequence[Recording]
-) -> FitQuality:
-    """Return errors on the last third of every recording, the numbers fitted to the rest."""
-    nominal, retuned, extended = (error_of(one) for one in (found.nominal, found.retuned, found.chosen))
-    noise = found.noise.total_sd / spread_of(recordings)
-    return FitQuality(nominal=nominal, retuned=retuned, extended=extended, noise_floor=noise)
-
-
-def residual_left(found: Searched, samples: Sequence[SampleEffect]) -> ResidualTests:
+def residual_left(found: Found[JudgedEquations], samples: Sequence[SampleEffect]) -> ResidualTests:
     """Return what the chosen model leaves; noise of some rows may account for a little more than all rows' has."""
-    ratio, chosen = found.variance_ratio(found.chosen), found.chosen
-    slow, chance = slow_power(chosen, found.taken.noise)
+    chosen = found.chosen.outcome
+    ratio, (slow, chance) = variance_ratio(chosen, found.best.noise), slow_power(chosen, found.chosen.noise)
     return ResidualTests(
         reduced_chi2=ratio, reduced_chi2_chance=math.sqrt(2.0 / chosen.residual.size), slow=slow, slow_chance=chance,
         uneven=any(kind_of(s.name).uneven for s in samples),
-        accounted=bool(samples) and ratio < found.limits.equation_astray, limits=found.limits,
+        accounted=bool(samples) and ratio < found.best.limits.equation_astray, limits=found.best.limits,
     )  # fmt: skip
 
 

@@ -2,29 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
-from functools import cache
+from collections.abc import Sequence
 
 import numpy as np
 
 from autotune.arrays import BoolArray
 from autotune.controller import Controller
 from autotune.diagnosis.equations.bench import Bench, Outcome
-from autotune.diagnosis.equations.evidence import (
-    EquationEvidence,
-    bench_of,
-    held_out_quality,
-    residual_left,
-    spread_of,
-)
-from autotune.diagnosis.equations.judged import Searched
-from autotune.diagnosis.equations.search import search
+from autotune.diagnosis.equations.equation_proposals import search_equations
+from autotune.diagnosis.equations.evidence import EquationEvidence, bench_of, residual_left
+from autotune.diagnosis.equations.judged import JudgedEquations
 from autotune.diagnosis.evidence.law import law_effect
 from autotune.diagnosis.evidence.sample_gain import SimulatedRows, is_material, select_supported
 from autotune.diagnosis.evidence.samples import SampleEffect, unspoiled_rows
 from autotune.diagnosis.evidence.spoiled_rows import clear_samples, search_beside
+from autotune.diagnosis.selection.search import Found
 from autotune.diagnosis.thresholds import Thresholds
-from autotune.effects import KINDS
 from autotune.equations.black_box import BlackBox
 from autotune.equations.model import EquationModel
 from autotune.progress import Progress, quiet
@@ -38,7 +31,7 @@ def evidence_of_equations(
     without: Sequence[str],
     progress: Progress,
     limits: Thresholds,
-    begun: Outcome | None = None,
+    begun: JudgedEquations | None = None,
 ) -> EquationEvidence:
     """Return all that the verdict rests on: samples, search, the residual, held-out rows.
 
@@ -46,7 +39,7 @@ def evidence_of_equations(
     ----------
     model, recordings, controller, without, progress, limits
         As in :func:`autotune.diagnosis.diagnose.diagnose`.
-    begun : Outcome, optional
+    begun : JudgedEquations, optional
         What predicted best on more rows: it is judged as well, from the numbers that it had there.
 
     Raises
@@ -60,28 +53,25 @@ def evidence_of_equations(
         bench = bench_of(model, recordings, good, limits)
         return _rows_of(bench.retuned(), recordings, bench)
 
-    def searched(seen: list[SampleEffect]) -> tuple[Searched, SimulatedRows]:
+    def searched(seen: list[SampleEffect]) -> tuple[Found[JudgedEquations], SimulatedRows]:
         bench = bench_of(model, recordings, unspoiled_rows(recordings, seen), limits)
-        found = search(bench, [*without, *(s.name for s in seen)], progress, begun)
-        return found, _rows_of(found.chosen, recordings, bench)
+        found = search_equations(bench, [*without, *(s.name for s in seen)], progress, begun)
+        return found, _rows_of(found.chosen.outcome, recordings, bench)
 
     seen = clear_samples(recordings, [name for name in without if name not in own], limits, retuned_rows)
     found, seen = search_beside(searched, seen, without)
-    run = _rows_of(found.chosen, recordings, found.bench)
+    run = _rows_of(found.chosen.outcome, recordings, found.best.bench)
     samples = [s for s in select_supported(seen, run) if s.name not in own]
-    samples = [s for s in samples if not found.taken.names or is_material(s, run)]
+    samples = [s for s in samples if not found.chosen.names or is_material(s, run)]
     law = law_effect(recordings, controller, limits)
     samples += [] if law is None or law.name in without else [law]
-    error_of = cache(lambda one: found.bench.held_out_error(one, one is not found.nominal) / spread_of(recordings))
-
-    def again(part: Sequence[Recording], known: Collection[str], begun: Outcome) -> EquationEvidence:
-        others = [*without, *(name for name in KINDS if name not in known)]
-        return evidence_of_equations(model, part, controller, others, quiet, limits, begun)
 
     return EquationEvidence(
         model=model, given=tuple(recordings), found=found, samples=tuple(samples),
-        residual=residual_left(found, samples), quality_of=cache(lambda: held_out_quality(found, error_of, recordings)),
-        error_of=error_of, again=again,
+        residual=residual_left(found, samples),
+        again=lambda part, more, then: evidence_of_equations(
+            model, part, controller, [*without, *more], quiet, limits, then
+        ),
     )  # fmt: skip
 
 

@@ -1,8 +1,9 @@
-"""Hypotheses of equations, judged as those of chains are, and what a search among them found."""
+"""Hypotheses of equations, judged as those of chains are."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -10,10 +11,10 @@ import numpy as np
 
 from autotune.diagnosis.equations.bench import Bench, Outcome
 from autotune.diagnosis.equations.candidates import key_of
-from autotune.diagnosis.equations.scores import innovations_variance, is_slow, noise_of, quick_score, variance_ratio
+from autotune.diagnosis.equations.scores import innovations_variance, is_noise, is_slow, noise_of
 from autotune.diagnosis.fitting.noise import Noise
-from autotune.diagnosis.selection.judged import Judged, probabilities
-from autotune.diagnosis.selection.probability import RARE, Candidate
+from autotune.diagnosis.selection.judged import Judged
+from autotune.diagnosis.selection.probability import RARE
 from autotune.diagnosis.thresholds import Thresholds
 from autotune.effects import kind_of
 from autotune.models import Effect
@@ -34,11 +35,19 @@ class JudgedEquations(Judged):
         Effects that the model has itself.
     bench : Bench
         What it was fitted on.
+    tuned : bool
+        Whether its numbers were fitted, or are the nominal ones.
     """
 
     outcome: Outcome
     own: int
     bench: Bench
+    tuned: bool = True
+
+    @property
+    def added(self) -> tuple[Effect, ...]:
+        """Its effects with their fitted values."""
+        return self.outcome.effects[self.own :]
 
     @property
     def limits(self) -> Thresholds:
@@ -54,10 +63,8 @@ class JudgedEquations(Judged):
     def leaves_noise(self) -> bool:
         """Whether what it leaves is noise: no more variance, no slow part, and stretches are foretold about as well."""
         outcome, limits = self.outcome, self.limits
-        chance = math.sqrt(2.0 / outcome.residual.size)
-        if self.noise.ar and self.noise.ar[0] > limits.slow_noise:
-            return False
-        if variance_ratio(outcome, self.noise) > limits.adequate_quick + chance or is_slow(outcome, self.noise, limits):
+        most = limits.adequate_quick + math.sqrt(2.0 / outcome.residual.size)
+        if not is_noise(self.bench, outcome, most) or is_slow(outcome, self.noise, limits):
             return False
         error = math.sqrt(float(self.long_squares.sum()) / outcome.residual.size)
         return error < limits.foretold * self.bench.grows * math.sqrt(outcome.rss / outcome.residual.size)
@@ -77,10 +84,21 @@ class JudgedEquations(Judged):
         """Numbers that were fitted, the model's own ones with them, which all hypotheses have."""
         return self.outcome.count
 
+    @cached_property
+    def error(self) -> float:
+        """Error on the last third of every recording, its numbers fitted to the rest, as a share of the spread of y."""
+        return self.bench.held_out_error(self.outcome, self.tuned) / self.bench.spread
+
+    def unfelt(self, effects: Sequence[Effect]) -> frozenset[str]:
+        """Return the effects that would change what is read by less than one row's noise does."""
+        changes = ((e.name, self.bench.with_trial(self.outcome, e)) for e in effects)
+        least = self.noise.total_sd**2
+        return frozenset(name for name, d in changes if d is not None and float(d @ d) <= least)
+
     @property
     def identity(self) -> frozenset[object]:
         """What tells hypotheses apart: an effect may act at several places."""
-        return frozenset(key_of(e) for e in self.outcome.effects[self.own :])
+        return frozenset(key_of(e) for e in self.added)
 
 
 def odds_of(effect: Effect) -> float:
@@ -100,65 +118,3 @@ def judge(bench: Bench, outcome: Outcome, own: int) -> JudgedEquations | None:
         names=tuple(e.name for e in added), long_squares=squares, short_squares=squares,
         log_odds=math.fsum(math.log(odds_of(e)) for e in added), outcome=outcome, own=own, bench=bench,
     )  # fmt: skip
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Searched:
-    """What a search found.
-
-    Attributes
-    ----------
-    nominal : Outcome
-        The model as it is.
-    judged : tuple of JudgedEquations
-        All that were judged, the model with its own numbers retuned first.
-    best, taken : JudgedEquations
-        What predicts best, for what it is, and what is left of it where parts of the recordings do not agree.
-    """
-
-    nominal: Outcome
-    judged: tuple[JudgedEquations, ...]
-    best: JudgedEquations
-    taken: JudgedEquations
-
-    @property
-    def limits(self) -> Thresholds:
-        """What decided."""
-        return self.best.limits
-
-    @property
-    def bench(self) -> Bench:
-        """The model on the rows that count."""
-        return self.best.bench
-
-    @property
-    def retuned(self) -> Outcome:
-        """The model with its own numbers retuned."""
-        return self.judged[0].outcome
-
-    @property
-    def chosen(self) -> Outcome:
-        """The model with the effects that are taken."""
-        return self.taken.outcome
-
-    @property
-    def tried(self) -> tuple[Outcome, ...]:
-        """All fits with effects, the one first that the least speaks against."""
-        return tuple(one.outcome for one in sorted(self.judged, key=lambda one: one.behind(self.best)) if one.names)
-
-    @property
-    def noise(self) -> Noise:
-        """What differences of the best residual show."""
-        return self.best.noise
-
-    def score(self, one: Outcome) -> float:
-        """Return Schwarz's criterion of a fit, up to a constant."""
-        return quick_score(one, self.noise)
-
-    def variance_ratio(self, one: Outcome) -> float:
-        """Return the residual's variance in units of the noise's."""
-        return variance_ratio(one, self.noise)
-
-    def candidates(self, unknown_odds: float) -> tuple[Candidate, ...]:
-        """Return the hypotheses with their probabilities, best first."""
-        return probabilities(self.judged, self.best, unknown_odds)

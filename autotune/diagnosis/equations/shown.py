@@ -8,13 +8,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from autotune.arrays import FloatArray
+from autotune.diagnosis.equations.bench import Bench
 from autotune.diagnosis.equations.equation_bench import EquationBench
 from autotune.diagnosis.equations.held_out import HELD_OUT, bounded_errors
-from autotune.diagnosis.equations.judged import Searched
+from autotune.diagnosis.equations.judged import JudgedEquations
 from autotune.diagnosis.equations.laws import line_in_equations
+from autotune.diagnosis.equations.scores import quick_score
 from autotune.diagnosis.evidence.missing_law import MissingLaw, law_of
 from autotune.diagnosis.evidence.unseen_run import UnseenRun
 from autotune.diagnosis.selection.retuned_numbers import RetunedNumber
+from autotune.diagnosis.selection.search import Found
 from autotune.diagnosis.thresholds import Thresholds
 from autotune.equations.black_box import BlackBox
 from autotune.equations.effects import where_told
@@ -34,18 +37,23 @@ class EquationSearch:
         The nominal model.
     recordings : tuple of Recording
         What was measured.
-    found : Searched
+    found : Found
         All hypotheses.
     """
 
     model: EquationModel | BlackBox
     recordings: tuple[Recording, ...]
-    found: Searched
+    found: Found[JudgedEquations]
+
+    @property
+    def bench(self) -> Bench:
+        """The model on the rows that count."""
+        return self.found.best.bench
 
     @property
     def limits(self) -> Thresholds:
         """What decided."""
-        return self.found.limits
+        return self.found.best.limits
 
     @property
     def units(self) -> tuple[str, str]:
@@ -68,20 +76,20 @@ class EquationSearch:
     @property
     def has_effects(self) -> bool:
         """Whether the hypothesis to go on with has effects that the model lacks."""
-        return self.found.chosen is not self.found.retuned
+        return bool(self.found.chosen.names)
 
     def simulated(self) -> Mapping[str, tuple[FloatArray, ...]]:
         """Return the readings of every recording by the retuned and the extended model."""
         fits = {"retuned": self.found.retuned} | ({"extended": self.found.chosen} if self.has_effects else {})
-        return {name: one.fitted.simulated for name, one in fits.items()}
+        return {name: one.outcome.fitted.simulated for name, one in fits.items()}
 
     def runs(self) -> tuple[int, ...]:
         """Return in how many runs each recording was simulated."""
-        return tuple(w.starts.size for w in self.found.retuned.fitted.windows) or (1,) * len(self.recordings)
+        return tuple(w.starts.size for w in self.found.retuned.outcome.fitted.windows) or (1,) * len(self.recordings)
 
     def numbers(self) -> tuple[RetunedNumber, ...]:
         """Return the model's own numbers before and after."""
-        retuned, chosen = self.found.retuned.fitted, self.found.chosen.fitted
+        retuned, chosen = self.found.retuned.outcome.fitted, self.found.chosen.outcome.fitted
         each = zip(
             self.model.parameters, retuned.parameters, retuned.sd, chosen.parameters, chosen.sd, strict=False
         )  # fmt: skip
@@ -93,38 +101,43 @@ class EquationSearch:
 
     def combinations(self) -> list[Combination]:
         """Return the directions of the numbers by how well the recordings determine them, the least first."""
-        return combinations(self.found.chosen.fitted, len(self.model.parameters))
+        return combinations(self.found.chosen.outcome.fitted, len(self.model.parameters))
+
+    def score(self, one: JudgedEquations) -> float:
+        """Return Schwarz's criterion of a fit, up to a constant."""
+        return quick_score(one.outcome, self.found.best.noise)
 
     def hypotheses(self) -> list[tuple[str, float]]:
         """Return what was fitted to all rows with the decrease of chi-square, numbers paid for, the best first."""
-        found, own = self.found, len(self.model.effects)
-        base = found.score(found.retuned)
-        named = [(one, " + ".join(f"{e.name} at {where_told(e)}" for e in one.effects[own:])) for one in found.tried]
-        return sorted(((name, base - found.score(one)) for one, name in named), key=lambda pair: -pair[1])
+        base = self.score(self.found.retuned)
+        each = ((one, [f"{e.name} at {where_told(e)}" for e in one.added]) for one in self.found.others)
+        found = ((" + ".join(names), base - self.score(one)) for one, names in each)
+        return sorted(found, key=lambda pair: -pair[1])
 
     def laws(self) -> tuple[MissingLaw, ...]:
         """Return the laws of the chosen effects over their signals, with the data in bins."""
-        if not isinstance(self.found.bench, EquationBench):
+        if not isinstance(self.bench, EquationBench):
             return ()
-        chosen, own = self.found.chosen, len(self.model.effects)
-        lines = (line_in_equations(self.found.bench, chosen, i) for i in range(own, len(chosen.effects)))
+        chosen = self.found.chosen
+        numbers = range(chosen.own, len(chosen.outcome.effects))
+        lines = (line_in_equations(self.bench, chosen.outcome, i) for i in numbers)
         return tuple(law for law in map(law_of, lines) if law is not None)
 
     def unseen_run(self) -> UnseenRun | None:
         """Return runs through the last third of the longest recording, the numbers fitted to the rest of all."""
-        if not isinstance(self.found.bench, EquationBench):
+        if not isinstance(self.bench, EquationBench):
             return None
         number = int(np.argmax([len(r) for r in self.recordings]))
         fits = {"nominal": self.found.nominal, "retuned": self.found.retuned}
         fits |= {"extended": self.found.chosen} if self.has_effects else {}
-        found = {name: self.found.bench.held_out_runs(one, name != "nominal") for name, one in fits.items()}
+        found = {name: self.bench.held_out_runs(one.outcome, name != "nominal") for name, one in fits.items()}
         runs = {name: one[number] for name, one in found.items() if one}
         r = self.recordings[number]
         row = int((1.0 - HELD_OUT) * len(r))
         first = min((first for _, first in runs.values()), default=len(r))
         if first >= len(r):
             return None
-        y = self.found.bench.recordings[number].y
+        y = self.bench.recordings[number].y
         spread = float(np.nanstd(y[first:])) or 1.0
         errors = {name: bounded_errors(y, run, first) for name, (run, first) in runs.items()}
         return UnseenRun(

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from typing import TypeVar
+from typing import Self, TypeVar
 
 import numpy as np
 
@@ -80,7 +80,7 @@ class Bench:
         """What hypotheses are judged on beside long windows: short ones, or the same where one scale is enough."""
         return self.few if self.two_scales else self.long
 
-    def with_sd(self, long: float, short: float) -> Bench:
+    def with_sd(self, long: float, short: float) -> Self:
         """Return the bench with other standard deviations of the residual."""
         return replace(self, cuts=tuple(as_white(d, long) for d in self.cuts), few=as_white(self.few, short))
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,7 +9,7 @@ import numpy as np
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import Fit
 from autotune.effects import kind_of
-from autotune.effects.base import EffectKind, Fitted
+from autotune.effects.base import Fitted
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -26,11 +25,6 @@ class Hypothesis:
         return self.fit.parametrisation.effect_numbers
 
     @property
-    def kinds(self) -> tuple[EffectKind, ...]:
-        """What is known of its effects."""
-        return tuple(kind_of(name) for name in self.names)
-
-    @property
     def penalised_chi2(self) -> float:
         """The cost with what free numbers have to pay: ln N each of the effects', 1 each start state.
 
@@ -42,21 +36,6 @@ class Hypothesis:
 def hypothesis(fit: Fit) -> Hypothesis:
     """Return a fit as a hypothesis, named after the effects that its model has beyond the nominal one's."""
     return Hypothesis(names=tuple(e.name for e in fit.parametrisation.added), fit=fit)
-
-
-def penalised(h: Hypothesis) -> float:
-    """Return a hypothesis's penalised chi-square, to sort by."""
-    return h.penalised_chi2
-
-
-def best_of_each(found: Sequence[Hypothesis]) -> list[Hypothesis]:
-    """Return the better fit of every combination of effects, best first."""
-    best: dict[frozenset[str], Hypothesis] = {}
-    for h in found:
-        key = frozenset(h.names)
-        if key not in best or penalised(h) < penalised(best[key]):
-            best[key] = h
-    return sorted(best.values(), key=penalised)
 
 
 def is_stand_in(h: Hypothesis, data: Data) -> bool:
@@ -87,7 +66,7 @@ def contradicted_effects(h: Hypothesis, data: Data) -> frozenset[str]:
     of the noise (a transmitter at its end, read through a noisy line) looks the same: ask only where a rig's noise is
     known to be in front of it, or where model error rules and a limit may stand for what it is not.
     """
-    able = frozenset(kind.name for kind in h.kinds if kind.flattens)
+    able = frozenset(name for name in h.names if kind_of(name).flattens)
     if not able:
         return able
     held, moving = [np.zeros(0)], [np.zeros(0)]

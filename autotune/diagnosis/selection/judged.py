@@ -8,16 +8,17 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from statistics import fmean
-from typing import TypeVar
+from typing import Self, TypeVar
 
 from autotune.arrays import FloatArray
 from autotune.diagnosis.evidence.stretches import STRETCHES, reduction
 from autotune.diagnosis.selection.probability import Candidate, weighed
 from autotune.diagnosis.thresholds import Thresholds
 from autotune.effects import called
+from autotune.models import Effect
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -66,8 +67,26 @@ class Judged(ABC):
 
     @property
     @abstractmethod
+    def error(self) -> float:
+        """Error on rows that were not fitted, as a share of the spread of y."""
+
+    @property
+    @abstractmethod
+    def added(self) -> tuple[Effect, ...]:
+        """Its effects with their fitted values."""
+
+    @abstractmethod
+    def unfelt(self, effects: Sequence[Effect]) -> frozenset[str]:
+        """Return the effects that would change what is read by less than one row of what it leaves."""
+
+    @property
+    @abstractmethod
     def identity(self) -> frozenset[object]:
         """What tells hypotheses apart that are fitted."""
+
+    def spread_out(self) -> Self:
+        """Return it with all rows of the recordings, where it was fitted to a part of them."""
+        return self
 
     @property
     def log_squares(self) -> float:
@@ -139,30 +158,6 @@ def leading(found: Sequence[_J], count: int) -> list[_J]:
     for one in rank(found):
         best.setdefault(one.identity, one)
     return list(best.values())[:count]
-
-
-def add_smaller(
-    found: Sequence[_J], count: int, rounds: int, smaller: Callable[[Sequence[_J], Sequence[_J]], list[_J]]
-) -> list[_J]:
-    """Return hypotheses with those that the leading ones become when an effect is left out, and again of these.
-
-    Parameters
-    ----------
-    found : sequence of Judged
-        What a search came to, effect by effect: one may have stood for another, or only led out of a local minimum.
-    count, rounds : int
-        How many lead, and how often they are gone over at most.
-    smaller : callable
-        Given hypotheses of several effects and all that are known, returns what they become.
-    """
-    result, done = list(found), set()
-    for _ in range(rounds):
-        fresh = [one for one in leading(result, count) if len(one.names) > 1 and id(one) not in done]
-        if not fresh:
-            break
-        done |= {id(one) for one in fresh}
-        result += smaller(fresh, result)
-    return result
 
 
 def built_on(found: Sequence[_J], count: int) -> list[_J]:

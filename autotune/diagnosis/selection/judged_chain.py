@@ -19,9 +19,9 @@ from autotune.diagnosis.fitting.long_windows import spread_of
 from autotune.diagnosis.fitting.retuning import reduced_chi2, under_noise
 from autotune.diagnosis.fitting.spreading import spread_out
 from autotune.diagnosis.selection.hypothesis import Hypothesis
-from autotune.diagnosis.selection.judged import Judged, probabilities
+from autotune.diagnosis.selection.judged import Judged
 from autotune.diagnosis.selection.prediction import extend
-from autotune.diagnosis.selection.probability import Candidate
+from autotune.diagnosis.selection.search import Found
 from autotune.diagnosis.selection.searched import Search
 from autotune.diagnosis.thresholds import Thresholds
 from autotune.models import Effect
@@ -53,6 +53,11 @@ class JudgedChain(Judged):
     def rows(self) -> int:
         """Rows that it was fitted to."""
         return self.fit.rows
+
+    @property
+    def added(self) -> tuple[Effect, ...]:
+        """Its effects with their fitted values."""
+        return self.fit.model.effects[self.fit.parametrisation.own :]
 
     @property
     def numbers(self) -> int:
@@ -129,85 +134,55 @@ def at_both_scales(one: JudgedChain, found: Sequence[JudgedChain]) -> JudgedChai
     return replace(one, fit=replace(far, covariance=joint.covariance))
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Found:
-    """What a search found.
+def as_search(found: Found[JudgedChain]) -> Search:
+    """Return what a search found in the form that pages and planning know."""
+    chosen = found.chosen
 
-    Attributes
+    def scaled(one: JudgedChain) -> Fit:
+        # chi-square in units of the residual that the chosen hypothesis was fitted at
+        return replace(one.fit, chi2=one.fit.chi2 * (one.data.noise.sd / chosen.data.noise.sd) ** 2)
+
+    return Search(
+        data=chosen.data,
+        nominal=scaled(found.nominal),
+        retuned=Hypothesis(names=(), fit=scaled(found.retuned)),
+        others=tuple(Hypothesis(names=one.names, fit=scaled(one)) for one in found.others),
+        chosen=Hypothesis(names=chosen.names, fit=chosen.fit),
+    )
+
+
+def gained(found: Found[JudgedChain]) -> float:
+    """Return twice the log likelihood ratio of what was chosen beside the retuned model, every row a witness."""
+    left, before = (rms(j.fit.residuals, j.data.good) for j in (found.chosen, found.retuned))
+    return 2.0 * found.chosen.fit.rows * math.log(before / left)
+
+
+def quality(found: Found[JudgedChain], noise_floor: float) -> FitQuality:
+    """Return errors beside the noise of the retuned model from row to row, or of the chosen one where that is less.
+
+    Parameters
     ----------
-    nominal, retuned : JudgedChain
-        The nominal structure with the operating point fitted alone, and all its numbers.
-    judged : tuple of JudgedChain
-        All that were judged, the retuned one first.
-    best : JudgedChain
-        The one that predicts best, for what it is.
-    chosen : JudgedChain
-        The one to go on with: the best one, or what is left of it where parts of the recordings do not agree.
+    found : Found
+        What a search found.
+    noise_floor : float
+        What the retuned model shows, as a share of the spread of y: a missing sign looks like noise there.
     """
+    chosen = found.chosen
+    shown = under_noise(chosen.fit, chosen.data).noise.total_sd / spread_of(chosen.data)
+    return found.quality(min(noise_floor, shown))
 
-    nominal: JudgedChain
-    retuned: JudgedChain
-    judged: tuple[JudgedChain, ...]
-    best: JudgedChain
-    chosen: JudgedChain
 
-    def as_search(self) -> Search:
-        """Return the hypotheses in the form that pages and planning know."""
-        order = sorted(self.judged, key=lambda j: j.behind(self.chosen))
-        return Search(
-            data=self.chosen.data,
-            nominal=self._scaled(self.nominal),
-            retuned=Hypothesis(names=(), fit=self._scaled(self.retuned)),
-            others=tuple(Hypothesis(names=one.names, fit=self._scaled(one)) for one in order if one.names),
-            chosen=Hypothesis(names=self.chosen.names, fit=self.chosen.fit),
-        )
+def varies_more(found: Found[JudgedChain]) -> bool:
+    """Whether what varies beside chosen effects that leave noise explains more than it may where they are true.
 
-    def _scaled(self, one: JudgedChain) -> Fit:
-        """Return a fit with its chi-square in units of the residual that the chosen hypothesis was fitted at."""
-        return replace(one.fit, chi2=one.fit.chi2 * (one.data.noise.sd / self.chosen.data.noise.sd) ** 2)
-
-    @property
-    def gained(self) -> float:
-        """Twice the log likelihood ratio of the chosen hypothesis beside the retuned model, every row a witness."""
-        left, before = (rms(j.fit.residuals, j.data.good) for j in (self.chosen, self.retuned))
-        return 2.0 * self.chosen.fit.rows * math.log(before / left)
-
-    def candidates(self, unknown_odds: float) -> tuple[Candidate, ...]:
-        """Return every hypothesis with its probability: what chose it weighs here too."""
-        return probabilities(self.judged, self.best, unknown_odds)
-
-    def quality(self, noise_floor: float) -> FitQuality:
-        """Return errors of free runs through stretches that were left out, beside the noise.
-
-        Parameters
-        ----------
-        noise_floor : float
-            What the retuned model's residual shows from row to row, as a share of the spread of y: a missing sign looks
-            like noise there. What the chosen hypothesis leaves counts where it is less.
-        """
-        shown = under_noise(self.chosen.fit, self.chosen.data).noise.total_sd / spread_of(self.chosen.data)
-        return FitQuality(
-            nominal=self.nominal.error,
-            retuned=self.retuned.error,
-            extended=self.chosen.error,
-            noise_floor=min(noise_floor, shown),
-        )
-
-    def varies_more(self, limits: Thresholds) -> bool:
-        """Whether what varies beside chosen effects that leave noise explains more than it may where they are true.
-
-        It may be a share of what was gained, which simulations are wrong by. Where the model's error decides, much
-        varies beside what is true as well, and says nothing.
-        """
-        chosen, before = self.chosen, rms(self.retuned.fit.residuals, self.retuned.data.good)
-        if not chosen.names or not chosen.leaves_noise:
-            return False
-        share = before**2 / rms(chosen.fit.residuals, chosen.data.good) ** 2 - 1.0
-        gained = max(share, 0.0) * sum(int(g.sum()) for g in chosen.data.good)
-        left = largest_variation(chosen.fit, under_noise(chosen.fit, chosen.data)).gain
-        return left > max(limits.inconstant, limits.inconstant_share * gained)
-
-    def keeps_nominal(self, share: float) -> bool:
-        """Whether the nominal numbers predict about as well as those retuned, so that they stand."""
-        ratio = float(self.retuned.long_squares.sum() / self.nominal.long_squares.sum())
-        return not self.chosen.names and math.sqrt(ratio) > 1.0 - share
+    It may be a share of what was gained, which simulations are wrong by. Where the model's error decides, much varies
+    beside what is true as well, and says nothing.
+    """
+    chosen, limits = found.chosen, found.chosen.limits
+    if not chosen.names or not chosen.leaves_noise:
+        return False
+    before = rms(found.retuned.fit.residuals, found.retuned.data.good)
+    share = before**2 / rms(chosen.fit.residuals, chosen.data.good) ** 2 - 1.0
+    explained = max(share, 0.0) * sum(int(g.sum()) for g in chosen.data.good)
+    left = largest_variation(chosen.fit, under_noise(chosen.fit, chosen.data)).gain
+    return left > max(limits.inconstant, limits.inconstant_share * explained)

@@ -13,7 +13,7 @@ from autotune.diagnosis.evidence.missing_law import MissingLaw, law_of
 from autotune.diagnosis.evidence.unseen_run import UnseenRun, unseen_run
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import Fit
-from autotune.diagnosis.selection.hypothesis import Hypothesis, best_of_each, penalised
+from autotune.diagnosis.selection.hypothesis import Hypothesis
 from autotune.diagnosis.selection.retuned_numbers import RetunedNumber, retuned_numbers
 from autotune.diagnosis.thresholds import Thresholds
 from autotune.effects import kind_of
@@ -97,7 +97,8 @@ class Search:
     def combinations(self) -> list[Combination]:
         """Return the directions of the numbers by how well the recordings determine them, the least first."""
         result = self.chosen.fit
-        called = dict(zip(self._own(self.retuned.fit), self.numbers(), strict=True))
+        own = (f.name for f in self.retuned.fit.parametrisation.free if f.kind != "effect")
+        called = dict(zip(own, self.numbers(), strict=True))
         free = result.parametrisation.free
         told = [i for i, f in enumerate(free) if f.name in called and np.isfinite(f.spread) and f.spread > 0.0]
         spread = np.array([free[i].spread for i in told])
@@ -105,15 +106,12 @@ class Search:
         names = [f"{called[free[i].name].block} {called[free[i].name].name}" for i in told]
         return determined(believed, spread, names)
 
-    @staticmethod
-    def _own(result: Fit) -> list[str]:
-        """Return the free numbers of a fit that are the chain's own."""
-        return [f.name for f in result.parametrisation.free if f.kind != "effect"]
-
     def hypotheses(self) -> list[tuple[str, float]]:
         """Return combinations of effects with the decrease of chi-square, numbers paid for, the best first."""
-        base = penalised(self.retuned)
-        return [(" + ".join(h.names), base - penalised(h)) for h in best_of_each(self.others)]
+        order = sorted(self.others, key=lambda h: h.penalised_chi2)
+        best = {frozenset(h.names): h for h in reversed(order)}  # the better fit of each
+        base = self.retuned.penalised_chi2
+        return [(" + ".join(h.names), base - h.penalised_chi2) for h in order if h is best[frozenset(h.names)]]
 
     def laws(self) -> tuple[MissingLaw, ...]:
         """Return the laws of the chosen effects over their signals, with the data in bins."""

@@ -9,6 +9,7 @@ import pytest
 from autotune.diagnosis.chain_evidence import ChainEvidence
 from autotune.diagnosis.findings import found_effects, left_open
 from autotune.diagnosis.gathering import evidence_of
+from autotune.diagnosis.selection.judged_chain import as_search
 from autotune.diagnosis.thresholds import IN_USE
 from autotune.diagnosis.verdict import judged
 from autotune.effects import CATALOGUE
@@ -45,6 +46,6 @@ def test_a_likely_effect_is_kept_though_the_leading_hypothesis_has_none(evidence
     """What is in many hypotheses may be likelier than not where no one of them leads."""
     assert evidence.found is not None
     found = replace(evidence.found, chosen=evidence.found.retuned)
-    leads = replace(evidence, found=found, search=found.as_search())
+    leads = replace(evidence, found=found, search=as_search(found))
     assert leads.keeping({DRAG}).search.chosen.names == (DRAG,)
     assert leads.keeping(set()).search.chosen.names == ()

@@ -190,9 +190,9 @@ def test_an_extended_model_that_runs_away_is_not_handed_out() -> None:
         name="plant.quadratic_drag", parameters={"coefficient": Parameter(value=-40.0)}, state="x"
     )  # fmt: skip
     found = evidence.found
-    chosen = replace(found.taken, names=(away.name,), outcome=replace(found.chosen, effects=(away,)))
-    quality = replace(evidence.quality, extended=0.0)
-    dangerous = replace(evidence, found=replace(found, taken=chosen), quality_of=lambda: quality)
+    chosen = replace(found.chosen, names=(away.name,), outcome=replace(found.chosen.outcome, effects=(away,)))
+    vars(chosen)["error"] = 0.0  # as if it foretold rows left out: only how it runs is against it
+    dangerous = replace(evidence, found=replace(found, chosen=chosen))
     handed_out, wanted = dangerous.handed_out("effect")
     assert isinstance(wanted, EquationModel)
     assert [e.name for e in wanted.effects] == [away.name]

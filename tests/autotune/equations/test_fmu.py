@@ -149,4 +149,4 @@ def test_a_step_function_is_retuned_like_any_model() -> None:
     noisy = y + np.random.default_rng(5).normal(0.0, 0.01, 400)
     found = diagnose(box, [Recording(t=t, u=u, y=noisy)])
     assert found.verdict == "parameters"
-    np.testing.assert_allclose(found.search.found.chosen.fitted.parameters, [2.5, 0.4], rtol=0.02)
+    np.testing.assert_allclose(found.search.found.chosen.outcome.fitted.parameters, [2.5, 0.4], rtol=0.02)

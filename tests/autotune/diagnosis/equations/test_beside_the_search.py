@@ -108,7 +108,7 @@ def test_spikes_smaller_than_the_reading_moves_are_found_in_what_a_simulation_le
     assert found.verdict == "effect"
     (outliers,) = found.effects
     assert outliers.name == "sensor.outliers"
-    rest = found.search.data.good[0] if of_chain else np.isfinite(found.search.found.bench.recordings[0].y)
+    rest = found.search.data.good[0] if of_chain else np.isfinite(found.search.bench.recordings[0].y)
     spared = np.flatnonzero(~rest)
     # a chain's start takes its first rows
     assert set(spared[spared > 10]) == set(struck)

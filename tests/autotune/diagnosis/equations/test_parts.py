@@ -12,8 +12,8 @@ from autotune.arrays import FloatArray
 from autotune.diagnosis import diagnose
 from autotune.diagnosis.equations.bench import Outcome
 from autotune.diagnosis.equations.equation_bench import EquationBench
+from autotune.diagnosis.equations.equation_proposals import _lengthen
 from autotune.diagnosis.equations.parts import telling_windows
-from autotune.diagnosis.equations.search import _lengthen
 from autotune.equations import Drive, compile_model, simulate
 from autotune.equations.effects import compile_with
 from autotune.errors import InputError
@@ -55,7 +55,7 @@ def test_an_effect_is_sought_on_a_part_and_judged_on_all_rows() -> None:
     found = diagnose(LAG, recordings)
     assert [e.name for e in found.effects] == ["actuator.saturation"]
     assert found.effects[0].parameters["high"].value == pytest.approx(0.3, abs=0.01)
-    assert all(one.residual.size == 6000 for one in (found.search.found.chosen, *found.search.found.tried))
+    assert all(one.rows == 6000 for one in found.search.found.judged)
     assert found.fit.extended == pytest.approx(found.fit.noise_floor, rel=0.1)
 
 
@@ -88,7 +88,7 @@ def test_gravity_that_a_spring_stands_for_is_one_number() -> None:
     assert (gravity.name, gravity.state) == ("plant.sine_torque", "omega")
     assert set(gravity.parameters) == {"amplitude", "period"}
     # in units of the derivative: m g l / J
-    J = found.search.found.chosen.fitted.parameters[0]
+    J = found.search.found.chosen.outcome.fitted.parameters[0]
     assert gravity.parameters["amplitude"].value * J == pytest.approx(0.5 * 9.81 * 0.3, rel=0.05)
 
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from autotune.diagnosis.evidence.samples import inspect
 from autotune.diagnosis.fitting.descent import freed_of
 from autotune.diagnosis.fitting.windows import window_rows
-from autotune.diagnosis.selection.search import search
+from autotune.diagnosis.selection.chain_proposals import search_chain
 from autotune.diagnosis.thresholds import IN_USE
 from autotune.effects import ALL
 from autotune.recording import Recording
@@ -32,7 +32,7 @@ def test_windows_cut_a_recording_without_gap_into_enough_parts(length_s: float) 
 def test_a_spring_that_short_windows_forgive_is_found_on_longer_ones() -> None:
     r = [servo_recording(seed, lambda x, v: -0.00032 * x, rows=3000) for seed in (1, 2)]
     few = ("plant.leak", "sensor.lag", "plant.quadratic_drag", "environment.step_load")
-    found = search(servo_model(), r, inspect(r)[0], [k.name for k in ALL if k.name not in few])
+    found = search_chain(servo_model(), r, inspect(r)[0], [k.name for k in ALL if k.name not in few])
     assert found.chosen.names == ("plant.leak",)
     p, covariance = found.chosen.fit.parametrisation, found.chosen.fit.covariance
     (i,) = (k for k, f in enumerate(p.free) if f.kind == "effect")

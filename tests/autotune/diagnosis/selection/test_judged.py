@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from autotune.diagnosis.evidence.stretches import STRETCHES
 from autotune.diagnosis.selection.judged import Judged, built_on, of_likely, probabilities, rank
 from autotune.diagnosis.selection.probability import probability_of
 from autotune.diagnosis.thresholds import IN_USE, Thresholds
+from autotune.models import Effect
 
 LAG, READING_LAG = "actuator.lag", "sensor.lag"
 GRAVITY, DRY, CURVED, DROPPING = (
@@ -28,7 +30,11 @@ class Astray(Judged):
 
     leaves_noise = False
     limits: Thresholds = IN_USE
-    variance, rows, numbers = math.nan, 0, 0
+    variance, rows, numbers, error, added = math.nan, 0, 0, 1.0, ()
+
+    def unfelt(self, effects: Sequence[Effect]) -> frozenset[str]:
+        """Return none: every effect would be felt."""
+        return frozenset()
 
     @property
     def identity(self) -> frozenset[object]:

@@ -12,9 +12,9 @@ from autotune.diagnosis import diagnose
 from autotune.diagnosis.agreement import NAMED
 from autotune.diagnosis.fitting.fit import fit
 from autotune.diagnosis.fitting.retuning import prepare
+from autotune.diagnosis.selection.chain_proposals import search_chain
 from autotune.diagnosis.selection.judged_chain import JudgedChain, at_both_scales
 from autotune.diagnosis.selection.prediction import extend
-from autotune.diagnosis.selection.search import search
 from autotune.diagnosis.simulation.chain import build_chain
 from autotune.diagnosis.thresholds import IN_USE
 from autotune.effects import ALL, taken_by
@@ -57,7 +57,7 @@ def good(recording: Recording):
 
 def test_gravity_and_dry_friction_of_a_pendulum_are_both_named_from_one_free_swing():
     recording = swing(gravity=22.0, friction=0.25, damping=0.02)
-    found = search(pendulum(20.0, 0.1), [recording], good(recording))
+    found = search_chain(pendulum(20.0, 0.1), [recording], good(recording))
     assert set(found.chosen.names) >= {"plant.sine_torque", "plant.coulomb_friction"}
     assert found.chosen.error < 0.05 * found.retuned.error
 
@@ -81,7 +81,7 @@ def test_a_linear_oscillation_is_given_no_effect():
     t = 0.01 * np.arange(1500)
     y = 0.5 * np.exp(-0.15 * t) * np.cos(4.7 * t) + 0.01 * rng.normal(size=t.size)
     recording = Recording(t=t, u=np.zeros(t.size), y=y)
-    found = search(pendulum(21.0, 0.25), [recording], good(recording))
+    found = search_chain(pendulum(21.0, 0.25), [recording], good(recording))
     assert found.chosen.names == ()
 
 
@@ -116,7 +116,7 @@ def test_a_long_record_of_what_swings_is_searched_in_windows_that_differ_from_sc
     block = Block(name="plant", place="plant", dynamics=TransferFunction(num=(400.0,), den=(1.0, 6.0, 400.0)))
     model = Model(name="oscillator", input=Port(), output=Port(), blocks=(block,))
     names = [k.name for k in ALL if k.name != "plant.cubic_stiffness"]
-    found = search(model, [recording], good(recording), left_out=names)
+    found = search_chain(model, [recording], good(recording), left_out=names)
     assert found.chosen.names == ("plant.cubic_stiffness",)
 
 
@@ -170,7 +170,7 @@ def test_what_stands_for_something_else_once_it_is_fitted_to_the_end_is_not_judg
         names=("plant.resonance",), fit=known, short=known, data=data, few=data, long_squares=np.ones(8),
         short_squares=np.ones(8), log_odds=0.0,
     )  # fmt: skip
-    found = search(model, [recording], good(recording), begun=begun)
+    found = search_chain(model, [recording], good(recording), begun=begun)
     assert ("plant.resonance",) not in {one.names for one in found.judged}
     assert set(found.chosen.names) == {"actuator.lag", "sensor.lag"}
     lags = {e.name: e.parameters["time_constant"].value for e in found.chosen.fit.model.effects}
@@ -180,9 +180,9 @@ def test_what_stands_for_something_else_once_it_is_fitted_to_the_end_is_not_judg
 def test_what_predicted_best_on_more_rows_is_judged_on_fewer_though_their_own_search_misses_it():
     recording = swing(gravity=22.0, friction=0.25, damping=0.02)
     model = pendulum(20.0, 0.1)
-    whole = search(model, [recording], good(recording)).chosen
+    whole = search_chain(model, [recording], good(recording)).chosen
     part = recording.only(np.arange(int(0.8 * len(recording))))
-    found = search(model, [part], good(part), left_out=whole.names, begun=whole)
+    found = search_chain(model, [part], good(part), left_out=whole.names, begun=whole)
     assert found.chosen.names == whole.names
     assert found.chosen.log_odds == whole.log_odds
 
@@ -228,7 +228,7 @@ def test_numbers_of_what_integrates_do_not_hang_on_which_of_its_fits_is_taken():
     model = Model(name="carriage", input=Port(unit="A"), output=Port(unit="m"), blocks=blocks)
     recording = carriage(1.2, 1.3)
     friction = "plant.coulomb_friction"
-    found = search(model, [recording], good(recording), left_out=[k.name for k in ALL if k.name != friction])
+    found = search_chain(model, [recording], good(recording), left_out=[k.name for k in ALL if k.name != friction])
     best = next(j for j in found.judged if j.names == (friction,))
     far = best.fit.theta + np.array([f.kind == "effect" for f in best.fit.parametrisation.free]) * math.log(6.0)
     held = np.zeros(far.size, dtype=bool)

@@ -16,10 +16,10 @@ from autotune.diagnosis.fitting.fit import fit
 from autotune.diagnosis.fitting.parameters import effect_with
 from autotune.diagnosis.fitting.restarts import realign_effects
 from autotune.diagnosis.fitting.retuning import prepare
+from autotune.diagnosis.selection.chain_proposals import search_chain
 from autotune.diagnosis.selection.hypothesis import Hypothesis, is_stand_in
 from autotune.diagnosis.selection.prediction import extend
 from autotune.diagnosis.selection.scan import search_starts
-from autotune.diagnosis.selection.search import search
 from autotune.diagnosis.thresholds import IN_USE
 from autotune.effects import ALL, CATALOGUE
 from autotune.models import Block, Effect, Model, Port, TransferFunction
@@ -152,7 +152,7 @@ def test_a_converter_that_is_off_its_levels_is_moved_onto_them() -> None:
 def test_what_a_slow_mode_explains_better_than_any_effect_is_named_after_none() -> None:
     r = [tank(0.08, 5), tank(0.08, 6)]
     few = ("plant.hysteresis", "environment.drifting_load", "actuator.lag")
-    found = search(lag(11.0), r, inspect(r)[0], [k.name for k in ALL if k.name not in (*few, "plant.slow_mode")])
+    found = search_chain(lag(11.0), r, inspect(r)[0], [k.name for k in ALL if k.name not in (*few, "plant.slow_mode")])
     assert found.chosen.names == ("plant.slow_mode",)
     assert diagnose(lag(11.0), r, without=[name for name in CATALOGUE if name not in few]).effects == ()
 
@@ -186,7 +186,7 @@ def test_a_spring_by_another_name_is_refused(name: str, values: Callable[[float]
 def test_a_cogging_torque_that_was_travelled_over_is_no_stand_in() -> None:
     r = [servo_recording(seed, lambda x, v: -0.1 * float(np.sin(2.0 * np.pi * x))) for seed in (1, 2)]
     few = ("plant.sine_torque", "plant.leak")
-    found = search(servo_model(), r, inspect(r)[0], [k.name for k in ALL if k.name not in few])
+    found = search_chain(servo_model(), r, inspect(r)[0], [k.name for k in ALL if k.name not in few])
     assert found.chosen.names == ("plant.sine_torque",)
     assert found.chosen.fit.model.effects[0].parameters["period"].value == pytest.approx(1.0, rel=0.01)
 
@@ -202,8 +202,9 @@ def test_of_a_long_recording_some_windows_tell_the_same() -> None:
     every = [np.ones(rows, dtype=bool)]
     few = ("actuator.saturation", "actuator.nonlinear_gain", "actuator.lag")
     without = [k.name for k in ALL if k.name not in few]
-    found = search(lag(1.0), [recording], every, without, limits=replace(IN_USE, searched_rows=1000, rig_rows=600))
-    whole = search(lag(1.0), [recording], every, without)
+    limits = replace(IN_USE, searched_rows=1000, rig_rows=600)
+    found = search_chain(lag(1.0), [recording], every, without, limits=limits)
+    whole = search_chain(lag(1.0), [recording], every, without)
     assert found.chosen.names == whole.chosen.names == ("actuator.saturation",)
     assert found.chosen.fit.residuals[0].size == rows
     np.testing.assert_allclose(found.chosen.fit.theta, whole.chosen.fit.theta, rtol=2e-2, atol=2e-2)

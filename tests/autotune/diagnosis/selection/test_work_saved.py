@@ -11,7 +11,7 @@ from autotune.diagnosis.fitting.bases import basis, determined
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.noise import Noise
 from autotune.diagnosis.selection.bench import at_once
-from autotune.diagnosis.selection.search import search
+from autotune.diagnosis.selection.chain_proposals import search_chain
 from autotune.diagnosis.simulation.assembly import assemble
 from autotune.diagnosis.thresholds import IN_USE
 from autotune.effects import ALL
@@ -82,6 +82,6 @@ def test_tasks_side_by_side_keep_their_order() -> None:
 def test_a_rig_is_given_a_second_effect_only_where_more_than_noise_is_left(sensor_lag_s: float, pairs: bool) -> None:
     recording = recorded(drag=1.0, sensor_lag_s=sensor_lag_s)
     names = [k.name for k in ALL if k.name not in ("plant.quadratic_drag", "sensor.lag")]
-    found = search(lag(), [recording], [np.ones(ROWS, dtype=bool)], left_out=names)
+    found = search_chain(lag(), [recording], [np.ones(ROWS, dtype=bool)], left_out=names)
     assert "plant.quadratic_drag" in found.chosen.names
     assert (set(found.chosen.names) == {"plant.quadratic_drag", "sensor.lag"}) is pairs

@@ -1,16 +1,22 @@
-"""First order screens every effect at every place, fits follow, and what they leave decides, as it does for chains."""
+"""What a search among equations proposes: first order screens every effect at every place, and fits follow.
+
+Where the best fit is far from the noise, the model may lie in a wrong minimum, from which no first order leads out:
+then everything is looked at from short windows too, whose free start states keep simulations near the readings, and the
+best go on to long ones.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from contextlib import suppress
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from autotune.diagnosis.equations.bench import Bench, Outcome
 from autotune.diagnosis.equations.candidates import is_plainer, is_usual, key_of, plainer
 from autotune.diagnosis.equations.dry_friction import select_minimum, sweep_levels, with_force
-from autotune.diagnosis.equations.judged import JudgedEquations, Searched, judge, odds_of
+from autotune.diagnosis.equations.judged import JudgedEquations, judge, odds_of
 from autotune.diagnosis.equations.scores import (
     attempt,
     is_noise,
@@ -21,7 +27,8 @@ from autotune.diagnosis.equations.scores import (
     variance_ratio,
 )
 from autotune.diagnosis.equations.screening import screen_effects
-from autotune.diagnosis.selection.judged import add_smaller, rank
+from autotune.diagnosis.selection.judged import rank
+from autotune.diagnosis.selection.search import Found, Proposals, search
 from autotune.errors import InputError
 from autotune.progress import Progress, quiet
 
@@ -31,54 +38,79 @@ LOOK, FIRST, LAST, FINAL = 2, 4, 8, 30
 CARRIED = 3
 
 
-def search(bench: Bench, without: Collection[str], progress: Progress, begun: Outcome | None = None) -> Searched:
-    """Search for what is missing.
+def search_equations(
+    bench: Bench, without: Collection[str], progress: Progress = quiet, begun: JudgedEquations | None = None
+) -> Found[JudgedEquations]:
+    """Search for what is missing in equations, or in a closed model.
 
     Parameters
     ----------
-    bench : Bench
-        The model on its recordings.
-    without : collection of str
-        Effects that are left out.
-    progress : callable
-        Told what is being done and the share done.
-    begun : Outcome, optional
-        What predicted best on more rows of these recordings: it is judged as well, from the numbers that it had there.
+    bench, without
+        The model on its recordings, and effects that are left out.
+    progress, begun
+        As in :func:`autotune.diagnosis.selection.search.search`.
 
-    Notes
-    -----
-    Every effect at every place is looked at to first order, the best are fitted, and one is added after the other; what
-    the last ones make needless is dropped. Where the best fit is far from the noise, the retuned model may lie in a
-    wrong minimum, from which no first order leads out: then everything is looked at from short windows too, whose free
-    start states keep simulations near the readings, and the best go on to long ones.
+    Raises
+    ------
+    InputError
+        The nominal model runs away.
     """
     progress("retuning the model", 0.02)
-    retuned, limits = bench.retuned(), bench.limits
-    own = len(retuned.effects)
-    found = _judge_all(bench, [retuned], own)
-    if not found:
+    outcome = bench.retuned()
+    retuned = judge(bench, outcome, len(outcome.effects))
+    if retuned is None:
         raise InputError("the model runs away on left-out stretches", where="diagnose", remedy="check its numbers")
-    best = found[0]
-    while len(best.names) < limits.rig_effects and not best.leaves_noise:
-        fits = _fit_larger(bench, best.outcome, without, progress, further=bool(best.names))
-        larger = _judge_all(bench, _select(bench, fits, own), own)
-        found += larger
-        first = rank([best, *larger])[0]
-        if first is best or not first.is_better(best, limits.material):
-            break
-        best = first
-    if begun is not None:
-        found += _judge_all(bench, [attempt(bench, begun.effects, retuned, FINAL)], own)
-    found = add_smaller(found, limits.confirmed, limits.rig_effects, lambda some, known: _smaller(bench, some, known))
-    found += _judge_all(bench, _fit_to_end(bench, rank(found)[0], retuned), own)
-    chosen = rank(found)[0]
-    return Searched(nominal=bench.as_it_is(retuned), judged=tuple(found), best=chosen, taken=chosen)
+    nominal = replace(retuned, outcome=bench.as_it_is(outcome), tuned=False)
+    return search(_EquationProposals(bench=bench, without=without, nominal=nominal, roots=(retuned,)), progress, begun)
 
 
-def _judge_all(bench: Bench, fits: Sequence[Outcome | None], own: int) -> list[JudgedEquations]:
-    """Return fits with their errors on left-out stretches, without those that ran away or are something else."""
-    each = (judge(bench, one, own) for one in fits if one is not None)
-    return [one for one in each if one is not None]
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _EquationProposals(Proposals[JudgedEquations]):
+    """Equations on recordings, some effects left out; fits are in units of the residual that each leaves."""
+
+    bench: Bench
+    without: Collection[str]
+    nominal: JudgedEquations
+    roots: tuple[JudgedEquations, ...]
+
+    def larger(self, beam: Sequence[JudgedEquations], progress: Progress) -> list[JudgedEquations]:
+        """Return hypotheses with one effect more than those of a beam, beside which more than noise is left."""
+        found: list[JudgedEquations] = []
+        for base in beam:
+            if not base.leaves_noise:
+                fits = _fit_larger(self.bench, base.outcome, self.without, progress, further=bool(base.names))
+                found += self._judged(_select(self.bench, fits, base.own))
+        return found
+
+    def resumed(self, one: JudgedEquations) -> JudgedEquations | None:
+        """Return a hypothesis that was fitted to more rows, fitted to these from its numbers; None if it runs away."""
+        return next(iter(self._judged([attempt(self.bench, one.outcome.effects, self.roots[0].outcome, FINAL)])), None)
+
+    def smaller(self, some: Sequence[JudgedEquations], known: Sequence[JudgedEquations]) -> list[JudgedEquations]:
+        """Return hypotheses without each of their effects, or with a plainer one, as far as these are not known yet.
+
+        Built one by one, an effect may have stood for another: a torque of free period for gravity and a bend.
+        """
+        seen, result = {one.identity for one in known}, []
+        for one in some:
+            effects = one.outcome.effects
+            for i in range(one.own, len(effects)):
+                less = plainer(effects[i])
+                tried = [(*effects[:i], *([] if other is None else [other]), *effects[i + 1 :])
+                         for other in ((None,) if less is None else (None, less))]  # fmt: skip
+                new = [e for e in tried if frozenset(map(key_of, e[one.own :])) not in seen]
+                result += self._judged(attempt(self.bench, e, one.outcome, LAST) for e in new)
+            seen |= {other.identity for other in result}
+        return result
+
+    def finish_leading(self, found: Sequence[JudgedEquations]) -> list[JudgedEquations]:
+        """Return the leading hypothesis fitted to the end."""
+        return self._judged(_fit_to_end(self.bench, rank(found)[0], self.roots[0].outcome))
+
+    def _judged(self, fits: Iterable[Outcome | None]) -> list[JudgedEquations]:
+        """Return fits with their errors on left-out stretches, without those that ran away or are something else."""
+        each = (judge(self.bench, one, self.roots[0].own) for one in fits if one is not None)
+        return [one for one in each if one is not None]
 
 
 def _select(bench: Bench, fits: Sequence[Outcome], own: int) -> list[Outcome]:
@@ -104,24 +136,6 @@ def _fit_plainer(bench: Bench, one: Outcome) -> Outcome | None:
         return None
     first = attempt(bench, (*one.effects[:-1], less), one, FIRST)
     return first and (attempt(bench, first.effects, first, LAST) or first)
-
-
-def _smaller(bench: Bench, some: Sequence[JudgedEquations], found: Sequence[JudgedEquations]) -> list[JudgedEquations]:
-    """Return hypotheses without each of their effects, or with a plainer one, as far as these are not known yet.
-
-    Built one by one, an effect may have stood for another: a torque of free period for gravity and a bend.
-    """
-    known, result = {one.identity for one in found}, []
-    for one in some:
-        effects = one.outcome.effects
-        for i in range(one.own, len(effects)):
-            less = plainer(effects[i])
-            tried = [(*effects[:i], *([] if other is None else [other]), *effects[i + 1 :])
-                     for other in ((None,) if less is None else (None, less))]  # fmt: skip
-            new = [e for e in tried if frozenset(map(key_of, e[one.own :])) not in known]
-            result += _judge_all(bench, [attempt(bench, e, one.outcome, LAST) for e in new], one.own)
-        known |= {other.identity for other in result}
-    return result
 
 
 def _fit_to_end(bench: Bench, one: JudgedEquations, retuned: Outcome) -> list[Outcome]:
@@ -157,7 +171,7 @@ def _fit_larger(
     for one in sorted(once.values(), key=found.index)[: limits.confirmed]:
         if np.log(there.rss / one.rss) < limits.equation_near * np.log(there.rss / found[0].rss):
             continue
-        progress(f"fitting {one.effects[-1].name} to all rows", 0.85 if further else 0.45)
+        progress(f"fitting {one.effects[-1].name} to all rows", 0.0)
         fits: list[Outcome | None] = []
         with suppress(InputError):
             fits.append(bench.carried(one, LAST if carried else 2 * LAST))
@@ -196,25 +210,21 @@ def _fit_at_scales(
     bench: Bench, base: Outcome, without: Collection[str], progress: Progress, *, further: bool
 ) -> list[Outcome]:
     """Look at every effect at every place, and fit the best: on long windows, and from short ones where those fail."""
-    share, limits = (0.5 if further else 0.1), bench.limits
+    limits = bench.limits
     count = limits.equation_further if further else limits.equation_fitted
-
-    def told(what: str, done: float) -> None:
-        progress(what, share + 0.35 * done)
-
     beside = further and not _is_near_noise(bench, base)
-    found = _fit_best(bench, base, without, told, count, beside)
+    found = _fit_best(bench, base, without, progress, count, beside)
     best = min(found, key=lambda one: one.rss, default=base)
     short = None if _is_near_noise(bench, best) else bench.shortened(base)
     if short is not None:
         # the base itself goes on as well: its effects may have been fitted in a wrong minimum
         again = [short] if further else []
-        found += _lengthen(bench, [*again, *_fit_best(bench, short, without, told, count, beside)])
+        found += _lengthen(bench, [*again, *_fit_best(bench, short, without, progress, count, beside)])
     found.sort(key=lambda one: one.rss)
     for k, one in enumerate(found[:2]):
         if is_settled(bench, one, found[0]):
             break
-        progress(f"fitting {one.effects[-1].name}", share + 0.35 + 0.04 * k)
+        progress(f"fitting {one.effects[-1].name}", 0.0)
         found[k] = _fit_on(bench, one, LAST)
     return [one for one in found if not bench.is_stand_in(one)]
 
@@ -226,7 +236,7 @@ def _fit_on(bench: Bench, one: Outcome, iterations: int) -> Outcome:
 
 
 def _fit_best(
-    bench: Bench, base: Outcome, without: Collection[str], told: Progress, count: int, usual: bool
+    bench: Bench, base: Outcome, without: Collection[str], progress: Progress, count: int, usual: bool
 ) -> list[Outcome]:
     """Return fits of a base with each of the effects that predict most, and with usual ones that predict anything.
 
@@ -234,7 +244,7 @@ def _fit_best(
     They are fitted for a few steps, and further where they are not far behind one that leaves noise. Effects that come
     down to a plainer one come after it, and only where that leaves more than noise.
     """
-    order = screen_effects(bench, base, without, lambda what, done: told(what, 0.4 * done))
+    order = screen_effects(bench, base, without, progress)
     tried = [e for k, (_, e) in enumerate(order) if k < count or (usual and is_usual(e))]
     found: list[Outcome] = []
     for effect in sorted(tried, key=lambda one: plainer(one) is not None):
@@ -243,7 +253,7 @@ def _fit_best(
             key_of(one.effects[-1]) == key_of(less) and is_noise(bench, one, bench.limits.adequate) for one in found
         ):
             continue
-        told(f"fitting {effect.name}", 0.6)
+        progress(f"fitting {effect.name}", 0.0)
         outer = bench.is_sought_outside(effect)
         one = attempt(bench, (*base.effects, effect), base, FIRST if outer else LOOK)
         if one is None:
