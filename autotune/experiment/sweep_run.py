@@ -82,7 +82,17 @@ class SweepRun:
         self.know(self.known)
 
     def tell(self, message: str, remaining_s: float, settings: RelaySettings | None = None) -> None:
-        """Say what happens."""
+        """Say what happens.
+
+        Parameters
+        ----------
+        message : str
+            What.
+        remaining_s : float
+            Rig time that is expected to remain [s]; NaN where nobody can know.
+        settings : RelaySettings, optional
+            Relay that will run; the one that runs where None.
+        """
         self._show(message, remaining_s, self.known, settings or self.oscillation.settings)
 
     @property
@@ -96,7 +106,22 @@ class SweepRun:
         return [_choice(self.goal, self.y_centre, self.known, phase) for phase in phases_rad]
 
     def cycle(self, choice: Choice, periods: int, until_s: float) -> None:
-        """Run a limit cycle of so many whole periods, or until its time is over, and take its point."""
+        """Run a limit cycle of so many whole periods, or until its time is over, and take its point.
+
+        Parameters
+        ----------
+        choice : Choice
+            Its relay and what is expected of it.
+        periods : int
+            Whole periods.
+        until_s : float
+            When its time is over, in the recording's time [s].
+
+        Raises
+        ------
+        ExperimentStopped
+            A limit, no oscillation, or rows that give no point.
+        """
         loop, known = self.loop, self.known
         foreseen = known.swept and self.wanted.relay_amplitude is None
         window = run_limit_cycle(self.oscillation, choice, periods, until_s, settled=self.settled, foreseen=foreseen)
@@ -124,7 +149,20 @@ class SweepRun:
         self.loop.note(relay=[one.to_table() for one in self.segments if one.part == self._part])
 
     def look(self, phases_rad: Sequence[float], price: Price | None = None) -> Found:
-        """Estimate all points from all rows together, those at the phases without a limit cycle too."""
+        """Estimate all points from all rows together, and note what came of it.
+
+        Parameters
+        ----------
+        phases_rad : sequence of float
+            Phases of the positive-gain plant at which points are wanted [rad].
+        price : callable, optional
+            Asked what is left unknown costs the controller.
+
+        Returns
+        -------
+        Found
+            Its ``why`` says why the points may not be used, commands of another master included.
+        """
         self.looks += 1
         self.tell("estimating all points together", 0.0)
         others = [phase for phase in phases_rad if not is_aimed(phase, self.cycles)]
@@ -143,7 +181,15 @@ class SweepRun:
 
 
 def is_aimed(phase_rad: float, segments: Sequence[Segment]) -> bool:
-    """Return whether a limit cycle aimed at a phase [rad]."""
+    """Return whether a limit cycle aimed at a phase.
+
+    Parameters
+    ----------
+    phase_rad : float
+        Phase of the positive-gain plant [rad].
+    segments : sequence of Segment
+        Limit cycles.
+    """
     return any(math.isclose(phase_rad, one.phase_rad) for one in segments)
 
 
