@@ -257,7 +257,7 @@ def test_whenever_an_estimate_ends_the_next_cycle_keeps_within_the_swing(
             oscillation.step()
         return Found(estimate=None, why="so long the estimate takes")
 
-    monkeypatch.setattr("autotune.experiment.sweep.estimate_beside", refuse_after)
+    monkeypatch.setattr("autotune.experiment.sweep_run.estimate_beside", refuse_after)
     result = run_experiment(ball_rig(seed=7), ball_config(limits={"time_s": 1e4}), tmp_path / "r.csv")
     assert len(result.points) == 5
     rows_of_it = read_recording(tmp_path / "r.csv").between(result.segments[0].start_s, 1e9)
