@@ -123,11 +123,11 @@ def _together(run: SweepRun, targets: Sequence[float], end_s: float, price: Pric
         left_s = end_s - loop.tick.t_s
         share = found.wanted_sd(run.wanted.gain_sd, budget_s - left_s, budget_s) / found.estimate.worst_sd
         if share >= 1.0:
-            return None
+            break
         choices = run.choices(first)
         periods = _further(run, choices, share, left_s)
         if not any(periods):
-            return None
+            break
         most = max(range(len(first)), key=lambda i: periods[i] * 2.0 * math.pi / choices[i].omega_rad_s)
         # to much slower ones by way of the one between: y, as fast as it is, would go far before the relay answers
         most = min(most, 1 + first.index(run.segments[-1].phase_rad))
@@ -135,6 +135,9 @@ def _together(run: SweepRun, targets: Sequence[float], end_s: float, price: Pric
         said = f"{found.words}: {math.degrees(first[most]):.0f} deg again"
         run.tell(said, remaining_s, choices[most].settings)
         run.cycle(choices[most], max(periods[most], LEAST_PERIODS), end_s)
+    run.note_look(found, targets)
+    if not found.why:
+        return None
     run.tell(f"each point by itself: {found.why}", math.nan)
     run.settled = False
     return _by_themselves(run, first, [phase for phase in targets if phase not in first], end_s)
@@ -142,7 +145,9 @@ def _together(run: SweepRun, targets: Sequence[float], end_s: float, price: Pric
 
 def _once_more(run: SweepRun, targets: Sequence[float]) -> None:
     """Ask the rows of all limit cycles, after those of the first were refused."""
-    if not run.look(targets).why:
+    found = run.look(targets)
+    run.note_look(found, targets)
+    if not found.why:
         run.take_together()
 
 

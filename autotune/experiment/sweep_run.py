@@ -149,7 +149,7 @@ class SweepRun:
         self.loop.note(relay=[one.to_table() for one in self.segments if one.part == self._part])
 
     def look(self, phases_rad: Sequence[float], price: Price | None = None) -> Found:
-        """Estimate all points from all rows together, and note what came of it.
+        """Estimate all points from all rows together.
 
         Parameters
         ----------
@@ -165,13 +165,27 @@ class SweepRun:
         """
         self.looks += 1
         self.tell("estimating all points together", 0.0)
-        others = [phase for phase in phases_rad if not is_aimed(phase, self.cycles)]
-        if self.known.plant_sign < 0:
-            others = [phase + math.pi for phase in others]
+        others = self._unvisited(phases_rad)
         found = estimate_beside(self.oscillation, self.cycles, others, self.known, self.looks, price)
-        why = "commands of another master" if self.loop.monitor.commands.found else found.why
-        self.loop.note(**{NOTED: note_of(found.estimate, why, len(self.cycles), others)})
-        return replace(found, why=why)
+        return replace(found, why="commands of another master" if self.loop.monitor.commands.found else found.why)
+
+    def note_look(self, found: Found, phases_rad: Sequence[float]) -> None:
+        """Note what came of a look that ends the sweep, or sends it to cycles of their own: a resumed one goes by it.
+
+        Parameters
+        ----------
+        found : Found
+            What came of it.
+        phases_rad : sequence of float
+            Phases of the positive-gain plant at which points were wanted [rad].
+        """
+        noted = note_of(found.estimate, found.why, len(self.cycles), self._unvisited(phases_rad))
+        self.loop.note(**{NOTED: noted})
+
+    def _unvisited(self, phases_rad: Sequence[float]) -> list[float]:
+        """Return the phases without a limit cycle, as they are of the plant, its sign included."""
+        turned = 0.0 if self.known.plant_sign > 0 else math.pi
+        return [phase + turned for phase in phases_rad if not is_aimed(phase, self.cycles)]
 
     def take_together(self) -> None:
         """Let all limit cycles of this sitting give the points together."""

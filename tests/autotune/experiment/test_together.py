@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import chi2
 
-from autotune.errors import ExperimentStopped
+from autotune.errors import ExperimentStopped, OperatorStop
 from autotune.experiment.cycles import read_earlier
 from autotune.experiment.dwell import Dwell, further_periods
 from autotune.experiment.local_model import LocalModel
@@ -142,6 +142,20 @@ def test_a_recording_that_lost_a_cycle_is_not_taken_for_a_whole_sweep(
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> ExperimentResult:
     return run_experiment(ball_rig(seed=3), ball_config(), tmp_path_factory.mktemp("whole") / "whole.csv")
+
+
+def test_a_sweep_that_ends_before_its_points_are_known_well_enough_goes_on_when_it_is_resumed(tmp_path: Path) -> None:
+    """An estimate of its rows asks for a further cycle, in which it is stopped: those rows are no whole sweep."""
+
+    def stop(status: Status) -> None:
+        if status.message.endswith("deg again"):
+            raise KeyboardInterrupt
+
+    with pytest.raises(OperatorStop):
+        run_experiment(ball_rig(seed=3), ball_config(), tmp_path / "begun.csv", on_status=stop)
+    earlier = read_earlier([tmp_path / "begun.csv"], SAMPLE_S)
+    assert len(earlier.segments) == 3
+    assert missing_phases(ball_config().experiment, earlier)
 
 
 @pytest.mark.parametrize("start_s", [16.0, 20.0, 24.0, 28.0])

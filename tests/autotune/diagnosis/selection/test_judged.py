@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 import numpy as np
 import pytest
@@ -11,10 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from autotune.diagnosis.evidence.stretches import STRETCHES
-from autotune.diagnosis.selection.judged import Judged, built_on, of_likely, probabilities, rank
+from autotune.diagnosis.selection.judged import built_on, of_likely, probabilities, rank
 from autotune.diagnosis.selection.probability import probability_of
-from autotune.diagnosis.thresholds import IN_USE, Thresholds
-from autotune.models import Effect
+from autotune.diagnosis.thresholds import IN_USE
+from tests.autotune.diagnosis.selection.on_stretches import Astray
 
 LAG, READING_LAG = "actuator.lag", "sensor.lag"
 GRAVITY, DRY, CURVED, DROPPING = (
@@ -23,23 +22,6 @@ GRAVITY, DRY, CURVED, DROPPING = (
 #: Errors on eight stretches, about 1.
 ERRORS = np.array([0.9, 1.1, 1.0, 0.95, 1.05, 1.02, 0.98, 1.0])
 SIZES = st.floats(0.4, 3.5)
-
-
-class Astray(Judged):
-    """A hypothesis of a rig whose model errs by more than noise: stretches judge it."""
-
-    leaves_noise = False
-    limits: Thresholds = IN_USE
-    variance, rows, numbers, error, added = math.nan, 0, 0, 1.0, ()
-
-    def unfelt(self, effects: Sequence[Effect]) -> frozenset[str]:
-        """Return none: every effect would be felt."""
-        return frozenset()
-
-    @property
-    def identity(self) -> frozenset[object]:
-        """What tells hypotheses apart."""
-        return frozenset(self.names)
 
 
 def hypothesis_of(names: tuple[str, ...], size: float, log_odds: float = 0.0, short: float | None = None) -> Astray:

@@ -2,76 +2,56 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from autotune.diagnosis.selection.judged import Judged
 from autotune.diagnosis.selection.search import Proposals, search
-from autotune.diagnosis.thresholds import IN_USE, Thresholds
-from autotune.models import Effect
 from autotune.progress import Progress, quiet
+from tests.autotune.diagnosis.selection.on_stretches import Astray
 
 DRY, GRAVITY, LAG = "plant.coulomb_friction", "plant.sine_torque", "actuator.lag"
 Names = frozenset[str]
 
 
-class Stated(Judged):
-    """A hypothesis that errs by more than noise."""
-
-    leaves_noise = False
-    limits: Thresholds = IN_USE
-    variance, rows, numbers, error, added = math.nan, 0, 0, 1.0, ()
-
-    def unfelt(self, effects: Sequence[Effect]) -> frozenset[str]:
-        """Return none: every effect would be felt."""
-        return frozenset()
-
-    @property
-    def identity(self) -> frozenset[object]:
-        """What tells hypotheses apart."""
-        return frozenset(self.names)
-
-
-def stated(names: Names, error: float) -> Stated:
+def stated(names: Names, error: float) -> Astray:
     squares = np.full(8, error**2)
-    return Stated(names=tuple(sorted(names)), long_squares=squares, short_squares=squares, log_odds=0.0)
+    return Astray(names=tuple(sorted(names)), long_squares=squares, short_squares=squares, log_odds=0.0)
 
 
 @dataclass(frozen=True)
-class Table(Proposals[Stated]):
+class Table(Proposals[Astray]):
     """Errors by effects; what is not in the table runs away."""
 
     errors: Mapping[Names, float]
-    nominal: Stated
-    roots: tuple[Stated, ...]
+    nominal: Astray
+    roots: tuple[Astray, ...]
 
-    def _known(self, wanted: Sequence[Names]) -> list[Stated]:
+    def _known(self, wanted: Sequence[Names]) -> list[Astray]:
         return [stated(names, self.errors[names]) for names in dict.fromkeys(wanted) if names in self.errors]
 
-    def larger(self, beam: Sequence[Stated], progress: Progress) -> list[Stated]:
+    def larger(self, beam: Sequence[Astray], progress: Progress) -> list[Astray]:
         """Return what has one effect more."""
         every = [frozenset(one.names) | {name} for one in beam for name in (DRY, GRAVITY, LAG) if name not in one.names]
         return self._known(every)
 
-    def resumed(self, one: Stated) -> Stated | None:
+    def resumed(self, one: Astray) -> Astray | None:
         """Return it as it is here."""
         return next(iter(self._known([frozenset(one.names)])), None)
 
-    def smaller(self, some: Sequence[Stated], known: Sequence[Stated]) -> list[Stated]:
+    def smaller(self, some: Sequence[Astray], known: Sequence[Astray]) -> list[Astray]:
         """Return what has one effect fewer and is not known."""
         seen = {one.identity for one in known}
         return self._known([frozenset(one.names) - {n} for one in some for n in one.names
                             if frozenset(one.names) - {n} not in seen])  # fmt: skip
 
-    def finish_leading(self, found: Sequence[Stated]) -> list[Stated]:
+    def finish_leading(self, found: Sequence[Astray]) -> list[Astray]:
         """Return nothing: a stated error does not get smaller."""
         return []
 
 
-def found_in(errors: Mapping[Names, float], begun: Stated | None = None) -> set[str]:
+def found_in(errors: Mapping[Names, float], begun: Astray | None = None) -> set[str]:
     root = stated(frozenset(), 1.0)
     return set(search(Table(errors, root, (root,)), quiet, begun).chosen.names)
 
