@@ -15,12 +15,12 @@ import numpy as np
 
 from autotune.controller import PIDController
 from autotune.design.margins import margins
-from autotune.design.rules import RULES
 from autotune.design.specification import Specification, spec1
 from autotune.design.synthesis import design
 from autotune.errors import DesignError
 from autotune.models import TransferFunction
 from tests.autotune.design.plants import BALL
+from tests.autotune.design.tuning_rules import RULES
 
 
 def batch(full: bool) -> Iterator[tuple[str, TransferFunction]]:

@@ -9,21 +9,19 @@ import pytest
 
 from autotune.design.margins import margins
 from autotune.design.rst import comparison_rst, place_poles
-from autotune.design.rules import (
-    RULES,
-    half_rule,
-    relay_ultimate_point,
-    simc,
-    step_response_model,
-    tyreus_luyben,
-    ultimate_point,
-    ziegler_nichols,
-)
+from autotune.design.rules import half_rule, simc, step_response_model
 from autotune.design.specification import Specification
 from autotune.design.synthesis import design
 from autotune.errors import DesignError
 from autotune.models import TransferFunction
 from tests.autotune.design.plants import BALL, EIGHT_LAGS, FOPDT
+from tests.autotune.design.tuning_rules import (
+    RULES,
+    relay_ultimate_point,
+    tyreus_luyben,
+    ultimate_point,
+    ziegler_nichols,
+)
 
 THREE_LAGS = TransferFunction(num=(1.0,), den=(1.0, 3.0, 3.0, 1.0))
 
