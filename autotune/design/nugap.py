@@ -10,7 +10,6 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import eigvalsh, solve_continuous_are
 
 from autotune.arrays import ComplexArray, FloatArray
 from autotune.controller import Controller
@@ -107,48 +106,6 @@ def generalized_stability_margin(plant: Plant, controller: Controller, *, scalin
 def _local_margin(loop: ContinuousLoop | SampledLoop, omega: FloatArray, scaling: float) -> FloatArray:
     P, C = scaling * loop.plant_response(omega), loop.controller_response(omega) / scaling
     return np.asarray(np.abs(1.0 + P * C) / (np.hypot(1.0, np.abs(P)) * np.hypot(1.0, np.abs(C))))
-
-
-def optimal_stability_margin(plant: Plant, *, scaling: float = 1.0) -> float:
-    """Return the largest b(C, k P) that any controller reaches: sqrt(1 - ||[N; M]||_H^2) = 1/sqrt(1 + rho(X Y)).
-
-    Parameters
-    ----------
-    plant : Plant
-        P, continuous, rational and proper.
-    scaling : float
-        k [u unit/y unit].
-
-    Raises
-    ------
-    DesignError
-        A plant with dead time (its optimum is not that of a rational plant), or improper.
-
-    References
-    ----------
-    McFarlane & Glover 1990, with X and Y of the control and filtering Riccati equations.
-    """
-    H = _scale(transfer_function_of(plant), scaling)
-    if H.delay_s > 0.0 or not H.is_proper:
-        raise DesignError(
-            "the optimal stability margin is computed for proper plants without dead time", where="nu-gap"
-        )
-    order = len(H.den) - 1
-    if order == 0:
-        return 1.0
-    w = float(np.exp(np.mean(np.log(characteristic_frequencies(H)))))
-    powers = w ** np.arange(order, -1, -1.0)
-    num = np.concatenate((np.zeros(order + 1 - len(H.num)), H.num)) * powers / (H.den[0] * powers[0])
-    den = np.array(H.den) * powers / (H.den[0] * powers[0])
-    A, B, D = np.eye(order, k=-1), np.eye(order, 1), float(num[0])
-    A[0] = -den[1:]
-    C = (num - D * den)[None, 1:]
-    R = 1.0 + D * D
-    F = A - B @ (D / R * C)
-    X = solve_continuous_are(F, B, C.T @ C / R, np.array([[R]]))
-    Y = solve_continuous_are(F.T, C.T, B @ B.T / R, np.array([[R]]))
-    root = np.linalg.cholesky(Y + 1e-14 * np.trace(Y) * np.eye(order))
-    return float(1.0 / math.sqrt(1.0 + max(0.0, float(eigvalsh(root.T @ X @ root)[-1]))))
 
 
 def loop_scaling(plant: Plant, controller: Controller) -> float:

@@ -17,7 +17,7 @@ from scipy.linalg import solve_triangular
 
 from autotune.arrays import FloatArray
 from autotune.errors import IdentificationError
-from autotune.identification.closed_loop.lagged import lagged_factor, lagged_range, lagged_rows, least_squares, triangle
+from autotune.identification.closed_loop.lagged import lagged_factor, least_squares, triangle
 from autotune.identification.closed_loop.state_space import InnovationModel
 
 Instrument: TypeAlias = Literal["r", "r and y", "u and y"]
@@ -39,15 +39,12 @@ class IndirectEstimate:
         Of (8) and (11), where a gap shows n_cl and n.
     loop_order : int
         n_cl used.
-    state_weights : (n, columns) array
-        Remark 2: X_t = state_weights [R_f; Psi], columns of lagged data.
     """
 
     model: InnovationModel
     loop_singular_values: FloatArray
     plant_singular_values: FloatArray
     loop_order: int
-    state_weights: FloatArray
 
 
 def toeplitz_blocks(markov: FloatArray, f: int) -> FloatArray:
@@ -159,7 +156,7 @@ def indirect_subspace(
     O_cl = (U_1[:, :n_cl] * s_cl[:n_cl]) @ V_1t[:n_cl]
     O_f = np.linalg.solve(T_f, O_cl - TH @ controller_states)
     # steps 5 and 6
-    U_2, s, V_2t = np.linalg.svd(O_f, full_matrices=False)
+    U_2, s, _ = np.linalg.svd(O_f, full_matrices=False)
     gamma = U_2[:, :order]
     C, A = gamma[:n_y], least_squares(gamma[:-n_y], gamma[n_y:])
     free_plant = free @ T_f  # annihilates T_f^-1 Gamma_cl
@@ -167,10 +164,7 @@ def indirect_subspace(
     B, D = input_matrices(free_plant, right, M11, gamma, n_u=n_u, n_y=n_y)
     K, sigma = _noise_from(free_plant, np.linalg.solve(T_f, M.block(2, 2)) / np.sqrt(rows), gamma, n_y=n_y)
     model = InnovationModel(A=A, B=B, C=C, D=D, K=K, innovation_covariance=sigma @ sigma.T, sample_time_s=sample_time_s)
-    weights = _state_weights(s[:order, None] * V_2t[:order], M)
-    return IndirectEstimate(
-        model=model, loop_singular_values=s_cl, plant_singular_values=s, loop_order=n_cl, state_weights=weights
-    )
+    return IndirectEstimate(model=model, loop_singular_values=s_cl, plant_singular_values=s, loop_order=n_cl)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -298,50 +292,6 @@ def _noise_from(free: FloatArray, spread: FloatArray, gamma: FloatArray, *, n_y:
     if np.linalg.cond(sigma) > 1e12:  # no noise to speak of
         return np.zeros((gamma.shape[1], n_y)), sigma
     return K_sigma @ np.linalg.inv(sigma), sigma
-
-
-def _state_weights(states: FloatArray, M: _Blocks) -> FloatArray:
-    """Return the weights on [R_f; Psi] that give S V' N2' (Remark 2)."""
-    M22 = M.block(1, 1)
-    on_psi = least_squares(M22.T, states.T).T
-    on_r = -on_psi @ np.linalg.solve(M.block(0, 0).T, M.block(1, 0).T).T
-    return np.hstack([on_r, on_psi])
-
-
-def estimated_states(
-    estimate: IndirectEstimate, r: FloatArray, y: FloatArray, *, f: int, p: int | None = None
-) -> tuple[FloatArray, int]:
-    """Return the states of Remark 2, a bank of non-stationary Kalman filters, for Psi = [R_p; Y_p] or R_p.
-
-    Parameters
-    ----------
-    estimate : IndirectEstimate
-        Made with the instruments "r" or "r and y".
-    r, y : (N, n_u), (N, n_y) arrays
-        The same data.
-    f, p : int
-        The same windows.
-
-    Returns
-    -------
-    states : (j, n) array
-        In the coordinates of ``estimate.model``.
-    start : int
-        Row of the data that the first state belongs to.
-
-    Notes
-    -----
-    Only the part of the state that past r and y tell about, freed of future r: exact without noise where r is white,
-    biased towards zero otherwise.
-    """
-    p = f if p is None else p
-    past = range(-p, 0)
-    signals = [(r, range(f)), (r, past)]
-    if estimate.state_weights.shape[1] > (f + p) * r.shape[1]:
-        signals.append((y, past))
-    start, end = lagged_range(signals)
-    end = min(end, len(y) - f + 1)
-    return lagged_rows(signals, start, end) @ estimate.state_weights.T, start
 
 
 def controller_markov_parameters(

@@ -16,12 +16,10 @@ from autotune.design.nugap import (
     generalized_stability_margin,
     loop_scaling,
     nu_gap,
-    optimal_stability_margin,
     validate,
 )
-from autotune.errors import DesignError
 from autotune.models import TransferFunction
-from tests.autotune.design.plants import BALL, FOPDT, REDUCED
+from tests.autotune.design.plants import BALL, REDUCED
 
 PAPER_PI = PIDController(K=-0.023, Ti_s=3.0)
 
@@ -141,25 +139,6 @@ def test_lags_far_apart_are_no_distance(decades: float) -> None:
     den = tuple(np.polymul(np.polymul(slow, slow), np.polymul(fast, fast)))
     louder = TransferFunction(num=(1.05,), den=den)
     assert nu_gap(TransferFunction(num=(1.0,), den=den), louder) == pytest.approx(0.05 / 2.05, rel=1e-3)
-
-
-def test_optimal_margin_of_an_integrator_and_of_a_double_integrator() -> None:
-    # X = Y = 1 gives 1/sqrt(2); X = [[sqrt 2, 1], [1, sqrt 2]] and its mirror image give rho(XY) = 3 + 2 sqrt 2
-    assert optimal_stability_margin(TransferFunction(num=(1.0,), den=(1.0, 0.0))) == pytest.approx(1.0 / math.sqrt(2.0))
-    double = optimal_stability_margin(TransferFunction(num=(1.0,), den=(1.0, 0.0, 0.0)))
-    assert double == pytest.approx(1.0 / math.sqrt(4.0 + 2.0 * math.sqrt(2.0)), rel=1e-6)
-
-
-def test_no_pi_beats_the_optimal_margin() -> None:
-    best = optimal_stability_margin(BALL, scaling=0.023)
-    for K in (-0.005, -0.01, -0.02, -0.04):
-        for Ti in (1.0, 3.0, 10.0, 1e6):
-            assert generalized_stability_margin(BALL, PIDController(K=K, Ti_s=Ti), scaling=0.023) <= best
-
-
-def test_optimal_margin_is_refused_with_dead_time() -> None:
-    with pytest.raises(DesignError, match="dead time"):
-        optimal_stability_margin(FOPDT)
 
 
 def test_unstable_loop_has_margin_zero() -> None:
