@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
 
 import typer
 from rich.console import Console
@@ -24,17 +23,10 @@ if TYPE_CHECKING:
     from autotune.identification.closed_loop.state_space import InnovationModel
 
 
-class ClosedLoopMethod(StrEnum):
-    """How the plant is identified; the names of ``autotune.identification.closed_loop.methods``."""
-
-    prediction_error = "prediction-error"
-    indirect = "indirect"
-    indirect_refitted = "indirect-refitted"
-    van_overschee = "van-overschee"
-    oku_tanaka = "oku-tanaka"
-    ort = "ort"
-    ssarx = "ssarx"
-    pbsid = "pbsid"
+#: How the plant is identified; the names of ``autotune.identification.closed_loop.methods``.
+ClosedLoopMethod: TypeAlias = Literal[
+    "prediction-error", "indirect", "indirect-refitted", "van-overschee", "oku-tanaka", "ort", "ssarx", "pbsid"
+]
 
 
 @identify.command("closed-loop")
@@ -59,7 +51,7 @@ def closed_loop(
     method: Annotated[
         ClosedLoopMethod,
         typer.Option(help="prediction-error has regions, evidence and a verdict; the others are the papers' own"),
-    ] = ClosedLoopMethod.prediction_error,
+    ] = "prediction-error",
     more_u: Annotated[list[str] | None, typer.Option(metavar="COLUMN", help="a further input; may be repeated")] = None,
     more_y: Annotated[
         list[str] | None, typer.Option(metavar="COLUMN", help="a further output; may be repeated")
@@ -88,16 +80,16 @@ def closed_loop(
     data = read_one(recording, signal_names(t, u, y, r))
     require_answer([data])
     law = None if controller is None else read_controller(controller)
-    if method is not ClosedLoopMethod.prediction_error or more_u or more_y:
+    if method != "prediction-error" or more_u or more_y:
         if delay is not None or config is not None:
-            raise InputError("--delay and --config are of prediction-error", where=method.value)
+            raise InputError("--delay and --config are of prediction-error", where=method)
         more = more_u or [], more_y or [], more_r or []
         model = model_of_recording(
-            data, method=method.value, order=order, controller=law, more=more, windows=_windows(f, p, n_cl, psi)
+            data, method=method, order=order, controller=law, more=more, windows=_windows(f, p, n_cl, psi)
         )
-        place.json(_model_json(model, method.value))
+        place.json(_model_json(model, method))
         poles = ", ".join(f"{pole:.4g}" for pole in model.poles)
-        typer.echo(f"order {model.order} by {method.value}, poles {poles}")
+        typer.echo(f"order {model.order} by {method}, poles {poles}")
         typer.echo(f"wrote {out}")
         return
     if any(value is not None for value in (f, p, n_cl, psi)):

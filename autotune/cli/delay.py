@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
 
 import typer
 
@@ -16,30 +15,11 @@ from autotune.outputs import Output
 
 if TYPE_CHECKING:
     from autotune.identification.delay.model import DelayModel
-    from autotune.recording import Recording
+    from autotune.identification.delay.two_delays import TwoDelays
 
 
-class Hold(StrEnum):
-    """How u runs between rows."""
-
-    zero = "zero"
-    linear = "linear"
-
-
-class PastInput(StrEnum):
-    """What u was before the first row."""
-
-    unknown = "unknown"
-    held = "held"
-    zero = "zero"
-
-
-class DelayMethod(StrEnum):
-    """How the delay is identified."""
-
-    output_error = "output-error"
-    algebraic = "algebraic"
-    online = "online"
+#: How u runs between rows.
+Hold: TypeAlias = Literal["zero", "linear"]
 
 
 @identify.command("delay")
@@ -54,8 +34,9 @@ def identify_delay_command(
         Hold | None, typer.Option(help="u between rows; default the sidecar's hold, else zero (held command)")
     ] = None,
     past_input: Annotated[
-        PastInput, typer.Option(help="u before the first row; unknown leaves out the rows of y that would need it")
-    ] = PastInput.unknown,
+        Literal["unknown", "held", "zero"],
+        typer.Option(help="u before the first row; unknown leaves out the rows of y that would need it"),
+    ] = "unknown",
     start: Annotated[
         float | None, typer.Option(help="time stamp from which y is used [s]; default the first row")
     ] = None,
@@ -63,12 +44,12 @@ def identify_delay_command(
     offset: Annotated[bool, typer.Option(help="estimate a constant offset of u or y")] = True,
     coloured: Annotated[bool, typer.Option(help="allow coloured (autoregressive) noise")] = True,
     method: Annotated[
-        DelayMethod,
+        Literal["output-error", "algebraic", "online"],
         typer.Option(
             help="output-error is maximum likelihood; algebraic and online are modulating functions, on intervals or "
             "row by row"
         ),
-    ] = DelayMethod.output_error,
+    ] = "output-error",
     delays: Annotated[
         int, typer.Option(min=1, max=2, help="2: x'' + a x(t - h1) = b u(t - h2), the output is delayed as well")
     ] = 1,
@@ -92,69 +73,39 @@ def identify_delay_command(
     """Identify x^(n) = sum a_i x^(i) + b u(t - h) from a recording; no starting value is needed."""
     from rich.console import Console
 
-    from autotune.identification.delay.identify import identify_delay
-    from autotune.identification.delay.model import write_delay_model
+    from autotune.api import methods
+    from autotune.identification.delay.model import DelayModel, write_delay_model
     from autotune.identification.dependence import require_answer
 
     place = Output(out, inputs=(recording,), overwrite=overwrite)
     record = read_one(recording, signal_names(t, u, y, r))
-    require_answer([record if hold is None else replace(record, metadata={**record.metadata, "hold": hold.value})])
-    if delays == 2:
-        place.json(_two_delays(record, interval))
-        typer.echo(f"wrote {out}")
-        return
-    if method is not DelayMethod.output_error:
-        model = _by_modulating(record, order, method, interval, forgetting, start_delay, hold)
+    if hold is not None:
+        record = replace(record, metadata={**record.metadata, "hold": hold})
+    require_answer([record])
+    settings: dict[str, Any] = {}
+    with Console(stderr=True).status("searching the delay") as status:
+        if delays == 1 and method == "output-error":
+            interval = None
+            settings = {"max_delay_s": max_delay, "past_input": past_input, "start_s": start}
+            settings |= {"integrator": integrator, "offset": offset, "coloured": coloured}
+            settings["progress"] = lambda what, _: status.update(what)
+        elif delays == 1:
+            settings = {} if start_delay is None else {"start_s": start_delay}
+            settings |= {"forgetting": forgetting} if method == "online" else {}
+        model = methods.delay(record, order, method=method, delays=delays, interval_s=interval, **settings)
+    if isinstance(model, DelayModel):
         place.by(lambda part: write_delay_model(model, part))
         typer.echo(f"{describe(model)}; wrote {out}")
-        return
-    with Console(stderr=True).status("searching the delay") as status:
-        model = identify_delay(
-            record,
-            order,
-            max_delay_s=max_delay,
-            hold=None if hold is None else hold.value,
-            past_input=past_input.value,
-            start_s=start,
-            integrator=integrator,
-            offset=offset,
-            coloured=coloured,
-            progress=lambda what, _: status.update(what),
-        )
-    place.by(lambda part: write_delay_model(model, part))
-    typer.echo(f"{describe(model)}; wrote {out}")
+    else:
+        place.json(model.to_json())
+        typer.echo(f"{_describe_two(model)}\nwrote {out}")
 
 
-def _by_modulating(
-    record: Recording,
-    order: int,
-    method: DelayMethod,
-    interval_s: float | None,
-    forgetting: float | None,
-    start_s: float | None,
-    hold: Hold | None,
-) -> DelayModel:
-    from autotune.identification.delay.methods import algebraic_delay, online_delay
-
-    held: Literal["zero", "linear"] | None = None if hold is None else ("zero" if hold is Hold.zero else "linear")
-    if method is DelayMethod.online and start_s is not None:
-        return online_delay(record, order, forgetting=forgetting, start_s=start_s, hold=held)
-    found = algebraic_delay(record, order, interval_s=interval_s, start_s=start_s or 0.0, hold=held)
-    if method is DelayMethod.algebraic:
-        return found
-    return online_delay(record, order, forgetting=forgetting, start_s=found.delay_s, hold=held)
-
-
-def _two_delays(record: Recording, interval_s: float | None) -> dict[str, object]:
-    """Return the content of the file of a model with two delays, and print it."""
-    from autotune.identification.delay.two_delays import intervals_of, two_delays
-
-    found = two_delays(record, intervals_of(record, interval_s))
-    values, sd = found.values, found.standard_deviations
-    names = ("a", "b", "h1", "h2")
-    parts = [f"{name} {value:.5g} +- {1.96 * s:.2g}" for name, value, s in zip(names, values, sd, strict=True)]
-    typer.echo(f"x'' + a x(t - h1) = b u(t - h2): {', '.join(parts)} (95 %)")
-    return found.to_json()
+def _describe_two(model: TwoDelays) -> str:
+    """Return a model with two delays in a sentence, with its 95 % intervals."""
+    names, sd = ("a", "b", "h1", "h2"), model.standard_deviations
+    parts = [f"{name} {value:.5g} +- {1.96 * s:.2g}" for name, value, s in zip(names, model.values, sd, strict=True)]
+    return f"x'' + a x(t - h1) = b u(t - h2): {', '.join(parts)} (95 %)"
 
 
 def describe(model: DelayModel) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias
 
@@ -20,20 +19,6 @@ if TYPE_CHECKING:
 
     from autotune.design.specification import Design, Specification
     from autotune.models import TransferFunction
-
-
-class Kind(StrEnum):
-    """Structure of the controller."""
-
-    PI = "pi"
-    PID = "pid"
-
-
-class Noise(StrEnum):
-    """Which form of the noise constraint is kept."""
-
-    BOUND = "bound"
-    TRUE = "true"
 
 
 @app.command("design")
@@ -53,8 +38,9 @@ def design_command(
         typer.Option(help="largest noise amplification y to u, N_max [u/y unit]; default from the plant's gain"),
     ] = None,
     noise: Annotated[
-        Noise, typer.Option(help="true: |C/(1+L)| <= N_max (15); bound: |C| <= M_m N_max (16), which implies it")
-    ] = Noise.TRUE,
+        Literal["bound", "true"],
+        typer.Option(help="true: |C/(1+L)| <= N_max (15); bound: |C| <= M_m N_max (16), which implies it"),
+    ] = "true",
     noise_frequency: Annotated[
         float | None, typer.Option(help="lowest frequency of the noise [rad/s]; default the crossover")
     ] = None,
@@ -66,7 +52,7 @@ def design_command(
     setpoint_command: Annotated[
         float | None, typer.Option(help="largest immediate command per unit set-point step [u/y unit]; default none")
     ] = None,
-    kind: Annotated[Kind, typer.Option(help="structure of the controller")] = Kind.PI,
+    kind: Annotated[Literal["pi", "pid"], typer.Option(help="structure of the controller")] = "pi",
     controller: Annotated[Path | None, typer.Option(help="also write the controller file (TOML) here")] = None,
     certificate: Annotated[bool, typer.Option(help="prove a lower bound on the H2 norm (PI on a model)")] = True,
     overwrite: OVERWRITE = False,
@@ -88,7 +74,7 @@ def design_command(
             modulus_margin=modulus_margin,
             phase_margin_rad=math.radians(phase_margin),
             noise_gain=allowed,
-            noise="true" if noise is Noise.TRUE else "bound",
+            noise=noise,
             noise_frequency_rad_s=noise_frequency,
             delay_margin_s=delay_margin,
             setpoint_command=math.inf if setpoint_command is None else setpoint_command,
@@ -108,14 +94,14 @@ def design_command(
         wanted = asked(H)
         reduced = read_reduced(model)
         if reduced is None:
-            designed = design(H, wanted, kind.value, certificate=certificate)
+            designed = design(H, wanted, kind, certificate=certificate)
         else:
-            designed, looked = on_reduced_model(reduced, wanted, kind.value, certificate=certificate)
+            designed, looked = on_reduced_model(reduced, wanted, kind, certificate=certificate)
             seen = "; ".join(check.sentence for check in looked) or designed.certificate
             typer.echo(f"designed on the reduced model; checked: {seen}")
     else:
         assert points is not None
-        designed = _on_points(points, asked, kind.value)
+        designed = _on_points(points, asked, kind)
     place.json(designed.to_json())
     if law is not None:
         law.by(lambda part: write_controller(designed.controller, part))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, TextIO
+from typing import TYPE_CHECKING, Annotated, TextIO
 
 import typer
 
@@ -31,7 +31,7 @@ class _Tracking:
     window_s: float | None
     every_s: float | None
     max_delay_s: float | None
-    hold: Literal["zero", "linear"] | None
+    hold: Hold | None
     integrator: bool
     controller: Controller | None
     modulus_margin: float
@@ -95,7 +95,7 @@ def watch(
         window_s=window,
         every_s=every,
         max_delay_s=max_delay,
-        hold=None if hold is None else hold.value,
+        hold=hold,
         integrator=integrator,
         controller=law,
         modulus_margin=modulus_margin,
