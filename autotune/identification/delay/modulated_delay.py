@@ -1,8 +1,8 @@
 """The a-posteriori method of Ollivier, Moutaouakil and Sadik (2007), section 3: least squares on modulated intervals.
 
 For every interval (T_1, T_2) of length L the equation of the system, multiplied by f((t - T_1)/L) and integrated by
-parts, is linear in a_i, b and, after an expansion in the remaining delay, in a correction of the delay. u is then
-shifted by the delay found, and the step repeated to a fixed point.
+parts, is linear in a_i, b and in a correction of the delay. u is then shifted by the delay found, and the step repeated
+to a fixed point.
 
 This is the paper's own estimate, biased by noise; without that bias it is
 :func:`autotune.identification.delay.methods.algebraic_delay`.
@@ -21,14 +21,8 @@ from scipy.optimize import minimize_scalar
 from scipy.stats import f as f_distribution
 
 from autotune.arrays import BoolArray
-from autotune.errors import IdentificationError, InputError
-from autotune.identification.delay.modulated_integrals import (
-    Interval,
-    Modulated,
-    modulated_by_expansion,
-    modulated_by_fourier_sums,
-)
-from autotune.identification.delay.modulating import SinePower, Window, require_window
+from autotune.errors import InputError
+from autotune.identification.delay.modulated_integrals import Interval, Modulated, modulated_by_fourier_sums
 from autotune.recording import Recording
 
 #: Fixed points this far below zero, in intervals, are noise about a delay of zero; further below they are none.
@@ -40,6 +34,7 @@ _BY_CHANCE = 1e-6
 _EXACT = 1e-6
 _GRID = 32  # delays per interval
 _RESTARTS = 6
+_ITERATIONS = 50
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,42 +66,20 @@ class ModulatedDelay:
     residual: float
 
 
-def modulated_delay(
-    recording: Recording,
-    order: int,
-    intervals: Sequence[Interval],
-    *,
-    window: Window | None = None,
-    expansion: int | None = None,
-    delay_s: float = 0.0,
-    linear: bool = True,
-    offset: bool = False,
-    iterations: int = 50,
-) -> ModulatedDelay:
-    """Estimate a, b and h by modulating functions and least squares over intervals, iterating on h.
+def modulated_delay(recording: Recording, order: int, intervals: Sequence[Interval]) -> ModulatedDelay:
+    """Estimate a, b and h by modulating functions and least squares over intervals, iterating on h from 0.
+
+    Where the iteration from there has no fixed point that holds, it is begun again from the delays of a grid that
+    explain the intervals best. The modulating function is sin^n for even n and sin^(n+1) for odd n.
 
     Parameters
     ----------
     recording : Recording
-        u from ``T_1 - h`` on, y from ``T_1`` on.
+        u from ``T_1 - h`` on, y from ``T_1`` on, both linear between rows.
     order : int
         Order n.
     intervals : sequence of (float, float)
-        (T_1, T_2) [s]; more than unknowns.
-    window : SinePower or PolynomialWindow, optional
-        f; sin^n for even n and sin^(n+1) for odd n where not given.
-    expansion : int, optional
-        Order k of the expansion in what the delay still lacks, 1 to the window's power. Where not given, powers of the
-        sine are shifted exactly and polynomials expanded to k = m - 1, beyond which terms of the window's ends remain.
-    delay_s : float
-        Starting value h_0 [s]. Where the iteration from it has no fixed point that holds, it is begun again from the
-        delays of a grid that explain the intervals best.
-    linear : bool
-        Whether u runs linearly between rows; held otherwise.
-    offset : bool
-        Whether a constant is estimated, as where u and y are counted from an operating point.
-    iterations : int
-        Largest number of steps.
+        (T_1, T_2) [s], all of one length; more than unknowns.
 
     Returns
     -------
@@ -116,44 +89,36 @@ def modulated_delay(
     Raises
     ------
     InputError
-        Fewer intervals than unknowns, a window too flat-footed, or an expansion beyond the window's power.
-    IdentificationError
-        With the starting delay too few of the intervals lie in the record.
+        Fewer intervals than unknowns, or of unequal lengths.
 
     Notes
     -----
-    Without noise, from h_0 = 0 and with intervals of 15 s, Example 2 is recovered for delays up to 6.8 s, at noise 5 up
-    to 6 s, without a second start: the basin is a bit under half the interval. Least squares with noise in its
-    regressors is biased towards zero (Table 1: b = 1.94 for 2 at noise 5), and breaks under coloured noise; its
-    standard deviations are 34 to 83 times the Cramer-Rao bound.
+    Without noise and with intervals of 15 s, Example 2 is recovered for delays up to 6.8 s, at noise 5 up to 6 s,
+    without a second start: the basin is a bit under half the interval. Least squares with noise in its regressors is
+    biased towards zero (Table 1: b = 1.94 for 2 at noise 5), and breaks under coloured noise; its standard deviations
+    are 34 to 83 times the Cramer-Rao bound.
 
     References
     ----------
-    Section 3, the equation E_(T1,T2),x,u, whose b_l is b h^l / l!, and Example 2.
+    Section 3, the equation E_(T1,T2),x,u, and Example 2.
     """
-    window = window if window is not None else SinePower(m=order + order % 2)
-    require_window(window, order)
+    lengths = np.array([T_2 - T_1 for T_1, T_2 in intervals])
+    if np.ptp(lengths) > 1e-9 * lengths.max():
+        raise InputError("intervals of unequal lengths", where="intervals", remedy="give them one length")
     recording.require_finite()
-    modulated = _modulated(recording, window, order, intervals, linear, expansion)
-    lengths = np.array([[T_2 - T_1] for T_1, T_2 in intervals])  # of which the windows' areas are one share
-    modulated = replace(modulated, constant=lengths if offset else np.zeros((len(intervals), 0)))
-    unknowns = order + modulated.whole.size + int(offset)
-    if _inside(recording, intervals, 0.0).sum() < unknowns:
-        raise InputError(
-            f"{len(intervals)} intervals, of which {_inside(recording, intervals, 0.0).sum()} within the record, for "
-            f"{unknowns} unknowns",
-            where="intervals",
-            remedy="give more intervals",
-        )
-    if _inside(recording, intervals, delay_s).sum() < unknowns:
-        raise _leaves_the_record(recording, delay_s)
-    two_signs = isinstance(window, SinePower) and window.m % 2 == 0 and expansion is None
-    signs = (1.0, -1.0) if two_signs else (0.0,)  # the wrong sign has its fixed point half a window away
-    starts = _best_of_a_grid(recording, intervals, modulated)
+    modulated = modulated_by_fourier_sums(recording, order, intervals)
+    unknowns = order + modulated.whole.size
 
     def within(h: float) -> int:
         return int(_inside(recording, intervals, h).sum())
 
+    if within(0.0) < unknowns:
+        raise InputError(
+            f"{len(intervals)} intervals, of which {within(0.0)} within the record, for {unknowns} unknowns",
+            where="intervals",
+            remedy="give more intervals",
+        )
+    starts = _best_of_a_grid(recording, intervals, modulated)
     others = [(within(other) - unknowns, left) for other, left in starts]
 
     def most(h: float) -> float:
@@ -165,9 +130,9 @@ def modulated_delay(
         return float(min(shares, default=0.0)) + _EXACT
 
     found: list[ModulatedDelay] = []
-    for start in (delay_s, *(h for h, _ in starts)):
-        for sign in signs:
-            result = _iterate(recording, intervals, modulated, start, sign, iterations)
+    for start in (0.0, *(h for h, _ in starts)):
+        for sign in (1.0, -1.0):  # the wrong sign of b has its fixed point half a window away
+            result = _iterate(recording, intervals, modulated, start, sign)
             found.append(replace(result, converged=result.converged and result.residual <= most(result.delay_s)))
             if found[-1].converged and within(result.delay_s) == within(0.0):
                 return found[-1]
@@ -175,46 +140,26 @@ def modulated_delay(
     return min(found, key=lambda result: (not result.converged, -within(result.delay_s), result.residual))
 
 
-def _modulated(
-    recording: Recording,
-    window: Window,
-    order: int,
-    intervals: Sequence[Interval],
-    linear: bool,
-    expansion: int | None,
-) -> Modulated:
-    if isinstance(window, SinePower) and expansion is None:
-        return modulated_by_fourier_sums(recording, window, order, intervals, linear)
-    k = max(window.m - 1, 1) if expansion is None else expansion
-    if not 1 <= k <= window.m:
-        raise InputError(
-            f"expansion to order {k} with a window of power {window.m}",
-            where="expansion",
-            remedy=f"1 to {window.m}: beyond, the window's ends do not vanish",
-        )
-    return modulated_by_expansion(recording, window, order, intervals, linear, k)
-
-
 def _iterate(
-    recording: Recording, intervals: Sequence[Interval], modulated: Modulated, h: float, sign: float, iterations: int
+    recording: Recording, intervals: Sequence[Interval], modulated: Modulated, h: float, sign: float
 ) -> ModulatedDelay:
-    """Repeat least squares and delay step to the fixed point; sign is b's, 0 where it is left to the coefficients."""
+    """Repeat least squares and delay step to the fixed point; sign is b's."""
     Y = modulated.output
     n = Y.shape[1] - 1
-    longest = max(T_2 - T_1 for T_1, T_2 in intervals)
-    step, count, solution = np.inf, 0, np.zeros(n + modulated.whole.size + modulated.constant.shape[1])
-    while count < iterations and abs(step) > 1e-6:
+    length = intervals[0][1] - intervals[0][0]
+    step, count, solution = np.inf, 0, np.zeros(n + modulated.whole.size)
+    while count < _ITERATIONS and abs(step) > 1e-6:
         inside = _inside(recording, intervals, h)
         # sum (-1)^i L^-i a_i I_{y,f^(i)} + b I_{u_h,f} + .. = (-1)^n L^-n I_{y,f^(n)}
-        matrix = np.column_stack([Y[:, :n], modulated.of_input(h), modulated.constant])[inside]
+        matrix = np.column_stack([Y[:, :n], modulated.of_input(h)])[inside]
         if matrix.shape[0] < matrix.shape[1]:
             break
         solution = np.linalg.lstsq(matrix, Y[inside, n], rcond=None)[0]
         step = modulated.step(solution[n:], sign)
-        h += step * longest
+        h += step * length
         count += 1
     b = solution[n:]
-    fixed = abs(step) <= 1e-6 and h >= -_EARLY * longest and sign * b[0] >= 0.0
+    fixed = abs(step) <= 1e-6 and h >= -_EARLY * length and sign * b[0] >= 0.0
     return ModulatedDelay(
         a=tuple(float(value) for value in solution[:n]),
         b=float(b[0]),
@@ -226,13 +171,13 @@ def _iterate(
 
 
 def _residual(recording: Recording, intervals: Sequence[Interval], modulated: Modulated, h: float) -> float:
-    """Return what the equations leave at a delay, with one gain and no expansion; infinite with too few intervals."""
+    """Return what the equations leave at a delay, with one gain; infinite with too few intervals."""
     inside = _inside(recording, intervals, h)
     Y = modulated.output[inside]
-    if len(Y) < Y.shape[1] - 1 + modulated.whole.size + modulated.constant.shape[1]:
+    if len(Y) < Y.shape[1] - 1 + modulated.whole.size:
         return float("inf")
     of_u = (modulated.of_input(h) @ modulated.whole)[inside]
-    matrix = np.column_stack([Y[:, :-1], of_u, modulated.constant[inside]])
+    matrix = np.column_stack([Y[:, :-1], of_u])
     left = Y[:, -1] - matrix @ np.linalg.lstsq(matrix, Y[:, -1], rcond=None)[0]
     total = float(Y[:, -1] @ Y[:, -1]) * (1.0 - matrix.shape[1] / len(Y))
     return float(left @ left) / total if total > 0.0 else float("inf")
@@ -266,11 +211,3 @@ def _inside(recording: Recording, intervals: Sequence[Interval], h: float) -> Bo
     slack = 1.5 * (recording.t[-1] - recording.t[0]) / (len(recording) - 1)
     inside = (ends[:, 0] >= recording.t[0] - slack) & (ends[:, 1] <= recording.t[-1] + slack)
     return np.asarray(inside, dtype=np.bool_)
-
-
-def _leaves_the_record(recording: Recording, h: float) -> IdentificationError:
-    return IdentificationError(
-        f"with a delay of {h:.4g} s the intervals leave the record",
-        where=recording.name,
-        remedy="start nearer to the delay, take shorter intervals, or use identify_delay, which needs no start",
-    )

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from autotune.arrays import FloatArray
-from autotune.errors import InputError
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,63 +53,3 @@ class SinePower:
             q = (self.m - frequency) // 2  # sin^m = (2j)^-m sum_q C(m, q) (-1)^q exp(j (m - 2q) theta)
             terms.append((2.0 * math.comb(self.m, q) * (-1) ** q / (2j) ** self.m, math.pi * frequency))
         return tuple(terms)
-
-    @property
-    def shifts(self) -> int:
-        """Dimension of the family that all shifts of f span."""
-        return self.m + 1
-
-
-@dataclass(frozen=True, kw_only=True)
-class PolynomialWindow:
-    """f(s) = s^m (1 - s)^m on [0, 1].
-
-    Attributes
-    ----------
-    m : int
-        Power; derivatives below the m-th vanish at the ends.
-    """
-
-    m: int
-
-    def derivative(self, i: int, s: FloatArray) -> FloatArray:
-        """Return f^(i)(s), same shape as s.
-
-        Parameters
-        ----------
-        i : int
-            Order of the derivative, 0 for f itself.
-        s : array
-            Place in the interval, 0 to 1; any shape.
-        """
-        f = np.polynomial.Polynomial([0.0, 1.0]) ** self.m * np.polynomial.Polynomial([1.0, -1.0]) ** self.m
-        return np.asarray(f.deriv(i)(s) if i else f(s), dtype=np.float64)
-
-    @property
-    def shifts(self) -> int:
-        """Dimension of the family that all shifts of f span."""
-        return 2 * self.m + 1
-
-
-Window = SinePower | PolynomialWindow
-
-
-def require_window(window: Window, order: int) -> None:
-    """Refuse a window that is too flat-footed for the order.
-
-    Parameters
-    ----------
-    window : Window
-        Of power m.
-    order : int
-        Order n of the equation.
-
-    Raises
-    ------
-    InputError
-        m below n: terms at the window's ends would remain.
-    """
-    if window.m < order:
-        raise InputError(
-            f"window of power {window.m} for order {order}", where="window", remedy=f"take a power of at least {order}"
-        )
