@@ -81,7 +81,6 @@ def response_gradient(estimate: PredictionErrorEstimate, omega_rad_s: FloatArray
         np.einsum("oip,wiu->woup", estimate.d_c, right)
         + np.einsum("woi,ikp,wku->woup", left, estimate.d_a, right, optimize=True)
         + np.einsum("woi,iup->woup", left, estimate.d_b)
-        + estimate.d_d
     )
     late = np.exp(-1j * np.asarray(omega_rad_s, dtype=np.float64) * model.sample_time_s * model.input_delay)
     return np.asarray(change * late[:, None, None, None], dtype=np.complex128)

@@ -266,7 +266,6 @@ def _in_units(
         model=scaled,
         d_b=estimate.d_b / scale_u,
         d_c=estimate.d_c * scale_y,
-        d_d=estimate.d_d * ratio,
         d_k=estimate.d_k / scale_y,
         offset_y=estimate.offset_y * scale_y,
         log_det=estimate.log_det + 2.0 * math.log(scale_y) * model.C.shape[0],

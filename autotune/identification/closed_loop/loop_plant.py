@@ -48,7 +48,7 @@ class LoopRegion:
     sample_time_s : float
         Sample time [s].
     free : (P,) tuple of int
-        Which of b_0, ..., b_n, a_1, ..., a_n, counted from 0, were estimated; b_0 only with feedthrough.
+        Which of b_0, ..., b_n, a_1, ..., a_n, counted from 0, were estimated.
     covariance : (P, P) array
         Of those.
     degrees_of_freedom : int
@@ -282,7 +282,6 @@ def _jacobian(estimate: PredictionErrorEstimate) -> FloatArray:
                     A=model.A + way * estimate.d_a[..., p],
                     B=model.B + way * estimate.d_b[..., p],
                     C=model.C + way * estimate.d_c[..., p],
-                    D=model.D + way * estimate.d_d[..., p],
                 )
             )
             for way in (-step, step)

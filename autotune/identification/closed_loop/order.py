@@ -109,19 +109,17 @@ def _start_and_polish(
     order: int,
     *,
     delay: int,
-    feedthrough: bool,
-    offset: bool,
+    offset: bool = True,
     max_iterations: int = 60,
 ) -> PredictionErrorEstimate:
     """Return the polished model of one order, started by PBSIDopt on the factor ``data`` of the shifted signals."""
     f = min(data.p, max(10, -(-order // data.n_y) + 2))
-    states = pbsid_states(data, f, feedthrough=feedthrough)
-    start = replace(regress_system(data, states, order, feedthrough=feedthrough), input_delay=delay)
+    states = pbsid_states(data, f)
+    start = replace(regress_system(data, states, order), input_delay=delay)
     return prediction_error(
         start,
         series.u,
         series.y,
-        feedthrough=feedthrough,
         offset=offset,
         max_iterations=max_iterations,
         starts=series.starts,
@@ -133,8 +131,6 @@ def choose_order(
     y: FloatArray,
     *,
     max_order: int = 8,
-    feedthrough: bool = False,
-    offset: bool = True,
     progress: Progress = quiet,
     starts: tuple[int, ...] = (0,),
 ) -> OrderChoice:
@@ -146,8 +142,6 @@ def choose_order(
         Input and output, mean removed and scaled alike.
     max_order : int
         Highest order tried; the record's length may lower it.
-    feedthrough, offset : bool
-        As in :func:`autotune.identification.closed_loop.prediction_error.prediction_error`.
     progress : callable
         Told what is tried; the share is NaN, since dead times are tried only where the data hint at one.
     starts : tuple of int
@@ -178,15 +172,7 @@ def choose_order(
     def try_order(order: int, delay: int, factor: LaggedData) -> None:
         progress(f"order {order}, dead time {delay}", math.nan)
         try:
-            fits[order, delay] = _start_and_polish(
-                factor,
-                few,
-                order,
-                delay=delay,
-                feedthrough=feedthrough,
-                offset=offset,
-                max_iterations=_CANDIDATE_STEPS,
-            )
+            fits[order, delay] = _start_and_polish(factor, few, order, delay=delay, max_iterations=_CANDIDATE_STEPS)
         except IdentificationError:
             return  # a candidate that has no model is no candidate
 
@@ -210,8 +196,8 @@ def choose_order(
     factor = _factor(series.head(_START_ROWS).delayed(best[1]), p=data.p)
     estimate = fits[best]
     if cut < len(u) or not estimate.converged:
-        estimate = _start_and_polish(factor, series, best[0], delay=best[1], feedthrough=feedthrough, offset=offset)
-    values = pbsid_states(factor, min(factor.p, 10), feedthrough=feedthrough).singular_values
+        estimate = _start_and_polish(factor, series, best[0], delay=best[1])
+    values = pbsid_states(factor, min(factor.p, 10)).singular_values
     return OrderChoice(
         estimate=estimate,
         others=_others(fits, best),
@@ -228,7 +214,6 @@ def fixed_order(
     *,
     delay: int = 0,
     p: int | None = None,
-    feedthrough: bool = False,
     offset: bool = True,
     starts: tuple[int, ...] = (0,),
 ) -> PredictionErrorEstimate:
@@ -242,14 +227,14 @@ def fixed_order(
         States, and whole samples of dead time.
     p : int, optional
         Past window of the start; chosen by Akaike's criterion when absent.
-    feedthrough, offset : bool
+    offset : bool
         As in :func:`autotune.identification.closed_loop.prediction_error.prediction_error`.
     starts : tuple of int
         First row of each stretch of equidistant rows.
     """
     series = Series(u=u, y=y, starts=starts)
     factor = _factor(series.head(_START_ROWS).delayed(delay), p=p, least=order + 2)
-    return _start_and_polish(factor, series, order, delay=delay, feedthrough=feedthrough, offset=offset)
+    return _start_and_polish(factor, series, order, delay=delay, offset=offset)
 
 
 def _factor(series: Series, p: int | None = None, least: int = 10) -> LaggedData:
@@ -278,7 +263,7 @@ def _dead_time(data: LaggedData, rows: int) -> int:
     if np.min(scale) <= 1e-9 * np.max(scale):
         return 0
     inverse = np.linalg.inv(factor)
-    phi, _ = autoregression(data, feedthrough=False)
+    phi = autoregression(data)
     n_u, n_z, n_y = data.n_u, data.n_u + data.n_y, data.n_y
     count = 0
     for k in range(1, data.p - 1):

@@ -49,7 +49,7 @@ class PredictionErrorEstimate:
     ----------
     model : InnovationModel
         The estimate, with the innovations' covariance (degrees of freedom counted).
-    d_a, d_b, d_c, d_d, d_k : arrays of shape (..., P)
+    d_a, d_b, d_c, d_k : arrays of shape (..., P)
         Directions of the parameters: the model moves by their sum weighted with the coordinates.
     covariance : (P, P) array
         Asymptotic covariance of these coordinates (inverse information); right for Gaussian white innovations and
@@ -78,7 +78,6 @@ class PredictionErrorEstimate:
     d_a: FloatArray
     d_b: FloatArray
     d_c: FloatArray
-    d_d: FloatArray
     d_k: FloatArray
     covariance: FloatArray
     offset_x: FloatArray
@@ -108,7 +107,6 @@ def prediction_error(
     u: FloatArray,
     y: FloatArray,
     *,
-    feedthrough: bool = False,
     offset: bool = True,
     max_iterations: int = 60,
     starts: tuple[int, ...] = (0,),
@@ -118,11 +116,10 @@ def prediction_error(
     Parameters
     ----------
     start : InnovationModel
-        Consistent start; its order and dead time are kept. Its predictor must be stable, the plant need not be.
+        Consistent start; its order and dead time are kept. Its predictor must be stable, the plant need not be. D is
+        zero in the estimate: y is measured before its row's u acts.
     u, y : (N, n_u), (N, n_y) arrays
         Command as applied and measurement, equidistant.
-    feedthrough : bool
-        Estimate D; otherwise D is zero (y is measured before its row's u acts).
     offset : bool
         Estimate a constant where the signals move about an operating point or the data ask for one (a gain in -2 log
         likelihood above log N), so that means and an integrator's bias need not be known; a constant that is not there
@@ -150,12 +147,12 @@ def prediction_error(
     series = Series(u=np.ascontiguousarray(u), y=np.ascontiguousarray(y), starts=starts).delayed(start.input_delay)
     u_level, y_level = (_level(column) if offset else np.zeros(column.shape[1]) for column in (series.u, series.y))
     series = series.less(u_level, y_level)
-    predictor = _initial_predictor(start, feedthrough=feedthrough, n_y=y.shape[1])
+    prompt, n, n_y = replace(start, D=np.zeros_like(start.D)), start.order, y.shape[1]
+    predictor = Predictor.of(prompt, np.zeros(n), np.zeros(n_y), np.zeros(n))
     predictor, evident = _linear_start(predictor, series, offset=offset)
     search = _search(
         predictor,
         series,
-        feedthrough=feedthrough,
         offset=offset,
         constant=evident or bool(np.any(u_level) or np.any(y_level)),
         max_iterations=max_iterations,
@@ -167,12 +164,6 @@ def _level(signal: FloatArray) -> FloatArray:
     """Return the operating point (channels,) that a signal moves about, zero where it moves about zero."""
     mean = signal.mean(axis=0)
     return np.where(np.abs(mean) > _OPERATING_POINT * signal.std(axis=0), mean, 0.0)
-
-
-def _initial_predictor(start: InnovationModel, *, feedthrough: bool, n_y: int) -> Predictor:
-    n = start.order
-    model = start if feedthrough else replace(start, D=np.zeros_like(start.D))
-    return Predictor.of(model, np.zeros(n), np.zeros(n_y), np.zeros(n))
 
 
 def _linear_start(predictor: Predictor, series: Series, *, offset: bool) -> tuple[Predictor, bool]:
@@ -217,7 +208,6 @@ def _search(
     predictor: Predictor,
     series: Series,
     *,
-    feedthrough: bool,
     offset: bool,
     constant: bool,
     max_iterations: int,
@@ -232,7 +222,7 @@ def _search(
         if renewed:
             predictor = _balance(predictor)
         if renewed or n_y > 1:  # with one output they hold as long as the coordinates do
-            full = behaviour_directions(predictor, feedthrough=feedthrough, offset=offset)
+            full = behaviour_directions(predictor, offset=offset)
             directions, phi = series.moving(predictor, full), regressors(predictor)
         parameters = full.shape[1] + (len(series.starts) - 1) * len(predictor.x0)
         if len(y) * n_y <= parameters:
@@ -311,7 +301,6 @@ def _estimate(
         d_a=d_f[:, :n] + feedback[:, :n],
         d_b=d_f[:, n : n + n_u] + feedback[:, n : n + n_u],
         d_c=d_h[:, :n],
-        d_d=d_h[:, n : n + n_u],
         d_k=d_k,
         covariance=inverse * rows / freedom,
         offset_x=predictor.F[:, -1] + K @ predictor.H[:, -1] - model.B @ u_level,

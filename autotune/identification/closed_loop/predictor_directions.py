@@ -90,12 +90,12 @@ class Predictor:
         return np.concatenate([self.F.ravel(), self.H.ravel(), self.x0])
 
 
-def _free_entries(predictor: Predictor, *, feedthrough: bool) -> IntArray:
-    """Return which entries of :meth:`Predictor.packed`, constants left out, are estimated, as indices."""
+def _free_entries(predictor: Predictor) -> IntArray:
+    """Return which entries of :meth:`Predictor.packed`, D and constants left out, are estimated, as indices."""
     n, n_u, _ = predictor.sizes
     F, H = np.ones(predictor.F.shape, dtype=bool), np.ones(predictor.H.shape, dtype=bool)
     F[:, -1] = H[:, -1] = False
-    H[:, n : n + n_u] = feedthrough
+    H[:, n : n + n_u] = False
     return np.asarray(np.flatnonzero(np.concatenate([F.ravel(), H.ravel(), np.ones(n, dtype=bool)])), dtype=np.int64)
 
 
@@ -113,21 +113,21 @@ def renaming_directions(predictor: Predictor) -> FloatArray:
     return np.concatenate([dF.reshape(-1, n * n), dH.reshape(-1, n * n), dx0])
 
 
-def behaviour_directions(predictor: Predictor, *, feedthrough: bool, offset: bool) -> FloatArray:
-    """Return a basis of the directions that change the behaviour.
+def behaviour_directions(predictor: Predictor, *, offset: bool) -> FloatArray:
+    """Return a basis of the directions that change the behaviour, D as it is.
 
     Parameters
     ----------
     predictor : Predictor
         Where they hold.
-    feedthrough, offset : bool
-        Whether D is free, and whether y_0 is.
+    offset : bool
+        Whether y_0 is free.
 
     Returns
     -------
     (entries, P) array
-        P = n (n_u + 2 n_y) + n + n_y n_u (feedthrough) + n_y (offset): the number of free parameters with the initial
-        state counted. The constants' columns are the last.
+        P = n (n_u + 2 n_y) + n + n_y (offset): the number of free parameters with the initial state counted. The
+        constants' columns are the last.
 
     Notes
     -----
@@ -138,9 +138,9 @@ def behaviour_directions(predictor: Predictor, *, feedthrough: bool, offset: boo
     n, _, n_y = predictor.sizes
     entries = predictor.packed().size
     if n_y == 1:
-        behaviour = _injection_directions(predictor, entries, feedthrough=feedthrough)
+        behaviour = _injection_directions(predictor, entries)
     else:
-        free = _free_entries(predictor, feedthrough=feedthrough)
+        free = _free_entries(predictor)
         renaming = renaming_directions(predictor)[free]
         behaviour = np.zeros((entries, len(free) - n * n))
         behaviour[free] = qr(renaming, check_finite=False)[0][:, n * n :]
@@ -178,12 +178,11 @@ def constant_directions(predictor: Predictor) -> FloatArray:
     return directions
 
 
-def _injection_directions(predictor: Predictor, entries: int, *, feedthrough: bool) -> FloatArray:
+def _injection_directions(predictor: Predictor, entries: int) -> FloatArray:
     n, n_u, _ = predictor.sizes
     m, C = predictor.F.shape[1], predictor.H[0, :n]
     states = np.arange(n)
     unit = [states * m + n + q for q in range(n_u + 1)]  # B and K
-    unit += [predictor.F.size + n + np.arange(n_u)] if feedthrough else []
     rows = np.concatenate([*unit, np.arange(entries - n, entries)])
     directions = np.zeros((entries, n + len(rows)))
     for i in range(n):

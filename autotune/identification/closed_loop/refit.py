@@ -1,4 +1,4 @@
-"""B and D again, from the prediction errors: the remedy for methods that estimate A, C and K well and B badly."""
+"""B again, from the prediction errors: the remedy for methods that estimate A, C and K well and B badly."""
 
 from __future__ import annotations
 
@@ -13,8 +13,10 @@ from autotune.identification.closed_loop.state_space import InnovationModel
 from autotune.identification.closed_loop.subspace_direct import with_stable_predictor
 
 
-def refit_inputs(model: InnovationModel, u: FloatArray, y: FloatArray, *, feedthrough: bool = False) -> InnovationModel:
-    """Return the model with B, D, initial state and a load refitted by linear least squares on its prediction errors.
+def refit_inputs(model: InnovationModel, u: FloatArray, y: FloatArray) -> InnovationModel:
+    """Return the model with B, initial state and a load refitted by linear least squares on its prediction errors.
+
+    D is zero: y is measured before its row's u acts.
 
     Parameters
     ----------
@@ -22,17 +24,15 @@ def refit_inputs(model: InnovationModel, u: FloatArray, y: FloatArray, *, feedth
         A, C and K are kept (K is replaced first where its predictor is not stable).
     u, y : (N, n_u), (N, n_y) arrays
         Command and measurement about any operating point: a load is fitted as well.
-    feedthrough : bool
-        Estimate D; otherwise it is zero.
 
     Returns
     -------
     InnovationModel
-        With B, D and the innovations' covariance of the refit.
+        With B and the innovations' covariance of the refit.
 
     Notes
     -----
-    The one-step predictor is linear in B, D and x(0) once A, C and K are given; in closed loop the estimate is
+    The one-step predictor is linear in B and x(0) once A, C and K are given; in closed loop the estimate is
     consistent where A and K are.
     """
     model = with_stable_predictor(model)
@@ -45,8 +45,6 @@ def refit_inputs(model: InnovationModel, u: FloatArray, y: FloatArray, *, feedth
     for q in range(n_u):
         signal = np.ascontiguousarray(u[:, q : q + 1])
         columns += [_response(model, np.eye(n)[:, i : i + 1], signal, np.zeros(n), len(y)) for i in range(n)]
-        if feedthrough:
-            columns += [_through(model, signal, o) for o in range(n_y)]
     base = innovations(
         _state_map(model, np.zeros((n, 0))), _output_map(model, 0), np.zeros(n), np.zeros((len(y), 0)), y
     )
@@ -56,11 +54,10 @@ def refit_inputs(model: InnovationModel, u: FloatArray, y: FloatArray, *, feedth
         R = triangle(np.vstack([R, np.stack(part, axis=1)]))
     theta = -least_squares(R[:, :-1], R[:, -1])
     rest = base + sum(column * value for column, value in zip(columns, theta, strict=True))
-    by_input = theta[first:].reshape(n_u, -1)
     return replace(
         model,
-        B=by_input[:, :n].T.copy(),
-        D=by_input[:, n:].T.copy() if feedthrough else np.zeros((n_y, n_u)),
+        B=theta[first:].reshape(n_u, n).T.copy(),
+        D=np.zeros((n_y, n_u)),
         innovation_covariance=rest.T @ rest / max(len(y) - len(theta), 1),
     )
 
@@ -83,15 +80,4 @@ def _response(model: InnovationModel, B: FloatArray, u: FloatArray, x0: FloatArr
     """Return the change of the innovations that a B and an initial state make, y left out."""
     y = np.zeros((rows, len(model.C)))
     errors: FloatArray = innovations(_state_map(model, B), _output_map(model, u.shape[1]), x0, u, y)
-    return errors
-
-
-def _through(model: InnovationModel, u: FloatArray, output: int) -> FloatArray:
-    """Return the change of the innovations that a unit feedthrough to one output makes."""
-    y = np.zeros((len(u), len(model.C)))
-    y[:, output] = -u[:, 0]
-    nothing = np.zeros((model.order, 0))
-    errors: FloatArray = innovations(
-        _state_map(model, nothing), _output_map(model, 0), np.zeros(model.order), np.zeros((len(u), 0)), y
-    )
     return errors

@@ -87,31 +87,22 @@ def _with_trace_of_noise(R: FloatArray, width: int) -> FloatArray:
     return triangle(np.vstack([R, trace]))
 
 
-def autoregression(data: LaggedData, *, feedthrough: bool) -> tuple[FloatArray, FloatArray]:
-    """Return the long ARX model y(t) = sum Phi_k z(t-k) + D u(t) + e.
+def autoregression(data: LaggedData) -> FloatArray:
+    """Return the long ARX model y(t) = sum Phi_k z(t-k) + e.
 
     Parameters
     ----------
     data : LaggedData
         Factor of p past samples and the present one.
-    feedthrough : bool
-        Whether u(t) acts on y(t).
 
     Returns
     -------
-    phi : (p, n_y, n_u + n_y) array
-        Markov parameters Phi_k = C (A - K C)^(k-1) [B - K D, K] of the predictor.
-    D : (n_y, n_u) array
-        Feedthrough, zero where not asked for.
+    (p, n_y, n_u + n_y) array
+        Markov parameters Phi_k = C (A - K C)^(k-1) [B, K] of the predictor.
     """
-    now_u, now_y = data.now
     width = data.past().stop
-    if feedthrough:  # u(t) may follow from the past exactly, the past alone never does: it holds a trace of noise
-        theta = least_squares(data.R[:, : now_u.stop], data.R[:, now_y])
-    else:
-        theta = solve_triangular(data.R[:width, :width], data.R[:width, now_y], check_finite=False)
-    phi = theta[:width].T.reshape(data.n_y, data.p, data.n_u + data.n_y).transpose(1, 0, 2)
-    return phi, theta[width:].T if feedthrough else np.zeros((data.n_y, data.n_u))
+    theta = solve_triangular(data.R[:width, :width], data.R[:width, data.now[1]], check_finite=False)
+    return np.asarray(theta.T.reshape(data.n_y, data.p, data.n_u + data.n_y).transpose(1, 0, 2))
 
 
 def choose_past_window(data: LaggedData) -> int:
@@ -144,7 +135,7 @@ class StateSelection:
     singular_values: FloatArray
 
 
-def pbsid_states(data: LaggedData, f: int, *, feedthrough: bool = False) -> StateSelection:
+def pbsid_states(data: LaggedData, f: int) -> StateSelection:
     """Return the states of PBSIDopt (Chiuso 2007): the SVD of the predicted outputs Gamma K Z_p.
 
     Parameters
@@ -153,10 +144,8 @@ def pbsid_states(data: LaggedData, f: int, *, feedthrough: bool = False) -> Stat
         Past window p.
     f : int
         Future window, at most p.
-    feedthrough : bool
-        Whether u(t) acts on y(t).
     """
-    phi, _ = autoregression(data, feedthrough=feedthrough)
+    phi = autoregression(data)
     n_z = data.n_u + data.n_y
     gamma_k = np.zeros((f * data.n_y, data.p * n_z))
     for i in range(f):
@@ -168,10 +157,8 @@ def pbsid_states(data: LaggedData, f: int, *, feedthrough: bool = False) -> Stat
     return StateSelection(weights=(U / scale).T @ gamma_k, singular_values=s / np.sqrt(data.rows))
 
 
-def regress_system(
-    data: LaggedData, states: StateSelection, order: int, *, feedthrough: bool = False
-) -> InnovationModel:
-    """Return A, B, C, D and K from two regressions on the states: the outputs, then the next states.
+def regress_system(data: LaggedData, states: StateSelection, order: int) -> InnovationModel:
+    """Return A, B, C and K from two regressions on the states: the outputs, then the next states.
 
     Parameters
     ----------
@@ -181,8 +168,6 @@ def regress_system(
         Weights of the past that give the states, the most telling first.
     order : int
         How many of them are taken.
-    feedthrough : bool
-        Whether u(t) acts on y(t).
 
     Raises
     ------
@@ -197,15 +182,14 @@ def regress_system(
     past = data.past()
     shifted = np.r_[now_u.start : now_y.stop, 0 : past.stop - n_z]  # z(t), z(t-1), ... z(t-p+1)
     X, X_next, U, Y = R[:, past] @ T.T, R[:, shifted] @ T.T, R[:, now_u], R[:, now_y]
-    first = np.hstack([X, U]) if feedthrough else X
-    CD = least_squares(first, Y).T
-    E = Y - first @ CD.T
+    C = least_squares(X, Y).T
+    E = Y - X @ C.T
     ABK = least_squares(np.hstack([X, U, E]), X_next).T
     model = InnovationModel(
         A=ABK[:, :order],
         B=ABK[:, order : order + data.n_u],
-        C=CD[:, :order],
-        D=CD[:, order:] if feedthrough else np.zeros((data.n_y, data.n_u)),
+        C=C,
+        D=np.zeros((data.n_y, data.n_u)),
         K=ABK[:, order + data.n_u :],
         innovation_covariance=E.T @ E / data.rows,
     )
@@ -236,9 +220,7 @@ def with_stable_predictor(model: InnovationModel) -> InnovationModel:
     raise IdentificationError("the start has no stable predictor", remedy="ask for another --order")
 
 
-def pbsid_opt(
-    u: FloatArray, y: FloatArray, order: int, *, p: int, f: int, feedthrough: bool = False
-) -> InnovationModel:
+def pbsid_opt(u: FloatArray, y: FloatArray, order: int, *, p: int, f: int) -> InnovationModel:
     """Identify by PBSIDopt (Chiuso 2007).
 
     Parameters
@@ -249,8 +231,6 @@ def pbsid_opt(
         Number of states.
     p, f : int
         Past and future window, f <= p.
-    feedthrough : bool
-        Estimate D.
 
     Notes
     -----
@@ -258,7 +238,7 @@ def pbsid_opt(
     polish it with :func:`autotune.identification.closed_loop.prediction_error.prediction_error`.
     """
     data = lagged_data(u, y, p)
-    return regress_system(data, pbsid_states(data, f, feedthrough=feedthrough), order, feedthrough=feedthrough)
+    return regress_system(data, pbsid_states(data, f), order)
 
 
 def ssarx(u: FloatArray, y: FloatArray, order: int, *, p: int, f: int) -> InnovationModel:
@@ -278,7 +258,7 @@ def ssarx(u: FloatArray, y: FloatArray, order: int, *, p: int, f: int) -> Innova
     Asymptotically equivalent to PBSIDopt (Chiuso 2006); no feedthrough.
     """
     data = lagged_data(u, y, p)
-    phi, _ = autoregression(data, feedthrough=False)
+    phi = autoregression(data)
     n_u, n_y, n_z = data.n_u, data.n_y, data.n_u + data.n_y
     z = np.hstack([u, y])
     R, _ = lagged_factor([(z, range(-1, -p - 1, -1)), (z, range(f))])
