@@ -55,53 +55,6 @@ def innovations(F: FloatArray, H: FloatArray, x0: FloatArray, u: FloatArray, y: 
     return e
 
 
-@njit(cache=True)
-def scatter(F: FloatArray, H: FloatArray, x0: FloatArray, u: FloatArray, y: FloatArray) -> FloatArray:
-    """Return the sum of e e^T over :func:`innovations`.
-
-    Parameters
-    ----------
-    F : (n, n + n_u + n_y + 1) array
-        Of the state equation.
-    H : (n_y, n + n_u + 1) array
-        Of the output equation.
-    x0 : (n,) array
-        Initial state.
-    u, y : (N, n_u), (N, n_y) arrays
-        The record.
-
-    Returns
-    -------
-    (n_y, n_y) array
-        The sum.
-    """
-    n, n_u, n_y = F.shape[0], u.shape[1], y.shape[1]
-    total = np.zeros((n_y, n_y))
-    x, following, e = x0.copy(), np.empty(n), np.empty(n_y)
-    for t in range(y.shape[0]):
-        for o in range(n_y):
-            value = y[t, o] - H[o, n + n_u]
-            for i in range(n):
-                value -= H[o, i] * x[i]
-            for q in range(n_u):
-                value -= H[o, n + q] * u[t, q]
-            e[o] = value
-        for i in range(n):
-            value = F[i, n + n_u + n_y]
-            for k in range(n):
-                value += F[i, k] * x[k]
-            for q in range(n_u):
-                value += F[i, n + q] * u[t, q]
-            for o in range(n_y):
-                value += F[i, n + n_u + o] * y[t, o]
-            following[i] = value
-        x[:] = following
-        for o in range(n_y):
-            for k in range(n_y):
-                total[o, k] += e[o] * e[k]
-    return total
-
-
 @njit(cache=True, fastmath={"contract", "nsz"})  # fused multiply-add only: NaN and order of sums are kept
 def normal_equations(
     F: FloatArray,

@@ -14,7 +14,7 @@ import numpy as np
 from autotune.arrays import BoolArray, FloatArray
 from autotune.errors import IdentificationError
 from autotune.identification.closed_loop.predictor_directions import Predictor
-from autotune.identification.closed_loop.predictor_sweep import innovations, normal_equations, scatter
+from autotune.identification.closed_loop.predictor_sweep import innovations, normal_equations
 
 #: Directions of an initial state that carry less than this share of the information are not moved.
 _RANK = 1e-12
@@ -105,9 +105,9 @@ class Series:
 
     def scatter(self, predictor: Predictor) -> FloatArray:
         """Return the sum of e e^T, (n_y, n_y), at the best initial states."""
-        states = self.states(predictor)
-        parts = [scatter(predictor.F, predictor.H, x0, u, y) for x0, (u, y) in zip(states, self.stretches, strict=True)]
-        return np.asarray(sum(parts), dtype=np.float64)
+        e = self.errors(predictor, self.states(predictor))
+        # not by BLAS, whose threads spin longer than they work
+        return np.asarray(np.einsum("to,tp->op", e, e), dtype=np.float64)
 
     def moving(self, predictor: Predictor, directions: FloatArray) -> FloatArray:
         """Return the directions that steps are taken along: none of initial states that are fitted stretch by stretch.
