@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
 
@@ -19,6 +21,68 @@ _FILLED = 2.5
 #: degrees of freedom of the noise's density from which on a covariance is stated
 _FREEDOM = 3.0
 _LONGER = 3.0
+
+
+class Settings(NamedTuple):
+    """What stays from row to row.
+
+    Attributes
+    ----------
+    n : int
+        Order of the equation.
+    lam : float
+        Decay of the kernels lambda [1/s].
+    gain : float
+        Above 0 that of the paper's gradient flow; else the gain matrix is the inverse of the averaged equations.
+    memory_s : float
+        Memory of the averages [s].
+    linear : bool
+        Whether u runs linearly between its rows (else it is held).
+    delayed, offset : bool
+        Whether a delay and a constant are unknowns.
+    after : float
+        Time since the first row from which on the delay moves [s].
+    rate : float
+        How fast it does [1/s].
+    """
+
+    n: int
+    lam: float
+    gain: float
+    memory_s: float
+    linear: bool
+    delayed: bool
+    offset: bool
+    after: float
+    rate: float
+
+
+class Carried(NamedTuple):
+    """What is carried over from row to row, changed in place.
+
+    Attributes
+    ----------
+    Jy, Ju : (kernels,) array
+        Chains of y and u.
+    A : (P,) array
+        The unknowns: coefficients, b, b times what the delay lacks, constant.
+    R : (P, P) array
+        Averaged equations.
+    slow : (P,) array
+        Averaged right-hand side.
+    spread : (P, P) array
+        What the equations leave, averaged.
+    scalars : (8,) array
+        Delay [s], stamps and values of the last row, and weights; places as named above.
+    """
+
+    Jy: FloatArray
+    Ju: FloatArray
+    A: FloatArray
+    R: FloatArray
+    slow: FloatArray
+    spread: FloatArray
+    scalars: FloatArray
 
 
 @njit(cache=True)
@@ -114,31 +178,9 @@ def _equations(Jy: FloatArray, Jh: FloatArray, n: int, lam: float, delayed: bool
 
 @njit(cache=True)
 def step_row(
-    k: int,
-    t: FloatArray,
-    u: FloatArray,
-    past: FloatArray,
-    y: float,
-    Jy: FloatArray,
-    Ju: FloatArray,
-    A: FloatArray,
-    R: FloatArray,
-    slow: FloatArray,
-    spread: FloatArray,
-    scalars: FloatArray,
-    n: int,
-    lam: float,
-    gain: float,
-    memory_s: float,
-    linear: bool,
-    delayed: bool,
-    offset: bool,
-    after: float,
-    rate: float,
+    k: int, t: FloatArray, u: FloatArray, past: FloatArray, y: float, carried: Carried, settings: Settings
 ) -> tuple[FloatArray, FloatArray, bool]:
     """Carry everything over to row k, in place; return state, covariance of the unknowns and whether lock holds.
-
-    ``gain`` above 0 is the paper's gradient flow; otherwise the gain matrix is the inverse of the averaged equations.
 
     Parameters
     ----------
@@ -150,35 +192,13 @@ def step_row(
         Chain of u at every row.
     y : float
         Measurement at row k [y unit].
-    Jy, Ju : (kernels,) array
-        Chains of y and u.
-    A : (P,) array
-        The unknowns: coefficients, b, b times what the delay lacks, constant.
-    R : (P, P) array
-        Averaged equations.
-    slow : (P,) array
-        Averaged right-hand side.
-    spread : (P, P) array
-        What the equations leave, averaged.
-    scalars : (8,) array
-        Delay [s], stamps and values of the last row, and weights; places as named above.
-    n : int
-        Order of the equation.
-    lam : float
-        Decay of the kernels lambda [1/s].
-    gain : float
-        Above 0 that of the paper's gradient flow; else the gain matrix is the inverse of the averaged equations.
-    memory_s : float
-        Memory of the averages [s].
-    linear : bool
-        Whether u runs linearly between its rows (else it is held).
-    delayed, offset : bool
-        Whether a delay and a constant are unknowns.
-    after : float
-        Time since the first row from which on the delay moves [s].
-    rate : float
-        How fast it does [1/s].
+    carried : Carried
+        From the row before.
+    settings : Settings
+        Those of the estimator.
     """
+    Jy, Ju, A, R, _, spread, scalars = carried
+    n, lam, gain, memory_s, linear, delayed, offset, after, rate = settings
     kernels = Jy.size
     step = t[k] - scalars[LAST_T]
     new = np.empty(kernels)
@@ -198,7 +218,7 @@ def step_row(
             whole = np.ones((C.shape[0], A.size))
             whole[:, : A.size - 1] = C
             C = whole
-        _solve_averaged(C, D, A, R, slow, spread, scalars, step, n, lam, memory_s, offset)
+        _solve_averaged(C, D, carried, step, settings)
     if delayed and t[k] - scalars[FIRST_T] > after and A[n] != 0.0:
         lacking = A[n + 1] / A[n]
         moved = max(step * rate * lacking, -scalars[H])  # u is not known ahead of its time
@@ -215,26 +235,7 @@ def step_row(
 
 @njit(cache=True)
 def step_rows(
-    t: FloatArray,
-    u: FloatArray,
-    past: FloatArray,
-    y: FloatArray,
-    Jy: FloatArray,
-    Ju: FloatArray,
-    A: FloatArray,
-    R: FloatArray,
-    slow: FloatArray,
-    spread: FloatArray,
-    scalars: FloatArray,
-    n: int,
-    lam: float,
-    gain: float,
-    memory_s: float,
-    linear: bool,
-    delayed: bool,
-    offset: bool,
-    after: float,
-    rate: float,
+    t: FloatArray, u: FloatArray, past: FloatArray, y: FloatArray, carried: Carried, settings: Settings
 ) -> tuple[FloatArray, FloatArray, int]:
     """Carry everything over all rows after the first; return state, covariance and the row where lock was lost, or 0.
 
@@ -244,36 +245,22 @@ def step_rows(
         As of :func:`step_row`.
     y : (N,) array
         Measurement [y unit].
-    Jy, Ju, A, R, slow, spread, scalars, n, lam, gain, memory_s, linear, delayed, offset, after, rate : as of step_row
-        What is carried over, and the settings.
+    carried, settings
+        As of :func:`step_row`.
     """
-    state, covariance = np.full(n, np.nan), np.full(R.shape, np.nan)
+    state, covariance = np.full(settings.n, np.nan), np.full(carried.R.shape, np.nan)
     for k in range(1, t.size):
-        state, covariance, locked = step_row(
-            k, t, u, past, y[k], Jy, Ju, A, R, slow, spread, scalars, n, lam, gain, memory_s, linear, delayed, offset,
-            after, rate,
-        )  # fmt: skip
+        state, covariance, locked = step_row(k, t, u, past, y[k], carried, settings)
         if not locked:
             return state, covariance, k
     return state, covariance, 0
 
 
 @njit(cache=True)
-def _solve_averaged(
-    C: FloatArray,
-    D: FloatArray,
-    A: FloatArray,
-    R: FloatArray,
-    slow: FloatArray,
-    spread: FloatArray,
-    scalars: FloatArray,
-    step: float,
-    n: int,
-    lam: float,
-    memory_s: float,
-    offset: bool,
-) -> None:
+def _solve_averaged(C: FloatArray, D: FloatArray, carried: Carried, step: float, settings: Settings) -> None:
     """Move A by the averaged equations' own inverse, which no unit changes; keep what its covariance is made of."""
+    A, R, slow, spread, scalars = carried.A, carried.R, carried.slow, carried.spread, carried.scalars
+    n, lam, memory_s, offset = settings.n, settings.lam, settings.memory_s, settings.offset
     factor = 1.0
     known = A.size - 1 if offset else A.size
     for j in range(n + C.shape[0]):  # kernels of area 1: every equation in the same unit, whatever that of time

@@ -158,17 +158,34 @@ class OnlineEstimator:
             raise InputError("forgetting, memory, gain and order must be positive", where="follow")
         if gain is not None and offset:
             raise InputError("a scalar gain has no offset", where="follow", remedy="give memory_s instead")
-        self._n, self._delay, self._linear, self._offset = order, delay, linear, offset
-        self._forgetting, self._memory_s, self._gain = float(forgetting), float(memory_s or 0.0), float(gain or 0.0)
         order = int(order)
+        self._delay = delay
+        self._settings = chain.Settings(
+            n=order,
+            lam=float(forgetting),
+            gain=float(gain or 0.0),
+            memory_s=float(memory_s or 0.0),
+            linear=linear,
+            delayed=delay is not None,
+            offset=offset,
+            after=float(delay.after_s) if delay else np.inf,
+            rate=float(delay.rate) if delay else 0.0,
+        )
         kernels, unknowns = 2 * order + 2, order + (2 if delay else 1) + int(offset)
-        self._chains = np.zeros(kernels), np.zeros(kernels)
-        self._averages = np.zeros(unknowns), np.zeros((unknowns,) * 2), np.zeros(unknowns), np.zeros((unknowns,) * 2)
+        self._carried = chain.Carried(
+            Jy=np.zeros(kernels),
+            Ju=np.zeros(kernels),
+            A=np.zeros(unknowns),
+            R=np.zeros((unknowns, unknowns)),
+            slow=np.zeros(unknowns),
+            spread=np.zeros((unknowns, unknowns)),
+            scalars=np.zeros(8),
+        )
+        self._scalars = self._carried.scalars
+        self._scalars[chain.H] = delay.start_s if delay else 0.0
         self._t, self._u, self._past = np.empty(_ROOM), np.empty(_ROOM), np.zeros((_ROOM, kernels))
         self._rows = self._taken = 0
         self._first_t = 0.0
-        self._scalars = np.zeros(8)
-        self._scalars[chain.H] = delay.start_s if delay else 0.0
 
     def step(self, t: float, u: float, y: float) -> OnlineSample:
         """Take a row and return the estimates after it.
@@ -195,16 +212,14 @@ class OnlineEstimator:
         if self._rows and not t > self._scalars[chain.LAST_T]:
             raise InputError(f"t = {t:g} s is not later than the last row", where="step", remedy="call it once a row")
         self._make_room()
-        k, n = self._rows, self._n
+        k, n = self._rows, self._settings.n
         self._t[k], self._u[k] = t, u
         self._rows += 1
         self._taken += 1
         if self._taken == 1:
             self._begin(t, u, y)
-            return self._sample(t, np.full(n, np.nan), np.full((len(self._averages[0]),) * 2, np.nan))
-        state, covariance, locked = chain.step_row(
-            k, self._t, self._u, self._past, y, *self._chains, *self._averages, self._scalars, *self._settings()
-        )
+            return self._sample(t, np.full(n, np.nan), np.full(self._carried.R.shape, np.nan))
+        state, covariance, locked = chain.step_row(k, self._t, self._u, self._past, y, self._carried, self._settings)
         if not locked:
             raise _lost(t)
         return self._filled_sample(t, state, covariance)
@@ -229,9 +244,7 @@ class OnlineEstimator:
         self._t, self._u, self._past = t, u, np.zeros((t.size, self._past.shape[1]))
         self._rows = self._taken = t.size
         self._begin(t[0], u[0], y[0])
-        state, covariance, lost = chain.step_rows(
-            t, u, self._past, y, *self._chains, *self._averages, self._scalars, *self._settings()
-        )
+        state, covariance, lost = chain.step_rows(t, u, self._past, y, self._carried, self._settings)
         if lost:
             raise _lost(float(t[lost]))
         return self._filled_sample(float(t[-1]), state, covariance)
@@ -241,18 +254,11 @@ class OnlineEstimator:
         for place, value in ((chain.LAST_T, t), (chain.LAST_U, u), (chain.LAST_Y, y), (chain.FIRST_T, t)):
             self._scalars[place] = value
 
-    def _settings(self) -> tuple[int, float, float, float, bool, bool, bool, float, float]:
-        follows, delay = self._delay is not None, self._delay
-        return (
-            self._n, self._forgetting, self._gain, self._memory_s, self._linear, follows, self._offset,
-            delay.after_s if delay else np.inf, delay.rate if delay else 0.0,
-        )  # fmt: skip
-
     def _filled_sample(self, t: float, state: FloatArray, covariance: FloatArray) -> OnlineSample:
         """Return the estimates, the state only once the kernels have filled."""
-        n = self._n
+        n = self._settings.n
         age = t - self._first_t
-        filled = age > (n + 2) / self._forgetting + 10.0 * age / (self._taken - 1)
+        filled = age > (n + 2) / self._settings.lam + 10.0 * age / (self._taken - 1)
         return self._sample(t, state if filled else np.full(n, np.nan), covariance)
 
     def _make_room(self) -> None:
@@ -274,18 +280,18 @@ class OnlineEstimator:
 
     def _delay_s(self, t: float) -> float:
         """Return the delay: the followed one, or what is lacking below zero, where u is not known yet."""
-        h, A = float(self._scalars[chain.H]), self._averages[0]
-        followed = self._delay is not None and t - self._first_t > self._delay.after_s and A[self._n] != 0.0
-        return h if h > 0.0 or not followed else min(float(A[self._n + 1] / A[self._n]), 0.0)
+        h, n, A = float(self._scalars[chain.H]), self._settings.n, self._carried.A
+        followed = self._delay is not None and t - self._first_t > self._delay.after_s and A[n] != 0.0
+        return h if h > 0.0 or not followed else min(float(A[n + 1] / A[n]), 0.0)
 
     def _sample(self, t: float, state: FloatArray, covariance: FloatArray) -> OnlineSample:
-        n, A = self._n, self._averages[0]
+        n, A, memory_s = self._settings.n, self._carried.A, self._settings.memory_s
         jacobian = np.zeros((n + 2, A.size))
         jacobian[: n + 1, : n + 1] = np.eye(n + 1)
         if self._delay:  # h_hat follows h_hat + b_1 / b_0, whose noise is as slow as the memory, with its rate
-            follows = self._delay.rate / (self._delay.rate + 1.0 / self._memory_s) if self._memory_s else 1.0
+            follows = self._delay.rate / (self._delay.rate + 1.0 / memory_s) if memory_s else 1.0
             jacobian[n + 1, n + 1] = np.sqrt(follows) / A[n] if A[n] != 0.0 else np.nan
-        if self._gain:
+        if self._settings.gain:
             covariance = np.full_like(covariance, np.nan)
         return OnlineSample(
             t=float(t),
