@@ -13,7 +13,7 @@ Every continuous term is discretised by the backward difference s -> (1 - q^-1)/
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -151,21 +151,6 @@ class PILaw:
         u = min(max(v, state.u - move), state.u + move)
         u = min(max(u, self.u_min), self.u_max)
         return u, LawState(integral=integral + self.tracking_gain * (u - v), y_filtered=y_f, u=u)
-
-    def with_gains(self, controller: PIDController, state: LawState, r: float, y: float) -> tuple[PILaw, LawState]:
-        """Return the law with other gains and the state that hands over without a bump in u.
-
-        Parameters
-        ----------
-        controller : PIDController
-            The new gains.
-        state : LawState
-            Of this law, after the last sample.
-        r, y : float
-            Set-point and measurement of the last sample [y unit].
-        """
-        law = replace(self, controller=controller)
-        return law, law.initial(state.u, r, y)
 
     def discrete(self) -> DiscreteController:
         """Return the law between its limits as C(q) acting on r - y (set-point weight 1), without the hold."""

@@ -61,7 +61,7 @@ def _segment(cycle: Cycle, found: LimitCycle, sample_time_s: float) -> Segment:
         delay_s=delay_s,
         point=found.points[0],
         harmonics=found.points[1:],
-        describing=describing_function(found, delay_s, plant_sign=relay.plant_sign),
+        describing=describing_function(found, delay_s),
         u_mean=found.u_mean,
         noise_sd=found.noise_sd,
         asymmetry=found.asymmetry,

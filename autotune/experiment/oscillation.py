@@ -139,11 +139,6 @@ class Oscillation:
         self._turning_s, self._foreseen = math.inf, False
 
     @property
-    def switched(self) -> int:
-        """Decisions the relay has taken in its life."""
-        return self._state.switches
-
-    @property
     def is_turning(self) -> bool:
         """Whether y is at its extremum: the switch has turned it, and no decision is on its way."""
         if not math.isfinite(self._turning_s) or len(self.slots) < 2:

@@ -76,14 +76,12 @@ METHODS: dict[str, Method] = {
 
 
 def _paper(d: LoopData) -> InnovationModel:
-    return indirect_subspace(d.r, d.u, d.y, 5, controller_markov=MARKOV, f=15, loop_order=9).model
+    return indirect_subspace(d.r, d.u, d.y, 5, controller_markov=MARKOV, f=15, loop_order=9)
 
 
 def _open_loop(d: LoopData) -> InnovationModel:
     nothing = np.zeros((15, 1, 1))
-    return indirect_subspace(
-        d.u, d.u, d.y, 5, controller_markov=nothing, f=15, loop_order=5, instrument="u and y"
-    ).model
+    return indirect_subspace(d.u, d.u, d.y, 5, controller_markov=nothing, f=15, loop_order=5, instrument="u and y")
 
 
 def parsim_k(d: LoopData) -> InnovationModel:

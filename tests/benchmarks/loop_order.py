@@ -87,9 +87,7 @@ def main() -> None:
                 r, u, y = recorded(loop, seed, rows)
                 orders = {"n": n, "n + n_c": n + n_c, "seen": min(max(seen(r, y, f), n), n + n_c)}
                 for choice, order in orders.items():
-                    model = indirect.indirect_subspace(
-                        r, u, y, n, controller_markov=markov, f=f, loop_order=order
-                    ).model
+                    model = indirect.indirect_subspace(r, u, y, n, controller_markov=markov, f=f, loop_order=order)
                     pole = max(float(np.min(np.abs(model.poles - p))) for p in plant.poles)
                     ratio = model.response(OMEGA) / plant.response(OMEGA) - 1.0
                     errors[choice].append((pole, float(np.sqrt(np.mean(np.abs(ratio) ** 2)))))

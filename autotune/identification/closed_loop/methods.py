@@ -184,7 +184,7 @@ def _by_excitation(
     instrument: Instrument = windows.Psi or "r and y"
     found = indirect_subspace(
         r, u, y, order, controller_markov=markov, f=f, p=p, loop_order=windows.n_cl, instrument=instrument
-    ).model
+    )
     return refit_inputs(found, u, y) if method == "indirect-refitted" else found
 
 

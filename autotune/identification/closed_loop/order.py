@@ -77,17 +77,11 @@ class OrderChoice:
         Models of other orders and dead times that the record leaves open, with their posterior probabilities.
     evidence : tuple of Candidate
         Every candidate, the best first.
-    singular_values : (f n_y,) array
-        Of the predicted future (PBSIDopt), where a gap shows the order.
-    past_window : int
-        Lags of the long autoregression.
     """
 
     estimate: PredictionErrorEstimate
     others: tuple[tuple[float, PredictionErrorEstimate], ...]
     evidence: tuple[Candidate, ...]
-    singular_values: FloatArray
-    past_window: int
 
 
 def default_past_window(rows: int, channels: int) -> int:
@@ -114,8 +108,7 @@ def _start_and_polish(
 ) -> PredictionErrorEstimate:
     """Return the polished model of one order, started by PBSIDopt on the factor ``data`` of the shifted signals."""
     f = min(data.p, max(10, -(-order // data.n_y) + 2))
-    states = pbsid_states(data, f)
-    start = replace(regress_system(data, states, order), input_delay=delay)
+    start = replace(regress_system(data, pbsid_states(data, f), order), input_delay=delay)
     return prediction_error(
         start,
         series.u,
@@ -197,14 +190,7 @@ def choose_order(
     estimate = fits[best]
     if cut < len(u) or not estimate.converged:
         estimate = _start_and_polish(factor, series, best[0], delay=best[1])
-    values = pbsid_states(factor, min(factor.p, 10)).singular_values
-    return OrderChoice(
-        estimate=estimate,
-        others=_others(fits, best),
-        evidence=evidence,
-        singular_values=values,
-        past_window=factor.p,
-    )
+    return OrderChoice(estimate=estimate, others=_others(fits, best), evidence=evidence)
 
 
 def fixed_order(

@@ -119,24 +119,8 @@ def choose_past_window(data: LaggedData) -> int:
     return int(k[np.argmin(np.where(signs > 0, criterion, np.inf))])
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class StateSelection:
-    """States as functions of the past, before their number is chosen.
-
-    Attributes
-    ----------
-    weights : (f n_y, p (n_u + n_y)) array
-        Row i gives the i-th candidate state from the lags z(t-1) ... z(t-p), the strongest first.
-    singular_values : (f n_y,) array
-        How much of the future each one predicts.
-    """
-
-    weights: FloatArray
-    singular_values: FloatArray
-
-
-def pbsid_states(data: LaggedData, f: int) -> StateSelection:
-    """Return the states of PBSIDopt (Chiuso 2007): the SVD of the predicted outputs Gamma K Z_p.
+def pbsid_states(data: LaggedData, f: int) -> FloatArray:
+    """Return the states of PBSIDopt (Chiuso 2007) before their number is chosen: the SVD of the outputs Gamma K Z_p.
 
     Parameters
     ----------
@@ -144,6 +128,11 @@ def pbsid_states(data: LaggedData, f: int) -> StateSelection:
         Past window p.
     f : int
         Future window, at most p.
+
+    Returns
+    -------
+    (f n_y, p (n_u + n_y)) array
+        Row i gives the i-th candidate state from the lags z(t-1) ... z(t-p), the strongest first.
     """
     phi = autoregression(data)
     n_z = data.n_u + data.n_y
@@ -154,17 +143,17 @@ def pbsid_states(data: LaggedData, f: int) -> StateSelection:
     past = data.past()
     U, s, _ = np.linalg.svd(gamma_k @ data.R[past, past].T, full_matrices=False)
     scale = np.sqrt(np.maximum(s, _RANK * max(s[0], np.finfo(np.float64).tiny)))
-    return StateSelection(weights=(U / scale).T @ gamma_k, singular_values=s / np.sqrt(data.rows))
+    return np.asarray((U / scale).T @ gamma_k, dtype=np.float64)
 
 
-def regress_system(data: LaggedData, states: StateSelection, order: int) -> InnovationModel:
+def regress_system(data: LaggedData, states: FloatArray, order: int) -> InnovationModel:
     """Return A, B, C and K from two regressions on the states: the outputs, then the next states.
 
     Parameters
     ----------
     data : LaggedData
         Factor of the past and the present.
-    states : StateSelection
+    states : (candidates, p (n_u + n_y)) array
         Weights of the past that give the states, the most telling first.
     order : int
         How many of them are taken.
@@ -174,9 +163,9 @@ def regress_system(data: LaggedData, states: StateSelection, order: int) -> Inno
     IdentificationError
         Fewer candidate states than ``order``.
     """
-    if order > len(states.weights):
-        raise IdentificationError(f"order {order} needs a longer future window than {len(states.weights)}")
-    T = states.weights[:order]
+    if order > len(states):
+        raise IdentificationError(f"order {order} needs a longer future window than {len(states)}")
+    T = states[:order]
     now_u, now_y = data.now
     n_z, R = data.n_u + data.n_y, data.R
     past = data.past()
@@ -271,6 +260,6 @@ def ssarx(u: FloatArray, y: FloatArray, order: int, *, p: int, f: int) -> Innova
     freed = freed.reshape(len(R), f * n_y)
     Y_half, Z_half = np.linalg.qr(freed)[1], R[:width, :width]
     cross = np.linalg.solve(Y_half.T, freed.T @ past) @ np.linalg.pinv(Z_half, rcond=_RANK)
-    _, s, Vt = np.linalg.svd(cross, full_matrices=False)
+    Vt = np.linalg.svd(cross, full_matrices=False)[2]
     weights = least_squares(Z_half, Vt.T).T * np.sqrt(data.rows)
-    return regress_system(data, StateSelection(weights=weights, singular_values=s), order)
+    return regress_system(data, weights, order)

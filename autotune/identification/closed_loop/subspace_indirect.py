@@ -27,26 +27,6 @@ _RANK = 1e-9
 _CONTROLLER_RANK = 1e-7
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class IndirectEstimate:
-    """What the method of the paper gives.
-
-    Attributes
-    ----------
-    model : InnovationModel
-        A, B, C, D of step 6 and K, sigma^2 of section III-C.
-    loop_singular_values, plant_singular_values : arrays
-        Of (8) and (11), where a gap shows n_cl and n.
-    loop_order : int
-        n_cl used.
-    """
-
-    model: InnovationModel
-    loop_singular_values: FloatArray
-    plant_singular_values: FloatArray
-    loop_order: int
-
-
 def toeplitz_blocks(markov: FloatArray, f: int) -> FloatArray:
     """Return the lower triangular block Toeplitz matrix H_f of f Markov parameters.
 
@@ -81,8 +61,7 @@ def indirect_subspace(
     p: int | None = None,
     loop_order: int | None = None,
     instrument: Instrument = "r and y",
-    sample_time_s: float = 1.0,
-) -> IndirectEstimate:
+) -> InnovationModel:
     """Identify the plant from r, u, y and the controller's Markov parameters.
 
     Parameters
@@ -104,12 +83,11 @@ def indirect_subspace(
         than the minimal order make the estimate inconsistent, more only cost precision.
     instrument : {"r", "r and y", "u and y"}
         Psi = R_p, or [R_p; Y_p]; ``"u and y"`` only for an open loop, where R_p = U_p.
-    sample_time_s : float
-        Sample time [s].
 
     Returns
     -------
-    IndirectEstimate
+    InnovationModel
+        A, B, C, D of step 6 and K, sigma^2 of section III-C.
 
     Raises
     ------
@@ -156,15 +134,13 @@ def indirect_subspace(
     O_cl = (U_1[:, :n_cl] * s_cl[:n_cl]) @ V_1t[:n_cl]
     O_f = np.linalg.solve(T_f, O_cl - TH @ controller_states)
     # steps 5 and 6
-    U_2, s, _ = np.linalg.svd(O_f, full_matrices=False)
-    gamma = U_2[:, :order]
+    gamma = np.linalg.svd(O_f, full_matrices=False)[0][:, :order]
     C, A = gamma[:n_y], least_squares(gamma[:-n_y], gamma[n_y:])
     free_plant = free @ T_f  # annihilates T_f^-1 Gamma_cl
     right = free_plant @ np.linalg.solve(T_f, M.block(2, 0))
     B, D = input_matrices(free_plant, right, M11, gamma, n_u=n_u, n_y=n_y)
     K, sigma = _noise_from(free_plant, np.linalg.solve(T_f, M.block(2, 2)) / np.sqrt(rows), gamma, n_y=n_y)
-    model = InnovationModel(A=A, B=B, C=C, D=D, K=K, innovation_covariance=sigma @ sigma.T, sample_time_s=sample_time_s)
-    return IndirectEstimate(model=model, loop_singular_values=s_cl, plant_singular_values=s, loop_order=n_cl)
+    return InnovationModel(A=A, B=B, C=C, D=D, K=K, innovation_covariance=sigma @ sigma.T)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -6,12 +6,11 @@ import math
 from dataclasses import dataclass
 
 from autotune.identification.frequency.limit_cycle_points import LimitCycle
-from autotune.points import FrequencyPoint
 
 
 @dataclass(frozen=True, kw_only=True)
 class DescribingFunctionEstimate:
-    """What the first-harmonic formulas make of a limit cycle, and how far that is from the Fourier ratio.
+    """What the first-harmonic formulas make of a limit cycle.
 
     Attributes
     ----------
@@ -21,20 +20,14 @@ class DescribingFunctionEstimate:
         pi a / (4 d), (21), with a and d the peak-to-peak values of y and u as read off the recording.
     phase_rad : float
         -180 deg + T omega_u, (20), of the positive-gain plant [rad].
-    gain_error : float
-        Relative error of ``gain`` against the Fourier ratio.
-    phase_error_rad : float
-        ``phase_rad`` less the Fourier ratio's phase [rad], in (-pi, pi].
     """
 
     omega_rad_s: float
     gain: float
     phase_rad: float
-    gain_error: float
-    phase_error_rad: float
 
 
-def describing_function(cycle: LimitCycle, delay_s: float, *, plant_sign: int) -> DescribingFunctionEstimate:
+def describing_function(cycle: LimitCycle, delay_s: float) -> DescribingFunctionEstimate:
     """Evaluate (20)-(22) for a limit cycle under a relay with inserted delay.
 
     Parameters
@@ -43,8 +36,6 @@ def describing_function(cycle: LimitCycle, delay_s: float, *, plant_sign: int) -
         The settled cycle with its Fourier-ratio points.
     delay_s : float
         Inserted delay T that was asked for [s].
-    plant_sign : {-1, 1}
-        Sign of the plant's gain; the phase is that of the positive-gain plant.
 
     Notes
     -----
@@ -57,18 +48,4 @@ def describing_function(cycle: LimitCycle, delay_s: float, *, plant_sign: int) -
     """
     omega = cycle.points[0].omega_rad_s
     gain = math.pi * cycle.y_peak_to_peak / (4.0 * 2.0 * cycle.u_amplitude)
-    phase = -math.pi + delay_s * omega
-    reference = _positive_gain_phase(cycle.points[0], plant_sign)
-    return DescribingFunctionEstimate(
-        omega_rad_s=omega,
-        gain=gain,
-        phase_rad=phase,
-        gain_error=gain / cycle.points[0].gain - 1.0,
-        phase_error_rad=math.remainder(phase - reference, 2.0 * math.pi),
-    )
-
-
-def _positive_gain_phase(point: FrequencyPoint, plant_sign: int) -> float:
-    """Return the phase of the positive-gain plant in (-2 pi, 0] [rad]."""
-    phase = math.atan2(plant_sign * point.response.imag, plant_sign * point.response.real)
-    return phase - 2.0 * math.pi if phase > 0.0 else phase
+    return DescribingFunctionEstimate(omega_rad_s=omega, gain=gain, phase_rad=-math.pi + delay_s * omega)

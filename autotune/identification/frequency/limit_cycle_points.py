@@ -47,8 +47,6 @@ class LimitCycle:
         Mean command over the window: holds an integrating plant where it is, the drift apart [u unit].
     u_amplitude : float
         Half of the relay's peak-to-peak command [u unit].
-    y_mean : float
-        Mean measurement over the window [y unit].
     y_amplitude : float
         Amplitude of the fundamental of y [y unit].
     y_peak_to_peak : float
@@ -59,8 +57,6 @@ class LimitCycle:
         Drift of y that the held command does not explain [y unit/s].
     noise_sd : float
         Standard deviation of the residual noise of y [y unit].
-    noise_is_white : bool
-        Whether the residual was found white.
     outliers : int
         Samples left out: more than six standard deviations off, or not a number.
     """
@@ -72,13 +68,11 @@ class LimitCycle:
     end_s: float
     u_mean: float
     u_amplitude: float
-    y_mean: float
     y_amplitude: float
     y_peak_to_peak: float
     asymmetry: float
     drift: float
     noise_sd: float
-    noise_is_white: bool
     outliers: int
 
 
@@ -276,12 +270,10 @@ def _summary(
         end_s=window.end_s,
         u_mean=float(np.sum(levels * np.diff(knots)) / (window.end_s - window.start_s)),
         u_amplitude=0.5 * edges.jump,
-        y_mean=float(np.mean(y[good])),
         y_amplitude=float(2.0 * abs(plain.coefficients[0])),
         y_peak_to_peak=_peak_to_peak(t[good], y[good], window),
         asymmetry=float(high - 0.5),
         drift=fit.slope,
         noise_sd=noise.sd,
-        noise_is_white=noise.is_white,
         outliers=outliers,
     )

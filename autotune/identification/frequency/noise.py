@@ -35,11 +35,6 @@ class NoiseSpectrum:
     freedom: tuple[float, ...]
     sample_time_s: float
 
-    @property
-    def is_white(self) -> bool:
-        """Whether order 0 was chosen."""
-        return not self.coefficients
-
     def variance_at(self, omega_rad_s: FloatArray) -> FloatArray:
         """Return the variance of white noise that has the same spectral density at these frequencies."""
         z = np.exp(-1j * np.asarray(omega_rad_s) * self.sample_time_s)

@@ -90,8 +90,9 @@ def test_the_describing_function_is_shown_with_its_error(finished: Finished) -> 
     result, _, _, _ = finished
     for segment in result.segments:
         # first-harmonic formulas: the hysteresis and the hold turn the phase, the relay's third harmonic the gain
-        assert 0.0 < segment.describing.gain_error < 0.8
-        assert segment.describing.phase_error_rad < 0.0
+        assert 1.0 < segment.describing.gain / segment.point.gain < 1.8
+        turned = segment.describing.phase_rad - np.angle(result.plant_sign * segment.point.response)
+        assert math.remainder(turned, 2.0 * math.pi) < 0.0
 
 
 def test_without_noise_the_points_are_exact(tmp_path: Path) -> None:
