@@ -22,7 +22,7 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 
-def one_of(value: Any, allowed: Iterable[str], *, name: str, where: str, default: str | None = None) -> Any:
+def one_of(value: Any, allowed: Iterable[str], *, name: str, where: str) -> Any:
     """Return ``value`` if it is one of the allowed words, in whatever case it is written.
 
     Parameters
@@ -33,8 +33,6 @@ def one_of(value: Any, allowed: Iterable[str], *, name: str, where: str, default
         The words, in lower case.
     name, where : str
         The argument and the function, for the refusal.
-    default : str, optional
-        Stands for None.
 
     Raises
     ------
@@ -44,8 +42,6 @@ def one_of(value: Any, allowed: Iterable[str], *, name: str, where: str, default
     words = list(allowed)
     if isinstance(value, str) and value.lower() in words:
         return value.lower()
-    if value is None and default is not None:
-        return default
     raise InputError(f"{name} = {value!r}"[:200], where=where, remedy=_nearest(value, words))
 
 
@@ -188,10 +184,8 @@ def _array(value: Any, *, name: str, where: str) -> FloatArray:
     return found
 
 
-def number(
-    value: Any, *, name: str, where: str, above: float = -math.inf, below: float = math.inf, whole: bool = False
-) -> float:
-    """Return a finite number strictly between two bounds.
+def number(value: Any, *, name: str, where: str, above: float = -math.inf, whole: bool = False) -> float:
+    """Return a finite number above a bound.
 
     Parameters
     ----------
@@ -199,8 +193,8 @@ def number(
         What was given; a bool or a text is no number.
     name, where : str
         The argument and the function, for the refusal.
-    above, below : float
-        The bounds, themselves not allowed; in the value's unit.
+    above : float
+        The bound, itself not allowed; in the value's unit.
     whole : bool
         Whether it must be a whole number.
 
@@ -213,10 +207,9 @@ def number(
         found = float(value)
     except (TypeError, ValueError, OverflowError):
         found = math.nan
-    if isinstance(value, bool | str | bytes) or not (math.isfinite(found) and above < found < below):
+    if isinstance(value, bool | str | bytes) or not (math.isfinite(found) and above < found):
         low = "" if above == -math.inf else f" above {above:g}"
-        high = "" if below == math.inf else f" below {below:g}"
-        raise InputError(f"{name} = {value!r}"[:200], where=where, remedy=f"it must be a finite number{low}{high}")
+        raise InputError(f"{name} = {value!r}"[:200], where=where, remedy=f"it must be a finite number{low}")
     if whole and found != int(found):
         raise InputError(f"{name} = {value!r}", where=where, remedy="it must be a whole number")
     return found

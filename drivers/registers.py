@@ -253,21 +253,20 @@ class Block:
         return {codec.name: codec.decode_from(data, 2 * at) for codec, at in self.parts}
 
 
-def blocks(signals: Sequence[Codec], *, gap: int = 0) -> tuple[Block, ...]:
+def blocks(signals: Sequence[Codec]) -> tuple[Block, ...]:
     """Group signals into as few requests as possible, keeping the block of the first signal first.
+
+    No register without a signal is touched: a write would overwrite it, and a device may refuse the address.
 
     Parameters
     ----------
     signals : sequence of Codec
         Signals to be read or written together.
-    gap : int
-        How many registers without a signal may be read along; 0 for writes, where they would be overwritten, and for
-        devices that refuse a request which touches an address they do not have.
     """
     found: list[list[Codec]] = []
     for codec in sorted(signals, key=lambda codec: (codec.register.table, codec.register.address)):
         last = found[-1] if found else None
-        if last is not None and _joins(last, codec, gap):
+        if last is not None and _joins(last, codec):
             last.append(codec)
         else:
             found.append([codec])
@@ -279,11 +278,11 @@ def _end(members: Sequence[Codec]) -> int:
     return max(codec.register.address + codec.register.words for codec in members)
 
 
-def _joins(members: Sequence[Codec], codec: Codec, gap: int) -> bool:
+def _joins(members: Sequence[Codec], codec: Codec) -> bool:
     register = codec.register
     return (
         register.table == members[0].register.table
-        and register.address - _end(members) <= gap
+        and register.address <= _end(members)
         and register.address + register.words - members[0].register.address <= MAX_WORDS
     )
 

@@ -9,6 +9,8 @@ from dataclasses import dataclass
 from typing import Any
 
 Json = dict[str, Any]
+#: Bins of stated probability.
+_BINS = 10
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,15 +76,13 @@ class Row:
     met: bool | None
 
 
-def wilson(successes: float, count: float, z: float = 1.959964) -> tuple[float, float]:
+def wilson(successes: float, count: float) -> tuple[float, float]:
     """95 % interval of a share (Wilson 1927).
 
     Parameters
     ----------
     successes, count
         Successes among ``count`` trials; not whole where cases belong together.
-    z
-        Normal quantile of the interval.
 
     Returns
     -------
@@ -91,7 +91,7 @@ def wilson(successes: float, count: float, z: float = 1.959964) -> tuple[float, 
     """
     if count == 0:
         return 0.0, 1.0
-    p = successes / count
+    p, z = successes / count, 1.959964
     middle = (p + z * z / (2 * count)) / (1 + z * z / count)
     half = z / (1 + z * z / count) * math.sqrt(p * (1 - p) / count + z * z / (4 * count * count))
     return max(middle - half, 0.0), min(middle + half, 1.0)
@@ -150,23 +150,21 @@ def _share(figure: str, asked: float, hits: Sequence[bool], at_most: bool = Fals
     return Row(figure=figure, asked=bound, value=share, interval=wilson(sum(hits), len(hits)), count=len(hits), met=met)
 
 
-def calibration_error(statements: Sequence[tuple[float, bool]], bins: int = 10) -> float:
-    """Average the distance between stated probability and share of right statements over bins of probability.
+def calibration_error(statements: Sequence[tuple[float, bool]]) -> float:
+    """Average the distance between stated probability and share of right statements over ten bins of probability.
 
-    Its bias is upward: a perfectly calibrated source of n statements scores about 0.4 / sqrt(n / bins).
+    Its bias is upward: a perfectly calibrated source of n statements scores about 0.4 / sqrt(n / 10).
 
     Parameters
     ----------
     statements : sequence of (float, bool)
         The probability that was stated, and whether it was right.
-    bins : int
-        Bins of probability.
     """
     if not statements:
         return math.nan
     total = 0.0
-    for b in range(bins):
-        inside = [(p, ok) for p, ok in statements if min(int(p * bins), bins - 1) == b]
+    for b in range(_BINS):
+        inside = [(p, ok) for p, ok in statements if min(int(p * _BINS), _BINS - 1) == b]
         if inside:
             total += abs(sum(p for p, _ in inside) - sum(ok for _, ok in inside))
     return total / len(statements)

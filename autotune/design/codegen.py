@@ -3,47 +3,45 @@
 from __future__ import annotations
 
 import math
-import re
 
 from autotune.design.law import PILaw
-from autotune.errors import DesignError
 
 _NO_LIMIT = 1e30  # stands for infinity where the language has no literal for it
 
 _C = """\
 /* {kind} law: K = {K:.9g}, Ti = {Ti:.9g} s, Td = {Td:.9g} s, Tf = {Tf:.9g} s, sampled every {Ts:.9g} s.
- * Call {name}_init once with the command the actuator holds: bumpless. Then call {name}_step at every sample.
+ * Call control_init once with the command the actuator holds: bumpless. Then call control_step at every sample.
  * The command stays within {u_min:.9g} .. {u_max:.9g} and moves by at most {move:.9g} per sample; anti-windup by
  * back-calculation. */
 
 typedef struct {{
-    {real} integral;
-    {real} y_filtered;
-    {real} u;
-}} {name}_state;
+    double integral;
+    double y_filtered;
+    double u;
+}} control_state;
 
-static {real} {name}_limit({real} low, {real} value, {real} high)
+static double control_limit(double low, double value, double high)
 {{
     if (value < low)
         return low;
     return value > high ? high : value;
 }}
 
-void {name}_init({name}_state *state, {real} u, {real} r, {real} y)
+void control_init(control_state *state, double u, double r, double y)
 {{
-    state->u = {name}_limit({u_min!r}{f}, u, {u_max!r}{f});
+    state->u = control_limit({u_min!r}, u, {u_max!r});
     state->y_filtered = y;
-    state->integral = state->u - {K!r}{f} * ({b!r}{f} * r - y) - {slope!r}{f} * (r - y);
+    state->integral = state->u - {K!r} * ({b!r} * r - y) - {slope!r} * (r - y);
 }}
 
-{real} {name}_step({name}_state *state, {real} r, {real} y)
+double control_step(control_state *state, double r, double y)
 {{
-    const {real} y_f = state->y_filtered + {alpha!r}{f} * (y - state->y_filtered);
-    const {real} integral = state->integral + {slope!r}{f} * (r - y_f);
-    const {real} v = {K!r}{f} * ({b!r}{f} * r - y_f) + integral - {D!r}{f} * (y_f - state->y_filtered);
-    {real} u = {name}_limit(state->u - {move!r}{f}, v, state->u + {move!r}{f});
-    u = {name}_limit({u_min!r}{f}, u, {u_max!r}{f});
-    state->integral = integral + {tracking!r}{f} * (u - v);
+    const double y_f = state->y_filtered + {alpha!r} * (y - state->y_filtered);
+    const double integral = state->integral + {slope!r} * (r - y_f);
+    const double v = {K!r} * ({b!r} * r - y_f) + integral - {D!r} * (y_f - state->y_filtered);
+    double u = control_limit(state->u - {move!r}, v, state->u + {move!r});
+    u = control_limit({u_min!r}, u, {u_max!r});
+    state->integral = integral + {tracking!r} * (u - v);
     state->y_filtered = y_f;
     state->u = u;
     return u;
@@ -53,7 +51,7 @@ void {name}_init({name}_state *state, {real} u, {real} r, {real} y)
 _ST = """\
 (* {kind} law: K = {K:.9g}, Ti = {Ti:.9g} s, Td = {Td:.9g} s, Tf = {Tf:.9g} s; call it every {Ts:.9g} s.
    While HOLD is TRUE the output follows U_HELD and takes over from it without a bump when HOLD falls. *)
-FUNCTION_BLOCK {name}
+FUNCTION_BLOCK CONTROL_LAW
 VAR_INPUT
     R : LREAL;
     Y : LREAL;
@@ -86,48 +84,19 @@ END_FUNCTION_BLOCK
 """
 
 
-def c_source(law: PILaw, *, name: str = "control", single: bool = False) -> str:
-    """Return C99 source with ``NAME_init`` and ``NAME_step``; no library, no allocation, no globals.
-
-    Parameters
-    ----------
-    law : PILaw
-        Gains, sample time, limits.
-    name : str
-        Prefix of the identifiers.
-    single : bool
-        ``float`` instead of ``double``, for processors without double precision.
-
-    Raises
-    ------
-    DesignError
-        A name that is no identifier.
-    """
-    constants = _constants(law, name)
-    return _C.format(**constants, real="float" if single else "double", f="f" if single else "")
+def c_source(law: PILaw) -> str:
+    """Return C99 source with ``control_init`` and ``control_step``; no library, no allocation, no globals."""
+    return _C.format(**_constants(law))
 
 
-def structured_text(law: PILaw, *, name: str = "CONTROL_LAW") -> str:
-    """Return an IEC 61131-3 function block in Structured Text, standard functions only.
-
-    Parameters
-    ----------
-    law : PILaw
-        Gains, sample time, limits.
-    name : str
-        Of the function block.
-
-    Raises
-    ------
-    DesignError
-        A name that is no identifier.
-    """
-    constants = _constants(law, name)
+def structured_text(law: PILaw) -> str:
+    """Return an IEC 61131-3 function block ``CONTROL_LAW`` in Structured Text, standard functions only."""
+    constants = _constants(law)
     shown = {"K", "Ti", "Td", "Tf", "Ts"}
     literal = {key: _literal(value) for key, value in constants.items() if isinstance(value, float)}
     body, comment = _ST.split("*)", 1)[1], _ST.split("*)", 1)[0]
     head = comment.format(**{key: constants[key] for key in (*shown, "kind")})
-    return head + "*)" + body.format(**(literal | {"name": name}))
+    return head + "*)" + body.format(**literal)
 
 
 def _literal(value: float) -> str:
@@ -139,12 +108,9 @@ def _literal(value: float) -> str:
     return f"({text})" if value < 0.0 else text
 
 
-def _constants(law: PILaw, name: str) -> dict[str, str | float]:
-    if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name):
-        raise DesignError(f"{name!r} is no identifier", where="code generation", remedy="letters, digits, underscore")
+def _constants(law: PILaw) -> dict[str, str | float]:
     c, T_s = law.controller, law.sample_time_s
     return {
-        "name": name,
         "kind": c.kind.upper(),
         "K": float(c.K),
         "Ti": float(c.Ti_s),

@@ -20,11 +20,13 @@ from autotune.models import TransferFunction
 _FEW = np.polynomial.legendre.leggauss(5)
 _MANY = np.polynomial.legendre.leggauss(10)
 _LEVELS = 30
+#: Relative, of the squared norm.
+_TOLERANCE = 1e-9
 #: Panels at most, and times those that the loop's features ask for: more swings of a dead time than that are no loop's.
 _MOST_PANELS, _TIMES_GIVEN = 100_000, 8
 
 
-def disturbance_h2(loop: OpenLoop, relative_tolerance: float = 1e-9) -> float:
+def disturbance_h2(loop: OpenLoop) -> float:
     """Return the H2 norm (11) of H/(1 + H C)/s, output unit sqrt(s) per input unit.
 
     Parameters
@@ -32,8 +34,6 @@ def disturbance_h2(loop: OpenLoop, relative_tolerance: float = 1e-9) -> float:
     loop : OpenLoop
         Continuous or sampled; for a sampled loop the integral of y^2 is T_s times the sum over the samples, for a step
         that begins at a sample.
-    relative_tolerance : float
-        Of the squared norm.
 
     Returns
     -------
@@ -52,7 +52,7 @@ def disturbance_h2(loop: OpenLoop, relative_tolerance: float = 1e-9) -> float:
     if not loop.is_stable:
         return math.inf
     if isinstance(loop, SampledLoop):
-        return _norm_of_sampled(loop, relative_tolerance)
+        return _norm_of_sampled(loop)
     assert isinstance(loop, ContinuousLoop)
     if order_at_zero(loop.plant) - min(order_at_zero(loop.plant) + order_at_zero(loop.controller), 0) < 1:
         return math.inf
@@ -68,7 +68,7 @@ def disturbance_h2(loop: OpenLoop, relative_tolerance: float = 1e-9) -> float:
     # below low f is its limit to within (low/corner)^2; above high it falls as omega^-2(r + 1), r the relative degree
     excess = len(loop.plant.den) - len(loop.plant.num)
     tails = f(np.array([low]))[0] * low + f(np.array([high]))[0] * high / (2 * excess + 1)
-    return math.sqrt((integral(f, edges, relative_tolerance) + tails) / math.pi)
+    return math.sqrt((integral(f, edges, _TOLERANCE) + tails) / math.pi)
 
 
 def order_at_zero(system: TransferFunction) -> int:
@@ -127,7 +127,7 @@ def _rule(
     return np.asarray((values @ weights) * half)
 
 
-def _norm_of_sampled(loop: SampledLoop, relative_tolerance: float) -> float:
+def _norm_of_sampled(loop: SampledLoop) -> float:
     T_s = loop.controller.sample_time_s
     if abs(np.sum(loop.controller.den)) > 1e-12 * np.sum(np.abs(loop.controller.den)):
         return math.inf
@@ -141,4 +141,4 @@ def _norm_of_sampled(loop: SampledLoop, relative_tolerance: float) -> float:
 
     tail = f(grid[:1])[0] * grid[0]
     # sum y^2 = (T_s/2 pi) int over a full circle = (T_s/pi) int_0^(pi/T_s); times T_s for the integral of y^2
-    return T_s * math.sqrt((integral(f, grid[::4], relative_tolerance) + tail) / math.pi)
+    return T_s * math.sqrt((integral(f, grid[::4], _TOLERANCE) + tail) / math.pi)

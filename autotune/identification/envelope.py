@@ -15,6 +15,8 @@ from autotune.models import TransferFunction
 from autotune.points import FrequencyPoint
 
 _DRAWS = 400
+#: Standard deviations of a difference that make a contradiction.
+_SIGMAS = 4.0
 _WHERE = "reduced model"
 
 
@@ -144,7 +146,7 @@ def envelope_of_transfer_function(plant: TransferFunction, sign: int, omega_rad_
     return Envelope(omega_rad_s=omega_rad_s, gain=np.abs(H), phase_rad=phase, phase_high_rad=phase)
 
 
-def require_class_one(points: Sequence[FrequencyPoint], sign: int, *, sigmas: float = 4.0) -> None:
+def require_class_one(points: Sequence[FrequencyPoint], sign: int) -> None:
     """Refuse points that cannot come from a plant of class (1), with the reason.
 
     Parameters
@@ -153,8 +155,6 @@ def require_class_one(points: Sequence[FrequencyPoint], sign: int, *, sigmas: fl
         Measured points in ascending frequency.
     sign : {-1, 1}
         Sign of the plant's gain.
-    sigmas : float
-        How many standard deviations of the difference make a contradiction.
 
     Raises
     ------
@@ -167,19 +167,19 @@ def require_class_one(points: Sequence[FrequencyPoint], sign: int, *, sigmas: fl
     for i in range(len(points)):
         for j in range(i + 1, len(points)):
             between = f"from {points[i].omega_rad_s:.4g} to {points[j].omega_rad_s:.4g} rad/s"
-            if gain[j] - gain[i] > sigmas * math.hypot(sd[i, 0], sd[j, 0]) + 1e-9:
+            if gain[j] - gain[i] > _SIGMAS * math.hypot(sd[i, 0], sd[j, 0]) + 1e-9:
                 raise IdentificationError(
                     f"the gain rises {between} (a resonance): outside class (1) of the reduced models",
                     where=_WHERE,
                     remedy="design on the points themselves",
                 )
-            if phase[j] - phase[i] > sigmas * math.hypot(sd[i, 1], sd[j, 1]) + 1e-9:
+            if phase[j] - phase[i] > _SIGMAS * math.hypot(sd[i, 1], sd[j, 1]) + 1e-9:
                 raise IdentificationError(
                     f"the phase rises {between} (lead, or a wrong sign): outside class (1) of the reduced models",
                     where=_WHERE,
                     remedy="design on the points themselves, or check for harmonics of another experiment",
                 )
-    if phase[0] + sigmas * sd[0, 1] < -0.75 * math.pi:
+    if phase[0] + _SIGMAS * sd[0, 1] < -0.75 * math.pi:
         raise IdentificationError(
             f"the phase at the lowest point ({points[0].omega_rad_s:.4g} rad/s) is {math.degrees(phase[0]):.1f} deg",
             where=_WHERE,

@@ -41,5 +41,5 @@ def _rounds(known: Investigation) -> Section:
     return Section(title="How it was learnt", text=(text,), tables=(table,) if rows else ())
 
 
-def _list_candidates(candidates: tuple[tuple[str, float], ...], most: int = 3) -> str:
-    return ", ".join(f"{name} {p:.2f}" for name, p in candidates[:most])
+def _list_candidates(candidates: tuple[tuple[str, float], ...]) -> str:
+    return ", ".join(f"{name} {p:.2f}" for name, p in candidates[:3])

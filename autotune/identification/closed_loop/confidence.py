@@ -154,9 +154,7 @@ def inside_region(error: ComplexArray, covariance: FloatArray, probability: floa
     return np.asarray(distance <= quantile, dtype=np.float64)
 
 
-def frequency_points(
-    estimate: PredictionErrorEstimate, omega_rad_s: FloatArray, *, inflation: float = 1.0
-) -> tuple[FrequencyPoint, ...]:
+def frequency_points(estimate: PredictionErrorEstimate, omega_rad_s: FloatArray) -> tuple[FrequencyPoint, ...]:
     """Return the response of a single-input, single-output estimate as frequency points with their regions.
 
     Parameters
@@ -165,11 +163,9 @@ def frequency_points(
         Polished model.
     omega_rad_s : (W,) array
         Angular frequencies [rad/s].
-    inflation : float
-        Factor on the covariance, for residuals that are not white.
     """
     response = estimate.model.response(omega_rad_s)[:, 0, 0]
-    covariance = inflation * response_covariance(estimate, omega_rad_s)[:, 0, 0]
+    covariance = response_covariance(estimate, omega_rad_s)[:, 0, 0]
     return tuple(
         FrequencyPoint(
             omega_rad_s=float(omega),

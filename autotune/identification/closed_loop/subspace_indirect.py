@@ -270,9 +270,7 @@ def _noise_from(free: FloatArray, spread: FloatArray, gamma: FloatArray, *, n_y:
     return K_sigma @ np.linalg.inv(sigma), sigma
 
 
-def controller_markov_parameters(
-    r: FloatArray, u: FloatArray, y: FloatArray, count: int, *, p: int | None = None
-) -> tuple[FloatArray, int]:
+def controller_markov_parameters(r: FloatArray, u: FloatArray, y: FloatArray, count: int) -> tuple[FloatArray, int]:
     """Return the controller's Markov parameters from the data (Remark 4), and the order its singular values show.
 
     Parameters
@@ -280,9 +278,7 @@ def controller_markov_parameters(
     r, u, y : (N, n_u), (N, n_u), (N, n_y) arrays
         Data of the loop u = r - C y; the relation holds without noise, whatever disturbs y.
     count : int
-        How many are wanted; also the future window.
-    p : int, optional
-        Past window; ``count`` when absent.
+        How many are wanted; also the future and the past window.
 
     Returns
     -------
@@ -296,11 +292,10 @@ def controller_markov_parameters(
     IdentificationError
         The relation is not exact: r is not what was added to the command, or the controller is not linear.
     """
-    p = count if p is None else p
     w = u - r  # = - C y
     n_u, n_y = u.shape[1], y.shape[1]
-    R, _ = lagged_factor([(y, range(count)), (y, range(-p, 0)), (w, range(-p, 0)), (w, range(count))])
-    M = _Blocks(R=R, sizes=(count * n_y, p * (n_u + n_y), count * n_u))
+    R, _ = lagged_factor([(y, range(count)), (y, range(-count, 0)), (w, range(-count, 0)), (w, range(count))])
+    M = _Blocks(R=R, sizes=(count * n_y, count * (n_u + n_y), count * n_u))
     U, s, _ = np.linalg.svd(M.block(2, 1), full_matrices=True)
     order = int(np.sum(s > 1e-7 * np.linalg.norm(M.block(2, 0)) / np.sqrt(count)))
     if order >= count * n_u:

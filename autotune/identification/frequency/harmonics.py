@@ -68,10 +68,9 @@ def fit_harmonics(
     omega_rad_s: float,
     harmonics: Sequence[int],
     *,
-    drift_order: int = 1,
     transients: Sequence[FloatArray] = (),
 ) -> HarmonicFit:
-    """Fit harmonics of ``omega_rad_s`` together with a polynomial drift and decaying transients by least squares.
+    """Fit harmonics of ``omega_rad_s`` together with a linear drift and decaying transients by least squares.
 
     Parameters
     ----------
@@ -81,8 +80,6 @@ def fit_harmonics(
         Fundamental [rad/s].
     harmonics : sequence of int
         Orders n to fit.
-    drift_order : int
-        Degree of the polynomial.
     transients : sequence of (N,) array
         Further columns.
 
@@ -95,7 +92,7 @@ def fit_harmonics(
     x = (t - middle) / half
     phasor = np.exp(1j * omega_rad_s * t)
     waves = [2.0 * phasor**n for n in harmonics]
-    drift = list(np.polynomial.legendre.legvander(x, drift_order).T)
+    drift = list(np.polynomial.legendre.legvander(x, 1).T)
     design = np.array([wave.real for wave in waves] + [-wave.imag for wave in waves] + drift + list(transients))
     scale = 1.0 / np.linalg.norm(design, axis=1)
     design *= scale[:, None]
@@ -114,5 +111,5 @@ def fit_harmonics(
         covariance_unit=covariance,
         residual=residual,
         columns=design.T,
-        slope=float(theta[2 * h + 1] / half) if drift_order >= 1 else 0.0,
+        slope=float(theta[2 * h + 1] / half),
     )
