@@ -1,6 +1,6 @@
 """Loops in operation: what is said of simulated loops whose cause is known, and how often the band is right.
 
-The loops are those of :mod:`sim.valve_cases`: valves after Choudhury, He and Karnopp, play, tight tuning, outside
+The loops are those of :mod:`tests.sim.valve_cases`: valves after Choudhury, He and Karnopp, play, tight tuning, outside
 oscillations, healthy loops. A claim is false where it names another cause than the true one; to abstain or to find
 nothing claims nothing.
 """
@@ -18,7 +18,7 @@ import numpy as np
 
 from autotune.diagnosis.routine import diagnose_routine
 from autotune.recording import Recording
-from sim.valve_cases import KINDS, ValveCase, valve_case
+from tests.sim.valve_cases import KINDS, ValveCase, valve_case
 
 CASES, SEED = 13, 5000
 #: What may be claimed of a kind: of a healthy loop nothing.

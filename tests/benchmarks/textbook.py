@@ -1,8 +1,8 @@
 """Ten textbook plants as equations, each concealing ten effects in turn, one outside the catalogue, and none.
 
-``python -m tests.benchmarks textbook`` makes the recordings by ``sim.textbook`` (integrators of its own) and gives them
-with the nominal equations to ``diagnose``. TEXTBOOK_PLANTS names some (separated by commas), TEXTBOOK_SEED is
-the first seed (61), TEXTBOOK_OUT the folder that holds one JSON file a case: what is there is not run again,
+``python -m tests.benchmarks textbook`` makes the recordings by ``tests.sim.textbook`` (integrators of its own) and
+gives them with the nominal equations to ``diagnose``. TEXTBOOK_PLANTS names some (separated by commas), TEXTBOOK_SEED
+is the first seed (61), TEXTBOOK_OUT the folder that holds one JSON file a case: what is there is not run again,
 TEXTBOOK_ROWS the length of each recording where it is not the plant's own. WORKERS processes at once (1).
 """
 
@@ -20,9 +20,9 @@ from pathlib import Path
 from typing import Any
 
 from sim.score import wilson
-from sim.textbook import PLANTS
-from sim.textbook.plant import Plant
-from sim.textbook.record import pair
+from tests.sim.textbook import PLANTS
+from tests.sim.textbook.plant import Plant
+from tests.sim.textbook.record import pair
 
 #: Laws that are the same curve over what a plant moves through: a T^4 and a T |T| about room temperature.
 SAME = ({"plant.radiation_loss", "plant.nonlinear_loss"}, {"plant.quadratic_drag", "plant.nonlinear_loss"})

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sim.valve_cases import KINDS, valve_case
-from sim.valve_loop import FloatArray, Surroundings, ValveKind, ValveLoop, simulate_loop, ultimate_gain
+from tests.sim.valve_cases import KINDS, valve_case
+from tests.sim.valve_loop import FloatArray, Surroundings, ValveKind, ValveLoop, simulate_loop, ultimate_gain
 
 FAULTY: tuple[ValveKind, ...] = ("play", "choudhury", "he", "friction")
 

@@ -14,8 +14,8 @@ from autotune.batch.settings import RoutineSettings, read_campaign
 from autotune.cli import app
 from autotune.errors import InputError
 from autotune.recording import Recording
-from sim.valve_cases import CaseKind, valve_case
 from tests.autotune.batch.plant_files import write
+from tests.sim.valve_cases import CaseKind, valve_case
 
 EXAMPLE = Path(__file__).resolve().parents[3] / "configs" / "campaigns" / "in_operation.toml"
 SEEDS: dict[CaseKind, int] = {"stiction": 5000, "tight_steps": 5000, "outside": 5000, "quiet": 5000}

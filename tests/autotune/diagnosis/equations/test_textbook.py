@@ -9,10 +9,10 @@ import pytest
 
 from autotune.equations import compile_model, read_equations, simulate
 from autotune.equations.simulate import Drive
-from sim.textbook import PLANTS
-from sim.textbook.hidden import Hidden
-from sim.textbook.record import record
 from tests.benchmarks.textbook import diagnosed, is_right
+from tests.sim.textbook import PLANTS
+from tests.sim.textbook.hidden import Hidden
+from tests.sim.textbook.record import record
 
 
 @pytest.mark.parametrize("name", PLANTS)

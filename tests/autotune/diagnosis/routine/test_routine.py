@@ -23,9 +23,9 @@ from autotune.diagnosis.routine.valves import compare_valves
 from autotune.diagnosis.thresholds import table
 from autotune.errors import IdentificationError, InputError
 from autotune.recording import Recording, read_recording, write_recording
-from sim.valve_cases import CaseKind, valve_case
-from sim.valve_loop import Surroundings, ValveLoop, simulate_loop
 from tests.benchmarks.surrogates import surrogate
+from tests.sim.valve_cases import CaseKind, valve_case
+from tests.sim.valve_loop import Surroundings, ValveLoop, simulate_loop
 
 LIMITS = RoutineThresholds()
 START = np.zeros(1, dtype=np.int64)

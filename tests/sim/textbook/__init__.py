@@ -1,8 +1,8 @@
 """Ten plants written down from textbooks and manuals, integrated here, each able to conceal one effect at a time."""
 
-from sim.textbook.flows import FLOWS
-from sim.textbook.machines import MACHINES
-from sim.textbook.plant import Plant
+from tests.sim.textbook.flows import FLOWS
+from tests.sim.textbook.machines import MACHINES
+from tests.sim.textbook.plant import Plant
 
 #: The plants by name.
 PLANTS: dict[str, Plant] = {one.name: one for one in (*MACHINES, *FLOWS)}

@@ -7,7 +7,7 @@ from math import cos, sin
 
 import numpy as np
 
-from sim.textbook.plant import Floats, Numbers, Place, Plant, steps, wave
+from tests.sim.textbook.plant import Floats, Numbers, Place, Plant, steps, wave
 
 PENDULUM_MODEL = """
 name = "pendulum"

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.integrate import odeint
 
-from sim.textbook.hidden import Hidden, Scale, hidden
-from sim.textbook.plant import Floats, Numbers, Plant
+from tests.sim.textbook.hidden import Hidden, Scale, hidden
+from tests.sim.textbook.plant import Floats, Numbers, Plant
 
 #: Error of a step, relative and of a state's usual size.
 RELATIVE, ABSOLUTE = 1e-10, 1e-11

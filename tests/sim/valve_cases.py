@@ -19,7 +19,7 @@ from typing import Literal, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.valve_loop import FloatArray, Surroundings, ValveKind, ValveLoop, simulate_loop, ultimate_gain
+from tests.sim.valve_loop import FloatArray, Surroundings, ValveKind, ValveLoop, simulate_loop, ultimate_gain
 
 CaseKind: TypeAlias = Literal[
     "stiction", "play", "tight_noise", "tight_steps", "outside", "wandering", "quiet", "steps"

@@ -8,7 +8,7 @@ from math import exp, pi, sin, tanh
 
 import numpy as np
 
-from sim.textbook.plant import Floats, Place
+from tests.sim.textbook.plant import Floats, Place
 
 #: Watt per square metre and K^4 times surface and emissivity over heat capacity: the Temperature Control Lab's.
 RADIATION = 0.9 * 5.67e-8 * 1.2e-3 / 2.0

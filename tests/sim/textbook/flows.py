@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from math import exp, sin, sqrt
 
-from sim.textbook.plant import Numbers, Place, Plant, steps, wave
+from tests.sim.textbook.plant import Numbers, Place, Plant, steps, wave
 
 HEATER_MODEL = """
 name = "heater"
