@@ -59,6 +59,11 @@ class NoiseColour:
     variance: float
     freedom: FloatArray
 
+    def variance_at(self, omega: FloatArray) -> FloatArray:
+        """Return the variance of white noise with the same spectral density at frequencies (F,) [rad/row]."""
+        transfer = np.polyval([*self.whitening[::-1], 1.0], np.exp(-1j * omega))
+        return np.asarray(self.variance / np.abs(transfer) ** 2, dtype=np.float64)
+
     def widening(self) -> FloatArray:
         """Return, for each parameter, by how much 1.96 standard deviations fall short of Student's 95 % interval."""
         from scipy.stats import norm, t

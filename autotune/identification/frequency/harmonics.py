@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -60,6 +61,12 @@ class HarmonicFit:
     residual: FloatArray
     columns: FloatArray
     slope: float
+
+    @property
+    def noise_sd(self) -> float:
+        """Standard deviation of the noise."""
+        freedom = max(self.residual.size - self.columns.shape[1], 1)
+        return math.sqrt(float(self.residual @ self.residual) / freedom)
 
 
 def fit_harmonics(

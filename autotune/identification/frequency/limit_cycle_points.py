@@ -15,14 +15,13 @@ from autotune.arrays import BoolArray, ComplexArray, FloatArray
 from autotune.errors import IdentificationError
 from autotune.identification.frequency.harmonics import HarmonicFit, fit_harmonics, held_coefficients
 from autotune.identification.frequency.limit_cycle import RelayEdges, WholePeriods, relay_edges, whole_periods
-from autotune.identification.frequency.noise import NoiseSpectrum, noise_spectrum
 from autotune.identification.frequency.reference_model import (
     ReferenceModel,
     fit_reference,
     free_responses,
     simulate_reference,
 )
-from autotune.identification.noise_colour import region_widening
+from autotune.identification.noise_colour import noise_colour, region_widening
 from autotune.points import FrequencyPoint, as_pairs
 
 _HIGHEST_HARMONIC = 9
@@ -130,11 +129,13 @@ def limit_cycle_points(
     good = inside & np.isfinite(y)
     orders = _orders(window, t, good, highest_harmonic)
     fit, reference, outliers = _corrected_fit(t, u, y, good, window, orders, known)
-    noise = noise_spectrum(fit.columns, fit.residual, window.period_s * window.periods / int(inside.sum()))
     omega = window.omega_rad_s * np.array(orders)
     U = held_coefficients(t, u, omega, window.start_s, window.end_s)
-    points = _points(omega, orders, U, fit, noise, reference, largest_relative_sd)
-    return _summary(t, u, y, good, window, edges, points, fit, noise, outliers + int((inside & ~good).sum()))
+    # of few periods the harmonics take most of the noise at low frequencies; stamps that jitter count as uniform, which
+    # is right for frequencies as far below the sampling rate as a limit cycle's
+    sample_time_s = window.period_s * window.periods / int(inside.sum())
+    points = _points(omega, orders, U, fit, sample_time_s, reference, largest_relative_sd)
+    return _summary(t, u, y, good, window, edges, points, fit, outliers + int((inside & ~good).sum()))
 
 
 def _orders(window: WholePeriods, t: FloatArray, good: BoolArray, highest: int) -> tuple[int, ...]:
@@ -202,13 +203,14 @@ def _points(
     orders: Sequence[int],
     U: ComplexArray,
     fit: HarmonicFit,
-    noise: NoiseSpectrum,
+    sample_time_s: float,
     reference: ReferenceModel | None,
     largest_relative_sd: float,
 ) -> tuple[FrequencyPoint, ...]:
     """Return the odd harmonics' complex gains with the covariance that the noise at each of them makes."""
     base = reference.response(omega) if reference is not None else np.zeros_like(U)
-    variance = noise.variance_at(omega)
+    noise = noise_colour(fit.columns, fit.residual)
+    variance = noise.variance_at(omega * sample_time_s)
     points = []
     for i, order in enumerate(orders):
         if order % 2 == 0 or abs(U[i]) < 1e-3 * abs(U[0]):
@@ -223,7 +225,7 @@ def _points(
             continue
         if order == 1 and sd > 0.5 * abs(response):
             raise IdentificationError(
-                f"the oscillation of y at {omega[0]:.4g} rad/s is drowned in noise of sd {noise.sd:.3g}",
+                f"the oscillation of y at {omega[0]:.4g} rad/s is drowned in noise of sd {fit.noise_sd:.3g}",
                 where="limit cycle",
                 remedy="raise the relay's amplitude or record more periods",
             )
@@ -253,7 +255,6 @@ def _summary(
     edges: RelayEdges,
     points: tuple[FrequencyPoint, ...],
     fit: HarmonicFit,
-    noise: NoiseSpectrum,
     outliers: int,
 ) -> LimitCycle:
     orders = range(1, len(fit.coefficients) + 1)
@@ -274,6 +275,6 @@ def _summary(
         y_peak_to_peak=_peak_to_peak(t[good], y[good], window),
         asymmetry=float(high - 0.5),
         drift=fit.slope,
-        noise_sd=noise.sd,
+        noise_sd=fit.noise_sd,
         outliers=outliers,
     )

@@ -11,7 +11,7 @@ from autotune.errors import IdentificationError
 from autotune.identification.frequency.describing import describing_function
 from autotune.identification.frequency.harmonics import held_coefficients
 from autotune.identification.frequency.limit_cycle_points import LimitCycle, limit_cycle_points
-from autotune.identification.frequency.noise import noise_spectrum
+from autotune.identification.noise_colour import noise_colour
 from autotune.models import TransferFunction
 from tests.autotune.identification.relay_loop import BALL, last_periods, relay_loop
 from tests.benchmarks.coverage import noise
@@ -148,12 +148,10 @@ def test_coloured_noise_is_recognised_and_its_level_found_at_low_frequency() -> 
     coloured[0] = white[0]
     for k in range(1, white.size):
         coloured[k] = 0.8 * coloured[k - 1] + white[k]
-    spectrum = noise_spectrum(np.ones((coloured.size, 1)), coloured, 0.01)
-    assert spectrum.coefficients
-    assert spectrum.variance_at(np.array([1.0]))[0] == pytest.approx(25.0, rel=0.2)
-    assert noise_spectrum(np.ones((white.size, 1)), white, 0.01).variance_at(np.array([1.0]))[0] == pytest.approx(
-        1.0, rel=0.1
-    )
+    low, colour = np.array([0.01]), noise_colour(np.ones((coloured.size, 1)), coloured)
+    assert colour.whitening.size
+    assert colour.variance_at(low)[0] == pytest.approx(25.0, rel=0.2)
+    assert noise_colour(np.ones((white.size, 1)), white).variance_at(low)[0] == pytest.approx(1.0, rel=0.1)
 
 
 def test_one_period_is_too_few() -> None:
