@@ -19,7 +19,6 @@ from autotune.outputs import Output, claim
 if TYPE_CHECKING:
     from autotune.identification.closed_loop.dither_proposal import DitherLimits
     from autotune.identification.closed_loop.identify import ClosedLoopIdentification
-    from autotune.identification.closed_loop.methods import Windows
     from autotune.identification.closed_loop.state_space import InnovationModel
 
 
@@ -70,9 +69,10 @@ def closed_loop(
     overwrite: OVERWRITE = False,
 ) -> None:
     """Identify the plant from r, u and y recorded while its loop is closed."""
+    from autotune.api import methods
     from autotune.controller import read_controller
     from autotune.identification.closed_loop.identify import identify_closed_loop
-    from autotune.identification.closed_loop.signals import model_of_recording
+    from autotune.identification.closed_loop.state_space import InnovationModel
     from autotune.identification.dependence import require_answer
 
     console = Console(stderr=True, highlight=False)
@@ -84,9 +84,9 @@ def closed_loop(
         if delay is not None or config is not None:
             raise InputError("--delay and --config are of prediction-error", where=method)
         more = more_u or [], more_y or [], more_r or []
-        model = model_of_recording(
-            data, method=method, order=order, controller=law, more=more, windows=_windows(f, p, n_cl, psi)
-        )
+        windows = {"f": f, "p": p, "n_cl": n_cl, "Psi": psi}
+        model = methods.closed_loop(data, order, controller=law, method=method, more=more, **windows)
+        assert isinstance(model, InnovationModel)
         place.json(_model_json(model, method))
         poles = ", ".join(f"{pole:.4g}" for pole in model.poles)
         typer.echo(f"order {model.order} by {method}, poles {poles}")
@@ -109,13 +109,6 @@ def closed_loop(
         console.print(f"warning: {warning}", markup=False, soft_wrap=True)
     typer.echo(summary(result))
     typer.echo(f"wrote {out}")
-
-
-def _windows(f: int | None, p: int | None, n_cl: int | None, psi: str | None) -> Windows:
-    from autotune.arguments import settings_of
-    from autotune.identification.closed_loop.methods import Windows
-
-    return Windows(**settings_of(Windows, {"f": f, "p": p, "n_cl": n_cl, "Psi": psi}, where="identify closed-loop"))
 
 
 def _model_json(model: InnovationModel, method: str) -> dict[str, Any]:
