@@ -6,7 +6,7 @@ import datetime
 import re
 import zipfile
 import zlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -184,20 +184,18 @@ def parquet_table(paths: Sequence[Path]) -> Table:
 
     plain = [field.name for field in schema if not pa.types.is_nested(field.type)]
 
-    def load(wanted: Sequence[str]) -> dict[str, Cells]:
+    def cells(rows: Callable[[], Any]) -> dict[str, Cells]:
         try:
-            table = data.to_table(columns=list(wanted))
-            return {name: _cells(table[name]) for name in wanted}
+            table = rows()
+            return {name: _cells(column) for name, column in zip(table.column_names, table.columns, strict=True)}
         except (pa.ArrowException, UnicodeDecodeError, OSError) as error:
             said = str(error).strip().splitlines()[0]
             raise InputError(f"cannot be read ({said})", where=str(paths[0]), remedy="write the file anew") from None
 
-    try:
-        head = data.head(2 * _LOOKED_AT, columns=plain)
-        sample = {name: _cells(column) for name, column in zip(plain, head.columns, strict=True)}
-    except (pa.ArrowException, UnicodeDecodeError, OSError) as error:
-        said = str(error).strip().splitlines()[0]
-        raise InputError(f"cannot be read ({said})", where=str(paths[0]), remedy="write the file anew") from None
+    def load(wanted: Sequence[str]) -> dict[str, Cells]:
+        return cells(lambda: data.to_table(columns=list(wanted)))
+
+    sample = cells(lambda: data.head(2 * _LOOKED_AT, columns=plain))
     units = {name: unit for name in plain if (unit := bare_and_unit(name)[1])}
     for field in schema:
         if field.metadata and b"unit" in field.metadata:

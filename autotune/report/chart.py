@@ -188,19 +188,8 @@ class Chart:
         """Draw a shape."""
         self.layout["shapes"].append(_nest(settings))
 
-    def add_annotation(self, *, row: int | None = None, col: int | None = None, **settings: Any) -> None:
-        """Write a text at a place.
-
-        Parameters
-        ----------
-        row, col : int, optional
-            Axes that x and y are of, counted from 1; the first where absent.
-        **settings : object
-            Of plotly's annotation.
-        """
-        if row is not None or col is not None:
-            name = self._name(row or 1, col or 1)
-            settings = {"xref": f"x{name}", "yref": f"y{name}", **settings}
+    def add_annotation(self, **settings: Any) -> None:
+        """Write a text at a place, of the first axes where none are named."""
         self.layout["annotations"].append(_nest(settings))
 
     def to_json(self) -> str:
