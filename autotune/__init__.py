@@ -46,14 +46,13 @@ from autotune.version import __version__ as __version__  # noqa: E402
 
 if TYPE_CHECKING:
     from autotune.api.control_systems import to_control
+    from autotune.api.diagnosing import diagnose, simulate
     from autotune.api.examples import example
     from autotune.api.methods import (
         closed_loop,
         delay,
-        diagnose,
         margins,
         reduce,
-        simulate,
         transition,
         tune,
         validate,
@@ -87,8 +86,8 @@ _HOMES = {
     "closed_loop": "autotune.api.methods",
     "transition": "autotune.api.methods",
     "Model": "autotune.api.models",
-    "simulate": "autotune.api.methods",
-    "diagnose": "autotune.api.methods",
+    "simulate": "autotune.api.diagnosing",
+    "diagnose": "autotune.api.diagnosing",
     "plot": "autotune.api.plots",
     "to_control": "autotune.api.control_systems",
     "from_control": "autotune.api.python_control",

@@ -1,81 +1,96 @@
-"""The one place where the public face calls the diagnosis and the simulation."""
+"""Simulation and diagnosis: the one place where the public face calls them."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
 from typing import Any
 
-from autotune.arguments import settings_of
-from autotune.arrays import FloatArray
-from autotune.controller import Controller
+import numpy as np
+
+from autotune.api.plants import as_controller
+from autotune.api.recordings import Source, read
+from autotune.api.recordings import recordings as all_of
+from autotune.arguments import number, settings_of
 from autotune.errors import InputError
 from autotune.models import Model
-from autotune.recording import Recording
 
 
-def diagnosed(model: Any, recordings: Sequence[Recording], controller: Controller | None, **settings: Any) -> Any:
-    """Return the diagnosis of recordings, which shows itself as a table.
-
-    Parameters
-    ----------
-    model : object
-        A model, or what :func:`autotune.diagnose` takes for one.
-    recordings : sequence of Recording
-        With the model's u and y.
-    controller : Controller or None
-        The law that closed the loop, if one did.
-    **settings : object
-        Keyword arguments of :func:`autotune.diagnosis.diagnose`.
-
-    Raises
-    ------
-    InputError
-        A setting that is not known, or units that do not fit the model or each other.
-    """
-    import autotune.api.shown_diagnosis  # noqa: F401 - it registers the table
-    from autotune.diagnosis import diagnose
-    from autotune.equations.recorded_units import require_units_of_each_other, require_units_of_model
-
-    given = _model(model)
-    asked = settings_of(diagnose, settings, where="diagnose", of=("without", "progress", "thresholds"))
-    require_units_of_model(given, recordings)
-    require_units_of_each_other(recordings)
-    return diagnose(given, recordings, controller, **asked)
-
-
-def simulated(model: Any, recording: Recording, horizon_s: float | None) -> FloatArray:
-    """Return y simulated with a recording's u, of a chain, of equations or of an FMU.
+def simulate(model: Any, recording: Source, *, horizon_s: float | None = None) -> Any:
+    """Return y simulated with a recording's u, shape (N,); with a horizon as forecasts of that length.
 
     Parameters
     ----------
-    model : object
-        A model, or what :func:`autotune.simulate` takes for one.
-    recording : Recording
-        N rows, evenly sampled; its u drives the model.
-    horizon_s : float or None
-        Length of the windows [s] before which the state is estimated anew; None for one free run.
+    model : Model or its file
+        The chain of blocks with its effects.
+    recording : Recording, path, DataFrame, mapping of arrays
+        u, and y for the state to begin with.
+    horizon_s : float, optional
+        Length of the windows [s] before which the state is estimated anew; one free run when absent.
 
-    Returns
-    -------
-    (N,) array
-        y [y unit].
-
-    Raises
-    ------
-    InputError
-        Units that do not fit, or a recording with gaps.
+    Examples
+    --------
+    >>> import autotune as at
+    >>> oven = at.example("oven")
+    >>> around = at.read({"t": oven.t, "u": oven.u - 5.0, "y": oven.y - 50.0})
+    >>> y = at.simulate(at.Model.from_text("2 e^-0.5s/((2s+1)(3s+1))"), around)
+    >>> bool((y - around.y).std() < 0.05)
+    True
     """
     from autotune.diagnosis import forecast
     from autotune.equations.files import forecast_any
     from autotune.equations.recorded_units import require_units_of_model
 
-    given = _model(model)
-    require_units_of_model(given, [recording])
-    recording.require_dense()
+    if horizon_s is not None:
+        horizon_s = number(horizon_s, name="horizon_s", where="simulate", above=0.0)
+    given, record = _model(model), read(recording)
+    require_units_of_model(given, [record])
+    record.require_dense()
     if isinstance(given, Model):
-        return forecast(given, recording, horizon_s)
-    return forecast_any(given, recording, horizon_s)
+        return np.asarray(forecast(given, record, horizon_s))
+    return np.asarray(forecast_any(given, record, horizon_s))
+
+
+def diagnose(model: Any, recordings: Source, controller: Any = None, **settings: Any) -> Any:
+    """Return where and why recordings differ from a model's simulation.
+
+    Parameters
+    ----------
+    model : Model or its file
+        What the rig is believed to be.
+    recordings : recording or list of recordings, paths, DataFrames
+        Best with different excitation.
+    controller : PI, controller file, optional
+        The law that u was computed by.
+    **settings
+        Of :func:`autotune.diagnosis.diagnose`: ``without``, effects that are not looked for, and ``thresholds``.
+
+    Returns
+    -------
+    Diagnosis
+        ``verdict``, ``effects`` with their probabilities, ``places``, and the ``extended_model``.
+
+    Examples
+    --------
+    >>> import autotune as at
+    >>> oven = at.example("oven")
+    >>> around = at.read({"t": oven.t, "u": oven.u - 5.0, "y": oven.y - 50.0})
+    >>> believed = at.Model.from_text("1.5 e^-0.5s/((2s+1)(3s+1))")
+    >>> found = at.diagnose(believed, around)
+    >>> found.verdict
+    'parameters'
+    >>> round(found.extended_model.transfer_function().num[0], 1)
+    2.0
+    """
+    import autotune.api.shown_diagnosis  # noqa: F401 - it registers the table
+    from autotune.diagnosis import diagnose as search
+    from autotune.equations.recorded_units import require_units_of_each_other, require_units_of_model
+
+    law = None if controller is None else as_controller(controller)
+    given, records = _model(model), all_of(recordings)
+    asked = settings_of(search, settings, where="diagnose", of=("without", "progress", "thresholds"))
+    require_units_of_model(given, records)
+    require_units_of_each_other(records)
+    return search(given, records, law, **asked)
 
 
 def _model(model: Any) -> Any:
