@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from autotune.arrays import ComplexArray, FloatArray
+from autotune.arrays import FloatArray
 from autotune.errors import InputError
 from autotune.text_files import read_json
 
@@ -72,15 +72,6 @@ class FrequencyPoint:
         eigenvalues, directions = np.linalg.eigh(np.array(self.covariance))
         quantile = -2.0 * math.log(1.0 - probability)
         return np.sqrt(np.maximum(eigenvalues, 0.0) * quantile), directions
-
-
-def responses(points: Sequence[FrequencyPoint]) -> tuple[FloatArray, ComplexArray]:
-    """Return the frequencies [rad/s] and the complex gains of the points, in ascending frequency."""
-    ordered = sorted(points, key=lambda point: point.omega_rad_s)
-    return (
-        np.array([point.omega_rad_s for point in ordered], dtype=np.float64),
-        np.array([point.response for point in ordered], dtype=np.complex128),
-    )
 
 
 def as_pairs(covariance: FloatArray) -> tuple[tuple[float, float], tuple[float, float]]:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.linalg import solve_discrete_lyapunov
 from scipy.signal import lfilter
+from scipy.stats import chi2
 
-from autotune.arrays import FloatArray
-from autotune.identification.closed_loop.state_space import InnovationModel, feedback, from_polynomials
+from autotune.arrays import ComplexArray, FloatArray
+from autotune.identification.closed_loop.state_space import InnovationModel, from_polynomials
 
 PLANT_NUM = 1e-3 * np.array([0.0, 0.98, 12.99, 18.59, 3.3, -0.02])
 PLANT_DEN = np.array([1.0, -4.4, 8.09, -7.83, 4.0, -0.86])
@@ -71,3 +73,87 @@ def two_by_two() -> tuple[InnovationModel, InnovationModel]:
         A=np.eye(2), B=np.eye(2), C=rate, D=gain, K=np.zeros((2, 2)), innovation_covariance=np.zeros((2, 2))
     )
     return plant, controller
+
+
+def feedback(plant: InnovationModel, controller: InnovationModel) -> InnovationModel:
+    """Return the loop u = r - C y of equation (3), from r to y, with states (x, x_c).
+
+    Parameters
+    ----------
+    plant, controller : InnovationModel
+        G with n_u inputs and n_y outputs, C with n_y inputs and n_u outputs, same sample time.
+
+    Returns
+    -------
+    InnovationModel
+        G (1 + C G)^-1 with its noise; A holds the closed-loop poles.
+    """
+    plant, controller = plant.with_delay_as_states(), controller.with_delay_as_states()
+    B, C, D, Dc = plant.B, plant.C, plant.D, controller.D
+    loop = np.eye(D.shape[0]) + D @ Dc
+    M = np.linalg.inv(loop)
+    # y = M (C x + D C_c x_c + D r + e), with x_c driven by -y as in (3): C_c x_c of the plain C(q) has the other sign
+    Cy, Dr = np.asarray(M @ np.hstack([C, -D @ controller.C]), dtype=np.float64), M @ D
+    Cu, Du, De = np.hstack([np.zeros((B.shape[1], C.shape[1])), -controller.C]) - Dc @ Cy, np.eye(B.shape[1]), -Dc @ M
+    n, n_c = plant.order, controller.order
+    A = np.block([[plant.A, np.zeros((n, n_c))], [np.zeros((n_c, n + n_c))]])
+    A[:n] += B @ Cu
+    A[n:, n:] += controller.A
+    A[n:] += controller.B @ Cy
+    return InnovationModel(
+        A=A,
+        B=np.vstack([B @ (Du - Dc @ Dr), controller.B @ Dr]),
+        C=Cy,
+        D=Dr,
+        K=np.vstack([plant.K + B @ De, controller.B @ M]),
+        innovation_covariance=plant.innovation_covariance,
+        sample_time_s=plant.sample_time_s,
+    )
+
+
+def h2_norm(model: InnovationModel) -> float:
+    """Return the H2 norm of the deterministic part, sqrt(sum of squared Markov parameters)."""
+    gramian = solve_discrete_lyapunov(model.A, model.B @ model.B.T)
+    return float(np.sqrt(np.trace(model.C @ gramian @ model.C.T) + np.sum(model.D**2)))
+
+
+def difference(first: InnovationModel, second: InnovationModel) -> InnovationModel:
+    """Return the model whose response is the first's minus the second's (deterministic part).
+
+    Parameters
+    ----------
+    first, second : InnovationModel
+        Of the same inputs, outputs and sample time.
+    """
+    first, second = first.with_delay_as_states(), second.with_delay_as_states()
+    n, k = first.order, second.order
+    return replace(
+        first,
+        A=np.block([[first.A, np.zeros((n, k))], [np.zeros((k, n)), second.A]]),
+        B=np.vstack([first.B, second.B]),
+        C=np.hstack([first.C, -second.C]),
+        D=first.D - second.D,
+        K=np.vstack([first.K, second.K]),
+    )
+
+
+def inside_region(error: ComplexArray, covariance: FloatArray, probability: float = 0.95) -> FloatArray:
+    """Return whether errors lie in the region of the probability, 1.0 or 0.0, same shape as ``error``.
+
+    Parameters
+    ----------
+    error : (...) array
+        Complex differences between a true value and its estimate.
+    covariance : (..., 2, 2) array
+        Covariance of (re, im); singular where only one direction varies (a real pole): there the region is an interval.
+    probability : float
+        Of the region.
+    """
+    values, vectors = np.linalg.eigh(covariance)
+    parts = np.stack([error.real, error.imag], axis=-1)
+    turned = np.einsum("...ij,...i->...j", vectors, parts)
+    largest = np.maximum(values[..., -1:], np.finfo(np.float64).tiny)
+    varies = values > 1e-12 * largest
+    distance = np.sum(np.where(varies, turned**2 / np.where(varies, values, 1.0), 0.0), axis=-1)
+    quantile = np.where(varies.all(axis=-1), chi2.ppf(probability, 2), chi2.ppf(probability, 1))
+    return np.asarray(distance <= quantile, dtype=np.float64)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from autotune.errors import InputError
-from autotune.points import FrequencyPoint, points_to_json, read_points, require_regions, responses
+from autotune.points import FrequencyPoint, points_to_json, read_points, require_regions
 
 
 def test_points_read_back_in_their_fixed_form(tmp_path: Path) -> None:
@@ -29,14 +29,6 @@ def test_the_region_of_95_per_cent_holds_95_per_cent() -> None:
     radii, directions = point.region_radii(0.95)
     draws = rng.multivariate_normal([0, 0], covariance, 100_000) @ directions / radii
     assert np.mean(np.sum(draws**2, axis=1) < 1) == pytest.approx(0.95, abs=0.003)
-
-
-def test_responses_come_in_ascending_frequency() -> None:
-    cov = ((1.0, 0.0), (0.0, 1.0))
-    points = [FrequencyPoint(omega_rad_s=w, response=w * 1j, covariance=cov) for w in (3.0, 1.0, 2.0)]
-    omega, response = responses(points)
-    assert omega.tolist() == [1, 2, 3]
-    assert response.imag.tolist() == [1, 2, 3]
 
 
 @pytest.mark.parametrize(

@@ -18,15 +18,12 @@ import numpy as np
 
 from autotune.batch.engine import cluster, run_all
 from autotune.errors import IdentificationError
-from autotune.identification.closed_loop.confidence import inside_region, pole_covariance, response_covariance
+from autotune.identification.closed_loop.confidence import pole_covariance, response_covariance
 from autotune.identification.closed_loop.order import choose_order, fixed_order
 from autotune.identification.closed_loop.prediction_error import prediction_error
 from autotune.identification.closed_loop.refit import refit_inputs
 from autotune.identification.closed_loop.state_space import (
     InnovationModel,
-    difference,
-    feedback,
-    h2_norm,
     spectral_radius,
 )
 from autotune.identification.closed_loop.subspace_direct import pbsid_opt, ssarx
@@ -36,7 +33,7 @@ from autotune.identification.closed_loop.subspace_peers import (
     orthogonal_decomposition,
     van_overschee_de_moor,
 )
-from tests.loop_example import CONTROLLER, PLANT, LoopData, example_set
+from tests.loop_example import CONTROLLER, PLANT, LoopData, difference, example_set, feedback, h2_norm, inside_region
 
 Method = Callable[[LoopData], InnovationModel]
 POLES = PLANT.poles[[3, 0, 1]]  # P1 = 0.7319+0.6007i, P2 = 1, P3 = 0.9681+0.1486i

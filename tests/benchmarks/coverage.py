@@ -17,7 +17,6 @@ from scipy.signal import cont2discrete, lfilter
 import autotune as at
 from autotune.arrays import BoolArray, FloatArray
 from autotune.errors import AutotuneError
-from autotune.identification.closed_loop.confidence import inside_region
 from autotune.identification.closed_loop.identify import identify_closed_loop
 from autotune.identification.closed_loop.loop_plant import loop_region
 from autotune.identification.frequency.limit_cycle_points import limit_cycle_points
@@ -25,7 +24,7 @@ from autotune.points import FrequencyPoint
 from tests.autotune.identification.relay_loop import BALL, last_periods, relay_loop
 from tests.autotune.identification.test_structures import loop
 from tests.benchmarks.delay import wilson
-from tests.loop_example import PLANT
+from tests.loop_example import PLANT, inside_region
 
 RECORDS = int(os.environ.get("RECORDS", "400"))
 #: 2 exp(-0.5 s)/((2 s + 1)(3 s + 1)): a_0, a_1, b, h

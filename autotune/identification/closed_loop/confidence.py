@@ -132,28 +132,6 @@ def _real_covariance(change: ComplexArray, covariance: FloatArray) -> FloatArray
     return np.asarray(parts @ covariance @ np.swapaxes(parts, -1, -2), dtype=np.float64)
 
 
-def inside_region(error: ComplexArray, covariance: FloatArray, probability: float = 0.95) -> FloatArray:
-    """Return whether errors lie in the region of the probability, 1.0 or 0.0, same shape as ``error``.
-
-    Parameters
-    ----------
-    error : (...) array
-        Complex differences between a true value and its estimate.
-    covariance : (..., 2, 2) array
-        Covariance of (re, im); singular where only one direction varies (a real pole): there the region is an interval.
-    probability : float
-        Of the region.
-    """
-    values, vectors = np.linalg.eigh(covariance)
-    parts = np.stack([error.real, error.imag], axis=-1)
-    turned = np.einsum("...ij,...i->...j", vectors, parts)
-    largest = np.maximum(values[..., -1:], np.finfo(np.float64).tiny)
-    varies = values > 1e-12 * largest
-    distance = np.sum(np.where(varies, turned**2 / np.where(varies, values, 1.0), 0.0), axis=-1)
-    quantile = np.where(varies.all(axis=-1), chi2.ppf(probability, 2), chi2.ppf(probability, 1))
-    return np.asarray(distance <= quantile, dtype=np.float64)
-
-
 def frequency_points(estimate: PredictionErrorEstimate, omega_rad_s: FloatArray) -> tuple[FrequencyPoint, ...]:
     """Return the response of a single-input, single-output estimate as frequency points with their regions.
 

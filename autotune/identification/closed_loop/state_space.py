@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.linalg import solve_discrete_lyapunov
 
 from autotune.arrays import ComplexArray, FloatArray
 from autotune.errors import IdentificationError, InputError
@@ -174,84 +173,6 @@ def from_polynomials(
         K=(c[1:] - a[1:])[:, None],
         innovation_covariance=np.array([[variance]]),
         sample_time_s=sample_time_s,
-    )
-
-
-def feedback(plant: InnovationModel, controller: InnovationModel) -> InnovationModel:
-    """Return the loop u = r - C y of equation (3), from r to y, with states (x, x_c).
-
-    Parameters
-    ----------
-    plant, controller : InnovationModel
-        G with n_u inputs and n_y outputs, C with n_y inputs and n_u outputs, same sample time.
-
-    Returns
-    -------
-    InnovationModel
-        G (1 + C G)^-1 with its noise; A holds the closed-loop poles.
-
-    Raises
-    ------
-    IdentificationError
-        The loop is not well posed: I + D D_c is singular.
-    """
-    plant, controller = plant.with_delay_as_states(), controller.with_delay_as_states()
-    B, C, D, Dc = plant.B, plant.C, plant.D, controller.D
-    loop = np.eye(D.shape[0]) + D @ Dc
-    if np.linalg.cond(loop) > 1e12:
-        raise IdentificationError("the loop is not well posed", where="feedback", remedy="let D or D_c be zero")
-    M = np.linalg.inv(loop)
-    # y = M (C x + D C_c x_c + D r + e), with x_c driven by -y as in (3): C_c x_c of the plain C(q) has the other sign
-    Cy, Dr = np.asarray(M @ np.hstack([C, -D @ controller.C]), dtype=np.float64), M @ D
-    Cu, Du, De = np.hstack([np.zeros((B.shape[1], C.shape[1])), -controller.C]) - Dc @ Cy, np.eye(B.shape[1]), -Dc @ M
-    n, n_c = plant.order, controller.order
-    A = np.block([[plant.A, np.zeros((n, n_c))], [np.zeros((n_c, n + n_c))]])
-    A[:n] += B @ Cu
-    A[n:, n:] += controller.A
-    A[n:] += controller.B @ Cy
-    return InnovationModel(
-        A=A,
-        B=np.vstack([B @ (Du - Dc @ Dr), controller.B @ Dr]),
-        C=Cy,
-        D=Dr,
-        K=np.vstack([plant.K + B @ De, controller.B @ M]),
-        innovation_covariance=plant.innovation_covariance,
-        sample_time_s=plant.sample_time_s,
-    )
-
-
-def h2_norm(model: InnovationModel) -> float:
-    """Return the H2 norm of the deterministic part, sqrt(sum of squared Markov parameters).
-
-    Raises
-    ------
-    IdentificationError
-        A pole on or outside the unit circle: the norm is infinite.
-    """
-    radius = spectral_radius(model.A)
-    if radius >= 1.0:
-        raise IdentificationError(f"not stable (spectral radius {radius:.6g})", where="H2 norm")
-    gramian = solve_discrete_lyapunov(model.A, model.B @ model.B.T)
-    return float(np.sqrt(np.trace(model.C @ gramian @ model.C.T) + np.sum(model.D**2)))
-
-
-def difference(first: InnovationModel, second: InnovationModel) -> InnovationModel:
-    """Return the model whose response is the first's minus the second's (deterministic part).
-
-    Parameters
-    ----------
-    first, second : InnovationModel
-        Of the same inputs, outputs and sample time.
-    """
-    first, second = first.with_delay_as_states(), second.with_delay_as_states()
-    n, k = first.order, second.order
-    return replace(
-        first,
-        A=np.block([[first.A, np.zeros((n, k))], [np.zeros((k, n)), second.A]]),
-        B=np.vstack([first.B, second.B]),
-        C=np.hstack([first.C, -second.C]),
-        D=first.D - second.D,
-        K=np.vstack([first.K, second.K]),
     )
 
 

@@ -10,13 +10,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from autotune.arrays import FloatArray
-from autotune.identification.closed_loop.confidence import inside_region, response_covariance
+from autotune.identification.closed_loop.confidence import response_covariance
 from autotune.identification.closed_loop.gaps import LONGEST, bridged, usable_stretch, usable_stretches
 from autotune.identification.closed_loop.identify import identify_closed_loop
 from autotune.identification.closed_loop.order import choose_order, fixed_order
 from autotune.identification.closed_loop.state_space import InnovationModel
 from autotune.recording import Recording
 from tests.autotune.identification.test_closed_loop import DT, ball_loop
+from tests.loop_example import inside_region
 
 GAPS = 30
 

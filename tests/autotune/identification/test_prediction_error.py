@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from autotune.arrays import FloatArray
 from autotune.errors import IdentificationError
 from autotune.identification.closed_loop.confidence import (
-    inside_region,
     pole_covariance,
     residuals,
     response_covariance,
@@ -23,8 +22,18 @@ from autotune.identification.closed_loop.order import choose_order, fixed_order
 from autotune.identification.closed_loop.prediction_error import prediction_error
 from autotune.identification.closed_loop.predictor_directions import Predictor, behaviour_directions
 from autotune.identification.closed_loop.predictor_sweep import innovations, normal_equations
-from autotune.identification.closed_loop.state_space import InnovationModel, feedback, from_polynomials, spectral_radius
-from tests.loop_example import CONTROLLER, PLANT, PLANT_DEN, PLANT_NUM, example_set, simulate_loop, two_by_two
+from autotune.identification.closed_loop.state_space import InnovationModel, from_polynomials, spectral_radius
+from tests.loop_example import (
+    CONTROLLER,
+    PLANT,
+    PLANT_DEN,
+    PLANT_NUM,
+    example_set,
+    feedback,
+    inside_region,
+    simulate_loop,
+    two_by_two,
+)
 
 OMEGA = np.geomspace(0.05, 1.2, 9)
 

@@ -8,7 +8,7 @@ from threadpoolctl import threadpool_limits
 
 from autotune.errors import IdentificationError
 from autotune.identification.closed_loop.refit import refit_inputs
-from autotune.identification.closed_loop.state_space import difference, feedback, h2_norm, spectral_radius
+from autotune.identification.closed_loop.state_space import spectral_radius
 from autotune.identification.closed_loop.subspace_direct import pbsid_opt, ssarx
 from autotune.identification.closed_loop.subspace_indirect import (
     controller_markov_parameters,
@@ -20,7 +20,18 @@ from autotune.identification.closed_loop.subspace_peers import (
     orthogonal_decomposition,
     van_overschee_de_moor,
 )
-from tests.loop_example import CONTROLLER, PLANT, PLANT_DEN, PLANT_NUM, example_set, simulate_loop, two_by_two
+from tests.loop_example import (
+    CONTROLLER,
+    PLANT,
+    PLANT_DEN,
+    PLANT_NUM,
+    difference,
+    example_set,
+    feedback,
+    h2_norm,
+    simulate_loop,
+    two_by_two,
+)
 
 MARKOV = CONTROLLER.markov_parameters(20)
 OMEGA = np.geomspace(0.02, 1.2, 9)
