@@ -10,7 +10,6 @@ from autotune.errors import LinkError
 from autotune.experiment.rig import Reading
 from drivers.kinds import Session
 from drivers.plants import plant_of
-from sim.imperfections import FaultyPlant
 from sim.plant import Plant
 
 
@@ -38,7 +37,7 @@ class SimulatedRig:
     Parameters
     ----------
     plant : Plant
-        The plant, with or without faults.
+        The plant.
     u_safe : float
         Command that ``make_safe`` leaves [u unit].
     controller : PIDController, optional
@@ -69,13 +68,11 @@ class SimulatedRig:
 
     def open(self) -> None:
         """Take command."""
-        self._check_link()
         self._is_open = True
 
     def read(self) -> Reading:
         """Take one sample."""
         self._require_open()
-        self._check_link()
         return Reading(
             t_s=self._clock.now(),
             y=self.plant.measure(),
@@ -86,11 +83,10 @@ class SimulatedRig:
     def write(self, u: float) -> None:
         """Hold ``u`` [u unit] from now on."""
         self._require_open()
-        self._check_link()
         self._u = u
 
     def make_safe(self) -> None:
-        """Hold the safe output; a cut link cannot stop it, as the device's own dead-man would do it."""
+        """Hold the safe output, also where the rig is not open."""
         self._u = self._u_safe
 
     def close(self) -> None:
@@ -99,24 +95,15 @@ class SimulatedRig:
 
     def read_gains(self) -> PIDController:
         """Return the gains the rig's own controller holds."""
-        self._check_link()
         return self._controller
 
     def write_gains(self, controller: PIDController) -> None:
         """Hand gains to the rig's own controller."""
-        self._check_link()
         self._controller = controller
 
     def _require_open(self) -> None:
         if not self._is_open:
             raise LinkError("the rig is not open", where="simulated rig", remedy="open it before the first sample")
-
-    def _check_link(self) -> None:
-        if isinstance(self.plant, FaultyPlant):
-            try:
-                self.plant.check_link()
-            except ConnectionError as error:
-                raise LinkError(str(error), where="simulated rig", remedy="check the cable and the device") from error
 
 
 def open_kind(settings: SimulatedRigSettings, session: Session) -> SimulatedRig:

@@ -26,10 +26,10 @@ from autotune.models import Block, Model, Port, TransferFunction
 from autotune.pipeline.investigation import Budget, Investigation, Listeners, investigate
 from autotune.recording import Recording, read_recording, write_recording
 from drivers.simulated import SimulatedRig
-from sim.imperfections import Fault, FaultyPlant
 from sim.tank import TwoTank, TwoTankSettings
 from sim.ties import draw, write
 from tests.autotune.diagnosis.servo_rigs import servo_model
+from tests.sim.imperfections import Fault, FaultyPlant, FaultyRig
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 #: A square-root outflow and what it can be taken for.
@@ -145,7 +145,7 @@ def test_an_excitation_longer_than_the_rig_may_be_used_is_refused_before_the_rig
 
 
 def test_a_fault_in_a_round_leaves_the_rig_safe_and_says_in_which_round(tmp_path: Path) -> None:
-    rig = SimulatedRig(FaultyPlant(tanks(5), (Fault(kind="cut link", start_s=1000.0),)), u_safe=0.0)
+    rig = FaultyRig(FaultyPlant(tanks(5), (Fault(kind="cut link", start_s=1000.0),)), u_safe=0.0)
     kept: list[Investigation] = []
     with pytest.raises(ExperimentStopped):
         investigate(

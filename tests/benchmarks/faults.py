@@ -24,9 +24,6 @@ from autotune.config import load_config
 from autotune.errors import AutotuneError
 from autotune.experiment.run import run_experiment
 from autotune.recording import read_recording
-from drivers.simulated import SimulatedRig
-from sim.imperfections import Fault as PlantFault
-from sim.imperfections import FaultyPlant
 from sim.plant import make_plant
 from tests.drivers.bench import DEADMAN_S
 from tests.drivers.campaign import FAULTS, Outcome, run_fault
@@ -34,6 +31,8 @@ from tests.drivers.ctrl_c import STATES, stop_in
 from tests.drivers.plant_campaign import PLANT_FAULTS as PLANT_CAMPAIGN
 from tests.drivers.plant_campaign import run_plant_fault
 from tests.drivers.signals import SIGNALS, is_right, strike_process
+from tests.sim.imperfections import Fault as PlantFault
+from tests.sim.imperfections import FaultyPlant, FaultyRig
 
 CONFIG = Path(__file__).parents[2] / "configs" / "ball_sim.toml"
 
@@ -74,7 +73,7 @@ def plant_fault(kind: str, level: float, seed: int) -> Outcome:
     )
 
 
-class _WatchedRig(SimulatedRig):
+class _WatchedRig(FaultyRig):
     """A simulated rig that keeps the commands it got."""
 
     commands: list[float]

@@ -28,14 +28,13 @@ from autotune.experiment.rig import Rig
 from autotune.recording import Recording
 from drivers import open_rig
 from drivers.replay import ReplayRig
-from drivers.simulated import SimulatedRig
-from sim.imperfections import Fault, FaultyPlant
 from sim.modbus_rig import ModbusRig, Refusal, RtuTransport, TcpTransport
 from sim.opcua_rig import OpcUaRig, ServedNode
 from sim.register_device import OutputChange, RegisterDevice
 from sim.serial_line import SerialLine, Tamper
 from sim.serial_rig import SerialRig, device_on_line
 from sim.servo import Servo, ServoSettings
+from tests.sim.imperfections import Fault, FaultyPlant, FaultyRig
 
 U_RANGE = (-10.0, 10.0)
 U_SAFE = -0.5
@@ -277,7 +276,7 @@ def firmware_bench(elf: Path, **changes: Any) -> Iterator[Bench]:
 @contextmanager
 def simulated_bench() -> Iterator[Bench]:
     plant = FaultyPlant(servo(), [Fault(kind="cut link", start_s=1000.0)])
-    rig = SimulatedRig(plant, u_safe=U_SAFE)
+    rig = FaultyRig(plant, u_safe=U_SAFE)
     yield Bench(rig=rig, output=lambda: rig.command, cut=lambda: rig.clock.sleep_until(1001.0))
 
 

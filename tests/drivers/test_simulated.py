@@ -11,11 +11,11 @@ from autotune.experiment.rig import HoldsGains, Rig
 from drivers.kinds import Session
 from drivers.simulated import SimulatedRig, open_kind
 from sim.ball import make_ball
-from sim.imperfections import Fault, FaultyPlant
+from tests.sim.imperfections import Fault, FaultyPlant, FaultyRig
 
 
 def ball_rig(*faults: Fault) -> SimulatedRig:
-    return SimulatedRig(FaultyPlant(make_ball(seed=1), faults), u_safe=0.5)
+    return FaultyRig(FaultyPlant(make_ball(seed=1), faults), u_safe=0.5)
 
 
 def test_time_moves_only_when_somebody_waits() -> None:

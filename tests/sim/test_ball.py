@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from scipy.signal import cont2discrete
 
 from sim.ball import DENOMINATOR, GAIN, TAU_BALL, TAU_SONAR, TAU_TURBINE, Ball, BallSettings, linear_ball, make_ball
-from sim.imperfections import Fault, FaultyPlant
 from sim.plant import Plant, make_plant
+from tests.sim.imperfections import Fault, FaultyPlant
 
 
 def test_the_chain_is_equation_23() -> None:
@@ -137,6 +137,6 @@ def test_a_frozen_sensor_repeats_a_stuck_actuator_keeps_and_an_inverted_one_mirr
     assert inverted.u_applied == pytest.approx(4.0, abs=10 / 4096)
 
 
-def test_a_cut_link_raises() -> None:
-    with pytest.raises(ConnectionError):
-        faulty(Fault(kind="cut link")).check_link()
+def test_a_cut_link_is_said_while_it_is_cut() -> None:
+    assert faulty(Fault(kind="cut link")).is_cut_off
+    assert not faulty(Fault(kind="cut link", start_s=1.0)).is_cut_off

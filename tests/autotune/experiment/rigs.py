@@ -12,7 +12,7 @@ from autotune.experiment.run import envelope_of
 from autotune.recording import RecordingWriter
 from drivers.simulated import SimulatedRig
 from sim.ball import make_ball
-from sim.imperfections import Fault, FaultyPlant
+from tests.sim.imperfections import Fault, FaultyPlant, FaultyRig
 
 CONFIG = Path(__file__).resolve().parents[3] / "configs" / "ball_sim.toml"
 
@@ -31,7 +31,7 @@ def ball_config(**sections: dict[str, Any]) -> Config:
 
 def ball_rig(*, seed: int = 1, noise: float = 0.35, faults: Sequence[Fault] = ()) -> SimulatedRig:
     """Return a ball on the floor, behind faults."""
-    return SimulatedRig(FaultyPlant(make_ball(seed=seed, noise=noise), faults), u_safe=0.0)
+    return FaultyRig(FaultyPlant(make_ball(seed=seed, noise=noise), faults), u_safe=0.0)
 
 
 def open_loop(rig: SimulatedRig, recording: Path, config: Config | None = None) -> ControlLoop:

@@ -12,8 +12,8 @@ from autotune.errors import ExperimentStopped, LinkError, OperatorStop
 from autotune.experiment.limits import Watch
 from autotune.experiment.loop import ControlLoop, Tick, Timing
 from autotune.recording import read_recording
-from sim.imperfections import Fault
 from tests.autotune.experiment.rigs import ball_config, ball_rig, open_loop
+from tests.sim.imperfections import Fault
 
 
 def go(loop: ControlLoop, *commands: float) -> None:

@@ -17,9 +17,9 @@ from autotune.experiment.rig import Reading
 from autotune.experiment.run import run_experiment
 from autotune.recording import read_recording
 from drivers.simulated import SimulatedRig
-from sim.imperfections import Fault, FaultyPlant
 from sim.plant import make_plant
 from tests.autotune.experiment.rigs import EACH, ball_config
+from tests.sim.imperfections import Fault, FaultyPlant
 
 
 class BusyComputer(SimulatedRig):

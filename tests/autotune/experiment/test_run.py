@@ -22,8 +22,8 @@ from autotune.experiment.run import bring_to_operating_point, envelope_of, run_e
 from autotune.recording import RecordingWriter, read_recording
 from drivers.simulated import SimulatedRig
 from sim.ball import make_ball
-from sim.imperfections import Fault, FaultyPlant
 from tests.autotune.experiment.rigs import CONFIG, EACH, ball_config, ball_rig, open_loop
+from tests.sim.imperfections import Fault, FaultyPlant
 
 
 @pytest.fixture(scope="module")

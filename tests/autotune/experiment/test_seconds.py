@@ -19,9 +19,9 @@ from autotune.experiment.limits import Envelope
 from autotune.experiment.run import bring_to_operating_point, run_experiment
 from autotune.experiment.step_test import plan_test
 from autotune.experiment.verify import law_for
-from sim.imperfections import Fault
 from tests.autotune.experiment.rigs import ball_config, ball_rig, open_loop
 from tests.autotune.experiment.test_verify import FIT, PI
+from tests.sim.imperfections import Fault
 
 SECTIONS = {
     "limits": LimitSettings,

@@ -33,9 +33,9 @@ from autotune.pipeline.swept import price_of
 from autotune.recording import read_recording
 from drivers.simulated import SimulatedRig
 from sim.ball import make_ball
-from sim.imperfections import Fault, FaultyPlant
 from tests.autotune.experiment.rigs import EACH, ball_config, ball_rig
 from tests.benchmarks._joint_plants import CASES, LinearPlant
+from tests.sim.imperfections import Fault, FaultyPlant
 
 SAMPLE_S = 0.01
 

@@ -1,4 +1,4 @@
-"""What real rigs do to signals: a wrapper around any plant, with faults that come and go on schedule."""
+"""What real rigs do to signals: a plant and a rig with faults that come and go on schedule."""
 
 from __future__ import annotations
 
@@ -10,6 +10,10 @@ from typing import Literal, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from autotune.controller import PIDController
+from autotune.errors import LinkError
+from autotune.experiment.rig import Reading
+from drivers.simulated import SimulatedRig
 from sim.plant import Plant
 
 FaultKind: TypeAlias = Literal[
@@ -28,7 +32,7 @@ class Fault:
         ``frozen sensor`` repeats the last reading; ``not a number`` answers NaN; ``spikes`` replaces one reading in
         twenty by ``value``; ``sensor at full scale`` answers ``value``; ``stuck actuator`` keeps the command it had;
         ``saturated actuator`` lets no command above ``value`` through; ``inverted actuator`` mirrors the command at
-        ``value``; ``cut link`` raises ConnectionError from every reading and command.
+        ``value``; ``cut link`` cuts the link of a :class:`FaultyRig`.
     start_s, end_s : float
         Plant time between which it acts [s].
     value : float
@@ -75,10 +79,10 @@ class FaultyPlant:
         """Truth: small-signal complex gain of the plant without faults."""
         return self.plant.response(omega_rad_s)
 
-    def check_link(self) -> None:
-        """Raise ConnectionError while the link is cut."""
-        if any(fault.kind == "cut link" for fault in self._active()):
-            raise ConnectionError("link cut")
+    @property
+    def is_cut_off(self) -> bool:
+        """Whether the link is cut."""
+        return any(fault.kind == "cut link" for fault in self._active())
 
     def advance(self, u: float, dt_s: float) -> None:
         """Hold what the faults leave of a command.
@@ -119,3 +123,31 @@ class FaultyPlant:
 
     def _active(self) -> list[Fault]:
         return [fault for fault in self._faults if fault.start_s <= self.plant.time_s < fault.end_s]
+
+
+class FaultyRig(SimulatedRig):
+    """A simulated rig whose link is cut while its plant says so."""
+
+    def open(self) -> None:
+        self._check_link()
+        super().open()
+
+    def read(self) -> Reading:
+        self._check_link()
+        return super().read()
+
+    def write(self, u: float) -> None:
+        self._check_link()
+        super().write(u)
+
+    def read_gains(self) -> PIDController:
+        self._check_link()
+        return super().read_gains()
+
+    def write_gains(self, controller: PIDController) -> None:
+        self._check_link()
+        super().write_gains(controller)
+
+    def _check_link(self) -> None:
+        if isinstance(self.plant, FaultyPlant) and self.plant.is_cut_off:
+            raise LinkError("link cut", where="simulated rig", remedy="check the cable and the device")
