@@ -133,8 +133,8 @@ def _of_type(value: Any, hint: Any, *, name: str, where: str, endless: bool = Fa
     if hint in (float, int):
         if endless and is_real(value) and math.isinf(value):
             return float(value)
-        found = number(value, name=name, where=where, whole=hint is int)
-        return int(found) if hint is int else found
+        result = number(value, name=name, where=where, whole=hint is int)
+        return int(result) if hint is int else result
     if origin is np.ndarray:
         return _array(value, name=name, where=where)
     kind = origin or hint
@@ -176,12 +176,12 @@ def _of_one(value: Any, hints: list[Any], *, name: str, where: str, endless: boo
 
 def _array(value: Any, *, name: str, where: str) -> FloatArray:
     try:
-        found = np.atleast_1d(np.asarray(value, dtype=np.float64))
+        result = np.atleast_1d(np.asarray(value, dtype=np.float64))
     except (TypeError, ValueError, OverflowError):
-        found = np.empty(0)
-    if found.size == 0 or found.ndim > 1 or not np.all(np.isfinite(found)):
+        result = np.empty(0)
+    if result.size == 0 or result.ndim > 1 or not np.all(np.isfinite(result)):
         raise InputError(f"{name} = {value!r}"[:200], where=where, remedy="it must be finite numbers in a row")
-    return found
+    return result
 
 
 def number(value: Any, *, name: str, where: str, above: float = -math.inf, whole: bool = False) -> float:
@@ -204,15 +204,15 @@ def number(value: Any, *, name: str, where: str, above: float = -math.inf, whole
         Something else; names what is allowed.
     """
     try:
-        found = float(value)
+        result = float(value)
     except (TypeError, ValueError, OverflowError):
-        found = math.nan
-    if isinstance(value, bool | str | bytes) or not (math.isfinite(found) and above < found):
+        result = math.nan
+    if isinstance(value, bool | str | bytes) or not (math.isfinite(result) and above < result):
         low = "" if above == -math.inf else f" above {above:g}"
         raise InputError(f"{name} = {value!r}"[:200], where=where, remedy=f"it must be a finite number{low}")
-    if whole and found != int(found):
+    if whole and result != int(result):
         raise InputError(f"{name} = {value!r}", where=where, remedy="it must be a whole number")
-    return found
+    return result
 
 
 def _nearest(value: Any, words: list[str]) -> str:

@@ -75,10 +75,10 @@ def diagnose(model: Any, recordings: Source, controller: Any = None, **settings:
     >>> oven = at.example("oven")
     >>> around = at.read({"t": oven.t, "u": oven.u - 5.0, "y": oven.y - 50.0})
     >>> believed = at.Model.from_text("1.5 e^-0.5s/((2s+1)(3s+1))")
-    >>> found = at.diagnose(believed, around)
-    >>> found.verdict
+    >>> diagnosis = at.diagnose(believed, around)
+    >>> diagnosis.verdict
     'parameters'
-    >>> round(found.extended_model.transfer_function().num[0], 1)
+    >>> round(diagnosis.extended_model.transfer_function().num[0], 1)
     2.0
     """
     import autotune.api.shown_diagnosis  # noqa: F401 - it registers the table

@@ -113,8 +113,8 @@ def tune(
     Examples
     --------
     >>> import autotune as at
-    >>> found = at.tune(at.example("ball"), noise_gain=0.1)
-    >>> found.margins.modulus >= 0.499
+    >>> design = at.tune(at.example("ball"), noise_gain=0.1)
+    >>> design.margins.modulus >= 0.499
     True
     """
     structure = one_of(kind, KINDS, name="kind", where="tune")
@@ -164,8 +164,8 @@ def _of_recordings(records: list[Recording], settings: dict[str, Any]) -> Design
     from autotune.schema import validated
 
     asked = validated(DesignSettings, settings, "tune, of a recording")
-    found = measured_of(records)
-    return analyse(found.points, asked, fit=found.fit, facts=found.facts, compare=False).design
+    measured = measured_of(records)
+    return analyse(measured.points, asked, fit=measured.fit, facts=measured.facts, compare=False).design
 
 
 def _specification(
@@ -195,8 +195,8 @@ def margins(plant: Any, controller: Any) -> Margins:
     Examples
     --------
     >>> import autotune as at
-    >>> found = at.margins(at.example("ball"), at.PI(K=-0.023, Ti_s=3.0))
-    >>> round(found.modulus, 4), found.stable
+    >>> margins = at.margins(at.example("ball"), at.PI(K=-0.023, Ti_s=3.0))
+    >>> round(margins.modulus, 4), margins.stable
     (0.6818, True)
     """
     from autotune.design.margins import margins as of_loop
@@ -205,10 +205,10 @@ def margins(plant: Any, controller: Any) -> Margins:
     if (isinstance(C, PIDController) and C.K == 0.0) or not any(H.num):
         raise InputError("there is no loop: a gain is 0", where="margins", remedy="give a plant and a controller")
     with np.errstate(all="ignore"):
-        found = of_loop(H, C)
-    if math.isnan(found.modulus + found.phase_rad):
+        result = of_loop(H, C)
+    if math.isnan(result.modulus + result.phase_rad):
         raise InputError("the loop's response leaves the range of numbers", where="margins", remedy="check its units")
-    return found
+    return result
 
 
 def validate(plant: Any, model: Any, controller: Any = None, *, scaling: float | None = None) -> Validation:
@@ -228,8 +228,8 @@ def validate(plant: Any, model: Any, controller: Any = None, *, scaling: float |
     --------
     >>> import autotune as at
     >>> ball = at.example("ball")
-    >>> found = at.validate(ball, at.reduce(ball), at.PI(K=-0.023, Ti_s=3.0))
-    >>> found.holds
+    >>> criterion = at.validate(ball, at.reduce(ball), at.PI(K=-0.023, Ti_s=3.0))
+    >>> criterion.holds
     True
     """
     from autotune.design.nugap import loop_scaling
@@ -271,8 +271,8 @@ def transition(
     --------
     >>> import autotune as at
     >>> plant = at.TransferFunction(num=(2.0,), den=(6.0, 5.0, 1.0), delay_s=0.5)
-    >>> found = at.transition(plant, y_start=0.0, y_end=1.0, u_rest=0.0, u_min=-2.0, u_max=2.0)
-    >>> found.binding
+    >>> move = at.transition(plant, y_start=0.0, y_end=1.0, u_rest=0.0, u_min=-2.0, u_max=2.0)
+    >>> move.binding
     'command'
     """
     from autotune.design.reference import flat_transition
@@ -380,8 +380,8 @@ def closed_loop(
     Examples
     --------
     >>> import autotune as at
-    >>> found = at.closed_loop(at.example("loop"), order=5)
-    >>> len(found.poles)
+    >>> loop = at.closed_loop(at.example("loop"), order=5)
+    >>> len(loop.poles)
     5
     """
     from autotune.identification.closed_loop.methods import METHODS, Windows

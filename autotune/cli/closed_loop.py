@@ -212,15 +212,15 @@ def closed_loop_json(result: ClosedLoopIdentification) -> dict[str, Any]:
 
 
 def summary(result: ClosedLoopIdentification) -> str:
-    """Return what was found, in a sentence or two."""
+    """Return model and excitation in a sentence or two."""
     model = result.estimate.model
     poles = ", ".join(
         f"{p.real:.4g}" + (f" ± {p.imag:.4g}i" if p.imag > 0 else "") for p in result.poles if p.imag >= 0
     )
     late = f" and {model.input_delay} samples of dead time" if model.input_delay else ""
     sd = math.sqrt(float(model.innovation_covariance[0, 0]))
-    found = f"order {model.order}{late}, poles {poles}, innovation sd {sd:.3g}"
-    return f"{found}; {_alternatives_text(result)}{result.excitation.sentence}"
+    of_model = f"order {model.order}{late}, poles {poles}, innovation sd {sd:.3g}"
+    return f"{of_model}; {_alternatives_text(result)}{result.excitation.sentence}"
 
 
 def _alternatives_text(result: ClosedLoopIdentification) -> str:

@@ -242,8 +242,8 @@ def _dead_time(data: LaggedData, rows: int) -> int:
     Biased where a loop is hardly excited: it says how far dead times are tried at least.
     """
     past, now_y = data.past(), data.now[1]
-    left = data.R[past.stop :, now_y]
-    variance = left.T @ left / max(rows - past.stop, 1)
+    residuals = data.R[past.stop :, now_y]
+    variance = residuals.T @ residuals / max(rows - past.stop, 1)
     factor = data.R[past, past]
     scale = np.abs(np.diag(factor))
     if np.min(scale) <= 1e-9 * np.max(scale):

@@ -119,25 +119,26 @@ def modulated_delay(recording: Recording, order: int, intervals: Sequence[Interv
             remedy="give more intervals",
         )
     starts = _best_of_a_grid(recording, intervals, modulated)
-    others = [(within(other) - unknowns, left) for other, left in starts]
+    others = [(within(other) - unknowns, residual) for other, residual in starts]
 
-    def most(h: float) -> float:
+    def largest_residual(h: float) -> float:
         """Return what a delay may leave beside all others, each with the intervals that it has in the record."""
         own = within(h) - unknowns
         if own <= 0:  # explained whatever the delay is: none of them is told from another
             return np.inf if within(0.0) == unknowns else 0.0
-        shares = (f_distribution.isf(_BY_CHANCE, own, n) * left for n, left in others if n > 0)
+        shares = (f_distribution.isf(_BY_CHANCE, own, n) * residual for n, residual in others if n > 0)
         return float(min(shares, default=0.0)) + _EXACT
 
-    found: list[ModulatedDelay] = []
+    estimates: list[ModulatedDelay] = []
     for start in (0.0, *(h for h, _ in starts)):
         for sign in (1.0, -1.0):  # the wrong sign of b has its fixed point half a window away
             result = _iterate(recording, intervals, modulated, start, sign)
-            found.append(replace(result, converged=result.converged and result.residual <= most(result.delay_s)))
-            if found[-1].converged and within(result.delay_s) == within(0.0):
-                return found[-1]
+            allowed = largest_residual(result.delay_s)
+            estimates.append(replace(result, converged=result.converged and result.residual <= allowed))
+            if estimates[-1].converged and within(result.delay_s) == within(0.0):
+                return estimates[-1]
     # a delay that leaves hardly more intervals in the record than unknowns explains these, whatever it is
-    return min(found, key=lambda result: (not result.converged, -within(result.delay_s), result.residual))
+    return min(estimates, key=lambda result: (not result.converged, -within(result.delay_s), result.residual))
 
 
 def _iterate(
@@ -178,9 +179,9 @@ def _residual(recording: Recording, intervals: Sequence[Interval], modulated: Mo
         return float("inf")
     of_u = (modulated.of_input(h) @ modulated.whole)[inside]
     matrix = np.column_stack([Y[:, :-1], of_u])
-    left = Y[:, -1] - matrix @ np.linalg.lstsq(matrix, Y[:, -1], rcond=None)[0]
+    residual = Y[:, -1] - matrix @ np.linalg.lstsq(matrix, Y[:, -1], rcond=None)[0]
     total = float(Y[:, -1] @ Y[:, -1]) * (1.0 - matrix.shape[1] / len(Y))
-    return float(left @ left) / total if total > 0.0 else float("inf")
+    return float(residual @ residual) / total if total > 0.0 else float("inf")
 
 
 def _best_of_a_grid(
@@ -197,12 +198,12 @@ def _best_of_a_grid(
     values = np.array([residual(h) for h in grid])
     padded = np.concatenate([[np.inf], values, [np.inf]])
     minima = np.flatnonzero((values < 1e9) & (values <= padded[:-2]) & (values <= padded[2:]))
-    found = []
+    candidates = []
     for i in minima[np.argsort(values[minima])][:_RESTARTS]:
         around = (max(grid[i] - longest / _GRID, 0.0), grid[i] + longest / _GRID)
         fine = minimize_scalar(residual, bounds=around, method="bounded", options={"xatol": 1e-3 * longest})
-        found.append(min((float(values[i]), float(grid[i])), (float(fine.fun), float(fine.x))))
-    return [(h, value) for value, h in sorted(found)]
+        candidates.append(min((float(values[i]), float(grid[i])), (float(fine.fun), float(fine.x))))
+    return [(h, value) for value, h in sorted(candidates)]
 
 
 def _inside(recording: Recording, intervals: Sequence[Interval], h: float) -> BoolArray:

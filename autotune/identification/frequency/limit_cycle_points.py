@@ -177,16 +177,16 @@ def _corrected_fit(
             np.concatenate([sd[excited], [math.sqrt(0.5 * float(np.trace(point.covariance))) for point in known]]),
             np.concatenate([np.abs(U[excited]), np.full(len(known), np.abs(U[0]))]),
         )
-        left = y - simulate_reference(t, centred, trial)
+        remainder = y - simulate_reference(t, centred, trial)
         transients = free_responses(t[good], trial)
-        trial_fit = fit_harmonics(t[good], left[good], window.omega_rad_s, orders, transients=transients)
+        trial_fit = fit_harmonics(t[good], remainder[good], window.omega_rad_s, orders, transients=transients)
         wild = _wild(trial_fit.residual, float(np.std(y[good])))
         if wild.any():
             good = good.copy()
             good[np.flatnonzero(good)[wild]] = False
             outliers += int(wild.sum())
             transients = free_responses(t[good], trial)
-            trial_fit = fit_harmonics(t[good], left[good], window.omega_rad_s, orders, transients=transients)
+            trial_fit = fit_harmonics(t[good], remainder[good], window.omega_rad_s, orders, transients=transients)
         fit, reference = trial_fit, trial
         G = reference.response(omega) + fit.coefficients / U
     return fit, reference, outliers
