@@ -75,7 +75,7 @@ def extended_model(evidence: ChainEvidence, verdict: Verdict) -> Model:
     ends = [
         Effect(name=s.name, parameters=s.parameters)
         for s in evidence.samples
-        if kind_of(s.name).late_stamps or is_nearer(s, simulated, use.fit.residuals, evidence.limits.rounding)
+        if kind_of(s.name).late_stamps or is_nearer(s, simulated, use.fit.residuals, 1.0 - evidence.limits.material)
     ]
     if extended is nominal and not ends:
         return nominal

@@ -44,11 +44,9 @@ def said_by(evidence: Evidence) -> dict[str, float]:
 
 
 def _of_samples(s: SampleEffect, evidence: Evidence) -> FoundEffect:
-    limits = evidence.limits
-    surely = 1.0 / (1.0 + limits.unknown_odds + math.exp(-0.5 * s.speaks))
     return FoundEffect(
         name=s.name,
-        probability=surely if s.evidence > limits.samples_sure else min(surely, limits.samples_probable),
+        probability=1.0 / (1.0 + evidence.limits.unknown_odds + math.exp(-0.5 * s.speaks)),
         places=(kind_of(s.name).place,),
         parameters=MappingProxyType(s.parameters),
         equation=s.equation,

@@ -261,7 +261,7 @@ class Evidence(ABC):
             "offset": self.offset is not None,
             "missing": self.residual.is_missing,
             "jitter explains more": self.jitter_explains_more,
-            "wrong numbers": self.numbers > self.limits.numbers_decrease,
+            "wrong numbers": self.numbers > self.limits.beyond_chance,
         }
         return frozenset(name for name, one in holds.items() if one)
 

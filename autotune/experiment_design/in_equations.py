@@ -75,7 +75,7 @@ def _plan(found: Diagnosis, model: EquationModel) -> NextExperiment | None:
                 weight += p * q
         if weight and told / weight > most:
             most, best = told / weight, excitation
-    if best is None or most < found.search.limits.least_discrimination:
+    if best is None or most < found.search.limits.beyond_chance:
         return None
     settings = {k: float(f"{v:.4g}") if isinstance(v, float) else v for k, v in best.settings().items()}
     return NextExperiment(

@@ -65,7 +65,7 @@ def _plan(found: Diagnosis) -> NextExperiment | None:
         plan = plan_in(found, recorded, rows * recorded.sample_time_s)
     except InputError:  # an integrating plant without a stated law
         return None
-    if plan is None or plan.discrimination < found.search.limits.least_discrimination:
+    if plan is None or plan.discrimination < found.search.limits.beyond_chance:
         return None
     return NextExperiment(
         purpose=told_apart(plan.between),

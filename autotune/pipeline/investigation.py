@@ -241,7 +241,7 @@ def _next(
     if (done + 1) * duration_s > rig_time_s * (1.0 + 1e-9):
         return None, f"the rig time of {rig_time_s:g} s is used up, {len(hypotheses)} hypotheses are left"
     plan = plan_in(found, conditions_of(config), duration_s, seed=done + 1, progress=report)
-    if plan is None or plan.discrimination < found.search.data.thresholds.least_discrimination:
+    if plan is None or plan.discrimination < found.search.data.thresholds.beyond_chance:
         told = 0.0 if plan is None else plan.discrimination
         names = ", ".join(hypotheses)
         return None, f"nothing more can be learnt within the limits (expected chi-square {told:.2g}): {names} are left"

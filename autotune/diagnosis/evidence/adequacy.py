@@ -74,12 +74,12 @@ class ResidualTests:
     @property
     def is_missing(self) -> bool:
         """Whether its variance alone shows that something is missing."""
-        return not (self.uneven or self.accounted) and self.reduced_chi2 > self.limits.missing
+        return not (self.uneven or self.accounted) and self.reduced_chi2 > self.limits.adequate
 
     @property
     def is_constant(self) -> bool:
         """Whether nothing swings, bends or goes past the chain in it."""
-        return self.accounted or self.varies.gain < self.limits.inconstant
+        return self.accounted or self.varies.gain < self.limits.beyond_chance
 
     def _is_white(self, bound: float) -> bool:
         return self.slow < bound + 2.0 * self.slow_chance

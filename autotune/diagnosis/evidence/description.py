@@ -249,7 +249,7 @@ def _equation(residual: FreedResidual) -> tuple[tuple[Term, ...], Place, float]:
     )
     before = residual.cross_validated(np.zeros((residual.e.size, 0)))
     limits = residual.data.thresholds
-    least = max(limits.material * (before - residual.floor), limits.least_decrease)
+    least = max(limits.material * (before - residual.floor), limits.beyond_chance)
     chosen: list[_Candidate] = []
     error = before
     groups = [*([c for c in pool if c.place == place] for place in residual.signals), memories]

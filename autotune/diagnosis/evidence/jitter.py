@@ -49,7 +49,7 @@ def jitter_effect(result: Fit, data: Data, recordings: Sequence[Recording]) -> S
         weight = 1.0 / np.maximum(varies, 1e-3 * level) ** 2
     fitted, constant = np.maximum(varies, 1e-9 * level), float(np.mean(z))
     gain = float(np.sum(np.log(constant) + z / constant - np.log(fitted) - z / fitted))
-    if coefficients[1] <= 0.0 or gain < data.thresholds.least_decrease:
+    if coefficients[1] <= 0.0 or gain < data.thresholds.beyond_chance:
         return None
     if not (is_noise(result, data) and largest_variation(result, data).gain < gain):
         return None

@@ -108,11 +108,11 @@ def late_rows(retuned: Fit, data: Data) -> SampleEffect | None:
             (c + i * factor * GRID[0], size * math.exp(k * factor * GRID[1])) for i in (-1, 0, 1) for k in (-1, 0, 1)
         ]
         late, c, size = max((told(c, size).score, c, size) for c, size in near if 0.0 <= c < 1.0)
-    if late - plain < limits.least_decrease:
+    if late - plain < limits.beyond_chance:
         return None
     noisy = max(told(one, 0.0, load).score for one in {c, a} for load in loads)
     best = told(c, size)
-    if late - noisy < limits.late_rows_beside_load or not _white(best.innovations, recordings, limits.line):
+    if late - noisy < limits.beyond_chance or not _white(best.innovations, recordings, limits.line):
         return None
     return SampleEffect(
         name=JITTER,

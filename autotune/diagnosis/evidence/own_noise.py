@@ -88,7 +88,7 @@ def own_noise(retuned: Fit, data: Data) -> OwnNoise | None:
         result = fit(result.parametrisation, coloured, result.theta, result.x0, iterations=STEPS)
     left = residual_tests(result, coloured)
     innovations = coloured.whitened(list(result.residuals))
-    shown = left.varies.gain > limits.inconstant or linear_gain(result, coloured) > limits.inconstant
+    shown = left.varies.gain > limits.beyond_chance or linear_gain(result, coloured) > limits.beyond_chance
     rings = strongest_line(result, coloured) > limits.line
     if shown or rings or not left.is_slowly_white or not _is_steady(innovations, limits):
         return None

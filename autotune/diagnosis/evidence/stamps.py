@@ -56,7 +56,7 @@ def even_stamps(
             stamped, evenly = (prepare(model, rs, good, limits) for rs in (recordings, at_even))
     except RUNAWAY:
         return recordings, None
-    if _rms(*evenly) > limits.even_share * _rms(*stamped):
+    if _rms(*evenly) > (1.0 - limits.material_numbers) * _rms(*stamped):
         return recordings, None
     sd = float(np.sqrt(np.mean(np.concatenate([(r.t - e.t) ** 2 for r, e in zip(recordings, at_even, strict=True)]))))
     gained = float(sum(len(r) for r in recordings) * np.log(_rms(*stamped) / _rms(*evenly)))

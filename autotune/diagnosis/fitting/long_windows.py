@@ -45,12 +45,12 @@ def lengths_of(model: Model, recordings: Sequence[Recording], limits: Thresholds
     damping = float(np.min(-settling.real / np.abs(settling))) if settling.size else 1.0
     long = duration
     if settling.size < poles.size:
-        long = max(limits.integrating_window * slowest, limits.least_window_rows * dt)
+        long = max(limits.long_window * slowest, limits.least_window_rows * dt)
     elif damping < limits.ringing:
-        long = max(limits.ringing_periods * 2.0 * math.pi * slowest, limits.least_window_rows * dt)
+        long = max(limits.long_window * 2.0 * math.pi * slowest, limits.least_window_rows * dt)
     elif sum(len(r) for r in recordings) > limits.searched_rows:
         # as many windows as are always kept, of all rows that are fitted
-        long = max(limits.integrating_window * slowest, limits.rig_rows / limits.least_windows * dt)
+        long = max(limits.long_window * slowest, limits.rig_rows / limits.least_windows * dt)
     long = min(long, duration)
     short = min(max(limits.short_window * slowest, limits.least_short_rows * dt), long)
     return Lengths(short=long if long < 1.5 * short else short, long=long, swings=damping < limits.swinging)

@@ -176,7 +176,7 @@ def _begin(model: Model, bench: Bench) -> _ChainProposals:
         raise OverflowError("the retuned model runs away")
     nominal = nominal if nominal is not None else retuned
     away = float(np.max(np.abs(retuned.fit.theta - p.centre) / p.spreads))
-    roots = (retuned, nominal) if away > bench.limits.nominal_too else (retuned,)
+    roots = (retuned, nominal) if away > bench.limits.far_from_prior else (retuned,)
     sought = (search_starts(k.name, retuned.short, retuned.few, bench.pool) for k, _ in bench.odds if k.lasting)
     known = vars(bench) | {"lasting": tuple(e for found in sought for e in found)}
     return _ChainProposals(**known, nominal=nominal, roots=roots)

@@ -185,4 +185,4 @@ def varies_more(found: Found[JudgedChain]) -> bool:
     share = before**2 / rms(chosen.fit.residuals, chosen.data.good) ** 2 - 1.0
     explained = max(share, 0.0) * sum(int(g.sum()) for g in chosen.data.good)
     left = largest_variation(chosen.fit, under_noise(chosen.fit, chosen.data)).gain
-    return left > max(limits.inconstant, limits.inconstant_share * explained)
+    return left > max(limits.beyond_chance, limits.material * explained)

@@ -186,7 +186,7 @@ def _predicted(base: Fit, effect: Effect, data: Data) -> tuple[Prediction, float
         low, high = 0.0, 1.0  # a limit or a step is not made larger by a factor
     a = float(np.clip(slope / curvature, low, high))
     scaled = _scaled(effect, a, 20.0 if kind.is_signed else 2.0)
-    least = min(data.thresholds.impact_decrease, curvature) if kind.impacts else 0.0
+    least = min(data.thresholds.beyond_chance, curvature) if kind.impacts else 0.0
     decrease = max(2.0 * a * slope - a * a * curvature, least)
     return Prediction(effect=effect, decrease=decrease, scaled=scaled), curvature / base.chi2
 

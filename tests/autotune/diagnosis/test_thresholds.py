@@ -37,7 +37,7 @@ def test_a_table_passed_in_decides_and_the_one_in_use_stays() -> None:
     recordings = [servo_recording(seed, lambda x, v: -0.03 * v * abs(v)) for seed in (1, 2)]
     rest = [name for name in CATALOGUE if name not in ("plant.quadratic_drag", "actuator.rate_limit")]
     assert diagnose(servo_model(), recordings, without=rest).verdict == "effect"
-    closed = replace(IN_USE, inconstant=-1.0, inconstant_share=-1.0)
+    closed = replace(IN_USE, beyond_chance=-1.0, material=0.0)
     assert diagnose(servo_model(), recordings, without=rest, thresholds=closed).verdict == "unexplained"
     with pytest.raises(FrozenInstanceError):
         IN_USE.material = 1.0  # type: ignore[misc]

@@ -52,7 +52,7 @@ def swing(period_s: float, depth: float) -> FloatArray:
 def test_a_model_that_is_right_leaves_chance_in_open_and_closed_loop() -> None:
     # the largest of some hundred chi-squares of two degrees: its median lies near 2 ln(100/0.7)
     gains = [recorded(seed, feedback=feedback).gain for seed in range(5) for feedback in (0.0, 3.0)]
-    assert max(gains) < IN_USE.inconstant
+    assert max(gains) < IN_USE.beyond_chance
     assert 6.0 < float(np.median(gains)) < 14.0
 
 
@@ -64,29 +64,29 @@ def test_a_slow_swing_of_the_gain_may_be_the_commands_or_the_readings() -> None:
 
 def test_a_gain_that_swings_is_found_with_its_period() -> None:
     found = recorded(1, gain=swing(20.0, 0.1))
-    assert found.gain > IN_USE.inconstant
+    assert found.gain > IN_USE.beyond_chance
     assert found.what.startswith("the command")
     assert found.period_s == pytest.approx(20.0, rel=0.08)
 
 
 def test_a_lag_that_swings_is_found_with_its_period() -> None:
     found = recorded(2, lag_s=LAG_S * swing(30.0, 0.2))
-    assert found.gain > IN_USE.inconstant
+    assert found.gain > IN_USE.beyond_chance
     assert found.period_s == pytest.approx(30.0, rel=0.12)
 
 
 def test_a_gain_that_is_switched_is_found() -> None:
-    assert recorded(3, gain=np.where(np.sin(swing(50.0, 1.0) - 1.0) > 0.0, 1.1, 0.95)).gain > IN_USE.inconstant
+    assert recorded(3, gain=np.where(np.sin(swing(50.0, 1.0) - 1.0) > 0.0, 1.1, 0.95)).gain > IN_USE.beyond_chance
 
 
 def test_a_command_that_the_reading_hears_is_told_from_feedback() -> None:
     found = recorded(4, crosstalk=0.05, feedback=3.0)
-    assert found.gain > IN_USE.inconstant
+    assert found.gain > IN_USE.beyond_chance
     assert "cross-talk" in found.what
     assert found.places == ("sensor",)
 
 
 def test_an_echo_of_the_reading_is_found() -> None:
     found = recorded(5, echo=0.1)
-    assert found.gain > IN_USE.inconstant
+    assert found.gain > IN_USE.beyond_chance
     assert found.places == ("sensor",)
