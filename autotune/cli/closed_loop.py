@@ -69,6 +69,7 @@ def closed_loop(
     overwrite: OVERWRITE = False,
 ) -> None:
     """Identify the plant from r, u and y recorded while its loop is closed."""
+    place = Output(out, inputs=(recording, controller, config), overwrite=overwrite)  # refused before all imports
     from autotune.api import methods
     from autotune.controller import read_controller
     from autotune.identification.closed_loop.identify import identify_closed_loop
@@ -76,7 +77,6 @@ def closed_loop(
     from autotune.identification.dependence import require_answer
 
     console = Console(stderr=True, highlight=False)
-    place = Output(out, inputs=(recording, controller, config), overwrite=overwrite)
     data = read_one(recording, signal_names(t, u, y, r))
     require_answer([data])
     law = None if controller is None else read_controller(controller)

@@ -73,11 +73,11 @@ def identify_delay_command(
     """Identify x^(n) = sum a_i x^(i) + b u(t - h) from a recording; no starting value is needed."""
     from rich.console import Console
 
+    place = Output(out, inputs=(recording,), overwrite=overwrite)  # refused before the method is imported
     from autotune.api import methods
     from autotune.identification.delay.model import DelayModel, write_delay_model
     from autotune.identification.dependence import require_answer
 
-    place = Output(out, inputs=(recording,), overwrite=overwrite)
     record = read_one(recording, signal_names(t, u, y, r))
     if hold is not None:
         record = replace(record, metadata={**record.metadata, "hold": hold})

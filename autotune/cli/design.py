@@ -58,12 +58,13 @@ def design_command(
     overwrite: OVERWRITE = False,
 ) -> None:
     """Design the PI or PID that rejects a step of load best under margins, on a model or straight on points."""
+    if (model is None) == (points is None):
+        raise InputError("give one of --model and --points", where="autotune design")
+    place = Output(out, inputs=(model, points), overwrite=overwrite)  # refused before the method is imported
+    law = None if controller is None else Output(controller, inputs=(model, points, out), overwrite=overwrite)
     from autotune.controller import write_controller
     from autotune.design.noise import LoopFacts, default_noise_gain
     from autotune.design.specification import Specification
-
-    if (model is None) == (points is None):
-        raise InputError("give one of --model and --points", where="autotune design")
 
     def asked(plant: TransferFunction, highest_rad_s: float | None = None) -> Specification:
         allowed = noise_gain
@@ -81,8 +82,6 @@ def design_command(
             criterion=criterion,
         )
 
-    place = Output(out, inputs=(model, points), overwrite=overwrite)
-    law = None if controller is None else Output(controller, inputs=(model, points, out), overwrite=overwrite)
     if model is not None:
         from autotune.design.loop import transfer_function_of
         from autotune.design.synthesis import design
@@ -166,11 +165,11 @@ def margins_command(
     overwrite: OVERWRITE = False,
 ) -> None:
     """Compute the margins of a controller with a model; a sampled controller is taken with its hold."""
+    place = Output(out, inputs=(model, controller), overwrite=overwrite)  # refused before the method is imported
     from autotune.controller import read_controller
     from autotune.design.margins import margins
     from autotune.model_file import read_model
 
-    place = Output(out, inputs=(model, controller), overwrite=overwrite)
     m = margins(read_model(model), read_controller(controller), noise_frequency_rad_s=noise_frequency)
     if math.isnan(m.modulus + m.phase_rad):
         raise InputError(

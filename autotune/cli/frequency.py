@@ -34,12 +34,12 @@ def frequency(
     overwrite: OVERWRITE = False,
 ) -> None:
     """Estimate Bode points from recordings: relay, multisine, random binary or steps, open or closed loop."""
+    place = Output(out, inputs=recordings, overwrite=overwrite)  # refused before the method is imported
     from rich.progress import track
 
     from autotune.identification.frequency.recorded import combine, session_points, sessions
     from autotune.points import points_to_json
 
-    place = Output(out, inputs=recordings, overwrite=overwrite)
     estimates = []
     data = sessions(read_all(recordings, signal_names(t, u, y, r)))
     for one in track(data, description="recordings", transient=True, disable=len(data) < 2):
@@ -87,14 +87,14 @@ def reduce(
     overwrite: OVERWRITE = False,
 ) -> None:
     """Reduce measured points, or a known plant, to the cautious low-order model that a robust PI is designed on."""
+    place = Output(out, inputs=(points, model), overwrite=overwrite)  # refused before the method is imported
+    if (points is None) == (model is None):
+        raise InputError("give one of --points and --model", where="autotune reduce")
     from autotune.identification.frequency.thinning import said, thinned
     from autotune.identification.reduced_file import write_reduced
     from autotune.identification.reduction import reduce_points, reduce_transfer_function
     from autotune.points import read_points, require_regions
 
-    place = Output(out, inputs=(points, model), overwrite=overwrite)
-    if (points is None) == (model is None):
-        raise InputError("give one of --points and --model", where="autotune reduce")
     if model is not None:
         from autotune.model_file import read_model
 
