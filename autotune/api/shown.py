@@ -205,6 +205,15 @@ def html(result: Any) -> str:
     return f"<table>{caption}<thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
 
 
+def text(result: Any) -> str:
+    """Return a result's table as lines for people."""
+    title, header, rows = rows_of(result)
+    table = [row for row in (header, *rows) if len(row) > 1 and any(row)]
+    widths = [max(map(len, column)) for column in zip(*table, strict=True)]
+    lines = ("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in table)
+    return "\n".join((title, *lines, *(row[0] for row in rows if len(row) == 1)))
+
+
 def _head(header: Row) -> list[str]:
     """Return the cells of the header, each above what it names."""
     first, *others = (escaping.escape(cell) for cell in header)
@@ -319,3 +328,5 @@ def to_pandas(result: Any) -> Any:
 
 for _shown in SHOWN:
     setattr(_shown, "_repr_html_", html)  # noqa: B010 - the rooms below know nothing of notebooks
+# printed as it is, it would be all matrices and residuals of every structure that was tried
+setattr(ClosedLoopIdentification, "__str__", text)  # noqa: B010 - see above

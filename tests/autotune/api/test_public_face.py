@@ -198,6 +198,9 @@ def test_a_remark_stands_once_over_the_whole_width_and_a_real_pole_without_imagi
     loop = at.closed_loop(at.example("loop"), order=5)
     shown = loop._repr_html_()
     assert shown.count("not excited enough") == 1
+    printed = str(loop).splitlines()
+    assert printed[0] == "Plant of order 5 from its loop"
+    assert len(printed) <= 10
     assert shown.count("<td colspan=") == len({loop.excitation.sentence, *loop.warnings})
     assert "+0i" not in shown
     assert len(at.to_pandas(loop).columns) == 3
