@@ -12,7 +12,7 @@ from rich.console import Console
 from autotune.cli import app
 from autotune.cli.init_keys import REGISTER, Table, add_registers, register, set_keys
 from autotune.cli.init_model import EXAMPLE, ModelOfRig, model_of_rig
-from autotune.cli.init_questions import Questions, one_of, pair
+from autotune.cli.init_questions import Questions, middle, one_of, pair
 from autotune.cli.init_text import text_of
 from autotune.errors import InputError
 from autotune.outputs import Output
@@ -145,13 +145,15 @@ def init(
     questions = Questions()
     kinds = {one.name: one for one in KINDS}
     question = f"how is the rig reached ({', '.join(kinds)})"
-    chosen: Kind = questions.ask("--kind", kind, question, lambda name: kinds[one_of(name, kinds, "--kind")])
+    chosen: Kind = questions.ask(
+        "--kind", kind, question, lambda name: kinds[one_of(name, kinds, "--kind")], suggested="simulated"
+    )
     questions.require()  # the others hang on it
     simulated = chosen.settings is SimulatedRigSettings
     twin: Plant | ModelOfRig | None = plant if model is None else model_of_rig(model)
     if simulated:
         asked = f"which plant: {', '.join(PLANTS)}, a model file, or a transfer function such as {EXAMPLE}"
-        twin = questions.ask("--plant", twin, asked, _plant_or_model)
+        twin = questions.ask("--plant", twin, asked, _plant_or_model, suggested="ball")
         questions.require()
     elif "twin" in chosen.settings.model_fields:
         asked = f"the rig for rehearsals: a transfer function such as {EXAMPLE}, a model file, or nothing"
@@ -175,9 +177,10 @@ def init(
             "u_range": questions.ask("--u-range", u_range, "lowest and highest command u the rig may see", pair),
             "u_safe": questions.ask("--u-safe", u_safe, "command at which the rig may be left alone", float),
             "y_range": questions.ask("--y-range", y_range, "lowest and highest measurement y it may see", pair),
-            "y": questions.ask("--y", y, "y of the operating point", float),
-            "u": questions.ask("--u", u, "command that holds it there, about", float),
         }
+        centre = middle(answers["y_range"])  # y is chosen; what command holds it there is known to the person alone
+        answers["y"] = questions.ask("--y", y, "y of the operating point", float, suggested=centre)
+        answers["u"] = questions.ask("--u", u, "command that holds it there, about", float)
         questions.require()
         played = _settings_of_twin(twin, config, answers)
         content = _real(reached | (played if simulated else {"twin": played} if played else {}), answers)

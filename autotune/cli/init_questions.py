@@ -19,7 +19,13 @@ class Questions:
         self._asks = sys.stdin.isatty() and sys.stdout.isatty()
 
     def ask(
-        self, flag: str, given: Any, question: str, convert: Callable[[str], Any], default: str | None = None
+        self,
+        flag: str,
+        given: Any,
+        question: str,
+        convert: Callable[[str], Any],
+        default: str | None = None,
+        suggested: str | None = None,
     ) -> Any:
         """Return what is given, or the answer; without a terminal the default, else it is missing.
 
@@ -35,6 +41,8 @@ class Questions:
             From an answer's text to what it means; an answer that it refuses is asked for again.
         default : str, optional
             Answer where nothing is entered.
+        suggested : str, optional
+            Answer where a person presses Enter; away from a terminal nobody has seen it, and the answer is missing.
         """
         if given is not None:
             return convert(given) if isinstance(given, str) else given
@@ -42,7 +50,8 @@ class Questions:
             if default is None:
                 self._missing.append(flag)
             return default
-        return typer.prompt(question, default=default, value_proc=_ask_again_where_refused(convert))
+        offered = default if suggested is None else suggested
+        return typer.prompt(question, default=offered, value_proc=_ask_again_where_refused(convert))
 
     def require(self) -> None:
         """Refuse where an answer is missing.
@@ -97,3 +106,8 @@ def pair(answer: str) -> tuple[float, float]:
     if len(parts) != 2:
         raise InputError(f"{answer!r}: two numbers are wanted", where="autotune init")
     return float(parts[0]), float(parts[1])
+
+
+def middle(limits: tuple[float, float] | None) -> str | None:
+    """Return the middle of two limits as it would be answered; nothing where they are missing."""
+    return None if limits is None else f"{sum(limits) / 2.0:g}"

@@ -213,6 +213,22 @@ def test_at_a_terminal_questions_are_asked_and_asked_again_after_a_wrong_answer(
     assert load_config(tmp_path / "rig.toml").rig.kind == "simulated"
 
 
+def test_at_a_terminal_enter_takes_what_is_suggested(tmp_path: Path) -> None:
+    said, status = typed(["init", "ball.toml"], "\n\n", tmp_path)
+    assert status == 0, said
+    assert load_config(tmp_path / "ball.toml").rig.plant == "ball"  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize("limits", ["0,100", "0 100", "0, 100"])
+def test_limits_are_taken_with_comma_or_space_and_their_middle_is_suggested(limits: str, tmp_path: Path) -> None:
+    answers = f"simulated\nK=2 T=10 L=1\n%\ndegC\n1\n{limits}\n0\n20 80\n\n30\n"
+    said, status = typed(["init", "oven.toml"], answers, tmp_path)
+    assert status == 0, said
+    content = load_config(tmp_path / "oven.toml")
+    assert (content.limits.u_min, content.limits.u_max) == (0.0, 100.0)
+    assert content.operating_point.y == 50.0
+
+
 def test_a_transfer_function_as_it_is_written_becomes_the_model_of_twin_or_simulated_rig(tmp_path: Path) -> None:
     written = "-65.5/(s(0.36s+1)) e^-0.1s"
     command("init", tmp_path / "oven.toml", "--kind", "simulated", "--model", "K=2 T=10,2 L=0.5", *REAL)
