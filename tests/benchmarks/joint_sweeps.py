@@ -6,8 +6,8 @@ sweeps, whichever way their points were made; *time* is the median of the sweeps
 answer on, over that of one by one, a limit cycle for each point; *to equal errors* it is multiplied by the square of
 the ratio of the errors, since errors of noise fall with the root of the time.
 
-``SEEDS=5`` runs each so often, 3 where nothing is said; ``CASE=tanks`` those whose name has the pattern in it;
-``VIOLATED=1`` runs the ball's linear twin with play, a curve, a drift and a load instead.
+``SEEDS=5`` runs each so often, 3 where nothing is said, from ``FIRST_SEED=1`` on; ``CASE=tanks`` those whose
+name has the pattern in it; ``VIOLATED=1`` runs the ball's linear twin with play, a curve, a drift and a load instead.
 """
 
 from __future__ import annotations
@@ -110,7 +110,8 @@ def covered(outcomes: list[Outcome]) -> float:
 
 def main() -> None:
     """Print a line for each plant, and the sums."""
-    seeds, wanted = int(os.environ.get("SEEDS", "3")), os.environ.get("CASE", "")
+    seeds, first = int(os.environ.get("SEEDS", "3")), int(os.environ.get("FIRST_SEED", "1"))
+    wanted = os.environ.get("CASE", "")
     cases = [case for case in CASES if re.search(wanted, case.name)]
     if os.environ.get("VIOLATED"):
         chosen = [case for case in CASES if case.name in VIOLATED]
@@ -126,7 +127,7 @@ def main() -> None:
     print(f"{'plant':>60}: together; error, covered both ways; time over that of one by one")
     for case in cases:
         own: dict[bool, list[Outcome]] = {True: [], False: []}
-        for seed in range(1, seeds + 1):
+        for seed in range(first, first + seeds):
             try:
                 pair = {together: outcome(case, seed, together=together) for together in (True, False)}
             except AutotuneError as error:
