@@ -14,7 +14,7 @@ from autotune.recording import Recording
 from autotune.report.chart import Chart
 from autotune.report.figures import ratio_title, recording_figure
 from autotune.report.free_run import forecast, free_run, share_explained
-from autotune.report.page import GREEN, GREY, Figure, Table, add_line, thinned
+from autotune.report.page import GREEN, RED, Figure, Table, add_line, thinned
 
 #: Plants that are drawn from the region for the intervals.
 DRAWS = 200
@@ -59,7 +59,7 @@ def _forecast_of(fit: PlantFit, recording: Recording, chart: Chart, signals: Sig
     if found is None:
         return ""
     t, y = thinned(recording.t[found.first :], found.y[found.first :])
-    add_line(chart, t, y, "forecast of unseen rows", GREY, dash="dash", row=1, col=1)
+    add_line(chart, t, y, "forecast of unseen rows", RED, dash="dash", row=1, col=1)
     errors = (f"{value:.2g} {signals.y_unit}".strip() for value in (found.unseen, found.seen))
     return (
         " Unseen rows: a plant fitted to the first two thirds alone misses the last third by {} (root mean square),"
