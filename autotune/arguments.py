@@ -117,6 +117,8 @@ def _of_type(value: Any, hint: Any, *, name: str, where: str, endless: bool = Fa
     InputError
         Something else.
     """
+    # an alias of its own kind (PEP 695), as numpy's NDArray is from 2.5 on, stands for its value
+    hint = getattr(get_origin(hint) or hint, "__value__", hint)
     origin, inner = get_origin(hint), get_args(hint)
 
     def each(values: Iterable[Any], hints: Iterable[Any]) -> Iterator[Any]:

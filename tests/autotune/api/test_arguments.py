@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, Phase, example, given, settings
 from hypothesis import strategies as st
+from typing_extensions import TypeAliasType
 
 import autotune as at
+from autotune.arguments import checked
 from autotune.errors import AutotuneError, InputError
 from autotune.points import FrequencyPoint
 
@@ -147,3 +149,16 @@ def test_a_table_is_of_numbers_with_all_of_their_digits() -> None:
     frame = at.to_pandas(m)
     assert frame.iloc[0, 1] == m.modulus
     assert frame.iloc[6, 1] == m.h2
+
+
+def test_an_alias_stands_for_the_type_that_it_names() -> None:
+    # what numpy's NDArray is from 2.5 on, on Python 3.12 and newer
+    row_of_numbers = TypeAliasType("row_of_numbers", np.ndarray[Any, np.dtype[np.float64]])
+
+    def largest(values: Any) -> float:
+        return float(values.max())
+
+    largest.__annotations__["values"] = row_of_numbers
+    assert checked(largest)([1, 3, 2]) == 3.0
+    with pytest.raises(InputError, match="finite numbers in a row"):
+        checked(largest)("many")
