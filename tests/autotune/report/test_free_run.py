@@ -81,3 +81,10 @@ def test_a_page_says_which_columns_of_which_file_it_rests_on_and_when_it_was_mad
     assert first == "From oven.csv: t = Zeit, u = Ventil [%], y = Istwert; 900 rows over 900 s, 1 s apart."
     assert last.startswith("Made by relay-autotune ")
     assert last.endswith("on 2026-03-01 at 08:05 UTC.")
+
+
+def test_a_set_point_is_among_the_columns_that_a_page_rests_on() -> None:
+    record = oven()
+    with_setpoint = replace(record, extra={"r": np.full(len(record), 50.0)})
+    assert "columns t, u, y;" in origin_text([record], None)[0]
+    assert "columns t, u, y, r;" in origin_text([with_setpoint], None)[0]
