@@ -184,9 +184,10 @@ def test_a_killed_run_is_gone_on_with_from_its_folder_alone(resumed: tuple[Path,
     # The second sitting has noise of its own, so that the two are as far apart as runs of two seeds. Of fourteen whole
     # runs the logarithms have standard deviations of .053 (K: the norm is flat along gain and integral time), .019
     # (norm) and .006 (modulus margin), of eight that were gone on with .045, .017 and .005, the means being the same.
-    # The difference of two runs is in a 95 % interval of 1.96 sqrt(2) times these.
+    # The difference of two runs is within 3.5 sqrt(2) times these but once in 2,000. Rounding makes other runs of the
+    # same seeds where a computer adds up in another order: an interval of 95 % was left on one of them.
     for of, name, sd in (("controller", "K", 0.053), ("controller", "h2", 0.019), ("margins", "modulus", 0.006)):
-        assert abs(math.log(result[of][name] / whole[of][name])) < 1.96 * math.sqrt(2.0) * sd, name
+        assert abs(math.log(result[of][name] / whole[of][name])) < 3.5 * math.sqrt(2.0) * sd, name
     assert "recording-2.csv" in (out / "report.html").read_text()
 
 
