@@ -92,8 +92,8 @@ def origin_text(recordings: Sequence[Recording], made: datetime | None) -> list[
     for recording in recordings:
         origin = recording.metadata.get("file", {})
         columns = origin.get("columns", {}) if isinstance(origin, dict) else {}
-        own = [role for role in ("t", "u", "y", "r") if role != "r" or role in recording.extra]
-        taken = ", ".join(f"{role} = {column}" for role, column in columns.items()) or f"columns {', '.join(own)}"
+        own = f"columns t, u, y{', r' if 'r' in recording.extra else ''}"
+        taken = ", ".join(f"{role} = {column}" for role, column in columns.items()) or own
         span = f"{len(recording)} rows over {recording.duration_s:.6g} s"
         lines.append(f"From {recording.name}: {taken}; {span}, {recording.sample_time_s:.4g} s apart.")
     when = "" if made is None else f" on {made:%Y-%m-%d at %H:%M %Z}".rstrip()
