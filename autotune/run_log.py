@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import math
 import os
 from collections.abc import Callable
 from dataclasses import asdict
@@ -35,7 +34,7 @@ from autotune.experiment.judgement import Verification, smoothed
 from autotune.experiment.result import Status
 from autotune.models import TransferFunction
 from autotune.points import FrequencyPoint, points_to_json
-from autotune.whole_files import append_whole
+from autotune.whole_files import append_whole, jsonable
 
 #: rows of a step response that are kept for a picture
 PICTURE_ROWS = 400
@@ -170,15 +169,3 @@ class RunLog:
             case _:
                 self._write("ended", reason=f"{type(error).__name__}: {error}", exit_status=1)
         self._file.close()
-
-
-def jsonable(value: Any) -> Any:
-    """Replace what JSON has no number for by null, at any depth."""
-    match value:
-        case float():
-            return value if math.isfinite(value) else None
-        case dict():
-            return {key: jsonable(entry) for key, entry in value.items()}
-        case list() | tuple():
-            return [jsonable(entry) for entry in value]
-    return value

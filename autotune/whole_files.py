@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import json
+import math
 import os
 import tempfile
 from pathlib import Path
@@ -111,3 +112,15 @@ def write_json(path: str | os.PathLike[str], content: Any) -> None:
             "the result has a number that is not finite", where=Path(path).name, remedy="check the size of the inputs"
         ) from None
     write_whole(path, text + "\n")
+
+
+def jsonable(value: Any) -> Any:
+    """Replace what JSON has no number for by null, at any depth."""
+    match value:
+        case float():
+            return value if math.isfinite(value) else None
+        case dict():
+            return {key: jsonable(entry) for key, entry in value.items()}
+        case list() | tuple():
+            return [jsonable(entry) for entry in value]
+    return value

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 from autotune.config.rig import RigSettings, SimulatedRigSettings
 from autotune.config.twin import PlantSettings, TwinSettings
 from autotune.controller import PIDController
@@ -18,6 +20,7 @@ def open_rig(
     u_range: tuple[float, float],
     u_safe: float,
     controller: PIDController | None = None,
+    speed: float | None = None,
 ) -> Rig:
     """Return the rig that ``[rig]`` describes, not yet opened: nothing has been sent to it.
 
@@ -31,13 +34,20 @@ def open_rig(
         Command that the rig is left with [u unit].
     controller : PIDController, optional
         Gains that a simulated rig's own controller is delivered with; a real one holds its own.
+    speed : float, optional
+        Seconds of a simulated rig in a second of whoever watches; as fast as the processor allows where not given.
 
     Raises
     ------
     InputError
-        A register cannot hold the commands, a certificate or a recording cannot be read.
+        A speed for a rig that has its own time, a register that cannot hold the commands, a certificate or a recording
+        that cannot be read.
     """
-    session = Session(u_range=u_range, u_safe=u_safe, controller=controller)
+    if speed is not None and not isinstance(settings, SimulatedRigSettings):
+        remedy = "give it for a simulated rig, or with --dry-run"
+        raise InputError("a rig has its own time", where="--speed", remedy=remedy)
+    fast = math.inf if speed is None else speed
+    session = Session(u_range=u_range, u_safe=u_safe, controller=controller, speed=fast)
     return kind_of(settings).open(settings, session)
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import ast
 import inspect
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
@@ -46,11 +47,14 @@ class Session:
         Command that the rig is left with [u unit].
     controller : PIDController or None
         Gains that a simulated rig's own controller is delivered with; a real one holds its own.
+    speed : float
+        Seconds of a simulated rig in a second of whoever watches; infinite: as fast as the processor allows.
     """
 
     u_range: tuple[float, float]
     u_safe: float
     controller: PIDController | None = None
+    speed: float = math.inf
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,4 +1,4 @@
-"""A simulated plant as a rig, in process and on a virtual clock: as fast as the processor allows."""
+"""A simulated plant as a rig, in process and on a virtual clock: as fast as the processor allows, or watched."""
 
 from __future__ import annotations
 
@@ -7,17 +7,28 @@ import math
 from autotune.config.rig import SimulatedRigSettings
 from autotune.controller import PIDController
 from autotune.errors import LinkError
-from autotune.experiment.rig import Reading
+from autotune.experiment.rig import Clock, Reading
+from drivers.clock import MonotonicClock
 from drivers.kinds import Session
 from drivers.plants import plant_of
 from sim.plant import Plant
 
 
 class VirtualClock:
-    """Time that moves only when somebody waits; the plant lives on meanwhile under the command it holds."""
+    """Time that moves only when somebody waits; the plant lives on meanwhile under the command it holds.
 
-    def __init__(self, rig: SimulatedRig) -> None:
-        self._rig = rig
+    Parameters
+    ----------
+    rig : SimulatedRig
+        Whose time it is.
+    speed : float
+        Seconds of the rig in a second of whoever watches; infinite where nobody does.
+    watched : Clock
+        Time of whoever watches. What is computed between two samples is not caught up.
+    """
+
+    def __init__(self, rig: SimulatedRig, speed: float, watched: Clock) -> None:
+        self._rig, self._speed, self._watched = rig, speed, watched
         self._now_s = 0.0
 
     def now(self) -> float:
@@ -27,6 +38,8 @@ class VirtualClock:
     def sleep_until(self, t_s: float) -> None:
         """Let the plant live until ``t_s`` [s]; at once when that has passed."""
         if t_s > self._now_s:
+            if self._speed < math.inf:
+                self._watched.sleep_until(self._watched.now() + (t_s - self._now_s) / self._speed)
             self._rig.live(t_s - self._now_s)
             self._now_s = t_s
 
@@ -42,14 +55,26 @@ class SimulatedRig:
         Command that ``make_safe`` leaves [u unit].
     controller : PIDController, optional
         Gains that the rig's own controller holds when it is delivered.
+    speed : float
+        Seconds of the rig in a second of whoever watches; infinite: as fast as the processor allows.
+    watched : Clock, optional
+        Time of whoever watches; the computer's where not given.
     """
 
-    def __init__(self, plant: Plant, *, u_safe: float, controller: PIDController | None = None) -> None:
+    def __init__(
+        self,
+        plant: Plant,
+        *,
+        u_safe: float,
+        controller: PIDController | None = None,
+        speed: float = math.inf,
+        watched: Clock | None = None,
+    ) -> None:
         self.plant = plant
         self._u = plant.u_applied
         self._u_safe = u_safe
         self._controller = controller if controller is not None else PIDController(K=0.0, Ti_s=math.inf)
-        self._clock = VirtualClock(self)
+        self._clock = VirtualClock(self, speed, watched if watched is not None else MonotonicClock())
         self._is_open = False
 
     @property
@@ -116,4 +141,5 @@ def open_kind(settings: SimulatedRigSettings, session: Session) -> SimulatedRig:
     session : Session
         What it is opened for.
     """
-    return SimulatedRig(plant_of(settings, u_safe=session.u_safe), u_safe=session.u_safe, controller=session.controller)
+    plant = plant_of(settings, u_safe=session.u_safe)
+    return SimulatedRig(plant, u_safe=session.u_safe, controller=session.controller, speed=session.speed)

@@ -34,7 +34,7 @@ from autotune.model_file import read_model
 from autotune.pipeline import Analysis, Measured, analyse, analysis_json, measured_of
 from autotune.points import FrequencyPoint, points_to_json
 from autotune.recording import Recording
-from autotune.run_log import jsonable
+from autotune.whole_files import jsonable
 
 #: A controller whose disturbance rejection (11) could be this many times better is worth a look.
 _SLUGGISH = 1.5

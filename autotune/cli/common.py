@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from autotune.experiment.rig import Rig
 
 
-def rig_of(config: Config, dry_run: bool = False) -> Rig:
+def rig_of(config: Config, dry_run: bool = False, speed: float | None = None) -> Rig:
     """Return the rig that the configuration describes, or its simulated twin; nothing has been sent to it.
 
     Parameters
@@ -28,6 +28,8 @@ def rig_of(config: Config, dry_run: bool = False) -> Rig:
         Of the rig.
     dry_run : bool
         Whether its simulated twin is meant.
+    speed : float, optional
+        Seconds of a simulated rig in a second of whoever watches; as fast as the processor allows where not given.
     """
     from autotune.controller import PIDController
     from drivers import open_rig, twin_of
@@ -39,6 +41,7 @@ def rig_of(config: Config, dry_run: bool = False) -> Rig:
         u_range=(config.limits.u_min, config.limits.u_max),
         u_safe=config.limits.u_safe,
         controller=PIDController(K=given.K, Ti_s=given.Ti_s) if given else None,
+        speed=speed,
     )
 
 

@@ -49,6 +49,13 @@ def run(
     live: Annotated[
         bool, typer.Option("--live", help="show the run in the browser, with Abort and the decision")
     ] = False,
+    speed: Annotated[
+        float | None,
+        typer.Option(
+            min=0.01,
+            help="seconds of a simulated rig in one second, to watch it with --live; default as fast as it can go",
+        ),
+    ] = None,
     listen: LISTEN = "127.0.0.1",
     port: PORT = 0,
     token_file: TOKEN_FILE = None,
@@ -62,7 +69,7 @@ def run(
     from autotune.report.page import write_page
     from autotune.report.run_page import run_page
 
-    rig = rig_of(content)
+    rig = rig_of(content, speed=speed)
     if out is not None:
         new_folder(out, FILES_OF_A_RUN)
         may_store(content, out)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.fft import irfft
@@ -44,14 +45,24 @@ class LoadStep:
     half_period_s: float
     rows: int
 
+    @cached_property
+    def _square_wave(self) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
+        """Its frequencies on the imaginary axis, what an integral is there, and its amplitudes."""
+        s = np.asarray(1j * self.omega, dtype=np.complex128)
+        k = np.arange(1, 2 * self.omega.size, 2)
+        wave = np.asarray(-1j * self.rows / (math.pi * k), dtype=np.complex128)
+        integral = np.asarray(-1j / self.omega, dtype=np.complex128)
+        return s, integral, wave
+
     def error(self, p: FloatArray) -> float:
         """Return the integral of abs(y) after a unit step, output unit times s, with gains (K, T_I, T_d, T_f)."""
         K, Ti, Td, Tf = p
-        s = 1j * self.omega
-        C = K * (1.0 + 1.0 / (Ti * s) + Td * s) / (1.0 + Tf * s)
+        s, integral, wave = self._square_wave
+        C = K + K / Ti * integral
+        if Td or Tf:
+            C = (C + K * Td * s) / (1.0 + Tf * s)
         spectrum = np.zeros(self.rows // 2 + 1, dtype=np.complex128)
-        k = np.arange(1, 2 * self.omega.size, 2)
-        spectrum[k] = self.h / (1.0 + self.h * C) * (-2j / (math.pi * k)) * self.rows / 2.0
+        spectrum[1 : 2 * s.size : 2] = self.h / (1.0 + self.h * C) * wave
         y = irfft(spectrum, self.rows)
         return float(np.mean(np.abs(y))) * self.half_period_s
 

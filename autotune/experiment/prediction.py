@@ -9,7 +9,6 @@ import numpy as np
 from numba import njit
 from scipy.linalg import expm
 from scipy.ndimage import uniform_filter1d
-from scipy.signal import tf2ss
 
 from autotune.arrays import FloatArray
 from autotune.design.law import PILaw
@@ -55,8 +54,10 @@ def sampled(plant: TransferFunction, sample_time_s: float) -> tuple[FloatArray, 
     num, den : (M,), (n + 1,) array
         Exact at the samples; den begins with 1.
     """
-    A, B, C, _ = (np.atleast_2d(matrix) for matrix in tf2ss(plant.num, plant.den))
-    n = A.shape[0]
+    n = len(plant.den) - 1
+    A, B = np.eye(n, k=-1), np.eye(n, 1)
+    A[0] = -np.array(plant.den[1:]) / plant.den[0]
+    C = np.array([(0.0,) * (n - len(plant.num)) + plant.num]) / plant.den[0]
     whole = int(np.floor(plant.delay_s / sample_time_s + 1e-9))
     late = max(0.0, plant.delay_s - whole * sample_time_s)
 
@@ -150,6 +151,26 @@ def _respond(
 
 
 @njit(cache=True)
+def respond_sampled(num: FloatArray, den: FloatArray, u: FloatArray) -> FloatArray:
+    """Return the output (N,) of a difference equation from rest, as :func:`sampled` gives it, to commands (N,)."""
+    y = np.zeros(u.size)
+    for k in range(u.size):
+        y[k] = _next_output(num, den, u, y, k)
+    return y
+
+
+@njit(cache=True)
+def _next_output(num: FloatArray, den: FloatArray, u: FloatArray, y: FloatArray, k: int) -> float:
+    """Return y of row k from the rows before it."""
+    total = 0.0
+    for i in range(1, min(num.size, k + 1)):
+        total += num[i] * u[k - i]
+    for i in range(1, min(den.size, k + 1)):
+        total -= den[i] * y[k - i]
+    return total
+
+
+@njit(cache=True)
 def _step_loop(
     num: FloatArray,
     den: FloatArray,
@@ -167,10 +188,7 @@ def _step_loop(
     y, u, into = np.zeros(count), np.zeros(count), np.zeros(count)
     y_filtered = integral = command = reached = 0.0
     for k in range(count):
-        for i in range(1, min(num.size, k + 1)):
-            y[k] += num[i] * into[k - i]
-        for i in range(1, min(den.size, k + 1)):
-            y[k] -= den[i] * y[k - i]
+        y[k] = _next_output(num, den, into, y, k)
         moved = blend * (y[k] + noise[k] - y_filtered)
         y_filtered += moved
         integral += slope * (setpoint[k] - y_filtered)

@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from autotune.arrays import FloatArray
+from autotune.distributions import log_normal_tail, normal_tail
 from autotune.errors import IdentificationError
 from autotune.recording import Recording
 
@@ -315,8 +316,6 @@ def _closest(cause: FloatArray, effect: FloatArray, first: int) -> tuple[float, 
 
     Every octave of lags and every length of the sums is looked at for the same part of the error probability.
     """
-    from scipy.stats import norm
-
     n = effect.size
     sd = float(np.sqrt(np.mean(effect[np.flatnonzero(effect)] ** 2))) if effect.any() else 0.0
     if sd == 0.0 or not cause.any():
@@ -333,11 +332,11 @@ def _closest(cause: FloatArray, effect: FloatArray, first: int) -> tuple[float, 
         left = energy[n - lags]
         scale = np.where(left > _LEAST_ENERGY * energy[n], sd * np.sqrt(left), math.inf)
         looks = each * np.maximum(1.0, lags / width)
-        chance = np.log(looks) + norm.logsf(np.abs(products) / scale)
+        chance = np.log(looks) + log_normal_tail(np.abs(products) / scale)
         at = int(np.argmin(chance))
         pairs = sums[: n - lags[at]] * effect[lags[at] :] * np.sign(products[at])
         size = float(np.sum(pairs) - np.max(pairs)) / float(scale[at])
-        found = float(min(1.0, 2.0 * norm.sf(size) * looks[at]))
+        found = float(min(1.0, 2.0 * normal_tail(size) * looks[at]))
         if found < best:
             best, lag, sign = found, int(lags[at]), 1 if products[at] > 0.0 else -1
             within = lag + int(width)

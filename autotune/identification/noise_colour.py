@@ -15,9 +15,7 @@ Giesbrecht, Burns, Two-stage analysis based on a mixed model, Biometrics 41, 198
 
 from __future__ import annotations
 
-import itertools
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -26,10 +24,11 @@ from numba import njit
 from scipy.optimize import minimize
 
 from autotune.arrays import FloatArray
+from autotune.distributions import chi2_quantile, f_quantile, normal_quantile, student_quantile
 
 WHITE = np.empty(0)
 MAX_AR = 12
-#: Step of a difference quotient in arctanh of a partial correlation, whose standard deviation is that of 1/sqrt(rows).
+#: Step of a difference quotient in a parameter, which is known to some 1/sqrt(rows).
 _DIFFERENCE = 1e-3
 #: Share of products below which they are rounding, as those of exact data are.
 _EXACT = 1e-12
@@ -37,7 +36,7 @@ _EXACT = 1e-12
 _INDEPENDENT = 1e-10
 #: Least degrees of freedom: a logarithm of a variance that is known to no factor of e is not to be linearised.
 _LEAST_FREEDOM = 2.0
-#: Partial correlation at which the search begins at most.
+#: Partial correlation beyond which the recursion back to them would divide by rounding.
 _STATIONARY = 0.9999
 
 
@@ -66,17 +65,13 @@ class NoiseColour:
 
     def widening(self) -> FloatArray:
         """Return, for each parameter, by how much 1.96 standard deviations fall short of Student's 95 % interval."""
-        from scipy.stats import norm, t
-
-        return np.asarray(t.ppf(0.975, self.freedom) / norm.ppf(0.975), dtype=np.float64)
+        return student_quantile(0.975, self.freedom) / normal_quantile(0.975)
 
 
 @lru_cache
 def region_widening(freedom: float) -> float:
     """Return the factor on a plane's covariance with which its 95 % region of known variance is that of Hotelling."""
-    from scipy.stats import chi2, f
-
-    return float(2.0 * f.ppf(0.95, 2, freedom) / chi2.ppf(0.95, 2))
+    return 2.0 * f_quantile(0.95, 2, freedom) / chi2_quantile(0.95, 2)
 
 
 def whitening_filter(residual: FloatArray, max_order: int = MAX_AR) -> FloatArray:
@@ -146,11 +141,12 @@ def noise_colour(columns: FloatArray, residual: FloatArray, max_order: int = MAX
     """
     start = whitening_filter(residual, max_order)
     likelihood = _Restricted.of(columns, residual, start.size)
-    partial = np.arctanh(_partial_correlations(start))
+    partial = likelihood.parameters(_partial_correlations(start))
     if start.size:
-        partial = minimize(likelihood.cost, partial, method="BFGS").x
+        scale = np.diag(likelihood.variances(partial))
+        partial = minimize(likelihood.cost_and_slope, partial, jac=True, method="BFGS", options={"hess_inv0": scale}).x
     return NoiseColour(
-        whitening=_filter_of(likelihood.correlations(partial)),
+        whitening=_filter_and_slopes(likelihood.correlations(partial))[0][1:],
         variance=likelihood.variance(partial) * float(residual @ residual),
         freedom=likelihood.freedom(partial),
     )
@@ -158,7 +154,9 @@ def noise_colour(columns: FloatArray, residual: FloatArray, max_order: int = MAX
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Restricted:
-    """Restricted likelihood of stationary autoregressive noise, as a function of arctanh of its partial correlations.
+    """Restricted likelihood of stationary autoregressive noise, as a function of its partial correlations.
+
+    Each is the hyperbolic tangent of a parameter, times the largest: all that the search tries is stationary.
 
     Attributes
     ----------
@@ -188,30 +186,66 @@ class _Restricted:
             to_parameters=(Vh[kept].T / sizes[kept]) / size[:, None],
         )
 
-    def correlations(self, partial: FloatArray) -> FloatArray:
-        """Return partial correlations; what lasts longer than the rows is told from a constant by none of them."""
-        most = 1.0 - 1.0 / self.rows
-        return np.asarray(np.clip(np.tanh(partial), -most, most), dtype=np.float64)
+    @property
+    def _most(self) -> float:
+        """Largest partial correlation: what lasts longer than the rows is told from a constant by none of them."""
+        return 1.0 - 1.0 / self.rows
 
-    def solved(self, partial: FloatArray) -> tuple[FloatArray, float, float]:
-        """Return the whitened columns' products, the sum of squares that they leave, and log |V| of the noise."""
+    def correlations(self, free: FloatArray) -> FloatArray:
+        """Return partial correlations (p,) from parameters of any size."""
+        return self._most * np.tanh(free)
+
+    def parameters(self, correlations: FloatArray) -> FloatArray:
+        """Return the parameters (p,) of partial correlations; the largest have no finite ones, and come near."""
+        return np.arctanh(np.clip(correlations / self._most, -self._most, self._most))
+
+    def slopes(self, correlations: FloatArray) -> FloatArray:
+        """Return the derivative of each partial correlation with respect to its parameter, (p,)."""
+        return (self._most**2 - correlations**2) / self._most
+
+    def variances(self, partial: FloatArray) -> FloatArray:
+        """Return roughly the variances of the parameters: that of a partial correlation k is (1 - k^2) / rows."""
         kappa = self.correlations(partial)
-        colour = np.append(1.0, _filter_of(kappa))
-        gram = np.einsum("i,ijab,j->ab", colour, self.products, colour)
-        of_columns, across = gram[:-1, :-1], gram[:-1, -1]
-        of_columns = of_columns + _EXACT * float(np.trace(of_columns)) * np.eye(len(of_columns))
-        left = max(float(gram[-1, -1] - across @ np.linalg.solve(of_columns, across)), _EXACT)
-        return of_columns, left, float(-np.arange(1, kappa.size + 1) @ np.log1p(-(kappa**2)))
+        return (1.0 - kappa**2) / (self.rows * self.slopes(kappa) ** 2)
 
-    def cost(self, partial: FloatArray) -> float:
-        """Return minus the logarithm of the restricted likelihood, the innovations' variance at its best."""
-        of_columns, left, of_noise = self.solved(partial)
+    def gram(self, partial: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return products of whitened signals (R+1, R+1), their slopes along c (p, R+1, R+1), and dc/dkappa (p, p)."""
+        colour, along = _filter_and_slopes(self.correlations(partial))
+        lag, width = colour.size, self.products.shape[2]
+        half = (colour @ self.products.reshape(lag, -1)).reshape(lag, width, width)
+        gram = (colour @ half.reshape(lag, -1)).reshape(width, width)
+        slopes = half[1:] + half[1:].transpose(0, 2, 1)
+        # a part in 1e12 of white noise: columns that a filter removes stay regular
+        of_columns = np.arange(width - 1)
+        gram[of_columns, of_columns] += _EXACT * float(np.trace(gram[:-1, :-1]))
+        return gram, slopes, along
+
+    def solved(self, partial: FloatArray) -> tuple[FloatArray, float]:
+        """Return the whitened columns' products and the sum of squares that they leave."""
+        gram = self.gram(partial)[0]
+        step = np.linalg.solve(gram[:-1, :-1], gram[:-1, -1])
+        return gram[:-1, :-1], max(float(gram[-1, -1] - gram[:-1, -1] @ step), _EXACT)
+
+    def cost_and_slope(self, partial: FloatArray) -> tuple[float, FloatArray]:
+        """Return minus the logarithm of the restricted likelihood, innovations' variance at its best, and its slope."""
+        kappa = self.correlations(partial)
+        gram, slopes, along = self.gram(partial)
+        of_columns, across = gram[:-1, :-1], gram[:-1, -1]
+        inverse = np.linalg.inv(of_columns)
+        step = np.append(-inverse @ across, 1.0)
+        left = float(gram[-1] @ step)
+        rest, order = self.rows - len(of_columns), np.arange(1, kappa.size + 1)
         size = float(np.linalg.slogdet(of_columns)[1])
-        return float(0.5 * ((self.rows - len(of_columns)) * math.log(left) + of_noise + size))
+        cost = 0.5 * (rest * math.log(max(left, _EXACT)) - float(order @ np.log1p(-(kappa**2))) + size)
+        of_left = step @ slopes @ step if left > _EXACT else np.zeros(kappa.size)
+        of_size = np.einsum("ab,kab->k", inverse, slopes[:, :-1, :-1])
+        of_colour = rest * of_left / max(left, _EXACT) + of_size
+        of_kappa = 0.5 * (of_colour @ along) + order * kappa / (1.0 - kappa**2)
+        return cost, of_kappa * self.slopes(kappa)
 
     def variance(self, partial: FloatArray) -> float:
         """Return the innovations' variance over the residual's sum of squares."""
-        of_columns, left, _ = self.solved(partial)
+        of_columns, left = self.solved(partial)
         return left / max(self.rows - len(of_columns), 1)
 
     def freedom(self, partial: FloatArray) -> FloatArray:
@@ -220,26 +254,22 @@ class _Restricted:
         scatter = np.full(len(self.to_parameters), 2.0 / max(self.rows - rank, 1))
 
         def logarithm(at: FloatArray) -> FloatArray:
-            gram, left, _ = self.solved(at)
+            gram, left = self.solved(at)
             inverse = np.linalg.inv(gram)
             sizes = np.einsum("pa,ab,pb->p", self.to_parameters, inverse, self.to_parameters)
             return np.asarray(np.log(np.maximum(sizes, np.finfo(np.float64).tiny) * left))
 
-        for direction in _standard_directions(self.cost, partial):
+        for direction in self._standard_directions(partial):
             scatter += (0.5 * (logarithm(partial + direction) - logarithm(partial - direction))) ** 2
         return np.asarray(np.maximum(2.0 / scatter, _LEAST_FREEDOM))
 
-
-def _standard_directions(cost: Callable[[FloatArray], float], at: FloatArray) -> FloatArray:
-    """Return directions one standard deviation long in which the minimum of a log likelihood is known, (p, p)."""
-    p = at.size
-    steps = _DIFFERENCE * np.eye(p)
-    hessian = np.empty((p, p))
-    for i, j in itertools.product(range(p), range(p)):
-        ends = [s * r * cost(at + s * steps[i] + r * steps[j]) for s in (1.0, -1.0) for r in (1.0, -1.0)]
-        hessian[i, j] = sum(ends) / (4.0 * _DIFFERENCE**2)
-    curvatures, vectors = np.linalg.eigh(hessian)
-    return np.asarray((vectors / np.sqrt(np.maximum(curvatures, 1.0))).T)
+    def _standard_directions(self, at: FloatArray) -> FloatArray:
+        """Return directions one standard deviation long in which the minimum is known, (p, p)."""
+        steps = _DIFFERENCE * np.eye(at.size)
+        slopes = [self.cost_and_slope(at + step)[1] - self.cost_and_slope(at - step)[1] for step in steps]
+        hessian = np.reshape(slopes, (at.size, at.size)) / (2.0 * _DIFFERENCE)
+        curvatures, vectors = np.linalg.eigh(0.5 * (hessian + hessian.T))
+        return np.asarray((vectors / np.sqrt(np.maximum(curvatures, 1.0))).T)
 
 
 def _products(signals: FloatArray, order: int) -> FloatArray:
@@ -255,13 +285,17 @@ def _products(signals: FloatArray, order: int) -> FloatArray:
     return products
 
 
-def _filter_of(partial: FloatArray) -> FloatArray:
-    """Return c of a stationary filter from its partial correlations (Levinson)."""
-    colour = np.ones(1)
-    for kappa in partial:
-        padded = np.append(colour, 0.0)
-        colour = padded - kappa * padded[::-1]
-    return colour[1:]
+def _filter_and_slopes(partial: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return 1, c_1..c_p of a stationary filter from its partial correlations (Levinson), and dc/dkappa (p, p)."""
+    p = partial.size
+    colour, slopes = np.zeros(p + 1), np.zeros((p, p + 1))  # a row for each partial correlation
+    colour[0] = 1.0
+    for k, kappa in enumerate(partial, 1):
+        reverse = colour[k::-1].copy()
+        slopes[:k, : k + 1] -= kappa * slopes[:k, k::-1]
+        slopes[k - 1, : k + 1] = -reverse
+        colour[: k + 1] -= kappa * reverse
+    return colour, slopes[:, 1:].T
 
 
 def _partial_correlations(whitening: FloatArray) -> FloatArray:

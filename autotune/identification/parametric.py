@@ -15,9 +15,9 @@ from typing import Literal
 
 import numpy as np
 from scipy.optimize import OptimizeResult, least_squares
-from scipy.stats import chi2
 
 from autotune.arrays import ComplexArray, FloatArray, inverse_in_any_units, principal_axes
+from autotune.distributions import chi2_quantile, chi2_tail
 from autotune.errors import IdentificationError
 from autotune.models import TransferFunction
 from autotune.points import FrequencyPoint
@@ -86,7 +86,7 @@ class PlantFit:
     @property
     def p_value(self) -> float:
         """Probability of a larger chi-square if the structure is right; 1 without degrees of freedom."""
-        return float(chi2.sf(self.chi_square, self.degrees_of_freedom)) if self.degrees_of_freedom else 1.0
+        return chi2_tail(self.chi_square, self.degrees_of_freedom) if self.degrees_of_freedom else 1.0
 
     def draws(self, count: int, rng: np.random.Generator) -> tuple[TransferFunction, ...]:
         """Return plants drawn from the parameters' normal distribution, cut at the bounds of the search.
@@ -130,7 +130,7 @@ class PlantFit:
         """
         if not self.covariance.any():
             return (self.plant,)
-        radius = math.sqrt(chi2.ppf(probability, self.parameters.size))
+        radius = math.sqrt(chi2_quantile(probability, self.parameters.size))
         axes = principal_axes(self.covariance)
         between = np.random.default_rng(0).standard_normal((_DIRECTIONS, self.parameters.size))
         between /= np.linalg.norm(between, axis=1, keepdims=True)

@@ -10,9 +10,9 @@ from itertools import product
 from typing import Literal, TypeAlias
 
 import numpy as np
-from scipy.stats import chi2
 
 from autotune.arrays import BoolArray, ComplexArray, FloatArray
+from autotune.distributions import chi2_quantile
 from autotune.points import FrequencyPoint
 
 First: TypeAlias = Literal["none", "integrator", "lag", "unstable", "pair"]
@@ -134,7 +134,7 @@ def evidence_of(points: Sequence[FrequencyPoint], probability: float) -> Evidenc
         sign=sign,
         whitener=np.array([np.linalg.inv(np.linalg.cholesky(covariance)) for covariance in floors]),
         omega_0=omega_0,
-        most=float(chi2.ppf(probability, 2 * len(ordered))),
+        most=chi2_quantile(probability, 2 * len(ordered)),
     )
 
 

@@ -6,10 +6,9 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from scipy.signal import lfilter
-from scipy.stats import f as fisher
 
 from autotune.arrays import FloatArray
+from autotune.distributions import f_tail
 from autotune.identification.delay.data import DelayData
 from autotune.identification.delay.output_error import residuals
 from autotune.identification.delay.response import sensitivities
@@ -105,6 +104,8 @@ def judge_equation(
     whitening : (p,) array
         Coefficients of the filter that makes the noise white.
     """
+    from scipy.signal import lfilter  # here: it takes long to import, and few recordings come this way
+
     residual = residuals(data, found.point)
     rows = np.column_stack([_sensitivities(data, found), columns, residual])
     white = lfilter([1.0, *whitening], [1.0], rows, axis=0)[whitening.size :]
@@ -121,7 +122,7 @@ def judge_equation(
     variance = (float(gram[-1, -1]) - by_all) / freedom
     each = [explained(kind) for kind in range(len(TESTS))]
     ratios = [(squares - by_model) / max(more - rank, 1) / variance for squares, more in each]
-    p = [float(fisher.sf(ratio, max(more - rank, 1), freedom)) for ratio, (_, more) in zip(ratios, each, strict=True)]
+    p = [f_tail(ratio, max(more - rank, 1), freedom) for ratio, (_, more) in zip(ratios, each, strict=True)]
     return (p[0], p[1], p[2]), max(1.0, ratios[0])
 
 

@@ -21,9 +21,9 @@ from dataclasses import dataclass, replace
 from typing import Any, TypeAlias
 
 import numpy as np
-from scipy.stats import chi2
 
 from autotune.arrays import ComplexArray, FloatArray
+from autotune.distributions import chi2_quantile
 from autotune.identification.delay.data import prepare
 from autotune.identification.envelope import polar_sd
 from autotune.identification.equation_region import plant_fit
@@ -182,4 +182,4 @@ def _shared_errors(covariance: FloatArray) -> float:
         whiten[i : i + 2, i : i + 2] = np.linalg.inv(np.linalg.cholesky(own))
     correlation = whiten @ covariance @ whiten.T
     spread = float(np.sum(correlation**2)) / size
-    return max(1.0, float(spread * chi2.ppf(0.95, size / spread) / chi2.ppf(0.95, size)))
+    return max(1.0, spread * chi2_quantile(0.95, size / spread) / chi2_quantile(0.95, size))

@@ -15,7 +15,7 @@ from pathlib import Path
 from autotune.config import Config
 from autotune.controller import PIDController
 from autotune.errors import InputError
-from autotune.run_log import jsonable
+from autotune.whole_files import jsonable
 
 AUDIT = "audit.jsonl"
 #: Of every line.

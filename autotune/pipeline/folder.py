@@ -6,16 +6,18 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from itertools import count, takewhile
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import tomli_w
 
 from autotune.config import Config, load_config
 from autotune.errors import InputError
-from autotune.experiment.cycles import Earlier, read_earlier
 from autotune.points import FrequencyPoint, read_points
 from autotune.text_files import read_json
 from autotune.whole_files import write_whole
+
+if TYPE_CHECKING:  # a recording is tuned without what runs a rig
+    from autotune.experiment.cycles import Earlier
 
 RECORDING, VERIFICATION, RESULT, JOURNAL = "recording.csv", "verification.csv", "result.json", "journal.jsonl"
 PROGRESS, CONFIG, REPORT, CONTROLLER = "progress.jsonl", "config.toml", "report.html", "controller.toml"
@@ -176,6 +178,8 @@ def read_interrupted(folder: Path, config: Config) -> Earlier:
     InputError
         No run, one that was completed, or a configuration that measures something else; names every difference.
     """
+    from autotune.experiment.cycles import read_earlier
+
     different = differences(stored_config(folder), config)
     if different:
         raise InputError(

@@ -13,8 +13,8 @@ from typing import Any
 from autotune.controller import PIDController, held_from_table
 from autotune.errors import ExperimentStopped, InputError
 from autotune.pipeline.audit import AuditLog
-from autotune.run_log import jsonable
 from autotune.text_files import read_text
+from autotune.whole_files import jsonable
 
 
 class Step(StrEnum):

@@ -5,19 +5,20 @@ from __future__ import annotations
 import json
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from autotune.controller import write_controller
 from autotune.design.nugap import Validation
-from autotune.diagnosis.result import Diagnosis
-from autotune.experiment.judgement import Verification
-from autotune.experiment.result import ExperimentResult
-from autotune.experiment.running_law import RunningLaw
 from autotune.pipeline.analysis import Analysis
 from autotune.pipeline.folder import CONTROLLER
 from autotune.points import points_to_json
-from autotune.run_log import jsonable
-from autotune.whole_files import write_whole
+from autotune.whole_files import jsonable, write_whole
+
+if TYPE_CHECKING:  # a recording is tuned without a rig and without a diagnosis
+    from autotune.diagnosis.result import Diagnosis
+    from autotune.experiment.judgement import Verification
+    from autotune.experiment.result import ExperimentResult
+    from autotune.experiment.running_law import RunningLaw
 
 
 def write_result(

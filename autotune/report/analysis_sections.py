@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -13,7 +14,6 @@ from autotune.config.procedure import SignalSettings
 from autotune.controller import PIDController
 from autotune.design.margins import margins
 from autotune.design.nugap import Validation
-from autotune.experiment.result import ExperimentResult
 from autotune.identification.parametric import PlantFit
 from autotune.pipeline import Analysis
 from autotune.report.analysis_words import based_on, with_units
@@ -22,6 +22,9 @@ from autotune.report.loop_diagrams import nichols_figure, nyquist_figure, sensit
 from autotune.report.maker_forms import maker_table
 from autotune.report.page import BLUE, GREEN, Figure, Section, Table
 from autotune.report.points_section import frequency_grid, is_of_rows, points_section
+
+if TYPE_CHECKING:  # a page from recordings is written without what runs a rig
+    from autotune.experiment.result import ExperimentResult
 
 #: a modulus margin that is less by this share cannot be seen in the figure
 _DRAWN = 0.01
@@ -283,3 +286,8 @@ def _price_table(analysis: Analysis, signals: SignalSettings) -> Table:
 def _certificate(analysis: Analysis) -> str:
     text = analysis.design.certificate
     return f"Certificate: {text}."
+
+
+def warnings_sections(warnings: Sequence[str]) -> tuple[Section, ...]:
+    """Return a section of warnings, each said once; none where there are none."""
+    return (Section(title="Warnings", text=tuple(dict.fromkeys(warnings))),) if warnings else ()

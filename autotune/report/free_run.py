@@ -6,11 +6,10 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.signal import lfilter
 
 from autotune.arrays import ComplexArray, FloatArray
 from autotune.errors import AutotuneError
-from autotune.experiment.prediction import sampled
+from autotune.experiment.prediction import respond_sampled, sampled
 from autotune.identification.delay.identify import identify_delay
 from autotune.identification.parametric import PlantFit
 from autotune.models import TransferFunction
@@ -64,7 +63,7 @@ def free_run(plant: TransferFunction, recording: Recording, rows: int | None = N
     if y.size < 10 or float(np.max(np.abs(steps - T_s))) > 0.05 * T_s or not np.all(np.isfinite(recording.u)):
         return None
     num, den = sampled(plant, T_s)
-    forced = np.asarray(lfilter(num, den, recording.u - recording.u[0]), dtype=np.float64)
+    forced = respond_sampled(num, den, recording.u - recording.u[0])
     t = recording.t - recording.t[0]
     # what was under way at the first row dies away, or goes on, as the plant's own modes; one at 0 is a constant
     modes: list[FloatArray] = [np.ones(t.size)]

@@ -10,6 +10,7 @@ import numpy as np
 from autotune.config.procedure import SignalSettings
 from autotune.identification.parametric import PlantFit
 from autotune.models import TransferFunction
+from autotune.pipeline.one_thread import on_one_thread
 from autotune.recording import Recording
 from autotune.report.chart import Chart
 from autotune.report.figures import ratio_title, recording_figure
@@ -20,6 +21,7 @@ from autotune.report.page import GREEN, RED, Figure, Table, add_line, thinned
 DRAWS = 200
 
 
+@on_one_thread
 def model_figures(fit: PlantFit, recordings: Sequence[Recording], signals: SignalSettings) -> tuple[Figure, ...]:
     """Return the recordings with the fitted plant run over them, each with its fit in per cent.
 

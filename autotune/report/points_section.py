@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from autotune.arrays import FloatArray
 from autotune.config.procedure import SignalSettings
-from autotune.experiment.result import ExperimentResult
 from autotune.pipeline import Analysis
 from autotune.points import FrequencyPoint
 from autotune.report.figures import (
@@ -19,6 +19,9 @@ from autotune.report.figures import (
     gain_phase,
 )
 from autotune.report.page import BLUE, GREEN, GREY, ORANGE, PURPLE, RED, Figure, Section, Table
+
+if TYPE_CHECKING:  # a page from recordings is written without what runs a rig
+    from autotune.experiment.result import ExperimentResult
 
 
 def frequency_grid(analysis: Analysis, decades: float) -> FloatArray:

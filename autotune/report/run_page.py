@@ -13,7 +13,7 @@ from autotune.experiment.leaving import sentence
 from autotune.pipeline import Tuning
 from autotune.pipeline.deployment import Deployment
 from autotune.recording import Recording
-from autotune.report.analysis_sections import analysis_sections
+from autotune.report.analysis_sections import analysis_sections, warnings_sections
 from autotune.report.analysis_words import designed_text, gains_text, margins_sentence
 from autotune.report.experiment_section import experiment_section
 from autotune.report.figures import ratio_title, recording_figure
@@ -248,8 +248,3 @@ def _diagnosis_section(found: Diagnosis) -> Section:
         links=(("The whole diagnosis, with its pictures", "diagnosis/report.html"),),
         tables=(effects,) if found.effects else (),
     )
-
-
-def warnings_sections(warnings: Sequence[str]) -> tuple[Section, ...]:
-    """Return a section of warnings, each said once; none where there are none."""
-    return (Section(title="Warnings", text=tuple(dict.fromkeys(warnings))),) if warnings else ()

@@ -9,13 +9,12 @@ from autotune.config.procedure import SignalSettings
 from autotune.controller import PIDController
 from autotune.pipeline import Analysis
 from autotune.recording import Recording
-from autotune.report.analysis_sections import analysis_sections
+from autotune.report.analysis_sections import analysis_sections, warnings_sections
 from autotune.report.analysis_words import based_on, designed_text, margins_sentence
 from autotune.report.figures import recording_figure
 from autotune.report.outlook import outlook_section
 from autotune.report.page import Figure, Page, Section
 from autotune.report.plant_section import model_figures, numbers_table
-from autotune.report.run_page import warnings_sections
 from autotune.version import __version__
 
 

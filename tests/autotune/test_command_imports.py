@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.benchmarks._front_door_files import DOORS
+
 #: calls the command line and says on its last line which of the packages named first were imported
 PROGRAM = """
 import contextlib, sys
@@ -36,6 +38,15 @@ def test_help_imports_no_package_of_the_method() -> None:
 
 def test_tune_imports_no_package_of_a_rig_or_of_an_extra(tmp_path: Path) -> None:
     assert imported(OF_OTHERS, "tune", tmp_path / "missing.csv", "--out", tmp_path / "out") == "imported:"
+
+
+def test_a_recording_is_tuned_without_what_runs_a_rig_and_without_a_diagnosis(tmp_path: Path) -> None:
+    """Nor is what takes longest of scipy to import."""
+    door = next(door for door in DOORS if door.name == "tank.csv")
+    door.write(tmp_path / door.name)
+    others = "autotune.diagnosis,autotune.experiment.run,autotune.pipeline.run,scipy.signal,scipy.stats"
+    assert imported(others, "tune", tmp_path / door.name, "--out", tmp_path / "out") == "imported:"
+    assert (tmp_path / "out" / "result.json").exists()
 
 
 @pytest.mark.parametrize(

@@ -4,10 +4,11 @@ import math
 
 import pytest
 
-from autotune.config.rig import SimulatedRigSettings
+from autotune.config.rig import ReplaySettings, SimulatedRigSettings
 from autotune.controller import PIDController
-from autotune.errors import LinkError
+from autotune.errors import InputError, LinkError
 from autotune.experiment.rig import HoldsGains, Rig
+from drivers import open_rig
 from drivers.kinds import Session
 from drivers.simulated import SimulatedRig, open_kind
 from sim.ball import make_ball
@@ -27,6 +28,22 @@ def test_time_moves_only_when_somebody_waits() -> None:
     assert rig.plant.time_s == pytest.approx(2.0)
     rig.clock.sleep_until(1.0)  # has passed
     assert rig.clock.now() == 2.0
+
+
+def test_who_watches_waits_a_tenth_of_the_rigs_time_at_ten_times_its_speed() -> None:
+    watched = SimulatedRig(make_ball(seed=2), u_safe=0.5).clock
+    rig = SimulatedRig(make_ball(seed=1), u_safe=0.5, speed=10.0, watched=watched)
+    for k in range(1, 101):
+        rig.clock.sleep_until(0.02 * k)
+    assert rig.clock.now() == pytest.approx(2.0)
+    assert rig.plant.time_s == pytest.approx(2.0)
+    assert watched.now() == pytest.approx(0.2)
+
+
+def test_only_a_simulated_rig_is_given_a_speed() -> None:
+    recorded = ReplaySettings(kind="replay", recording="recording.csv")
+    with pytest.raises(InputError, match="has its own time"):
+        open_rig(recorded, u_range=(0.0, 1.0), u_safe=0.5, speed=10.0)
 
 
 def test_the_plant_lives_under_the_command_it_holds() -> None:

@@ -10,9 +10,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2
 
 from autotune.arrays import ComplexArray, FloatArray
+from autotune.distributions import chi2_tail
 from autotune.errors import IdentificationError
 from autotune.identification.closed_loop.prediction_error import PredictionErrorEstimate
 from autotune.identification.closed_loop.predictor_directions import Predictor
@@ -215,5 +215,5 @@ def whiteness(estimate: PredictionErrorEstimate, errors: FloatArray) -> Whitenes
         power = float(e @ e)
         correlation = np.array([float(e[k:] @ e[:-k]) / power for k in range(1, lags + 1)])
         statistic = rows * (rows + 2) * float(np.sum(correlation**2 / (rows - np.arange(1, lags + 1))))
-        worst = min(worst, float(chi2.sf(statistic, max(lags - n, 1))))
+        worst = min(worst, chi2_tail(statistic, max(lags - n, 1)))
     return Whiteness(probability=min(1.0, n_y * worst) if math.isfinite(worst) else 0.0, lags=lags)

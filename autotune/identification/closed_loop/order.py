@@ -6,9 +6,9 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import chi2
 
 from autotune.arrays import FloatArray
+from autotune.distributions import chi2_quantile
 from autotune.errors import IdentificationError
 from autotune.identification.closed_loop.prediction_error import PredictionErrorEstimate, prediction_error
 from autotune.identification.closed_loop.series import Series
@@ -257,7 +257,7 @@ def _dead_time(data: LaggedData, rows: int) -> int:
         spread = inverse[at] @ inverse[at].T
         terms = np.concatenate([phi[i, :, :n_u].T for i in range(k)])  # (k n_u, n_y)
         statistic = float(np.trace(np.linalg.solve(spread, terms) @ np.linalg.solve(variance, terms.T)))
-        if statistic > chi2.ppf(0.99, k * n_u * n_y):
+        if statistic > chi2_quantile(0.99, k * n_u * n_y):
             break
         count = k
     return count if count < data.p - 2 else 0

@@ -11,10 +11,9 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from scipy.signal import lfilter
-from scipy.stats import chi2
 
 from autotune.arrays import FloatArray
+from autotune.distributions import chi2_quantile
 from autotune.identification.delay.data import DelayData
 from autotune.identification.delay.model import DelayModel
 from autotune.identification.delay.output_error import Structure, solve_linear
@@ -48,6 +47,8 @@ def mean_over_window(data: DelayData, structure: Structure, model: DelayModel) -
     -----
     First order in the drift; what moves faster than the window is averaged as the record weights it.
     """
+    from scipy.signal import lfilter  # here: it takes long to import, and few recordings come this way
+
     usable = data.usable_from(model.delay_s * 1.02)
     whitening = np.array(model.noise_ar)
     point = solve_linear(usable, structure, model.a, model.delay_s, whitening)
@@ -70,7 +71,8 @@ def mean_over_window(data: DelayData, structure: Structure, model: DelayModel) -
     step = solution / scale[:-1]
     count = levels.shape[1]
     statistic = step[count:] @ np.linalg.solve(joint[count:, count:], step[count:])
-    return _with(model, structure, moving, step, joint, moved=bool(statistic > chi2.ppf(1.0 - _LEVEL, len(moving))))
+    moved = bool(statistic > chi2_quantile(1.0 - _LEVEL, len(moving)))
+    return _with(model, structure, moving, step, joint, moved=moved)
 
 
 def _response(data: DelayData, a: tuple[float, ...], h: float, theta: FloatArray) -> FloatArray:

@@ -6,11 +6,9 @@ import contextlib
 from collections.abc import Callable, Iterator
 
 import numpy as np
-from scipy.signal import lfilter
-from scipy.stats import norm
-from scipy.stats import t as student
 
 from autotune.arrays import FloatArray
+from autotune.distributions import normal_quantile, student_quantile
 from autotune.errors import IdentificationError, InputError
 from autotune.identification.delay.data import DelayData, prepare
 from autotune.identification.delay.model import DelayModel
@@ -186,6 +184,8 @@ def _values(sample: OnlineSample) -> FloatArray:
 
 def _noise_like(residual: FloatArray, whitening: FloatArray, rows: int) -> Iterator[FloatArray]:
     """Yield records of noise with the residual's variance and that colour."""
+    from scipy.signal import lfilter  # here: it takes long to import, and few recordings come this way
+
     colour = np.array([1.0, *whitening])
     innovations = lfilter(colour, [1.0], residual)[colour.size - 1 :]
     rng = np.random.default_rng(0)
@@ -196,7 +196,7 @@ def _noise_like(residual: FloatArray, whitening: FloatArray, rows: int) -> Itera
 
 def _spread(draws: FloatArray) -> FloatArray:
     """Return the covariance of estimates, larger by what few draws leave open: 1.96 sd are a 95 % interval."""
-    open_left = float(student.ppf(0.975, len(draws) - 1) / norm.ppf(0.975)) ** 2
+    open_left = (student_quantile(0.975, len(draws) - 1) / normal_quantile(0.975)) ** 2
     return np.asarray(np.cov(draws.T) * open_left)
 
 

@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import LinAlgError, eigh
-from scipy.signal import lfilter
 from threadpoolctl import threadpool_limits
 
 from autotune.arrays import ComplexArray, FloatArray
@@ -225,6 +224,8 @@ def _correct_quadrature(
 
     The colour is that of the residual's means over samples, None where it is not asked for or rows are too few.
     """
+    from scipy.signal import lfilter  # here: it takes long to import, and few recordings come this way
+
     n = plain.order
     structure = Structure(order=n)
     point = solve_linear(data, structure, tuple(values[:n].tolist()), max(float(values[n + 1]), 0.0))

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from autotune.distributions import chi2_tail
 from autotune.errors import IdentificationError
 from autotune.identification.frequency.excitation import relay_segments
 from autotune.identification.frequency.limit_cycle_points import limit_cycle_points
@@ -180,9 +181,7 @@ def _judge(
     freedom: int,
     notes: tuple[str, ...],
 ) -> tuple[tuple[str, ...], tuple[FrequencyPoint, ...]]:
-    from scipy.stats import chi2
-
-    probability = float(chi2.sf(chi_square, freedom))
+    probability = chi2_tail(chi_square, freedom)
     shared = freedom // 2
     if probability > 0.01:
         note = f"the recordings agree where they share frequencies ({shared} comparisons, p = {probability:.2g})"

@@ -94,20 +94,34 @@ def test_degrees_of_freedom_are_never_more_than_the_rows_leave(seed: int, pole: 
     assert np.all(noise_colour(X, residual, max_order=0).freedom == pytest.approx(200 - X.shape[1]))
 
 
-def test_generalised_least_squares_under_the_filter_are_those_under_the_noise_covariance() -> None:
-    """The maximum of the restricted likelihood, against a search with the dense covariance of first-order noise."""
-    X, y = slow_columns(120), coloured(np.random.default_rng(3), 120, 0.8)
-    residual = y - X @ np.linalg.lstsq(X, y, rcond=None)[0]
+def likeliest_pole(X: FloatArray, residual: FloatArray, poles: FloatArray) -> float:
+    """The maximum of the restricted likelihood by a search with the dense covariance of first-order noise."""
+    rows = residual.size
 
     def minus_log_likelihood(pole: float) -> float:
-        V = toeplitz(pole ** np.arange(120)) / (1.0 - pole**2)
+        V = toeplitz(pole ** np.arange(rows)) / (1.0 - pole**2)
         of_columns = X.T @ np.linalg.solve(V, X)
         step = np.linalg.solve(of_columns, X.T @ np.linalg.solve(V, residual))
         left = residual - X @ step
         cost = left @ np.linalg.solve(V, left)
         dets = np.linalg.slogdet(V)[1] + np.linalg.slogdet(of_columns)[1]
-        return float(0.5 * ((120 - X.shape[1]) * np.log(cost) + dets))
+        return float(0.5 * ((rows - X.shape[1]) * np.log(cost) + dets))
 
-    poles = np.linspace(0.4, 0.99, 600)
-    best = poles[np.argmin([minus_log_likelihood(pole) for pole in poles])]
+    return float(poles[np.argmin([minus_log_likelihood(pole) for pole in poles])])
+
+
+def test_generalised_least_squares_under_the_filter_are_those_under_the_noise_covariance() -> None:
+    X, y = slow_columns(120), coloured(np.random.default_rng(3), 120, 0.8)
+    residual = y - X @ np.linalg.lstsq(X, y, rcond=None)[0]
+    best = likeliest_pole(X, residual, np.linspace(0.4, 0.99, 600))
     assert noise_colour(X, residual, max_order=1).whitening == pytest.approx([-best], abs=2e-3)
+
+
+def test_the_likeliest_colour_is_found_from_a_residual_that_hardly_returns() -> None:
+    """The search begins beside the largest pole that so many rows can show, where a slope is nearly flat."""
+    X = slow_columns(400)[:, :2]
+    y = coloured(np.random.default_rng(246), 400, 1.0)
+    residual = y - X @ np.linalg.lstsq(X, y, rcond=None)[0]
+    best = likeliest_pole(X, residual, np.linspace(0.98, 0.9975, 100))
+    assert best < 0.995
+    assert noise_colour(X, residual, max_order=1).whitening == pytest.approx([-best], abs=2e-4)
