@@ -22,7 +22,9 @@ types: $(VENV)/.test
 imports: $(VENV)/.test
 	$(BIN)/lint-imports
 
+# each kernel is compiled once, where every worker of a fresh clone would compile them all
 unit: $(VENV)/.test
+	$(BIN)/python -m tests.compile_kernels
 	$(BIN)/pytest -n auto --durations 30
 
 # damaged files, odd options and places that cannot be written, against every command that reads or writes them

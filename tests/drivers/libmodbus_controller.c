@@ -1,6 +1,8 @@
 /* A controller with a plant behind it on libmodbus, for the tests: a PI of its own in positional form, cycle 10 ms.
  *
  *   controller LAW [PORT [DEADMAN [LOG]]]    listens on the loopback, on a free port for 0, prints "ready PORT"
+ *   controller LAW PORT DEADMAN - steps      the same on the reader's time: runs on to each time [s] that comes on a line
+ *                                            of the standard input, and says so in a line
  *
  * LAW says how it understands its gains: ideal, swapped (words of K the other way round), minutes (T_I), percent (K of
  * an output of 0..10 over a measurement of 0..5), parallel, reversed, tenfold (set-point).
@@ -130,7 +132,8 @@ int main(int count, char **words)
         return 1;
     if (count > 3)
         deadman = atof(words[3]);
-    if (count > 4 && (record = fopen(words[4], "a")))
+    int stepped = count > 5 && strcmp(words[5], "steps") == 0;
+    if (count > 4 && !stepped && (record = fopen(words[4], "a")))
         setvbuf(record, NULL, _IOLBF, 0);
     for (int i = 0; i < PEERS; i++)
         peers[i] = -1;
@@ -138,16 +141,21 @@ int main(int count, char **words)
     put(memory->tab_registers + 12, 1.0);
     printf("ready %d\n", ntohs(address.sin_port));
     fflush(stdout);
-    for (double next = now() + SCAN;;) {
-        double wait = next - now();
+    double reached = 0.0; /* in steps */
+    for (double next = (stepped ? 0.0 : now()) + SCAN;;) {
+        double wait = next - (stepped ? reached : now());
         if (wait <= 0.0) {
             scan(memory, law, next);
             next += SCAN;
+            if (stepped && next > reached)
+                printf("%.6f\n", reached), fflush(stdout);
             continue;
         }
         fd_set ready;
         FD_ZERO(&ready);
         FD_SET(listener, &ready);
+        if (stepped)
+            FD_SET(STDIN_FILENO, &ready);
         int highest = listener;
         for (int i = 0; i < PEERS; i++)
             if (peers[i] >= 0) {
@@ -155,8 +163,14 @@ int main(int count, char **words)
                 highest = peers[i] > highest ? peers[i] : highest;
             }
         struct timeval limit = {0, (suseconds_t)(1e6 * wait)};
-        if (select(highest + 1, &ready, NULL, NULL, &limit) <= 0)
+        if (select(highest + 1, &ready, NULL, NULL, stepped ? NULL : &limit) <= 0)
             continue;
+        if (stepped && FD_ISSET(STDIN_FILENO, &ready)) {
+            if (scanf("%lf", &reached) != 1)
+                return 0;
+            if (next > reached)
+                printf("%.6f\n", reached), fflush(stdout);
+        }
         for (int i = 0; i < PEERS; i++)
             if (peers[i] >= 0 && FD_ISSET(peers[i], &ready))
                 serve(link, memory, peers + i);

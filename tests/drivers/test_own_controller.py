@@ -26,8 +26,8 @@ from autotune.models import TransferFunction
 from autotune.pipeline.deployment import deploy
 from autotune.recording import read_recording
 from autotune.report.run_page import verification_page
-from drivers import open_rig
 from drivers.gain_rig import GainRegisterRig
+from drivers.modbus import ModbusLink
 from sim.plant import make_plant
 from tests.autotune.experiment.test_verify import CONFIG as BALL
 from tests.autotune.experiment.test_verify import FIT as BALL_FIT
@@ -325,6 +325,39 @@ def controller(program: Path, law_name: str) -> Iterator[int]:
             process.kill()
 
 
+class SteppedClock:
+    """The time of a device that goes on only when somebody waits: a computer may be as busy as it likes."""
+
+    def __init__(self, process: subprocess.Popen[str]) -> None:
+        self._process, self._t_s = process, 0.0
+
+    def now(self) -> float:
+        return self._t_s
+
+    def sleep_until(self, t_s: float) -> None:
+        if t_s <= self._t_s:
+            return
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        self._process.stdin.write(f"{t_s:.6f}\n")
+        self._process.stdin.flush()
+        assert self._process.stdout.readline()
+        self._t_s = t_s
+
+
+@contextmanager
+def stepped_controller(program: Path, law_name: str) -> Iterator[tuple[int, SteppedClock]]:
+    """Run the controller on the time that its clock gives it; yield its port and that clock."""
+    command = [program, law_name, "0", "0.5", "-", "steps"]
+    pipe = subprocess.PIPE
+    with subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True, preexec_fn=run_before_others) as process:
+        try:
+            assert process.stdout is not None
+            yield int(process.stdout.readline().split()[1]), SteppedClock(process)
+        finally:
+            process.kill()
+
+
 def peer_config(port: int, folder: Path) -> Config:
     content: dict[str, Any] = {
         "name": "C controller",
@@ -346,7 +379,6 @@ def peer_config(port: int, folder: Path) -> Config:
 
 
 @pytest.mark.system("libmodbus-dev", "gcc")
-@pytest.mark.timeout(240)
 @pytest.mark.parametrize(
     ("law_name", "named"),
     [
@@ -362,9 +394,12 @@ def test_a_controller_in_c_is_verified_or_named(
     controller_program: Path, tmp_path: Path, law_name: str, named: str
 ) -> None:
     fit = fitted(LAGS, 1.5, 3.0, 5.0, 8.0)
-    with controller(controller_program, law_name) as port:
+    with stepped_controller(controller_program, law_name) as (port, clock):
         config = peer_config(port, tmp_path)
-        rig: Any = open_rig(config.rig, u_range=(0.0, 10.0), u_safe=4.5)
+        rig = GainRegisterRig(
+            ModbusLink(config.rig), RegisterMap.model_validate(PEER), u_range=(0.0, 10.0), u_safe=4.5,
+            scan_time_s=0.01, clock=clock,
+        )  # fmt: skip
 
         def trial(held: PIDController, gains: TrialGains | None) -> Verification:
             return run_verification(

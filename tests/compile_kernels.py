@@ -1,0 +1,63 @@
+"""Compile the kernels that most tests run, each of them once, before tests start on several processors.
+
+``python -m tests.compile_kernels``, as ``make unit`` does. Workers that start together on a fresh clone would each
+compile all of them, as none finds yet what another is about to store. Where all is compiled, it takes seconds.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import subprocess
+import sys
+import tempfile
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+
+import numpy as np
+
+BALL = Path(__file__).resolve().parents[1] / "configs" / "ball_sim.toml"
+PROCESSORS = 2
+
+
+def compile_equations() -> None:
+    """Simulate a model of equations, and look at its derivatives."""
+    import autotune as at
+    from autotune.equations.linearise import linearise
+    from tests.autotune.equations.models import model
+
+    lag = at.Model.from_equations({
+        "input": [{"column": "u"}], "output": {"value": "x"}, "parameters": {"K": 2.0, "T": 0.5},
+        "state": [{"name": "x", "derivative": "(K*u - x)/T"}],
+    })  # fmt: skip
+    at.simulate(lag, _record())
+    linearise(model(), np.array([0.5]))
+
+
+def compile_chain() -> None:
+    """Simulate a chain of blocks with the lines of all effects."""
+    import autotune as at
+
+    at.simulate(at.Model.from_text("2/(0.5s + 1)"), _record())
+
+
+def compile_run() -> None:
+    """Commission the simulated ball: the rig, its points, the delay, the reduced model and the design."""
+    with tempfile.TemporaryDirectory() as folder:
+        command = [sys.executable, "-m", "autotune", "run", str(BALL), "--out", f"{folder}/run"]
+        subprocess.run(command, check=True, stdout=subprocess.DEVNULL, cwd=folder)
+
+
+def _record() -> dict[str, np.ndarray]:
+    t = 0.05 * np.arange(200)
+    return {"t": t, "u": np.ones(200), "y": 2.0 * (1.0 - np.exp(-t / 0.5))}
+
+
+def main() -> None:
+    """Do all of them, as many at a time as there are processors in the smallest machine; the longest first."""
+    with ProcessPoolExecutor(PROCESSORS, mp_context=multiprocessing.get_context("spawn")) as pool:
+        for done in [pool.submit(kernels) for kernels in (compile_equations, compile_run, compile_chain)]:
+            done.result()
+
+
+if __name__ == "__main__":
+    main()
